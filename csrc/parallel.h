@@ -1,0 +1,39 @@
+// The one way kernels use threads.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <cstdint>
+#include <exception>
+
+namespace univoxel {
+
+/// Call f(begin, end) over [0, n) in chunks of `grain`, on up to `threads` threads.
+///
+/// Chunk bounds depend on n and grain alone, never on the thread count: a kernel whose chunks
+/// write to disjoint places gives the same bits for any number of threads. Work of a single
+/// chunk runs serially: a thread team costs more than it brings there. The first exception
+/// leaves the parallel region and is thrown in the caller.
+template <class F>
+void parallel_for(int64_t n, int64_t grain, int threads, F&& f) {
+    const int64_t chunks = (n + grain - 1) / grain;
+    const int team = static_cast<int>(std::min<int64_t>(chunks, threads));
+    if (team <= 1) {
+        for (int64_t c = 0; c < chunks; ++c) f(c * grain, std::min(n, (c + 1) * grain));
+        return;
+    }
+    std::exception_ptr error;
+    std::atomic<bool> failed{false};
+#pragma omp parallel for schedule(dynamic, 1) num_threads(team)
+    for (int64_t c = 0; c < chunks; ++c) {
+        if (failed.load(std::memory_order_relaxed)) continue;
+        try {
+            f(c * grain, std::min(n, (c + 1) * grain));
+        } catch (...) {
+            if (!failed.exchange(true)) error = std::current_exception();
+        }
+    }
+    if (error) std::rethrow_exception(error);
+}
+
+}  // namespace univoxel

@@ -1,0 +1,60 @@
+"""Pinhole cameras and the rays through their pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from univoxel.records import Rays
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """V pinhole cameras of one picture size. Camera axes: +X right, +Y up, looking along -Z."""
+
+    camera_to_world: Tensor  # [V, 3, 4] float32, rigid
+    focal: Tensor  # [V, 2] pixels, along x and y
+    centre: Tensor  # [V, 2] principal point, pixels from the top left corner
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        return len(self.camera_to_world)
+
+
+def pixel_rays(cameras: Cameras, view: Tensor, pixel: Tensor) -> Rays:
+    """Rays through points of the pictures.
+
+    Args:
+        view: [N] int64, which camera.
+        pixel: [N, 2] x to the right and y down in pixels; pixel (column i, row j) has its centre at
+            (i + 0.5, j + 0.5).
+    """
+    pose, focal, centre = cameras.camera_to_world[view], cameras.focal[view], cameras.centre[view]
+    x, y = ((pixel - centre) / focal).unbind(-1)
+    local = torch.stack([x, -y, -torch.ones_like(x)], -1)
+    direction = torch.einsum("nij,nj->ni", pose[:, :, :3], local)
+    return Rays(pose[:, :, 3], torch.nn.functional.normalize(direction, dim=-1))
+
+
+def image_rays(cameras: Cameras, view: int) -> Rays:
+    """Rays through all pixel centres of one view, row by row: N = height * width."""
+    row, column = torch.meshgrid(
+        torch.arange(cameras.height), torch.arange(cameras.width), indexing="ij"
+    )
+    pixel = torch.stack([column, row], -1).reshape(-1, 2) + 0.5
+    return pixel_rays(cameras, torch.full((len(pixel),), view), pixel)
+
+
+def project(cameras: Cameras, view: int, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixel coordinates [P, 2] of world points [P, 3] in one view, and their depth along -Z [P].
+
+    Coordinates mean nothing where the depth is not positive.
+    """
+    pose = cameras.camera_to_world[view]
+    local = (points - pose[:, 3]) @ pose[:, :3]
+    depth = -local[:, 2]
+    xy = torch.stack([local[:, 0], -local[:, 1]], -1) / depth[:, None]
+    return xy * cameras.focal[view] + cameras.centre[view], depth

@@ -1,0 +1,60 @@
+"""What every loader returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from univoxel.camera import Cameras
+from univoxel.color import srgb_to_linear
+
+
+class DataError(ValueError):
+    """Input that cannot be used: the message names the file, what was expected and what came."""
+
+
+@dataclass(frozen=True)
+class Photos:
+    """Posed photographs of one split, all of one size."""
+
+    folder: Path
+    names: list[str]  # V, unique within the split, such as r_000
+    color: (
+        Tensor  # [V, H, W, 3] uint8 sRGB, or float32 linear radiance; straight, not premultiplied
+    )
+    alpha: Tensor  # [V, H, W] uint8 (0 to 255) or float32 (0 to 1) coverage
+    cameras: Cameras
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def pixels(self, view: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
+        """Linear straight colour [..., 3] and alpha [...] of pixels, float32."""
+        return decode(self.color[view, row, column], self.alpha[view, row, column])
+
+    def picture(self, view: int) -> tuple[Tensor, Tensor]:
+        """Linear straight colour [H, W, 3] and alpha [H, W] of one view, float32."""
+        return decode(self.color[view], self.alpha[view])
+
+
+def decode(color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Stored pixels to linear float32."""
+    if color.dtype == torch.uint8:
+        color = srgb_to_linear(color.float() / 255)
+    if alpha.dtype == torch.uint8:
+        alpha = alpha.float() / 255
+    return color, alpha
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of one test view, as far as a data set has it; float32, linear, row 0 on top."""
+
+    albedo: Tensor | None = None  # [H, W, 3]
+    roughness: Tensor | None = None  # [H, W]
+    normal: Tensor | None = None  # [H, W, 3] unit, world; shading normal
+    mask: Tensor | None = None  # [H, W] bool: well inside the object
+    depth: Tensor | None = None  # [H, W] along the camera's -Z, world units; 0 background
