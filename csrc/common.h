@@ -29,12 +29,12 @@ inline void store3(T* p, int64_t i, const vec3<T>& v) {
 
 // A broken invariant is a bug of ours: it stops a debug build. User errors are raised in Python.
 #ifdef UNIVOXEL_DEBUG
-#define DCHECK(condition)                                                                  \
-    do {                                                                                   \
-        if (!(condition)) {                                                                \
-            std::fprintf(stderr, "%s:%d: DCHECK(%s)\n", __FILE__, __LINE__, #condition);   \
-            std::abort();                                                                  \
-        }                                                                                  \
+#define DCHECK(condition)                                                                \
+    do {                                                                                 \
+        if (!(condition)) {                                                              \
+            std::fprintf(stderr, "%s:%d: DCHECK(%s)\n", __FILE__, __LINE__, #condition); \
+            std::abort();                                                                \
+        }                                                                                \
     } while (false)
 #else
 #define DCHECK(condition) ((void)0)

@@ -1,6 +1,14 @@
 """Differentiable torch ops over native CPU kernels, each beside its eager reference."""
 
 from univoxel.ops.composite import composite, composite_reference
+from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.native import use_backend
 
-__all__ = ["composite", "composite_reference", "use_backend"]
+__all__ = [
+    "brick_minimum",
+    "composite",
+    "composite_reference",
+    "march",
+    "march_reference",
+    "use_backend",
+]

@@ -1,0 +1,168 @@
+#include "march.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+
+#include "parallel.h"
+
+namespace univoxel {
+namespace {
+
+constexpr int64_t kRaysPerChunk = 128;
+// A brick whose sdf stays above this many s lets light through: sigmoid(8) = 0.99966.
+constexpr int kClearBand = 8;
+
+/// Trilinear sdf at grid coordinates inside [0, size - 1].
+template <class T>
+T sdf_at(const March<T>& in, vec3<T> g) {
+    int64_t i[3], stride[3] = {in.size[1] * in.size[2], in.size[2], 1};
+    T w[3];
+    for (int a = 0; a < 3; ++a) {
+        const T x = std::min(std::max(g[a], T(0)), T(in.size[a] - 1));
+        i[a] = std::min(static_cast<int64_t>(x), std::max<int64_t>(in.size[a] - 2, 0));
+        w[a] = x - T(i[a]);
+        if (in.size[a] == 1) stride[a] = 0;
+    }
+    const T* p = in.sdf + (i[0] * in.size[1] + i[1]) * in.size[2] + i[2];
+    const auto lerp = [](T a, T b, T t) { return a + t * (b - a); };
+    const auto along_z = [&](const T* q) { return lerp(q[0], q[stride[2]], w[2]); };
+    const auto along_y = [&](const T* q) { return lerp(along_z(q), along_z(q + stride[1]), w[1]); };
+    return lerp(along_y(p), along_y(p + stride[0]), w[0]);
+}
+
+/// log(sigmoid(x)) without overflow.
+template <class T>
+T log_sigmoid(T x) {
+    return std::min(x, T(0)) - std::log1p(std::exp(-std::abs(x)));
+}
+
+/// Part of a ray inside the box [0, upper]; false when it misses or is no ray.
+template <class T>
+bool clip(vec3<T> o, vec3<T> d, vec3<T> upper, T& near, T& far) {
+    if (!std::isfinite(glm::dot(o, o) + glm::dot(d, d))) return false;
+    near = 0;
+    far = std::numeric_limits<T>::infinity();
+    for (int a = 0; a < 3; ++a) {
+        if (d[a] == 0) {
+            if (!(o[a] >= 0 && o[a] <= upper[a])) return false;
+            continue;
+        }
+        const T t0 = -o[a] / d[a], t1 = (upper[a] - o[a]) / d[a];
+        near = std::max(near, std::min(t0, t1));
+        far = std::min(far, std::max(t0, t1));
+    }
+    return near < far && std::isfinite(far);
+}
+
+/// Walk one ray; append its samples.
+template <class T>
+void march_ray(const March<T>& in, int64_t ray, Marched<T>& out) {
+    // Change to grid coordinates; t stays in world units.
+    const vec3<T> o = (load3(in.origin, ray) - in.grid_origin) / in.voxel_size;
+    const vec3<T> d = load3(in.direction, ray) / in.voxel_size;
+    const vec3<T> upper(in.size[0] - 1, in.size[1] - 1, in.size[2] - 1);
+    T near, far;
+    if (!clip(o, d, upper, near, far)) return;
+    const T start = near + in.jitter[ray] * in.step;
+    const T band = kClearBand / in.inv_s;
+    const int64_t by = bricks_along(in.size[1]), bz = bricks_along(in.size[2]);
+    const int64_t last = static_cast<int64_t>((far - start) / in.step);
+
+    T trans = 1, log_before = 0;
+    int64_t k = 0, before = -2, emitted = -2;
+    while (k <= last && trans >= in.early_stop) {
+        const vec3<T> g = o + (start + T(k) * in.step) * d;
+        // Skip an empty brick: go to the first sample behind it.
+        vec3<T> corner;
+        int64_t b[3];
+        for (int a = 0; a < 3; ++a) {
+            const int64_t n = bricks_along(in.size[a]);
+            b[a] = std::min(std::max<int64_t>(static_cast<int64_t>(g[a]) / kBrick, 0), n - 1);
+            corner[a] = T(kBrick * (b[a] + (d[a] > 0 ? 1 : 0)));
+        }
+        if (in.brick_min[(b[0] * by + b[1]) * bz + b[2]] > band) {
+            T exit = far;
+            for (int a = 0; a < 3; ++a)
+                if (d[a] != 0) exit = std::min(exit, (corner[a] - o[a]) / d[a]);
+            k = std::max(k + 1, static_cast<int64_t>(std::ceil((exit - start) / in.step)));
+            continue;
+        }
+        // The section that ends here starts at the sample before, even if that was skipped.
+        if (before != k - 1) {
+            const T t = start + T(std::max<int64_t>(k - 1, 0)) * in.step;
+            log_before = log_sigmoid(sdf_at(in, o + t * d) * in.inv_s);
+        }
+        const T log_here = log_sigmoid(sdf_at(in, g) * in.inv_s);
+        const T alpha = k > 0 ? std::max(T(0), -std::expm1(log_here - log_before)) : T(0);
+        if (alpha * trans > in.min_weight) {
+            if (emitted != k - 1) {
+                out.t.push_back(start + T(k - 1) * in.step);
+                out.connected.push_back(0);
+            }
+            out.connected.back() = 1;
+            out.t.push_back(start + T(k) * in.step);
+            out.connected.push_back(0);
+            emitted = k;
+        }
+        trans *= 1 - alpha;
+        log_before = log_here;
+        before = k++;
+    }
+}
+
+}  // namespace
+
+template <class T>
+void brick_minimum(const T* sdf, const int64_t size[3], T* out, int threads) {
+    const int64_t X = size[0], Y = size[1], Z = size[2];
+    const int64_t by = bricks_along(Y), bz = bricks_along(Z);
+    parallel_for(bricks_along(X), 1, threads, [&](int64_t begin, int64_t end) {
+        for (int64_t bx = begin; bx < end; ++bx) {
+            T* plane = out + bx * by * bz;
+            std::fill(plane, plane + by * bz, std::numeric_limits<T>::infinity());
+            // A brick owns the nodes on all its faces: neighbours share them.
+            for (int64_t x = bx * kBrick; x <= std::min(X - 1, (bx + 1) * kBrick); ++x)
+                for (int64_t b = 0; b < by; ++b)
+                    for (int64_t y = b * kBrick; y <= std::min(Y - 1, (b + 1) * kBrick); ++y) {
+                        const T* row = sdf + (x * Y + y) * Z;
+                        for (int64_t c = 0; c < bz; ++c) {
+                            T least = plane[b * bz + c];
+                            const int64_t stop = std::min(Z - 1, (c + 1) * kBrick);
+                            for (int64_t z = c * kBrick; z <= stop; ++z)
+                                least = std::min(least, row[z]);
+                            plane[b * bz + c] = least;
+                        }
+                    }
+        }
+    });
+}
+
+template <class T>
+Marched<T> march(const March<T>& in, int threads) {
+    const int64_t chunks = (in.n_rays + kRaysPerChunk - 1) / kRaysPerChunk;
+    std::vector<Marched<T>> parts(chunks);
+    parallel_for(in.n_rays, kRaysPerChunk, threads, [&](int64_t begin, int64_t end) {
+        Marched<T>& part = parts[begin / kRaysPerChunk];
+        for (int64_t ray = begin; ray < end; ++ray) {
+            march_ray(in, ray, part);
+            part.offsets.push_back(static_cast<int64_t>(part.t.size()));
+        }
+    });
+    Marched<T> all;
+    all.offsets.push_back(0);
+    for (const Marched<T>& part : parts) {
+        const int64_t base = all.offsets.back();
+        all.t.insert(all.t.end(), part.t.begin(), part.t.end());
+        all.connected.insert(all.connected.end(), part.connected.begin(), part.connected.end());
+        for (int64_t end : part.offsets) all.offsets.push_back(base + end);
+    }
+    return all;
+}
+
+template void brick_minimum(const float*, const int64_t[3], float*, int);
+template void brick_minimum(const double*, const int64_t[3], double*, int);
+template Marched<float> march(const March<float>&, int);
+template Marched<double> march(const March<double>&, int);
+
+}  // namespace univoxel

@@ -1,0 +1,148 @@
+"""Marching: native against reference, and against what geometry says."""
+
+import pytest
+import torch
+
+from univoxel.ops import brick_minimum, march, march_reference
+
+
+def sphere(n=24, radius=0.6, dtype=torch.float64):
+    """SDF of a sphere on the grid over [-1, 1]^3, and its voxel size."""
+    x = torch.linspace(-1, 1, n, dtype=dtype)
+    grid = torch.stack(torch.meshgrid(x, x, x, indexing="ij"), -1)
+    return grid.norm(dim=-1) - radius, 2 / (n - 1)
+
+
+def random_rays(n, dtype=torch.float64, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    origin = 2.5 * torch.nn.functional.normalize(torch.randn(n, 3, generator=g, dtype=dtype), dim=1)
+    target = torch.rand(n, 3, generator=g, dtype=dtype) * 1.6 - 0.8
+    direction = torch.nn.functional.normalize(target - origin, dim=1)
+    return origin, direction, torch.rand(n, generator=g, dtype=dtype)
+
+
+@pytest.mark.parametrize("inv_s", [10.0, 60.0])
+def test_native_equals_reference(inv_s):
+    sdf, voxel = sphere()
+    rays = random_rays(500)
+    options = {"step": voxel, "inv_s": inv_s}
+    # Skipping leaves out transmittance above sigmoid(8), so weights at the threshold may differ.
+    # A threshold that no section is near to makes the comparison exact.
+    got = march(sdf, brick_minimum(sdf), *rays, (-1.0,) * 3, voxel, **options, min_weight=1e-3)
+    want = march_reference(sdf, *rays, (-1.0,) * 3, voxel, **options, min_weight=1e-3)
+    assert torch.equal(got.offsets, want.offsets)
+    torch.testing.assert_close(got.t, want.t)
+    assert torch.equal(got.connected, want.connected)
+
+
+def test_samples_stand_around_the_surface():
+    sdf, voxel = sphere(48)
+    origin, direction, jitter = random_rays(200)
+    samples = march(
+        sdf,
+        brick_minimum(sdf),
+        origin,
+        direction,
+        jitter,
+        (-1.0,) * 3,
+        voxel,
+        step=voxel,
+        inv_s=4 / voxel,
+    )
+    # Distance along the ray to the analytic sphere
+    b = (origin * direction).sum(1)
+    disc = b**2 - (origin.square().sum(1) - 0.36)
+    hits = disc > 0.01
+    counts = samples.offsets.diff()
+    assert (counts[hits] >= 2).all()
+    assert (counts[disc < -0.3] == 0).all()
+    first = samples.t[samples.offsets[:-1][hits]]
+    # the first sample lies before the surface, by no more than the 8 s of the band and one step
+    gap = (-b[hits] - disc[hits].sqrt()) - first
+    assert (gap > -voxel).all()
+    assert (gap < 24 * voxel).all()
+
+
+def test_last_sample_of_a_ray_starts_no_section():
+    sdf, voxel = sphere()
+    s = march(
+        sdf, brick_minimum(sdf), *random_rays(100), (-1.0,) * 3, voxel, step=voxel, inv_s=30.0
+    )
+    ends = s.offsets[1:][s.offsets.diff() > 0] - 1
+    assert not s.connected[ends].any()
+    gaps = s.t.diff()[s.connected[:-1]]
+    torch.testing.assert_close(gaps, torch.full_like(gaps, voxel))
+
+
+def test_threads_do_not_change_the_bits():
+    sdf, voxel = sphere(dtype=torch.float32)
+    rays = random_rays(1000, torch.float32)
+    before = torch.get_num_threads()
+    results = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        results.append(
+            march(sdf, brick_minimum(sdf), *rays, (-1.0,) * 3, voxel, step=voxel, inv_s=30.0)
+        )
+    torch.set_num_threads(before)
+    assert torch.equal(results[0].t, results[1].t)
+    assert torch.equal(results[0].offsets, results[1].offsets)
+
+
+@pytest.mark.parametrize("shape", [(9, 5, 6), (4, 13, 2), (1, 1, 1)])
+def test_brick_minimum(shape):
+    from univoxel.ops import use_backend
+
+    sdf = torch.randn(shape)
+    with use_backend("reference"):
+        expected = brick_minimum(sdf)
+    assert torch.equal(brick_minimum(sdf), expected)
+
+
+def test_rays_that_miss_or_are_not_numbers_have_no_samples():
+    sdf, voxel = sphere(dtype=torch.float32)
+    origin = torch.tensor([[5.0, 5.0, 5.0], [0.0, 0.0, 3.0], [float("nan"), 0.1, 0.0]])
+    direction = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])
+    s = march(
+        sdf,
+        brick_minimum(sdf),
+        origin,
+        direction,
+        torch.zeros(3),
+        (-1.0,) * 3,
+        voxel,
+        step=voxel,
+        inv_s=30.0,
+    )
+    assert s.offsets.tolist() == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sdf": torch.zeros(4, 4)}, r"sdf must be \[X, Y, Z\]"),
+        ({"origin": torch.zeros(3, 2)}, r"origin must be \[N, 3\]"),
+        ({"direction": torch.zeros(4, 3)}, r"direction must be \[N, 3\] .* N=3"),
+        ({"jitter": torch.zeros(3).double()}, "jitter must be .* float32"),
+        ({"brick_min": torch.zeros(3, 3, 3)}, "brick_min does not belong to this sdf"),
+        ({"step": 0.0}, "step must be positive and finite, got 0.0"),
+        ({"inv_s": float("nan")}, "inv_s must be positive"),
+        ({"min_weight": -1.0}, r"min_weight must be in \[0, 1\]"),
+    ],
+)
+def test_bad_arguments(change, message):
+    sdf = torch.ones(5, 5, 5)
+    arguments = {
+        "sdf": sdf,
+        "brick_min": brick_minimum(sdf),
+        "origin": torch.zeros(3, 3),
+        "direction": torch.ones(3, 3),
+        "jitter": torch.zeros(3),
+        "grid_origin": (0.0, 0.0, 0.0),
+        "voxel_size": 0.1,
+        "step": 0.1,
+        "inv_s": 10.0,
+    }
+    march(**arguments)
+    with pytest.raises(ValueError, match=message):
+        march(**(arguments | change))

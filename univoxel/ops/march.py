@@ -1,0 +1,165 @@
+"""Marching rays through an SDF grid: where along each ray is there something to see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from univoxel.ops import native
+from univoxel.ops.checks import check
+from univoxel.records import Samples
+
+BRICK = 4  # voxels along the side of a brick that is skipped as a whole; as in csrc/march.h
+
+
+def brick_minimum(sdf: Tensor) -> Tensor:
+    """Least sdf in each brick of 4^3 voxels (5^3 nodes; neighbours share their faces).
+
+    Args:
+        sdf: [X, Y, Z] world units.
+
+    Returns:
+        [ceil((X - 1) / 4), ...] at least 1 along each axis.
+    """
+    check("brick_minimum", sdf=(sdf, "X Y Z"))
+    if native.serves(sdf):
+        out = sdf.new_empty([max(1, (n - 2) // BRICK + 1) for n in sdf.shape])
+        native.require().brick_minimum(*native.arrays(sdf.contiguous(), out), native.threads())
+        return out
+    for axis in range(3):
+        n = sdf.shape[axis]
+        sdf = torch.stack(
+            [
+                sdf.narrow(axis, i, min(BRICK + 1, n - i)).amin(axis)
+                for i in range(0, max(n - 1, 1), BRICK)
+            ],
+            axis,
+        )
+    return sdf
+
+
+def march(
+    sdf: Tensor,  # [X, Y, Z]
+    brick_min: Tensor,
+    origin: Tensor,  # [N, 3]
+    direction: Tensor,  # [N, 3]
+    jitter: Tensor,  # [N]
+    grid_origin: Sequence[float],
+    voxel_size: float,
+    *,
+    step: float,
+    inv_s: float,
+    min_weight: float = 1e-4,
+    early_stop: float = 1e-3,
+) -> Samples:
+    """Samples along rays where the NeuS density of an SDF grid lets anything be seen.
+
+    Samples stand at t = near + (k + jitter) step inside the grid's box. A section between two of
+    them is kept when it weighs more than min_weight, with
+
+        alpha = max(0, 1 - sigmoid(f_end / s) / sigmoid(f_start / s))
+
+    from the trilinear sdf f at its ends; the samples at the ends of kept sections are returned.
+    Bricks whose sdf stays above 8 s are skipped as a whole.
+
+    Args:
+        sdf: [X, Y, Z] world units, negative inside.
+        brick_min: `brick_minimum(sdf)`; may lag a few optimisation steps behind.
+        origin, direction: [N, 3] rays in the world, direction unit.
+        jitter: [N] in [0, 1): where in its first step a ray starts.
+        grid_origin: world position of node (0, 0, 0).
+        voxel_size: world units.
+        step: distance of samples, world units, > 0.
+        inv_s: 1 / s, sharpness of the density, 1 / world units, > 0.
+        min_weight: in [0, 1].
+        early_stop: a ray ends where its transmittance falls below this, in [0, 1].
+
+    Raises:
+        TypeError, ValueError: an argument of another size, dtype, device or range than above.
+
+    Not differentiable. Source: Wang et al. 2021 (NeuS), eq. 13.
+    """
+    check(
+        "march",
+        sdf=(sdf, "X Y Z"),
+        brick_min=(brick_min, "A B C"),
+        origin=(origin, "N 3"),
+        direction=(direction, "N 3"),
+        jitter=(jitter, "N"),
+    )
+    for name, number in (("voxel_size", voxel_size), ("step", step), ("inv_s", inv_s)):
+        if not 0 < number < float("inf"):
+            raise ValueError(f"march: {name} must be positive and finite, got {number}")
+    for name, number in (("min_weight", min_weight), ("early_stop", early_stop)):
+        if not 0 <= number <= 1:
+            raise ValueError(f"march: {name} must be in [0, 1], got {number}")
+    if not native.serves(sdf):
+        return march_reference(
+            sdf,
+            origin,
+            direction,
+            jitter,
+            grid_origin,
+            voxel_size,
+            step=step,
+            inv_s=inv_s,
+            min_weight=min_weight,
+            early_stop=early_stop,
+        )
+    tensors = [t.contiguous() for t in (sdf, brick_min, origin, direction, jitter)]
+    t, connected, offsets = native.require().march(
+        *native.arrays(*tensors),
+        tuple(map(float, grid_origin)),
+        float(voxel_size),
+        float(step),
+        float(inv_s),
+        float(min_weight),
+        float(early_stop),
+        native.threads(),
+    )
+    return Samples(
+        torch.from_numpy(t), torch.from_numpy(connected).bool(), torch.from_numpy(offsets)
+    )
+
+
+def march_reference(
+    sdf: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    jitter: Tensor,
+    grid_origin: Sequence[float],
+    voxel_size: float,
+    *,
+    step: float,
+    inv_s: float,
+    min_weight: float = 1e-4,
+    early_stop: float = 1e-3,
+) -> Samples:
+    """The same in eager torch, without skipping: every sample of every ray at once."""
+    start = origin.new_tensor(grid_origin)
+    size = torch.tensor(sdf.shape, device=sdf.device, dtype=sdf.dtype) - 1
+    o, d = (origin - start) / voxel_size, direction / voxel_size
+    ends = torch.stack([-o / d, (size - o) / d])
+    near = ends.amin(0).amax(1).clamp_min(0)
+    far = ends.amax(0).amin(1)
+    count = torch.where(near < far, (far - near - jitter * step) / step, -1.0).floor() + 1
+    k = torch.arange(max(int(count.max()), 0) if len(count) else 0, device=sdf.device)
+    t = near[:, None] + (jitter[:, None] + k) * step
+    valid = k < count[:, None]
+    g = (o[:, None] + t[..., None] * d[:, None]).clamp(torch.zeros_like(size), size)
+    f = torch.nn.functional.grid_sample(
+        sdf[None, None], (2 * g / size - 1).flip(-1)[None, None], align_corners=True
+    )[0, 0, 0]
+    log_phi = torch.nn.functional.logsigmoid(f * inv_s)
+    alpha = -torch.expm1(log_phi[:, 1:] - log_phi[:, :-1]).clamp_max(0)
+    alpha = torch.where(valid[:, 1:], alpha, 0.0)
+    trans = torch.cumprod(1 - alpha, 1)
+    trans = torch.cat([torch.ones_like(trans[:, :1]), trans[:, :-1]], 1)
+    kept = (alpha * trans > min_weight) & (trans >= early_stop)
+    none = torch.zeros_like(kept[:, :1])
+    starts, stops = torch.cat([kept, none], 1), torch.cat([none, kept], 1)
+    used = starts | stops
+    offsets = torch.cat([none[:1, 0].long(), used.sum(1).cumsum(0)])
+    return Samples(t[used], starts[used], offsets)
