@@ -1,0 +1,177 @@
+"""Pictures in files: PNG, JPEG, OpenEXR and Radiance in; PNG and OpenEXR out."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import torch
+from PIL import Image
+from torch import Tensor
+
+from univoxel.data.base import DataError
+from univoxel.data.radiance import read_radiance
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
+
+
+def read_image(path: str | Path) -> Tensor:
+    """Read a picture, row 0 on top, channels in the order RGB(A) or grey.
+
+    Returns:
+        [H, W, C]: uint8 as stored for PNG and JPEG of 8 bits; float32 in [0, 1], still encoded as
+        stored, for grey PNG of 16 bits (colour PNG of 16 bits is cut to 8); float32 linear for EXR
+        (channels R, G, B and A if there, or Y) and Radiance .hdr.
+
+    Raises:
+        DataError: the file is missing, empty, cut off, not what its name says, of an unsupported
+            kind, or holds NaN or infinity.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise DataError(f"{path}: expected a picture ({' '.join(SUFFIXES)}), got '{path.suffix}'")
+    if suffix == ".hdr":
+        _require_file(path)
+        return torch.from_numpy(read_radiance(path))
+    if suffix == ".exr":
+        channels = read_exr(path)
+        names = [c for c in "RGBA" if c in channels] if "R" in channels else ["Y"]
+        if names not in (["R", "G", "B"], ["R", "G", "B", "A"], ["Y"]) or names[0] not in channels:
+            raise DataError(f"{path}: expected channels R, G, B or Y, got {', '.join(channels)}")
+        image = np.stack([channels[name] for name in names], -1)
+        if not np.isfinite(image).all():
+            row, column, _ = np.argwhere(~np.isfinite(image))[0]
+            raise DataError(f"{path}: NaN or infinity at row {row}, column {column}")
+        return torch.from_numpy(image)
+    return torch.from_numpy(_read_pillow(path))
+
+
+def read_exr(path: str | Path) -> dict[str, np.ndarray]:
+    """All channels of the first part of an OpenEXR file, [H, W] float32 each.
+
+    Raises:
+        DataError: the file is missing, empty, cut off, no EXR file, or has subsampled channels or a
+            data window unlike its display window.
+    """
+    path = Path(path)
+    _require_file(path)
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            header = file.header()
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise DataError(f"{path}: expected an OpenEXR file, could not read it: {error}") from None
+    data, display = header["dataWindow"], header["displayWindow"]
+    if not all(np.array_equal(a, b) for a, b in zip(data, display, strict=True)):
+        raise DataError(f"{path}: expected a data window like the display window, got a crop")
+    if len({pixels.shape for pixels in channels.values()}) != 1:
+        raise DataError(f"{path}: expected channels of one size, got subsampled ones")
+    return {name: np.asarray(pixels, np.float32) for name, pixels in channels.items()}
+
+
+def write_png(path: str | Path, image: Tensor | np.ndarray) -> None:
+    """Write [H, W], [H, W, 3] or [H, W, 4] as 8-bit PNG, whole or not at all.
+
+    Args:
+        image: uint8, or floating in [0, 1] as it shall be stored (sRGB for colours); floating
+            values are clipped and rounded.
+
+    Raises:
+        OSError: the file cannot be written; nothing is left behind.
+        ValueError: another shape or type, or NaN.
+    """
+    array = np.asarray(image)
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (3, 4)):
+        raise ValueError(f"write_png: image must be [H, W(, 3 or 4)], got {list(array.shape)}")
+    if np.issubdtype(array.dtype, np.floating):
+        if np.isnan(array).any():
+            raise ValueError(f"write_png: image for {path} holds NaN")
+        array = (array.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+    if array.dtype != np.uint8:
+        raise ValueError(f"write_png: image must be uint8 or floating, got {array.dtype}")
+    with replacing(path) as temporary:
+        Image.fromarray(array).save(temporary, format="PNG")
+
+
+def write_exr(
+    path: str | Path, channels: dict[str, Tensor | np.ndarray], half: bool = True
+) -> None:
+    """Write [H, W] channels of one size as an OpenEXR file, whole or not at all.
+
+    Args:
+        channels: by name, such as R, rgb.R or depth.
+        half: 16-bit floats (values above 65504 become 65504), else 32-bit.
+
+    Raises:
+        OSError: the file cannot be written; nothing is left behind.
+        ValueError: no channels, or channels of differing or empty shape.
+    """
+    kind = np.float16 if half else np.float32
+    arrays = {name: np.asarray(value, np.float32) for name, value in channels.items()}
+    shapes = {array.shape for array in arrays.values()}
+    if len(shapes) != 1 or len(shape := shapes.pop()) != 2 or 0 in shape:
+        got = {name: list(array.shape) for name, array in arrays.items()}
+        raise ValueError(f"write_exr: channels must be [H, W] of one size, got {got}")
+    if half:
+        arrays = {name: array.clip(-65504, 65504) for name, array in arrays.items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with replacing(path) as temporary:
+        pixels = {n: np.ascontiguousarray(a.astype(kind)) for n, a in arrays.items()}
+        try:
+            OpenEXR.File(header, pixels).write(str(temporary))
+        except RuntimeError as error:  # OpenEXR's way to say that the disk is full
+            raise OSError(str(error)) from None
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Give a temporary path beside `path` to write to; it takes the place of `path` at the end.
+
+    If the block raises, the temporary file is removed and `path` is as it was. OSError comes out
+    naming `path`.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        reason = error.strerror or str(error).replace(str(temporary), path.name)
+        raise OSError(error.errno or 0, f"cannot write: {reason}", str(path)) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _require_file(path: Path) -> None:
+    """OpenEXR prints to stderr about files that are not there; ask before."""
+    if not path.is_file():
+        what = "a folder" if path.is_dir() else "nothing there"
+        raise DataError(f"{path}: expected a file, got {what}")
+    if not path.stat().st_size:
+        raise DataError(f"{path}: the file is empty")
+
+
+def _read_pillow(path: Path) -> np.ndarray:
+    """[H, W, C] uint8, or float32 for 16-bit grey."""
+    _require_file(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=["PNG", "JPEG"]) as image:
+                image.load()
+                if image.mode.startswith("I;16"):
+                    return np.asarray(image, np.float32)[..., None] / 65535
+                grey = image.mode in ("1", "L")
+                transparent = image.has_transparency_data
+                array = np.asarray(
+                    image.convert("L" if grey else "RGBA" if transparent else "RGB")
+                ).copy()
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path}: expected a PNG or JPEG, could not read it: {error}") from None
+    return array[..., None] if grey else array

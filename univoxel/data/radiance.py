@@ -1,0 +1,78 @@
+"""Reading Radiance pictures (.hdr): shared-exponent pixels, flat or run-length encoded."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from univoxel.data.base import DataError
+
+
+def read_radiance(path: Path) -> np.ndarray:
+    """Linear RGB [H, W, 3] float32: mantissa * 2^(exponent - 136), exactly; 0 where exponent is 0.
+
+    EXPOSURE lines are not applied, as in other readers.
+
+    Raises:
+        DataError: not a Radiance RGBE picture, cut off, or of an orientation or encoding other than
+            -Y +X rows, flat or with run lengths per channel.
+        OSError: the file cannot be read.
+
+    Source: Ward 1991, "Real pixels" (Graphics Gems II), and the Radiance file format description.
+    """
+    data = path.read_bytes()
+    if not data.startswith(b"#?"):
+        raise DataError(f"{path}: expected a Radiance picture (first bytes '#?'), got {data[:8]!r}")
+    head, blank, rest = data.partition(b"\n\n")
+    line, newline, body = rest.partition(b"\n")
+    if not (blank and newline):
+        raise DataError(f"{path}: the file ends within its header")
+    if form := re.search(rb"^FORMAT=(.*)$", head, re.MULTILINE):
+        if form[1].strip() != b"32-bit_rle_rgbe":
+            raise DataError(f"{path}: expected FORMAT=32-bit_rle_rgbe, got {form[1].strip()!r}")
+    size = re.fullmatch(rb"-Y (\d+) \+X (\d+)\s*", line)
+    if not size or not (int(size[1]) and int(size[2])):
+        raise DataError(f"{path}: expected the size as '-Y height +X width', got {line[:40]!r}")
+    height, width = int(size[1]), int(size[2])
+
+    # A flat file cannot start with the marker: its largest mantissa would be below 128.
+    marker = bytes([2, 2, width >> 8 & 255, width & 255])
+    if 8 <= width < 32768 and body.startswith(marker):
+        rgbe = _run_lengths(path, np.frombuffer(body, np.uint8), marker, height, width)
+    elif len(body) == 4 * height * width:
+        rgbe = np.frombuffer(body, np.uint8).reshape(height, width, 4)
+    else:
+        raise DataError(
+            f"{path}: expected {4 * height * width} bytes of {width}x{height} flat pixels or "
+            f"run-length encoded rows, got {len(body)} bytes"
+        )
+    exponent = rgbe[..., 3:].astype(np.int32)
+    value = np.ldexp(rgbe[..., :3].astype(np.float32), exponent - 136)
+    return np.where(exponent > 0, value, np.float32(0))
+
+
+def _run_lengths(
+    path: Path, body: np.ndarray, marker: bytes, height: int, width: int
+) -> np.ndarray:
+    """Rows that start with the marker and hold each channel as runs (> 128) and literals."""
+    out = np.empty((height, 4, width), np.uint8)
+    at = 0
+    for row in range(height):
+        if body[at : at + 4].tobytes() != marker:
+            raise DataError(f"{path}: row {row} of {height} is missing or broken")
+        at += 4
+        for channel in out[row]:
+            x = 0
+            while x < width:
+                count = int(body[at]) if at < len(body) else 0
+                run = count > 128
+                count -= 128 if run else 0
+                needed = 1 if run else count
+                if not count or x + count > width or at + 1 + needed > len(body):
+                    raise DataError(f"{path}: row {row} of {height} is cut off or broken")
+                channel[x : x + count] = body[at + 1 : at + 1 + needed]
+                x += count
+                at += 1 + needed
+    return out.transpose(0, 2, 1)
