@@ -13,6 +13,7 @@
 
 #include "composite.h"
 #include "march.h"
+#include "smooth.h"
 
 namespace py = pybind11;
 using namespace univoxel;
@@ -119,6 +120,26 @@ void bind_march(py::module_& m) {
         py::arg("early_stop"), py::arg("threads"));
 }
 
+template <class T>
+void bind_smooth(py::module_& m) {
+    m.def(
+        "smooth_rows",
+        [](array<T>& grid, const array<int64_t>& rows, double amount, int order, int threads) {
+            const int64_t size[3] = {grid.shape(0), grid.shape(1), grid.shape(2)};
+            const int64_t nodes = size[0] * size[1] * size[2];
+            const int64_t* r = rows.data();
+            for (int64_t k = 0; k < rows.size(); ++k)
+                require(r[k] >= 0 && r[k] < nodes, "smooth_rows: rows must be in [0, " +
+                                                       std::to_string(nodes) + "), got " +
+                                                       std::to_string(r[k]));
+            T* g = grid.mutable_data();
+            py::gil_scoped_release nogil;
+            smooth_rows(g, size, grid.shape(3), r, rows.size(), T(amount), order, threads);
+        },
+        py::arg("grid").noconvert(), py::arg("rows").noconvert(), py::arg("amount"),
+        py::arg("order"), py::arg("threads"));
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_core, m) {
@@ -127,4 +148,6 @@ PYBIND11_MODULE(_core, m) {
     bind_composite<double>(m);
     bind_march<float>(m);
     bind_march<double>(m);
+    bind_smooth<float>(m);
+    bind_smooth<double>(m);
 }

@@ -3,6 +3,7 @@
 from univoxel.ops.composite import composite, composite_reference
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.native import use_backend
+from univoxel.ops.smooth import smooth_rows_, smooth_rows_reference_
 
 __all__ = [
     "brick_minimum",
@@ -10,5 +11,7 @@ __all__ = [
     "composite_reference",
     "march",
     "march_reference",
+    "smooth_rows_",
+    "smooth_rows_reference_",
     "use_backend",
 ]

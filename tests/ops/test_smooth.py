@@ -1,0 +1,53 @@
+"""Smoothing at chosen nodes."""
+
+import pytest
+import torch
+
+from univoxel.ops import smooth_rows_, smooth_rows_reference_
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("shape", [(6, 5, 7, 3), (2, 1, 4, 1)])
+def test_native_equals_reference(order, shape):
+    grid = torch.randn(shape, dtype=torch.float64)
+    nodes = grid[..., 0].numel()
+    rows = torch.randperm(nodes)[: nodes // 2]
+    got = smooth_rows_(grid.clone(), rows, 0.3, order)
+    torch.testing.assert_close(got, smooth_rows_reference_(grid.clone(), rows, 0.3, order))
+    untouched = torch.ones(nodes, dtype=torch.bool).index_fill_(0, rows, False)
+    assert torch.equal(got.view(nodes, -1)[untouched], grid.view(nodes, -1)[untouched])
+
+
+def test_thin_plate_keeps_a_plane_and_lowers_a_bump():
+    x = torch.arange(9.0)
+    plane = (2 * x[:, None, None] - x[None, :, None] + 0.5 * x).expand(9, 9, 9)[..., None]
+    bump = plane.clone()
+    bump[4, 4, 4] += 1
+    middle = torch.tensor([(4 * 9 + 4) * 9 + 4])
+    torch.testing.assert_close(smooth_rows_(plane.clone(), middle, 0.4, 2), plane.contiguous())
+    # L L f at the bump is 1 + 6/36
+    change = smooth_rows_(bump.clone(), middle, 0.4, 2)[4, 4, 4, 0] - bump[4, 4, 4, 0]
+    assert change.item() == pytest.approx(-0.4 * (1 + 1 / 6), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"grid": torch.zeros(3, 3, 3)}, r"grid must be \[X, Y, Z, C\]"),
+        ({"rows": torch.zeros(2)}, "rows must be .* int64"),
+        ({"rows": torch.tensor([27])}, r"rows must be in \[0, 27\), got 27"),
+        ({"amount": 2.0}, r"amount must be in \[0, 1\], got 2.0"),
+        ({"order": 3}, "order must be 1 or 2, got 3"),
+        ({"grid": torch.zeros(3, 3, 3, 4)[..., ::2]}, "grid must be contiguous"),
+    ],
+)
+def test_bad_arguments(change, message):
+    arguments = {
+        "grid": torch.zeros(3, 3, 3, 2),
+        "rows": torch.tensor([0, 5]),
+        "amount": 0.1,
+        "order": 1,
+    }
+    smooth_rows_(**arguments)
+    with pytest.raises(ValueError, match=message):
+        smooth_rows_(**(arguments | change))

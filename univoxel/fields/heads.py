@@ -1,0 +1,50 @@
+"""Small networks that decode a ray's composited features."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+def mlp(sizes: list[int]) -> nn.Sequential:
+    """Linear layers with ReLU between them."""
+    layers: list[nn.Module] = []
+    for i, o in zip(sizes[:-1], sizes[1:], strict=True):
+        layers += [nn.Linear(i, o), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+class MaterialHead(nn.Module):
+    """Features [N, C] -> albedo [N, 3] and roughness [N]."""
+
+    min_roughness = 0.05  # below, a highlight is narrower than the light's own detail
+
+    def __init__(self, channels: int, hidden: int):
+        super().__init__()
+        self.net = mlp([channels, hidden, hidden, 4])
+        with torch.no_grad():  # start mid-grey and rather rough, whatever the features
+            self.net[-1].weight.mul_(0.1)
+            self.net[-1].bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.5]))
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        out = torch.sigmoid(self.net(features))
+        low = self.min_roughness
+        return out[:, :3], low + (1 - low) * out[:, 3]
+
+
+class RadianceHead(nn.Module):
+    """Outgoing radiance without any model of light: it lets geometry converge early.
+
+    Reads features, normal, the mirrored view direction (Verbin et al. 2022, Ref-NeRF) and n.wo;
+    returns sRGB-encoded colour, so that the network is as fine in the dark as the eye is.
+    """
+
+    def __init__(self, channels: int, hidden: int):
+        super().__init__()
+        self.net = mlp([channels + 3 + 9 + 1, hidden, hidden, 3])
+
+    def forward(self, features: Tensor, normal: Tensor, wo: Tensor) -> Tensor:
+        cosine = (normal * wo).sum(1, keepdim=True)
+        mirrored = 2 * cosine * normal - wo
+        waves = torch.cat([mirrored, (2 * mirrored).sin(), (2 * mirrored).cos()], 1)
+        return torch.sigmoid(self.net(torch.cat([features, normal, waves, cosine], 1)))

@@ -1,0 +1,140 @@
+"""Where the object can be: bounds and a first SDF from silhouettes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from univoxel.camera import Cameras, project
+
+
+@dataclass(frozen=True)
+class GridShape:
+    """A grid of cubic voxels in the world; node (i, j, k) lies at origin + voxel_size (i, j, k)."""
+
+    origin: tuple[float, float, float]
+    voxel_size: float
+    size: tuple[int, int, int]  # nodes
+
+    def nodes(self, step: int = 1) -> Tensor:
+        """World positions of every step-th node: [X, Y, Z, 3] float32."""
+        axes = [
+            o + self.voxel_size * torch.arange(0, n, step)
+            for o, n in zip(self.origin, self.size, strict=True)
+        ]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+
+
+def fit_grid(lower: Tensor, upper: Tensor, voxels: int) -> GridShape:
+    """A grid over the box [lower, upper] with about this many voxels."""
+    extent = (upper - lower).double().clamp_min(1e-9)
+    voxel_size = float((extent.prod() / voxels) ** (1 / 3))
+    cells = (extent / voxel_size).ceil().clamp_min(2)
+    origin = (lower + upper).double() / 2 - cells * voxel_size / 2
+    return GridShape(tuple(origin.tolist()), voxel_size, tuple(int(c) + 1 for c in cells.tolist()))
+
+
+def mask_distances(alpha: Tensor) -> Tensor:
+    """Signed distance to the silhouette in pixels, negative inside: [V, H, W] -> the same.
+
+    Sub-pixel: a half-covered pixel lies on the silhouette.
+    """
+    result = np.empty(alpha.shape, np.float32)
+    for v, a in enumerate(alpha.numpy()):
+        inside = a >= 0.5
+        if not inside.any():
+            result[v] = max(a.shape)  # nothing seen: everything is far outside
+            continue
+        padded = np.pad(inside, 1)  # what leaves the picture ends there
+        d = ndimage.distance_transform_edt(~padded) - ndimage.distance_transform_edt(padded)
+        d = d[1:-1, 1:-1]
+        # Next to the edge the distance to pixel centres is 1; coverage says where in between.
+        edge = np.abs(d) <= 1
+        d = d - np.sign(d) * 0.5
+        result[v] = np.where(edge & (a > 0) & (a < 1), 0.5 - a, d)
+    return torch.from_numpy(result)
+
+
+def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
+    """Signed distance to the visual hull, a lower bound of the object's: [P, 3] -> [P].
+
+    The largest over views of the silhouette's distance times depth / focal length. A view says
+    nothing about points behind it or outside its picture; points that no view sees are outside.
+
+    Args:
+        distance: [V, H, W] from `mask_distances`.
+    """
+    sdf = torch.full((len(points),), -torch.inf)
+    scale = torch.tensor([2 / cameras.width, 2 / cameras.height])
+    for v in range(len(cameras)):
+        pixel, depth = project(cameras, v, points)
+        uv = pixel * scale - 1
+        d = torch.nn.functional.grid_sample(
+            distance[v][None, None], uv[None, None], align_corners=False, padding_mode="border"
+        )[0, 0, 0]
+        seen = (depth > 0) & (uv.abs() <= 1).all(1)
+        sdf = torch.where(seen, torch.maximum(sdf, d * depth / cameras.focal[v].mean()), sdf)
+    return torch.where(sdf.isinf(), torch.inf, sdf)
+
+
+def estimate_bounds(distance: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Corners [3], [3] of a box around the visual hull, with a margin of 3 % of its diagonal.
+
+    Raises:
+        ValueError: the silhouettes share no volume.
+    """
+    # The point nearest to all optical axes, and what the cameras see around it
+    position, axis = cameras.camera_to_world[:, :, 3], -cameras.camera_to_world[:, :, 2]
+    across = torch.eye(3) - axis[:, :, None] * axis[:, None]
+    system = across.mean(0) + 1e-6 * torch.eye(3)
+    centre = torch.linalg.solve(system, (across @ position[:, :, None]).mean(0)[:, 0])
+    away = (position - centre).norm(dim=1)
+    field_of_view = max(cameras.width, cameras.height) / (2 * cameras.focal.min(1).values)
+    half = float((away * field_of_view).max()) * 1.2
+    lower, upper = centre - half, centre + half
+    for _ in range(3):  # each round sees the hull at a finer grid
+        grid = fit_grid(lower, upper, 64**3)
+        nodes = grid.nodes().reshape(-1, 3)
+        inside = nodes[hull_sdf(distance, cameras, nodes) < grid.voxel_size]
+        if not len(inside):
+            raise ValueError(
+                "the silhouettes of the photographs share no volume: check masks and cameras"
+            )
+        lower, upper = inside.amin(0), inside.amax(0)
+        margin = 0.03 * (upper - lower).norm() + grid.voxel_size
+        lower, upper = lower - margin, upper + margin
+    return lower, upper
+
+
+def visual_hull(distance: Tensor, cameras: Cameras, grid: GridShape) -> Tensor:
+    """SDF of the visual hull on a grid: [X, Y, Z], world units; evaluated at about 1 M nodes."""
+    stride = max(1, round((np.prod(grid.size) / 1e6) ** (1 / 3)))
+    coarse = fit_coarse(grid, stride)
+    sdf = hull_sdf(distance, cameras, coarse.nodes().reshape(-1, 3)).reshape(coarse.size)
+    far = sum(n * n for n in grid.size) ** 0.5 * grid.voxel_size
+    return resample(sdf.clamp(-far, far), coarse, grid)
+
+
+def fit_coarse(grid: GridShape, stride: int) -> GridShape:
+    """A grid from the same origin with voxels `stride` times as wide that covers the same box."""
+    size = tuple(-(-(n - 1) // stride) + 1 for n in grid.size)
+    return GridShape(grid.origin, grid.voxel_size * stride, size)
+
+
+def resample(values: Tensor, source: GridShape, target: GridShape) -> Tensor:
+    """Trilinear resampling between grids: [X, Y, Z] or [X, Y, Z, C], clamped at the border."""
+    start = torch.tensor(target.origin) - torch.tensor(source.origin)
+    axes = []
+    for a in range(3):
+        g = (start[a] + target.voxel_size * torch.arange(target.size[a])) / source.voxel_size
+        axes.append(2 * g / max(source.size[a] - 1, 1) - 1)
+    where = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flip(-1).to(values.dtype)
+    channels_first = values[None] if values.dim() == 3 else values.movedim(-1, 0)
+    out = torch.nn.functional.grid_sample(
+        channels_first[None], where[None], align_corners=True, padding_mode="border"
+    )[0]
+    return out[0] if values.dim() == 3 else out.movedim(0, -1).contiguous()

@@ -1,0 +1,65 @@
+"""Rays -> samples -> field -> opacity -> one surface per ray -> material -> light."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from univoxel.camera import Cameras, image_rays
+from univoxel.ops import composite
+from univoxel.records import Rays, Surface
+from univoxel.render.density import section_alpha
+from univoxel.scene import Scene
+
+RAYS_AT_ONCE = 32768  # of pictures: bounds memory
+
+
+def surface_at(scene: Scene, rays: Rays, jitter: Tensor | None = None) -> Surface:
+    """What rays meet. Features are composited and decoded once per ray, not per sample.
+
+    Args:
+        jitter: [N] in [0, 1), where in its first step a ray starts; half a step when left out.
+    """
+    n = len(rays.origin)
+    jitter = rays.origin.new_full((n,), 0.5) if jitter is None else jitter
+    samples = scene.field.march(rays, jitter, scene.inv_s)
+    ray = torch.repeat_interleave(samples.offsets.diff())
+    points = torch.addcmul(rays.origin[ray], samples.t[:, None], rays.direction[ray])
+    field = scene.field.sample(points)
+    alpha = section_alpha(field.sdf, samples.connected, scene.inv_s)
+    one = torch.ones_like(alpha)[:, None]
+    ends = torch.cat([field.features, field.gradient, samples.t[:, None], one], 1)
+    middles = 0.5 * (ends + ends.roll(-1, 0))  # a section's value; where none starts alpha is 0
+    total, _ = composite(alpha, middles, samples.offsets)
+    opacity = total[:, -1]
+    mean = total[:, :-1] / opacity.clamp_min(1e-4)[:, None]
+    features, gradient, t = mean.split([scene.field.channels, 3, 1], 1)
+    albedo, roughness = scene.material(features)
+    return Surface(
+        position=rays.origin + t * rays.direction,
+        normal=torch.nn.functional.normalize(gradient, dim=1, eps=1e-6),
+        features=features,
+        albedo=albedo,
+        roughness=roughness,
+        opacity=opacity,
+        depth=t[:, 0],
+    )
+
+
+def shade(scene: Scene, surface: Surface, wo: Tensor) -> Tensor:
+    """Physically based radiance [N, 3] that the surface sends along wo, linear."""
+    return scene.light.reflected(surface, wo)
+
+
+@torch.no_grad()
+def surface_of_view(scene: Scene, cameras: Cameras, view: int) -> tuple[Surface, Tensor]:
+    """Surface at every pixel of a view, row by row [H * W], and wo [H * W, 3]."""
+    rays = image_rays(cameras, view)
+    parts = [
+        surface_at(scene, Rays(o, d))
+        for o, d in zip(
+            rays.origin.split(RAYS_AT_ONCE), rays.direction.split(RAYS_AT_ONCE), strict=True
+        )
+    ]
+    whole = Surface(**{name: torch.cat([vars(p)[name] for p in parts]) for name in vars(parts[0])})
+    return whole, -rays.direction
