@@ -35,6 +35,10 @@ class Photos:
         """Linear straight colour [..., 3] and alpha [...] of pixels, float32."""
         return decode(self.color[view, row, column], self.alpha[view, row, column])
 
+    def coverage(self) -> Tensor:
+        """Alpha of all pixels [V, H, W], float32 in [0, 1]."""
+        return self.alpha.float() / 255 if self.alpha.dtype == torch.uint8 else self.alpha
+
     def picture(self, view: int) -> tuple[Tensor, Tensor]:
         """Linear straight colour [H, W, 3] and alpha [H, W] of one view, float32."""
         return decode(self.color[view], self.alpha[view])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from univoxel.fields.base import AbstractField
@@ -56,6 +57,21 @@ class DenseField(AbstractField):
     def refresh(self) -> None:
         """Look again which bricks are empty: after the sdf has moved or was loaded."""
         self._brick_min = brick_minimum(self.sdf.detach())
+
+    def isosurface(self) -> tuple[Tensor, Tensor]:
+        """Vertices [P, 3] float32 and faces [F, 3] int32 of the zero level (marching cubes,
+        Lewiner et al. 2003), counter-clockwise seen from outside.
+
+        Raises:
+            ValueError: the sdf has no zero level.
+        """
+        sdf = self.sdf.detach().numpy()
+        if not sdf.min() < 0 < sdf.max():
+            raise ValueError("the field has no surface: its sdf does not change sign")
+        vertices, faces, _, _ = marching_cubes(sdf, 0.0, gradient_direction="ascent")
+        origin = torch.tensor(self.grid.origin)
+        world = origin + self.voxel_size * torch.from_numpy(vertices.copy())
+        return world.float(), torch.from_numpy(faces.astype("int32"))
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         lower = torch.tensor(self.grid.origin)

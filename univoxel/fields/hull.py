@@ -20,10 +20,15 @@ class GridShape:
     voxel_size: float
     size: tuple[int, int, int]  # nodes
 
-    def nodes(self, step: int = 1) -> Tensor:
-        """World positions of every step-th node: [X, Y, Z, 3] float32."""
+    @property
+    def nodes_count(self) -> int:
+        x, y, z = self.size
+        return x * y * z
+
+    def nodes(self) -> Tensor:
+        """World positions of the nodes: [X, Y, Z, 3] float32."""
         axes = [
-            o + self.voxel_size * torch.arange(0, n, step)
+            o + self.voxel_size * torch.arange(n)
             for o, n in zip(self.origin, self.size, strict=True)
         ]
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from univoxel.camera import Cameras, image_rays
 from univoxel.ops import composite
-from univoxel.records import Rays, Surface
+from univoxel.records import Mesh, Rays, Surface
 from univoxel.render.density import section_alpha
 from univoxel.scene import Scene
 
@@ -46,9 +46,24 @@ def surface_at(scene: Scene, rays: Rays, jitter: Tensor | None = None) -> Surfac
     )
 
 
+def at_rays(surface: Surface, index: Tensor) -> Surface:
+    """The surface at some of its rays."""
+    return Surface(**{name: value[index] for name, value in vars(surface).items()})
+
+
 def shade(scene: Scene, surface: Surface, wo: Tensor) -> Tensor:
     """Physically based radiance [N, 3] that the surface sends along wo, linear."""
     return scene.light.reflected(surface, wo)
+
+
+@torch.no_grad()
+def shade_hits(scene: Scene, surface: Surface, wo: Tensor) -> Tensor:
+    """`shade` where there is a surface, times its opacity: linear radiance on black [N, 3]."""
+    rgb = torch.zeros_like(surface.position)
+    for index in (surface.opacity > 1e-3).nonzero()[:, 0].split(RAYS_AT_ONCE):
+        met = at_rays(surface, index)
+        rgb[index] = shade(scene, met, wo[index]) * met.opacity[:, None]
+    return rgb
 
 
 @torch.no_grad()
@@ -63,3 +78,20 @@ def surface_of_view(scene: Scene, cameras: Cameras, view: int) -> tuple[Surface,
     ]
     whole = Surface(**{name: torch.cat([vars(p)[name] for p in parts]) for name in vars(parts[0])})
     return whole, -rays.direction
+
+
+@torch.no_grad()
+def extract_mesh(scene: Scene) -> Mesh:
+    """The zero level of the field's sdf as triangles, with materials decoded at the vertices.
+
+    Raises:
+        ValueError: the sdf has no zero level.
+    """
+    vertices, faces = scene.field.isosurface()
+    parts = []
+    for points in vertices.split(RAYS_AT_ONCE):
+        sample = scene.field.sample(points)
+        normal = torch.nn.functional.normalize(sample.gradient, dim=1, eps=1e-6)
+        parts.append((normal, *scene.material(sample.features)))
+    normals, albedo, roughness = (torch.cat(p) for p in zip(*parts, strict=True))
+    return Mesh(vertices, faces, normals, albedo, roughness)

@@ -1,0 +1,56 @@
+"""The whole configuration of a training run, and its presets."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from univoxel.scene import SceneConfig
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """One stage of training, on a grid of its own resolution."""
+
+    voxels: float  # millions of voxels in the object's box
+    iterations: int  # optimisation steps, fewer when time runs out
+    share: float  # of the time budget, (0, 1]
+    rays: int = 2048  # per step
+    sharpness: tuple[float, float] = (0.5, 0.5)  # s of the NeuS density at begin and end, voxels
+    lr_sdf: tuple[float, float] = (0.05, 0.01)  # at begin and end, voxels per step
+    lr_features: tuple[float, float] = (0.1, 0.01)
+    lr_networks: tuple[float, float] = (3e-3, 3e-4)
+    plate: float = 0.05  # thin-plate smoothing of touched sdf nodes per step, [0, 0.5]
+    diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 1]
+    physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the losses; the photometric loss of the physically based render has 1."""
+
+    radiance: float = 1.0
+    silhouette: float = 0.1
+    albedo_smoothness: float = 0.005
+    roughness_smoothness: float = 0.02
+    light_smoothness: float = 0.1
+    white_light: float = 0.01
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    data: Path  # folder of the data set
+    out: Path  # folder of the run
+    stages: tuple[StageConfig, ...]
+    minutes: float  # training ends in time, with what it has
+    seed: int = 0
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+
+
+def save_config(cfg: TrainConfig) -> None:
+    """Write the resolved configuration to config.json in the run's folder."""
+    text = json.dumps(dataclasses.asdict(cfg), indent=2, default=str)
+    (cfg.out / "config.json").write_text(text + "\n")

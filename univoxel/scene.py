@@ -1,0 +1,117 @@
+"""A scene: field, heads and light; and its checkpoint."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import nn
+
+from univoxel.fields.dense import DenseField
+from univoxel.fields.heads import MaterialHead, RadianceHead
+from univoxel.fields.hull import GridShape
+from univoxel.lights.sg import LocalSG, SGConfig
+
+FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
+FILE = "scene.safetensors"
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Sizes of the model."""
+
+    channels: int = 12  # features per voxel
+    hidden: int = 64  # width of the material and radiance heads
+    light: SGConfig = field(default_factory=SGConfig)
+
+
+class Scene(nn.Module):
+    """Everything that is learned of an object and of the light it stood in."""
+
+    def __init__(self, cfg: SceneConfig, field: DenseField, inv_s: float = 1.0):
+        super().__init__()
+        self.cfg = cfg
+        self.inv_s = inv_s  # sharpness of the NeuS density, 1 / world units
+        self.field = field
+        self.material = MaterialHead(cfg.channels, cfg.hidden)
+        self.radiance = RadianceHead(cfg.channels, cfg.hidden)
+        self.light = LocalSG(cfg.light, cfg.channels)
+
+
+def save_scene(scene: Scene, run: Path, state: dict) -> Path:
+    """Write run/scene.safetensors whole or not at all; `state` (JSON) travels in its metadata.
+
+    Raises:
+        OSError: names the file when it cannot be written; the one before stays.
+    """
+    tensors = {k: v.contiguous() for k, v in scene.state_dict().items() if k != "field.features"}
+    # Features that no sample has touched are 0: only the others are stored.
+    features = scene.field.features.detach().flatten(0, 2)
+    rows = features.any(1).nonzero()[:, 0]
+    tensors["field.feature_rows"], tensors["field.feature_values"] = rows.int(), features[rows]
+    meta = {
+        "format": FORMAT,
+        "scene": asdict(scene.cfg),
+        "grid": asdict(scene.field.grid),
+        "inv_s": scene.inv_s,
+        "state": state,
+    }
+    path = run / FILE
+    temporary = path.with_suffix(".partial")
+    try:
+        save_file(tensors, temporary, {"univoxel": json.dumps(meta)})
+        os.replace(temporary, path)
+    except (OSError, SafetensorError) as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(f"{path}: cannot write the checkpoint: {error}") from error
+    return path
+
+
+def load_checkpoint(run: Path) -> tuple[Scene, dict]:
+    """The scene of a run and the state it was saved with.
+
+    Raises:
+        FileNotFoundError: no checkpoint there.
+        ValueError: one that is cut short, damaged, or of another version.
+    """
+    path = Path(run) / FILE
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no checkpoint in {run} (looked for {FILE}); run `univoxel train` first"
+        )
+    try:
+        with safe_open(path, "pt") as file:
+            meta = json.loads((file.metadata() or {}).get("univoxel", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(f"{path}: damaged or cut short: {error}") from error
+    if meta.get("format") != FORMAT:
+        raise ValueError(
+            f"{path}: expected checkpoint format {FORMAT}, got {meta.get('format')}; "
+            "it was written by another version of univoxel"
+        )
+    light = SGConfig(**meta["scene"].pop("light"))
+    cfg = SceneConfig(**meta["scene"], light=light)
+    grid = GridShape(
+        tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
+    )
+    scene = Scene(cfg, DenseField(grid, cfg.channels), meta["inv_s"])
+    rows, values = tensors.pop("field.feature_rows"), tensors.pop("field.feature_values")
+    features = torch.zeros(grid.nodes_count, cfg.channels)
+    features[rows.long()] = values
+    tensors["field.features"] = features.view(*grid.size, cfg.channels)
+    try:
+        scene.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise ValueError(f"{path}: does not fit its own description: {error}") from error
+    return scene, meta["state"]
+
+
+def load_scene(run: Path) -> Scene:
+    """The scene of a run, see `load_checkpoint`."""
+    return load_checkpoint(run)[0]

@@ -1,0 +1,225 @@
+"""Photographs in, a scene out: the training loop from top to bottom."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from univoxel.optim import RowAdam
+
+from univoxel import losses
+from univoxel.camera import pixel_rays
+from univoxel.color import linear_to_srgb
+from univoxel.config import LossConfig, StageConfig, TrainConfig, save_config
+from univoxel.data import Photos, load_photos
+from univoxel.fields.dense import DenseField
+from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
+from univoxel.ops import smooth_rows_
+from univoxel.records import Rays, Surface
+from univoxel.render.picture import preview
+from univoxel.render.pipeline import at_rays, shade, surface_at
+from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
+from univoxel.tasks.progress import Progress
+
+MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
+HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
+REFRESH = 16  # steps between looks at which bricks are empty
+MOMENTS = (0.9, 0.99)
+# Adam's epsilon for the grids. Far above 0 on purpose: a node's gradient is then scaled by the
+# batch, not by its own history, and nodes that few rays see do not jump.
+EPS_SDF, EPS_FEATURES = 1e-4, 1e-8
+MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silhouette's fringe
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays, and what the photographs show there."""
+
+    rays: Rays
+    color: Tensor  # [N, 3] linear, straight
+    alpha: Tensor  # [N]
+
+    @property
+    def wo(self) -> Tensor:
+        return -self.rays.direction
+
+
+def train(cfg: TrainConfig, resume: bool = False) -> Path:
+    """Train a scene; leave model, log, preview and configuration in cfg.out and return it.
+
+    Raises:
+        DataError: input that cannot be used.
+        FileExistsError: cfg.out holds a run already and resume is False.
+        FloatingPointError: the loss is not a number any more.
+        OSError: the folder cannot be written.
+    """
+    begin = time.monotonic()
+    torch.manual_seed(cfg.seed)
+    photos = load_photos(cfg.data, "train")
+    if not resume and (cfg.out / FILE).exists():
+        raise FileExistsError(f"{cfg.out} holds a run already: pass --resume or another --out")
+    cfg.out.mkdir(parents=True, exist_ok=True)
+    save_config(cfg)
+
+    distance = mask_distances(photos.coverage())
+    pixels, held_out = split_pixels(distance)
+    lower, upper = estimate_bounds(distance, photos.cameras)
+    grids = [fit_grid(lower, upper, round(1e6 * stage.voxels)) for stage in cfg.stages]
+    if resume:
+        scene, state = load_checkpoint(cfg.out)
+        begin -= state["seconds"]
+    else:
+        hull = visual_hull(distance, photos.cameras, grids[0])
+        scene = Scene(cfg.scene, DenseField(grids[0], cfg.scene.channels, hull))
+        state = {"stage": 0, "progress": 0.0, "step": 0}
+
+    with Progress(cfg, begin, state) as progress:
+        for index in range(state["stage"], len(cfg.stages)):
+            if scene.field.grid != grids[index]:
+                scene.field = scene.field.resized(grids[index])
+            run_stage(scene, cfg, cfg.stages[index], photos, pixels, held_out, progress)
+            save_scene(scene, cfg.out, progress.state())
+            preview(scene, photos, cfg.out / "preview.png")
+    return cfg.out
+
+
+def run_stage(
+    scene: Scene,
+    cfg: TrainConfig,
+    stage: StageConfig,
+    photos: Photos,
+    pixels: Tensor,
+    held_out: Tensor,
+    progress: Progress,
+) -> None:
+    """Optimise the scene on its present grid until the stage's steps or its time are over."""
+    field = scene.field
+    optimizer = RowAdam(
+        [
+            {"params": [field.sdf], "eps": EPS_SDF},
+            {"params": [field.features], "eps": EPS_FEATURES},
+            {"params": [p for n, p in scene.named_parameters() if not n.startswith("field.")]},
+        ],
+        betas=MOMENTS,
+    )
+    for done in progress.steps():
+        physical = done >= stage.physical_from
+        rates = (
+            between(stage.lr_sdf, done) * field.voxel_size,
+            between(stage.lr_features, done),
+            between(stage.lr_networks, done),
+        )
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate
+        scene.inv_s = 1 / (between(stage.sharpness, done) * field.voxel_size)
+        if progress.step % REFRESH == 0:
+            field.refresh()
+
+        batch = random_batch(photos, pixels, stage.rays)
+        surface = surface_at(scene, batch.rays, torch.rand(stage.rays))
+        terms = objective(scene, cfg.loss, surface, batch, physical)
+        loss = torch.stack(list(terms.values())).sum()
+        if not torch.isfinite(loss):
+            raise FloatingPointError(f"the loss is {loss.item()} at step {progress.step}")
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        smooth(field, stage)
+        if progress.due():
+            quality = held_out_psnr(scene, photos, held_out, physical)
+            progress.report({k: v.item() for k, v in terms.items()}, quality)
+        if progress.checkpoint_due():
+            save_scene(scene, cfg.out, progress.state())
+    field.refresh()
+
+
+def objective(
+    scene: Scene, weight: LossConfig, surface: Surface, batch: Batch, physical: bool
+) -> dict[str, Tensor]:
+    """Every term that is minimised, weighted."""
+    opacity, alpha = surface.opacity[:, None], batch.alpha[:, None]
+    # A random background: otherwise a surface of the background's colour explains empty space.
+    behind = torch.rand_like(batch.color)
+    target = linear_to_srgb(batch.color * alpha + behind * (1 - alpha))
+    radiance = scene.radiance(surface.features, surface.normal, batch.wo)
+    drawn = radiance * opacity + linear_to_srgb(behind) * (1 - opacity)
+    terms = {
+        "radiance": weight.radiance * losses.photometric(drawn, target),
+        "silhouette": weight.silhouette * losses.silhouette(surface.opacity, batch.alpha),
+    }
+    hit = (surface.opacity.detach() > MIN_OPACITY).nonzero()[:, 0]
+    if not physical or not len(hit):
+        return terms
+
+    met = at_rays(surface, hit)
+    opacity, behind, target = opacity[hit], behind[hit], target[hit]
+    shaded = shade(scene, met, batch.wo[hit])
+    encoded = losses.encode(shaded * opacity + behind * (1 - opacity))
+    beside = met.position.detach() + scene.field.voxel_size * torch.randn_like(met.position)
+    near = scene.field.sample(beside).features
+    albedo, roughness = scene.material(near)
+    lobes = scene.light.raw(met)
+    lobes_near = scene.light.raw(replace(met, features=near, position=beside))
+    terms |= {
+        "physical": losses.photometric(encoded, target),
+        "albedo": weight.albedo_smoothness * losses.smoothness(met.albedo, albedo),
+        "roughness": weight.roughness_smoothness * losses.smoothness(met.roughness, roughness),
+        "light": weight.light_smoothness * losses.smoothness(lobes, lobes_near),
+        "white": weight.white_light * losses.white_light(scene.light.lobes_from_raw(lobes)[2]),
+    }
+    return terms
+
+
+def smooth(field: DenseField, stage: StageConfig) -> None:
+    """Regularise the nodes that the step has touched, beside the optimiser and not inside it."""
+    for grid, order, amount in (
+        (field.sdf.data[..., None], 2, stage.plate),
+        (field.features.data, 1, stage.diffusion),
+    ):
+        grad = field.sdf.grad if order == 2 else field.features.grad
+        x, y, z = grad.coalesce().indices()
+        rows = (x * grid.shape[1] + y) * grid.shape[2] + z
+        smooth_rows_(grid, rows, amount, order)
+
+
+def split_pixels(distance: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels [P, 3] (view, row, column) in or near silhouettes: to train on, and held out."""
+    pixels = (distance < MARGIN).nonzero()
+    order = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))
+    held = min(HELD_OUT, len(pixels) // 10)
+    return pixels[order[held:]], pixels[order[:held]]
+
+
+def random_batch(photos: Photos, pixels: Tensor, count: int) -> Batch:
+    """`count` of the pixels, drawn with replacement."""
+    return batch_at(photos, pixels[torch.randint(len(pixels), (count,))])
+
+
+def batch_at(photos: Photos, pixels: Tensor) -> Batch:
+    view, row, column = pixels.unbind(1)
+    color, alpha = photos.pixels(view, row, column)
+    centre = torch.stack([column, row], 1) + 0.5
+    return Batch(pixel_rays(photos.cameras, view, centre), color, alpha)
+
+
+@torch.no_grad()
+def held_out_psnr(scene: Scene, photos: Photos, pixels: Tensor, physical: bool) -> float:
+    """PSNR in sRGB on black over held-out pixels, of the physically based render once there is one
+    and of the radiance head before."""
+    batch = batch_at(photos, pixels)
+    surface = surface_at(scene, batch.rays)
+    if physical:
+        shaded = linear_to_srgb(shade(scene, surface, batch.wo) * surface.opacity[:, None])
+    else:
+        shaded = scene.radiance(surface.features, surface.normal, batch.wo)
+        shaded = shaded * surface.opacity[:, None]
+    target = linear_to_srgb(batch.color * batch.alpha[:, None])
+    return -10 * torch.log10((shaded - target).square().mean()).item()
+
+
+def between(ends: tuple[float, float], done: float) -> float:
+    """Geometric interpolation."""
+    return ends[0] * (ends[1] / ends[0]) ** done
