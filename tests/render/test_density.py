@@ -25,7 +25,8 @@ def test_weights_do_not_depend_on_the_number_of_sections():
     """1 - prod (1 - alpha) telescopes to 1 - Phi_last / Phi_first: finer steps change nothing."""
     coarse, fine = torch.linspace(0.5, -0.5, 5), torch.linspace(0.5, -0.5, 65)
     through = [
-        (1 - section_alpha(f, torch.arange(len(f)) < len(f) - 1, 8.0)).prod() for f in (coarse, fine)
+        (1 - section_alpha(f, torch.arange(len(f)) < len(f) - 1, 8.0)).prod()
+        for f in (coarse, fine)
     ]
     torch.testing.assert_close(through[0], through[1])
 

@@ -1,16 +1,22 @@
 """Differentiable torch ops over native CPU kernels, each beside its eager reference."""
 
+from univoxel.ops.adam import adam_rows_, adam_rows_reference_
 from univoxel.ops.composite import composite, composite_reference
+from univoxel.ops.dense_grid import sample_dense, sample_dense_reference
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.native import use_backend
 from univoxel.ops.smooth import smooth_rows_, smooth_rows_reference_
 
 __all__ = [
+    "adam_rows_",
+    "adam_rows_reference_",
     "brick_minimum",
     "composite",
     "composite_reference",
     "march",
     "march_reference",
+    "sample_dense",
+    "sample_dense_reference",
     "smooth_rows_",
     "smooth_rows_reference_",
     "use_backend",
