@@ -1,0 +1,104 @@
+"""Directions: point sets on the sphere, frames around a normal, the lat-long mapping."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+
+def fibonacci_hemisphere(count: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """[D, 3] unit directions around +Z, none on the horizon; each stands for 2 pi / D steradians.
+
+    Raises:
+        ValueError: count < 1.
+
+    Source: Gonzalez 2010, "Measurement of areas on a sphere using Fibonacci and latitude-longitude
+    lattices", offset by half a step.
+    """
+    return _spiral(count, (torch.arange(count, dtype=torch.float64) + 0.5) / max(count, 1), dtype)
+
+
+def fibonacci_sphere(count: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """[D, 3] unit directions over the sphere; each stands for 4 pi / D steradians.
+
+    Raises:
+        ValueError: count < 1.
+    """
+    step = (2 * torch.arange(count, dtype=torch.float64) + 1) / max(count, 1)
+    return _spiral(count, 1 - step, dtype)
+
+
+def _spiral(count: int, z: Tensor, dtype: torch.dtype) -> Tensor:
+    """Turn by the golden angle from one height to the next."""
+    if count < 1:
+        raise ValueError(f"fibonacci: count must be at least 1, got {count}")
+    phi = torch.arange(count, dtype=torch.float64) * _GOLDEN_ANGLE
+    radius = (1 - z * z).sqrt()
+    return torch.stack([radius * phi.cos(), radius * phi.sin(), z], -1).to(dtype)
+
+
+def rotate_z(direction: Tensor, angle: Tensor) -> Tensor:
+    """Turn directions [..., 3] by angles [...] in radians about +Z, counter-clockwise from above."""
+    x, y, z = direction.unbind(-1)
+    c, s = angle.cos(), angle.sin()
+    return torch.stack(torch.broadcast_tensors(c * x - s * y, s * x + c * y, z), -1)
+
+
+def frame(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Tangent and bitangent [..., 3] that make a right-handed orthonormal frame with unit normals.
+
+    Without branches and square roots; it jumps where the normal crosses z = 0, and is finite for
+    any normal, zero too. Source: Duff et al. 2017, "Building an orthonormal basis, revisited".
+    """
+    x, y, z = normal.unbind(-1)
+    sign = torch.copysign(torch.ones_like(z), z.detach())
+    a = -1 / (sign + z)
+    b = x * y * a
+    tangent = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], -1)
+    bitangent = torch.stack([b, sign + y * y * a, -y], -1)
+    return tangent, bitangent
+
+
+def to_world(local: Tensor, normal: Tensor) -> Tensor:
+    """Directions [..., 3] around +Z to directions around normals [..., 3], broadcast."""
+    tangent, bitangent = frame(normal)
+    return local[..., :1] * tangent + local[..., 1:2] * bitangent + local[..., 2:] * normal
+
+
+def latlong_direction(uv: Tensor) -> Tensor:
+    """Unit directions [..., 3] of places on an environment map.
+
+    Args:
+        uv: [..., 2], u to the right and v downwards, both in [0, 1]; column c of W has its centre at
+            u = (c + 0.5) / W, row r of H at v = (r + 0.5) / H.
+    """
+    u, v = uv.unbind(-1)
+    phi, theta = math.pi * (1 - 2 * u), math.pi * (0.5 - v)
+    return torch.stack([theta.cos() * phi.cos(), theta.cos() * phi.sin(), theta.sin()], -1)
+
+
+def direction_to_latlong(direction: Tensor) -> Tensor:
+    """The inverse of latlong_direction: [..., 3] of any length above 0 -> uv [..., 2] in [0, 1].
+
+    Differentiable; at the poles u is 0.5 and gets no gradient.
+    """
+    x, y, z = direction.unbind(-1)
+    radius2 = x * x + y * y
+    pole = radius2 < 1e-20
+    x, y = torch.where(pole, 1.0, x), torch.where(pole, 0.0, y)
+    radius = torch.where(pole, 0.0, torch.where(pole, 1.0, radius2).sqrt())
+    u = 0.5 - torch.atan2(y, x) / (2 * math.pi)
+    # Keep both arguments of atan2 from being 0 together: the zero vector then maps to v = 0.5.
+    nothing = pole & (z == 0)
+    v = 0.5 - torch.atan2(z, torch.where(nothing, 1.0, radius)) / math.pi
+    return torch.stack([u, v], -1)
+
+
+def texel_solid_angles(height: int, width: int) -> Tensor:
+    """[H, W] steradians of the texels of a lat-long map, exact; they sum to 4 pi."""
+    edge = torch.sin(math.pi * (0.5 - torch.arange(height + 1, dtype=torch.float64) / height))
+    return (-(edge.diff()) * (2 * math.pi / width)).float()[:, None].expand(height, width)
