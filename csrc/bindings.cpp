@@ -17,9 +17,9 @@
 #include "adam.h"
 #include "bricks.h"
 #include "composite.h"
+#include "dense_grid.h"
 #include "march.h"
 #include "smooth.h"
-#include "dense_grid.h"
 
 namespace py = pybind11;
 using namespace univoxel;
@@ -124,6 +124,28 @@ void bind_march(py::module_& m) {
         py::arg("direction").noconvert(), py::arg("jitter").noconvert(), py::arg("grid_origin"),
         py::arg("voxel_size"), py::arg("step"), py::arg("inv_s"), py::arg("min_weight"),
         py::arg("early_stop"), py::arg("threads"));
+}
+
+template <class T>
+void bind_smooth(py::module_& m) {
+    m.def(
+        "smooth_rows",
+        [](array<T>& grid, const array<int64_t>& rows, double amount, int order, int threads) {
+            const int64_t size[3] = {grid.shape(0), grid.shape(1), grid.shape(2)};
+            const int64_t nodes = size[0] * size[1] * size[2];
+            const int64_t* r = rows.data();
+            for (int64_t k = 0; k < rows.size(); ++k)
+                require(r[k] >= 0 && r[k] < nodes, "smooth_rows: rows must be in [0, " +
+                                                       std::to_string(nodes) + "), got " +
+                                                       std::to_string(r[k]));
+            T* g = grid.mutable_data();
+            py::gil_scoped_release nogil;
+            smooth_rows(g, size, grid.shape(3), r, rows.size(), T(amount), order, threads);
+        },
+        py::arg("grid").noconvert(), py::arg("rows").noconvert(), py::arg("amount"),
+        py::arg("order"), py::arg("threads"));
+}
+
 /// Size [X, Y, Z], origin and voxel size as Python passes them; a size of 0 holds nothing.
 Lattice lattice_of(const std::array<int64_t, 3>& size, const std::array<double, 3>& origin,
                    double voxel_size) {
@@ -202,11 +224,11 @@ void bind_dense_grid(py::module_& m) {
                 return wanted ? std::make_unique<TouchedRows>(grid, columns, wide, threads)
                               : nullptr;
             };
-            return std::pair(rows(sdf, true),
-                             rows(features, false));
+            return std::pair(rows(sdf, true), rows(features, false));
         },
         py::arg("points").noconvert(), py::arg("order").noconvert(), py::arg("size"),
-        py::arg("origin"), py::arg("voxel_size"), py::arg("sdf"), py::arg("features"), py::arg("threads"));
+        py::arg("origin"), py::arg("voxel_size"), py::arg("sdf"), py::arg("features"),
+        py::arg("threads"));
 }
 
 void bind_touched_rows(py::module_& m) {
@@ -255,26 +277,6 @@ void bind_adam(py::module_& m) {
         py::arg("exp_avg_sq").noconvert(), py::arg("rows").noconvert(), py::arg("grad").noconvert(),
         py::arg("lr"), py::arg("beta1"), py::arg("beta2"), py::arg("eps"), py::arg("step"),
         py::arg("threads"));
-}
-
-template <class T>
-void bind_smooth(py::module_& m) {
-    m.def(
-        "smooth_rows",
-        [](array<T>& grid, const array<int64_t>& rows, double amount, int order, int threads) {
-            const int64_t size[3] = {grid.shape(0), grid.shape(1), grid.shape(2)};
-            const int64_t nodes = size[0] * size[1] * size[2];
-            const int64_t* r = rows.data();
-            for (int64_t k = 0; k < rows.size(); ++k)
-                require(r[k] >= 0 && r[k] < nodes, "smooth_rows: rows must be in [0, " +
-                                                       std::to_string(nodes) + "), got " +
-                                                       std::to_string(r[k]));
-            T* g = grid.mutable_data();
-            py::gil_scoped_release nogil;
-            smooth_rows(g, size, grid.shape(3), r, rows.size(), T(amount), order, threads);
-        },
-        py::arg("grid").noconvert(), py::arg("rows").noconvert(), py::arg("amount"),
-        py::arg("order"), py::arg("threads"));
 }
 
 }  // namespace
