@@ -42,7 +42,7 @@ def _spiral(count: int, z: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def rotate_z(direction: Tensor, angle: Tensor) -> Tensor:
-    """Turn directions [..., 3] by angles [...] in radians about +Z, counter-clockwise from above."""
+    """Turn directions [..., 3] by angles [...] about +Z: radians, counter-clockwise from above."""
     x, y, z = direction.unbind(-1)
     c, s = angle.cos(), angle.sin()
     return torch.stack(torch.broadcast_tensors(c * x - s * y, s * x + c * y, z), -1)
@@ -73,7 +73,7 @@ def latlong_direction(uv: Tensor) -> Tensor:
     """Unit directions [..., 3] of places on an environment map.
 
     Args:
-        uv: [..., 2], u to the right and v downwards, both in [0, 1]; column c of W has its centre at
+        uv: [..., 2], u to the right, v downwards, in [0, 1]; column c of W has its centre at
             u = (c + 0.5) / W, row r of H at v = (r + 0.5) / H.
     """
     u, v = uv.unbind(-1)

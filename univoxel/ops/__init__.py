@@ -5,6 +5,7 @@ from univoxel.ops.composite import composite, composite_reference
 from univoxel.ops.dense_grid import sample_dense, sample_dense_reference
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.native import use_backend
+from univoxel.ops.sg import shade_sg, shade_sg_reference
 from univoxel.ops.smooth import smooth_rows_, smooth_rows_reference_
 
 __all__ = [
@@ -17,6 +18,8 @@ __all__ = [
     "march_reference",
     "sample_dense",
     "sample_dense_reference",
+    "shade_sg",
+    "shade_sg_reference",
     "smooth_rows_",
     "smooth_rows_reference_",
     "use_backend",

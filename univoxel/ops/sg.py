@@ -1,0 +1,168 @@
+"""Shading under spherical Gaussian light, by quadrature over the half-sphere."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from univoxel import brdf, sphere
+from univoxel.ops import native
+from univoxel.ops.checks import check
+
+
+def shade_sg(
+    axis: Tensor,  # [N, K, 3]
+    sharpness: Tensor,  # [N, K]
+    amplitude: Tensor,  # [N, K, 3]
+    normal: Tensor,  # [N, 3]
+    wo: Tensor,  # [N, 3]
+    albedo: Tensor,  # [N, 3]
+    roughness: Tensor,  # [N]
+    directions: Tensor,  # [D, 3]
+    rotation: Tensor,  # [N]
+    f0: float = 0.04,
+) -> Tensor:
+    """Radiance towards the eye of points lit by K spherical Gaussians each.
+
+        rgb = (2 pi / D) sum_d L(w_d) f(w_d, wo) max(n.w_d, 0)
+        L(w) = sum_k amplitude_k exp(sharpness_k (w.axis_k - 1))
+
+    with f the BRDF of docs/conventions.md and w_d the directions, turned by the rotation about +Z
+    and put into the frame of the normal (sphere.frame).
+
+    Args:
+        axis: [N, K, 3] unit, world; any number of lobes.
+        sharpness: [N, K] >= 0; 0 is light from everywhere.
+        amplitude: [N, K, 3] linear radiance at the axis.
+        normal, wo: [N, 3] unit, world; wo points to the eye.
+        albedo: [N, 3] linear, in [0, 1].
+        roughness: [N] perceptual, in [0, 1].
+        directions: [D, 3] unit, around +Z, of equal solid angle, such as
+            sphere.fibonacci_hemisphere; any number above 0.
+        rotation: [N] radians; random turns trade the pattern of a fixed set for noise.
+        f0: reflectance at normal incidence, in [0, 1].
+
+    Returns:
+        rgb [N, 3] linear radiance.
+
+    Raises:
+        TypeError, ValueError: an argument is no tensor, or of another size or dtype than above;
+            no directions; f0 outside [0, 1].
+
+    Differentiable in: axis, sharpness, amplitude, normal (the directions turn with it), wo, albedo,
+    roughness. Second order raises.
+    """
+    sizes = check(
+        "shade_sg",
+        axis=(axis, "N K 3"),
+        sharpness=(sharpness, "N K"),
+        amplitude=(amplitude, "N K 3"),
+        normal=(normal, "N 3"),
+        wo=(wo, "N 3"),
+        albedo=(albedo, "N 3"),
+        roughness=(roughness, "N"),
+        directions=(directions, "D 3"),
+        rotation=(rotation, "N"),
+    )
+    if sizes["D"] == 0:
+        raise ValueError("shade_sg: directions must hold at least one direction, got none")
+    if not 0.0 <= f0 <= 1.0:
+        raise ValueError(f"shade_sg: f0 must be in [0, 1], got {f0}")
+    lobes = (axis, sharpness, amplitude)
+    arguments = (*lobes, normal, wo, albedo, roughness, directions.detach(), rotation.detach())
+    if native.serves(axis):
+        return _shade_sg(*(a.contiguous() for a in arguments), float(f0))
+    return shade_sg_reference(*arguments, f0)
+
+
+def shade_sg_reference(
+    axis: Tensor,
+    sharpness: Tensor,
+    amplitude: Tensor,
+    normal: Tensor,
+    wo: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    directions: Tensor,
+    rotation: Tensor,
+    f0: float = 0.04,
+) -> Tensor:
+    """The same in eager torch, in the frame of each normal, where the normal is +Z."""
+    to_local = torch.stack([*sphere.frame(normal), normal], 1)
+    axis = torch.einsum("nij,nkj->nki", to_local, axis)
+    wo = torch.einsum("nij,nj->ni", to_local, wo)[:, None]
+    wi = sphere.rotate_z(directions, rotation[:, None])
+    lobe = (sharpness[..., None] * (torch.einsum("nki,ndi->nkd", axis, wi) - 1)).exp()
+    radiance = torch.einsum("nkd,nkc->ndc", lobe, amplitude)
+    up = wi.new_tensor([0.0, 0.0, 1.0])
+    diffuse = (1 - brdf.specular_albedo(wo[..., 2], roughness[:, None], f0)) / math.pi
+    layer = brdf.specular(up, wo, wi, roughness[:, None], f0)
+    f = diffuse[..., None] * albedo[:, None] + layer[..., None]
+    cosine = wi[..., 2:].clamp_min(0)
+    return (2 * math.pi / len(directions)) * (radiance * f * cosine).sum(1)
+
+
+@torch.library.custom_op("univoxel::shade_sg", mutates_args=(), device_types="cpu")
+def _shade_sg(
+    axis: Tensor,
+    sharpness: Tensor,
+    amplitude: Tensor,
+    normal: Tensor,
+    wo: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    directions: Tensor,
+    rotation: Tensor,
+    f0: float,
+) -> Tensor:
+    inputs = (axis, sharpness, amplitude, normal, wo, albedo, roughness, directions, rotation)
+    rgb = torch.empty_like(normal)
+    native.require().shade_sg_forward(*native.arrays(*inputs, rgb), f0, native.threads())
+    return rgb
+
+
+@torch.library.custom_op("univoxel::shade_sg_backward", mutates_args=(), device_types="cpu")
+def _shade_sg_backward(
+    axis: Tensor,
+    sharpness: Tensor,
+    amplitude: Tensor,
+    normal: Tensor,
+    wo: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    directions: Tensor,
+    rotation: Tensor,
+    grad_rgb: Tensor,
+    f0: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    inputs = (axis, sharpness, amplitude, normal, wo, albedo, roughness, directions, rotation)
+    grads = tuple(torch.empty_like(t) for t in inputs[:7])
+    native.require().shade_sg_backward(
+        *native.arrays(*inputs, grad_rgb, *grads), f0, native.threads()
+    )
+    return grads
+
+
+@_shade_sg.register_fake
+def _(axis, sharpness, amplitude, normal, *others):
+    return torch.empty_like(normal)
+
+
+@_shade_sg_backward.register_fake
+def _(*inputs):
+    return tuple(torch.empty_like(t) for t in inputs[:7])
+
+
+def _save(ctx, inputs, output):
+    *tensors, ctx.f0 = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def _backward(ctx, grad_rgb):
+    grads = _shade_sg_backward(*ctx.saved_tensors, grad_rgb.contiguous(), ctx.f0)
+    return *grads, None, None, None
+
+
+_shade_sg.register_autograd(_backward, setup_context=_save)
