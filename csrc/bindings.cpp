@@ -125,214 +125,208 @@ void bind_march(py::module_& m) {
         py::arg("direction").noconvert(), py::arg("jitter").noconvert(), py::arg("grid_origin"),
         py::arg("voxel_size"), py::arg("step"), py::arg("inv_s"), py::arg("min_weight"),
         py::arg("early_stop"), py::arg("threads"));
-    /// Size [X, Y, Z], origin and voxel size as Python passes them; a size of 0 holds nothing.
-    Lattice lattice_of(const std::array<int64_t, 3>& size, const std::array<double, 3>& origin,
-                       double voxel_size) {
-        require(size[0] > 0 && size[1] > 0 && size[2] > 0, "sample_dense: the grid has no nodes");
-        return {{size[0], size[1], size[2]}, {origin[0], origin[1], origin[2]}, voxel_size};
-    }
+}
 
-    template <class T>
-    DenseGrid<T> dense_grid_of(const array<T>& sdf, const array<T>& features,
-                               const array<T>& points, const array<int32_t>& order,
-                               const std::array<double, 3>& origin, double voxel_size) {
-        const int64_t n = points.shape(0);
-        require(order.size() == n, "sample_dense: order and points differ in length");
-        return {sdf.data(),
-                features.data(),
-                points.data(),
-                order.data(),
-                lattice_of({sdf.shape(0), sdf.shape(1), sdf.shape(2)}, origin, voxel_size),
-                n,
-                features.shape(3)};
-    }
+template <class T>
+void bind_smooth(py::module_& m) {
+    m.def(
+        "smooth_rows",
+        [](array<T>& grid, const array<int64_t>& rows, double amount, int order, int threads) {
+            const int64_t size[3] = {grid.shape(0), grid.shape(1), grid.shape(2)};
+            const int64_t nodes = size[0] * size[1] * size[2];
+            const int64_t* r = rows.data();
+            for (int64_t k = 0; k < rows.size(); ++k)
+                require(r[k] >= 0 && r[k] < nodes, "smooth_rows: rows must be in [0, " +
+                                                       std::to_string(nodes) + "), got " +
+                                                       std::to_string(r[k]));
+            T* g = grid.mutable_data();
+            py::gil_scoped_release nogil;
+            smooth_rows(g, size, grid.shape(3), r, rows.size(), T(amount), order, threads);
+        },
+        py::arg("grid").noconvert(), py::arg("rows").noconvert(), py::arg("amount"),
+        py::arg("order"), py::arg("threads"));
+}
 
-    template <class T>
-    void bind_dense_grid(py::module_ & m) {
-        using Vec3 = std::array<double, 3>;
-        m.def(
-            "sample_dense_forward",
-            [](const array<T>& sdf, const array<T>& features, const array<T>& points,
-               array<int32_t>& order, array<T>& value, array<T>& gradient, array<T>& feature,
-               const Vec3& origin, double voxel_size, int threads) {
-                int32_t* o = order.mutable_data();
-                const auto in = dense_grid_of(sdf, features, points, order, origin, voxel_size);
-                T *v = value.mutable_data(), *g = gradient.mutable_data(),
-                  *f = feature.mutable_data();
+/// Size [X, Y, Z], origin and voxel size as Python passes them; a size of 0 holds nothing.
+Lattice lattice_of(const std::array<int64_t, 3>& size, const std::array<double, 3>& origin,
+                   double voxel_size) {
+    require(size[0] > 0 && size[1] > 0 && size[2] > 0, "sample_dense: the grid has no nodes");
+    return {{size[0], size[1], size[2]}, {origin[0], origin[1], origin[2]}, voxel_size};
+}
+
+template <class T>
+DenseGrid<T> dense_grid_of(const array<T>& sdf, const array<T>& features, const array<T>& points,
+                           const array<int32_t>& order, const std::array<double, 3>& origin,
+                           double voxel_size) {
+    const int64_t n = points.shape(0);
+    require(order.size() == n, "sample_dense: order and points differ in length");
+    return {sdf.data(),
+            features.data(),
+            points.data(),
+            order.data(),
+            lattice_of({sdf.shape(0), sdf.shape(1), sdf.shape(2)}, origin, voxel_size),
+            n,
+            features.shape(3)};
+}
+
+template <class T>
+void bind_dense_grid(py::module_& m) {
+    using Vec3 = std::array<double, 3>;
+    m.def(
+        "sample_dense_forward",
+        [](const array<T>& sdf, const array<T>& features, const array<T>& points,
+           array<int32_t>& order, array<T>& value, array<T>& gradient, array<T>& feature,
+           const Vec3& origin, double voxel_size, int threads) {
+            int32_t* o = order.mutable_data();
+            const auto in = dense_grid_of(sdf, features, points, order, origin, voxel_size);
+            T *v = value.mutable_data(), *g = gradient.mutable_data(), *f = feature.mutable_data();
+            py::gil_scoped_release nogil;
+            sort_by_brick(in.lattice, in.points, in.n_points, o, threads);
+            sample_dense_forward(in, v, g, f, threads);
+        },
+        py::arg("sdf").noconvert(), py::arg("features").noconvert(), py::arg("points").noconvert(),
+        py::arg("order").noconvert(), py::arg("value").noconvert(), py::arg("gradient").noconvert(),
+        py::arg("feature").noconvert(), py::arg("origin"), py::arg("voxel_size"),
+        py::arg("threads"));
+    m.def(
+        "sample_dense_backward",
+        [](const array<T>& sdf, const array<T>& features, const array<T>& points,
+           const array<int32_t>& order, const array<T>& grad_value, const array<T>& grad_gradient,
+           const array<T>& grad_feature, std::optional<array<T>> grad_sdf,
+           std::optional<array<T>> grad_features, std::optional<array<T>> grad_points,
+           const TouchedRows* sdf_rows, const TouchedRows* feature_rows, const Vec3& origin,
+           double voxel_size, int threads) {
+            const auto in = dense_grid_of(sdf, features, points, order, origin, voxel_size);
+            const auto data = [](auto& a) { return a ? a->mutable_data() : nullptr; };
+            const DenseGridGrads<T> grads{
+                grad_value.data(), grad_gradient.data(), grad_feature.data(),
+                data(grad_sdf),    data(grad_features),  data(grad_points),
+                sdf_rows,          feature_rows};
+            py::gil_scoped_release nogil;
+            sample_dense_backward(in, grads, threads);
+        },
+        py::arg("sdf").noconvert(), py::arg("features").noconvert(), py::arg("points").noconvert(),
+        py::arg("order").noconvert(), py::arg("grad_value").noconvert(),
+        py::arg("grad_gradient").noconvert(), py::arg("grad_feature").noconvert(),
+        py::arg("grad_sdf").noconvert(), py::arg("grad_features").noconvert(),
+        py::arg("grad_points").noconvert(), py::arg("sdf_rows"), py::arg("feature_rows"),
+        py::arg("origin"), py::arg("voxel_size"), py::arg("threads"));
+    m.def(
+        "touched_rows",
+        [](const array<T>& points, const array<int32_t>& order, const std::array<int64_t, 3>& size,
+           const Vec3& origin, double voxel_size, bool sdf, bool features, int threads) {
+            const Lattice grid = lattice_of(size, origin, voxel_size);
+            const T* p = points.data();
+            const int32_t* o = order.data();
+            const int64_t n = order.size();
+            py::gil_scoped_release nogil;
+            const auto columns = occupied_columns(grid, p, o, slab_bounds(grid, p, n, o), threads);
+            const auto rows = [&](bool wanted, bool wide) {
+                return wanted ? std::make_unique<TouchedRows>(grid, columns, wide, threads)
+                              : nullptr;
+            };
+            return std::pair(rows(sdf, true), rows(features, false));
+        },
+        py::arg("points").noconvert(), py::arg("order").noconvert(), py::arg("size"),
+        py::arg("origin"), py::arg("voxel_size"), py::arg("sdf"), py::arg("features"),
+        py::arg("threads"));
+}
+
+void bind_touched_rows(py::module_& m) {
+    py::class_<TouchedRows>(m, "TouchedRows")
+        .def("__len__", &TouchedRows::count)
+        .def(
+            "write_indices",
+            [](const TouchedRows& rows, array<int64_t>& indices, int threads) {
+                require(indices.size() == 3 * rows.count(),
+                        "touched_rows: indices of another size");
+                int64_t* out = indices.mutable_data();
                 py::gil_scoped_release nogil;
-                sort_by_brick(in.lattice, in.points, in.n_points, o, threads);
-                sample_dense_forward(in, v, g, f, threads);
+                rows.write_indices(out, threads);
             },
-            py::arg("sdf").noconvert(), py::arg("features").noconvert(),
-            py::arg("points").noconvert(), py::arg("order").noconvert(),
-            py::arg("value").noconvert(), py::arg("gradient").noconvert(),
-            py::arg("feature").noconvert(), py::arg("origin"), py::arg("voxel_size"),
-            py::arg("threads"));
-        m.def(
-            "sample_dense_backward",
-            [](const array<T>& sdf, const array<T>& features, const array<T>& points,
-               const array<int32_t>& order, const array<T>& grad_value,
-               const array<T>& grad_gradient, const array<T>& grad_feature,
-               std::optional<array<T>> grad_sdf, std::optional<array<T>> grad_features,
-               std::optional<array<T>> grad_points, const TouchedRows* sdf_rows,
-               const TouchedRows* feature_rows, const Vec3& origin, double voxel_size,
+            py::arg("indices").noconvert(), py::arg("threads"));
+}
+
+template <class T>
+void bind_adam(py::module_& m) {
+    m.def(
+        "adam_rows",
+        [](array<T>& param, array<T>& exp_avg, array<T>& exp_avg_sq, const array<int64_t>& rows,
+           const array<T>& grad, double lr, double beta1, double beta2, double eps, double step,
+           int threads) {
+            const int64_t n = param.shape(0), k = rows.size();
+            const int64_t* r = rows.data();
+            bool ok = true;
+            for (int64_t i = 0; i < k; ++i) ok &= r[i] >= 0 && r[i] < n;
+            require(ok, "adam_rows_: rows must lie in [0, R=" + std::to_string(n) + ")");
+            const AdamRows<T> in{param.mutable_data(),
+                                 exp_avg.mutable_data(),
+                                 exp_avg_sq.mutable_data(),
+                                 r,
+                                 grad.data(),
+                                 k,
+                                 param.shape(1),
+                                 lr,
+                                 beta1,
+                                 beta2,
+                                 eps,
+                                 step};
+            py::gil_scoped_release nogil;
+            adam_rows(in, threads);
+        },
+        py::arg("param").noconvert(), py::arg("exp_avg").noconvert(),
+        py::arg("exp_avg_sq").noconvert(), py::arg("rows").noconvert(), py::arg("grad").noconvert(),
+        py::arg("lr"), py::arg("beta1"), py::arg("beta2"), py::arg("eps"), py::arg("step"),
+        py::arg("threads"));
+}
+
+RayBatch rays_of(const array<float>& origin, const array<float>& direction, float t_min,
+                 float t_max) {
+    require(origin.size() == direction.size(), "rays: as many origins as directions");
+    return {origin.data(), direction.data(), origin.size() / 3, t_min, t_max};
+}
+
+void bind_visibility(py::module_& m) {
+    m.def("embree_version", &embree_version);
+    py::class_<VisibilityScene>(m, "VisibilityScene")
+        .def(py::init([](const array<float>& vertices, const array<int32_t>& faces, int threads) {
+                 py::gil_scoped_release nogil;
+                 return std::make_unique<VisibilityScene>(vertices.data(), vertices.size() / 3,
+                                                          faces.data(), faces.size() / 3, threads);
+             }),
+             py::arg("vertices").noconvert(), py::arg("faces").noconvert(), py::arg("threads"))
+        .def(
+            "occluded",
+            [](const VisibilityScene& scene, const array<float>& origin,
+               const array<float>& direction, array<bool>& out, float t_min, float t_max,
                int threads) {
-                const auto in = dense_grid_of(sdf, features, points, order, origin, voxel_size);
-                const auto data = [](auto& a) { return a ? a->mutable_data() : nullptr; };
-                const DenseGridGrads<T> grads{
-                    grad_value.data(), grad_gradient.data(), grad_feature.data(),
-                    data(grad_sdf),    data(grad_features),  data(grad_points),
-                    sdf_rows,          feature_rows};
+                const auto rays = rays_of(origin, direction, t_min, t_max);
+                require(out.size() == rays.n_rays, "occluded: out must be [N]");
+                bool* o = out.mutable_data();
                 py::gil_scoped_release nogil;
-                sample_dense_backward(in, grads, threads);
+                occluded(scene, rays, o, threads);
             },
-            py::arg("sdf").noconvert(), py::arg("features").noconvert(),
-            py::arg("points").noconvert(), py::arg("order").noconvert(),
-            py::arg("grad_value").noconvert(), py::arg("grad_gradient").noconvert(),
-            py::arg("grad_feature").noconvert(), py::arg("grad_sdf").noconvert(),
-            py::arg("grad_features").noconvert(), py::arg("grad_points").noconvert(),
-            py::arg("sdf_rows"), py::arg("feature_rows"), py::arg("origin"), py::arg("voxel_size"),
+            py::arg("origin").noconvert(), py::arg("direction").noconvert(),
+            py::arg("out").noconvert(), py::arg("t_min"), py::arg("t_max"), py::arg("threads"))
+        .def(
+            "closest_hit",
+            [](const VisibilityScene& scene, const array<float>& origin,
+               const array<float>& direction, array<float>& t, array<int64_t>& face,
+               array<float>& barycentric, float t_min, float t_max, int threads) {
+                const auto rays = rays_of(origin, direction, t_min, t_max);
+                require(t.size() == rays.n_rays && face.size() == rays.n_rays &&
+                            barycentric.size() == 2 * rays.n_rays,
+                        "closest_hit: t, face and barycentric must be [N], [N] and [N, 2]");
+                float *out_t = t.mutable_data(), *out_uv = barycentric.mutable_data();
+                int64_t* out_face = face.mutable_data();
+                py::gil_scoped_release nogil;
+                closest_hit(scene, rays, out_t, out_face, out_uv, threads);
+            },
+            py::arg("origin").noconvert(), py::arg("direction").noconvert(),
+            py::arg("t").noconvert(), py::arg("face").noconvert(),
+            py::arg("barycentric").noconvert(), py::arg("t_min"), py::arg("t_max"),
             py::arg("threads"));
-        m.def(
-            "touched_rows",
-            [](const array<T>& points, const array<int32_t>& order,
-               const std::array<int64_t, 3>& size, const Vec3& origin, double voxel_size, bool sdf,
-               bool features, int threads) {
-                const Lattice grid = lattice_of(size, origin, voxel_size);
-                const T* p = points.data();
-                const int32_t* o = order.data();
-                const int64_t n = order.size();
-                py::gil_scoped_release nogil;
-                const auto columns =
-                    occupied_columns(grid, p, o, slab_bounds(grid, p, n, o), threads);
-                const auto rows = [&](bool wanted, bool wide) {
-                    return wanted ? std::make_unique<TouchedRows>(grid, columns, wide, threads)
-                                  : nullptr;
-                };
-                return std::pair(rows(sdf, true), rows(features, false));
-            },
-            py::arg("points").noconvert(), py::arg("order").noconvert(), py::arg("size"),
-            py::arg("origin"), py::arg("voxel_size"), py::arg("sdf"), py::arg("features"),
-            py::arg("threads"));
-    }
-
-    void bind_touched_rows(py::module_ & m) {
-        py::class_<TouchedRows>(m, "TouchedRows")
-            .def("__len__", &TouchedRows::count)
-            .def(
-                "write_indices",
-                [](const TouchedRows& rows, array<int64_t>& indices, int threads) {
-                    require(indices.size() == 3 * rows.count(),
-                            "touched_rows: indices of another size");
-                    int64_t* out = indices.mutable_data();
-                    py::gil_scoped_release nogil;
-                    rows.write_indices(out, threads);
-                },
-                py::arg("indices").noconvert(), py::arg("threads"));
-    }
-
-    template <class T>
-    void bind_adam(py::module_ & m) {
-        m.def(
-            "adam_rows",
-            [](array<T>& param, array<T>& exp_avg, array<T>& exp_avg_sq, const array<int64_t>& rows,
-               const array<T>& grad, double lr, double beta1, double beta2, double eps, double step,
-               int threads) {
-                const int64_t n = param.shape(0), k = rows.size();
-                const int64_t* r = rows.data();
-                bool ok = true;
-                for (int64_t i = 0; i < k; ++i) ok &= r[i] >= 0 && r[i] < n;
-                require(ok, "adam_rows_: rows must lie in [0, R=" + std::to_string(n) + ")");
-                const AdamRows<T> in{param.mutable_data(),
-                                     exp_avg.mutable_data(),
-                                     exp_avg_sq.mutable_data(),
-                                     r,
-                                     grad.data(),
-                                     k,
-                                     param.shape(1),
-                                     lr,
-                                     beta1,
-                                     beta2,
-                                     eps,
-                                     step};
-                py::gil_scoped_release nogil;
-                adam_rows(in, threads);
-            },
-            py::arg("param").noconvert(), py::arg("exp_avg").noconvert(),
-            py::arg("exp_avg_sq").noconvert(), py::arg("rows").noconvert(),
-            py::arg("grad").noconvert(), py::arg("lr"), py::arg("beta1"), py::arg("beta2"),
-            py::arg("eps"), py::arg("step"), py::arg("threads"));
-    }
-
-    RayBatch rays_of(const array<float>& origin, const array<float>& direction, float t_min,
-                     float t_max) {
-        require(origin.size() == direction.size(), "rays: as many origins as directions");
-        return {origin.data(), direction.data(), origin.size() / 3, t_min, t_max};
-    }
-
-    void bind_visibility(py::module_ & m) {
-        m.def("embree_version", &embree_version);
-        py::class_<VisibilityScene>(m, "VisibilityScene")
-            .def(py::init(
-                     [](const array<float>& vertices, const array<int32_t>& faces, int threads) {
-                         py::gil_scoped_release nogil;
-                         return std::make_unique<VisibilityScene>(vertices.data(),
-                                                                  vertices.size() / 3, faces.data(),
-                                                                  faces.size() / 3, threads);
-                     }),
-                 py::arg("vertices").noconvert(), py::arg("faces").noconvert(), py::arg("threads"))
-            .def(
-                "occluded",
-                [](const VisibilityScene& scene, const array<float>& origin,
-                   const array<float>& direction, array<bool>& out, float t_min, float t_max,
-                   int threads) {
-                    const auto rays = rays_of(origin, direction, t_min, t_max);
-                    require(out.size() == rays.n_rays, "occluded: out must be [N]");
-                    bool* o = out.mutable_data();
-                    py::gil_scoped_release nogil;
-                    occluded(scene, rays, o, threads);
-                },
-                py::arg("origin").noconvert(), py::arg("direction").noconvert(),
-                py::arg("out").noconvert(), py::arg("t_min"), py::arg("t_max"), py::arg("threads"))
-            .def(
-                "closest_hit",
-                [](const VisibilityScene& scene, const array<float>& origin,
-                   const array<float>& direction, array<float>& t, array<int64_t>& face,
-                   array<float>& barycentric, float t_min, float t_max, int threads) {
-                    const auto rays = rays_of(origin, direction, t_min, t_max);
-                    require(t.size() == rays.n_rays && face.size() == rays.n_rays &&
-                                barycentric.size() == 2 * rays.n_rays,
-                            "closest_hit: t, face and barycentric must be [N], [N] and [N, 2]");
-                    float *out_t = t.mutable_data(), *out_uv = barycentric.mutable_data();
-                    int64_t* out_face = face.mutable_data();
-                    py::gil_scoped_release nogil;
-                    closest_hit(scene, rays, out_t, out_face, out_uv, threads);
-                },
-                py::arg("origin").noconvert(), py::arg("direction").noconvert(),
-                py::arg("t").noconvert(), py::arg("face").noconvert(),
-                py::arg("barycentric").noconvert(), py::arg("t_min"), py::arg("t_max"),
-                py::arg("threads"));
-    }
-
-    template <class T>
-    void bind_smooth(py::module_ & m) {
-        m.def(
-            "smooth_rows",
-            [](array<T>& grid, const array<int64_t>& rows, double amount, int order, int threads) {
-                const int64_t size[3] = {grid.shape(0), grid.shape(1), grid.shape(2)};
-                const int64_t nodes = size[0] * size[1] * size[2];
-                const int64_t* r = rows.data();
-                for (int64_t k = 0; k < rows.size(); ++k)
-                    require(r[k] >= 0 && r[k] < nodes, "smooth_rows: rows must be in [0, " +
-                                                           std::to_string(nodes) + "), got " +
-                                                           std::to_string(r[k]));
-                T* g = grid.mutable_data();
-                py::gil_scoped_release nogil;
-                smooth_rows(g, size, grid.shape(3), r, rows.size(), T(amount), order, threads);
-            },
-            py::arg("grid").noconvert(), py::arg("rows").noconvert(), py::arg("amount"),
-            py::arg("order"), py::arg("threads"));
-    }
+}
 
 }  // namespace
 

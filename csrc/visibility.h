@@ -29,7 +29,8 @@ class VisibilityScene {
                     int64_t n_faces, int threads);
     ~VisibilityScene();
 
-    /// Whether a triangle lies at t in [t_min, t_max]. A ray that is not finite meets none.
+    /// Whether a triangle lies at t in [t_min, t_max]. A ray that is not finite, or as
+    /// far out as 1e18, meets none.
     bool occluded(const vec3<float>& origin, const vec3<float>& direction, float t_min,
                   float t_max = std::numeric_limits<float>::infinity()) const;
 

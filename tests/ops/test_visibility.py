@@ -125,10 +125,11 @@ def test_rays_that_are_not_finite_meet_nothing():
     above = torch.tensor([[0.2, 0.3, 2.0]])
     scene = VisibilityScene(TRIANGLE, FACE)
     assert scene.occluded(above, down).item()
-    for bad in (math.nan, math.inf):
+    for bad in (math.nan, math.inf, 1e30):
         assert not scene.occluded(above.clone().fill_(bad), down).item()
         assert scene.closest_hit(above, down * bad).face.item() == -1
-        assert not occluded_reference(TRIANGLE, FACE, above, down * bad).item()
+    assert not scene.occluded(above, torch.zeros(1, 3)).item()
+    assert not occluded_reference(TRIANGLE, FACE, above, down * math.nan).item()
 
 
 def test_degenerate_triangles_are_passed_over():
