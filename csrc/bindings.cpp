@@ -21,6 +21,7 @@
 #include "march.h"
 #include "sg.h"
 #include "smooth.h"
+#include "visibility.h"
 
 namespace py = pybind11;
 using namespace univoxel;
@@ -352,6 +353,54 @@ void bind_sg(py::module_& m) {
         py::arg("threads"));
 }
 
+RayBatch rays_of(const array<float>& origin, const array<float>& direction, float t_min,
+                 float t_max) {
+    require(origin.size() == direction.size(), "rays: as many origins as directions");
+    return {origin.data(), direction.data(), origin.size() / 3, t_min, t_max};
+}
+
+void bind_visibility(py::module_& m) {
+    m.def("embree_version", &embree_version);
+    py::class_<VisibilityScene>(m, "VisibilityScene")
+        .def(py::init([](const array<float>& vertices, const array<int32_t>& faces, int threads) {
+                 py::gil_scoped_release nogil;
+                 return std::make_unique<VisibilityScene>(vertices.data(), vertices.size() / 3,
+                                                          faces.data(), faces.size() / 3, threads);
+             }),
+             py::arg("vertices").noconvert(), py::arg("faces").noconvert(), py::arg("threads"))
+        .def(
+            "occluded",
+            [](const VisibilityScene& scene, const array<float>& origin,
+               const array<float>& direction, array<bool>& out, float t_min, float t_max,
+               int threads) {
+                const auto rays = rays_of(origin, direction, t_min, t_max);
+                require(out.size() == rays.n_rays, "occluded: out must be [N]");
+                bool* o = out.mutable_data();
+                py::gil_scoped_release nogil;
+                occluded(scene, rays, o, threads);
+            },
+            py::arg("origin").noconvert(), py::arg("direction").noconvert(),
+            py::arg("out").noconvert(), py::arg("t_min"), py::arg("t_max"), py::arg("threads"))
+        .def(
+            "closest_hit",
+            [](const VisibilityScene& scene, const array<float>& origin,
+               const array<float>& direction, array<float>& t, array<int64_t>& face,
+               array<float>& barycentric, float t_min, float t_max, int threads) {
+                const auto rays = rays_of(origin, direction, t_min, t_max);
+                require(t.size() == rays.n_rays && face.size() == rays.n_rays &&
+                            barycentric.size() == 2 * rays.n_rays,
+                        "closest_hit: t, face and barycentric must be [N], [N] and [N, 2]");
+                float *out_t = t.mutable_data(), *out_uv = barycentric.mutable_data();
+                int64_t* out_face = face.mutable_data();
+                py::gil_scoped_release nogil;
+                closest_hit(scene, rays, out_t, out_face, out_uv, threads);
+            },
+            py::arg("origin").noconvert(), py::arg("direction").noconvert(),
+            py::arg("t").noconvert(), py::arg("face").noconvert(),
+            py::arg("barycentric").noconvert(), py::arg("t_min"), py::arg("t_max"),
+            py::arg("threads"));
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_core, m) {
@@ -369,4 +418,5 @@ PYBIND11_MODULE(_core, m) {
     bind_adam<double>(m);
     bind_sg<float>(m);
     bind_sg<double>(m);
+    bind_visibility(m);
 }

@@ -7,15 +7,20 @@ from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.native import use_backend
 from univoxel.ops.sg import shade_sg, shade_sg_reference
 from univoxel.ops.smooth import smooth_rows_, smooth_rows_reference_
+from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference, occluded_reference
 
 __all__ = [
+    "Hit",
+    "VisibilityScene",
     "adam_rows_",
     "adam_rows_reference_",
     "brick_minimum",
+    "closest_hit_reference",
     "composite",
     "composite_reference",
     "march",
     "march_reference",
+    "occluded_reference",
     "sample_dense",
     "sample_dense_reference",
     "shade_sg",

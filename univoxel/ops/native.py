@@ -65,6 +65,11 @@ def serves(tensor: Tensor) -> bool:
     return core is not None and fits
 
 
+def reference_asked() -> bool:
+    """Whether the reference is forced; for ops too slow in eager torch to fall back unasked."""
+    return _backend == "reference"
+
+
 @contextlib.contextmanager
 def use_backend(name: Backend) -> Iterator[None]:
     """Force a side within a ``with`` block: "native", "reference", or "auto" (the default).

@@ -1,0 +1,207 @@
+"""Rays against triangles: Embree against brute force, closed forms, bad meshes and rays."""
+
+import math
+
+import pytest
+import torch
+
+from univoxel.ops import (
+    VisibilityScene,
+    closest_hit_reference,
+    native,
+    occluded_reference,
+    use_backend,
+)
+
+TRIANGLE = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+FACE = torch.tensor([[0, 1, 2]], dtype=torch.int32)
+
+
+def soup(n=200, seed=0):
+    """Random triangles in the unit cube: nothing closed, nothing ordered."""
+    g = torch.Generator().manual_seed(seed)
+    centre = torch.rand(n, 1, 3, generator=g)
+    corner = centre + 0.2 * torch.randn(n, 3, 3, generator=g)
+    return corner.reshape(-1, 3), torch.arange(3 * n, dtype=torch.int32).reshape(n, 3)
+
+
+def rays(n=2000, seed=1):
+    g = torch.Generator().manual_seed(seed)
+    direction = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
+    return torch.rand(n, 3, generator=g), direction
+
+
+@pytest.mark.parametrize("interval", [(0.0, math.inf), (0.1, 0.4)])
+def test_native_equals_brute_force(interval):
+    scene = VisibilityScene(*soup())
+    got, wanted = (
+        scene.closest_hit(*rays(), *interval),
+        closest_hit_reference(*soup(), *rays(), *interval),
+    )
+    assert 0.1 < (wanted.face >= 0).float().mean() < 0.95
+    # Rays that graze an edge or the ends of the interval may fall on either side in float32.
+    same = got.face == wanted.face
+    assert same.float().mean() > 0.999
+    torch.testing.assert_close(got.t[same], wanted.t[same], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(got.barycentric[same], wanted.barycentric[same], rtol=0, atol=1e-3)
+    occluded = scene.occluded(*rays(), *interval)
+    assert occluded.dtype == torch.bool
+    assert (occluded == (wanted.face >= 0)).float().mean() > 0.999
+
+
+def test_one_triangle_in_closed_form():
+    """The ray from above (x, y) meets the triangle at (u, v) = (x, y)."""
+    origin = torch.tensor([[0.2, 0.3, 2.0], [0.7, 0.7, 2.0], [0.2, 0.3, -1.0]])
+    down = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
+    hit = VisibilityScene(TRIANGLE, FACE).closest_hit(origin, down)
+    assert hit.face.tolist() == [0, -1, -1]
+    assert hit.t.tolist() == pytest.approx([2.0, math.inf, math.inf])
+    assert hit.barycentric[0].tolist() == pytest.approx([0.2, 0.3])
+    assert hit.barycentric[1:].eq(0).all()
+
+
+def test_t_counts_in_the_length_of_the_direction():
+    scene = VisibilityScene(TRIANGLE, FACE)
+    origin, down = torch.tensor([[0.2, 0.3, 2.0]]), torch.tensor([[0.0, 0.0, -4.0]])
+    assert scene.closest_hit(origin, down).t.item() == pytest.approx(0.5)
+    assert scene.occluded(origin, down, t_min=0.51).item() is False
+    assert scene.occluded(origin, down, t_max=0.49).item() is False
+    assert scene.occluded(origin, down, 0.49, 0.51).item() is True
+
+
+def test_closed_mesh_lets_no_ray_through():
+    """Rays from inside, aimed at shared edges and corners, where neighbouring triangles meet."""
+    x, y = torch.meshgrid(torch.arange(9.0), torch.arange(9.0), indexing="ij")
+    vertices = torch.stack([x, y, 0.1 * torch.sin(3 * x + y)], -1).reshape(-1, 3)
+    i = (9 * torch.arange(8)[:, None] + torch.arange(8)).reshape(-1)
+    faces = torch.cat([torch.stack([i, i + 9, i + 10], 1), torch.stack([i, i + 10, i + 1], 1)])
+    g = torch.Generator().manual_seed(0)
+    edge = faces[torch.randint(len(faces), (20_000,), generator=g)][:, [0, 1]]
+    inner = ((vertices[edge][..., :2] > 0.5) & (vertices[edge][..., :2] < 7.5)).all(-1).all(-1)
+    a, b = vertices[edge[inner]].unbind(1)
+    target = a + torch.rand(len(a), 1, generator=g) * (b - a)
+    origin = torch.rand(len(a), 3, generator=g) + torch.tensor([3.5, 3.5, 2.0])
+    assert VisibilityScene(vertices, faces).occluded(origin, target - origin).all()
+
+
+def test_same_answers_for_any_number_of_threads():
+    threads = torch.get_num_threads()
+    found = []
+    for n in (1, 2):
+        torch.set_num_threads(n)
+        hit = VisibilityScene(*soup()).closest_hit(*rays(5000))
+        found.append((hit.t, hit.face, hit.barycentric))
+    torch.set_num_threads(threads)
+    for a, b in zip(*found, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_strided_rays_and_wide_faces():
+    vertices, faces = soup()
+    scene = VisibilityScene(vertices.repeat(1, 2)[:, :3], faces.long())
+    origin, direction = rays()
+    strided = origin.repeat(1, 2)[:, :3], direction.t().contiguous().t()
+    assert not strided[0].is_contiguous()
+    assert torch.equal(scene.occluded(*strided), scene.occluded(origin, direction))
+
+
+def test_no_rays_and_no_triangles():
+    none = torch.empty(0, 3)
+    scene = VisibilityScene(*soup())
+    assert scene.occluded(none, none).shape == (0,)
+    assert scene.closest_hit(none, none).barycentric.shape == (0, 2)
+    for empty in (
+        VisibilityScene(TRIANGLE, torch.empty(0, 3, dtype=torch.int32)),
+        VisibilityScene(none, torch.empty(0, 3, dtype=torch.int32)),
+    ):
+        assert not empty.occluded(*rays()).any()
+        assert empty.closest_hit(*rays()).face.eq(-1).all()
+        with use_backend("reference"):
+            assert not empty.occluded(*rays()).any()
+
+
+def test_rays_that_are_not_finite_meet_nothing():
+    down = torch.tensor([[0.0, 0.0, -1.0]])
+    above = torch.tensor([[0.2, 0.3, 2.0]])
+    scene = VisibilityScene(TRIANGLE, FACE)
+    assert scene.occluded(above, down).item()
+    for bad in (math.nan, math.inf, 1e30):
+        assert not scene.occluded(above.clone().fill_(bad), down).item()
+        assert scene.closest_hit(above, down * bad).face.item() == -1
+    assert not scene.occluded(above, torch.zeros(1, 3)).item()
+    assert not occluded_reference(TRIANGLE, FACE, above, down * math.nan).item()
+
+
+def test_degenerate_triangles_are_passed_over():
+    faces = torch.tensor([[0, 1, 2], [0, 0, 1], [2, 2, 2]], dtype=torch.int32)
+    origin, down = torch.tensor([[0.2, 0.3, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+    assert VisibilityScene(TRIANGLE, faces).closest_hit(origin, down).face.item() == 0
+    with use_backend("reference"):
+        assert VisibilityScene(TRIANGLE, faces).closest_hit(origin, down).face.item() == 0
+
+
+def test_the_mesh_is_copied():
+    vertices, faces = TRIANGLE.clone(), FACE.clone()
+    scene = VisibilityScene(vertices, faces)
+    vertices += 100
+    faces.zero_()
+    assert scene.occluded(torch.tensor([[0.2, 0.3, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])).item()
+
+
+def test_without_embree_the_error_says_how_to_get_it(monkeypatch):
+    class Core:
+        @staticmethod
+        def embree_version():
+            return 0
+
+    monkeypatch.setattr(native, "core", Core)
+    with pytest.raises(RuntimeError, match=r"built without Embree.*libembree-dev.*rebuild"):
+        VisibilityScene(*soup())
+    with use_backend("reference"):
+        scene = VisibilityScene(*soup())
+        assert scene.occluded(*rays(10)).any()
+    with pytest.raises(RuntimeError, match="built without Embree"):
+        scene.occluded(*rays(10))
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "error", "message"),
+    [
+        (TRIANGLE.double(), FACE, ValueError, r"vertices must be \[P, 3\] float32.*float64"),
+        (TRIANGLE.numpy(), FACE, TypeError, "vertices must be a tensor"),
+        (TRIANGLE, FACE.float(), ValueError, r"faces must be \[F, 3\] int32.*float32"),
+        (TRIANGLE, FACE[0], ValueError, r"faces must be \[F, 3\]"),
+        (TRIANGLE, FACE + 1, ValueError, "index the 3 vertices, got indices 1 to 3"),
+        (TRIANGLE, FACE - 1, ValueError, "index the 3 vertices, got indices -1 to 1"),
+        (TRIANGLE, FACE.long() + 2**32, ValueError, "index the 3 vertices"),
+        (TRIANGLE * math.nan, FACE, ValueError, "vertices must be finite, got .*nan.* row 0"),
+        (TRIANGLE.to("meta"), FACE.to("meta"), ValueError, "vertices must be on the cpu"),
+    ],
+)
+def test_bad_meshes(vertices, faces, error, message):
+    with pytest.raises(error, match=message):
+        VisibilityScene(vertices, faces)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"origin": torch.rand(4, 2)}, r"origin must be \[N, 3\]"),
+        ({"direction": torch.rand(3, 3)}, r"direction must be \[N, 3\].*N=4"),
+        ({"direction": torch.rand(4, 3).double()}, "direction must be .*float32.*float64"),
+        (
+            {"origin": torch.rand(4, 3).to("meta"), "direction": torch.rand(4, 3).to("meta")},
+            "must be on the cpu",
+        ),
+        ({"t_min": -1.0}, "0 <= t_min <= t_max must hold, got -1.0"),
+        ({"t_min": 2.0, "t_max": 1.0}, "0 <= t_min <= t_max must hold"),
+        ({"t_max": math.nan}, "0 <= t_min <= t_max must hold"),
+    ],
+)
+def test_bad_rays(change, message):
+    scene = VisibilityScene(TRIANGLE, FACE)
+    arguments = {"origin": torch.rand(4, 3), "direction": torch.rand(4, 3)}
+    for query in (scene.occluded, scene.closest_hit):
+        query(**arguments)
+        with pytest.raises(ValueError, match=message):
+            query(**(arguments | change))
