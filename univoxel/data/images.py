@@ -63,12 +63,11 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     _require_file(path)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            header = file.header()
+            window = [np.array(file.header()[key]) for key in ("dataWindow", "displayWindow")]
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError) as error:
         raise DataError(f"{path}: expected an OpenEXR file, could not read it: {error}") from None
-    data, display = header["dataWindow"], header["displayWindow"]
-    if not all(np.array_equal(a, b) for a, b in zip(data, display, strict=True)):
+    if not np.array_equal(*window):
         raise DataError(f"{path}: expected a data window like the display window, got a crop")
     if len({pixels.shape for pixels in channels.values()}) != 1:
         raise DataError(f"{path}: expected channels of one size, got subsampled ones")

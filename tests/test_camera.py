@@ -1,0 +1,73 @@
+"""Pixels to rays and back, and the axes of the camera."""
+
+import math
+
+import pytest
+import torch
+
+from univoxel.camera import Cameras, image_rays, pixel_rays, project
+
+
+def cameras():
+    """Two cameras: one at +Z looking down -Z, one turned at random with an odd principal point."""
+    q, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)))
+    q = q * torch.linalg.det(q).sign()
+    first = torch.cat([torch.eye(3), torch.tensor([[0.0], [0.0], [4.0]])], 1)
+    second = torch.cat([q, torch.tensor([[1.0], [-2.0], [0.5]])], 1)
+    return Cameras(
+        torch.stack([first, second]),
+        focal=torch.tensor([[10.0, 10.0], [12.0, 9.0]]),
+        centre=torch.tensor([[4.0, 3.0], [3.5, 3.25]]),
+        width=8,
+        height=6,
+    )
+
+
+def test_the_first_camera_by_hand():
+    """x to the right is +X, y down is -Y, the centre looks along -Z; pixel centres are at 0.5."""
+    rays = pixel_rays(cameras(), torch.zeros(3, dtype=torch.int64), torch.tensor(
+        [[4.0, 3.0], [7.5, 3.0], [4.0, 5.5]]
+    ))  # fmt: skip
+    assert rays.origin.tolist() == [[0.0, 0.0, 4.0]] * 3
+    expected = torch.tensor([[0.0, 0.0, -1.0], [0.35, 0.0, -1.0], [0.0, -0.25, -1.0]])
+    expected = torch.nn.functional.normalize(expected, dim=1)
+    torch.testing.assert_close(rays.direction, expected)
+
+
+def test_image_rays_go_row_by_row_through_pixel_centres():
+    rays = image_rays(cameras(), 1)
+    column, row = 5, 2
+    single = pixel_rays(cameras(), torch.tensor([1]), torch.tensor([[column + 0.5, row + 0.5]]))
+    assert len(rays.direction) == 48
+    torch.testing.assert_close(rays.direction[row * 8 + column], single.direction[0])
+
+
+@pytest.mark.parametrize("view", [0, 1])
+def test_points_along_a_ray_project_to_its_pixel(view):
+    cams = cameras()
+    pixel = torch.rand(50, 2, generator=torch.Generator().manual_seed(2)) * torch.tensor([8.0, 6.0])
+    rays = pixel_rays(cams, torch.full((50,), view), pixel)
+    t = torch.linspace(0.5, 6.0, 50)[:, None]
+    xy, depth = project(cams, view, rays.origin + t * rays.direction)
+    # fp32 with coordinates of about 10 pixels
+    torch.testing.assert_close(xy, pixel, atol=2e-5, rtol=1e-5)
+    forward = -cams.camera_to_world[view, :, 2]
+    torch.testing.assert_close(depth, t[:, 0] * (rays.direction @ forward))
+
+
+def test_points_behind_the_camera_have_no_positive_depth():
+    _, depth = project(cameras(), 0, torch.tensor([[0.0, 0.0, 5.0], [0.0, 0.0, 3.0]]))
+    assert depth.tolist() == pytest.approx([-1.0, 1.0])
+
+
+def test_directions_are_unit():
+    norm = image_rays(cameras(), 1).direction.norm(dim=1)
+    torch.testing.assert_close(norm, torch.ones(48))
+
+
+def test_field_of_view():
+    """The outer edges of the picture lie at half the field of view to both sides."""
+    angle = 2 * math.atan(0.5 * 8 / 10.0)
+    edges = torch.tensor([[0.0, 3.0], [8.0, 3.0]])
+    left, right = pixel_rays(cameras(), torch.zeros(2, dtype=torch.int64), edges).direction
+    assert math.acos(float(left @ right)) == pytest.approx(angle, rel=1e-5)
