@@ -12,7 +12,6 @@ from rich import print
 from rich.progress import track
 from rich.table import Table
 from torch import Tensor
-from univoxel.envmap import EnvMap
 
 from univoxel import metrics
 from univoxel.color import linear_to_srgb
@@ -28,6 +27,7 @@ from univoxel.data import (
 )
 from univoxel.data.base import decode
 from univoxel.data.images import read_image, replacing, write_exr, write_png
+from univoxel.envmap import EnvMap
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.scene import Scene, load_scene

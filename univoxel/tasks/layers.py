@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from torch import Tensor
-from univoxel.envmap import EnvMap
-from univoxel.render.relight import relight_surface
 
 from univoxel.camera import Cameras
+from univoxel.envmap import EnvMap
 from univoxel.records import Mesh, Surface
 from univoxel.render.pipeline import shade, surface_of_view
+from univoxel.render.relight import relight_surface
 from univoxel.scene import Scene
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from univoxel.optim import RowAdam
 
 from univoxel import losses
 from univoxel.camera import pixel_rays
@@ -18,6 +17,7 @@ from univoxel.data import Photos, load_photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
 from univoxel.ops import smooth_rows_
+from univoxel.optim import RowAdam
 from univoxel.records import Rays, Surface
 from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at

@@ -1,0 +1,72 @@
+# Every target does its own set-up: Debian packages, .venv, the compiled extension. Set up once, a
+# target goes straight to work; C++ edits recompile what they touch, Python edits need nothing.
+PYTHON ?= python3
+BIN := .venv/bin
+SETUP := .venv/.installed
+CXX_SOURCES := CMakeLists.txt $(wildcard cmake/*.cmake csrc/*)
+export OMP_WAIT_POLICY ?= passive
+
+.PHONY: help dev demo test lint format bench asan clean
+.DELETE_ON_ERROR:
+
+help:
+	@echo "make demo    train, evaluate and relight the bundled scene; prints the page to open"
+	@echo "make test    all tests"
+	@echo "make lint    formatting, lint and types, as CI checks them"
+	@echo "make format  put formatting right"
+	@echo "make bench   time every op against its peers and draw the charts"
+	@echo "make asan    the ops' tests under address and undefined-behaviour sanitizers"
+	@echo "make dev     set up only"
+
+dev: build/.installed
+
+$(SETUP): pyproject.toml constraints.txt scripts/system.sh scripts/venv.sh
+	scripts/system.sh $(PYTHON)
+	scripts/venv.sh $(PYTHON)
+	@touch $@
+
+build/.installed: $(SETUP) scripts/build.sh $(CXX_SOURCES)
+	scripts/build.sh build .
+	@touch $@
+
+demo: dev
+	$(BIN)/univoxel demo --out runs/demo
+
+test: dev
+	$(BIN)/python -m pytest -q
+
+lint: $(SETUP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/clang-format --dry-run -Werror csrc/*
+	$(BIN)/pyright
+
+format: $(SETUP)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+	$(BIN)/clang-format -i csrc/*
+
+.venv/.bench: $(SETUP)
+	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'
+	@touch $@
+
+bench: dev .venv/.bench
+	$(BIN)/python benchmarks/ops.py
+	$(BIN)/python benchmarks/charts.py
+
+# The instrumented build stands in a package of its own, of links to the Python sources. Inductor's
+# own compiler runs are no business of the sanitizers; Python itself leaks by design.
+build-asan/.installed: $(SETUP) scripts/build.sh $(CXX_SOURCES)
+	scripts/build.sh build-asan build-asan/site -DUNIVOXEL_SANITIZE=ON
+	@touch $@
+
+asan: build-asan/.installed
+	ln -sf $(addprefix $(CURDIR)/,$(filter-out univoxel/_core,$(wildcard univoxel/*))) \
+		build-asan/site/univoxel/
+	cd build-asan/site && ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+		LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libubsan.so)" \
+		$(CURDIR)/$(BIN)/python -m pytest -q -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
+		-p no:cacheprovider -k "not compile" $(CURDIR)/tests/ops
+
+clean:
+	rm -rf build build-asan .deps .venv univoxel/_core

@@ -1,0 +1,170 @@
+"""What is timed: one function per op, at the sizes of a training step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import peers
+import torch
+from torch import Tensor
+
+from univoxel import ops
+
+RAYS, SAMPLES = 4096, 64  # per ray: 262,144 samples
+POINTS, LOBES, DIRECTIONS = 4096, 16, 256
+
+
+@dataclass(frozen=True)
+class Case:
+    """One op at one size. Tensors of `arguments` that require a gradient are differentiated."""
+
+    op: str
+    size: str
+    ours: Callable
+    reference: Callable
+    arguments: tuple  # float32
+    work: dict[str, float]  # least work, forward and backward, in the units of limits.measure
+    peers: dict[str, Callable[[], object]] = field(default_factory=dict)  # forward and backward
+    tolerance: float = 1e-4  # relative L2 error against the reference in float64
+
+
+def all_cases() -> Iterator[Case]:
+    yield composite()
+    yield sample_dense(160)
+    yield sample_dense(256)
+    yield shade_sg()
+    yield adam_rows()
+
+
+def composite(channels: int = 12) -> Case:
+    g = torch.Generator().manual_seed(0)
+    m = RAYS * SAMPLES
+    alpha = (torch.rand(m, generator=g) * 0.1).requires_grad_()
+    value = torch.randn(m, channels, generator=g).requires_grad_()
+    offsets = torch.arange(0, m + 1, SAMPLES)
+    return Case(
+        "composite",
+        f"{m:,} samples, {channels} channels",
+        ops.composite,
+        ops.composite_reference,
+        (alpha, value, offsets),
+        # alpha and value read twice, weight and both gradients written
+        {"read": 4.0 * m * (2 * (1 + channels) + 1 + 1 + channels)},
+        peers.composite(alpha, value, RAYS),
+    )
+
+
+def _points_on_rays(generator: torch.Generator) -> Tensor:
+    """Points in [0, 1]^3 in the order a ray march gives: sections of neighbouring rays."""
+    side = int(RAYS**0.5)
+    uv = torch.cartesian_prod(torch.arange(side), torch.arange(side)) / side * 0.6 + 0.2
+    depth = torch.linspace(0.35, 0.65, SAMPLES) + 0.3 / SAMPLES * torch.rand(
+        RAYS, 1, generator=generator
+    )
+    xy = uv[:, None].expand(-1, SAMPLES, -1)
+    return torch.cat([xy, depth[..., None]], -1).reshape(-1, 3).contiguous()
+
+
+def sample_dense(resolution: int, channels: int = 16) -> Case:
+    g = torch.Generator().manual_seed(0)
+    shape = (resolution,) * 3
+    sdf = torch.randn(*shape, generator=g).requires_grad_()
+    features = torch.randn(*shape, channels, generator=g).requires_grad_()
+    points = _points_on_rays(g)
+    h = 1.0 / (resolution - 1)
+
+    def ours(*arguments):
+        return ops.sample_dense(*arguments, sparse_grad=True)
+
+    m = len(points)
+    return Case(
+        "sample_dense",
+        f"{m:,} points, {channels} channels, {resolution}^3",
+        ours,
+        ops.sample_dense_reference,
+        (sdf, features, points, (0.0, 0.0, 0.0), h),
+        # 8 rows of features read and 8 of their gradient read and written, rows of 64 bytes
+        {"gather": 24.0 * m * channels / 16},
+        peers.sample_dense(sdf, features, points, h),
+    )
+
+
+def shade_sg() -> Case:
+    g = torch.Generator().manual_seed(0)
+
+    def unit(*size):
+        return torch.nn.functional.normalize(torch.randn(*size, 3, generator=g), dim=-1)
+
+    normal = unit(POINTS)
+    wo = torch.nn.functional.normalize(normal + 0.7 * unit(POINTS), dim=-1)
+    parameters = [
+        unit(POINTS, LOBES),
+        torch.rand(POINTS, LOBES, generator=g) * 30 + 0.1,
+        torch.rand(POINTS, LOBES, 3, generator=g),
+        normal,
+        wo,
+        torch.rand(POINTS, 3, generator=g),
+        torch.rand(POINTS, generator=g) * 0.8 + 0.1,
+    ]
+    i = torch.arange(DIRECTIONS) + 0.5  # Fibonacci half-sphere
+    z, phi = 1 - i / DIRECTIONS, i * 2.399963229728653
+    r = (1 - z * z).sqrt()
+    directions = torch.stack([r * phi.cos(), r * phi.sin(), z], -1)
+    rotation = torch.rand(POINTS, generator=g) * 6.2831853
+    pairs = float(POINTS * LOBES * DIRECTIONS)
+    return Case(
+        "shade_sg",
+        f"{POINTS:,} points, {LOBES} lobes, {DIRECTIONS} directions",
+        ops.shade_sg,
+        ops.shade_sg_reference,
+        (*(p.requires_grad_() for p in parameters), directions, rotation, 0.04),
+        # a dot product, an exponential and three sums forward; their gradients backward
+        {"exp": pairs, "fma": 2 * pairs * (3 + 1 + 3 + 3 + 3 + 4)},
+    )
+
+
+def adam_rows(table: int = 160**3, rows: int = 262_144, channels: int = 16) -> Case:
+    g = torch.Generator().manual_seed(0)
+    chosen = torch.randperm(table, generator=g)[:rows].sort().values
+    param, mean = torch.randn(2, table, channels, generator=g).unbind()
+    square = torch.rand(table, channels, generator=g)
+    grad = torch.randn(rows, channels, generator=g)
+    numbers = (1e-3, 0.9, 0.99, 1e-8, 5)
+    state = [t.clone() for t in (param, mean, square)]
+
+    def step(function):
+        def run(param, mean, square, chosen, grad):
+            function(param, mean, square, chosen, grad, *numbers)
+            return param, mean, square
+
+        return run
+
+    dense = torch.zeros(table, channels)
+
+    def adam():  # what torch does with a dense gradient of the same table
+        torch.optim._functional.adam(
+            [state[0]],
+            [dense],
+            [state[1]],
+            [state[2]],
+            [],
+            [torch.tensor(5.0)],
+            amsgrad=False,
+            beta1=0.9,
+            beta2=0.99,
+            lr=1e-3,
+            weight_decay=0.0,
+            eps=1e-8,
+            maximize=False,
+        )
+
+    return Case(
+        "adam_rows_",
+        f"{rows:,} of {table:,} rows, {channels} channels",
+        step(ops.adam_rows_),
+        step(ops.adam_rows_reference_),
+        (param, mean, square, chosen, grad),
+        {"gather": 6.0 * rows * channels / 16, "read": 4.0 * rows * channels},
+        {"torch.optim.Adam, dense gradient": adam},
+    )

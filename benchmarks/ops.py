@@ -1,0 +1,175 @@
+"""Time every op, forward and backward, against its reference, eager and compiled, and its peers.
+
+    python benchmarks/ops.py [--only composite] [--rounds 15] [--out benchmarks/results/ops.json]
+
+Each op is first held against its reference in float64. All contenders of a case run in turn, round
+by round, so that a noisy machine treats them alike. Timings on 1 and 2 threads come from processes
+of their own: not every peer can change its threads.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+HERE = Path(__file__).parent
+
+
+def arguments_as(case, dtype: torch.dtype) -> tuple:
+    """Fresh leaves of the case's tensors, floating ones in the dtype."""
+    return tuple(
+        a.detach().to(dtype, copy=True).requires_grad_(a.requires_grad)
+        if isinstance(a, Tensor) and a.is_floating_point()
+        else a
+        for a in case.arguments
+    )
+
+
+def forward_backward(function, arguments: tuple) -> tuple[list[Tensor], list[Tensor]]:
+    outputs = function(*arguments)
+    outputs = [outputs] if isinstance(outputs, Tensor) else list(outputs)
+    leaves = [a for a in arguments if isinstance(a, Tensor) and a.requires_grad]
+    if not leaves:
+        return outputs, []
+    through = [o for o in outputs if o.requires_grad]
+    seeds = [torch.linspace(0.5, 1.5, o.numel(), dtype=o.dtype).view(o.shape) for o in through]
+    return outputs, list(torch.autograd.grad(through, leaves, seeds))
+
+
+def verify(case) -> float:
+    """Largest relative L2 error of values and gradients against the reference in float64."""
+    ours = forward_backward(case.ours, arguments_as(case, torch.float32))
+    wanted = forward_backward(case.reference, arguments_as(case, torch.float64))
+    worst = 0.0
+    for got, want in zip([*ours[0], *ours[1]], [*wanted[0], *wanted[1]], strict=True):
+        got = got.to_dense() if got.is_sparse else got
+        error = (got.detach().double() - want.detach()).norm() / want.detach().norm()
+        worst = max(worst, float(error))
+    if not worst < case.tolerance:
+        raise SystemExit(f"{case.op}, {case.size}: error {worst:.1e} is above {case.tolerance}")
+    return worst
+
+
+def contenders(case) -> dict:
+    """Closures by name; one that cannot run is left out, with the reason on stderr."""
+
+    def of(function):
+        arguments = arguments_as(case, torch.float32)
+        return lambda: forward_backward(function, arguments)
+
+    found = {"univoxel": of(case.ours), "torch eager": of(case.reference)}
+    found["torch.compile"] = of(torch.compile(case.reference))
+    found |= case.peers
+    for name, run in list(found.items()):
+        try:
+            run()
+            run()
+        except Exception as error:
+            print(f"{case.op}: {name} left out: {str(error).splitlines()[0]}", file=sys.stderr)
+            del found[name]
+    return found
+
+
+def times(found: dict, rounds: int) -> dict[str, list[float]]:
+    """Milliseconds of every round, contenders in turn."""
+    measured: dict[str, list[float]] = {name: [] for name in found}
+    for _ in range(rounds):
+        for name, run in found.items():
+            start = time.perf_counter()
+            run()
+            measured[name].append(1e3 * (time.perf_counter() - start))
+    return measured
+
+
+def quartiles(values: list[float]) -> dict[str, float]:
+    low, median, high = torch.tensor(values).quantile(torch.tensor([0.25, 0.5, 0.75])).tolist()
+    return {"median_ms": round(median, 3), "low_ms": round(low, 3), "high_ms": round(high, 3)}
+
+
+def run_cases(threads: int, only: str, rounds: int) -> dict:
+    import cases
+    import limits
+    import peers
+
+    peers.set_threads(threads)
+    reach = limits.measure()
+    results = []
+    for case in cases.all_cases():
+        if only not in case.op:
+            continue
+        error = verify(case)
+        least, bound = limits.floor(case.work, reach)
+        measured = {n: quartiles(t) for n, t in times(contenders(case), rounds).items()}
+        ours = measured["univoxel"]["median_ms"]
+        results.append(
+            {
+                "op": case.op,
+                "size": case.size,
+                "threads": threads,
+                "error": error,
+                "floor_ms": round(1e3 * least, 3),
+                "bound": bound,
+                "fraction_of_bound": round(1e3 * least / ours, 3),
+                "contenders": measured,
+            }
+        )
+        print(f"{case.op:14s} {case.size}, threads {threads}, floor {1e3 * least:.1f} ms ({bound})")
+        for name, t in measured.items():
+            print(
+                f"    {name:34s} {t['median_ms']:9.2f} ms  [{t['low_ms']:.2f}, {t['high_ms']:.2f}]"
+                f"  {t['median_ms'] / ours:6.1f} x"
+            )
+    return {"limits": {str(threads): reach}, "results": results, "peers": peers.versions()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", default="", help="ops whose name contains this (default: all)")
+    parser.add_argument("--rounds", type=int, default=15, help="at least 3 (default: 15)")
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "ops.json")
+    parser.add_argument("--threads", type=int, help=argparse.SUPPRESS)  # in the child processes
+    options = parser.parse_args()
+    if options.threads:
+        result = run_cases(options.threads, options.only, options.rounds)
+        options.out.write_text(json.dumps(result))
+        return
+
+    merged: dict = {"limits": {}, "results": []}
+    for threads in (1, 2):
+        part = options.out.with_suffix(f".{threads}.part")
+        part.parent.mkdir(parents=True, exist_ok=True)
+        # XLA sizes its thread pool by the cores it may use.
+        cores = sorted(os.sched_getaffinity(0))[:threads]
+        subprocess.run(
+            [sys.executable, __file__, "--threads", str(threads), "--only", options.only]
+            + ["--rounds", str(options.rounds), "--out", str(part)],
+            check=True,
+            env={**os.environ, "OMP_WAIT_POLICY": "passive", "OMP_NUM_THREADS": str(threads)},
+            preexec_fn=lambda cores=cores: os.sched_setaffinity(0, cores),
+        )
+        result = json.loads(part.read_text())
+        part.unlink()
+        merged["limits"] |= result["limits"]
+        merged["results"] += result["results"]
+        merged["peers"] = result["peers"]
+    git = ["git", "-C", str(HERE), "describe", "--always", "--dirty"]
+    merged["commit"] = subprocess.run(git, capture_output=True, text=True).stdout.strip()
+    merged["versions"] = {"python": platform.python_version(), "torch": torch.__version__}
+    merged["versions"] |= merged.pop("peers")
+    merged["cpu"] = torch.backends.cpu.get_cpu_capability()
+    merged["cores"] = len(os.sched_getaffinity(0))
+    options.out.write_text(json.dumps(merged, indent=1) + "\n")
+    print(options.out)
+
+
+if __name__ == "__main__":
+    main()

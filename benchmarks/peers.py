@@ -1,0 +1,116 @@
+"""The same work in other packages, where they can be imported: closures of forward and backward."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Peers = dict[str, Callable[[], object]]
+
+try:
+    import jax
+    import jax.numpy as jnp
+except ImportError:
+    jax = None
+try:
+    import drjit
+    from drjit.auto import ad
+except ImportError:
+    drjit = None
+
+
+def versions() -> dict[str, str]:
+    """Of the peers that are there."""
+    there = {"jax": jax, "drjit": drjit}
+    return {name: importlib.metadata.version(name) for name, module in there.items() if module}
+
+
+def composite(alpha: Tensor, value: Tensor, n_rays: int) -> Peers:
+    """Rays of one length: JAX gets the dense form, which suits it best."""
+    if jax is None:
+        return {}
+    a = jnp.asarray(alpha.detach().numpy()).reshape(n_rays, -1)
+    v = jnp.asarray(value.detach().numpy()).reshape(*a.shape, -1)
+
+    def loss(a, v):
+        trans = jnp.cumprod(1 - a, 1)
+        weight = a * jnp.concatenate([jnp.ones_like(a[:, :1]), trans[:, :-1]], 1)
+        return (weight[..., None] * v).sum() + weight.sum()
+
+    run = jax.jit(jax.grad(loss, (0, 1)))
+    return {"JAX": lambda: jax.block_until_ready(run(a, v))}
+
+
+def sample_dense(sdf: Tensor, features: Tensor, points: Tensor, h: float) -> Peers:
+    """Value, central differences over one voxel and features, with dense gradients."""
+    found: Peers = {}
+    if jax is not None:
+        f, c = (jnp.asarray(t.detach().numpy()) for t in (sdf, features))
+        p = jnp.asarray(points.numpy())
+
+        def lookup(grid, x):
+            x = jnp.clip(x / h, 0, grid.shape[0] - 1)
+            i = jnp.minimum(x.astype(jnp.int32), grid.shape[0] - 2)
+            t = (x - i).reshape(len(x), 3, *[1] * (grid.ndim - 3))
+            total = 0.0
+            for corner in range(8):
+                d = [(corner >> k) & 1 for k in range(3)]
+                w = 1.0
+                for k in range(3):
+                    w = w * (t[:, k] if d[k] else 1 - t[:, k])
+                total += w * grid[i[:, 0] + d[0], i[:, 1] + d[1], i[:, 2] + d[2]]
+            return total
+
+        def loss(f, c):
+            total = lookup(f, p).sum() + lookup(c, p).sum()
+            for k in range(3):
+                e = h * jnp.eye(3)[k]
+                total += (k + 1) * (lookup(f, p + e) - lookup(f, p - e)).sum()
+            return total
+
+        run = jax.jit(jax.grad(loss, (0, 1)))
+        found["JAX"] = lambda: jax.block_until_ready(run(f, c))
+    if drjit is not None:
+        found["Dr.Jit"] = _drjit_sample_dense(sdf, features, points, h)
+    return found
+
+
+def _drjit_sample_dense(sdf: Tensor, features: Tensor, points: Tensor, h: float):
+    n = sdf.shape[0]
+    f = ad.TensorXf(sdf.detach().numpy()[..., None])
+    c = ad.TensorXf(features.detach().numpy())
+    p = ad.Array3f(*points.numpy().T)
+    # Texel centres stand at half texels, and Dr.Jit's x is the fastest axis.
+    to_texture = [(p[2 - k] / h + 0.5) / n for k in range(3)]
+
+    def run():
+        drjit.enable_grad(f)
+        drjit.enable_grad(c)
+        values = ad.Texture3f(f, migrate=False, use_accel=False)
+        colors = ad.Texture3f(c, migrate=False, use_accel=False)
+        place = ad.Array3f(*to_texture)
+        total = drjit.sum(values.eval(place)[0])
+        for channel in colors.eval(place):
+            total += drjit.sum(channel)
+        for k in range(3):
+            e = ad.Array3f(0)
+            e[k] = 1 / n
+            total += (k + 1) * drjit.sum(values.eval(place + e)[0] - values.eval(place - e)[0])
+        drjit.backward(total)
+        drjit.eval(drjit.grad(f), drjit.grad(c))
+        drjit.sync_thread()
+        drjit.disable_grad(f)
+        drjit.disable_grad(c)
+
+    return run
+
+
+def set_threads(threads: int) -> bool:
+    """Give the peers this many threads; False where they cannot change it in a running process."""
+    if drjit is not None:
+        drjit.set_thread_count(threads)
+    torch.set_num_threads(threads)
+    return jax is None

@@ -1,0 +1,181 @@
+"""The command line over stand-ins for the tasks: what is passed on, what a mistake prints."""
+
+import importlib
+import subprocess
+import sys
+import types
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from univoxel.cli import main
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    radiance: float = 1.0
+
+
+@dataclass(frozen=True)
+class Config:
+    data: Path
+    out: Path
+    preset: str
+    minutes: float = 4.0
+    seed: int = 0
+    loss: LossConfig = LossConfig()
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Replace config and tasks; every task call is noted as (name, args, kwargs)."""
+    noted = []
+
+    def stand_in(module, **functions):
+        fake = types.ModuleType(module)
+        for name, function in functions.items():
+            setattr(fake, name, function)
+        monkeypatch.setitem(sys.modules, module, fake)
+        parent, _, leaf = module.rpartition(".")
+        monkeypatch.setattr(importlib.import_module(parent), leaf, fake, raising=False)
+
+    def task(name, result=None):
+        def call(*args, **kwargs):
+            noted.append((name, args, kwargs))
+            if isinstance(result, BaseException):
+                raise result
+            return result
+
+        return call
+
+    def replace(name, result):
+        stand_in(f"univoxel.tasks.{name}", **{name: task(name, result)})
+
+    stand_in("univoxel.config", preset=lambda name, data, out: Config(data, out, name))
+    replace("train", None)
+    replace("evaluate", {"psnr": 31.25, "views": 5})
+    replace("relight", None)
+    replace("export", None)
+    replace("demo", Path("demo/index.html"))
+    noted_and_replace = types.SimpleNamespace(noted=noted, replace=replace)
+    return noted_and_replace
+
+
+def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path):
+    out = tmp_path / "run"
+    options = ["--preset", "draft", "--minutes", "2", "--set", "loss.radiance=2", "--set", "seed=7"]
+    assert main(["train", "photos", "--out", str(out), *options]) == 0
+    expected = Config(Path("photos"), out, "draft", 2.0, 7, LossConfig(2.0))
+    assert calls.noted == [("train", (expected,), {"resume": False})]
+
+
+def test_train_keeps_the_minutes_of_the_preset(calls, tmp_path):
+    assert main(["train", "photos", "--out", str(tmp_path / "run")]) == 0
+    assert calls.noted[0][1][0].minutes == 4.0
+
+
+def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
+    (tmp_path / "scene.safetensors").touch()
+    assert main(["train", "photos", "--out", str(tmp_path)]) == 2
+    assert "holds a run already: add --resume" in capsys.readouterr().err
+    assert main(["train", "photos", "--out", str(tmp_path), "--resume"]) == 0
+    assert calls.noted[0][2] == {"resume": True}
+
+
+def test_eval_prints_the_measures(calls, capsys):
+    assert main(["eval", "run", "--data", "photos", "--save", "dir", "--json", "m.json"]) == 0
+    paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
+    assert calls.noted == [("evaluate", (Path("run"),), paths)]
+    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
+        ["psnr", "31.2500"],
+        ["views", "5"],
+    ]
+
+
+def test_relight_export_and_demo(calls, capsys):
+    assert main(["relight", "run", "--envmap", "maps/hall.exr", "--rotate", "90"]) == 0
+    assert main(["export", "run", "--mesh", "out.ply"]) == 0
+    assert main(["demo", "--out", "demo"]) == 0
+    paths = (Path("run"), Path("maps/hall.exr"), Path("run/relight/hall"))
+    assert calls.noted == [
+        ("relight", paths, {"cameras": "test", "rotate": 90.0}),
+        ("export", (Path("run"), Path("out.ply")), {}),
+        ("demo", (Path("demo"),), {}),
+    ]
+    printed = capsys.readouterr().out.split()
+    assert printed == ["run/relight/hall", "out.ply", "demo/index.html"]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("bad\n  input"),
+        FileNotFoundError("bad input"),
+        RuntimeError("bad input"),
+        ImportError("bad input"),
+    ],
+)
+def test_a_mistake_is_one_line(calls, capsys, error):
+    calls.replace("evaluate", error)
+    assert main(["eval", "run"]) == 2
+    assert capsys.readouterr().err == "univoxel eval: bad input\n"
+    with pytest.raises(type(error)):
+        main(["eval", "run", "--traceback"])
+
+
+def test_a_bug_is_no_mistake_of_the_user(calls):
+    calls.replace("evaluate", ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        main(["eval", "run"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--minutes", "0"], "--minutes must be above 0, got 0.0"),
+        (["--minutes", "nan"], "--minutes must be above 0, got nan"),
+        (["--set", "seed"], "--set seed: expected FIELD=VALUE"),
+        (["--set", "sede=1"], "--set sede=1: no field 'sede', there are: data, out, preset"),
+        (["--set", "seed.x=1"], "--set seed.x=1: no field 'x', there are: none"),
+        (["--set", "seed=fast"], "--set seed=fast: seed is a int such as 0, got 'fast'"),
+    ],
+)
+def test_bad_options(calls, tmp_path, capsys, options, message):
+    assert main(["train", "photos", "--out", str(tmp_path), *options]) == 2
+    assert capsys.readouterr().err.startswith(f"univoxel train: {message}")
+    assert calls.noted == []
+
+
+@pytest.mark.parametrize("arguments", [["train"], ["train", "x", "--out", "y", "--preset", "z"]])
+def test_unknown_arguments_exit_with_2(calls, capsys, arguments):
+    with pytest.raises(SystemExit) as exit_:
+        main(arguments)
+    assert exit_.value.code == 2
+    assert calls.noted == []
+
+
+def test_an_interrupt_says_what_was_kept(calls, tmp_path, capsys):
+    calls.replace("train", KeyboardInterrupt())
+    arguments = ["train", "photos", "--out", str(tmp_path), "--resume"]
+    assert main(arguments) == 130
+    assert capsys.readouterr().err.endswith(f"interrupted; nothing was saved in {tmp_path} yet\n")
+    (tmp_path / "scene.safetensors").touch()
+    assert main(arguments) == 130
+    assert capsys.readouterr().err.endswith("keeps the last saved state: go on with --resume\n")
+
+
+def test_help_does_not_wait_for_torch():
+    code = (
+        "import sys\nfrom univoxel.cli import main\n"
+        "try: main(['train', '--help'])\nexcept SystemExit as e: assert not e.code\n"
+        "assert 'torch' not in sys.modules"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert "--preset {draft,fast,full}" in run.stdout
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("univoxel 0.")

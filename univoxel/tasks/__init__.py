@@ -1,0 +1,1 @@
+"""One module per command: a function that does the whole of it."""
