@@ -290,9 +290,19 @@ ShadeSG<T> shade_sg_of(const array<T>& axis, const array<T>& sharpness, const ar
                 amplitude.size() == 3 * n * k && normal.size() == 3 * n && wo.size() == 3 * n &&
                 albedo.size() == 3 * n && roughness.size() == n && directions.size() % 3 == 0,
             "shade_sg: sizes do not fit");
-    return {axis.data(), sharpness.data(), amplitude.data(), normal.data(), wo.data(),
-            albedo.data(), roughness.data(), directions.data(), rotation.data(),
-            n, k, directions.size() / 3, T(f0)};
+    return {axis.data(),
+            sharpness.data(),
+            amplitude.data(),
+            normal.data(),
+            wo.data(),
+            albedo.data(),
+            roughness.data(),
+            directions.data(),
+            rotation.data(),
+            n,
+            k,
+            directions.size() / 3,
+            T(f0)};
 }
 
 template <class T>
@@ -310,11 +320,10 @@ void bind_sg(py::module_& m) {
             shade_sg_forward(in, out, threads);
         },
         py::arg("axis").noconvert(), py::arg("sharpness").noconvert(),
-        py::arg("amplitude").noconvert(), py::arg("normal").noconvert(),
-        py::arg("wo").noconvert(), py::arg("albedo").noconvert(),
-        py::arg("roughness").noconvert(), py::arg("directions").noconvert(),
-        py::arg("rotation").noconvert(), py::arg("rgb").noconvert(), py::arg("f0"),
-        py::arg("threads"));
+        py::arg("amplitude").noconvert(), py::arg("normal").noconvert(), py::arg("wo").noconvert(),
+        py::arg("albedo").noconvert(), py::arg("roughness").noconvert(),
+        py::arg("directions").noconvert(), py::arg("rotation").noconvert(),
+        py::arg("rgb").noconvert(), py::arg("f0"), py::arg("threads"));
     m.def(
         "shade_sg_backward",
         [](const array<T>& axis, const array<T>& sharpness, const array<T>& amplitude,
@@ -333,14 +342,14 @@ void bind_sg(py::module_& m) {
             shade_sg_backward(in, grad_rgb.data(), grad, threads);
         },
         py::arg("axis").noconvert(), py::arg("sharpness").noconvert(),
-        py::arg("amplitude").noconvert(), py::arg("normal").noconvert(),
-        py::arg("wo").noconvert(), py::arg("albedo").noconvert(),
-        py::arg("roughness").noconvert(), py::arg("directions").noconvert(),
-        py::arg("rotation").noconvert(), py::arg("grad_rgb").noconvert(),
-        py::arg("grad_axis").noconvert(), py::arg("grad_sharpness").noconvert(),
-        py::arg("grad_amplitude").noconvert(), py::arg("grad_normal").noconvert(),
-        py::arg("grad_wo").noconvert(), py::arg("grad_albedo").noconvert(),
-        py::arg("grad_roughness").noconvert(), py::arg("f0"), py::arg("threads"));
+        py::arg("amplitude").noconvert(), py::arg("normal").noconvert(), py::arg("wo").noconvert(),
+        py::arg("albedo").noconvert(), py::arg("roughness").noconvert(),
+        py::arg("directions").noconvert(), py::arg("rotation").noconvert(),
+        py::arg("grad_rgb").noconvert(), py::arg("grad_axis").noconvert(),
+        py::arg("grad_sharpness").noconvert(), py::arg("grad_amplitude").noconvert(),
+        py::arg("grad_normal").noconvert(), py::arg("grad_wo").noconvert(),
+        py::arg("grad_albedo").noconvert(), py::arg("grad_roughness").noconvert(), py::arg("f0"),
+        py::arg("threads"));
 }
 
 }  // namespace

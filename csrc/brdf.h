@@ -1,5 +1,5 @@
-// The BRDF of docs/conventions.md in scalars: a GGX layer over a Lambertian base. univoxel/brdf.py is
-// its twin; tests hold one against the other.
+// The BRDF of docs/conventions.md in scalars: a GGX layer over a Lambertian base. univoxel/brdf.py
+// is its twin; tests hold one against the other.
 #pragma once
 
 #include <algorithm>
@@ -8,9 +8,9 @@
 namespace univoxel {
 
 constexpr double kPi = 3.14159265358979323846;
-constexpr double kAlphaMin = 1e-3;      // smallest GGX alpha
-constexpr double kCosMin = 1e-4;        // cosines in denominators are held above this
-constexpr double kHalfEpsilon = 1e-12;  // added to |wi + wo|^2, which may be 0
+constexpr double kAlphaMin = 1e-3;     // smallest GGX alpha
+constexpr double kCosMin = 1e-4;       // cosines in denominators are held above this
+constexpr double kHalfEpsilon = 1e-7;  // added to |wi + wo|^2, which may be 0
 
 /// GGX alpha = roughness^2, at least kAlphaMin.
 template <class T>
@@ -38,8 +38,8 @@ inline T smith_root(T cosine, T a2) {
     return std::sqrt(cosine * cosine * (1 - a2) + a2);
 }
 
-/// Height-correlated Smith masking-shadowing over 4 (n.v)(n.l) (Heitz 2014, eq. 99). Cosines must be
-/// at least kCosMin.
+/// Height-correlated Smith masking-shadowing over 4 (n.v)(n.l) (Heitz 2014, eq. 99). Cosines must
+/// be at least kCosMin.
 template <class T>
 inline T smith_v(T n_dot_v, T n_dot_l, T a2) {
     return T(0.5) / (n_dot_l * smith_root(n_dot_v, a2) + n_dot_v * smith_root(n_dot_l, a2));
@@ -63,16 +63,16 @@ struct SpecularAlbedo {
 /// Polynomials of total degree 4 in cosine, roughness and u = cosine / (cosine + alpha), exponents
 /// counting up with that of u fastest: E for F0 = 0 and for F0 = 1. See univoxel/brdf.py.
 constexpr double kAlbedoBlack[35] = {
-    0.745523, 2.79565, -8.54429, 10.4028, -4.40541, -2.03631, -3.23016, 5.87168, -1.51822,
-    2.34881, -10.8813, 28.1217, -1.20787, 31.7152, 0.18939, -5.392, 5.48925, -22.6324,
-    17.9447, 3.53936, -28.1758, 25.3064, -25.0208, 5.48368, 6.23112, 9.27461, 3.79092,
-    -4.89692, 5.30421, -3.44505, -1.23944, -2.04994, -4.57074, -1.07901, 2.02599,
+    0.745523, 2.79565,  -8.54429, 10.4028,  -4.40541, -2.03631, -3.23016, 5.87168, -1.51822,
+    2.34881,  -10.8813, 28.1217,  -1.20787, 31.7152,  0.18939,  -5.392,   5.48925, -22.6324,
+    17.9447,  3.53936,  -28.1758, 25.3064,  -25.0208, 5.48368,  6.23112,  9.27461, 3.79092,
+    -4.89692, 5.30421,  -3.44505, -1.23944, -2.04994, -4.57074, -1.07901, 2.02599,
 };
 constexpr double kAlbedoWhite[35] = {
-    0.724531, -0.74156, 1.75763, -0.0237653, -0.714459, 1.22618, 14.7944, -35.535, 19.52,
-    -2.26108, -44.7913, 76.4906, 2.05057, 90.465, -0.773033, -13.8655, 30.9258, -45.5647,
-    28.4446, 5.73739, -84.7276, 77.534, -79.2618, 69.526, 24.9903, 23.2341, -46.2919, 23.344,
-    -6.60739, 9.15137, -7.20615, 7.20929, -7.59783, -0.86621, 0.162265,
+    0.724531, -0.74156, 1.75763,  -0.0237653, -0.714459, 1.22618,   14.7944,  -35.535,  19.52,
+    -2.26108, -44.7913, 76.4906,  2.05057,    90.465,    -0.773033, -13.8655, 30.9258,  -45.5647,
+    28.4446,  5.73739,  -84.7276, 77.534,     -79.2618,  69.526,    24.9903,  23.2341,  -46.2919,
+    23.344,   -6.60739, 9.15137,  -7.20615,   7.20929,   -7.59783,  -0.86621, 0.162265,
 };
 
 /// Within 0.005 of quadrature for n.v in [0.02, 1], roughness in [0.05, 1] and any F0.
@@ -90,8 +90,8 @@ inline SpecularAlbedo<T> specular_albedo(T n_dot_v, T roughness, T f0) {
     for (int i = 0, term = 0; i < 5; ++i) {
         for (int j = 0; i + j < 5; ++j) {
             for (int k = 0; i + j + k < 5; ++k, ++term) {
-                const T c = T(kAlbedoBlack[term]) +
-                            f0 * (T(kAlbedoWhite[term]) - T(kAlbedoBlack[term]));
+                const T c =
+                    T(kAlbedoBlack[term]) + f0 * (T(kAlbedoWhite[term]) - T(kAlbedoBlack[term]));
                 value += c * pv[i] * pr[j] * pu[k];
                 if (i > 0) dv += c * T(i) * pv[i - 1] * pr[j] * pu[k];
                 if (j > 0) dr += c * T(j) * pv[i] * pr[j - 1] * pu[k];
@@ -100,8 +100,10 @@ inline SpecularAlbedo<T> specular_albedo(T n_dot_v, T roughness, T f0) {
         }
     }
     if (value < 0 || value > 1) return {std::min(std::max(value, T(0)), T(1)), 0, 0};
-    if (n_dot_v >= T(kCosMin)) dv += du * alpha * inv * inv;
-    else dv = 0;
+    if (n_dot_v >= T(kCosMin))
+        dv += du * alpha * inv * inv;
+    else
+        dv = 0;
     if (roughness * roughness >= T(kAlphaMin)) dr -= du * v * inv * inv * 2 * roughness;
     return {value, dv, dr};
 }
