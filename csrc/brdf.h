@@ -8,9 +8,9 @@
 namespace univoxel {
 
 constexpr double kPi = 3.14159265358979323846;
-constexpr double kAlphaMin = 1e-3;      // smallest GGX alpha
-constexpr double kCosMin = 1e-4;        // cosines in denominators are held above this
-constexpr double kHalfEpsilon = 1e-12;  // added to |wi + wo|^2, which may be 0
+constexpr double kAlphaMin = 1e-3;     // smallest GGX alpha
+constexpr double kCosMin = 1e-4;       // cosines in denominators are held above this
+constexpr double kHalfEpsilon = 1e-7;  // added to |wi + wo|^2, which may be 0
 
 /// GGX alpha = roughness^2, at least kAlphaMin.
 template <class T>

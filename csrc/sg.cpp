@@ -72,20 +72,22 @@ template <class T>
 struct Directions {
     int64_t count;
     std::vector<T> buffer;
-    T *x, *y, *z, *cosine, *layer, *grad_layer;
+    T *x, *y, *z, *cosine, *held, *layer, *grad_layer;
 
-    explicit Directions(const ShadeSG<T>& in) : count(in.n_directions), buffer(6 * count) {
-        T* rows[6];
-        for (int i = 0; i < 6; ++i) rows[i] = buffer.data() + i * count;
+    explicit Directions(const ShadeSG<T>& in) : count(in.n_directions), buffer(7 * count) {
+        T* rows[7];
+        for (int i = 0; i < 7; ++i) rows[i] = buffer.data() + i * count;
         x = rows[0], y = rows[1], z = rows[2];
-        cosine = rows[3];      // max(n.w, 0)
-        layer = rows[4];       // D F V max(n.w, 0)
-        grad_layer = rows[5];  // its gradient
+        cosine = rows[3];  // max(n.w, 0)
+        held = rows[4];   // n.w held above kCosMin; std::max of z[d] in a loop would keep it scalar
+        layer = rows[5];  // D F V max(n.w, 0)
+        grad_layer = rows[6];  // its gradient
         for (int64_t d = 0; d < count; ++d) {
             x[d] = in.directions[3 * d];
             y[d] = in.directions[3 * d + 1];
             z[d] = in.directions[3 * d + 2];
             cosine[d] = std::max(z[d], T(0));
+            held[d] = std::max(z[d], T(kCosMin));
         }
     }
 };
@@ -152,36 +154,25 @@ struct Point {
     }
 };
 
-/// What the specular layer needs of one direction; the normal is +Z.
-template <class T>
-struct Half {
-    T x, y, z;  // wi + wo
-    T inv;      // 1 / |wi + wo|^2
-    T zz;       // (n.h)^2
-    T xy;       // |n x h|^2
-    T cosine;   // wo.h
+// In the two loops below q = |wi + wo|^2, and D's denominator is taken times q: `raw`, and `den`
+// with the floor of ggx_denominator.
 
-    Half(T wx, T wy, T wz, const vec3<T>& wo) : x(wx + wo.x), y(wy + wo.y), z(wz + wo.z) {
-        const T xy2 = x * x + y * y, squared = xy2 + z * z + T(kHalfEpsilon);
-        inv = 1 / squared;
-        zz = z * z * inv;
-        xy = xy2 * inv;
-        cosine = T(0.5) * std::sqrt(squared);
-    }
-};
-
-/// Fill `layer`: D F V max(n.w, 0) for every direction.
+/// Fill `layer`: D F V max(n.w, 0) for every direction. D V is one quotient: divisions are dear.
 template <class T>
 void specular_layer(const Point<T>& p, T f0, Directions<T>& dir) {
-    const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine;
+    const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *held = dir.held;
     T* out = dir.layer;
-    const vec3<T> wo = p.wo;
-    const T a2 = p.a2, v = p.v;
+    const T ox = p.wo.x, oy = p.wo.y, oz = p.wo.z;
+    const T a2 = p.a2, v = p.v, root_v = smith_root(v, a2), scale = a2 / T(2 * kPi);
+    const int64_t count = dir.count;
 #pragma omp simd
-    for (int64_t d = 0; d < dir.count; ++d) {
-        const Half<T> h(x[d], y[d], z[d], wo);
-        const T l = std::max(z[d], T(kCosMin));
-        out[d] = ggx_d(h.zz, h.xy, a2) * smith_v(v, l, a2) * schlick_f(h.cosine, f0) * cosine[d];
+    for (int64_t d = 0; d < count; ++d) {
+        const T hx = x[d] + ox, hy = y[d] + oy, hz = z[d] + oz;
+        const T xy = hx * hx + hy * hy, q = xy + hz * hz + T(kHalfEpsilon);
+        const T raw = xy + a2 * hz * hz, den = std::max(raw, T(0.5) * a2 * q);
+        const T l = held[d], smith = l * root_v + v * smith_root(l, a2);
+        const T top = scale * q * q * cosine[d];
+        out[d] = top * schlick_f(T(0.5) * std::sqrt(q), f0) / (den * den * smith);
     }
 }
 
@@ -189,37 +180,49 @@ void specular_layer(const Point<T>& p, T f0, Directions<T>& dir) {
 template <class T>
 void specular_layer_backward(const Point<T>& p, T f0, const Directions<T>& dir, vec3<T>& grad_wo,
                              T& grad_a2) {
-    const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *grad = dir.grad_layer;
-    const vec3<T> wo = p.wo;
-    const T a2 = p.a2, v = p.v, root_v = smith_root(v, a2);
+    const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *held = dir.held,
+            *grad = dir.grad_layer;
+    const T ox = p.wo.x, oy = p.wo.y, oz = p.wo.z;
+    const T a2 = p.a2, v = p.v, root_v = smith_root(v, a2), scale = a2 / T(2 * kPi);
+    const T inv_a2 = 1 / a2;
+    const int64_t count = dir.count;
     T gx = 0, gy = 0, gz = 0, gv = 0, g_root = 0, ga = 0;
 #pragma omp simd reduction(+ : gx, gy, gz, gv, g_root, ga)
-    for (int64_t d = 0; d < dir.count; ++d) {
-        const Half<T> h(x[d], y[d], z[d], wo);
-        const T l = std::max(z[d], T(kCosMin)), root_l = smith_root(l, a2);
-        const T raw = h.xy + a2 * h.zz, den = ggx_denominator(h.zz, h.xy, a2);
-        const T inv_den = 1 / den, vis = T(0.5) / (l * root_v + v * root_l);
-        const T dv = a2 * inv_den * inv_den / T(kPi) * vis * cosine[d] * grad[d];
-        const T r = dv * schlick_f(h.cosine, f0);  // grad * value
-        // D: the denominator's floor passes gradient to alpha alone.
-        const T g_den = -2 * r * inv_den, g_live = raw > T(0.5) * a2 ? g_den : T(0);
-        ga += r / a2 + (raw > T(0.5) * a2 ? g_den * h.zz : T(0.5) * g_den);
-        // F, through wo.h = |wi + wo| / 2.
-        const T m = 1 - h.cosine, m2 = m * m;
-        const T g_half = dv * T(-5) * (1 - f0) * m2 * m2 / (4 * h.cosine);
-        const T g_scale = 2 * g_live * h.inv;
-        gx += h.x * (g_scale * (1 - raw) + g_half);
-        gy += h.y * (g_scale * (1 - raw) + g_half);
-        gz += h.z * (g_scale * (a2 - raw) + g_half);
-        // V, through its denominator.
-        const T g_vis = -2 * r * vis;
-        gv += g_vis * root_l;
-        g_root += g_vis * l;
-        ga += g_vis * v * (1 - l * l) / (2 * root_l);
+    for (int64_t d = 0; d < count; ++d) {
+        const T hx = x[d] + ox, hy = y[d] + oy, hz = z[d] + oz;
+        const T xy = hx * hx + hy * hy, q = xy + hz * hz + T(kHalfEpsilon);
+        const T raw = xy + a2 * hz * hz, den = std::max(raw, T(0.5) * a2 * q);
+        const T l = held[d];
+        const T root_l2 = l * l * (1 - a2) + a2, inv_root_l = 1 / std::sqrt(root_l2);
+        const T root_l = root_l2 * inv_root_l, smith = l * root_v + v * root_l;
+        const T inv_length = 1 / std::sqrt(q), inv_q = inv_length * inv_length;
+        const T cosine_h = T(0.5) * q * inv_length;
+        const T quotient = 1 / (den * den * smith);
+        const T inv_den = quotient * den * smith;
+        const T inv_smith = quotient * den * den;
+        const T dv = scale * q * q * quotient * cosine[d] * grad[d];
+        const T r = dv * schlick_f(cosine_h, f0);  // grad * value
+        // D = a^2 q^2 / (pi denominator^2); its floor passes gradient to alpha alone.
+        const bool live = raw > T(0.5) * a2 * q;
+        const T g_den = -2 * r * inv_den;
+        const T g_live = live ? g_den : T(0), g_q = live ? 2 * r * inv_q : T(0);
+        ga += r * inv_a2 + g_den * (live ? hz * hz : T(0.5) * q);
+        // F, through wo.h = sqrt(q) / 2.
+        const T m = 1 - cosine_h, m2 = m * m;
+        const T g_half = dv * T(-2.5) * (1 - f0) * m2 * m2 * inv_length;
+        const T g_xy = 2 * (g_live + g_q) + g_half;
+        gx += hx * g_xy;
+        gy += hy * g_xy;
+        gz += hz * (2 * (g_live * a2 + g_q) + g_half);
+        // V = 1 / (2 smith)
+        const T g_smith = -r * inv_smith;
+        gv += g_smith * root_l;
+        g_root += g_smith * l;
+        ga += g_smith * v * (1 - l * l) * T(0.5) * inv_root_l;
     }
     gv += g_root * v * (1 - a2) / root_v;
     grad_a2 = ga + g_root * (1 - v * v) / (2 * root_v);
-    grad_wo = {gx, gy, gz + (wo.z >= T(kCosMin) ? gv : T(0))};
+    grad_wo = {gx, gy, gz + (oz >= T(kCosMin) ? gv : T(0))};
 }
 
 /// Integrals of one lobe of unit amplitude over the directions.
@@ -231,11 +234,12 @@ struct LobeSums {
 template <class T>
 LobeSums<T> lobe_forward(const Directions<T>& dir, const vec3<T>& axis, T sharpness) {
     const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *layer = dir.layer;
-    const vec3<T> e = axis * sharpness;
+    const T ex = axis.x * sharpness, ey = axis.y * sharpness, ez = axis.z * sharpness;
+    const int64_t count = dir.count;
     T diffuse = 0, specular = 0;
 #pragma omp simd reduction(+ : diffuse, specular)
-    for (int64_t d = 0; d < dir.count; ++d) {
-        const T g = simd_exp(e.x * x[d] + e.y * y[d] + e.z * z[d] - sharpness);
+    for (int64_t d = 0; d < count; ++d) {
+        const T g = simd_exp(ex * x[d] + ey * y[d] + ez * z[d] - sharpness);
         diffuse += g * cosine[d];
         specular += g * layer[d];
     }
@@ -249,11 +253,12 @@ LobeSums<T> lobe_backward(Directions<T>& dir, const vec3<T>& axis, T sharpness, 
                           T grad_layer_scale, vec3<T>& moment) {
     const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *layer = dir.layer;
     T* grad_layer = dir.grad_layer;
-    const vec3<T> e = axis * sharpness;
+    const T ex = axis.x * sharpness, ey = axis.y * sharpness, ez = axis.z * sharpness;
+    const int64_t count = dir.count;
     T diffuse = 0, specular = 0, mx = 0, my = 0, mz = 0;
 #pragma omp simd reduction(+ : diffuse, specular, mx, my, mz)
-    for (int64_t d = 0; d < dir.count; ++d) {
-        const T g = simd_exp(e.x * x[d] + e.y * y[d] + e.z * z[d] - sharpness);
+    for (int64_t d = 0; d < count; ++d) {
+        const T g = simd_exp(ex * x[d] + ey * y[d] + ez * z[d] - sharpness);
         const T gc = g * cosine[d], gl = g * layer[d];
         const T w = grad_cosine_scale * gc + grad_layer_scale * gl;
         diffuse += gc;

@@ -17,7 +17,7 @@ from torch import Tensor
 
 ALPHA_MIN = 1e-3  # smallest GGX alpha: below, a highlight is narrower than any quadrature
 COS_MIN = 1e-4  # cosines in denominators are held above this
-_HALF_EPSILON = 1e-12  # added to |wi + wo|^2, which is 0 where the light is opposite the eye
+_HALF_EPSILON = 1e-7  # added to |wi + wo|^2, which is 0 where the light is opposite the eye
 
 # E with F0 = 0 and with F0 = 1 as polynomials of total degree 4 in cosine, roughness and
 # u = cosine / (cosine + alpha); u follows the boundary layer of Smith's masking at grazing view.
