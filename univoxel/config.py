@@ -19,10 +19,10 @@ class StageConfig:
     share: float  # of the time budget, (0, 1]
     rays: int = 2048  # per step
     sharpness: tuple[float, float] = (0.5, 0.5)  # s of the NeuS density at begin and end, voxels
-    lr_sdf: tuple[float, float] = (0.05, 0.01)  # at begin and end, voxels per step
+    lr_sdf: tuple[float, float] = (0.2, 0.02)  # at begin and end, voxels per step
     lr_features: tuple[float, float] = (0.1, 0.01)
     lr_networks: tuple[float, float] = (3e-3, 3e-4)
-    plate: float = 0.05  # thin-plate smoothing of touched sdf nodes per step, [0, 0.5]
+    plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.5]
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 1]
     physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
 
@@ -54,3 +54,33 @@ def save_config(cfg: TrainConfig) -> None:
     """Write the resolved configuration to config.json in the run's folder."""
     text = json.dumps(dataclasses.asdict(cfg), indent=2, default=str)
     (cfg.out / "config.json").write_text(text + "\n")
+
+
+def preset(name: str, data: Path, out: Path) -> TrainConfig:
+    """The configuration of a preset: draft (1 minute), fast (4) or full (12) on two cores.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    match name:
+        case "draft":
+            minutes, voxels, steps, rays = 1.0, 1.0, 400, 1024
+        case "fast":
+            minutes, voxels, steps, rays = 4.0, 2.0, 1200, 2048
+        case "full":
+            minutes, voxels, steps, rays = 12.0, 4.0, 2500, 2048
+        case _:
+            raise ValueError(f"preset must be draft, fast or full, got {name!r}")
+    coarse = StageConfig(
+        voxels=0.9, iterations=steps // 2, share=0.2, rays=rays // 2, sharpness=(0.7, 0.35)
+    )
+    fine = StageConfig(
+        voxels=voxels,
+        iterations=steps,
+        share=0.8,
+        rays=rays,
+        sharpness=(0.5, 0.3),
+        lr_sdf=(0.05, 0.005),
+        physical_from=0.3,
+    )
+    return TrainConfig(data, out, (coarse, fine), minutes)

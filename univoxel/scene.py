@@ -40,7 +40,7 @@ class Scene(nn.Module):
         self.field = field
         self.material = MaterialHead(cfg.channels, cfg.hidden)
         self.radiance = RadianceHead(cfg.channels, cfg.hidden)
-        self.light = LocalSG(cfg.light, cfg.channels)
+        self.light = LocalSG(cfg.channels, cfg.light)
 
 
 def save_scene(scene: Scene, run: Path, state: dict) -> Path:

@@ -73,7 +73,9 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
         begin -= state["seconds"]
     else:
         hull = visual_hull(distance, photos.cameras, grids[0])
-        scene = Scene(cfg.scene, DenseField(grids[0], cfg.scene.channels, hull))
+        field = DenseField(grids[0], cfg.scene.channels, hull)
+        light = replace(cfg.scene.light, scale=float((upper - lower).max()) / 2)
+        scene = Scene(replace(cfg.scene, light=light), field)
         state = {"stage": 0, "progress": 0.0, "step": 0}
 
     with Progress(cfg, begin, state) as progress:
@@ -180,7 +182,7 @@ def smooth(field: DenseField, stage: StageConfig) -> None:
         (field.features.data, 1, stage.diffusion),
     ):
         grad = field.sdf.grad if order == 2 else field.features.grad
-        x, y, z = grad.coalesce().indices()
+        x, y, z = grad._indices()  # coalesced by the op; autograd only forgets the flag
         rows = (x * grid.shape[1] + y) * grid.shape[2] + z
         smooth_rows_(grid, rows, amount, order)
 
