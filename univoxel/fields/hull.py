@@ -101,7 +101,7 @@ def estimate_bounds(distance: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]
     field_of_view = max(cameras.width, cameras.height) / (2 * cameras.focal.min(1).values)
     half = float((away * field_of_view).max()) * 1.2
     lower, upper = centre - half, centre + half
-    for _ in range(3):  # each round sees the hull at a finer grid
+    for _ in range(2):  # each round sees the hull at a finer grid
         grid = fit_grid(lower, upper, 64**3)
         nodes = grid.nodes().reshape(-1, 3)
         inside = nodes[hull_sdf(distance, cameras, nodes) < grid.voxel_size]

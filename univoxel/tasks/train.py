@@ -26,6 +26,7 @@ from univoxel.tasks.progress import Progress
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
+SMOOTH_EVERY = 4  # steps between smoothings of what the step has touched
 REFRESH = 16  # steps between looks at which bricks are empty
 MOMENTS = (0.9, 0.99)
 # Adam's epsilon for the grids. Far above 0 on purpose: a node's gradient is then scaled by the
@@ -129,7 +130,8 @@ def run_stage(
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
-        smooth(field, stage)
+        if progress.step % SMOOTH_EVERY == 0:
+            smooth(field, stage)
         if progress.due():
             quality = held_out_psnr(scene, photos, held_out, physical)
             progress.report({k: v.item() for k, v in terms.items()}, quality)
@@ -178,8 +180,8 @@ def objective(
 def smooth(field: DenseField, stage: StageConfig) -> None:
     """Regularise the nodes that the step has touched, beside the optimiser and not inside it."""
     for grid, order, amount in (
-        (field.sdf.data[..., None], 2, stage.plate),
-        (field.features.data, 1, stage.diffusion),
+        (field.sdf.data[..., None], 2, stage.plate * SMOOTH_EVERY),
+        (field.features.data, 1, stage.diffusion * SMOOTH_EVERY),
     ):
         grad = field.sdf.grad if order == 2 else field.features.grad
         x, y, z = grad._indices()  # coalesced by the op; autograd only forgets the flag

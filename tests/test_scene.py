@@ -1,0 +1,89 @@
+"""Checkpoints: what goes in comes out; what is damaged is refused in one line."""
+
+import os
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from univoxel.fields.dense import DenseField
+from univoxel.fields.hull import fit_grid
+from univoxel.scene import FILE, Scene, SceneConfig, load_checkpoint, load_scene, save_scene
+
+
+def small_scene():
+    torch.manual_seed(0)
+    grid = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 12**3)
+    field = DenseField(grid, 4, grid.nodes().norm(dim=-1) - 0.5)
+    with torch.no_grad():
+        field.features[3:6, 3:6, 3:6] = torch.randn(3, 3, 3, 4)
+    return Scene(SceneConfig(channels=4, hidden=8), field, inv_s=20.0)
+
+
+def test_a_checkpoint_gives_the_same_scene(tmp_path):
+    scene = small_scene()
+    save_scene(scene, tmp_path, {"step": 7})
+    again, state = load_checkpoint(tmp_path)
+    assert state == {"step": 7}
+    assert again.inv_s == scene.inv_s
+    assert again.field.grid == scene.field.grid
+    for (name, a), (_, b) in zip(
+        scene.state_dict().items(), again.state_dict().items(), strict=True
+    ):
+        assert torch.equal(a, b), name
+
+
+def test_untouched_features_take_no_room(tmp_path):
+    path = save_scene(small_scene(), tmp_path, {})
+    assert load_file(path)["field.feature_rows"].numel() == 27
+
+
+def test_a_failed_write_keeps_the_checkpoint_before(tmp_path, monkeypatch):
+    save_scene(small_scene(), tmp_path, {"step": 1})
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OSError, match=r"scene.safetensors: cannot write .* No space left"):
+        save_scene(small_scene(), tmp_path, {"step": 2})
+    monkeypatch.undo()
+    assert load_checkpoint(tmp_path)[1] == {"step": 1}
+    assert [p.name for p in tmp_path.iterdir()] == [FILE]
+
+
+def test_no_checkpoint(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"looked for scene.safetensors.*univoxel train"):
+        load_scene(tmp_path)
+
+
+def test_cut_short(tmp_path):
+    path = save_scene(small_scene(), tmp_path, {})
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match="damaged or cut short"):
+        load_scene(tmp_path)
+
+
+def test_another_version(tmp_path):
+    save_file({"a": torch.zeros(1)}, tmp_path / FILE, {"univoxel": '{"format": 99}'})
+    with pytest.raises(ValueError, match="expected checkpoint format 1, got 99"):
+        load_scene(tmp_path)
+
+
+def test_not_a_checkpoint_of_ours(tmp_path):
+    save_file({"a": torch.zeros(1)}, tmp_path / FILE)
+    with pytest.raises(ValueError, match="expected checkpoint format 1, got None"):
+        load_scene(tmp_path)
+
+
+def test_tensors_that_do_not_fit(tmp_path):
+    path = save_scene(small_scene(), tmp_path, {})
+    from safetensors import safe_open
+
+    with safe_open(path, "pt") as file:
+        meta = file.metadata()
+    tensors = load_file(path)
+    tensors["field.sdf"] = torch.zeros(2, 2, 2)
+    save_file(tensors, path, meta)
+    with pytest.raises(ValueError, match="does not fit its own description"):
+        load_scene(tmp_path)
