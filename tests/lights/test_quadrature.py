@@ -55,5 +55,4 @@ def test_bad_arguments():
     with pytest.raises(ValueError, match=r"visibility must be \[5, 64\], got \[5, 32\]"):
         quadrature.reflected(White(), s, s.normal, 64, torch.ones(5, 32))
     with pytest.raises(ValueError, match="visibility needs fixed directions"):
-        generator = torch.Generator()
-        quadrature.reflected(White(), s, s.normal, 64, torch.ones(5, 64), generator)
+        quadrature.reflected(White(), s, s.normal, 64, torch.ones(5, 64), torch.Generator())
