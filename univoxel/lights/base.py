@@ -32,8 +32,8 @@ class AbstractLight(nn.Module, ABC):
         """Linear radiance [N, 3] that N points send along unit world directions wo.
 
         Args:
-            visibility: share of the light that arrives, in [0, 1], for each of the D directions that
-                the light shades with; what a light makes of it stands in its own docstring.
+            visibility: share of the light that arrives, in [0, 1], for each of the D directions
+                that the light shades with; its own docstring says what it makes of it.
             generator: turns the directions of a quadrature at random for each point; without one
                 the result is deterministic.
         """

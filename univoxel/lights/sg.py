@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -69,7 +70,7 @@ class LocalSG(AbstractLight):
         self.features = features
         sizes = [features + 3 + 6 * _FREQUENCIES] + [config.hidden] * config.layers
         stack: list[nn.Module] = []
-        for before, after in zip(sizes[:-1], sizes[1:], strict=True):
+        for before, after in itertools.pairwise(sizes):
             stack += [nn.Linear(before, after), nn.ReLU()]
         stack.append(nn.Linear(sizes[-1], 7 * config.lobes))
         self.head = nn.Sequential(*stack)
@@ -115,9 +116,9 @@ class LocalSG(AbstractLight):
         visibility: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Radiance [N, 3] towards wo, with config.directions in training mode, else directions_eval.
+        """Radiance [N, 3] towards wo; config.directions in training mode, else directions_eval.
 
-        Visibility is part of the lobes already; where it is given nevertheless, it multiplies them.
+        The lobes hold visibility already; where it is given nevertheless, it multiplies them.
         """
         count = self.config.directions if self.training else self.config.directions_eval
         if visibility is not None:

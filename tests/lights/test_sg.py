@@ -1,0 +1,129 @@
+"""Local spherical Gaussian light: its two forms agree, its start, recovery of a known light."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from univoxel import ops, sphere
+from univoxel.lights import LocalSG, SGConfig, quadrature
+from univoxel.records import Surface
+
+
+def ball(n=200, features=4, albedo=0.5, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    normal = sphere.fibonacci_sphere(n)
+    return Surface(
+        position=normal,
+        normal=normal,
+        features=torch.randn(n, features, generator=g),
+        albedo=torch.full((n, 3), albedo),
+        roughness=torch.full((n,), 0.5),
+        opacity=torch.ones(n),
+        depth=torch.ones(n),
+    )
+
+
+def views(surface, seed=1):
+    g = torch.Generator().manual_seed(seed)
+    offset = torch.nn.functional.normalize(torch.randn(surface.normal.shape, generator=g), dim=-1)
+    return torch.nn.functional.normalize(surface.normal + 0.7 * offset, dim=-1)
+
+
+def shaken(light, seed=0):
+    """The light with random weights in the last layer, so that points differ."""
+    g = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        light.head[-1].weight.normal_(0, 0.1, generator=g)
+    return light
+
+
+@pytest.mark.parametrize("generator", [False, True])
+def test_reflected_equals_the_quadrature_of_its_incident(generator):
+    surface, light = ball(), shaken(LocalSG(4))
+    wo = views(surface)
+
+    def turns():
+        return torch.Generator().manual_seed(3) if generator else None
+
+    got = light.reflected(surface, wo, generator=turns())
+    wanted = quadrature.reflected(light, surface, wo, 128, generator=turns())
+    torch.testing.assert_close(got, wanted, rtol=2e-4, atol=1e-5)
+    light.eval()
+    wanted = quadrature.reflected(light, surface, wo, 256)
+    torch.testing.assert_close(light.reflected(surface, wo), wanted, rtol=2e-4, atol=1e-5)
+
+
+def test_visibility_hides_the_light():
+    surface, light = ball(10), LocalSG(4)
+    dark = light.reflected(surface, views(surface), visibility=torch.zeros(10, 128))
+    assert float(dark.detach().abs().max()) == 0
+
+
+@pytest.mark.parametrize("lobes", [1, 12, 16, 128])
+def test_start_is_white_and_mid_grey(lobes):
+    surface, light = ball(), LocalSG(4, SGConfig(lobes=lobes))
+    rgb = light.reflected(surface, surface.normal).detach()
+    torch.testing.assert_close(rgb[:, 0], rgb[:, 2])
+    # albedo 0.5 under irradiance pi / 2 gives 0.25, and the layer adds about 0.01
+    assert float(rgb.mean()) == pytest.approx(0.26, abs=0.03)
+    assert float(light.raw(surface).detach().abs().max()) == 0
+
+
+def test_lobes_are_in_range_and_finite():
+    light, surface = shaken(LocalSG(4)), ball()
+    axis, sharpness, amplitude = light.lobes(surface)
+    torch.testing.assert_close(axis.norm(dim=-1), torch.ones(200, 16))
+    assert bool(((sharpness >= 0.1) & (sharpness <= 30.1)).all())
+    assert bool((amplitude >= 0).all())
+    raw = -light.base.detach().flatten().expand(2, -1).clone().requires_grad_()
+    lobes = light.lobes_from_raw(raw)  # zero vectors for axes
+    (grad,) = torch.autograd.grad(sum(t.sum() for t in lobes), raw)
+    assert bool(grad.isfinite().all())
+
+
+def test_recovers_a_known_light():
+    """A ball of known material under one coloured lobe: the fit renders it and finds the light."""
+    surface = dataclasses.replace(ball(300), roughness=torch.full((300,), 0.25))
+    wo = views(surface)
+    axis = torch.nn.functional.normalize(torch.tensor([[0.5, -0.3, 0.8]]), dim=-1)
+    truth = (axis.expand(300, 1, 3), torch.full((300, 1), 8.0), torch.ones(300, 1, 3))
+    truth[2][..., 2] = 0.3
+    target = ops.shade_sg(
+        *truth, surface.normal, wo, surface.albedo, surface.roughness,
+        sphere.fibonacci_hemisphere(128), torch.zeros(300),
+    )  # fmt: skip
+    light = LocalSG(4, SGConfig(hidden=16), torch.Generator().manual_seed(0))
+    # No features: the light is the same everywhere, so a ball determines it.
+    surface = dataclasses.replace(surface, features=torch.zeros(300, 4))
+    optimizer = torch.optim.Adam([light.base], lr=0.05)
+    start = float((light.reflected(surface, wo).detach() - target).square().mean())
+    for _ in range(400):
+        optimizer.zero_grad()
+        loss = (light.reflected(surface, wo) - target).square().mean()
+        loss.backward()
+        optimizer.step()
+    assert float(loss.detach()) < 1e-3 * start
+    probe = sphere.fibonacci_sphere(500).expand(300, 500, 3)[:1]
+    one = Surface(*(getattr(surface, f.name)[:1] for f in dataclasses.fields(surface)))
+    got = light.incident(one, probe)[0].detach()
+    wanted = (8 * (probe[0] @ axis[0] - 1)).exp()[:, None] * truth[2][0, 0]
+    # Reflection blurs light: a third of its norm is what it leaves open; the start is off by 3.
+    assert float((got - wanted).norm() / wanted.norm()) < 0.33
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lobes": 0}, "lobes must be >= 1, got 0"),
+        ({"hidden": 0}, "hidden must be >= 1"),
+        ({"layers": -1}, "layers must be >= 0"),
+        ({"directions": 0}, "directions must be >= 1"),
+        ({"directions_eval": 0}, "directions_eval must be >= 1"),
+        ({"max_sharpness": 0.0}, "max_sharpness must be > 0"),
+        ({"scale": float("nan")}, "scale must be > 0, got nan"),
+    ],
+)
+def test_bad_config(change, message):
+    with pytest.raises(ValueError, match=message):
+        LocalSG(4, SGConfig(**change))

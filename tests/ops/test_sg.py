@@ -1,0 +1,168 @@
+"""Spherical Gaussian shading: native against reference, closed forms, extremes, bad arguments."""
+
+import math
+
+import pytest
+import torch
+from check_op import check_op
+
+from univoxel import sphere
+from univoxel.ops import shade_sg, shade_sg_reference
+from univoxel.ops.sg import _shade_sg
+
+# Above check_op's common bound: a few hundred directions through exp of -60 .. 0, whose argument is
+# a difference of terms up to 30, and D's denominator at low roughness.
+RTOL = {torch.float32: 1e-4, torch.float64: 1e-12}
+
+
+def unit(g, *shape):
+    x = torch.randn(*shape, 3, generator=g, dtype=torch.float64)
+    return torch.nn.functional.normalize(x, dim=-1)
+
+
+def points(n, lobes, count, seed=0, roughness=(0.2, 1.0), f0=0.04):
+    g = torch.Generator().manual_seed(seed)
+
+    def uniform(low, high, *shape):
+        return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    normal = unit(g, n)
+    tensors = [
+        unit(g, n, lobes),
+        uniform(0.1, 30, n, lobes),
+        uniform(0, 2, n, lobes, 3),
+        normal,
+        torch.nn.functional.normalize(normal + 0.8 * unit(g, n), dim=-1),
+        uniform(0, 1, n, 3),
+        uniform(*roughness, n),
+    ]
+    directions = sphere.fibonacci_hemisphere(count, torch.float64)
+    return *[t.requires_grad_() for t in tensors], directions, uniform(0, 6.28, n), f0
+
+
+def test_native_equals_reference():
+    cases = [
+        points(3, 4, 37),
+        points(1, 1, 1, f0=0.5),
+        points(2, 0, 16),
+        points(0, 3, 16),
+        points(4, 2, 64, roughness=(0.05, 0.2), f0=0.0),
+    ]
+    check_op(shade_sg, shade_sg_reference, cases, rtol=RTOL)
+
+
+def test_eye_behind_the_surface_and_light_below():
+    case = list(points(3, 2, 20))
+    case[4] = -case[4].detach()
+    case[4].requires_grad_()
+    case[7] = sphere.fibonacci_sphere(20, torch.float64)
+    check_op(shade_sg, shade_sg_reference, [tuple(case)], rtol=RTOL)
+
+
+def test_opcheck():
+    torch.library.opcheck(_shade_sg, points(3, 2, 16))
+
+
+def test_many_points_cross_the_chunks():
+    case = points(300, 3, 16)
+    torch.testing.assert_close(shade_sg(*case), shade_sg_reference(*case))
+
+
+def test_whole_graph_compiles():
+    axis, *rest = points(4, 2, 16)
+
+    @torch.compile(fullgraph=True)
+    def loss(axis):
+        return shade_sg(axis, *rest).square().sum()
+
+    got = torch.autograd.grad(loss(axis), axis)
+    wanted = torch.autograd.grad(shade_sg_reference(axis, *rest).square().sum(), axis)
+    torch.testing.assert_close(got, wanted)
+
+
+def test_strided_inputs():
+    axis, *rest = points(3, 4, 16)
+    strided = axis.repeat(1, 1, 2)[..., :3].transpose(0, 1).contiguous().transpose(0, 1)
+    assert not strided.is_contiguous()
+    torch.testing.assert_close(shade_sg(strided, *rest), shade_sg_reference(axis, *rest))
+
+
+def test_white_furnace():
+    """Sharpness 0 is the same light from everywhere: white under it shows its radiance."""
+    case = list(points(5, 1, 4096, roughness=(0.5, 1.0)))
+    case[1], case[2] = torch.zeros(5, 1).double(), torch.full((5, 1, 3), 0.7).double()
+    case[4] = case[3]  # seen from above, where 4096 directions resolve the highlight
+    case[5] = torch.ones(5, 3).double()
+    # 0.006: the fit of the layer's albedo is good to 0.005
+    torch.testing.assert_close(
+        shade_sg(*case), torch.full((5, 3), 0.7).double(), rtol=0.006, atol=0
+    )
+
+
+def test_diffuse_under_a_wide_lobe():
+    """Without a layer, a lobe on the normal has a closed form: int exp(s (z - 1)) z 2 pi dz."""
+    case = list(points(1, 1, 4096, f0=0.0))
+    s = 3.0
+    case[0] = case[3][:, None]
+    case[1], case[2] = torch.full((1, 1), s).double(), torch.ones(1, 1, 3).double()
+    case[4], case[6] = case[3], torch.ones(1).double()
+    lit = case[5].clone()
+    case[5] = torch.zeros(1, 3).double()
+    diffuse = shade_sg(*case[:5], lit, *case[6:]) - shade_sg(*case)
+    closed = 2 * (1 / s - 1 / s**2 + math.exp(-s) / s**2)
+    # The layer with F0 = 0 still takes its grazing Fresnel share E < 0.03 from the base.
+    share = (diffuse / lit / closed)[0]
+    assert bool(((share > 0.97) & (share <= 1.0)).all())
+
+
+def test_exponential_is_accurate():
+    """One direction straight up and lobes straight down: rgb is exp(-2 s) times a constant."""
+    s = torch.linspace(0, 40, 5001)  # 2 s is exact; exp(-80) / 300 is still a normal number
+    n = len(s)
+    up = torch.tensor([0.0, 0, 1]).expand(n, 3)
+    one = torch.ones(n, 1, 3)
+    args = (one, up, up, torch.zeros(n, 3), torch.ones(n), up[:1], torch.zeros(n))
+    rgb = shade_sg(-up[:, None], s[:, None], *args)[:, 0].double()
+    relative = rgb / rgb[0] / torch.exp(-2 * s.double()) - 1
+    # 2 ulp for exp, half an ulp for each of the few products around it
+    assert float(relative.abs().max()) < 4 * 2**-23
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_extremes_are_finite(dtype):
+    case = list(points(6, 4, 32, roughness=(0.0, 0.04)))
+    with torch.no_grad():
+        case[1][0], case[1][1], case[6][:2] = 0, 1e6, 0
+        case[3][2], case[4][3] = 0, -case[3][3]  # no normal; eye opposite the normal
+        case[0][4] = 0
+    case = [
+        t.detach().to(dtype).requires_grad_(t.requires_grad) if isinstance(t, torch.Tensor) else t
+        for t in case
+    ]
+    for op in (shade_sg, shade_sg_reference):
+        rgb = op(*case)
+        for t in (rgb, *torch.autograd.grad(rgb.sum(), case[:7])):
+            assert bool(t.isfinite().all())
+
+
+@pytest.mark.parametrize(
+    ("index", "value", "error", "message"),
+    [
+        (0, torch.rand(3, 2), ValueError, r"axis must be \[N, K, 3\]"),
+        (1, torch.rand(3, 5), ValueError, r"sharpness must be \[N, K\] .* K=2"),
+        (2, torch.rand(3, 2, 1), ValueError, r"amplitude must be \[N, K, 3\]"),
+        (3, torch.rand(4, 3), ValueError, r"normal must be \[N, 3\]"),
+        (4, torch.rand(3, 2), ValueError, r"wo must be \[N, 3\]"),
+        (5, [0.5], TypeError, "albedo must be a tensor, got list"),
+        (6, torch.rand(3, 1), ValueError, r"roughness must be \[N\]"),
+        (7, torch.rand(0, 3), ValueError, "at least one direction"),
+        (8, torch.rand(3).double(), ValueError, "rotation must be .* float32"),
+        (9, 1.5, ValueError, r"f0 must be in \[0, 1\], got 1.5"),
+    ],
+)
+def test_bad_arguments(index, value, error, message):
+    case = [a.detach().float() if isinstance(a, torch.Tensor) else a for a in points(3, 2, 8)]
+    shade_sg(*case)
+    case[index] = value
+    with pytest.raises(error, match=message):
+        shade_sg(*case)
