@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
 from collections.abc import Iterator
@@ -94,8 +95,10 @@ def write_png(path: str | Path, image: Tensor | np.ndarray) -> None:
         array = (array.clip(0, 1) * 255 + 0.5).astype(np.uint8)
     if array.dtype != np.uint8:
         raise ValueError(f"write_png: image must be uint8 or floating, got {array.dtype}")
+    encoded = io.BytesIO()
+    Image.fromarray(array).save(encoded, format="PNG")
     with replacing(path) as temporary:
-        Image.fromarray(array).save(temporary, format="PNG")
+        temporary.write_bytes(encoded.getbuffer())
 
 
 def write_exr(
@@ -120,12 +123,12 @@ def write_exr(
     if half:
         arrays = {name: array.clip(-65504, 65504) for name, array in arrays.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    pixels = {n: np.ascontiguousarray(a.astype(kind)) for n, a in arrays.items()}
+    # Not straight to the file: when the disk fills up while OpenEXR closes a file, it says nothing.
+    encoded = io.BytesIO()
+    OpenEXR.File(header, pixels).write(encoded)
     with replacing(path) as temporary:
-        pixels = {n: np.ascontiguousarray(a.astype(kind)) for n, a in arrays.items()}
-        try:
-            OpenEXR.File(header, pixels).write(str(temporary))
-        except RuntimeError as error:  # OpenEXR's way to say that the disk is full
-            raise OSError(str(error)) from None
+        temporary.write_bytes(encoded.getbuffer())
 
 
 @contextmanager
@@ -141,8 +144,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        reason = error.strerror or str(error).replace(str(temporary), path.name)
-        raise OSError(error.errno or 0, f"cannot write: {reason}", str(path)) from error
+        raise OSError(error.errno, f"cannot write: {error.strerror}", str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
