@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -64,11 +64,11 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     _require_file(path)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            window = [np.array(file.header()[key]) for key in ("dataWindow", "displayWindow")]
+            crop = not np.array_equal(file.header()["dataWindow"], file.header()["displayWindow"])
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError) as error:
         raise DataError(f"{path}: expected an OpenEXR file, could not read it: {error}") from None
-    if not np.array_equal(*window):
+    if crop:
         raise DataError(f"{path}: expected a data window like the display window, got a crop")
     if len({pixels.shape for pixels in channels.values()}) != 1:
         raise DataError(f"{path}: expected channels of one size, got subsampled ones")
@@ -102,7 +102,7 @@ def write_png(path: str | Path, image: Tensor | np.ndarray) -> None:
 
 
 def write_exr(
-    path: str | Path, channels: dict[str, Tensor | np.ndarray], half: bool = True
+    path: str | Path, channels: Mapping[str, Tensor | np.ndarray], half: bool = True
 ) -> None:
     """Write [H, W] channels of one size as an OpenEXR file, whole or not at all.
 
