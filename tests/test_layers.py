@@ -28,7 +28,7 @@ HELPERS = {
     "lights": {"base", "quadrature"},
     "data": {"base", "images", "radiance"},
     "render": {"density"},
-    "tasks": {"contact_sheet"},
+    "tasks": {"contact_sheet", "layers"},
 }
 OPTIONAL = {"matplotlib", "trimesh", "viser"}  # extras: imported inside the function that needs one
 # The one file that includes it; headers of ours may pass it on to nobody else.

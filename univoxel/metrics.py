@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -51,17 +51,16 @@ def ssim(picture: Tensor, truth: Tensor) -> float:
     _same_size("ssim", picture, truth)
     if min(picture.shape[:2]) < 11:
         raise ValueError(f"ssim: expected at least 11x11 pixels, got {list(picture.shape[:2])}")
-    return float(
-        structural_similarity(
-            picture.double().numpy(),
-            truth.double().numpy(),
-            data_range=1.0,
-            channel_axis=-1,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-        )
+    similarity = structural_similarity(
+        picture.double().numpy(),
+        truth.double().numpy(),
+        data_range=1.0,
+        channel_axis=-1,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
     )
+    return float(np.asarray(similarity))
 
 
 def albedo_scale(truth: Tensor, albedo: Tensor, mask: Tensor, channels: int = 3) -> Tensor:
@@ -118,8 +117,8 @@ def chamfer(points: Tensor, truth: Tensor) -> float:
     if not len(points) or not len(truth):
         raise ValueError(f"chamfer: expected points, got {len(points)} and {len(truth)}")
     a, b = points.double().numpy(), truth.double().numpy()
-    there, _ = cKDTree(b).query(a)
-    back, _ = cKDTree(a).query(b)
+    there, _ = KDTree(b).query(a)
+    back, _ = KDTree(a).query(b)
     return float(0.5 * (there.mean() + back.mean()))
 
 

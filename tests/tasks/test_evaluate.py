@@ -251,6 +251,10 @@ def broken_relit(folders):
         (lambda f: (f.run / "config.json").write_text("{}"), "config.json: .* the key data"),
         (lambda f: (f.run / "config.json").write_text("{"), "config.json: .* JSON"),
         (lambda f: (f.run / "log.jsonl").write_text("{}\n{"), "log.jsonl: .* last line"),
+        (
+            lambda f: (f.data / "envmaps" / "dim.hdr").write_bytes(b"#?"),
+            r"dim\.hdr: expected a header",
+        ),
         (broken_truth, "truth of r_1 to have 16x16 pixels .* got 5x4"),
         (broken_relit, "pictures in relight/dim to have 16x16 pixels .* got 5x4"),
     ],

@@ -46,10 +46,6 @@ def load_blender(folder: str | Path, split: str = "train") -> Photos:
     frames = root.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{path}: expected a list of frames, got {_short(frames)}")
-    if bent := [key for key in DISTORTION if root.get(key)]:
-        raise DataError(
-            f"{path}: lens distortion ({', '.join(bent)}) is not supported: undistort the pictures"
-        )
 
     names: list[str] = []
     colors: list[Tensor] = []
@@ -223,6 +219,11 @@ def _cameras(path: Path, root: dict, frames: list[dict], width: int, height: int
         where = f"{path}: frame {index}"
         poses.append(_pose(frame.get("transform_matrix"), where))
         values = root | frame  # intrinsics may stand with a frame
+        if bent := [key for key in DISTORTION if values.get(key)]:
+            raise DataError(
+                f"{where}: lens distortion ({', '.join(bent)}) is not supported: "
+                f"undistort the pictures"
+            )
         if "fl_x" in values:
             x = _number(values, "fl_x", where, 0.0, math.inf)
             y = _number(values, "fl_y", where, 0.0, math.inf) if "fl_y" in values else x
@@ -293,7 +294,7 @@ def _name(file_path: str) -> str:
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             return {key: file[key] for key in file.files}
     except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         raise DataError(f"{path}: expected an npz file, could not read it: {error}") from None

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -63,11 +64,11 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     _require_file(path)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            window = [np.array(file.header()[key]) for key in ("dataWindow", "displayWindow")]
+            crop = not np.array_equal(file.header()["dataWindow"], file.header()["displayWindow"])
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError) as error:
         raise DataError(f"{path}: expected an OpenEXR file, could not read it: {error}") from None
-    if not np.array_equal(*window):
+    if crop:
         raise DataError(f"{path}: expected a data window like the display window, got a crop")
     if len({pixels.shape for pixels in channels.values()}) != 1:
         raise DataError(f"{path}: expected channels of one size, got subsampled ones")
@@ -94,12 +95,14 @@ def write_png(path: str | Path, image: Tensor | np.ndarray) -> None:
         array = (array.clip(0, 1) * 255 + 0.5).astype(np.uint8)
     if array.dtype != np.uint8:
         raise ValueError(f"write_png: image must be uint8 or floating, got {array.dtype}")
+    encoded = io.BytesIO()
+    Image.fromarray(array).save(encoded, format="PNG")
     with replacing(path) as temporary:
-        Image.fromarray(array).save(temporary, format="PNG")
+        temporary.write_bytes(encoded.getbuffer())
 
 
 def write_exr(
-    path: str | Path, channels: dict[str, Tensor | np.ndarray], half: bool = True
+    path: str | Path, channels: Mapping[str, Tensor | np.ndarray], half: bool = True
 ) -> None:
     """Write [H, W] channels of one size as an OpenEXR file, whole or not at all.
 
@@ -120,12 +123,12 @@ def write_exr(
     if half:
         arrays = {name: array.clip(-65504, 65504) for name, array in arrays.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    pixels = {n: np.ascontiguousarray(a.astype(kind)) for n, a in arrays.items()}
+    # Not straight to the file: when the disk fills up while OpenEXR closes a file, it says nothing.
+    encoded = io.BytesIO()
+    OpenEXR.File(header, pixels).write(encoded)
     with replacing(path) as temporary:
-        pixels = {n: np.ascontiguousarray(a.astype(kind)) for n, a in arrays.items()}
-        try:
-            OpenEXR.File(header, pixels).write(str(temporary))
-        except RuntimeError as error:  # OpenEXR's way to say that the disk is full
-            raise OSError(str(error)) from None
+        temporary.write_bytes(encoded.getbuffer())
 
 
 @contextmanager
@@ -141,8 +144,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        reason = error.strerror or str(error).replace(str(temporary), path.name)
-        raise OSError(error.errno or 0, f"cannot write: {reason}", str(path)) from error
+        raise OSError(error.errno, f"cannot write: {error.strerror}", str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -28,7 +28,7 @@ def read_radiance(path: Path) -> np.ndarray:
     head, blank, rest = data.partition(b"\n\n")
     line, newline, body = rest.partition(b"\n")
     if not (blank and newline):
-        raise DataError(f"{path}: the file ends within its header")
+        raise DataError(f"{path}: expected a header and pixels, the file ends before")
     if form := re.search(rb"^FORMAT=(.*)$", head, re.MULTILINE):
         if form[1].strip() != b"32-bit_rle_rgbe":
             raise DataError(f"{path}: expected FORMAT=32-bit_rle_rgbe, got {form[1].strip()!r}")

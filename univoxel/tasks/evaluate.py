@@ -123,7 +123,7 @@ def evaluate(
     photos = load_photos(folder, "test")
     relit = _relit_photos(photos)
     points = load_points(folder)
-    maps = {name: EnvMap(read_image(path)) for name, path in relight_maps(folder).items()}
+    maps = {name: _read_map(path) for name, path in relight_maps(folder).items()}
     scene = load_scene(run)
     if save:
         save.mkdir(parents=True, exist_ok=True)
@@ -178,7 +178,7 @@ def score(layers: Layers, expected: Expected, scales: Scales) -> list[tuple[str,
         scaled, raw = layers.relit_scaled[name], layers.relit[name]
         found.append(("relit_psnr", metrics.psnr(linear_to_srgb(scaled), photo)))
         found.append(("relit_psnr_raw", metrics.psnr(linear_to_srgb(raw), photo)))
-    seen = truth.mask is not None and bool(truth.mask.any())
+    mask = truth.mask if truth.mask is not None and truth.mask.any() else None
     if expected.albedo is not None:
         aligned = linear_to_srgb(layers.albedo * scales.three)
         one = linear_to_srgb(layers.albedo * scales.one)
@@ -186,16 +186,13 @@ def score(layers: Layers, expected: Expected, scales: Scales) -> list[tuple[str,
         found.append(("albedo_psnr_raw", metrics.psnr(raw, expected.albedo)))
         found.append(("albedo_psnr_1ch", metrics.psnr(one, expected.albedo)))
         found.append(("albedo_psnr_3ch", metrics.psnr(aligned, expected.albedo)))
-        if seen:
-            inside = metrics.psnr(aligned, expected.albedo, truth.mask)
-            found.append(("albedo_psnr_fg", inside))
-    if truth.roughness is not None and seen:
-        error = metrics.roughness_mse(layers.roughness, truth.roughness, truth.mask)
+        if mask is not None:
+            found.append(("albedo_psnr_fg", metrics.psnr(aligned, expected.albedo, mask)))
+    if truth.roughness is not None and mask is not None:
+        error = metrics.roughness_mse(layers.roughness, truth.roughness, mask)
         found.append(("roughness_mse", error))
-    if truth.normal is not None and seen:
-        found.append(
-            ("normal_mae_deg", metrics.normal_mae(layers.normal, truth.normal, truth.mask))
-        )
+    if truth.normal is not None and mask is not None:
+        found.append(("normal_mae_deg", metrics.normal_mae(layers.normal, truth.normal, mask)))
     return found
 
 
@@ -207,6 +204,15 @@ def _relit_photos(photos: Photos) -> dict[str, tuple[Tensor, Tensor]]:
         _check_size(photos, alpha[0], f"pictures in relight/{name}")
         relit[name] = color, alpha
     return relit
+
+
+def _read_map(path: Path) -> EnvMap:
+    try:
+        return EnvMap(read_image(path))
+    except DataError:
+        raise
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from None
 
 
 def _truth(photos: Photos, view: int) -> Truth:

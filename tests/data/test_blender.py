@@ -1,0 +1,343 @@
+"""The NeRF/Blender and Synthetic4Relight layouts, and a clear error for each way to break them."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from univoxel.data import DataError, load_photos
+from univoxel.data.blender import RIGID_TOLERANCE, find_image
+from univoxel.data.images import write_exr, write_png
+
+WIDTH, HEIGHT, ANGLE = 6, 4, 0.8
+
+
+def pose(angle=0.3):
+    c, s = math.cos(angle), math.sin(angle)
+    return [[c, -s, 0.0, 1.0], [s, c, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def rgba(seed=0, width=WIDTH):
+    return np.random.default_rng(seed).integers(1, 256, (HEIGHT, width, 4), dtype=np.uint8)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Two views in the layout of NeRF-synthetic."""
+    (tmp_path / "train").mkdir()
+    for view in range(2):
+        write_png(tmp_path / "train" / f"r_{view}.png", rgba(view))
+    frames = [
+        {"file_path": f"./train/r_{view}", "transform_matrix": pose(view)} for view in range(2)
+    ]
+    save(tmp_path, {"camera_angle_x": ANGLE, "frames": frames})
+    return tmp_path
+
+
+def save(folder, transforms, split="train"):
+    (folder / f"transforms_{split}.json").write_text(json.dumps(transforms))
+
+
+def load(folder):
+    return json.loads((folder / "transforms_train.json").read_text())
+
+
+def edit(folder, change):
+    """Apply a change to the parsed transforms file."""
+    transforms = load(folder)
+    change(transforms)
+    save(folder, transforms)
+
+
+def test_photos_and_cameras(scene):
+    photos = load_photos(scene)
+    assert photos.names == ["r_0", "r_1"]
+    assert photos.folder == scene
+    for view in range(2):
+        assert np.array_equal(photos.color[view].numpy(), rgba(view)[..., :3])
+        assert np.array_equal(photos.alpha[view].numpy(), rgba(view)[..., 3])
+    cameras = photos.cameras
+    assert (cameras.width, cameras.height) == (WIDTH, HEIGHT)
+    focal = 0.5 * WIDTH / math.tan(0.5 * ANGLE)
+    torch.testing.assert_close(cameras.focal, torch.full((2, 2), focal))
+    assert cameras.centre.tolist() == [[WIDTH / 2, HEIGHT / 2]] * 2
+    torch.testing.assert_close(cameras.camera_to_world[1], torch.tensor(pose(1))[:3])
+
+
+def test_pictures_are_decoded(scene):
+    color, alpha = load_photos(scene).picture(0)
+    stored = rgba(0)[1, 2] / 255
+    expected = [((v + 0.055) / 1.055) ** 2.4 if v > 0.04045 else v / 12.92 for v in stored[:3]]
+    assert color[1, 2].tolist() == pytest.approx(expected, rel=1e-5)
+    assert float(alpha[1, 2]) == pytest.approx(stored[3])
+
+
+def test_names_with_extension_and_with_dots(scene):
+    (scene / "train" / "r_1.png").rename(scene / "train" / "r_1.5.png")
+
+    def change(transforms):
+        transforms["frames"][0]["file_path"] = "train/r_0.png"
+        transforms["frames"][1]["file_path"] = "train/r_1.5"
+
+    edit(scene, change)
+    assert load_photos(scene).names == ["r_0", "r_1.5"]
+
+
+def test_intrinsics_in_pixels(scene):
+    def change(transforms):
+        del transforms["camera_angle_x"]
+        transforms.update(fl_x=7.0, fl_y=8.0, cx=2.5, cy=1.5, w=WIDTH, h=HEIGHT, k1=0.0)
+        transforms["frames"][1]["fl_x"] = 9.0
+
+    edit(scene, change)
+    cameras = load_photos(scene).cameras
+    assert cameras.focal.tolist() == [[7.0, 8.0], [9.0, 8.0]]
+    assert cameras.centre.tolist() == [[2.5, 1.5]] * 2
+
+
+def test_one_focal_length_serves_both_axes(scene):
+    edit(scene, lambda t: t.update(fl_x=7.0))
+    assert load_photos(scene).cameras.focal.tolist() == [[7.0, 7.0]] * 2
+
+
+def test_rounded_matrices_become_rotations(scene):
+    def change(transforms):
+        matrix = np.array(pose(0.3))
+        matrix[:3, :3] *= 1 + 0.5 * RIGID_TOLERANCE
+        transforms["frames"][0]["transform_matrix"] = matrix.tolist()
+        transforms["frames"][1]["transform_matrix"] = matrix[:3].tolist()
+
+    edit(scene, change)
+    for matrix in load_photos(scene).cameras.camera_to_world:
+        torch.testing.assert_close(matrix, torch.tensor(pose(0.3))[:3])
+
+
+def test_synthetic4relight(tmp_path):
+    """Training views are linear EXR with a mask, test views RGBA PNG."""
+    for split in ("train", "test"):
+        (tmp_path / split).mkdir()
+        frames = [{"file_path": f"{split}/001", "transform_matrix": pose()}]
+        save(tmp_path, {"camera_angle_x": ANGLE, "frames": frames}, split)
+    linear = np.random.default_rng(0).random((HEIGHT, WIDTH, 3)).astype(np.float32) * 3
+    linear[0, 0] = -0.01  # a filter's undershoot
+    channels = {name: linear[..., k] for k, name in enumerate("RGB")}
+    write_exr(tmp_path / "train" / "001_rgb.exr", channels, half=False)
+    mask = rgba(1)[..., 0]
+    write_png(tmp_path / "train" / "001_mask.png", mask)
+    write_png(tmp_path / "test" / "001_rgba.png", rgba(2))
+
+    train = load_photos(tmp_path)
+    assert train.names == ["001"]
+    assert train.color.dtype == torch.float32
+    assert np.array_equal(train.color[0].numpy(), linear.clip(0))
+    assert np.array_equal(train.alpha[0].numpy(), mask)
+    test = load_photos(tmp_path, "test")
+    assert test.names == ["001"]
+    assert np.array_equal(test.color[0].numpy(), rgba(2)[..., :3])
+
+
+def test_exr_with_alpha_is_divided_by_it(scene):
+    (scene / "train" / "r_0.png").unlink()
+    (scene / "train" / "r_1.png").unlink()
+    plane = np.full((HEIGHT, WIDTH), 0.25, np.float32)
+    alpha = np.full((HEIGHT, WIDTH), 0.5, np.float32)
+    alpha[0, 0] = 0.0
+    for view in range(2):
+        write_exr(scene / "train" / f"r_{view}.exr", dict.fromkeys("RGB", plane) | {"A": alpha})
+    photos = load_photos(scene)
+    assert photos.color[0, 1, 1].tolist() == [0.5] * 3
+    assert photos.color[0, 0, 0].tolist() == [0.0] * 3
+    assert float(photos.alpha[0, 1, 1]) == 0.5
+
+
+def test_alpha_of_both_kinds_becomes_one(scene):
+    for view in range(2):
+        (scene / "train" / f"r_{view}.png").unlink()
+    plane = np.full((HEIGHT, WIDTH), 0.25, np.float32)
+    write_exr(scene / "train" / "r_0.exr", dict.fromkeys("RGBA", plane))
+    write_exr(scene / "train" / "r_1.exr", dict.fromkeys("RGB", plane))
+    write_png(scene / "train" / "r_1_mask.png", np.full((HEIGHT, WIDTH), 51, np.uint8))
+    assert load_photos(scene).alpha[:, 0, 0].tolist() == pytest.approx([0.25, 0.2])
+
+
+# Each way to break a data set
+
+
+def without(folder, name):
+    (folder / name).unlink()
+
+
+def matrix(change):
+    """An edit of the first frame's matrix."""
+
+    def apply(folder):
+        m = np.array(pose())
+        m = change(m)
+        edit(
+            folder,
+            lambda t: t["frames"][0].update(
+                transform_matrix=m.tolist() if isinstance(m, np.ndarray) else m
+            ),
+        )
+
+    return apply
+
+
+def frame(**values):
+    return lambda folder: edit(folder, lambda t: t["frames"][1].update(values))
+
+
+def root(**values):
+    return lambda folder: edit(folder, lambda t: t.update(values))
+
+
+def text(content):
+    return lambda folder: (folder / "transforms_train.json").write_bytes(content)
+
+
+def nan_exr(folder):
+    without(folder, "train/r_1.png")
+    plane = np.full((HEIGHT, WIDTH), np.nan, np.float32)
+    write_exr(folder / "train" / "r_1.exr", dict.fromkeys("RGBA", plane), half=False)
+
+
+def mixed(folder):
+    without(folder, "train/r_1.png")
+    plane = np.ones((HEIGHT, WIDTH), np.float32)
+    write_exr(folder / "train" / "r_1.exr", dict.fromkeys("RGBA", plane))
+
+
+def transparent(folder):
+    for view in range(2):
+        write_png(folder / "train" / f"r_{view}.png", np.zeros((HEIGHT, WIDTH, 4), np.uint8))
+
+
+def opaque(folder):
+    write_png(folder / "train" / "r_1.png", rgba()[..., :3])
+
+
+def gray(folder):
+    write_png(folder / "train" / "r_1.png", rgba()[..., 0])
+
+
+def small_mask(folder):
+    opaque(folder)
+    write_png(folder / "train" / "r_1_mask.png", np.zeros((2, 2), np.uint8))
+
+
+BROKEN = {
+    "no transforms": (
+        lambda f: without(f, "transforms_train.json"),
+        "expected transforms_train.json, got train$",
+    ),
+    "broken JSON": (text(b'{\n"frames": [,]\n}'), "broken JSON in line 2, column 12"),
+    "cut JSON": (text(b'{"frames": ['), "broken JSON in line 1"),
+    "not UTF-8": (text(b'{"frames": "\xff\xfe"}'), "expected text in UTF-8"),
+    "a list": (text(b"[1, 2]"), r"expected a JSON object, got \[1, 2\]"),
+    "no frames": (root(frames=[]), r"expected a list of frames, got \[\]"),
+    "frames of another kind": (root(frames={"a": 1}), "expected a list of frames, got {'a': 1}"),
+    "a frame of another kind": (root(frames=["r_0"]), "frame 0: expected an object .* got 'r_0'"),
+    "a frame without a path": (
+        frame(file_path=None),
+        "frame 1: expected an object with a file_path",
+    ),
+    "no picture": (
+        lambda f: without(f, "train/r_1.png"),
+        r"frame 1: no picture .*train/r_1 \(looked for the endings none, \.png",
+    ),
+    "empty path": (frame(file_path=""), "frame 1: no picture"),
+    "double name": (frame(file_path="./train/r_0.png"), "frame 1: the name r_0 .* came before"),
+    "distortion": (root(k1=0.1, p2=-0.01), r"frame 0: lens distortion \(k1, p2\) is not supported"),
+    "distortion of a frame": (frame(k2=0.1), r"frame 1: lens distortion \(k2\) is not supported"),
+    "another size": (
+        lambda f: write_png(f / "train" / "r_1.png", rgba(width=5)),
+        r"r_1\.png: expected 6x4 pixels like r_0, got 5x4",
+    ),
+    "size unlike the file's": (root(w=60, h=40), r"pictures of 60x40 pixels \(w and h\), got 6x4"),
+    "transparent": (transparent, "all 2 pictures are fully transparent"),
+    "no alpha": (opaque, r"r_1\.png: expected an alpha channel or a mask r_1_mask\.png"),
+    "grey": (gray, r"r_1\.png: expected a picture with 3 or 4 channels, got 1"),
+    "mask of another size": (small_mask, r"r_1_mask\.png: expected 6x4 pixels, got 2x2"),
+    "NaN": (nan_exr, r"r_1\.exr: NaN or infinity at row 0, column 0"),
+    "formats mixed": (mixed, r"r_1\.exr: expected the format of r_0"),
+    "broken picture": (
+        lambda f: (f / "train" / "r_1.png").write_bytes(b"no picture"),
+        r"r_1\.png: expected a PNG or JPEG",
+    ),
+    "empty picture": (
+        lambda f: (f / "train" / "r_1.png").write_bytes(b""),
+        r"r_1\.png: the file is empty",
+    ),
+    "no matrix": (
+        matrix(lambda m: None),
+        "frame 0: expected a finite 4x4 transform_matrix, got None",
+    ),
+    "small matrix": (matrix(lambda m: m[:2]), "frame 0: expected a finite 4x4"),
+    "ragged matrix": (matrix(lambda m: [[1.0], [1.0, 2.0]]), "frame 0: expected a finite 4x4"),
+    "words in the matrix": (matrix(lambda m: [["a"] * 4] * 4), "frame 0: expected a finite 4x4"),
+    "NaN in the matrix": (matrix(lambda m: m * np.nan), "frame 0: expected a finite 4x4"),
+    "singular matrix": (
+        matrix(lambda m: m * [0, 1, 1, 1]),
+        "frame 0: expected a rigid .* scales by 1, 1, 0",
+    ),
+    "scaled matrix": (matrix(lambda m: m * [2, 2, 2, 1]), "rigid .* scales by 2, 2, 2"),
+    "sheared matrix": (
+        matrix(lambda m: m @ (np.eye(4) + 0.1 * np.eye(4, k=1) * [1, 1, 0, 0])),
+        "frame 0: expected a rigid",
+    ),
+    "just beyond the tolerance": (
+        matrix(lambda m: m * [1 + 2 * RIGID_TOLERANCE, 1, 1, 1]),
+        "frame 0: expected a rigid",
+    ),
+    "mirrored": (matrix(lambda m: m * [-1, 1, 1, 1]), "frame 0: expected a rotation .* reflection"),
+    "transposed": (matrix(lambda m: m.T), "frame 0: expected the last row 0 0 0 1"),
+    "no angle": (
+        lambda f: edit(f, lambda t: t.pop("camera_angle_x")),
+        "frame 0: expected camera_angle_x between 0 and 3.142, got nothing",
+    ),
+    "angle in degrees": (root(camera_angle_x=40.0), "camera_angle_x between 0 and 3.142, got 40.0"),
+    "angle of zero": (root(camera_angle_x=0), "camera_angle_x .* got 0"),
+    "angle in words": (root(camera_angle_x="0.7"), "camera_angle_x .* got '0.7'"),
+    "angle of NaN": (root(camera_angle_x=math.nan), "camera_angle_x .* got nan"),
+    "angle of truth": (root(camera_angle_x=True), "camera_angle_x .* got True"),
+    "focal length": (root(fl_x=-5.0), "expected fl_x between 0 and inf, got -5.0"),
+    "second focal length": (root(fl_x=5.0, fl_y=0.0), "expected fl_y between 0 and inf, got 0.0"),
+    "principal point": (root(cx=1000.0), "expected cx between -6 and 12, got 1000.0"),
+    "principal point, y": (root(cy=-1000.0), "expected cy between -4 and 8, got -1000.0"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_scenes(scene, case):
+    change, message = BROKEN[case]
+    load_photos(scene)
+    change(scene)
+    with pytest.raises(DataError, match=message) as caught:
+        load_photos(scene)
+    assert "\n" not in str(caught.value)
+    assert str(scene) in str(caught.value)
+
+
+def test_missing_and_empty_folders(tmp_path):
+    with pytest.raises(DataError, match="none: expected a folder with a scene, got nothing there"):
+        load_photos(tmp_path / "none")
+    with pytest.raises(DataError, match=r"expected transforms_test\.json, got an empty folder"):
+        load_photos(tmp_path, "test")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="file: expected a folder with a scene, got a file"):
+        load_photos(tmp_path / "file")
+
+
+def test_full_folders_are_not_listed_whole(tmp_path):
+    for k in range(9):
+        (tmp_path / f"{k}.txt").write_text("")
+    with pytest.raises(DataError, match=r"got 0\.txt, .*4\.txt, \.\.\.$"):
+        load_photos(tmp_path)
+
+
+def test_an_exact_name_comes_first(tmp_path):
+    for name in ("a.png", "a.png.png"):
+        write_png(tmp_path / name, rgba())
+    assert find_image(tmp_path, "a.png", "frame 0").name == "a.png"

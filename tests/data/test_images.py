@@ -1,0 +1,321 @@
+"""Reading and writing pictures: exact values, broken files, writes that are whole or not at all."""
+
+import errno
+import os
+import stat
+import struct
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from PIL import Image
+
+from univoxel.data import DataError, images
+from univoxel.data.images import read_exr, read_image, replacing, write_exr, write_png
+
+
+def noise(*shape, dtype=np.float32):
+    return np.random.default_rng(0).random(shape).astype(dtype)
+
+
+# PNG and JPEG
+
+
+@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 3), (5, 7, 4)])
+def test_png_bytes_survive_a_round_trip(tmp_path, shape):
+    image = (255 * noise(*shape)).astype(np.uint8)
+    write_png(tmp_path / "a.png", torch.from_numpy(image))
+    back = read_image(tmp_path / "a.png")
+    assert back.dtype == torch.uint8
+    assert np.array_equal(back.numpy().reshape(shape), image)
+    assert back.shape == (5, 7, shape[2] if len(shape) == 3 else 1)
+
+
+def test_png_of_floats_rounds_and_clips(tmp_path):
+    write_png(tmp_path / "a.png", np.array([[-1.0, 0.2, 0.5, 2.0]]))
+    assert read_image(tmp_path / "a.png").flatten().tolist() == [0, 51, 128, 255]
+
+
+def test_png_of_16_bits_is_not_cut(tmp_path):
+    image = np.array([[0, 257, 32768, 65535]], np.uint16)
+    Image.fromarray(image).save(tmp_path / "a.png")
+    back = read_image(tmp_path / "a.png")
+    torch.testing.assert_close(back[0, :, 0], torch.tensor([0, 257, 32768, 65535]) / 65535)
+
+
+def test_palette_with_transparency_becomes_rgba(tmp_path):
+    image = Image.new("P", (2, 1))
+    image.putpalette([255, 0, 0, 0, 0, 255])
+    image.putdata([0, 1])
+    image.save(tmp_path / "a.png", transparency=1)
+    assert read_image(tmp_path / "a.png").tolist() == [[[255, 0, 0, 255], [0, 0, 255, 0]]]
+
+
+def test_jpeg(tmp_path):
+    Image.new("RGB", (8, 4), (200, 100, 50)).save(tmp_path / "a.JPG", quality=100)
+    image = read_image(tmp_path / "a.JPG")
+    assert image.shape == (4, 8, 3)
+    # JPEG rounds its colour transform
+    torch.testing.assert_close(image[0, 0].float(), torch.tensor([200.0, 100, 50]), atol=2, rtol=0)
+
+
+# OpenEXR
+
+
+def test_half_exr_survives_a_round_trip(tmp_path):
+    channels = {name: noise(6, 9, dtype=np.float16) for name in ("R", "rgb.G", "depth")}
+    write_exr(tmp_path / "a.exr", channels)
+    back = read_exr(tmp_path / "a.exr")
+    assert back.keys() == channels.keys()
+    for name, value in channels.items():
+        assert back[name].dtype == np.float32
+        assert np.array_equal(back[name], value.astype(np.float32))
+
+
+def test_float_exr_survives_a_round_trip(tmp_path):
+    value = torch.from_numpy(1e6 * noise(6, 9))
+    write_exr(tmp_path / "a.exr", {"Y": value}, half=False)
+    assert torch.equal(read_image(tmp_path / "a.exr")[..., 0], value)
+
+
+def test_half_exr_holds_no_infinity(tmp_path):
+    write_exr(tmp_path / "a.exr", {"Y": np.array([[1e6, -1e6, 1.0]])})
+    assert read_exr(tmp_path / "a.exr")["Y"].tolist() == [[65504.0, -65504.0, 1.0]]
+
+
+def test_image_takes_rgba_in_order(tmp_path):
+    channels = {name: np.full((2, 3), k) for k, name in enumerate("ABGR")}
+    write_exr(tmp_path / "a.exr", channels | {"Z": np.zeros((2, 3))})
+    assert read_image(tmp_path / "a.exr")[0, 0].tolist() == [3, 2, 1, 0]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_exr_with_nan_is_no_picture(tmp_path, bad):
+    value = np.zeros((4, 5), np.float32)
+    value[2, 3] = bad
+    write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", value), half=False)
+    with pytest.raises(DataError, match=r"a\.exr: NaN or infinity at row 2, column 3"):
+        read_image(tmp_path / "a.exr")
+
+
+def test_exr_without_colours_is_no_picture(tmp_path):
+    write_exr(tmp_path / "a.exr", {"depth": np.zeros((2, 2))})
+    with pytest.raises(DataError, match="expected channels R, G, B or Y, got depth"):
+        read_image(tmp_path / "a.exr")
+    write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 2)), "G": np.zeros((2, 2))})
+    with pytest.raises(DataError, match="expected channels R, G, B or Y, got G, R"):
+        read_image(tmp_path / "a.exr")
+
+
+def test_cropped_exr(tmp_path):
+    window = (np.array([0, 0], np.int32), np.array([9, 9], np.int32))
+    header = {"type": OpenEXR.scanlineimage, "displayWindow": window}
+    OpenEXR.File(header, {"Y": noise(4, 4)}).write(str(tmp_path / "a.exr"))
+    with pytest.raises(DataError, match="got a crop"):
+        read_exr(tmp_path / "a.exr")
+
+
+# Radiance
+
+
+def radiance(body, size="-Y 2 +X 8", form="32-bit_rle_rgbe"):
+    return f"#?RADIANCE\n# a comment\nFORMAT={form}\n\n{size}\n".encode() + bytes(body)
+
+
+def rgbe_value(r, g, b, e):
+    return [m * 2.0 ** (e - 136) for m in (r, g, b)]
+
+
+def test_flat_radiance_is_exact(tmp_path):
+    g = np.random.default_rng(0)
+    pixels = g.integers(0, 256, (2, 8, 4), dtype=np.uint8)
+    pixels[..., 3] = g.integers(100, 160, (2, 8))
+    pixels[1, 2] = (9, 9, 9, 0)  # exponent 0 is black
+    (tmp_path / "a.hdr").write_bytes(radiance(pixels.tobytes()))
+    image = read_image(tmp_path / "a.hdr")
+    for row in range(2):
+        for column in range(8):
+            expected = rgbe_value(*map(int, pixels[row, column]))
+            if (row, column) == (1, 2):
+                expected = [0.0] * 3
+            assert image[row, column].tolist() == expected
+
+
+def test_run_lengths_are_decoded(tmp_path):
+    head = [2, 2, 0, 8]
+    red = [128 + 8, 200]  # one run
+    green = [3, 10, 20, 30, 128 + 5, 40]  # literals, then a run
+    blue = [8, 1, 2, 3, 4, 5, 6, 7, 8]
+    exponent = [128 + 7, 136, 1, 137]
+    row = head + red + green + blue + exponent
+    (tmp_path / "a.hdr").write_bytes(radiance(row + row))
+    image = read_image(tmp_path / "a.hdr")
+    expected = [[200, g, b] for g, b in zip([10, 20, 30] + [40] * 5, range(1, 9), strict=True)]
+    expected[-1] = [2 * v for v in expected[-1]]
+    assert image.tolist() == [expected, expected]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"P6 8 2 255", r"expected a Radiance picture .* got b'P6 8 2 2'"),
+        (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n", "expected a header and pixels"),
+        (
+            radiance(bytes(64), form="32-bit_rle_xyze"),
+            "expected FORMAT=32-bit_rle_rgbe, got .*xyze",
+        ),
+        (radiance(bytes(64), size="+Y 2 +X 8"), r"expected the size .* got b'\+Y 2"),
+        (radiance(b"", size="-Y 0 +X 8"), "expected the size"),
+        (radiance(bytes(63)), "expected 64 bytes of 8x2 flat pixels .* got 63"),
+        (radiance([2, 2, 0, 8, 128 + 8]), "row 0 of 2 is cut off"),
+        (radiance([2, 2, 0, 8, 128 + 9, 1]), "row 0 of 2 is cut off or broken"),
+        (radiance([2, 2, 0, 8, 0, 1]), "row 0 of 2 is cut off or broken"),
+        (radiance([2, 2, 0, 8] + [128 + 8, 1] * 4), "row 1 of 2 is missing"),
+    ],
+)
+def test_broken_radiance(tmp_path, content, message):
+    (tmp_path / "a.hdr").write_bytes(content)
+    with pytest.raises(DataError, match=rf"a\.hdr: {message}"):
+        read_image(tmp_path / "a.hdr")
+
+
+# Broken files of all kinds
+
+
+def written(path):
+    match path.suffix:
+        case ".png":
+            write_png(path, (255 * noise(40, 40, 3)).astype(np.uint8))
+        case ".jpg":
+            Image.fromarray((255 * noise(40, 40, 3)).astype(np.uint8)).save(path)
+        case ".exr":
+            write_exr(path, dict.fromkeys("RGB", noise(40, 40)))
+        case ".hdr":
+            path.write_bytes(radiance(bytes(64)))
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".exr", ".hdr"])
+@pytest.mark.parametrize("keep", [0.02, 0.5, 0.95])
+def test_truncated_files(tmp_path, suffix, keep):
+    path = tmp_path / f"a{suffix}"
+    content = written(path)
+    path.write_bytes(content[: int(keep * len(content))])
+    with pytest.raises(DataError, match=rf"a\{suffix}: "):
+        read_image(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".exr", ".hdr"])
+def test_empty_missing_and_foreign_files(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    with pytest.raises(DataError, match="expected a file, got nothing there"):
+        read_image(path)
+    path.write_bytes(b"")
+    with pytest.raises(DataError, match="the file is empty"):
+        read_image(path)
+    path.write_bytes(b"this is no picture, whatever its name says" * 20)
+    with pytest.raises(DataError, match=rf"a\{suffix}: expected"):
+        read_image(path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(DataError, match="expected a file, got a folder"):
+        read_image(path)
+
+
+def test_png_that_declares_a_huge_size(tmp_path):
+    write_png(tmp_path / "a.png", np.zeros((4, 4), np.uint8))
+    content = bytearray((tmp_path / "a.png").read_bytes())
+    content[16:24] = struct.pack(">II", 1 << 30, 1 << 30)
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.png: expected a PNG or JPEG"):
+        read_image(tmp_path / "a.png")
+
+
+def test_unknown_suffix(tmp_path):
+    with pytest.raises(DataError, match=r"expected a picture \(\.png .* got '\.tif'"):
+        read_image(tmp_path / "a.tif")
+
+
+# Writing
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((2, 3, 2)), r"must be \[H, W\(, 3 or 4\)\], got \[2, 3, 2\]"),
+        (np.zeros(3), r"got \[3\]"),
+        (np.full((2, 2), np.nan), "holds NaN"),
+        (np.zeros((2, 2), np.int64), "must be uint8 or floating, got int64"),
+    ],
+)
+def test_what_is_no_png(tmp_path, image, message):
+    with pytest.raises(ValueError, match=message):
+        write_png(tmp_path / "a.png", image)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "channels", [{}, {"Y": np.zeros((2, 2)), "Z": np.zeros((2, 3))}, {"Y": np.zeros((0, 2))}]
+)
+def test_what_is_no_exr(tmp_path, channels):
+    with pytest.raises(ValueError, match=r"channels must be \[H, W\] of one size"):
+        write_exr(tmp_path / "a.exr", channels)
+    assert not list(tmp_path.iterdir())
+
+
+def write(path, value):
+    if path.suffix == ".png":
+        write_png(path, np.full((2, 2), value, np.uint8))
+    else:
+        write_exr(path, {"Y": np.full((2, 2), value)})
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.exr"])
+def test_a_file_is_replaced(tmp_path, name):
+    write(tmp_path / name, 1)
+    write(tmp_path / name, 2)
+    assert float(read_image(tmp_path / name)[0, 0, 0]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.exr"])
+def test_new_files_get_usual_permissions(tmp_path, name):
+    (tmp_path / "plain").write_bytes(b"")
+    write(tmp_path / name, 1)
+    assert stat.S_IMODE((tmp_path / name).stat().st_mode) == stat.S_IMODE(
+        (tmp_path / "plain").stat().st_mode
+    )
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.exr"])
+def test_a_missing_folder_is_named(tmp_path, name):
+    with pytest.raises(OSError, match=rf"cannot write: No such file or directory: .*none/{name}"):
+        write(tmp_path / "none" / name, 1)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.exr"])
+def test_a_full_disk_leaves_the_old_file(tmp_path, name):
+    """/dev/full fails every write with ENOSPC; the temporary file is made a link to it."""
+    if not os.path.exists("/dev/full"):
+        pytest.skip("no /dev/full on this system")
+    path = tmp_path / name
+    write(path, 1)
+    with replacing(path) as temporary:  # learn its name
+        temporary.write_bytes(path.read_bytes())
+    temporary.symlink_to("/dev/full")
+    with pytest.raises(OSError, match=rf"cannot write: .*No space left on device.*{name}"):
+        write(path, 2)
+    assert float(read_image(path)[0, 0, 0]) == 1
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_failed_replacement_cleans_up(tmp_path, monkeypatch):
+    def replace(source, target):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), source)
+
+    monkeypatch.setattr(images.os, "replace", replace)
+    with pytest.raises(OSError, match=r"Read-only file system: .*a\.png") as caught:
+        write(tmp_path / "a.png", 1)
+    assert caught.value.errno == errno.EROFS
+    assert not list(tmp_path.iterdir())
