@@ -167,9 +167,9 @@ TouchedRows::TouchedRows(const Lattice& grid, const std::vector<std::vector<Cell
                       [&](int64_t x, int64_t y, bool) { line_[x * size_y_ + y] = 0; });
         }
     });
-    int32_t lines = 0;
+    int64_t lines = 0;
     for (int32_t& line : line_) {
-        if (line == 0) line = lines++;
+        if (line == 0) line = static_cast<int32_t>(words_per_line_ * lines++);
     }
     // Set the bits of the nodes.
     words_.assign(lines * words_per_line_, Word{0, 0});
@@ -189,7 +189,7 @@ TouchedRows::TouchedRows(const Lattice& grid, const std::vector<std::vector<Cell
             for_lines(grid, column, wide, [&](int64_t x, int64_t y, bool inner) {
                 const uint64_t nodes = inner ? beyond : ends;
                 const int64_t shift = z & 63;
-                Word* w = &words_[line_[x * size_y_ + y] * words_per_line_ + (z >> 6)];
+                Word* w = &words_[line_[x * size_y_ + y] + (z >> 6)];
                 w[0].bits |= nodes << shift;
                 const uint64_t rest = shift ? nodes >> (64 - shift) : 0;
                 if (rest) w[1].bits |= rest;
@@ -201,7 +201,7 @@ TouchedRows::TouchedRows(const Lattice& grid, const std::vector<std::vector<Cell
         for (int64_t y = 0; y < size_y_; ++y) {
             const int32_t line = line_[x * size_y_ + y];
             if (line < 0) continue;
-            for (int64_t w = line * words_per_line_; w < (line + 1) * words_per_line_; ++w) {
+            for (int64_t w = line; w < line + words_per_line_; ++w) {
                 words_[w].first = count_;
                 count_ += __builtin_popcountll(words_[w].bits);
             }
@@ -220,7 +220,7 @@ void TouchedRows::write_indices(int64_t* indices, int threads) const {
                 if (line < 0) continue;
                 const int64_t first = slot;
                 for (int64_t w = 0; w < words_per_line_; ++w) {
-                    uint64_t bits = words_[line * words_per_line_ + w].bits;
+                    uint64_t bits = words_[line + w].bits;
                     for (; bits; bits &= bits - 1) {
                         indices[2 * count_ + slot++] = 64 * w + __builtin_ctzll(bits);
                     }

@@ -65,7 +65,7 @@ class TouchedRows {
     int64_t count() const { return count_; }
     /// Slot of a touched node.
     int64_t slot(int64_t x, int64_t y, int64_t z) const {
-        const Word& w = words_[line_[x * size_y_ + y] * words_per_line_ + (z >> 6)];
+        const Word& w = words_[line_[x * size_y_ + y] + (z >> 6)];
         const uint64_t below = w.bits & ((uint64_t(1) << (z & 63)) - 1);
         return w.first + __builtin_popcountll(below);
     }
@@ -80,7 +80,7 @@ class TouchedRows {
         int64_t first;  // touched nodes before this word
     };
     int64_t size_x_, size_y_, size_z_, words_per_line_, count_ = 0;
-    std::vector<int32_t> line_;   // [X * Y] number among the touched lines, or -1
+    std::vector<int32_t> line_;   // [X * Y] its first word if it is touched, or -1
     std::vector<Word> words_;     // [touched lines, words_per_line]
     std::vector<int64_t> plane_;  // [X + 1]
 };

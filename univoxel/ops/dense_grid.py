@@ -95,7 +95,7 @@ def sample_dense_reference(
     lost = points.isnan().any(1, keepdim=True)
     start = torch.tensor(origin, dtype=torch.float64, device=sdf.device)
     # Locate in double, so that a float32 point far from the origin keeps its fraction.
-    at = (torch.where(lost, 0.0, points).double() - start) / voxel_size
+    at = (torch.where(lost, 0.0, points).double() - start) * (1 / voxel_size)
     at = torch.minimum(at.clamp_min(0.0), (size - 1).double())
     cell = torch.minimum(at.detach().long(), (size - 2).clamp_min(0))
     t = (at - cell).to(points.dtype)
