@@ -9,6 +9,11 @@
 
 namespace univoxel {
 
+/// Threads for work on n points: few are done before a team stands.
+inline int team_for(int64_t n_points, int threads) {
+    return n_points < 2048 ? 1 : threads;
+}
+
 /// Write to order [M] the points sorted by brick, x slowest; equal bricks keep their order.
 template <class T>
 void sort_by_brick(const Lattice& grid, const T* points, int64_t n_points, int32_t* order,

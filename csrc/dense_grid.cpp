@@ -4,11 +4,12 @@
 #include <limits>
 #include <type_traits>
 
+#include "huge_pages.h"
+
 namespace univoxel {
 namespace {
 
 constexpr int64_t kPointsPerChunk = 2048;
-constexpr int64_t kSerialBelow = 2048;  // points: fewer are done before a thread team stands
 
 constexpr int64_t kBlock = 8;
 constexpr int64_t kAhead = 12;  // samples: sorted ones lie anywhere in the buffers of the caller
@@ -254,6 +255,11 @@ void scatter(const DenseGrid<T>& in, const DenseGridGrads<T>& grads, const Rows*
     const int64_t C = in.n_channels;
     const std::vector<int64_t> bounds = slab_bounds(in.lattice, in.points, in.n_points, in.order);
     const int64_t slabs = static_cast<int64_t>(bounds.size()) - 1;
+    const int64_t end = in.lattice.size[0], bytes = sizeof(T);
+    if (grads.grad_sdf) want_huge_pages(grads.grad_sdf, sdf_rows->slots_below(end) * bytes);
+    if (grads.grad_features) {
+        want_huge_pages(grads.grad_features, feature_rows->slots_below(end) * C * bytes);
+    }
     for_slabs(slabs, threads, [&](int64_t slab) {
         const Planes planes = planes_to_clear(in.lattice, slab, slabs);
         const auto clear = [&](T* grad, const Rows* rows, int64_t width) {
@@ -323,7 +329,7 @@ void sample_dense_forward(const DenseGrid<T>& in, T* value, T* gradient, T* feat
 template <class T>
 void sample_dense_backward(const DenseGrid<T>& in, const DenseGridGrads<T>& grads, int threads) {
     const int64_t C = in.n_channels;
-    const int team = in.n_points < kSerialBelow ? 1 : threads;
+    const int team = team_for(in.n_points, threads);
     with_channels(C, [&](auto constant) {
         constexpr int64_t kC = decltype(constant)::value;
         if (grads.sdf_rows || grads.feature_rows) {
