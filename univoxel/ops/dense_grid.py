@@ -267,11 +267,12 @@ def _save(ctx, inputs, output):
 def _backward(ctx, grad_value, grad_gradient, grad_feature, _):
     grad_outputs = [g.contiguous() for g in (grad_value, grad_gradient, grad_feature)]
     needs = list(ctx.needs_input_grad[:3])
-    place = (ctx.origin, ctx.voxel_size, needs)
+    sdf, features, points, order = ctx.saved_tensors
+    saved, place = (sdf, features, points, order), (ctx.origin, ctx.voxel_size, needs)
     if ctx.sparse_grad:
-        grads = _sparse_backward(*ctx.saved_tensors, grad_outputs, *place)
+        grads = _sparse_backward(*saved, grad_outputs, *place)
     else:
-        dense = _sample_dense_backward(*ctx.saved_tensors, *grad_outputs, *place)
+        dense = _sample_dense_backward(*saved, *grad_outputs, *place)
         grads = [g if need else None for g, need in zip(dense, needs, strict=True)]
     return *grads, None, None, None
 
