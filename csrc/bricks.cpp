@@ -4,6 +4,8 @@
 #include <numeric>
 #include <utility>
 
+#include "huge_pages.h"
+
 namespace univoxel {
 namespace {
 
@@ -41,6 +43,7 @@ void for_lines(const Lattice& grid, const CellColumn& column, bool wide, F&& f) 
 template <class T>
 void sort_by_brick(const Lattice& grid, const T* points, int64_t n_points, int32_t* order,
                    int threads) {
+    threads = team_for(n_points, threads);
     const int64_t slabs = bricks_along(grid, 0);
     const int64_t ny = bricks_along(grid, 1), nz = bricks_along(grid, 2);
     const int64_t chunks = (n_points + kPointsPerChunk - 1) / kPointsPerChunk;
@@ -117,6 +120,7 @@ std::vector<std::vector<CellColumn>> occupied_columns(const Lattice& grid, const
                                                       int threads) {
     const int64_t slabs = static_cast<int64_t>(bounds.size()) - 1;
     std::vector<std::vector<CellColumn>> columns(slabs);
+    threads = team_for(bounds.back(), threads);
     parallel_for(slabs, 1, threads, [&](int64_t s, int64_t) {
         uint8_t cells[kSide][kSide] = {};  // of one brick: a bit per cell along z
         int64_t corner[3] = {-1, -1, -1};  // its first cell
@@ -160,6 +164,9 @@ TouchedRows::TouchedRows(const Lattice& grid, const std::vector<std::vector<Cell
       line_(grid.size[0] * grid.size[1], -1),
       plane_(grid.size[0] + 1, 0) {
     const int64_t slabs = static_cast<int64_t>(columns.size());
+    int64_t n_columns = 0;
+    for (const auto& of_slab : columns) n_columns += static_cast<int64_t>(of_slab.size());
+    threads = team_for(n_columns, threads);
     // Number the lines that are touched.
     for_slabs(slabs, threads, [&](int64_t s) {
         for (const CellColumn& column : columns[s]) {
@@ -167,9 +174,9 @@ TouchedRows::TouchedRows(const Lattice& grid, const std::vector<std::vector<Cell
                       [&](int64_t x, int64_t y, bool) { line_[x * size_y_ + y] = 0; });
         }
     });
-    int32_t lines = 0;
+    int64_t lines = 0;
     for (int32_t& line : line_) {
-        if (line == 0) line = lines++;
+        if (line == 0) line = static_cast<int32_t>(words_per_line_ * lines++);
     }
     // Set the bits of the nodes.
     words_.assign(lines * words_per_line_, Word{0, 0});
@@ -189,7 +196,7 @@ TouchedRows::TouchedRows(const Lattice& grid, const std::vector<std::vector<Cell
             for_lines(grid, column, wide, [&](int64_t x, int64_t y, bool inner) {
                 const uint64_t nodes = inner ? beyond : ends;
                 const int64_t shift = z & 63;
-                Word* w = &words_[line_[x * size_y_ + y] * words_per_line_ + (z >> 6)];
+                Word* w = &words_[line_[x * size_y_ + y] + (z >> 6)];
                 w[0].bits |= nodes << shift;
                 const uint64_t rest = shift ? nodes >> (64 - shift) : 0;
                 if (rest) w[1].bits |= rest;
@@ -201,7 +208,7 @@ TouchedRows::TouchedRows(const Lattice& grid, const std::vector<std::vector<Cell
         for (int64_t y = 0; y < size_y_; ++y) {
             const int32_t line = line_[x * size_y_ + y];
             if (line < 0) continue;
-            for (int64_t w = line * words_per_line_; w < (line + 1) * words_per_line_; ++w) {
+            for (int64_t w = line; w < line + words_per_line_; ++w) {
                 words_[w].first = count_;
                 count_ += __builtin_popcountll(words_[w].bits);
             }
@@ -211,6 +218,8 @@ TouchedRows::TouchedRows(const Lattice& grid, const std::vector<std::vector<Cell
 }
 
 void TouchedRows::write_indices(int64_t* indices, int threads) const {
+    threads = team_for(count_, threads);
+    want_huge_pages(indices, 3 * count_ * static_cast<int64_t>(sizeof(int64_t)));
     parallel_for(size_x_, kSide, threads, [&](int64_t begin, int64_t end) {
         for (int64_t x = begin; x < end; ++x) {
             std::fill(indices + plane_[x], indices + plane_[x + 1], x);
@@ -220,7 +229,7 @@ void TouchedRows::write_indices(int64_t* indices, int threads) const {
                 if (line < 0) continue;
                 const int64_t first = slot;
                 for (int64_t w = 0; w < words_per_line_; ++w) {
-                    uint64_t bits = words_[line * words_per_line_ + w].bits;
+                    uint64_t bits = words_[line + w].bits;
                     for (; bits; bits &= bits - 1) {
                         indices[2 * count_ + slot++] = 64 * w + __builtin_ctzll(bits);
                     }

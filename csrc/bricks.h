@@ -9,6 +9,11 @@
 
 namespace univoxel {
 
+/// Threads for work on n points: few are done before a team stands.
+inline int team_for(int64_t n_points, int threads) {
+    return n_points < 2048 ? 1 : threads;
+}
+
 /// Write to order [M] the points sorted by brick, x slowest; equal bricks keep their order.
 template <class T>
 void sort_by_brick(const Lattice& grid, const T* points, int64_t n_points, int32_t* order,
@@ -65,7 +70,7 @@ class TouchedRows {
     int64_t count() const { return count_; }
     /// Slot of a touched node.
     int64_t slot(int64_t x, int64_t y, int64_t z) const {
-        const Word& w = words_[line_[x * size_y_ + y] * words_per_line_ + (z >> 6)];
+        const Word& w = words_[line_[x * size_y_ + y] + (z >> 6)];
         const uint64_t below = w.bits & ((uint64_t(1) << (z & 63)) - 1);
         return w.first + __builtin_popcountll(below);
     }
@@ -80,7 +85,7 @@ class TouchedRows {
         int64_t first;  // touched nodes before this word
     };
     int64_t size_x_, size_y_, size_z_, words_per_line_, count_ = 0;
-    std::vector<int32_t> line_;   // [X * Y] number among the touched lines, or -1
+    std::vector<int32_t> line_;   // [X * Y] its first word if it is touched, or -1
     std::vector<Word> words_;     // [touched lines, words_per_line]
     std::vector<int64_t> plane_;  // [X + 1]
 };

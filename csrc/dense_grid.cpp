@@ -4,11 +4,23 @@
 #include <limits>
 #include <type_traits>
 
+#include "huge_pages.h"
+
 namespace univoxel {
 namespace {
 
 constexpr int64_t kPointsPerChunk = 2048;
-constexpr int64_t kSerialBelow = 2048;  // points: fewer are done before a thread team stands
+
+constexpr int64_t kBlock = 8;
+constexpr int64_t kAhead = 12;  // samples: sorted ones lie anywhere in the buffers of the caller
+
+/// Fetch the cache lines of n numbers before they are read or written.
+template <class T>
+inline void prefetch(const T* p, int64_t n) {
+    constexpr int64_t kLine = 64 / sizeof(T);
+    for (int64_t i = 0; i < n; i += kLine) __builtin_prefetch(p + i, 1);
+    if (n) __builtin_prefetch(p + n - 1, 1);
+}
 
 /// Call f with the channel count as a compile-time constant where it is a common one, else 0.
 template <class F>
@@ -37,50 +49,52 @@ inline Stencil3<T> stencil3(const Lattice& grid, const T* p) {
             stencil<T>(grid, 2, place(grid, 2, static_cast<double>(p[2])))};
 }
 
-/// Whether line (a, b) of the 4 x 4 lines along z carries all four nodes; the other lines carry
-/// the middle two, and those at the corners none.
-inline bool inner(int a) {
-    return a == 1 || a == 2;
-}
-
-/// Sums along one line of the stencil.
+/// The four nodes of a line; one load where the line is not clamped.
 template <class T>
-struct Line {
-    T value, slope;            // sum of f times the weights along z
-    T value_step, slope_step;  // and their derivatives to the point's z
-};
-
-template <class T>
-inline Line<T> sum_line(const T* f, const Stencil<T>& z, bool all) {
-    const T f1 = f[z.node[1]], f2 = f[z.node[2]];
-    Line<T> line{z.value[1] * f1 + z.value[2] * f2, 0, z.value_step[1] * f1 + z.value_step[2] * f2,
-                 0};
-    if (all) {
-        const T f0 = f[z.node[0]], f3 = f[z.node[3]];
-        line.slope = z.slope[0] * f0 + z.slope[1] * f1 + z.slope[2] * f2 + z.slope[3] * f3;
-        line.slope_step = z.slope_step[0] * f0 + z.slope_step[1] * f1 + z.slope_step[2] * f2 +
-                          z.slope_step[3] * f3;
+inline void load4(const T* line, const Stencil<T>& z, T* f) {
+    if (z.node[3] - z.node[0] == 3) {
+        for (int c = 0; c < 4; ++c) f[c] = line[z.node[0] + c];
+    } else {
+        for (int c = 0; c < 4; ++c) f[c] = line[z.node[c]];
     }
-    return line;
 }
 
+template <class T>
+inline void add4(T* sum, T weight, const T* f) {
+    for (int c = 0; c < 4; ++c) sum[c] += weight * f[c];
+}
+
+template <class T>
+inline T dot4(const T* a, const T* b) {
+    return (a[0] * b[0] + a[1] * b[1]) + (a[2] * b[2] + a[3] * b[3]);
+}
+
+/// Sums over the lines first, four nodes at a time, then along z.
 template <class T>
 inline void sample_sdf(const DenseGrid<T>& in, const Stencil3<T>& s, T* value, T* gradient) {
-    T v = 0, gx = 0, gy = 0, gz = 0;
-    for (int a = 0; a < 4; ++a) {
-        for (int b = 0; b < 4; ++b) {
-            if (!inner(a) && !inner(b)) continue;
-            const T* f =
-                in.sdf + (s.x.node[a] * in.lattice.size[1] + s.y.node[b]) * in.lattice.size[2];
-            const Line<T> line = sum_line(f, s.z, inner(a) && inner(b));
-            v += s.x.value[a] * s.y.value[b] * line.value;
-            gx += s.x.slope[a] * s.y.value[b] * line.value;
-            gy += s.x.value[a] * s.y.slope[b] * line.value;
-            gz += s.x.value[a] * s.y.value[b] * line.slope;
-        }
+    T straight[4] = {}, across_x[4] = {}, across_y[4] = {}, f[4];
+    const auto load = [&](int a, int b) {
+        const int64_t line = s.x.node[a] * in.lattice.size[1] + s.y.node[b];
+        load4(in.sdf + line * in.lattice.size[2], s.z, f);
+    };
+    for (int k = 0; k < 4; ++k) {
+        const int a = 1 + (k >> 1), b = 1 + (k & 1);
+        load(a, b);
+        add4(straight, s.x.value[a] * s.y.value[b], f);
+        add4(across_x, s.x.slope[a] * s.y.value[b], f);
+        add4(across_y, s.x.value[a] * s.y.slope[b], f);
     }
-    *value = v;
-    gradient[0] = gx, gradient[1] = gy, gradient[2] = gz;
+    for (int k = 0; k < 4; ++k) {
+        const int outer = 3 * (k >> 1), middle = 1 + (k & 1);
+        load(outer, middle);
+        add4(across_x, s.x.slope[outer] * s.y.value[middle], f);
+        load(middle, outer);
+        add4(across_y, s.x.value[middle] * s.y.slope[outer], f);
+    }
+    *value = dot4(straight, s.z.value);
+    gradient[0] = dot4(across_x, s.z.value);
+    gradient[1] = dot4(across_y, s.z.value);
+    gradient[2] = dot4(straight, s.z.slope);
 }
 
 /// First node of the pair of corners (a, b, .) along z, and how far the second is behind it.
@@ -109,6 +123,19 @@ inline void sample_features(const DenseGrid<T>& in, const Stencil3<T>& s, T* fea
     }
 }
 
+/// Fetch the nodes around a sample, save the outermost: they lie in its neighbours' lines.
+template <int64_t kC, class T>
+inline void prefetch_nodes(const DenseGrid<T>& in, const Stencil3<T>& s) {
+    const int64_t C = kC ? kC : in.n_channels;
+    for (int a = 0; a < 4; ++a) {
+        for (int b = 0; b < 4; ++b) {
+            const int64_t line = s.x.node[a] * in.lattice.size[1] + s.y.node[b];
+            __builtin_prefetch(in.sdf + line * in.lattice.size[2] + s.z.node[1]);
+        }
+    }
+    for (int k = 0; k < 4; ++k) prefetch(in.features + corner(in.lattice, s, k) * C, 2 * C);
+}
+
 /// Slots of a dense gradient: every node has a row.
 struct AllRows {
     const Lattice& grid;
@@ -135,24 +162,31 @@ inline Pull<T> pull_of(const DenseGridGrads<T>& g, int64_t i) {
 // X the value weights and X' the slope weights along x. See docs/derivations/dense_grid.md.
 template <class T, class Rows>
 inline void scatter_sdf(const Rows& rows, const Stencil3<T>& s, const Pull<T>& g, T* grad_sdf) {
-    const int64_t first = s.z.node[0], middle = s.z.node[1];
-    for (int a = 0; a < 4; ++a) {
-        for (int b = 0; b < 4; ++b) {
-            if (!inner(a) && !inner(b)) continue;
-            const T straight = (g.value * s.x.value[a] + g.x * s.x.slope[a]) * s.y.value[b] +
-                               g.y * s.x.value[a] * s.y.slope[b];
-            if (inner(a) && inner(b)) {
-                const T along = g.z * s.x.value[a] * s.y.value[b];
-                T* out = grad_sdf + rows.slot(s.x.node[a], s.y.node[b], first);
-                for (int c = 0; c < 4; ++c) {
-                    out[s.z.node[c] - first] += straight * s.z.value[c] + along * s.z.slope[c];
-                }
-            } else {
-                T* out = grad_sdf + rows.slot(s.x.node[a], s.y.node[b], middle);
-                out[0] += straight * s.z.value[1];
-                out[s.z.node[2] - middle] += straight * s.z.value[2];
-            }
+    const bool whole = s.z.node[3] - s.z.node[0] == 3;
+    const int64_t far = s.z.node[2] - s.z.node[1];
+    for (int k = 0; k < 4; ++k) {
+        const int a = 1 + (k >> 1), b = 1 + (k & 1);
+        const T straight = (g.value * s.x.value[a] + g.x * s.x.slope[a]) * s.y.value[b] +
+                           g.y * s.x.value[a] * s.y.slope[b];
+        const T along = g.z * s.x.value[a] * s.y.value[b];
+        T* out = grad_sdf + rows.slot(s.x.node[a], s.y.node[b], s.z.node[0]);
+        T add[4];
+        for (int c = 0; c < 4; ++c) add[c] = straight * s.z.value[c] + along * s.z.slope[c];
+        if (whole) {
+            for (int c = 0; c < 4; ++c) out[c] += add[c];
+        } else {
+            for (int c = 0; c < 4; ++c) out[s.z.node[c] - s.z.node[0]] += add[c];
         }
+    }
+    const auto add2 = [&](int a, int b, T weight) {
+        T* out = grad_sdf + rows.slot(s.x.node[a], s.y.node[b], s.z.node[1]);
+        out[0] += weight * s.z.value[1];
+        out[far] += weight * s.z.value[2];
+    };
+    for (int k = 0; k < 4; ++k) {
+        const int outer = 3 * (k >> 1), middle = 1 + (k & 1);
+        add2(outer, middle, g.x * s.x.slope[outer] * s.y.value[middle]);
+        add2(middle, outer, g.y * s.x.value[middle] * s.y.slope[outer]);
     }
 }
 
@@ -176,54 +210,79 @@ inline void scatter_features(const Rows& rows, const Stencil3<T>& s, const T* g,
 
 /// dL/d point of one sample: the same sums with the weights' derivatives.
 template <int64_t kC, class T>
-inline void point_gradient(const DenseGrid<T>& in, const Stencil3<T>& s, const Pull<T>& g,
+inline void point_gradient(const DenseGrid<T>& in, const T* point, const Pull<T>& g,
                            const T* grad_feature, T* grad_point) {
-    T dx = 0, dy = 0, dz = 0;
+    const Stencil3<T> s = stencil3(in.lattice, point);
+    StencilStep<T> step[3];
+    for (int d = 0; d < 3; ++d) {
+        step[d] = stencil_step<T>(in.lattice, place(in.lattice, d, static_cast<double>(point[d])));
+    }
+    const StencilStep<T>&x = step[0], &y = step[1], &z = step[2];
+    T dx = 0, dy = 0, dz = 0, f[4];
     for (int a = 0; a < 4; ++a) {
         for (int b = 0; b < 4; ++b) {
-            if (!inner(a) && !inner(b)) continue;
-            const T* f =
-                in.sdf + (s.x.node[a] * in.lattice.size[1] + s.y.node[b]) * in.lattice.size[2];
-            const Line<T> line = sum_line(f, s.z, inner(a) && inner(b));
+            const int64_t line = s.x.node[a] * in.lattice.size[1] + s.y.node[b];
+            load4(in.sdf + line * in.lattice.size[2], s.z, f);
             const T X = s.x.value[a], Y = s.y.value[b], XX = s.x.slope[a], YY = s.y.slope[b];
-            const T dX = s.x.value_step[a], dY = s.y.value_step[b];
-            const T dXX = s.x.slope_step[a], dYY = s.y.slope_step[b];
-            const T pulled = g.value * line.value + g.z * line.slope;
-            dx += (pulled * dX + g.x * line.value * dXX) * Y + g.y * line.value * dX * YY;
-            dy += (pulled * X + g.x * line.value * XX) * dY + g.y * line.value * X * dYY;
-            dz += ((g.value * X + g.x * XX) * Y + g.y * X * YY) * line.value_step +
-                  g.z * X * Y * line.slope_step;
+            const T value = dot4(f, s.z.value), slope = dot4(f, s.z.slope);
+            const T pulled = g.value * value + g.z * slope;
+            dx += (pulled * x.value[a] + g.x * value * x.slope[a]) * Y +
+                  g.y * value * x.value[a] * YY;
+            dy += (pulled * X + g.x * value * XX) * y.value[b] + g.y * value * X * y.slope[b];
+            dz += ((g.value * X + g.x * XX) * Y + g.y * X * YY) * dot4(f, z.value) +
+                  g.z * X * Y * dot4(f, z.slope);
         }
     }
     const int64_t C = kC ? kC : in.n_channels;
     for (int k = 0; k < 8; ++k) {
         const int a = 1 + (k >> 2), b = 1 + (k >> 1 & 1), c = 1 + (k & 1);
-        const int64_t node =
-            (s.x.node[a] * in.lattice.size[1] + s.y.node[b]) * in.lattice.size[2] + s.z.node[c];
-        const T* row = in.features + node * C;
+        const int64_t line = s.x.node[a] * in.lattice.size[1] + s.y.node[b];
+        const T* row = in.features + (line * in.lattice.size[2] + s.z.node[c]) * C;
         T dot = 0;
 #pragma omp simd reduction(+ : dot)
         for (int64_t i = 0; i < C; ++i) dot += row[i] * grad_feature[i];
-        dx += dot * s.x.value_step[a] * s.y.value[b] * s.z.value[c];
-        dy += dot * s.x.value[a] * s.y.value_step[b] * s.z.value[c];
-        dz += dot * s.x.value[a] * s.y.value[b] * s.z.value_step[c];
+        dx += dot * x.value[a] * s.y.value[b] * s.z.value[c];
+        dy += dot * s.x.value[a] * y.value[b] * s.z.value[c];
+        dz += dot * s.x.value[a] * s.y.value[b] * z.value[c];
     }
     grad_point[0] = dx, grad_point[1] = dy, grad_point[2] = dz;
 }
 
-/// Sum the samples into the rows of a gradient with `width` numbers each, slab by slab.
-template <class T, class Rows, class F>
-void accumulate(const DenseGrid<T>& in, const std::vector<int64_t>& bounds, const Rows& rows,
-                int64_t width, T* grad, int threads, F&& add) {
+/// Sum the samples into the gradients of sdf and features, slab by slab.
+template <int64_t kC, class T, class Rows>
+void scatter(const DenseGrid<T>& in, const DenseGridGrads<T>& grads, const Rows* sdf_rows,
+             const Rows* feature_rows, int threads) {
+    const int64_t C = in.n_channels;
+    const std::vector<int64_t> bounds = slab_bounds(in.lattice, in.points, in.n_points, in.order);
     const int64_t slabs = static_cast<int64_t>(bounds.size()) - 1;
+    const int64_t end = in.lattice.size[0], bytes = sizeof(T);
+    if (grads.grad_sdf) want_huge_pages(grads.grad_sdf, sdf_rows->slots_below(end) * bytes);
+    if (grads.grad_features) {
+        want_huge_pages(grads.grad_features, feature_rows->slots_below(end) * C * bytes);
+    }
     for_slabs(slabs, threads, [&](int64_t slab) {
         const Planes planes = planes_to_clear(in.lattice, slab, slabs);
-        std::fill(grad + rows.slots_below(planes.begin) * width,
-                  grad + rows.slots_below(planes.end) * width, T(0));
+        const auto clear = [&](T* grad, const Rows* rows, int64_t width) {
+            std::fill(grad + rows->slots_below(planes.begin) * width,
+                      grad + rows->slots_below(planes.end) * width, T(0));
+        };
+        if (grads.grad_sdf) clear(grads.grad_sdf, sdf_rows, 1);
+        if (grads.grad_features) clear(grads.grad_features, feature_rows, C);
         for (int64_t j = bounds[slab]; j < bounds[slab + 1]; ++j) {
             const int64_t i = in.order[j];
+            const int64_t next = in.order[std::min(j + kAhead, bounds[slab + 1] - 1)];
+            prefetch(in.points + 3 * next, 3);
+            prefetch(grads.grad_value + next, 1);
+            prefetch(grads.grad_gradient + 3 * next, 3);
+            prefetch(grads.grad_feature + C * next, kC ? kC : C);
             const T* p = in.points + 3 * i;
-            if (!has_nan(p)) add(i, stencil3(in.lattice, p));
+            if (has_nan(p)) continue;
+            const Stencil3<T> s = stencil3(in.lattice, p);
+            if (grads.grad_sdf) scatter_sdf(*sdf_rows, s, pull_of(grads, i), grads.grad_sdf);
+            if (grads.grad_features) {
+                scatter_features<kC>(*feature_rows, s, grads.grad_feature + i * C, C,
+                                     grads.grad_features);
+            }
         }
     });
 }
@@ -236,19 +295,32 @@ void sample_dense_forward(const DenseGrid<T>& in, T* value, T* gradient, T* feat
     with_channels(C, [&](auto constant) {
         constexpr int64_t kC = decltype(constant)::value;
         parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
-            for (int64_t j = begin; j < end; ++j) {
-                const int64_t i = in.order[j];
-                const T* p = in.points + 3 * i;
-                if (has_nan(p)) {
-                    const T nan = std::numeric_limits<T>::quiet_NaN();
-                    value[i] = nan;
-                    std::fill(gradient + 3 * i, gradient + 3 * i + 3, nan);
-                    std::fill(feature + C * i, feature + C * i + C, nan);
-                    continue;
+            Stencil3<T> stencils[kBlock];
+            for (int64_t j = begin; j < end; j += kBlock) {
+                const int64_t n = std::min(kBlock, end - j);
+                // Locate a few samples and fetch what they need, then sample.
+                for (int64_t k = 0; k < n; ++k) {
+                    const int64_t i = in.order[j + k];
+                    const int64_t next = in.order[std::min(j + k + kAhead, end - 1)];
+                    prefetch(in.points + 3 * next, 3);
+                    prefetch(value + next, 1);
+                    prefetch(gradient + 3 * next, 3);
+                    prefetch(feature + C * next, kC ? kC : C);
+                    stencils[k] = stencil3(in.lattice, in.points + 3 * i);
+                    prefetch_nodes<kC>(in, stencils[k]);
                 }
-                const Stencil3<T> s = stencil3(in.lattice, p);
-                sample_sdf(in, s, value + i, gradient + 3 * i);
-                sample_features<kC>(in, s, feature + C * i);
+                for (int64_t k = 0; k < n; ++k) {
+                    const int64_t i = in.order[j + k];
+                    if (has_nan(in.points + 3 * i)) {
+                        const T nan = std::numeric_limits<T>::quiet_NaN();
+                        value[i] = nan;
+                        std::fill(gradient + 3 * i, gradient + 3 * i + 3, nan);
+                        std::fill(feature + C * i, feature + C * i + C, nan);
+                        continue;
+                    }
+                    sample_sdf(in, stencils[k], value + i, gradient + 3 * i);
+                    sample_features<kC>(in, stencils[k], feature + C * i);
+                }
             }
         });
     });
@@ -257,33 +329,14 @@ void sample_dense_forward(const DenseGrid<T>& in, T* value, T* gradient, T* feat
 template <class T>
 void sample_dense_backward(const DenseGrid<T>& in, const DenseGridGrads<T>& grads, int threads) {
     const int64_t C = in.n_channels;
-    const int team = in.n_points < kSerialBelow ? 1 : threads;
-    const std::vector<int64_t> bounds = slab_bounds(in.lattice, in.points, in.n_points, in.order);
-    const auto into_sdf = [&](const auto& rows) {
-        accumulate(in, bounds, rows, 1, grads.grad_sdf, team, [&](int64_t i, const auto& s) {
-            scatter_sdf(rows, s, pull_of(grads, i), grads.grad_sdf);
-        });
-    };
-    if (grads.grad_sdf) {
-        if (grads.sdf_rows)
-            into_sdf(*grads.sdf_rows);
-        else
-            into_sdf(AllRows{in.lattice});
-    }
+    const int team = team_for(in.n_points, threads);
     with_channels(C, [&](auto constant) {
         constexpr int64_t kC = decltype(constant)::value;
-        const auto into_features = [&](const auto& rows) {
-            accumulate(in, bounds, rows, C, grads.grad_features, team,
-                       [&](int64_t i, const auto& s) {
-                           scatter_features<kC>(rows, s, grads.grad_feature + i * C, C,
-                                                grads.grad_features);
-                       });
-        };
-        if (grads.grad_features) {
-            if (grads.feature_rows)
-                into_features(*grads.feature_rows);
-            else
-                into_features(AllRows{in.lattice});
+        if (grads.sdf_rows || grads.feature_rows) {
+            scatter<kC>(in, grads, grads.sdf_rows, grads.feature_rows, team);
+        } else if (grads.grad_sdf || grads.grad_features) {
+            const AllRows all{in.lattice};
+            scatter<kC>(in, grads, &all, &all, team);
         }
         if (!grads.grad_points) return;
         parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
@@ -295,8 +348,7 @@ void sample_dense_backward(const DenseGrid<T>& in, const DenseGridGrads<T>& grad
                     std::fill(out, out + 3, T(0));
                     continue;
                 }
-                point_gradient<kC>(in, stencil3(in.lattice, p), pull_of(grads, i),
-                                   grads.grad_feature + i * C, out);
+                point_gradient<kC>(in, p, pull_of(grads, i), grads.grad_feature + i * C, out);
             }
         });
     });

@@ -11,7 +11,7 @@ namespace univoxel {
 struct Lattice {
     int64_t size[3];  // X, Y, Z: at least 1 each
     double origin[3];
-    double voxel_size;
+    double per_voxel;  // 1 / voxel_size
 };
 
 /// Place of a point along one axis, between the nodes cell and cell + 1.
@@ -23,7 +23,7 @@ struct Place {
 
 /// In double, so that a float32 point far from the origin keeps its fraction. NaN gives cell 0.
 inline Place place(const Lattice& grid, int axis, double x) {
-    const double p = (x - grid.origin[axis]) / grid.voxel_size;
+    const double p = (x - grid.origin[axis]) * grid.per_voxel;
     const double last = static_cast<double>(grid.size[axis] - 1);
     const double u = std::min(std::max(0.0, p), last);  // max(0, NaN) is 0
     const int64_t cell =
@@ -45,8 +45,6 @@ struct Stencil {
     int64_t node[4];  // cell - 1 .. cell + 2, clamped to the lattice
     T value[4];       // {0, 1 - t, t, 0}
     T slope[4];       // {t - 1, -t, 1 - t, t} / (2 h)
-    T value_step[4];  // d value / d x
-    T slope_step[4];  // d slope / d x
 };
 
 template <class T>
@@ -57,15 +55,23 @@ inline Stencil<T> stencil(const Lattice& grid, int axis, const Place& at) {
         s.node[a] = std::min(std::max<int64_t>(at.cell - 1 + a, 0), last);
     }
     const T t = static_cast<T>(at.t), u = static_cast<T>(1 - at.t);
-    const T half = static_cast<T>(0.5 / grid.voxel_size);
-    const T step = at.inside ? static_cast<T>(1 / grid.voxel_size) : T(0);
-    const T bend = half * step;
+    const T half = static_cast<T>(0.5 * grid.per_voxel);
     s.value[0] = 0, s.value[1] = u, s.value[2] = t, s.value[3] = 0;
     s.slope[0] = -half * u, s.slope[1] = -half * t, s.slope[2] = half * u, s.slope[3] = half * t;
-    s.value_step[0] = 0, s.value_step[1] = -step, s.value_step[2] = step, s.value_step[3] = 0;
-    s.slope_step[0] = bend, s.slope_step[1] = -bend, s.slope_step[2] = -bend;
-    s.slope_step[3] = bend;
     return s;
+}
+
+/// Derivatives of a stencil's weights to the point, in world units; 0 where it is clamped.
+template <class T>
+struct StencilStep {
+    T value[4], slope[4];
+};
+
+template <class T>
+inline StencilStep<T> stencil_step(const Lattice& grid, const Place& at) {
+    const T step = at.inside ? static_cast<T>(grid.per_voxel) : T(0);
+    const T bend = step * static_cast<T>(0.5 * grid.per_voxel);
+    return {{0, -step, step, 0}, {bend, -bend, -bend, bend}};
 }
 
 }  // namespace univoxel

@@ -87,14 +87,18 @@ class RowAdam(torch.optim.Optimizer):
             rows = _rows_of(grad)
         values = grad._values()
         n_rows = param.shape[: grad.sparse_dim()].numel()
+        beta1, beta2 = group["betas"]
         adam_rows_(
-            *[t.view(n_rows, -1) for t in (param, state["exp_avg"], state["exp_avg_sq"])],
+            param.view(n_rows, -1),
+            state["exp_avg"].view(n_rows, -1),
+            state["exp_avg_sq"].view(n_rows, -1),
             rows,
             values.reshape(len(rows), -1),
-            group["lr"],
-            *group["betas"],
-            group["eps"],
-            int(state["step"]),
+            lr=group["lr"],
+            beta1=beta1,
+            beta2=beta2,
+            eps=group["eps"],
+            step=int(state["step"]),
         )
 
     def _step_dense(self, params: list[Tensor], group: dict) -> None:

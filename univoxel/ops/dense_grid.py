@@ -95,7 +95,7 @@ def sample_dense_reference(
     lost = points.isnan().any(1, keepdim=True)
     start = torch.tensor(origin, dtype=torch.float64, device=sdf.device)
     # Locate in double, so that a float32 point far from the origin keeps its fraction.
-    at = (torch.where(lost, 0.0, points).double() - start) / voxel_size
+    at = (torch.where(lost, 0.0, points).double() - start) * (1 / voxel_size)
     at = torch.minimum(at.clamp_min(0.0), (size - 1).double())
     cell = torch.minimum(at.detach().long(), (size - 2).clamp_min(0))
     t = (at - cell).to(points.dtype)
@@ -267,11 +267,12 @@ def _save(ctx, inputs, output):
 def _backward(ctx, grad_value, grad_gradient, grad_feature, _):
     grad_outputs = [g.contiguous() for g in (grad_value, grad_gradient, grad_feature)]
     needs = list(ctx.needs_input_grad[:3])
-    place = (ctx.origin, ctx.voxel_size, needs)
+    sdf, features, points, order = ctx.saved_tensors
+    saved, place = (sdf, features, points, order), (ctx.origin, ctx.voxel_size, needs)
     if ctx.sparse_grad:
-        grads = _sparse_backward(*ctx.saved_tensors, grad_outputs, *place)
+        grads = _sparse_backward(*saved, grad_outputs, *place)
     else:
-        dense = _sample_dense_backward(*ctx.saved_tensors, *grad_outputs, *place)
+        dense = _sample_dense_backward(*saved, *grad_outputs, *place)
         grads = [g if need else None for g, need in zip(dense, needs, strict=True)]
     return *grads, None, None, None
 
