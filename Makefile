@@ -5,6 +5,9 @@ BIN := .venv/bin
 SETUP := .venv/.installed
 CXX_SOURCES := CMakeLists.txt $(wildcard cmake/*.cmake csrc/*)
 export OMP_WAIT_POLICY ?= passive
+# Where torch.compile finds Python's headers when they had to be unpacked there.
+DEPS := $(CURDIR)/.deps/usr/include
+export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE_PATH))
 
 .PHONY: help dev demo test lint format bench asan clean
 .DELETE_ON_ERROR:

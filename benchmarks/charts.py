@@ -1,6 +1,6 @@
 """Draw benchmarks/results/*.json, from the files alone: one PNG and one SVG each.
 
-    python benchmarks/charts.py [RESULTS.json ...]
+python benchmarks/charts.py [RESULTS.json ...]
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Time every op, forward and backward, against its reference, eager and compiled, and its peers.
 
-    python benchmarks/ops.py [--only composite] [--rounds 15] [--out benchmarks/results/ops.json]
+    python benchmarks/ops.py [--only composite] [--rounds 11] [--out benchmarks/results/ops.json]
 
 Each op is first held against its reference in float64. All contenders of a case run in turn, round
 by round, so that a noisy machine treats them alike. Timings on 1 and 2 threads come from processes
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import platform
 import subprocess
@@ -22,6 +23,7 @@ import torch
 from torch import Tensor
 
 HERE = Path(__file__).parent
+SLOW_MS = 3000.0
 
 
 def arguments_as(case, dtype: torch.dtype) -> tuple:
@@ -34,21 +36,28 @@ def arguments_as(case, dtype: torch.dtype) -> tuple:
     )
 
 
-def forward_backward(function, arguments: tuple) -> tuple[list[Tensor], list[Tensor]]:
-    outputs = function(*arguments)
-    outputs = [outputs] if isinstance(outputs, Tensor) else list(outputs)
+def forward_backward(function, arguments: tuple):
+    """A closure of one pass: (values, gradients of a fixed projection of them)."""
     leaves = [a for a in arguments if isinstance(a, Tensor) and a.requires_grad]
-    if not leaves:
-        return outputs, []
-    through = [o for o in outputs if o.requires_grad]
-    seeds = [torch.linspace(0.5, 1.5, o.numel(), dtype=o.dtype).view(o.shape) for o in through]
-    return outputs, list(torch.autograd.grad(through, leaves, seeds))
+    seeds: list[Tensor] = []
+
+    def run() -> tuple[list[Tensor], list[Tensor]]:
+        outputs = function(*arguments)
+        outputs = [outputs] if isinstance(outputs, Tensor) else list(outputs)
+        if not leaves:
+            return outputs, []
+        through = [o for o in outputs if o.requires_grad]
+        if not seeds:
+            seeds.extend(torch.linspace(0.5, 1.5, o.numel()).to(o).view(o.shape) for o in through)
+        return outputs, list(torch.autograd.grad(through, leaves, seeds))
+
+    return run
 
 
 def verify(case) -> float:
     """Largest relative L2 error of values and gradients against the reference in float64."""
-    ours = forward_backward(case.ours, arguments_as(case, torch.float32))
-    wanted = forward_backward(case.reference, arguments_as(case, torch.float64))
+    ours = forward_backward(case.ours, arguments_as(case, torch.float32))()
+    wanted = forward_backward(case.reference, arguments_as(case, torch.float64))()
     worst = 0.0
     for got, want in zip([*ours[0], *ours[1]], [*wanted[0], *wanted[1]], strict=True):
         got = got.to_dense() if got.is_sparse else got
@@ -63,8 +72,7 @@ def contenders(case) -> dict:
     """Closures by name; one that cannot run is left out, with the reason on stderr."""
 
     def of(function):
-        arguments = arguments_as(case, torch.float32)
-        return lambda: forward_backward(function, arguments)
+        return forward_backward(function, arguments_as(case, torch.float32))
 
     found = {"univoxel": of(case.ours), "torch eager": of(case.reference)}
     found["torch.compile"] = of(torch.compile(case.reference))
@@ -80,10 +88,12 @@ def contenders(case) -> dict:
 
 
 def times(found: dict, rounds: int) -> dict[str, list[float]]:
-    """Milliseconds of every round, contenders in turn."""
+    """Milliseconds of every round, contenders in turn; a slow one ends early, with 3 or more."""
     measured: dict[str, list[float]] = {name: [] for name in found}
     for _ in range(rounds):
         for name, run in found.items():
+            if len(measured[name]) >= 3 and sum(measured[name]) > SLOW_MS:
+                continue
             start = time.perf_counter()
             run()
             measured[name].append(1e3 * (time.perf_counter() - start))
@@ -101,11 +111,13 @@ def run_cases(threads: int, only: str, rounds: int) -> dict:
     import peers
 
     peers.set_threads(threads)
+    logging.getLogger("torch._dynamo").setLevel(logging.ERROR)  # graph breaks of the references
     reach = limits.measure()
     results = []
-    for case in cases.all_cases():
-        if only not in case.op:
+    for name, make in cases.CASES:
+        if only not in name:
             continue
+        case = make()
         error = verify(case)
         least, bound = limits.floor(case.work, reach)
         measured = {n: quartiles(t) for n, t in times(contenders(case), rounds).items()}
@@ -134,7 +146,7 @@ def run_cases(threads: int, only: str, rounds: int) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="", help="ops whose name contains this (default: all)")
-    parser.add_argument("--rounds", type=int, default=15, help="at least 3 (default: 15)")
+    parser.add_argument("--rounds", type=int, default=11, help="at least 3 (default: 11)")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "ops.json")
     parser.add_argument("--threads", type=int, help=argparse.SUPPRESS)  # in the child processes
     options = parser.parse_args()

@@ -35,13 +35,15 @@ def composite(alpha: Tensor, value: Tensor, n_rays: int) -> Peers:
     a = jnp.asarray(alpha.detach().numpy()).reshape(n_rays, -1)
     v = jnp.asarray(value.detach().numpy()).reshape(*a.shape, -1)
 
-    def loss(a, v):
+    def loss(a, v, seed, weight_seed):
         trans = jnp.cumprod(1 - a, 1)
         weight = a * jnp.concatenate([jnp.ones_like(a[:, :1]), trans[:, :-1]], 1)
-        return (weight[..., None] * v).sum() + weight.sum()
+        out = (weight[..., None] * v).sum(1)
+        return (out * seed).sum() + (weight * weight_seed).sum()
 
     run = jax.jit(jax.grad(loss, (0, 1)))
-    return {"JAX": lambda: jax.block_until_ready(run(a, v))}
+    seeds = jnp.ones((n_rays, v.shape[-1])), jnp.ones_like(a)
+    return {"JAX": lambda: jax.block_until_ready(run(a, v, *seeds))}
 
 
 def sample_dense(sdf: Tensor, features: Tensor, points: Tensor, h: float) -> Peers:
@@ -108,9 +110,8 @@ def _drjit_sample_dense(sdf: Tensor, features: Tensor, points: Tensor, h: float)
     return run
 
 
-def set_threads(threads: int) -> bool:
-    """Give the peers this many threads; False where they cannot change it in a running process."""
+def set_threads(threads: int) -> None:
+    """For torch and Dr.Jit; XLA goes by the cores that the process may use."""
     if drjit is not None:
         drjit.set_thread_count(threads)
     torch.set_num_threads(threads)
-    return jax is None

@@ -13,9 +13,8 @@ if [ -d .deps/usr ]; then
     options+=("-DCMAKE_PREFIX_PATH=$PWD/.deps/usr" -DCMAKE_INSTALL_RPATH_USE_LINK_PATH=ON
               -DCMAKE_MODULE_LINKER_FLAGS=-Wl,--disable-new-dtags)
     export CPLUS_INCLUDE_PATH=$PWD/.deps/usr/include
-    for include in "$PWD"/.deps/usr/include/python3*; do
-        [ -d "$include" ] && options+=("-DPython_INCLUDE_DIR=$include")
-    done
+    [ ! -e .deps/usr/include/python/Python.h ] ||
+        options+=("-DPython_INCLUDE_DIR=$PWD/.deps/usr/include/python")
 fi
 cmake -G Ninja -S . -B "$build" "-DPython_EXECUTABLE=$PWD/.venv/bin/python" \
     "-Dpybind11_DIR=$(python -m pybind11 --cmakedir)" "${options[@]}" >"$build.log" 2>&1 ||

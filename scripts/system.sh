@@ -18,7 +18,7 @@ command -v c++ >/dev/null || missing+=(g++)
 command -v c++ >/dev/null && header glm/vec3.hpp || missing+=(libglm-dev)
 command -v c++ >/dev/null && { header embree4/rtcore.h || header embree3/rtcore.h; } ||
     missing+=(libembree-dev)
-python_headers || [ -e "$deps/usr/include/python$version/Python.h" ] ||
+python_headers || [ -e "$deps/usr/include/python/Python.h" ] ||
     missing+=("libpython$version-dev")
 "$python" -c 'import ensurepip, venv' 2>/dev/null ||
     compgen -G "$deps/usr/share/python-wheels/pip-*.whl" >/dev/null ||
@@ -57,3 +57,4 @@ apt-get -q download "${packages[@]}" >&2 2>/dev/null ||
     { apt-get "${own[@]}" update >&2 && apt-get "${own[@]}" download "${packages[@]}" >&2; }
 for archive in ./*.deb; do dpkg -x "$archive" "$deps"; done
 rm -rf "$deps/apt"
+ln -sfn "python$version" "$deps/usr/include/python"

@@ -17,3 +17,6 @@ fi
 # torch first and pinned: a bare `torch` would bring gigabytes of CUDA packages.
 .venv/bin/pip install -q -c constraints.txt torch
 .venv/bin/pip install -q -c constraints.txt -e '.[dev]'
+# Of the editable install only the path counts. Its import hook would stand before PYTHONPATH and the
+# current folder, and so hide any other build of the package, such as the one with sanitizers.
+sed -i '/^import /d' .venv/lib/python3*/site-packages/_editable_skbc_univoxel.pth

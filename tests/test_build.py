@@ -54,7 +54,8 @@ def test_variant_loads_and_composites(variant):
         pytest.skip(f"this processor has no {variant}")
     code = (
         "import importlib.util, numpy, torch\n"
-        f"spec = importlib.util.spec_from_file_location('univoxel._core', {str(built()[variant])!r})\n"
+        f"path = {str(built()[variant])!r}\n"
+        "spec = importlib.util.spec_from_file_location('univoxel._core', path)\n"
         "core = importlib.util.module_from_spec(spec)\n"
         "spec.loader.exec_module(core)\n"
         "alpha, value = numpy.array([0.5, 0.5]), numpy.array([[4.0], [8.0]])\n"

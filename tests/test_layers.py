@@ -28,7 +28,7 @@ HELPERS = {
     "lights": {"base", "quadrature"},
     "data": {"base", "images", "radiance"},
     "render": {"density"},
-    "tasks": {"contact_sheet", "layers"},
+    "tasks": {"contact_sheet", "progress"},
 }
 OPTIONAL = {"matplotlib", "trimesh", "viser"}  # extras: imported inside the function that needs one
 # The one file that includes it; headers of ours may pass it on to nobody else.
@@ -75,7 +75,7 @@ def violations(package: Path) -> list[str]:
     for module, path in known.items():
         if not module:
             continue
-        folder, _, leaf = module.rpartition(".")
+        folder = module.rpartition(".")[0]
         for name in sorted(imports(path, set(known))):
             if name.endswith("._core"):
                 found.append(f"{module} imports {name}: only ops/native.py loads it")
