@@ -152,7 +152,7 @@ void bind_smooth(py::module_& m) {
 Lattice lattice_of(const std::array<int64_t, 3>& size, const std::array<double, 3>& origin,
                    double voxel_size) {
     require(size[0] > 0 && size[1] > 0 && size[2] > 0, "sample_dense: the grid has no nodes");
-    return {{size[0], size[1], size[2]}, {origin[0], origin[1], origin[2]}, voxel_size};
+    return {{size[0], size[1], size[2]}, {origin[0], origin[1], origin[2]}, 1 / voxel_size};
 }
 
 template <class T>
