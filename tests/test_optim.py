@@ -112,6 +112,17 @@ def test_gradients_of_two_backward_passes_add_up():
     torch.testing.assert_close(mine, wanted)
 
 
+@pytest.mark.parametrize(("channels", "n_points"), [(3, 0), (0, 5)])
+def test_empty_gradient(channels, n_points):
+    sdf, features = grid(4, 4, 4), grid(4, 4, 4, channels)
+    before = sdf.detach().clone()
+    points = torch.full((n_points, 3), 1.5, dtype=torch.float64)
+    outputs = sample_dense(sdf, features, points, (0, 0, 0), 1.0, sparse_grad=True)
+    sum(o.sum() for o in outputs).backward()
+    RowAdam([sdf, features], lr=0.1).step()
+    assert torch.equal(sdf, before) is (n_points == 0)
+
+
 def test_layout_may_change_and_state_is_saved():
     """Half the steps, save, load into a fresh optimizer, the other half: as in one go."""
     straight, broken = grid(4, 5, 6), grid(4, 5, 6)

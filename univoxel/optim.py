@@ -86,14 +86,15 @@ class RowAdam(torch.optim.Optimizer):
             grad = grad.coalesce()
             rows = _rows_of(grad)
         values = grad._values()
-        n_rows = param.shape[: grad.sparse_dim()].numel()
+        dims = grad.sparse_dim()
+        table = (param.shape[:dims].numel(), param.shape[dims:].numel())  # no -1: it may be empty
         beta1, beta2 = group["betas"]
         adam_rows_(
-            param.view(n_rows, -1),
-            state["exp_avg"].view(n_rows, -1),
-            state["exp_avg_sq"].view(n_rows, -1),
+            param.view(table),
+            state["exp_avg"].view(table),
+            state["exp_avg_sq"].view(table),
             rows,
-            values.reshape(len(rows), -1),
+            values.reshape(len(rows), table[1]),
             lr=group["lr"],
             beta1=beta1,
             beta2=beta2,

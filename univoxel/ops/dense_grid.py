@@ -212,7 +212,10 @@ def _sparse_backward(
     rows = core.touched_rows(
         *native.arrays(points, order), list(sdf.shape), origin, voxel_size, *needs[:2], threads
     )
-    values = [r and g.new_empty(len(r), *g.shape[3:]) for r, g in zip(rows, grids, strict=True)]
+    values = [
+        None if r is None else g.new_empty(len(r), *g.shape[3:])
+        for r, g in zip(rows, grids, strict=True)
+    ]
     grad_points = torch.empty_like(points) if needs[2] else None
     core.sample_dense_backward(
         *native.arrays(sdf, features, points, order, *grad_outputs),
