@@ -1,10 +1,14 @@
 """An analytic scene for tests: a sphere with a known look, photographed from around it."""
 
+import json
 import math
+from pathlib import Path
 
 import torch
+from PIL import Image
 
 from univoxel.camera import Cameras, image_rays
+from univoxel.color import linear_to_srgb
 
 RADIUS = 0.5
 
@@ -39,3 +43,33 @@ def sphere_normals(cameras: Cameras, view: int) -> tuple[torch.Tensor, torch.Ten
     normal = (rays.origin + t[:, None] * rays.direction) / RADIUS
     shape = (cameras.height, cameras.width)
     return torch.where(hit[:, None], normal, 0.0).reshape(*shape, 3), hit.reshape(shape)
+
+
+def photograph(cameras: Cameras, view: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Linear colour [H, W, 3] and coverage [H, W] of the sphere under a hemispherical sky.
+
+    Lambertian, brighter above than below (irradiance pi (0.6 + 0.4 n.z)), red on +X and blue on -X.
+    """
+    normal, hit = sphere_normals(cameras, view)
+    side = (normal[..., :1] > 0).float()
+    albedo = side * torch.tensor([0.7, 0.2, 0.2]) + (1 - side) * torch.tensor([0.2, 0.2, 0.7])
+    return albedo * (0.6 + 0.4 * normal[..., 2:]) * hit[..., None], hit.float()
+
+
+def write_scene(folder: Path, views: int = 12, size: int = 32) -> Path:
+    """The photographs as a data set in the NeRF/Blender layout, train and test."""
+    for split, count in (("train", views), ("test", 2)):
+        cameras = cameras_around(count, size)
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for v in range(count):
+            color, alpha = photograph(cameras, v)
+            rgba = torch.cat([linear_to_srgb(color), alpha[..., None]], -1)
+            picture = (255 * rgba).round().to(torch.uint8).numpy()
+            Image.fromarray(picture).save(folder / split / f"r_{v}.png")
+            pose = torch.cat([cameras.camera_to_world[v], torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
+            frames.append({"file_path": f"{split}/r_{v}", "transform_matrix": pose.tolist()})
+        angle = 2 * math.atan(size / 2 / float(cameras.focal[0, 0]))
+        text = json.dumps({"camera_angle_x": angle, "frames": frames})
+        (folder / f"transforms_{split}.json").write_text(text)
+    return folder

@@ -68,7 +68,7 @@ class DenseField(AbstractField):
         sdf = self.sdf.detach().numpy()
         if not sdf.min() < 0 < sdf.max():
             raise ValueError("the field has no surface: its sdf does not change sign")
-        vertices, faces, _, _ = marching_cubes(sdf, 0.0, gradient_direction="ascent")
+        vertices, faces, _, _ = marching_cubes(sdf, 0.0, gradient_direction="descent")
         origin = torch.tensor(self.grid.origin)
         world = origin + self.voxel_size * torch.from_numpy(vertices.copy())
         return world.float(), torch.from_numpy(faces.astype("int32"))

@@ -67,12 +67,15 @@ def mask_distances(alpha: Tensor) -> Tensor:
 def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
     """Signed distance to the visual hull, a lower bound of the object's: [P, 3] -> [P].
 
-    The largest over views of the silhouette's distance times depth / focal length. A view says
-    nothing about points behind it or outside its picture; points that no view sees are outside.
+    The largest over views of the silhouette's distance times depth / focal length. Outside a
+    picture there is nothing where its silhouette stays clear of the border; where the silhouette
+    is cut off by it, the view says nothing. Points that no view sees are outside.
 
     Args:
         distance: [V, H, W] from `mask_distances`.
     """
+    border = [distance[:, 0], distance[:, -1], distance[:, :, 0], distance[:, :, -1]]
+    whole = torch.stack([b.amin(1) > 0 for b in border]).all(0)
     sdf = torch.full((len(points),), -torch.inf)
     scale = torch.tensor([2 / cameras.width, 2 / cameras.height])
     for v in range(len(cameras)):
@@ -82,7 +85,9 @@ def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
             distance[v][None, None], uv[None, None], align_corners=False, padding_mode="border"
         )[0, 0, 0]
         seen = (depth > 0) & (uv.abs() <= 1).all(1)
-        sdf = torch.where(seen, torch.maximum(sdf, d * depth / cameras.focal[v].mean()), sdf)
+        here = d.clamp_min(0.5) if whole[v] else torch.full_like(d, -torch.inf)
+        here = torch.where(seen, d, here) * depth.abs() / cameras.focal[v].mean()
+        sdf = torch.maximum(sdf, here)
     return torch.where(sdf.isinf(), torch.inf, sdf)
 
 

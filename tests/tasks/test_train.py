@@ -1,0 +1,114 @@
+"""The whole street on an analytic sphere, in seconds."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+from analytic import RADIUS, write_scene
+
+from univoxel.config import StageConfig, TrainConfig, preset
+from univoxel.data import load_photos
+from univoxel.lights.sg import SGConfig
+from univoxel.render.pipeline import extract_mesh
+from univoxel.scene import FILE, SceneConfig, load_scene
+from univoxel.tasks import train as task
+from univoxel.tasks.train import batch_at, split_pixels, train
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("sphere") / "data")
+
+
+def config(data, out, **changes) -> TrainConfig:
+    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
+    stages = (
+        StageConfig(voxels=0.01, iterations=60, share=0.5, rays=256),
+        StageConfig(voxels=0.03, iterations=80, share=0.5, rays=256, physical_from=0.0),
+    )
+    cfg = TrainConfig(
+        data, out, stages, minutes=2.0, scene=SceneConfig(channels=4, hidden=16, light=light)
+    )
+    return dataclasses.replace(cfg, **changes)
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory):
+    return train(config(data, tmp_path_factory.mktemp("sphere") / "run"))
+
+
+def test_a_run_folder_holds_what_is_promised(run):
+    assert {"config.json", FILE, "preview.png"} <= {p.name for p in run.iterdir()}
+    assert json.loads((run / "config.json").read_text())["stages"][1]["rays"] == 256
+
+
+def test_geometry_is_the_sphere(run):
+    mesh = extract_mesh(load_scene(run))
+    away = mesh.vertices.norm(dim=1) - RADIUS
+    assert away.abs().mean() < 0.03  # a pixel of these photographs is 0.056 wide at the sphere
+
+
+def test_the_physical_render_learns_the_photographs(run, data):
+    photos = load_photos(data, "test")
+    pixels = torch.cartesian_prod(torch.arange(2), torch.arange(32), torch.arange(32))
+    psnr = task.held_out_psnr(load_scene(run).eval(), photos, pixels, physical=True)
+    assert psnr > 20  # black gives 9 dB, the right sphere in one mean colour 16
+
+
+def test_albedo_tells_the_sides_apart(run):
+    mesh = extract_mesh(load_scene(run))
+    red, blue = mesh.vertices[:, 0] > 0.2, mesh.vertices[:, 0] < -0.2
+    assert mesh.albedo[red].mean(0).argmax() == 0
+    assert mesh.albedo[blue].mean(0).argmax() == 2
+
+
+def test_time_ends_a_run_with_a_usable_result(data, tmp_path):
+    out = train(config(data, tmp_path / "run", minutes=0.0))
+    assert extract_mesh(load_scene(out)).faces.numel() > 0
+
+
+def test_resume_goes_on_where_it_stopped(data, tmp_path, monkeypatch):
+    cfg = config(data, tmp_path / "run")
+    original, seen = task.run_stage, []
+
+    def killed(scene, cfg, stage, *rest):
+        if len(seen):
+            raise KeyboardInterrupt
+        seen.append(stage)
+        original(scene, cfg, stage, *rest)
+
+    monkeypatch.setattr(task, "run_stage", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(cfg)
+    first = load_scene(cfg.out)
+    monkeypatch.setattr(task, "run_stage", lambda scene, cfg, stage, *rest: seen.append(stage))
+    train(cfg, resume=True)
+    assert seen == list(cfg.stages)
+    assert load_scene(cfg.out).field.grid != first.field.grid  # the second stage's resolution
+
+
+def test_a_run_is_not_overwritten(run, data):
+    with pytest.raises(FileExistsError, match="holds a run already: pass --resume"):
+        train(config(data, run))
+
+
+def test_a_loss_that_is_no_number_stops_in_one_line(data, tmp_path, monkeypatch):
+    bad = {"radiance": torch.tensor(float("nan"), requires_grad=True)}
+    monkeypatch.setattr(task, "objective", lambda *_: bad)
+    with pytest.raises(FloatingPointError, match="the loss is nan at step 0"):
+        train(config(data, tmp_path / "run"))
+
+
+def test_held_out_pixels_are_not_trained_on(data):
+    photos = load_photos(data, "train")
+    pixels, held = split_pixels(torch.where(photos.coverage() > 0, -1.0, 99.0))
+    both = torch.cat([pixels, held])
+    assert len(both.unique(dim=0)) == len(both)
+    batch = batch_at(photos, held)
+    assert (batch.alpha == 1).all()
+
+
+def test_unknown_preset(tmp_path):
+    with pytest.raises(ValueError, match="preset must be draft, fast or full, got 'best'"):
+        preset("best", tmp_path, tmp_path)
