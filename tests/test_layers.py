@@ -24,7 +24,7 @@ LAYERS = [
     {"cli"},
 ]
 HELPERS = {
-    "ops": {"checks", "native"},
+    "ops": {"checks", "native", "visibility"},
     "fields": {"base", "hull"},
     "lights": {"base", "quadrature"},
     "data": {"base", "images", "radiance"},

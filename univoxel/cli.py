@@ -9,14 +9,14 @@ import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from univoxel import __version__
 
-Run = Annotated[Positional[Path], arg(metavar="RUN")]
+Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
 
 
 def train(
