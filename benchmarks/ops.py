@@ -162,8 +162,10 @@ def main() -> None:
         # XLA sizes its thread pool by the cores it may use.
         cores = sorted(os.sched_getaffinity(0))[:threads]
         subprocess.run(
-            [sys.executable, __file__, "--threads", str(threads), "--only", options.only]
-            + ["--rounds", str(options.rounds), "--out", str(part)],
+            [
+                *(sys.executable, __file__, "--threads", str(threads), "--only", options.only),
+                *("--rounds", str(options.rounds), "--out", str(part)),
+            ],
             check=True,
             env={**os.environ, "OMP_WAIT_POLICY": "passive", "OMP_NUM_THREADS": str(threads)},
             preexec_fn=lambda cores=cores: os.sched_setaffinity(0, cores),

@@ -10,7 +10,8 @@ export PATH=$PWD/.venv/bin:$PATH
 options=("$@")
 if [ -d .deps/usr ]; then
     # RPATH, unlike RUNPATH, also serves the libraries that Embree needs in turn.
-    options+=("-DCMAKE_PREFIX_PATH=$PWD/.deps/usr" -DCMAKE_INSTALL_RPATH_USE_LINK_PATH=ON
+    options+=("-DCMAKE_PREFIX_PATH=$PWD/.deps/usr"
+              "-DCMAKE_INSTALL_RPATH=$PWD/.deps/usr/lib/$(c++ -print-multiarch)"
               -DCMAKE_MODULE_LINKER_FLAGS=-Wl,--disable-new-dtags)
     export CPLUS_INCLUDE_PATH=$PWD/.deps/usr/include
     [ ! -e .deps/usr/include/python/Python.h ] ||

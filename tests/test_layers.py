@@ -14,6 +14,7 @@ LAYERS = [
     {"records"},
     {"brdf", "camera", "color", "sphere"},
     {"ops"},
+    {"envmap"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
     {"distributed", "losses", "metrics", "render"},
@@ -23,12 +24,12 @@ LAYERS = [
     {"cli"},
 ]
 HELPERS = {
-    "ops": {"checks", "native"},
+    "ops": {"checks", "native", "visibility"},
     "fields": {"base", "hull"},
     "lights": {"base", "quadrature"},
     "data": {"base", "images", "radiance"},
-    "render": {"density"},
-    "tasks": {"contact_sheet", "progress"},
+    "render": {"density", "pipeline"},
+    "tasks": {"contact_sheet", "layers", "progress"},
 }
 OPTIONAL = {"matplotlib", "trimesh", "viser"}  # extras: imported inside the function that needs one
 # The one file that includes it; headers of ours may pass it on to nobody else.

@@ -9,14 +9,14 @@ import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from univoxel import __version__
 
-Run = Annotated[Positional[Path], arg(metavar="RUN")]
+Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
 
 
 def train(
@@ -68,7 +68,7 @@ def evaluate(
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: only printed)")
     ] = None,
 ) -> None:
-    """Measure a run on the test views.
+    """Measure a run on the test views and print the table.
 
     Args:
         run: folder of a trained run
@@ -78,8 +78,7 @@ def evaluate(
     """
     from univoxel.tasks import evaluate as task
 
-    for name, value in task.evaluate(run, data=data, save=save, json=json).items():
-        print(f"{name:32s} {value:.4f}" if isinstance(value, float) else f"{name:32s} {value}")
+    task.evaluate(run, data=data, save=save, json=json)
 
 
 def relight(

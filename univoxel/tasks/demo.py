@@ -21,7 +21,7 @@ _PAGE = """<!doctype html>
 <title>univoxel demo</title>
 <style>
 body {{ font: 16px/1.5 sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em }}
-img {{ width: 200px; image-rendering: pixelated; background: #000 }}
+img {{ min-width: 200px; max-width: 100%; image-rendering: pixelated; background: #000 }}
 figure {{ display: inline-block; margin: 4px; text-align: center; font-size: 13px }}
 td {{ padding-right: 2em }}
 </style>
@@ -37,8 +37,8 @@ td {{ padding-right: 2em }}
 def demo(out: Path) -> Path:
     """Train on the bundled scene, evaluate, relight under two maps; returns the page to open.
 
-    Writes into `out`: run/, test/ (pictures of the test views), relight/<map>/, mesh.ply and
-    index.html, which holds its pictures and needs no other file.
+    Writes into `out`: run/, test/ (what `univoxel eval --save` writes), relight/<map>/, mesh.ply
+    and index.html, which holds its pictures and needs no other file.
 
     Raises:
         OSError: `out` cannot be written.
@@ -54,8 +54,10 @@ def demo(out: Path) -> Path:
     export(run, out / "mesh.ply")
 
     views = sorted(p.stem for p in (SCENE / "test").glob("*.png"))
-    sections = [_section("Photographs of the test views, never trained on", SCENE / "test", views)]
-    sections.append(_section("What univoxel makes of these views", out / "test", views))
+    sections = [
+        _section("Test views, never trained on", out / "test", ["contact_sheet"]),
+        _section("Photographs of these views", SCENE / "test", views),
+    ]
     for name in MAPS:
         sections.append(_section(f"Relit: {name}", out / "relight" / name, views))
         sections.append(_section(f"Truth: {name}", SCENE / "relight" / name, views))
