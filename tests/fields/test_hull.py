@@ -69,7 +69,7 @@ def test_a_silhouette_cut_by_the_border_says_nothing_beyond_it(silhouettes):
     one = Cameras(
         *(t[:1] for t in (cameras.camera_to_world, cameras.focal, cameras.centre)), 64, 64
     )
-    beside = -1.5 * cameras.camera_to_world[:1, :, 0]  # left of the picture
+    beside = -1.5 * pose[:1, :, 0]  # left of the picture
     assert hull_sdf(distance[:1], one, beside) > 0
     assert hull_sdf(torch.full((1, 64, 64), -3.0), one, torch.zeros(1, 3)) < 0
     assert hull_sdf(torch.full((1, 64, 64), -3.0), one, beside) == torch.inf  # nobody sees it
