@@ -66,9 +66,8 @@ def test_points_that_no_view_sees_are_outside(silhouettes):
 
 def test_a_silhouette_cut_by_the_border_says_nothing_beyond_it(silhouettes):
     distance, cameras = silhouettes
-    one = Cameras(
-        *(t[:1] for t in (cameras.camera_to_world, cameras.focal, cameras.centre)), 64, 64
-    )
+    pose, focal, centre = cameras.camera_to_world, cameras.focal, cameras.centre
+    one = Cameras(pose[:1], focal[:1], centre[:1], 64, 64)
     beside = -1.5 * pose[:1, :, 0]  # left of the picture
     assert hull_sdf(distance[:1], one, beside) > 0
     assert hull_sdf(torch.full((1, 64, 64), -3.0), one, torch.zeros(1, 3)) < 0
