@@ -18,6 +18,7 @@
 #include "bricks.h"
 #include "composite.h"
 #include "dense_grid.h"
+#include "integrator.h"
 #include "march.h"
 #include "sg.h"
 #include "smooth.h"
@@ -401,6 +402,60 @@ void bind_visibility(py::module_& m) {
             py::arg("threads"));
 }
 
+void bind_integrator(py::module_& m) {
+    py::enum_<Strategy>(m, "Strategy")
+        .value("mis", Strategy::mis)
+        .value("map", Strategy::map)
+        .value("brdf", Strategy::brdf);
+    using optional_array = std::optional<array<float>>;
+    m.def(
+        "relight",
+        [](const VisibilityScene& scene, const optional_array& vertex_normal,
+           const optional_array& vertex_albedo, const optional_array& vertex_roughness,
+           const array<float>& radiance, const array<float>& row_cdf,
+           const array<float>& column_cdf, float rotation, const array<float>& position,
+           const array<float>& normal, const array<float>& wo, const array<float>& albedo,
+           const array<float>& roughness, array<float>& rgb, float offset, int samples, int bounces,
+           uint32_t seed, Strategy strategy, int threads) {
+            const int64_t n = roughness.size(), h = radiance.shape(0), w = radiance.shape(1);
+            require(row_cdf.size() == h + 1 && column_cdf.size() == h * (w + 1),
+                    "relight: the tables do not belong to this map");
+            for (const array<float>* a :
+                 {&position, &normal, &wo, &albedo, static_cast<const array<float>*>(&rgb)})
+                require(a->size() == 3 * n, "relight: points differ in number");
+            require(bounces == 0 || (vertex_normal && vertex_albedo && vertex_roughness),
+                    "relight: bounces need materials");
+            const auto data = [](const optional_array& a) { return a ? a->data() : nullptr; };
+            const Relight in{&scene,
+                             data(vertex_normal),
+                             data(vertex_albedo),
+                             data(vertex_roughness),
+                             {radiance.data(), row_cdf.data(), column_cdf.data(), h, w, rotation},
+                             position.data(),
+                             normal.data(),
+                             wo.data(),
+                             albedo.data(),
+                             roughness.data(),
+                             n,
+                             offset,
+                             samples,
+                             bounces,
+                             seed,
+                             strategy};
+            float* out = rgb.mutable_data();
+            py::gil_scoped_release nogil;
+            relight(in, out, threads);
+        },
+        py::arg("scene"), py::arg("vertex_normal").noconvert(),
+        py::arg("vertex_albedo").noconvert(), py::arg("vertex_roughness").noconvert(),
+        py::arg("radiance").noconvert(), py::arg("row_cdf").noconvert(),
+        py::arg("column_cdf").noconvert(), py::arg("rotation"), py::arg("position").noconvert(),
+        py::arg("normal").noconvert(), py::arg("wo").noconvert(), py::arg("albedo").noconvert(),
+        py::arg("roughness").noconvert(), py::arg("rgb").noconvert(), py::arg("offset"),
+        py::arg("samples"), py::arg("bounces"), py::arg("seed"), py::arg("strategy"),
+        py::arg("threads"));
+}
+
 }  // namespace
 
 PYBIND11_MODULE(_core, m) {
@@ -419,4 +474,5 @@ PYBIND11_MODULE(_core, m) {
     bind_sg<float>(m);
     bind_sg<double>(m);
     bind_visibility(m);
+    bind_integrator(m);
 }

@@ -1,0 +1,247 @@
+"""Relit points: furnaces, closed forms, quadrature with the torch BRDF, convergence, bad input."""
+
+import math
+
+import pytest
+import torch
+
+from univoxel import brdf
+from univoxel.envmap import EnvMap, lookup, tables
+from univoxel.ops import VisibilityScene, occluded_reference, relight, use_backend
+from univoxel.records import Mesh
+from univoxel.sphere import fibonacci_sphere
+
+WHITE = EnvMap(torch.ones(8, 16, 3))
+
+
+def unit(*shape, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return torch.nn.functional.normalize(torch.randn(*shape, generator=g), dim=-1)
+
+
+def octahedron(albedo=1.0, roughness=0.5, inside_out=False):
+    """A closed mesh of eight flat faces with corners of their own; (mesh, scene)."""
+    axes = torch.eye(3)
+    signs = torch.tensor([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
+    corners = signs[:, :, None] * axes  # [8, 3, 3]
+    flip = signs.prod(1) < 0
+    corners = torch.where(flip[:, None, None], corners.flip(1), corners)
+    vertices = corners.reshape(-1, 3)
+    normals = (signs / math.sqrt(3)).repeat_interleave(3, 0)
+    faces = torch.arange(24, dtype=torch.int32).reshape(8, 3)
+    if inside_out:
+        normals = -normals
+    mesh = Mesh(vertices, faces, normals, torch.full((24, 3), albedo), torch.full((24,), roughness))
+    return mesh, VisibilityScene(vertices, faces)
+
+
+def sphere_points(n, seed=0, facing=0.2):
+    """Points of the unit sphere, which are their own normals, and eyes that look at them."""
+    normal, wo = unit(n, 3, seed=seed), unit(n, 3, seed=seed + 1)
+    return normal, torch.nn.functional.normalize(wo + (1 + facing) * normal, dim=1)
+
+
+def shade(mesh, scene, envmap, normal, wo, albedo=1.0, roughness=0.5, **kwargs):
+    n = len(normal)
+    arguments = {"position": normal, "offset": 0.01, "samples": 64}
+    return relight(
+        scene,
+        mesh,
+        tables(envmap),
+        normal=normal,
+        wo=wo,
+        albedo=torch.as_tensor(albedo).expand(n, 3),
+        roughness=torch.as_tensor(roughness).expand(n),
+        **(arguments | kwargs),
+    )
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.4, 0.8, 1.0])
+def test_white_furnace(roughness):
+    """In white light albedo 1 sends (1 - E) + E = 1, a grey base (1 - E) albedo + E."""
+    mesh, scene = octahedron()
+    normal, wo = sphere_points(100)
+    layer = brdf.specular_albedo((normal * wo).sum(1), torch.tensor(roughness))[:, None]
+    for albedo in (1.0, 0.3):
+        rgb = shade(mesh, scene, WHITE, normal, wo, albedo, roughness, samples=2048, bounces=8)
+        # The fit of E is good to 0.005, noise comes on top; over many points both average out.
+        torch.testing.assert_close(
+            rgb.mean(0), ((1 - layer) * albedo + layer).mean().expand(3), rtol=0, atol=2e-3
+        )
+        assert (rgb - (1 - layer) * albedo - layer).abs().max() < 0.012
+
+
+def test_furnace_of_many_bounces_between_surfaces():
+    """Albedo 1 in white light shows white through any number of reflections; a bowl has many."""
+    n = 24
+    phi, theta = torch.meshgrid(
+        2 * math.pi * torch.arange(n + 1) / n, math.pi / 2 * torch.arange(n + 1) / n, indexing="ij"
+    )
+    point = -torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()], -1)
+    i = ((n + 1) * torch.arange(n)[:, None] + torch.arange(n)).reshape(-1)
+    quads = torch.stack([i, i + 1, i + n + 2, i, i + n + 2, i + n + 1], 1).reshape(-1, 3)
+    corner = point.reshape(-1, 3)[quads].reshape(-1, 3)  # flat faces: smooth ones lose light
+    normal = torch.linalg.cross(corner[1::3] - corner[::3], corner[2::3] - corner[::3])
+    normal = torch.nn.functional.normalize(normal, dim=1, eps=1e-12).repeat_interleave(3, 0)
+    normal = torch.where((normal * corner).sum(1, keepdim=True) > 0, -normal, normal)
+    faces = torch.arange(len(corner), dtype=torch.int32).reshape(-1, 3)
+    mesh = Mesh(corner, faces, normal, torch.ones_like(corner), torch.full((len(corner),), 0.5))
+    scene = VisibilityScene(corner, faces)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(64, 3)
+    start = {"position": torch.tensor([[0.0, 0.0, -0.95]]).expand(64, 3), "samples": 256}
+    direct = shade(mesh, scene, WHITE, up, up, **start)
+    assert direct.mean() < 0.95  # part of the sky is hidden by the bowl
+    full = shade(mesh, scene, WHITE, up, up, bounces=64, **start)
+    assert full.mean() == pytest.approx(1.0, abs=5e-3)
+    once = shade(mesh, scene, WHITE, up, up, bounces=1, **start)
+    assert direct.mean() < once.mean() < full.mean()
+
+
+def spotted_map(height=16, seed=3):
+    g = torch.Generator().manual_seed(seed)
+    radiance = torch.rand(height, 2 * height, 3, generator=g) ** 3
+    radiance[height // 4, height // 3] = 40.0  # a small sun, 70 times what is around it
+    return EnvMap(radiance, rotation=50.0, exposure=0.8)
+
+
+def quadrature(envmap, position, normal, wo, albedo, roughness, visible):
+    """The rendering equation summed over 200,000 directions with the torch BRDF."""
+    wi = fibonacci_sphere(200_000)
+    light = lookup(envmap, wi) * (4 * math.pi / len(wi))
+    out = []
+    for p, n, o in zip(position, normal, wo, strict=True):
+        f = brdf.evaluate(n, o, wi, albedo, roughness.expand(len(wi)))
+        cosine = (wi @ n).clamp_min(0) * visible(p, wi)
+        out.append((f * light * cosine[:, None]).sum(0))
+    return torch.stack(out)
+
+
+@pytest.mark.parametrize("strategy", ["mis", "map", "brdf"])
+@pytest.mark.parametrize("blocked", [False, True])
+def test_direct_light_equals_quadrature(strategy, blocked):
+    """Every strategy has the mean that the rendering equation gives, occluder or none."""
+    mesh, scene = octahedron()
+    normal, wo = sphere_points(6, seed=5)
+    position = normal
+    visible = lambda p, wi: torch.ones(len(wi))  # noqa: E731
+    if blocked:  # a square over the points takes a part of their sky
+        corner = torch.tensor([[-2.0, -2, 0], [2.0, -2, 0], [2.0, 2, 0], [-2.0, 2, 0]])
+        vertices = corner + torch.tensor([0.7, 0.0, 1.6])
+        faces = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
+        scene = VisibilityScene(vertices, faces)
+
+        def visible(p, wi):
+            return (~occluded_reference(vertices, faces, p.expand_as(wi), wi)).float()
+
+    albedo, roughness, envmap = torch.tensor([0.7, 0.4, 0.2]), torch.tensor(0.4), spotted_map()
+    wanted = quadrature(envmap, position, normal, wo, albedo, roughness, visible)
+    got = shade(
+        mesh, scene, envmap, normal, wo, albedo, roughness,
+        samples=65536, strategy=strategy, offset=0.0 if blocked else 0.01,
+    )  # fmt: skip
+    # One strategy alone is noisy where the other is good; none is off by more than its noise.
+    assert (got - wanted).norm() / wanted.norm() < {"mis": 0.003, "map": 0.01, "brdf": 0.01}[
+        strategy
+    ]
+
+
+def test_error_falls_with_samples():
+    mesh, scene = octahedron()
+    normal, wo = sphere_points(200, seed=7)
+    truth = shade(mesh, scene, spotted_map(), normal, wo, 0.5, samples=16384, seed=9)
+    error = [
+        (shade(mesh, scene, spotted_map(), normal, wo, 0.5, samples=n) - truth).norm().item()
+        for n in (16, 256)
+    ]
+    assert error[1] < error[0] / 4  # sixteen times the samples, 1 / sqrt(16) or better
+
+
+def test_same_bits_for_any_number_of_threads():
+    mesh, scene = octahedron(albedo=0.6)
+    normal, wo = sphere_points(300)
+    threads, found = torch.get_num_threads(), []
+    for n in (1, 2):
+        torch.set_num_threads(n)
+        found.append(shade(mesh, scene, spotted_map(), normal, wo, 0.5, samples=8, bounces=2))
+    torch.set_num_threads(threads)
+    assert torch.equal(*found)
+    other = shade(mesh, scene, spotted_map(), normal, wo, 0.5, samples=8, bounces=2, seed=1)
+    assert not torch.equal(found[0], other)
+
+
+def test_points_off_the_surface_do_not_shade_themselves():
+    """A start just inside the mesh sees the sky once the offset carries it out."""
+    mesh, scene = octahedron()
+    normal = mesh.normals[::3]
+    inside = mesh.vertices.reshape(8, 3, 3).mean(1) - 0.01 * normal
+    lit = shade(mesh, scene, WHITE, normal, normal, position=inside, offset=0.02)
+    dark = shade(mesh, scene, WHITE, normal, normal, position=inside, offset=0.001)
+    assert lit.mean() == pytest.approx(1.0, abs=0.02)
+    assert dark.mean() < 0.01
+
+
+def test_both_sides_reflect():
+    """Seen against its winding and its normals a mesh sends on the same light."""
+    normal, wo = sphere_points(50)
+    position = 0.9 * normal
+    results = [
+        shade(*octahedron(0.8, inside_out=flip), WHITE, -normal, -wo, position=position, bounces=2)
+        for flip in (False, True)
+    ]
+    torch.testing.assert_close(*results)
+
+
+def test_senseless_points_come_out_black():
+    mesh, scene = octahedron()
+    normal = torch.tensor([[0.0, 0, 0], [math.nan, 0, 1], [0, 0, 1.0], [0, 0, 1.0]])
+    position = torch.tensor([[2.0, 0, 0]] * 3 + [[math.inf, 0, 0]])
+    wo = torch.tensor([[0.0, 0, 1.0]] * 4)
+    rgb = shade(mesh, scene, WHITE, normal, wo, position=position, samples=4, bounces=1)
+    assert rgb[[0, 1, 3]].eq(0).all()
+    assert rgb[2].gt(0).all()
+    behind = shade(mesh, scene, WHITE, normal[2:3], -wo[2:3], position=position[2:3], samples=4)
+    assert behind.isfinite().all()
+    black = EnvMap(torch.zeros(2, 4, 3))
+    assert shade(mesh, scene, black, normal, wo, position=position, bounces=1).eq(0).all()
+
+
+def test_no_points_and_strided_points():
+    mesh, scene = octahedron()
+    none = torch.empty(0, 3)
+    assert shade(mesh, scene, WHITE, none, none).shape == (0, 3)
+    normal, wo = sphere_points(10)
+    wide = normal.repeat(1, 2)[:, :3]
+    assert not wide.is_contiguous()
+    assert torch.equal(shade(mesh, scene, WHITE, wide, wo), shade(mesh, scene, WHITE, normal, wo))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"normal": torch.rand(3, 3)}, r"normal must be \[N, 3\].*N=4"),
+        ({"wo": torch.rand(4, 3).double()}, "wo must be .*float32.*float64"),
+        ({"roughness": torch.rand(4, 1)}, r"roughness must be \[N\]"),
+        ({"offset": -1.0}, "offset must be finite and at least 0, got -1.0"),
+        ({"offset": math.nan}, "offset must be finite"),
+        ({"samples": 0}, "samples must be at least 1, got 0"),
+        ({"bounces": -1}, "bounces must be at least 0, got -1"),
+        ({"seed": -1}, "seed must be in"),
+        ({"strategy": "best"}, "strategy must be mis, map or brdf, got 'best'"),
+        ({"mesh": Mesh(torch.rand(3, 3), torch.zeros(1, 3).int())}, "bounces need a mesh with"),
+        ({"scene": VisibilityScene(torch.rand(5, 3), torch.zeros(1, 3).int())}, "mesh_normals"),
+    ],
+)
+def test_bad_arguments(change, message):
+    mesh, scene = octahedron()
+    arguments = {"scene": scene, "mesh": mesh, "tables": tables(WHITE), "offset": 0.01}
+    arguments |= {name: unit(4, 3) for name in ("position", "normal", "wo", "albedo")}
+    arguments |= {"roughness": torch.rand(4), "samples": 1, "bounces": 1}
+    relight(**arguments)
+    with pytest.raises(ValueError, match=message):
+        relight(**(arguments | change))
+
+
+def test_there_is_no_reference():
+    mesh, scene = octahedron()
+    with use_backend("reference"), pytest.raises(RuntimeError, match="native backend only"):
+        shade(mesh, scene, WHITE, *sphere_points(2))

@@ -1,0 +1,145 @@
+"""Equirectangular environment maps: lookup, and sampling in proportion to their light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from univoxel.color import luminance
+from univoxel.ops.integrator import EnvTables
+from univoxel.sphere import direction_to_latlong, rotate_z, texel_solid_angles
+
+
+@dataclass(frozen=True)
+class EnvMap:
+    """Light from far away, in the axes of docs/conventions.md.
+
+    Raises:
+        ValueError: the map is not [H, 2H, 3] floating, negative or not finite; exposure is.
+    """
+
+    radiance: Tensor  # [H, W, 3] float32 linear, >= 0; W = 2 H
+    rotation: float = 0.0  # degrees, counter-clockwise about +Z seen from above
+    exposure: float = 1.0  # factor on the radiance, >= 0
+
+    def __post_init__(self) -> None:
+        r = self.radiance
+        shape = list(r.shape)
+        if r.dim() != 3 or shape[0] < 1 or shape[1] != 2 * shape[0] or shape[2] != 3:
+            raise ValueError(
+                f"environment map: expected [H, W, 3], twice as wide as high (W = 2 H), got {shape}"
+            )
+        if r.dtype != torch.float32:
+            raise ValueError(f"environment map: expected float32 radiance, got {r.dtype}")
+        bad = (~r.isfinite() | (r < 0)).nonzero()
+        if len(bad):
+            row, column, channel = bad[0].tolist()
+            raise ValueError(
+                "environment map: expected finite radiance of at least 0, got "
+                f"{r[row, column, channel].item()} in row {row}, column {column} and "
+                f"{len(bad) - 1} more"
+            )
+        if not math.isfinite(self.rotation):
+            raise ValueError(f"environment map: rotation must be finite, got {self.rotation}")
+        if not 0 <= self.exposure < math.inf:
+            raise ValueError(
+                f"environment map: exposure must be finite and at least 0, got {self.exposure}"
+            )
+
+
+def lookup(envmap: EnvMap, direction: Tensor) -> Tensor:
+    """Radiance [..., 3] from directions [..., 3] (unit, world).
+
+    Bilinear between pixel centres, around the border in phi, clamped at the poles.
+    Differentiable in: radiance, direction.
+    """
+    height, width, _ = envmap.radiance.shape
+    turn = direction.new_tensor(-math.radians(envmap.rotation))
+    u, v = direction_to_latlong(rotate_z(direction, turn)).unbind(-1)
+    column, row = u * width - 0.5, (v * height - 0.5).clamp(0, height - 1)
+    left, top = column.floor(), row.floor()
+    fc, fr = (column - left)[..., None], (row - top)[..., None]
+    c0, r0 = left.long() % width, top.long()
+    c1, r1 = (c0 + 1) % width, (r0 + 1).clamp_max(height - 1)
+    texel = envmap.radiance
+    upper = (1 - fc) * texel[r0, c0] + fc * texel[r0, c1]
+    lower = (1 - fc) * texel[r1, c0] + fc * texel[r1, c1]
+    return envmap.exposure * ((1 - fr) * upper + fr * lower)
+
+
+def tables(envmap: EnvMap) -> EnvTables:
+    """Tables that draw texels in proportion to their light, for `sample`, `pdf` and `relight`.
+
+    A texel's share is its solid angle times the luminance of the interpolated map, averaged over
+    the texel: wherever a lookup finds light, the share is above 0. A black map is drawn uniformly.
+    """
+    height, width, _ = envmap.radiance.shape
+    light = luminance(envmap.radiance.double())
+    # The mean of the interpolant over a texel weighs it and its two neighbours 6 : 1 : 1 an axis.
+    light = 0.75 * light + 0.125 * (light.roll(1, 1) + light.roll(-1, 1))
+    padded = torch.cat([light[:1], light, light[-1:]])
+    light = 0.75 * light + 0.125 * (padded[:-2] + padded[2:])
+    solid = texel_solid_angles(height, width).double()
+    share = light * solid
+    if not share.any():
+        share = solid
+    # A row without light is never chosen; any table will do for it.
+    share_in_row = torch.where(share.any(1, keepdim=True), share, 1.0)
+    return EnvTables(
+        radiance=(envmap.exposure * envmap.radiance).contiguous(),
+        row_cdf=_cdf(share.sum(1)),
+        column_cdf=_cdf(share_in_row),
+        rotation=math.radians(envmap.rotation),
+    )
+
+
+def sample(tables: EnvTables, uniform: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw directions [N, 3] and give their density [N] per steradian.
+
+    Args:
+        uniform: [N, 2] in [0, 1): across and down the map.
+
+    Source: Pharr, Jakob and Humphreys 2023, section A.5.
+    """
+    row, down = _invert(tables.row_cdf.expand(len(uniform), -1), uniform[:, 1])
+    column, across = _invert(tables.column_cdf[row], uniform[:, 0])
+    height, width, _ = tables.radiance.shape
+    top, bottom = (torch.cos(math.pi * (row + i) / height) for i in (0, 1))
+    z = top + down * (bottom - top)
+    phi = math.pi - 2 * math.pi * (column + across) / width + tables.rotation
+    radius = (1 - z * z).clamp_min(0).sqrt()
+    direction = torch.stack([radius * phi.cos(), radius * phi.sin(), z], -1)
+    return direction, _texel_pdf(tables, row, column)
+
+
+def pdf(tables: EnvTables, direction: Tensor) -> Tensor:
+    """Density [N] per steradian with which `sample` draws unit directions [N, 3]."""
+    height, width, _ = tables.radiance.shape
+    turn = direction.new_tensor(-tables.rotation)
+    u, v = direction_to_latlong(rotate_z(direction, turn)).unbind(-1)
+    row = (v * height).long().clamp_max(height - 1)
+    column = (u * width).long().clamp_max(width - 1)
+    return _texel_pdf(tables, row, column)
+
+
+def _cdf(share: Tensor) -> Tensor:
+    """Normalised running sums along the last axis, from 0 to exactly 1: [..., n + 1] float32."""
+    total = torch.nn.functional.pad(share.cumsum(-1), (1, 0))
+    return (total / total[..., -1:]).float().contiguous()
+
+
+def _invert(cdf: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """The interval of each row of cdf [N, n + 1] that holds u [N], and the place within it."""
+    i = torch.searchsorted(cdf.contiguous(), u[:, None].contiguous(), right=True) - 1
+    i = i.clamp(0, cdf.shape[1] - 2)
+    low, high = cdf.gather(1, i)[:, 0], cdf.gather(1, i + 1)[:, 0]
+    return i[:, 0], ((u - low) / (high - low).clamp_min(1e-30)).clamp_max(1 - 2**-24)
+
+
+def _texel_pdf(tables: EnvTables, row: Tensor, column: Tensor) -> Tensor:
+    height, width, _ = tables.radiance.shape
+    share = tables.row_cdf.diff()[row] * tables.column_cdf.diff()[row, column]
+    return share / texel_solid_angles(height, width)[row, column]
