@@ -3,12 +3,20 @@
 from pathlib import Path
 
 from univoxel.data.base import DataError, Photos, Truth
-from univoxel.data.blender import load_blender, load_points, load_relit, load_truth, relight_maps
+from univoxel.data.blender import (
+    load_blender,
+    load_cameras,
+    load_points,
+    load_relit,
+    load_truth,
+    relight_maps,
+)
 
 __all__ = [
     "DataError",
     "Photos",
     "Truth",
+    "load_cameras",
     "load_photos",
     "load_points",
     "load_relit",

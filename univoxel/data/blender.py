@@ -189,6 +189,33 @@ def load_points(folder: str | Path) -> Tensor | None:
     return torch.from_numpy(points.astype(np.float32))
 
 
+def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
+    """Names and cameras of a file in the form of transforms_<split>.json, without pictures.
+
+    Args:
+        size: pixels, width and height of the pictures to come where the file gives no w and h.
+
+    Returns:
+        A name for each frame, from its file_path or its number, and the cameras.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(f"{path}: expected a file of cameras, got nothing there")
+    root = _read_json(path)
+    frames = root.get("frames")
+    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
+        raise DataError(f"{path}: expected a list of frames, got {_short(frames)}")
+    names = [_name(str(f.get("file_path", f"{i:04d}"))) for i, f in enumerate(frames)]
+    if len(set(names)) != len(names):
+        raise DataError(f"{path}: expected every frame under a name of its own")
+    values = {"w": size, "h": size} | root
+    width, height = (int(_number(values, key, str(path), 0, math.inf)) for key in ("w", "h"))
+    return names, _cameras(path, root, frames, width, height)
+
+
 def _read_transforms(folder: Path, split: str) -> tuple[dict, Path]:
     if not folder.is_dir():
         what = "a file" if folder.exists() else "nothing there"
@@ -200,6 +227,10 @@ def _read_transforms(folder: Path, split: str) -> tuple[dict, Path]:
             f"{folder}: expected {path.name}, got "
             + (", ".join(files[:5]) + (", ..." if len(files) > 5 else "") or "an empty folder")
         )
+    return _read_json(path), path
+
+
+def _read_json(path: Path) -> dict:
     try:
         root = json.loads(path.read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:
@@ -210,7 +241,7 @@ def _read_transforms(folder: Path, split: str) -> tuple[dict, Path]:
         raise DataError(f"{path}: expected text in UTF-8, got {error.reason}") from None
     if not isinstance(root, dict):
         raise DataError(f"{path}: expected a JSON object, got {_short(root)}")
-    return root, path
+    return root
 
 
 def _cameras(path: Path, root: dict, frames: list[dict], width: int, height: int) -> Cameras:
