@@ -17,7 +17,7 @@ def small_scene():
     field = DenseField(grid, 4, grid.nodes().norm(dim=-1) - 0.5)
     with torch.no_grad():
         field.features[3:6, 3:6, 3:6] = torch.randn(3, 3, 3, 4)
-    return Scene(SceneConfig(channels=4, hidden=8), field, inv_s=20.0)
+    return Scene(SceneConfig(channels=4, material_channels=2, hidden=8), field, inv_s=20.0)
 
 
 def test_a_checkpoint_gives_the_same_scene(tmp_path):

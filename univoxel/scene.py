@@ -25,7 +25,8 @@ FILE = "scene.safetensors"
 class SceneConfig:
     """Sizes of the model."""
 
-    channels: int = 12  # features per voxel
+    channels: int = 16  # features per voxel
+    material_channels: int = 8  # of them, that albedo and roughness are decoded from
     hidden: int = 64  # width of the material and radiance heads
     light: SGConfig = field(default_factory=SGConfig)
 
@@ -38,7 +39,7 @@ class Scene(nn.Module):
         self.cfg = cfg
         self.inv_s = inv_s  # sharpness of the NeuS density, 1 / world units
         self.field = field
-        self.material = MaterialHead(cfg.channels, cfg.hidden)
+        self.material = MaterialHead(cfg.material_channels, cfg.hidden)
         self.radiance = RadianceHead(cfg.channels, cfg.hidden)
         self.light = LocalSG(cfg.channels, cfg.light)
 

@@ -24,7 +24,9 @@ def scene():
     grid = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 48**3)
     field = DenseField(grid, 4, grid.nodes().norm(dim=-1) - RADIUS)
     torch.nn.init.normal_(field.features)
-    return Scene(SceneConfig(channels=4, hidden=8), field, inv_s=2 / grid.voxel_size).eval()
+    return Scene(
+        SceneConfig(channels=4, material_channels=2, hidden=8), field, inv_s=2 / grid.voxel_size
+    ).eval()
 
 
 def test_surface_is_the_sphere(scene):
@@ -82,7 +84,10 @@ def test_mesh_lies_on_the_surface_and_faces_outwards(scene):
 
 def test_a_field_without_surface_has_no_mesh(scene):
     grid = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 8**3)
-    empty = Scene(SceneConfig(channels=4, hidden=8), DenseField(grid, 4, torch.ones(grid.size)))
+    empty = Scene(
+        SceneConfig(channels=4, material_channels=2, hidden=8),
+        DenseField(grid, 4, torch.ones(grid.size)),
+    )
     with pytest.raises(ValueError, match="no surface: its sdf does not change sign"):
         extract_mesh(empty)
 

@@ -28,7 +28,11 @@ def config(data, out, **changes) -> TrainConfig:
         StageConfig(voxels=0.03, iterations=80, share=0.5, rays=256, physical_from=0.0),
     )
     cfg = TrainConfig(
-        data, out, stages, minutes=2.0, scene=SceneConfig(channels=4, hidden=16, light=light)
+        data,
+        out,
+        stages,
+        minutes=2.0,
+        scene=SceneConfig(channels=4, material_channels=2, hidden=16, light=light),
     )
     return dataclasses.replace(cfg, **changes)
 

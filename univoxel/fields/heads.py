@@ -17,19 +17,20 @@ def mlp(sizes: list[int]) -> nn.Sequential:
 
 
 class MaterialHead(nn.Module):
-    """Features [N, C] -> albedo [N, 3] and roughness [N]."""
+    """The first `channels` features of [N, C] -> albedo [N, 3] and roughness [N]."""
 
     min_roughness = 0.05  # below, a highlight is narrower than the light's own detail
 
     def __init__(self, channels: int, hidden: int):
         super().__init__()
+        self.channels = channels
         self.net = mlp([channels, hidden, hidden, 4])
         with torch.no_grad():  # start mid-grey and rather rough, whatever the features
             self.net[-1].weight.mul_(0.1)
             self.net[-1].bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.5]))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        out = torch.sigmoid(self.net(features))
+        out = torch.sigmoid(self.net(features[:, : self.channels]))
         low = self.min_roughness
         return out[:, :3], low + (1 - low) * out[:, 3]
 

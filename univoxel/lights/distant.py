@@ -1,0 +1,46 @@
+"""One distant light for the whole object: an environment map at evenly spread directions."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from univoxel import sphere
+
+NODES_AT_ONCE = 8192
+
+
+class DistantLight(nn.Module):
+    """Radiance at D directions of a Fibonacci sphere, 4 pi / D steradians each; kept as logarithm,
+    so that it stays positive and a bright sun is as far away as a dark wall."""
+
+    def __init__(self, count: int, radiance: float = 1.0):
+        super().__init__()
+        self.log_radiance = nn.Parameter(torch.full((count, 3), radiance).log())  # [D, 3]
+        self.register_buffer("direction", sphere.fibonacci_sphere(count))  # [D, 3]
+
+    @property
+    def radiance(self) -> Tensor:
+        """[D, 3] linear."""
+        return self.log_radiance.exp()
+
+    def incident(self, wi: Tensor) -> Tensor:
+        """Radiance [M, 3] from unit directions wi [M, 3], interpolated between the nodes.
+
+        Weights are normalised Gaussians about as wide as the nodes lie apart.
+        """
+        sharpness = len(self.direction) / 5.0
+        parts = []
+        for w in wi.split(NODES_AT_ONCE):
+            parts.append(torch.softmax(sharpness * (w @ self.direction.T), 1) @ self.radiance)
+        return torch.cat(parts)
+
+    def latlong(self, height: int) -> Tensor:
+        """An equirectangular map [height, 2 height, 3] in the axes of docs/conventions.md."""
+        v, u = torch.meshgrid(
+            (torch.arange(height) + 0.5) / height,
+            (torch.arange(2 * height) + 0.5) / (2 * height),
+            indexing="ij",
+        )
+        wi = sphere.latlong_direction(torch.stack([u, v], -1).reshape(-1, 2))
+        return self.incident(wi).reshape(height, 2 * height, 3)

@@ -1,0 +1,147 @@
+"""Light transport over the recovered surface: points, what sees them, what they see."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, normalize
+
+from univoxel.camera import project
+from univoxel.color import srgb_to_linear
+from univoxel.data import Photos
+from univoxel.ops import VisibilityScene
+from univoxel.records import Mesh
+
+MIN_COSINE = 0.15  # views at a more grazing angle blur over too much surface
+POINTS_AT_ONCE = 4096
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Surface points as the photographs see them; S sightings, sorted by point."""
+
+    position: Tensor  # [P, 3]
+    normal: Tensor  # [P, 3] unit
+    offsets: Tensor  # [P + 1] int64: point p has sightings offsets[p] .. offsets[p + 1]
+    wo: Tensor  # [S, 3] unit, to the camera
+    color: Tensor  # [S, 3] linear
+
+
+@dataclass(frozen=True)
+class Transport:
+    """What arrives at surface points from D directions: the sky's share, and what blocks it."""
+
+    direction: Tensor  # [D, 3] unit, evenly spread over the sphere
+    open: Tensor  # [P, D] uint8: share of the direction that is open to the sky, 255 for all
+    indirect: Tensor  # [P, D, 3] float16: radiance from the blocked share, times that share
+
+
+def surface_points(mesh: Mesh, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Points [P, 3] spread evenly over a mesh by area, and their interpolated unit normals."""
+    a, b, c = mesh.vertices[mesh.faces.long()].unbind(1)
+    area = torch.linalg.cross(b - a, c - a).norm(dim=1).double()
+    # Stratified: one point in each equal share of the area
+    share = (torch.arange(count) + torch.rand(count, generator=generator)) / count
+    face = torch.searchsorted(area.cumsum(0) / area.sum(), share.double()).clamp_max(len(area) - 1)
+    u, v = torch.rand(2, count, generator=generator).unbind(0)
+    u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)
+    weight = torch.stack([1 - u - v, u, v], 1)[..., None]
+    corner = mesh.faces[face].long()
+    position = (mesh.vertices[corner] * weight).sum(1)
+    return position, normalize((mesh.normals[corner] * weight).sum(1), dim=1)
+
+
+def observe(
+    position: Tensor, normal: Tensor, photos: Photos, scene: VisibilityScene, offset: float
+) -> Observations:
+    """Find in which photographs each point is seen, and its colour there.
+
+    A sighting counts where the photograph is opaque, the view not too grazing and nothing on the
+    mesh stands between.
+
+    Args:
+        offset: world units that rays start above the surface.
+    """
+    point, wo, color = [], [], []
+    coverage = photos.coverage()
+    for v in range(len(photos)):
+        eye = photos.cameras.camera_to_world[v, :, 3]
+        towards = normalize(eye - position, dim=1)
+        pixel, depth = project(photos.cameras, v, position)
+        size = torch.tensor([photos.cameras.width, photos.cameras.height])
+        inside = ((pixel > 1) & (pixel < size - 1)).all(1) & (depth > 0)
+        near = (inside & ((normal * towards).sum(1) > MIN_COSINE)).nonzero()[:, 0]
+        picture = photos.color[v].movedim(-1, 0)[None].float()
+        uv = (2 * pixel[near] / size - 1)[None, None]
+        # Interpolate as stored, then decode: what is seen between two pixels is their mean colour
+        seen = grid_sample(picture, uv, align_corners=False)[0, :, 0].T
+        seen = srgb_to_linear(seen / 255) if photos.color.dtype == torch.uint8 else seen
+        alpha = grid_sample(coverage[v][None, None], uv, align_corners=False)[0, 0, 0]
+        start = position[near] + offset * (normal[near] + towards[near])
+        reach = (eye - start).norm(dim=1).max().item() if len(near) else 0.0
+        clear = ~scene.occluded(start, towards[near], 0.0, reach)
+        kept = clear & (alpha > 0.99)
+        point.append(near[kept])
+        wo.append(towards[near][kept])
+        color.append(seen[kept])
+    index = torch.cat(point)
+    order = torch.argsort(index, stable=True)
+    counts = torch.bincount(index, minlength=len(position))
+    offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    return Observations(position, normal, offsets, torch.cat(wo)[order], torch.cat(color)[order])
+
+
+def mean_colors(seen: Observations) -> Tensor:
+    """Mean colour [P, 3] over the photographs that see a point: how bright it is for others.
+
+    Black where none does: such places are deep and dark.
+    """
+    counts = seen.offsets.diff()
+    point = torch.repeat_interleave(counts)
+    total = seen.color.new_zeros(len(counts), 3).index_add(0, point, seen.color)
+    return total / counts.clamp_min(1)[:, None]
+
+
+def trace(
+    seen: Observations,
+    scene: VisibilityScene,
+    mesh: Mesh,
+    vertex_color: Tensor,
+    direction: Tensor,
+    rays: int,
+    offset: float,
+    generator: torch.Generator,
+) -> Transport:
+    """Trace from every point into all directions above its horizon.
+
+    Occluded light needs no model: what a ray hits is as bright as the photographs show it.
+
+    Args:
+        vertex_color: [V, 3] linear radiance of the mesh's vertices.
+        direction: [D, 3] unit, evenly spread over the sphere.
+        rays: per direction, jittered within its share of the sphere.
+        offset: world units that rays start above the surface.
+    """
+    count, nodes = len(seen.position), len(direction)
+    spread = math.sqrt(4 * math.pi / nodes) / 2  # half the distance of neighbouring directions
+    first = mesh.faces[:, 0].long()
+    open_share = torch.zeros(count, nodes, dtype=torch.uint8)
+    indirect = torch.zeros(count, nodes, 3, dtype=torch.float16)
+    for begin in range(0, count, POINTS_AT_ONCE):
+        part = slice(begin, min(begin + POINTS_AT_ONCE, count))
+        above = seen.normal[part] @ direction.T > -spread
+        point, node = above.nonzero().unbind(1)
+        start = (seen.position[part] + offset * seen.normal[part])[point]
+        sky = torch.zeros(len(point))
+        radiance = torch.zeros(len(point), 3)
+        for _ in range(rays):
+            jitter = spread * torch.randn(len(point), 3, generator=generator) / math.sqrt(2)
+            hit = scene.closest_hit(start, normalize(direction[node] + jitter, dim=1)).face
+            sky += hit < 0
+            radiance += torch.where((hit >= 0)[:, None], vertex_color[first[hit.clamp_min(0)]], 0.0)
+        open_share[part][point, node] = (255 * sky / rays).round().to(torch.uint8)
+        indirect[part][point, node] = (radiance / rays).half()
+    return Transport(direction, open_share, indirect)
