@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.installed
-CXX_SOURCES := CMakeLists.txt $(wildcard cmake/*.cmake csrc/*)
+CXX_SOURCES := CMakeLists.txt $(wildcard cmake/*.cmake csrc/*.* csrc/*/*)
 export OMP_WAIT_POLICY ?= passive
 # Where torch.compile finds Python's headers when they had to be unpacked there.
 DEPS := $(CURDIR)/.deps/usr/include
@@ -41,13 +41,13 @@ test: dev
 lint: $(SETUP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/clang-format --dry-run -Werror csrc/*
+	$(BIN)/clang-format --dry-run -Werror csrc/*.* csrc/*/*
 	$(BIN)/pyright
 
 format: $(SETUP)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
-	$(BIN)/clang-format -i csrc/*
+	$(BIN)/clang-format -i csrc/*.* csrc/*/*
 
 .venv/.bench: $(SETUP)
 	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'

@@ -1,0 +1,72 @@
+#include <string>
+
+#include "adam.h"
+#include "bindings/common.h"
+#include "smooth.h"
+
+namespace univoxel {
+namespace {
+
+template <class T>
+void bind_adam(py::module_& m) {
+    m.def(
+        "adam_rows",
+        [](array<T>& param, array<T>& exp_avg, array<T>& exp_avg_sq, const array<int64_t>& rows,
+           const array<T>& grad, double lr, double beta1, double beta2, double eps, double step,
+           int threads) {
+            const int64_t n = param.shape(0), k = rows.size();
+            const int64_t* r = rows.data();
+            bool ok = true;
+            for (int64_t i = 0; i < k; ++i) ok &= r[i] >= 0 && r[i] < n;
+            require(ok, "adam_rows_: rows must lie in [0, R=" + std::to_string(n) + ")");
+            const AdamRows<T> in{param.mutable_data(),
+                                 exp_avg.mutable_data(),
+                                 exp_avg_sq.mutable_data(),
+                                 r,
+                                 grad.data(),
+                                 k,
+                                 param.shape(1),
+                                 lr,
+                                 beta1,
+                                 beta2,
+                                 eps,
+                                 step};
+            py::gil_scoped_release nogil;
+            adam_rows(in, threads);
+        },
+        py::arg("param").noconvert(), py::arg("exp_avg").noconvert(),
+        py::arg("exp_avg_sq").noconvert(), py::arg("rows").noconvert(), py::arg("grad").noconvert(),
+        py::arg("lr"), py::arg("beta1"), py::arg("beta2"), py::arg("eps"), py::arg("step"),
+        py::arg("threads"));
+}
+
+template <class T>
+void bind_smooth(py::module_& m) {
+    m.def(
+        "smooth_rows",
+        [](array<T>& grid, const array<int64_t>& rows, double amount, int order, int threads) {
+            const int64_t size[3] = {grid.shape(0), grid.shape(1), grid.shape(2)};
+            const int64_t nodes = size[0] * size[1] * size[2];
+            const int64_t* r = rows.data();
+            const int64_t n = rows.size();
+            bool ok = true;
+            for (int64_t k = 0; k < n; ++k) ok &= r[k] >= 0 && r[k] < nodes;
+            require(ok, "smooth_rows_: rows must lie in [0, " + std::to_string(nodes) + ")");
+            T* g = grid.mutable_data();
+            py::gil_scoped_release nogil;
+            smooth_rows(g, size, grid.shape(3), r, n, T(amount), order, threads);
+        },
+        py::arg("grid").noconvert(), py::arg("rows").noconvert(), py::arg("amount"),
+        py::arg("order"), py::arg("threads"));
+}
+
+}  // namespace
+
+void bind_rows_ops(py::module_& m) {
+    bind_adam<float>(m);
+    bind_adam<double>(m);
+    bind_smooth<float>(m);
+    bind_smooth<double>(m);
+}
+
+}  // namespace univoxel
