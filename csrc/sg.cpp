@@ -5,9 +5,8 @@
 #include <cstring>
 #include <vector>
 
-#include "brdf.h"
-#include "common.h"
 #include "parallel.h"
+#include "shading.h"
 
 namespace univoxel {
 namespace {
@@ -67,54 +66,19 @@ inline double simd_exp(double x) {
     return p * scale;
 }
 
-/// The directions, each coordinate in a row of its own, and scratch rows of the same length.
+/// The directions, which are the same for every point in its own frame.
 template <class T>
-struct Directions {
-    int64_t count;
-    std::vector<T> buffer;
-    T *x, *y, *z, *cosine, *held, *layer, *grad_layer;
-
-    explicit Directions(const ShadeSG<T>& in) : count(in.n_directions), buffer(7 * count) {
-        T* rows[7];
-        for (int i = 0; i < 7; ++i) rows[i] = buffer.data() + i * count;
-        x = rows[0], y = rows[1], z = rows[2];
-        cosine = rows[3];  // max(n.w, 0)
-        held = rows[4];   // n.w held above kCosMin; std::max of z[d] in a loop would keep it scalar
-        layer = rows[5];  // D F V max(n.w, 0)
-        grad_layer = rows[6];  // its gradient
-        for (int64_t d = 0; d < count; ++d) {
-            x[d] = in.directions[3 * d];
-            y[d] = in.directions[3 * d + 1];
-            z[d] = in.directions[3 * d + 2];
-            cosine[d] = std::max(z[d], T(0));
-            held[d] = std::max(z[d], T(kCosMin));
-        }
+Directions<T> canonical(const ShadeSG<T>& in) {
+    Directions<T> dir(in.n_directions);
+    for (int64_t d = 0; d < dir.count; ++d) {
+        dir.x[d] = in.directions[3 * d];
+        dir.y[d] = in.directions[3 * d + 1];
+        dir.z[d] = in.directions[3 * d + 2];
+        dir.cosine[d] = std::max(dir.z[d], T(0));
+        dir.held[d] = std::max(dir.z[d], T(kCosMin));
     }
-};
-
-/// The frame of Duff et al. 2017 around a normal. Its rows take a world vector to local
-/// coordinates.
-template <class T>
-struct Frame {
-    vec3<T> tangent, bitangent, normal;
-    T sign, a;
-
-    explicit Frame(const vec3<T>& n) : normal(n), sign(std::copysign(T(1), n.z)) {
-        a = -1 / (sign + n.z);
-        const T b = n.x * n.y * a;
-        tangent = {1 + sign * n.x * n.x * a, sign * b, -sign * n.x};
-        bitangent = {b, sign + n.y * n.y * a, -n.y};
-    }
-
-    /// Gradient to the normal from those to the three rows.
-    vec3<T> backward(const vec3<T>& gt, const vec3<T>& gb, const vec3<T>& gn) const {
-        const T x = normal.x, y = normal.y;
-        const T grad_b = sign * gt.y + gb.x;
-        const T grad_a = gt.x * sign * x * x + gb.y * y * y + grad_b * x * y;
-        return gn + vec3<T>(2 * gt.x * sign * x * a - sign * gt.z + grad_b * y * a,
-                            2 * gb.y * y * a - gb.z + grad_b * x * a, grad_a * a * a);
-    }
-};
+    return dir;
+}
 
 /// One point in the frame of the directions: the frame of its normal, turned by -rotation. There
 /// the directions are constants and the normal is +Z.
@@ -122,22 +86,13 @@ template <class T>
 struct Point {
     Frame<T> frame;
     T cos_r, sin_r;
-    vec3<T> wo;  // local
-    T v, a2;     // n.wo held above kCosMin, alpha squared
-    SpecularAlbedo<T> layer;
-    vec3<T> diffuse;  // (1 - E) albedo / pi
+    LocalBrdf<T> brdf;
 
     Point(const ShadeSG<T>& in, int64_t i)
         : frame(load3(in.normal, i)),
           cos_r(std::cos(in.rotation[i])),
           sin_r(std::sin(in.rotation[i])),
-          wo(local(load3(in.wo, i))) {
-        v = std::max(wo.z, T(kCosMin));
-        const T alpha = ggx_alpha(in.roughness[i]);
-        a2 = alpha * alpha;
-        layer = specular_albedo(wo.z, in.roughness[i], in.f0);
-        diffuse = load3(in.albedo, i) * ((1 - layer.value) / T(kPi));
-    }
+          brdf(local(load3(in.wo, i)), load3(in.albedo, i), in.roughness[i], in.f0) {}
 
     vec3<T> local(const vec3<T>& w) const {
         const T t = glm::dot(frame.tangent, w), b = glm::dot(frame.bitangent, w);
@@ -153,77 +108,6 @@ struct Point {
         return u.x * frame.tangent + u.y * frame.bitangent + u.z * frame.normal;
     }
 };
-
-// In the two loops below q = |wi + wo|^2, and D's denominator is taken times q: `raw`, and `den`
-// with the floor of ggx_denominator.
-
-/// Fill `layer`: D F V max(n.w, 0) for every direction. D V is one quotient: divisions are dear.
-template <class T>
-void specular_layer(const Point<T>& p, T f0, Directions<T>& dir) {
-    const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *held = dir.held;
-    T* out = dir.layer;
-    const T ox = p.wo.x, oy = p.wo.y, oz = p.wo.z;
-    const T a2 = p.a2, v = p.v, root_v = smith_root(v, a2), scale = a2 / T(2 * kPi);
-    const int64_t count = dir.count;
-#pragma omp simd
-    for (int64_t d = 0; d < count; ++d) {
-        const T hx = x[d] + ox, hy = y[d] + oy, hz = z[d] + oz;
-        const T xy = hx * hx + hy * hy, q = xy + hz * hz + T(kHalfEpsilon);
-        const T raw = xy + a2 * hz * hz, den = std::max(raw, T(0.5) * a2 * q);
-        const T l = held[d], smith = l * root_v + v * smith_root(l, a2);
-        const T top = scale * q * q * cosine[d];
-        out[d] = top * schlick_f(T(0.5) * std::sqrt(q), f0) / (den * den * smith);
-    }
-}
-
-/// Take the gradient of the specular layer to wo (local) and alpha squared.
-template <class T>
-void specular_layer_backward(const Point<T>& p, T f0, const Directions<T>& dir, vec3<T>& grad_wo,
-                             T& grad_a2) {
-    const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *held = dir.held,
-            *grad = dir.grad_layer;
-    const T ox = p.wo.x, oy = p.wo.y, oz = p.wo.z;
-    const T a2 = p.a2, v = p.v, root_v = smith_root(v, a2), scale = a2 / T(2 * kPi);
-    const T inv_a2 = 1 / a2;
-    const int64_t count = dir.count;
-    T gx = 0, gy = 0, gz = 0, gv = 0, g_root = 0, ga = 0;
-#pragma omp simd reduction(+ : gx, gy, gz, gv, g_root, ga)
-    for (int64_t d = 0; d < count; ++d) {
-        const T hx = x[d] + ox, hy = y[d] + oy, hz = z[d] + oz;
-        const T xy = hx * hx + hy * hy, q = xy + hz * hz + T(kHalfEpsilon);
-        const T raw = xy + a2 * hz * hz, den = std::max(raw, T(0.5) * a2 * q);
-        const T l = held[d];
-        const T root_l2 = l * l * (1 - a2) + a2, inv_root_l = 1 / std::sqrt(root_l2);
-        const T root_l = root_l2 * inv_root_l, smith = l * root_v + v * root_l;
-        const T inv_length = 1 / std::sqrt(q), inv_q = inv_length * inv_length;
-        const T cosine_h = T(0.5) * q * inv_length;
-        const T quotient = 1 / (den * den * smith);
-        const T inv_den = quotient * den * smith;
-        const T inv_smith = quotient * den * den;
-        const T dv = scale * q * q * quotient * cosine[d] * grad[d];
-        const T r = dv * schlick_f(cosine_h, f0);  // grad * value
-        // D = a^2 q^2 / (pi denominator^2); its floor passes gradient to alpha alone.
-        const bool live = raw > T(0.5) * a2 * q;
-        const T g_den = -2 * r * inv_den;
-        const T g_live = live ? g_den : T(0), g_q = live ? 2 * r * inv_q : T(0);
-        ga += r * inv_a2 + g_den * (live ? hz * hz : T(0.5) * q);
-        // F, through wo.h = sqrt(q) / 2.
-        const T m = 1 - cosine_h, m2 = m * m;
-        const T g_half = dv * T(-2.5) * (1 - f0) * m2 * m2 * inv_length;
-        const T g_xy = 2 * (g_live + g_q) + g_half;
-        gx += hx * g_xy;
-        gy += hy * g_xy;
-        gz += hz * (2 * (g_live * a2 + g_q) + g_half);
-        // V = 1 / (2 smith)
-        const T g_smith = -r * inv_smith;
-        gv += g_smith * root_l;
-        g_root += g_smith * l;
-        ga += g_smith * v * (1 - l * l) * T(0.5) * inv_root_l;
-    }
-    gv += g_root * v * (1 - a2) / root_v;
-    grad_a2 = ga + g_root * (1 - v * v) / (2 * root_v);
-    grad_wo = {gx, gy, gz + (oz >= T(kCosMin) ? gv : T(0))};
-}
 
 /// Integrals of one lobe of unit amplitude over the directions.
 template <class T>
@@ -279,14 +163,14 @@ void shade_sg_forward(const ShadeSG<T>& in, T* rgb, int threads) {
     const int64_t K = in.n_lobes;
     const T weight = T(2 * kPi) / T(in.n_directions);
     parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Directions<T> dir(in);
+        Directions<T> dir = canonical(in);
         for (int64_t i = begin; i < end; ++i) {
             const Point<T> p(in, i);
-            specular_layer(p, in.f0, dir);
+            specular_layer(p.brdf, in.f0, dir);
             vec3<T> sum(0);
             for (int64_t k = i * K; k < (i + 1) * K; ++k) {
                 const auto s = lobe_forward(dir, p.local(load3(in.axis, k)), in.sharpness[k]);
-                sum += load3(in.amplitude, k) * (p.diffuse * s.diffuse + s.layer);
+                sum += load3(in.amplitude, k) * (p.brdf.diffuse * s.diffuse + s.layer);
             }
             store3(rgb, i, weight * sum);
         }
@@ -302,11 +186,11 @@ void shade_sg_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGra
     const int64_t K = in.n_lobes;
     const T weight = T(2 * kPi) / T(in.n_directions);
     parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Directions<T> dir(in);
+        Directions<T> dir = canonical(in);
         for (int64_t i = begin; i < end; ++i) {
             const Point<T> p(in, i);
             const vec3<T> g = weight * load3(grad_rgb, i);
-            specular_layer(p, in.f0, dir);
+            specular_layer(p.brdf, in.f0, dir);
             std::fill(dir.grad_layer, dir.grad_layer + dir.count, T(0));
             vec3<T> grad_diffuse(0), grad_t(0), grad_b(0), grad_n(0);
             // Rows of the frame meet each local vector's gradient by an outer product.
@@ -321,25 +205,21 @@ void shade_sg_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGra
                 const vec3<T> world = load3(in.axis, k), axis = p.local(world);
                 const T sharpness = in.sharpness[k];
                 const vec3<T> amplitude = load3(in.amplitude, k), ga = g * amplitude;
-                const T to_cosine = glm::dot(ga, p.diffuse), to_layer = ga.x + ga.y + ga.z;
+                const T to_cosine = glm::dot(ga, p.brdf.diffuse), to_layer = ga.x + ga.y + ga.z;
                 vec3<T> moment;
                 const auto s = lobe_backward(dir, axis, sharpness, to_cosine, to_layer, moment);
-                store3(grad.amplitude, k, g * (p.diffuse * s.diffuse + s.layer));
+                store3(grad.amplitude, k, g * (p.brdf.diffuse * s.diffuse + s.layer));
                 grad_diffuse += ga * s.diffuse;
                 grad.sharpness[k] =
                     glm::dot(moment, axis) - (to_cosine * s.diffuse + to_layer * s.layer);
                 store3(grad.axis, k, from_local(sharpness * moment, world));
             }
-            vec3<T> grad_wo;
-            T grad_a2;
-            specular_layer_backward(p, in.f0, dir, grad_wo, grad_a2);
-            // diffuse = (1 - E) albedo / pi
-            store3(grad.albedo, i, grad_diffuse * ((1 - p.layer.value) / T(kPi)));
-            const T grad_e = -glm::dot(grad_diffuse, load3(in.albedo, i)) / T(kPi);
-            grad_wo.z += grad_e * p.layer.d_cosine;
-            const T r = in.roughness[i];
-            const T d_a2 = r * r >= T(kAlphaMin) ? 4 * r * r * r : T(0);
-            grad.roughness[i] = grad_e * p.layer.d_roughness + grad_a2 * d_a2;
+            auto [grad_a2, grad_wo] = specular_layer_backward<true>(p.brdf, in.f0, dir);
+            const auto grad_brdf =
+                p.brdf.backward(grad_diffuse, grad_a2, load3(in.albedo, i), in.roughness[i]);
+            store3(grad.albedo, i, grad_brdf.albedo);
+            grad.roughness[i] = grad_brdf.roughness;
+            grad_wo.z += grad_brdf.e * p.brdf.layer.d_cosine;
             store3(grad.wo, i, from_local(grad_wo, load3(in.wo, i)));
             store3(grad.normal, i, p.frame.backward(grad_t, grad_b, grad_n));
         }

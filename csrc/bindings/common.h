@@ -28,6 +28,7 @@ void bind_dense_grid_ops(py::module_& m);
 void bind_march_ops(py::module_& m);
 void bind_rows_ops(py::module_& m);
 void bind_sg_ops(py::module_& m);
+void bind_shade_ops(py::module_& m);
 void bind_visibility_ops(py::module_& m);
 
 }  // namespace univoxel

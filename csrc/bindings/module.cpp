@@ -7,5 +7,6 @@ PYBIND11_MODULE(_core, m) {
     univoxel::bind_march_ops(m);
     univoxel::bind_rows_ops(m);
     univoxel::bind_sg_ops(m);
+    univoxel::bind_shade_ops(m);
     univoxel::bind_visibility_ops(m);
 }

@@ -7,6 +7,12 @@ from univoxel.ops.integrator import EnvTables, relight
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.native import use_backend
 from univoxel.ops.sg import shade_sg, shade_sg_reference
+from univoxel.ops.shade import (
+    shade_map,
+    shade_map_reference,
+    shade_radiance,
+    shade_radiance_reference,
+)
 from univoxel.ops.smooth import smooth_rows_, smooth_rows_reference_
 from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference, occluded_reference
 
@@ -26,6 +32,10 @@ __all__ = [
     "relight",
     "sample_dense",
     "sample_dense_reference",
+    "shade_map",
+    "shade_map_reference",
+    "shade_radiance",
+    "shade_radiance_reference",
     "shade_sg",
     "shade_sg_reference",
     "smooth_rows_",

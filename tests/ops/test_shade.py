@@ -1,0 +1,298 @@
+"""Shading from given directions: native against reference, closed forms, extremes, bad arguments."""
+
+import math
+
+import pytest
+import torch
+from check_op import check_op
+
+from univoxel import sphere
+from univoxel.ops import (
+    shade_map,
+    shade_map_reference,
+    shade_radiance,
+    shade_radiance_reference,
+    use_backend,
+)
+from univoxel.ops.shade import _shade_map, _shade_radiance
+
+# Above check_op's common bound: sums of a few hundred directions, and D's denominator at low
+# roughness.
+RTOL = {torch.float32: 1e-4, torch.float64: 1e-12}
+
+
+def unit(g, *shape):
+    x = torch.randn(*shape, 3, generator=g, dtype=torch.float64)
+    return torch.nn.functional.normalize(x, dim=-1)
+
+
+def uniform(g, low, high, *shape):
+    return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
+
+
+def surface(g, n, count, roughness=(0.2, 1.0)):
+    """normal, wo, albedo, roughness, directions, solid_angle."""
+    normal = unit(g, n)
+    wo = torch.nn.functional.normalize(normal + 0.8 * unit(g, n), dim=-1)
+    albedo = uniform(g, 0, 1, n, 3).requires_grad_()
+    roughness = uniform(g, *roughness, n).requires_grad_()
+    directions = sphere.fibonacci_sphere(count, torch.float64)
+    return normal, wo, albedo, roughness, directions, 4 * math.pi / count
+
+
+def lit(n, count, seed=0, roughness=(0.2, 1.0), f0=0.04):
+    g = torch.Generator().manual_seed(seed)
+    radiance = uniform(g, 0, 2, n, count, 3).requires_grad_()
+    return (radiance, *surface(g, n, count, roughness), f0)
+
+
+def mapped(n, count, points=5, seed=0, roughness=(0.2, 1.0), f0=0.04):
+    """Halves in float64: exact in every dtype. Visibility in 255ths."""
+    g = torch.Generator().manual_seed(seed)
+    map = uniform(g, 0, 2, count, 3).requires_grad_()
+    visibility = torch.randint(0, 256, (points, count), generator=g, dtype=torch.uint8)
+    indirect = uniform(g, 0, 1, points, count, 3).half().double()
+    index = torch.randint(0, max(points, 1), (n,), generator=g)
+    return (map, visibility, indirect, index, *surface(g, n, count, roughness), f0)
+
+
+def detached(case, dtype=torch.float32):
+    return [
+        a.detach().to(dtype) if isinstance(a, torch.Tensor) and a.is_floating_point() else a
+        for a in case
+    ]
+
+
+def in_halves(op):
+    return lambda map, visibility, indirect, *rest: op(map, visibility, indirect.half(), *rest)
+
+
+def test_radiance_native_equals_reference():
+    cases = [
+        lit(3, 37),
+        lit(1, 1, f0=0.5),
+        lit(0, 16),
+        lit(4, 64, roughness=(0.05, 0.2), f0=0.0),
+    ]
+    check_op(shade_radiance, shade_radiance_reference, cases, RTOL, _shade_radiance)
+
+
+def test_map_native_equals_reference():
+    cases = [
+        mapped(6, 37),
+        mapped(1, 1, points=1, f0=0.5),
+        mapped(0, 16, points=0),
+        mapped(4, 64, roughness=(0.05, 0.2), f0=0.0),
+    ]
+    check_op(shade_map, shade_map_reference, cases, RTOL, _shade_map)
+    check_op(in_halves(shade_map), in_halves(shade_map_reference), cases[:1], RTOL)
+    map, visibility, *rest = mapped(6, 37)
+    check_op(shade_map, shade_map_reference, [(map, visibility.double() / 255, *rest)], RTOL)
+
+
+def test_eye_behind_the_surface():
+    case = list(lit(3, 20))
+    case[2] = -case[2]
+    check_op(shade_radiance, shade_radiance_reference, [tuple(case)], RTOL)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_many_samples_cross_the_chunks(threads):
+    """300 samples are chunks of 64, 5000 in one map are chunks of more; the sums must not care."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        for op, reference, case in (
+            (shade_radiance, shade_radiance_reference, lit(300, 16)),
+            (shade_map, shade_map_reference, mapped(5000, 16, points=40)),
+        ):
+            rgb, wanted = op(*case), reference(*case)
+            torch.testing.assert_close(rgb, wanted)
+            leaves = [a for a in case if isinstance(a, torch.Tensor) and a.requires_grad]
+            got = torch.autograd.grad(rgb.square().sum(), leaves)
+            torch.testing.assert_close(got, torch.autograd.grad(wanted.square().sum(), leaves))
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_map_gradient_has_the_same_bits_on_any_number_of_threads():
+    case = detached(mapped(5000, 16, points=40))
+    before, grads = torch.get_num_threads(), []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        map = case[0].clone().requires_grad_()
+        grads += torch.autograd.grad(shade_map(map, *case[1:]).square().sum(), map)
+    torch.set_num_threads(before)
+    assert torch.equal(grads[0], grads[1])
+    assert torch.equal(grads[0], grads[2])
+
+
+def test_every_half_is_read_right():
+    """One point for each of the 65536 halves; straight up, it is all that arrives."""
+    halves = torch.arange(65536).to(torch.int32).to(torch.uint16).view(torch.float16)
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    n = len(halves)
+    indirect = halves[:, None, None].expand(n, 1, 3).contiguous()
+    args = (torch.zeros(1, 3), torch.zeros(n, 1, dtype=torch.uint8), indirect, torch.arange(n))
+    args = (*args, up.expand(n, 3), up.expand(n, 3), torch.ones(n, 3), torch.ones(n), up, 1.0)
+    got = shade_map(*args)
+    wanted = shade_map(*args[:2], indirect.float(), *args[3:])
+    torch.testing.assert_close(got, wanted, rtol=0, atol=0, equal_nan=True)
+    assert int(got[:, 0].isnan().sum()) == 2 * 1023
+    assert int(got[:, 0].isinf().sum()) == 2
+
+
+def test_fixed_light_gets_no_gradient():
+    """Materials alone: the same gradients, and nothing computed for the light."""
+    for op, case in ((shade_radiance, lit(3, 16)), (shade_map, mapped(3, 16))):
+        materials = case[-5], case[-4]
+        wanted = torch.autograd.grad(op(*case).sum(), materials)
+        fixed = (case[0].detach(), *case[1:])
+        got = torch.autograd.grad(op(*fixed).sum(), materials)
+        assert all(torch.equal(a, b) for a, b in zip(got, wanted, strict=True))
+
+
+def test_whole_graph_compiles():
+    for op, reference, case in (
+        (shade_radiance, shade_radiance_reference, lit(4, 16)),
+        (shade_map, shade_map_reference, mapped(4, 16)),
+    ):
+        light, *rest = case
+
+        @torch.compile(fullgraph=True)
+        def loss(light, op=op, rest=rest):
+            return op(light, *rest).square().sum()
+
+        got = torch.autograd.grad(loss(light), light)
+        wanted = torch.autograd.grad(reference(light, *rest).square().sum(), light)
+        torch.testing.assert_close(got, wanted)
+
+
+def test_strided_inputs():
+    radiance, *rest = lit(3, 16)
+    strided = radiance.transpose(0, 1).contiguous().transpose(0, 1)
+    assert not strided.is_contiguous()
+    torch.testing.assert_close(shade_radiance(strided, *rest), shade_radiance(radiance, *rest))
+    map, visibility, indirect, *rest = mapped(3, 16)
+    torch.testing.assert_close(
+        shade_map(map, visibility.T.contiguous().T, indirect.mT.contiguous().mT, *rest),
+        shade_map(map, visibility, indirect, *rest),
+    )
+
+
+def test_white_furnace():
+    """White under the same light from everywhere shows its radiance."""
+    case = detached(lit(5, 8192, roughness=(0.5, 1.0)), torch.float64)
+    case[0] = torch.full_like(case[0], 0.7)
+    case[2] = case[1]  # seen from above, where 4096 directions resolve the highlight
+    case[3] = torch.ones_like(case[3])
+    # 0.006: the fit of the layer's albedo is good to 0.005
+    wanted = torch.full((5, 3), 0.7).double()
+    torch.testing.assert_close(shade_radiance(*case), wanted, rtol=0.006, atol=0)
+
+
+def test_the_two_forms_agree():
+    map, visibility, indirect, index, *rest = mapped(6, 40)
+    radiance = visibility[index][..., None] / 255 * map + indirect[index]
+    torch.testing.assert_close(
+        shade_map(map, visibility, indirect, index, *rest), shade_radiance(radiance, *rest)
+    )
+
+
+def test_light_below_the_horizon_counts_for_nothing():
+    radiance, normal, *rest = lit(3, 64)
+    below = (normal @ rest[3].T <= 0)[..., None]
+    rgb = shade_radiance(radiance, normal, *rest)
+    (grad,) = torch.autograd.grad(rgb.sum(), radiance)
+    assert int(below.sum()) > 50
+    assert bool((grad == 0).eq(below).all())
+    assert torch.equal(shade_radiance(radiance.masked_fill(below, 9.0), normal, *rest), rgb)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_extremes_are_finite(dtype):
+    radiance = detached(lit(6, 32, roughness=(0.0, 0.04)), dtype)
+    map = detached(mapped(6, 32, roughness=(0.0, 0.04)), dtype)
+    radiance[0][0], radiance[0][1], map[0][::2], map[0][1::2] = 0, 1e6, 0, 1e6
+    map[2][:] = 1e6
+    for op, reference, case in (
+        (shade_radiance, shade_radiance_reference, radiance),
+        (shade_map, shade_map_reference, map),
+    ):
+        normal, wo, albedo, roughness, directions = case[-7:-2]
+        roughness[0], roughness[1] = 0, 1
+        normal[2], wo[3] = 0, -normal[3]  # no normal; eye opposite the normal
+        wo[4] = -directions[0]  # light opposite the eye, behind the surface
+        normal[4], albedo[5] = directions[0], 0
+        leaves = [t.requires_grad_() for t in (case[0], albedo, roughness)]
+        for function in (op, reference):
+            rgb = function(*case)
+            for t in (rgb, *torch.autograd.grad(rgb.sum(), leaves)):
+                assert bool(t.isfinite().all())
+            assert bool((rgb[2] == 0).all())
+
+
+SURFACE_ERRORS = [
+    (0, torch.rand(4, 3), ValueError, r"normal must be \[N, 3\]"),
+    (1, torch.rand(3, 2), ValueError, r"wo must be \[N, 3\]"),
+    (2, [0.5], TypeError, "albedo must be a tensor, got list"),
+    (3, torch.rand(3).double(), ValueError, "roughness must be .* float32"),
+    (4, torch.rand(7, 3), ValueError, r"directions must be \[D, 3\] .* D=8"),
+    (5, 0.0, ValueError, "solid_angle must be above 0 and finite, got 0.0"),
+    (6, 1.5, ValueError, r"f0 must be in \[0, 1\], got 1.5"),
+    (0, torch.rand(3, 3, requires_grad=True), NotImplementedError, "no gradient to normal"),
+    (1, torch.rand(3, 3, requires_grad=True), NotImplementedError, "no gradient to wo"),
+]
+RADIANCE_ERRORS = [
+    (0, torch.rand(3, 8), ValueError, r"radiance must be \[N, D, 3\]"),
+    *[(i + 1, *error) for i, *error in SURFACE_ERRORS],
+]
+MAP_ERRORS = [
+    (0, torch.rand(8), ValueError, r"map must be \[D, 3\]"),
+    (1, torch.ones(5, 7, dtype=torch.uint8), ValueError, r"visibility must be \[P, D\] uint8"),
+    (1, torch.ones(5, 8, dtype=torch.int64), ValueError, r"visibility must be \[P, D\] float32"),
+    (1, None, TypeError, "visibility must be a tensor"),
+    (1, torch.rand(5, 8, requires_grad=True), NotImplementedError, "no gradient to visibility"),
+    (2, torch.rand(4, 8, 3), ValueError, r"indirect must be \[P, D, 3\] float32"),
+    (2, torch.rand(5, 8).half(), ValueError, r"indirect must be \[P, D, 3\] float16"),
+    (2, torch.rand(5, 8, 3, requires_grad=True), NotImplementedError, "no gradient to indirect"),
+    (3, torch.zeros(3), ValueError, r"index must be \[N\] int64"),
+    (3, torch.tensor([0, 1, 5]), ValueError, r"index must lie in \[0, P=5\)"),
+    (3, torch.tensor([0, 1, -1]), ValueError, r"index must lie in \[0, P=5\)"),
+    (4, torch.rand(4, 3), ValueError, r"normal must be \[N, 3\]"),
+    *[(i + 4, *error) for i, *error in SURFACE_ERRORS],
+]
+
+
+def refuse(op, case, index, value, error, message):
+    op(*case)
+    case[index] = value
+    with pytest.raises(error, match=message):
+        op(*case)
+
+
+@pytest.mark.parametrize(("index", "value", "error", "message"), RADIANCE_ERRORS)
+def test_bad_arguments_of_radiance(index, value, error, message):
+    refuse(shade_radiance, detached(lit(3, 8)), index, value, error, message)
+
+
+@pytest.mark.parametrize(("index", "value", "error", "message"), MAP_ERRORS)
+def test_bad_arguments_of_map(index, value, error, message):
+    refuse(shade_map, detached(mapped(3, 8)), index, value, error, message)
+
+
+def test_no_directions():
+    radiance, *rest = detached(lit(3, 8))
+    rest[4] = rest[4][:0]
+    with pytest.raises(ValueError, match="at least one direction"):
+        shade_radiance(radiance[:, :0], *rest)
+    map, visibility, indirect, index, *rest = detached(mapped(3, 8))
+    rest[4] = rest[4][:0]
+    with pytest.raises(ValueError, match="at least one direction"):
+        shade_map(map[:0], visibility[:, :0], indirect[:, :0], index, *rest)
+
+
+def test_the_reference_can_be_forced():
+    case = detached(mapped(3, 8))
+    with use_backend("reference"):
+        assert torch.equal(shade_map(*case), shade_map_reference(*case))

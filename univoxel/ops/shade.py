@@ -1,0 +1,345 @@
+"""Shading under light that is given on fixed directions of the sphere."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from univoxel import brdf
+from univoxel.ops import native
+from univoxel.ops.checks import check
+
+
+def shade_radiance(
+    radiance: Tensor,  # [N, D, 3]
+    normal: Tensor,  # [N, 3]
+    wo: Tensor,  # [N, 3]
+    albedo: Tensor,  # [N, 3]
+    roughness: Tensor,  # [N]
+    directions: Tensor,  # [D, 3]
+    solid_angle: float,
+    f0: float = 0.04,
+) -> Tensor:
+    """Radiance towards the eye of points that each receive their own light.
+
+        rgb_n = solid_angle sum_d radiance_nd f(w_d, wo_n) max(n.w_d, 0)
+
+    with f the BRDF of docs/conventions.md.
+
+    Args:
+        radiance: [N, D, 3] linear, arriving from each direction; what comes from below a point's
+            horizon counts for nothing.
+        normal, wo: [N, 3] unit, world; wo points to the eye.
+        albedo: [N, 3] linear, in [0, 1].
+        roughness: [N] perceptual, in [0, 1].
+        directions: [D, 3] unit, world, over the whole sphere, such as sphere.fibonacci_sphere;
+            any number above 0.
+        solid_angle: of each direction, steradians; 4 pi / D over the whole sphere.
+        f0: reflectance at normal incidence, in [0, 1].
+
+    Returns:
+        rgb [N, 3] linear radiance.
+
+    Raises:
+        TypeError, ValueError: an argument is no tensor, or of another size or dtype than above;
+            no directions; solid_angle not above 0; f0 outside [0, 1].
+        NotImplementedError: normal or wo requires grad.
+
+    Differentiable in: radiance, albedo, roughness. Second order raises.
+    """
+    check(
+        "shade_radiance",
+        radiance=(radiance, "N D 3"),
+        normal=(normal, "N 3"),
+        wo=(wo, "N 3"),
+        albedo=(albedo, "N 3"),
+        roughness=(roughness, "N"),
+        directions=(directions, "D 3"),
+    )
+    _check_rest("shade_radiance", normal, wo, directions, solid_angle, f0)
+    arguments = (radiance, normal, wo, albedo, roughness, directions.detach())
+    if native.serves(radiance):
+        contiguous = (a.contiguous() for a in arguments)
+        return _shade_radiance(*contiguous, float(solid_angle), float(f0))
+    return shade_radiance_reference(*arguments, solid_angle, f0)
+
+
+def shade_map(
+    map: Tensor,  # [D, 3]
+    visibility: Tensor,  # [P, D]
+    indirect: Tensor,  # [P, D, 3]
+    index: Tensor,  # [N]
+    normal: Tensor,  # [N, 3]
+    wo: Tensor,  # [N, 3]
+    albedo: Tensor,  # [N, 3]
+    roughness: Tensor,  # [N]
+    directions: Tensor,  # [D, 3]
+    solid_angle: float,
+    f0: float = 0.04,
+) -> Tensor:
+    """Radiance towards the eye of points under one distant map, partly hidden from each.
+
+        rgb_n = solid_angle sum_d radiance_nd f(w_d, wo_n) max(n.w_d, 0)
+        radiance_nd = visibility_pd map_d + indirect_pd,   p = index_n
+
+    shade_radiance without the [N, D, 3] radiance, which is put together sample by sample.
+
+    Args:
+        map: [D, 3] linear radiance of the distant light.
+        visibility: [P, D] the open share of each direction at P points: of map's dtype in [0, 1],
+            or uint8 in 255ths.
+        indirect: [P, D, 3] linear radiance that arrives from the blocked share, times that share:
+            of map's dtype, or float16.
+        index: [N] int64 in [0, P), the point of each sample.
+        normal, wo, albedo, roughness, directions, solid_angle, f0: as in shade_radiance.
+
+    Returns:
+        rgb [N, 3] linear radiance.
+
+    Raises:
+        TypeError, ValueError: as in shade_radiance; an index outside [0, P).
+        NotImplementedError: visibility, indirect, normal or wo requires grad.
+
+    Differentiable in: map, albedo, roughness. Second order raises.
+    """
+    bytes_or_map = (torch.uint8,) if _is(visibility, torch.uint8) else ()
+    half_or_map = (torch.float16,) if _is(indirect, torch.float16) else ()
+    check(
+        "shade_map",
+        map=(map, "D 3"),
+        visibility=(visibility, "P D", *bytes_or_map),
+        indirect=(indirect, "P D 3", *half_or_map),
+        index=(index, "N", torch.int64),
+        normal=(normal, "N 3"),
+        wo=(wo, "N 3"),
+        albedo=(albedo, "N 3"),
+        roughness=(roughness, "N"),
+        directions=(directions, "D 3"),
+    )
+    _check_rest("shade_map", normal, wo, directions, solid_angle, f0, visibility, indirect)
+    arguments = (map, visibility, indirect, index, normal, wo, albedo, roughness)
+    arguments = (*arguments, directions.detach())
+    if native.serves(map):
+        contiguous = (a.contiguous() for a in arguments)
+        return _shade_map(*contiguous, float(solid_angle), float(f0))
+    return shade_map_reference(*arguments, solid_angle, f0)
+
+
+def _is(argument: object, dtype: torch.dtype) -> bool:
+    return isinstance(argument, Tensor) and argument.dtype == dtype
+
+
+def _check_rest(
+    op: str,
+    normal: Tensor,
+    wo: Tensor,
+    directions: Tensor,
+    solid_angle: float,
+    f0: float,
+    visibility: Tensor | None = None,
+    indirect: Tensor | None = None,
+) -> None:
+    """What sizes and dtypes do not show."""
+    if len(directions) == 0:
+        raise ValueError(f"{op}: directions must hold at least one direction, got none")
+    if not 0.0 < solid_angle < math.inf:
+        raise ValueError(f"{op}: solid_angle must be above 0 and finite, got {solid_angle}")
+    if not 0.0 <= f0 <= 1.0:
+        raise ValueError(f"{op}: f0 must be in [0, 1], got {f0}")
+    constants = {"normal": normal, "wo": wo, "visibility": visibility, "indirect": indirect}
+    for name, tensor in constants.items():
+        if tensor is not None and tensor.requires_grad and torch.is_grad_enabled():
+            raise NotImplementedError(f"{op}: no gradient to {name}; detach it")
+
+
+def shade_radiance_reference(
+    radiance: Tensor,
+    normal: Tensor,
+    wo: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    directions: Tensor,
+    solid_angle: float,
+    f0: float = 0.04,
+) -> Tensor:
+    """The same in eager torch."""
+    surface = (albedo[:, None], roughness[:, None])
+    f = brdf.evaluate(normal[:, None], wo[:, None], directions, *surface, f0)
+    cosine = (normal[:, None] * directions).sum(-1, keepdim=True).clamp_min(0)
+    return solid_angle * (radiance * f * cosine).sum(1)
+
+
+def shade_map_reference(
+    map: Tensor,
+    visibility: Tensor,
+    indirect: Tensor,
+    index: Tensor,
+    normal: Tensor,
+    wo: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    directions: Tensor,
+    solid_angle: float,
+    f0: float = 0.04,
+) -> Tensor:
+    """The same in eager torch; its memory grows with N D."""
+    fraction = visibility[index].to(map.dtype)
+    if visibility.dtype == torch.uint8:
+        fraction = fraction / 255
+    radiance = fraction[..., None] * map + indirect[index].to(map.dtype)
+    return shade_radiance_reference(
+        radiance, normal, wo, albedo, roughness, directions, solid_angle, f0
+    )
+
+
+@torch.library.custom_op("univoxel::shade_radiance", mutates_args=(), device_types="cpu")
+def _shade_radiance(
+    radiance: Tensor,
+    normal: Tensor,
+    wo: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    directions: Tensor,
+    solid_angle: float,
+    f0: float,
+) -> Tensor:
+    inputs = (radiance, normal, wo, albedo, roughness, directions)
+    rgb = torch.empty_like(normal)
+    native.require().shade_radiance_forward(
+        *native.arrays(*inputs, rgb), solid_angle, f0, native.threads()
+    )
+    return rgb
+
+
+@torch.library.custom_op("univoxel::shade_radiance_backward", mutates_args=(), device_types="cpu")
+def _shade_radiance_backward(
+    radiance: Tensor,
+    normal: Tensor,
+    wo: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    directions: Tensor,
+    grad_rgb: Tensor,
+    solid_angle: float,
+    f0: float,
+    to_radiance: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    inputs = (radiance, normal, wo, albedo, roughness, directions)
+    grads = _empty_grads(radiance, albedo, roughness, to_radiance)
+    native.require().shade_radiance_backward(
+        *native.arrays(*inputs, grad_rgb, *grads), solid_angle, f0, native.threads()
+    )
+    return grads
+
+
+@torch.library.custom_op("univoxel::shade_map", mutates_args=(), device_types="cpu")
+def _shade_map(
+    map: Tensor,
+    visibility: Tensor,
+    indirect: Tensor,
+    index: Tensor,
+    normal: Tensor,
+    wo: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    directions: Tensor,
+    solid_angle: float,
+    f0: float,
+) -> Tensor:
+    surface = (normal, wo, albedo, roughness, directions)
+    rgb = torch.empty_like(normal)
+    native.require().shade_map_forward(
+        *native.arrays(map, visibility, _bits(indirect), index, *surface, rgb),
+        solid_angle,
+        f0,
+        native.threads(),
+    )
+    return rgb
+
+
+@torch.library.custom_op("univoxel::shade_map_backward", mutates_args=(), device_types="cpu")
+def _shade_map_backward(
+    map: Tensor,
+    visibility: Tensor,
+    indirect: Tensor,
+    index: Tensor,
+    normal: Tensor,
+    wo: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    directions: Tensor,
+    grad_rgb: Tensor,
+    solid_angle: float,
+    f0: float,
+    to_map: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    surface = (normal, wo, albedo, roughness, directions)
+    grads = _empty_grads(map, albedo, roughness, to_map)
+    native.require().shade_map_backward(
+        *native.arrays(map, visibility, _bits(indirect), index, *surface, grad_rgb, *grads),
+        solid_angle,
+        f0,
+        native.threads(),
+    )
+    return grads
+
+
+def _bits(indirect: Tensor) -> Tensor:
+    """Halves as the integers that the extension takes."""
+    return indirect.view(torch.uint16) if indirect.dtype == torch.float16 else indirect
+
+
+def _empty_grads(light: Tensor, albedo: Tensor, roughness: Tensor, to_light: bool):
+    """Room for the gradients; none for that of the light, the largest, unless it is asked for."""
+    grad_light = torch.empty_like(light) if to_light else light.new_empty(0)
+    return grad_light, torch.empty_like(albedo), torch.empty_like(roughness)
+
+
+@_shade_radiance.register_fake
+def _(radiance, normal, *others):
+    return torch.empty_like(normal)
+
+
+@_shade_radiance_backward.register_fake
+def _(radiance, normal, wo, albedo, roughness, *others):
+    return _empty_grads(radiance, albedo, roughness, others[-1])
+
+
+@_shade_map.register_fake
+def _(map, visibility, indirect, index, normal, *others):
+    return torch.empty_like(normal)
+
+
+@_shade_map_backward.register_fake
+def _(map, visibility, indirect, index, normal, wo, albedo, roughness, *others):
+    return _empty_grads(map, albedo, roughness, others[-1])
+
+
+def _save(ctx, inputs, output):
+    *tensors, ctx.solid_angle, ctx.f0 = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def _radiance_backward(ctx, grad_rgb):
+    to_radiance = ctx.needs_input_grad[0]
+    grad_radiance, grad_albedo, grad_roughness = _shade_radiance_backward(
+        *ctx.saved_tensors, grad_rgb.contiguous(), ctx.solid_angle, ctx.f0, to_radiance
+    )
+    light = grad_radiance if to_radiance else None
+    return light, None, None, grad_albedo, grad_roughness, None, None, None
+
+
+def _map_backward(ctx, grad_rgb):
+    to_map = ctx.needs_input_grad[0]
+    grad_map, grad_albedo, grad_roughness = _shade_map_backward(
+        *ctx.saved_tensors, grad_rgb.contiguous(), ctx.solid_angle, ctx.f0, to_map
+    )
+    light = grad_map if to_map else None
+    nothing = (None,) * 5
+    return light, *nothing, grad_albedo, grad_roughness, None, None, None
+
+
+_shade_radiance.register_autograd(_radiance_backward, setup_context=_save)
+_shade_map.register_autograd(_map_backward, setup_context=_save)
