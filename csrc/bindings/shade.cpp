@@ -1,5 +1,7 @@
 #include "shade.h"
 
+#include <pybind11/stl.h>
+
 #include <variant>
 
 #include "bindings/common.h"
