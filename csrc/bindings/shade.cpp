@@ -1,5 +1,8 @@
 #include "shade.h"
 
+#include <pybind11/stl.h>
+
+#include <string>
 #include <variant>
 
 #include "bindings/common.h"
