@@ -148,6 +148,7 @@ struct MapReader {
     Rows3<T> map;
     Rows3<T> radiance;
     std::vector<T> visibility, interleaved;
+    int64_t loaded = -1;  // views of one point often follow each other
 
     MapReader(const MapLight<T>& in, int64_t count)
         : light(in), map(count), radiance(count), visibility(count), interleaved(3 * count) {
@@ -156,6 +157,8 @@ struct MapReader {
 
     void load(int64_t i) {
         const int64_t count = map.count, p = light.index[i];
+        if (p == loaded) return;
+        loaded = p;
         std::visit(
             [&](auto* from) {
                 T* to = visibility.data();

@@ -2,6 +2,7 @@
 
 #include <pybind11/stl.h>
 
+#include <string>
 #include <variant>
 
 #include "bindings/common.h"
