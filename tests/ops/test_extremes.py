@@ -32,7 +32,7 @@ def pick(generator, values, *size):
 
 
 def run(op, arguments, dtype=torch.float32):
-    """Outputs, and gradients of their sum to every floating tensor that asks for one."""
+    """Outputs, then gradients of their sum to every floating tensor that asks for one."""
     arguments = [
         a.detach().to(dtype).requires_grad_(a.requires_grad)
         if isinstance(a, torch.Tensor) and a.is_floating_point()
@@ -44,13 +44,13 @@ def run(op, arguments, dtype=torch.float32):
     leaves = [a for a in arguments if isinstance(a, torch.Tensor) and a.requires_grad]
     through = [o for o in out if o.requires_grad]
     grads = torch.autograd.grad(through, leaves, [torch.ones_like(o) for o in through])
-    return [o.detach() for o in out], [g.to_dense() if g.is_sparse else g for g in grads]
+    return [*(o.detach() for o in out), *(g.to_dense() if g.is_sparse else g for g in grads)]
 
 
 def check_finite(op, reference, arguments):
     for got, want in zip(
-        sum(run(op, arguments), []),
-        sum(run(reference, arguments, torch.float64), []),
+        run(op, arguments),
+        run(reference, arguments, torch.float64),
         strict=True,
     ):
         assert got.shape == want.shape
@@ -96,8 +96,8 @@ def test_composite_keeps_nan_in_its_ray(seed, n_channels, sample, in_alpha):
         (alpha if in_alpha else value)[2 + sample] = math.nan  # of the third ray
     after = run(ops.composite, (alpha, value, offsets))
     others = torch.tensor([0, 1, 5, 6])
-    assert same(before[0][0][[0, 1, 3]], after[0][0][[0, 1, 3]])
-    for a, b in zip([before[0][1], *before[1]], [after[0][1], *after[1]], strict=True):
+    assert same(before[0][[0, 1, 3]], after[0][[0, 1, 3]])
+    for a, b in zip(before[1:], after[1:], strict=True):
         assert same(a[others], b[others])
 
 
@@ -137,13 +137,13 @@ def test_sample_dense_keeps_nan_at_its_point(seed, lost, axis, sparse):
     without = run(op, (sdf, features, points.detach()[kept].requires_grad_()))
     with torch.no_grad():
         points[lost, axis] = math.nan
-    out, grads = run(op, (sdf, features, points))
-    for got, want in zip([*out, grads[2]], [*without[0], without[1][2]], strict=True):
-        assert same(got[kept], want)
-    assert out[0][lost].isnan()
+    found = run(op, (sdf, features, points))
+    for i in (0, 1, 2, 5):  # value, gradient, feature, gradient to the points
+        assert same(found[i][kept], without[i])
+    assert found[0][lost].isnan()
     # Its gradient reaches no node: the grid's are what the other points alone give.
-    assert same(grads[0], without[1][0])
-    assert same(grads[1], without[1][1])
+    assert same(found[3], without[3])
+    assert same(found[4], without[4])
 
 
 @few
@@ -153,7 +153,7 @@ def test_sample_dense_keeps_a_nan_gradient_near_its_point(seed, sparse):
     sdf = torch.randn(9, 3, 12, generator=g).requires_grad_()
     features = torch.randn(9, 3, 12, 2, generator=g).requires_grad_()
     points = torch.rand(30, 3, generator=g) * torch.tensor([8.0, 2.0, 11.0])
-    value, gradient, feature = ops.sample_dense(
+    value, _, feature = ops.sample_dense(
         sdf, features, points, (0.0, 0.0, 0.0), 1.0, sparse_grad=sparse
     )
     (value[0] * math.nan + value.sum() + feature[0, 0] * math.nan + feature.sum()).backward()
@@ -204,7 +204,7 @@ def test_shade_sg_keeps_nan_at_its_point(seed, point, argument):
         arguments[argument][point] = math.nan
     after = run(ops.shade_sg, arguments)
     others = torch.arange(4) != point
-    for a, b in zip(sum(before, []), sum(after, []), strict=True):
+    for a, b in zip(before, after, strict=True):
         assert same(a[others], b[others])
 
 
