@@ -25,7 +25,7 @@ class Case:
     reference: Callable
     arguments: tuple  # float32
     work: dict[str, float]  # least work, forward and backward, in the units of limits.measure
-    peers: dict[str, Callable[[], object]] = field(default_factory=dict)  # forward and backward
+    peers: peers.Peers = field(default_factory=dict)
     tolerance: float = 1e-4  # relative L2 error against float64: sums of hundreds in float32
 
 
@@ -125,7 +125,7 @@ def shade_sg() -> Case:
     )
 
 
-def adam_rows(table: int = 160**3, rows: int = 262_144, channels: int = 16) -> Case:
+def adam_rows(table: int = 256**3, rows: int = 256**3 // 50, channels: int = 8) -> Case:
     g = torch.Generator().manual_seed(0)
     chosen = torch.randperm(table, generator=g)[:rows].sort().values
     param, mean = torch.randn(2, table, channels, generator=g).unbind()
@@ -168,7 +168,63 @@ def adam_rows(table: int = 160**3, rows: int = 262_144, channels: int = 16) -> C
         (param, mean, square, chosen, grad),
         # three tables read and written, the gradient read
         {"read": 4.0 * 7 * rows * channels},
-        {"torch.optim.Adam, dense gradient": adam},
+        {"torch.optim.Adam, dense gradient": lambda: adam},
+    )
+
+
+def _ellipsoid(size: tuple[int, int, int]) -> tuple[Tensor, list[float], float]:
+    """About the distance to one, on a grid whose first axis is 1 long: sdf, origin, voxel size."""
+    h = 1.0 / (size[0] - 1)
+    axes = [(torch.arange(n) - (n - 1) / 2) * h for n in size]
+    x, y, z = torch.meshgrid(*axes, indexing="ij")
+    sdf = (1.2 * x**2 + 2 * y**2 + 2.6 * z**2).sqrt() - 0.42
+    return sdf, [float(a[0]) for a in axes], h
+
+
+def march(rays: int = 2048) -> Case:
+    g = torch.Generator().manual_seed(0)
+    size = (200, 155, 130)
+    sdf, start, h = _ellipsoid(size)
+    least = ops.brick_minimum(sdf)
+
+    def unit(t):
+        return torch.nn.functional.normalize(t, dim=1)
+
+    origin = 1.5 * unit(torch.randn(rays, 3, generator=g))
+    direction = unit(0.15 * torch.randn(rays, 3, generator=g) - origin)
+    jitter = torch.rand(rays, generator=g)
+
+    def count(samples):  # rounding moves single samples in or out
+        return samples.t.sum(), samples.t.new_tensor(len(samples.t))
+
+    def ours(sdf, least, *rays):
+        return count(ops.march(sdf, least, *rays, start, h, step=h, inv_s=2 / h))
+
+    def reference(sdf, least, *rays):
+        return count(ops.march_reference(sdf, *rays, start, h, step=h, inv_s=2 / h))
+
+    return Case(
+        "march",
+        f"{rays:,} rays, {'x'.join(map(str, size))}",
+        ours,
+        reference,
+        (sdf, least, origin, direction, jitter),
+        {},
+        tolerance=1e-3,
+    )
+
+
+def smooth_rows(rows: int = 130_000, channels: int = 1, order: int = 2) -> Case:
+    sdf, *_ = _ellipsoid((200, 155, 130))
+    grid = sdf[..., None].repeat(1, 1, 1, channels)
+    near = sdf.abs().flatten().argsort()[:rows].sort().values
+    return Case(
+        "smooth_rows_",
+        f"{rows:,} rows, {channels} channel{'s' * (channels > 1)}, order {order}",
+        lambda grid: ops.smooth_rows_(grid, near, 0.1, order),
+        lambda grid: ops.smooth_rows_reference_(grid, near, 0.1, order),
+        (grid,),
+        {"read": 4.0 * 3 * rows * channels},  # read, then read and written
     )
 
 
@@ -178,4 +234,7 @@ CASES: list[tuple[str, Callable[[], Case]]] = [
     ("sample_dense", lambda: sample_dense(256)),
     ("shade_sg", shade_sg),
     ("adam_rows_", adam_rows),
+    ("march", march),
+    ("smooth_rows_", smooth_rows),
+    ("smooth_rows_", lambda: smooth_rows(channels=12, order=1)),
 ]

@@ -41,7 +41,8 @@ def draw(path: Path) -> None:
             colors = [COLORS.get(name, "#b0b0b0") for name in bars]
             shown = axis.barh(list(bars), median, xerr=whiskers, color=colors, ecolor="#404040")
             axis.bar_label(shown, [f" {m:.1f}" for m in median], padding=4)
-            axis.axvline(result["floor_ms"], color="#c03020", linestyle=":")
+            if result["bound"]:
+                axis.axvline(result["floor_ms"], color="#c03020", linestyle=":")
             axis.set_xscale("log")
             axis.set_xlim(right=max(median) * 3)
             axis.invert_yaxis()

@@ -30,8 +30,11 @@ def measure() -> dict[str, float]:
 
 
 def floor(work: dict[str, float], limits: dict[str, float]) -> tuple[float, str]:
-    """Least seconds that work (amounts by the names of `measure`) can take, and what bounds it."""
-    return max((amount / limits[name], name) for name, amount in work.items())
+    """Least seconds that work (amounts by the names of `measure`) can take, and what bounds it.
+
+    No work stands for an amount that nobody can name: 0 seconds, unbounded.
+    """
+    return max(((amount / limits[name], name) for name, amount in work.items()), default=(0.0, ""))
 
 
 def _best(run: Callable[[], object], repeats: int) -> float:

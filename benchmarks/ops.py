@@ -3,27 +3,31 @@
     python benchmarks/ops.py [--only composite] [--rounds 11] [--out benchmarks/results/ops.json]
 
 Each op is first held against its reference in float64. All contenders of a case run in turn, round
-by round, so that a noisy machine treats them alike. Timings on 1 and 2 threads come from processes
-of their own: not every peer can change its threads.
+by round, so that a noisy machine treats them alike; compiled code and other packages do so in
+processes of their own (workers.py). Timings on 1 and 2 threads come from different processes: not
+every peer can change its threads.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import logging
 import os
 import platform
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
+import workers
 from torch import Tensor
 
 HERE = Path(__file__).parent
 SLOW_MS = 3000.0
+COMPILED = "torch.compile"
 
 
 def arguments_as(case, dtype: torch.dtype) -> tuple:
@@ -68,35 +72,48 @@ def verify(case) -> float:
     return worst
 
 
-def contenders(case) -> dict:
-    """Closures by name; one that cannot run is left out, with the reason on stderr."""
+def build(index: int, name: str):
+    """In a worker: the closure of one contender of cases.CASES[index]."""
+    import cases
 
-    def of(function):
-        return forward_backward(function, arguments_as(case, torch.float32))
+    logging.getLogger("torch._dynamo").setLevel(logging.ERROR)  # graph breaks of the references
+    case = cases.CASES[index][1]()
+    if name == COMPILED:
+        return forward_backward(torch.compile(case.reference), arguments_as(case, torch.float32))
+    return case.peers[name]()
 
-    found = {"univoxel": of(case.ours), "torch eager": of(case.reference)}
-    found["torch.compile"] = of(torch.compile(case.reference))
-    found |= case.peers
-    for name, run in list(found.items()):
+
+def contenders(case, index: int) -> dict[str, Callable[[], float]]:
+    """By name, what runs once and tells the milliseconds; one that cannot run is left out."""
+    found: dict[str, Callable[[], float]] = {}
+    for name, function in (("univoxel", case.ours), ("torch eager", case.reference)):
+        run = forward_backward(function, arguments_as(case, torch.float32))
+        run()
+        run()
+        found[name] = functools.partial(workers.milliseconds, run)
+    for name in (COMPILED, *case.peers):
         try:
-            run()
-            run()
-        except Exception as error:
-            print(f"{case.op}: {name} left out: {str(error).splitlines()[0]}", file=sys.stderr)
-            del found[name]
+            found[name] = workers.Worker(build, index, name)
+        except RuntimeError as error:
+            print(f"{case.op}: {name} left out: {error}", file=sys.stderr)
     return found
 
 
-def times(found: dict, rounds: int) -> dict[str, list[float]]:
+def times(found: dict[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:
     """Milliseconds of every round, contenders in turn; a slow one ends early, with 3 or more."""
     measured: dict[str, list[float]] = {name: [] for name in found}
     for _ in range(rounds):
         for name, run in found.items():
-            if len(measured[name]) >= 3 and sum(measured[name]) > SLOW_MS:
+            if name not in measured or (len(measured[name]) >= 3 and sum(measured[name]) > SLOW_MS):
                 continue
-            start = time.perf_counter()
-            run()
-            measured[name].append(1e3 * (time.perf_counter() - start))
+            try:
+                measured[name].append(run())
+            except RuntimeError as error:
+                print(f"{name} left out: {error}", file=sys.stderr)
+                del measured[name]
+    for run in found.values():
+        if isinstance(run, workers.Worker):
+            run.close()
     return measured
 
 
@@ -110,17 +127,16 @@ def run_cases(threads: int, only: str, rounds: int) -> dict:
     import limits
     import peers
 
-    peers.set_threads(threads)
-    logging.getLogger("torch._dynamo").setLevel(logging.ERROR)  # graph breaks of the references
+    torch.set_num_threads(threads)
     reach = limits.measure()
     results = []
-    for name, make in cases.CASES:
+    for index, (name, make) in enumerate(cases.CASES):
         if only not in name:
             continue
         case = make()
         error = verify(case)
         least, bound = limits.floor(case.work, reach)
-        measured = {n: quartiles(t) for n, t in times(contenders(case), rounds).items()}
+        measured = {n: quartiles(t) for n, t in times(contenders(case, index), rounds).items()}
         ours = measured["univoxel"]["median_ms"]
         results.append(
             {
@@ -180,6 +196,7 @@ def main() -> None:
     merged["versions"] = {"python": platform.python_version(), "torch": torch.__version__}
     merged["versions"] |= merged.pop("peers")
     merged["cpu"] = torch.backends.cpu.get_cpu_capability()
+    merged["load_average"] = os.getloadavg()[0]  # 1 minute; above the cores: others ran too
     merged["cores"] = len(os.sched_getaffinity(0))
     options.out.write_text(json.dumps(merged, indent=1) + "\n")
     print(options.out)

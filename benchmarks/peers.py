@@ -1,37 +1,38 @@
-"""The same work in other packages, where they can be imported: closures of forward and backward."""
+"""The same work in other packages, where they are installed: forward and backward.
+
+A package is imported by the function that sets its work up, which runs in a process of its own.
+"""
 
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-Peers = dict[str, Callable[[], object]]
+Peers = dict[str, Callable[[], Callable[[], object]]]  # by name: sets up and returns the work
 
-try:
-    import jax
-    import jax.numpy as jnp
-except ImportError:
-    jax = None
-try:
-    import drjit
-    from drjit.auto import ad
-except ImportError:
-    drjit = None
+
+def _there(package: str) -> bool:
+    return importlib.util.find_spec(package) is not None
 
 
 def versions() -> dict[str, str]:
     """Of the peers that are there."""
-    there = {"jax": jax, "drjit": drjit}
-    return {name: importlib.metadata.version(name) for name, module in there.items() if module}
+    return {name: importlib.metadata.version(name) for name in ("jax", "drjit") if _there(name)}
 
 
 def composite(alpha: Tensor, value: Tensor, n_rays: int) -> Peers:
     """Rays of one length: JAX gets the dense form, which suits it best."""
-    if jax is None:
-        return {}
+    return {"JAX": lambda: _jax_composite(alpha, value, n_rays)} if _there("jax") else {}
+
+
+def _jax_composite(alpha: Tensor, value: Tensor, n_rays: int):
+    import jax
+    import jax.numpy as jnp
+
     a = jnp.asarray(alpha.detach().numpy()).reshape(n_rays, -1)
     v = jnp.asarray(value.detach().numpy()).reshape(*a.shape, -1)
 
@@ -43,44 +44,55 @@ def composite(alpha: Tensor, value: Tensor, n_rays: int) -> Peers:
 
     run = jax.jit(jax.grad(loss, (0, 1)))
     seeds = jnp.ones((n_rays, v.shape[-1])), jnp.ones_like(a)
-    return {"JAX": lambda: jax.block_until_ready(run(a, v, *seeds))}
+    return lambda: jax.block_until_ready(run(a, v, *seeds))
 
 
 def sample_dense(sdf: Tensor, features: Tensor, points: Tensor, h: float) -> Peers:
     """Value, central differences over one voxel and features, with dense gradients."""
     found: Peers = {}
-    if jax is not None:
-        f, c = (jnp.asarray(t.detach().numpy()) for t in (sdf, features))
-        p = jnp.asarray(points.numpy())
-
-        def lookup(grid, x):
-            x = jnp.clip(x / h, 0, grid.shape[0] - 1)
-            i = jnp.minimum(x.astype(jnp.int32), grid.shape[0] - 2)
-            t = (x - i).reshape(len(x), 3, *[1] * (grid.ndim - 3))
-            total = 0.0
-            for corner in range(8):
-                d = [(corner >> k) & 1 for k in range(3)]
-                w = 1.0
-                for k in range(3):
-                    w = w * (t[:, k] if d[k] else 1 - t[:, k])
-                total += w * grid[i[:, 0] + d[0], i[:, 1] + d[1], i[:, 2] + d[2]]
-            return total
-
-        def loss(f, c):
-            total = lookup(f, p).sum() + lookup(c, p).sum()
-            for k in range(3):
-                e = h * jnp.eye(3)[k]
-                total += (k + 1) * (lookup(f, p + e) - lookup(f, p - e)).sum()
-            return total
-
-        run = jax.jit(jax.grad(loss, (0, 1)))
-        found["JAX"] = lambda: jax.block_until_ready(run(f, c))
-    if drjit is not None:
-        found["Dr.Jit"] = _drjit_sample_dense(sdf, features, points, h)
+    if _there("jax"):
+        found["JAX"] = lambda: _jax_sample_dense(sdf, features, points, h)
+    if _there("drjit"):
+        found["Dr.Jit"] = lambda: _drjit_sample_dense(sdf, features, points, h)
     return found
 
 
+def _jax_sample_dense(sdf: Tensor, features: Tensor, points: Tensor, h: float):
+    import jax
+    import jax.numpy as jnp
+
+    f, c = (jnp.asarray(t.detach().numpy()) for t in (sdf, features))
+    p = jnp.asarray(points.numpy())
+
+    def lookup(grid, x):
+        x = jnp.clip(x / h, 0, grid.shape[0] - 1)
+        i = jnp.minimum(x.astype(jnp.int32), grid.shape[0] - 2)
+        t = (x - i).reshape(len(x), 3, *[1] * (grid.ndim - 3))
+        total = 0.0
+        for corner in range(8):
+            d = [(corner >> k) & 1 for k in range(3)]
+            w = 1.0
+            for k in range(3):
+                w = w * (t[:, k] if d[k] else 1 - t[:, k])
+            total += w * grid[i[:, 0] + d[0], i[:, 1] + d[1], i[:, 2] + d[2]]
+        return total
+
+    def loss(f, c):
+        total = lookup(f, p).sum() + lookup(c, p).sum()
+        for k in range(3):
+            e = h * jnp.eye(3)[k]
+            total += (k + 1) * (lookup(f, p + e) - lookup(f, p - e)).sum()
+        return total
+
+    run = jax.jit(jax.grad(loss, (0, 1)))
+    return lambda: jax.block_until_ready(run(f, c))
+
+
 def _drjit_sample_dense(sdf: Tensor, features: Tensor, points: Tensor, h: float):
+    import drjit
+    from drjit.auto import ad
+
+    drjit.set_thread_count(torch.get_num_threads())
     n = sdf.shape[0]
     f = ad.TensorXf(sdf.detach().numpy()[..., None])
     c = ad.TensorXf(features.detach().numpy())
@@ -108,10 +120,3 @@ def _drjit_sample_dense(sdf: Tensor, features: Tensor, points: Tensor, h: float)
         drjit.disable_grad(c)
 
     return run
-
-
-def set_threads(threads: int) -> None:
-    """For torch and Dr.Jit; XLA goes by the cores that the process may use."""
-    if drjit is not None:
-        drjit.set_thread_count(threads)
-    torch.set_num_threads(threads)

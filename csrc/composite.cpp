@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <vector>
 
+#include "channels.h"
+#include "huge_pages.h"
 #include "parallel.h"
 
 namespace univoxel {
@@ -22,26 +24,65 @@ int64_t transmittance(const T* alpha, int64_t n, T early_stop, T* trans) {
     return n;
 }
 
+template <int64_t kC, class T>
+void forward_ray(const Composite<T>& in, int64_t ray, T* out, T* weight) {
+    const int64_t C = kC ? kC : in.n_channels;
+    const int64_t first = in.offsets[ray], n = in.offsets[ray + 1] - first;
+    const T* alpha = in.alpha + first;
+    const T* value = in.value + first * C;
+    T *sum = out + ray * C, *w = weight + first;
+    const int64_t used = transmittance(alpha, n, in.early_stop, w);
+    // Sums of a known width stay in registers: the compiler cannot know that `out` is not `value`.
+    T held[kC ? kC : 1] = {};
+    T* s = kC ? held : sum;
+    if (!kC) std::fill(sum, sum + C, T(0));
+    for (int64_t i = 0; i < used; ++i) {
+        const T wi = w[i] * alpha[i];
+        w[i] = wi;
+#pragma omp simd
+        for (int64_t c = 0; c < C; ++c) s[c] += wi * value[i * C + c];
+    }
+    if (kC) std::copy(held, held + kC, sum);
+    std::fill(w + used, w + n, T(0));
+}
+
+/// `trans` and `own` are scratch of the ray's length.
+template <int64_t kC, class T>
+void backward_ray(const Composite<T>& in, int64_t ray, const T* grad_out, const T* grad_weight,
+                  T* grad_alpha, T* grad_value, T* trans, T* own) {
+    const int64_t C = kC ? kC : in.n_channels;
+    const int64_t first = in.offsets[ray], n = in.offsets[ray + 1] - first;
+    const T *alpha = in.alpha + first, *value = in.value + first * C, *g = grad_out + ray * C;
+    T *ga = grad_alpha + first, *gv = grad_value + first * C;
+    const int64_t used = transmittance(alpha, n, in.early_stop, trans);
+    for (int64_t i = 0; i < used; ++i) {
+        const T w = alpha[i] * trans[i];
+        T sum = 0;
+#pragma omp simd reduction(+ : sum)
+        for (int64_t c = 0; c < C; ++c) {
+            sum += g[c] * value[i * C + c];
+            gv[i * C + c] = w * g[c];
+        }
+        own[i] = sum + grad_weight[first + i];
+    }
+    T behind = 0;
+    for (int64_t i = used - 1; i >= 0; --i) {
+        ga[i] = trans[i] * (own[i] - behind);
+        behind = alpha[i] * own[i] + (1 - alpha[i]) * behind;
+    }
+    std::fill(ga + used, ga + n, T(0));
+    std::fill(gv + used * C, gv + n * C, T(0));
+}
+
 }  // namespace
 
 template <class T>
 void composite_forward(const Composite<T>& in, T* out, T* weight, int threads) {
-    const int64_t C = in.n_channels;
-    parallel_for(in.n_rays, kRaysPerChunk, threads, [&](int64_t begin, int64_t end) {
-        for (int64_t ray = begin; ray < end; ++ray) {
-            const int64_t first = in.offsets[ray], n = in.offsets[ray + 1] - first;
-            T* sum = out + ray * C;
-            T* w = weight + first;
-            std::fill(sum, sum + C, T(0));
-            const int64_t used = transmittance(in.alpha + first, n, in.early_stop, w);
-            for (int64_t i = 0; i < used; ++i) {
-                w[i] *= in.alpha[first + i];
-                const T* v = in.value + (first + i) * C;
-#pragma omp simd
-                for (int64_t c = 0; c < C; ++c) sum[c] += w[i] * v[c];
-            }
-            std::fill(w + used, w + n, T(0));
-        }
+    with_channels(in.n_channels, [&](auto constant) {
+        constexpr int64_t kC = decltype(constant)::value;
+        parallel_for(in.n_rays, kRaysPerChunk, threads, [&](int64_t begin, int64_t end) {
+            for (int64_t ray = begin; ray < end; ++ray) forward_ray<kC>(in, ray, out, weight);
+        });
     });
 }
 
@@ -51,32 +92,20 @@ void composite_forward(const Composite<T>& in, T* out, T* weight, int threads) {
 template <class T>
 void composite_backward(const Composite<T>& in, const T* grad_out, const T* grad_weight,
                         T* grad_alpha, T* grad_value, int threads) {
-    const int64_t C = in.n_channels;
-    parallel_for(in.n_rays, kRaysPerChunk, threads, [&](int64_t begin, int64_t end) {
-        std::vector<T> trans;
-        for (int64_t ray = begin; ray < end; ++ray) {
-            const int64_t first = in.offsets[ray], n = in.offsets[ray + 1] - first;
-            trans.resize(std::max<int64_t>(n, static_cast<int64_t>(trans.size())));
-            const int64_t used = transmittance(in.alpha + first, n, in.early_stop, trans.data());
-            const T* g = grad_out + ray * C;
-            T behind = 0;
-            for (int64_t i = used - 1; i >= 0; --i) {
-                const int64_t s = first + i;
-                const T a = in.alpha[s], w = a * trans[i];
-                const T* v = in.value + s * C;
-                T* gv = grad_value + s * C;
-                T own = grad_weight[s];
-#pragma omp simd reduction(+ : own)
-                for (int64_t c = 0; c < C; ++c) {
-                    own += g[c] * v[c];
-                    gv[c] = w * g[c];
-                }
-                grad_alpha[s] = trans[i] * (own - behind);
-                behind = a * own + (1 - a) * behind;
-            }
-            std::fill(grad_alpha + first + used, grad_alpha + first + n, T(0));
-            std::fill(grad_value + (first + used) * C, grad_value + (first + n) * C, T(0));
-        }
+    const int64_t samples = in.offsets[in.n_rays];
+    want_huge_pages(grad_value, samples * in.n_channels * static_cast<int64_t>(sizeof(T)));
+    with_channels(in.n_channels, [&](auto constant) {
+        constexpr int64_t kC = decltype(constant)::value;
+        parallel_for(in.n_rays, kRaysPerChunk, threads, [&](int64_t begin, int64_t end) {
+            int64_t longest = 0;
+            for (int64_t ray = begin; ray < end; ++ray)
+                longest = std::max(longest, in.offsets[ray + 1] - in.offsets[ray]);
+            std::vector<T> scratch(2 * longest);
+            T *trans = scratch.data(), *own = trans + longest;
+            for (int64_t ray = begin; ray < end; ++ray)
+                backward_ray<kC>(in, ray, grad_out, grad_weight, grad_alpha, grad_value, trans,
+                                 own);
+        });
     });
 }
 

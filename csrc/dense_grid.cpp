@@ -2,8 +2,8 @@
 
 #include <algorithm>
 #include <limits>
-#include <type_traits>
 
+#include "channels.h"
 #include "huge_pages.h"
 
 namespace univoxel {
@@ -20,21 +20,6 @@ inline void prefetch(const T* p, int64_t n) {
     constexpr int64_t kLine = 64 / sizeof(T);
     for (int64_t i = 0; i < n; i += kLine) __builtin_prefetch(p + i, 1);
     if (n) __builtin_prefetch(p + n - 1, 1);
-}
-
-/// Call f with the channel count as a compile-time constant where it is a common one, else 0.
-template <class F>
-void with_channels(int64_t n, F&& f) {
-    switch (n) {
-        case 8:
-            return f(std::integral_constant<int64_t, 8>{});
-        case 12:
-            return f(std::integral_constant<int64_t, 12>{});
-        case 16:
-            return f(std::integral_constant<int64_t, 16>{});
-        default:
-            return f(std::integral_constant<int64_t, 0>{});
-    }
 }
 
 template <class T>

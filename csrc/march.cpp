@@ -12,6 +12,7 @@ namespace {
 constexpr int64_t kRaysPerChunk = 128;
 // A brick whose sdf stays above this many s lets light through: sigmoid(8) = 0.99966.
 constexpr int kClearBand = 8;
+constexpr int kLongest = 1000;  // diagonals of the grid that a ray may take to cross it
 
 /// Trilinear sdf at grid coordinates inside [0, size - 1].
 template <class T>
@@ -64,7 +65,10 @@ void march_ray(const March<T>& in, int64_t ray, Marched<T>& out) {
     const vec3<T> upper(in.size[0] - 1, in.size[1] - 1, in.size[2] - 1);
     T near, far;
     if (!clip(o, d, upper, near, far)) return;
+    // A direction that is far from unit would take steps without end.
+    if (far - near > T(kLongest) * glm::length(upper) * in.voxel_size) return;
     const T start = near + in.jitter[ray] * in.step;
+    if (!std::isfinite(start)) return;
     const T band = kClearBand / in.inv_s;
     const int64_t by = bricks_along(in.size[1]), bz = bricks_along(in.size[2]);
     const int64_t last = static_cast<int64_t>((far - start) / in.step);

@@ -1,7 +1,7 @@
 #include "smooth.h"
 
 #include <algorithm>
-#include <vector>
+#include <memory>
 
 #include "parallel.h"
 
@@ -35,33 +35,68 @@ void add_laplacian(const T* grid, const int64_t size[3], int64_t C, const Node& 
         }
 }
 
-/// L L f as one stencil of 25 nodes, for nodes at least two away from the border.
-struct Plate {
-    int64_t offset[25];
-    double weight[25];
+/// The change of a node far enough from the border, as one weighted sum: amount L f or
+/// -amount L L f. Offsets and the width of a tile count numbers, not nodes.
+template <class T>
+struct Stencil {
+    static constexpr int64_t kTile = 16;
+    int64_t offset[25], reach = 0;
+    T weight[25];
+    int count = 0;
 
-    explicit Plate(const int64_t size[3]) {
-        const int64_t stride[3] = {size[1] * size[2], size[2], 1};
-        int n = 0;
+    Stencil(const int64_t size[3], int64_t C, T amount, int order) {
+        const int64_t stride[3] = {size[1] * size[2] * C, size[2] * C, C};
         const auto put = [&](int64_t o, double w) {
-            offset[n] = o;
-            weight[n++] = w;
+            reach = std::max(reach, o);
+            offset[count] = o;
+            weight[count++] = amount * T(w);
         };
-        put(0, 7.0 / 6);
+        put(0, order == 1 ? -1 : -7.0 / 6);
         for (int a = 0; a < 3; ++a)
             for (int64_t s : {-1, 1}) {
-                put(s * stride[a], -1.0 / 3);
-                put(2 * s * stride[a], 1.0 / 36);
+                put(s * stride[a], order == 1 ? 1.0 / 6 : 1.0 / 3);
+                if (order == 1) continue;
+                put(2 * s * stride[a], -1.0 / 36);
                 for (int b = a + 1; b < 3; ++b)
-                    for (int64_t t : {-1, 1}) put(s * stride[a] + t * stride[b], 1.0 / 18);
+                    for (int64_t t : {-1, 1}) put(s * stride[a] + t * stride[b], -1.0 / 18);
             }
+    }
+
+    /// Sums for n numbers from p; a tile may read, and drop, the numbers behind them.
+    void apply(const T* p, int64_t n, const T* grid_end, T* out) const {
+        for (int64_t i = 0; i < n; i += kTile, p += kTile, out += kTile) {
+            const int64_t used = std::min(kTile, n - i);
+            T sum[kTile] = {};
+            if (grid_end - p >= reach + kTile) {
+                for (int j = 0; j < count; ++j) {
+                    const T* q = p + offset[j];
+#pragma omp simd
+                    for (int64_t k = 0; k < kTile; ++k) sum[k] += weight[j] * q[k];
+                }
+            } else {
+                for (int j = 0; j < count; ++j)
+                    for (int64_t k = 0; k < used; ++k) sum[k] += weight[j] * p[offset[j] + k];
+            }
+            std::copy(sum, sum + used, out);
+        }
     }
 };
 
-bool inner(const Node& node, const int64_t size[3]) {
-    for (int a = 0; a < 3; ++a)
-        if (node.i[a] < 2 || node.i[a] >= size[a] - 2) return false;
-    return true;
+bool away_from_border(int64_t i, int64_t size, int64_t margin) {
+    return i >= margin && i < size - margin;
+}
+
+/// The change of a node near the border, where neighbours repeat.
+template <class T>
+void border_change(const T* grid, const int64_t size[3], int64_t C, const Node& node, T amount,
+                   int order, T* out) {
+    std::fill(out, out + C, T(0));
+    add_laplacian(grid, size, C, node, amount, out);
+    if (order == 1) return;
+    // -amount L (Lf) = amount (Lf - mean of Lf)
+    for (int axis = 0; axis < 3; ++axis)
+        for (int64_t by : {-1, 1})
+            add_laplacian(grid, size, C, node.step(axis, by, size), -amount / 6, out);
 }
 
 }  // namespace
@@ -70,29 +105,26 @@ template <class T>
 void smooth_rows(T* grid, const int64_t size[3], int64_t C, const int64_t* rows, int64_t n,
                  T amount, int order, int threads) {
     // Compute every change before any is applied: the order of rows does not matter.
-    std::vector<T> change(n * C, T(0));
-    const Plate plate(size);
+    const std::unique_ptr<T[]> change(new T[n * C]);
+    const Stencil<T> stencil(size, C, amount, order);
+    const T* grid_end = grid + size[0] * size[1] * size[2] * C;
     parallel_for(n, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
-        for (int64_t k = begin; k < end; ++k) {
-            const Node node{
-                {rows[k] / (size[1] * size[2]), rows[k] / size[2] % size[1], rows[k] % size[2]}};
-            T* out = change.data() + k * C;
-            if (order == 1) {
-                add_laplacian(grid, size, C, node, amount, out);
+        for (int64_t k = begin; k < end;) {
+            const int64_t line = rows[k] / size[2], z = rows[k] - line * size[2];
+            const int64_t x = line / size[1], y = line - x * size[1];
+            T* out = change.get() + k * C;
+            if (!away_from_border(x, size[0], order) || !away_from_border(y, size[1], order) ||
+                !away_from_border(z, size[2], order)) {
+                border_change(grid, size, C, {{x, y, z}}, amount, order, out);
+                ++k;
                 continue;
             }
-            if (inner(node, size)) {
-                for (int j = 0; j < 25; ++j) {
-                    const T* near = grid + (rows[k] + plate.offset[j]) * C;
-                    const T w = -amount * T(plate.weight[j]);
-                    for (int64_t c = 0; c < C; ++c) out[c] += w * near[c];
-                }
-                continue;
-            }
-            add_laplacian(grid, size, C, node, amount, out);  // -amount L (Lf) = amount (Lf - mean)
-            for (int axis = 0; axis < 3; ++axis)
-                for (int64_t by : {-1, 1})
-                    add_laplacian(grid, size, C, node.step(axis, by, size), -amount / 6, out);
+            // Neighbours along z that follow each other are one run of numbers.
+            const int64_t longest = std::min(end - k, size[2] - order - z);
+            int64_t run = 1;
+            while (run < longest && rows[k + run] == rows[k] + run) ++run;
+            stencil.apply(grid + rows[k] * C, run * C, grid_end, out);
+            k += run;
         }
     });
     parallel_for(n, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {

@@ -18,6 +18,26 @@ def test_native_equals_reference(order, shape):
     assert torch.equal(got.view(nodes, -1)[untouched], grid.view(nodes, -1)[untouched])
 
 
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("channels", [1, 2, 12])
+def test_runs_of_rows_and_shuffled_rows_give_the_same_bits(order, channels):
+    # Runs longer than a tile of 16 numbers, up to the end of the grid; several chunks of rows.
+    grid = torch.randn(20, 15, 45, channels)
+    rows = torch.arange(grid[..., 0].numel())[3:]
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count, chosen in ((1, rows), (2, rows), (3, rows[torch.randperm(len(rows))])):
+            torch.set_num_threads(count)
+            found.append(smooth_rows_(grid.clone(), chosen, 0.3, order))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
+    wanted = smooth_rows_reference_(grid.clone(), rows, 0.3, order)
+    # 25 products of numbers of order 1 in float32
+    torch.testing.assert_close(found[0], wanted, rtol=0, atol=2e-6)
+
+
 def test_thin_plate_keeps_a_plane_and_lowers_a_bump():
     x = torch.arange(9.0)
     plane = (2 * x[:, None, None] - x[None, :, None] + 0.5 * x).expand(9, 9, 9)[..., None]

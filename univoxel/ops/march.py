@@ -62,7 +62,8 @@ def march(
         alpha = max(0, 1 - sigmoid(f_end / s) / sigmoid(f_start / s))
 
     from the trilinear sdf f at its ends; the samples at the ends of kept sections are returned.
-    Bricks whose sdf stays above 8 s are skipped as a whole.
+    Bricks whose sdf stays above 8 s are skipped as a whole. A ray that is not finite, or whose
+    direction is shorter than 1e-3, gets no samples.
 
     Args:
         sdf: [X, Y, Z] world units, negative inside.

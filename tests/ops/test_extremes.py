@@ -1,0 +1,387 @@
+"""Values at the edge of float32: finite where the reference in float64 is, and NaN stays at home.
+
+Every op must survive any numbers of any size. What a float64 run of the reference finds within the
+reach of float32 must come out finite; a NaN may only touch the ray, point or row that it came with.
+"""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from univoxel import ops, sphere
+from univoxel.ops import native
+
+pytestmark = pytest.mark.skipif(native.core is None, reason="without the extension")
+few = settings(max_examples=40, deadline=None, derandomize=True)
+
+REACH = 1e36  # of a float32 result: sums of some tens of these stay below 3.4e38
+WILD = (0.0, -0.0, 1e-45, -1e-40, 1.2e-38, 1e-7, 0.5, 1.0, -1.0, 1e4, 1e30, -1e30)
+seeds = st.integers(0, 2**31)
+channels = st.sampled_from([0, 1, 3, 12, 17])
+
+
+def pick(generator, values, *size):
+    """Numbers drawn from a list, and as many from a normal distribution."""
+    values = torch.tensor(values, dtype=torch.float64)
+    drawn = values[torch.randint(len(values), size, generator=generator)]
+    usual = torch.randn(size, generator=generator, dtype=torch.float64)
+    return torch.where(torch.rand(size, generator=generator) < 0.5, drawn, usual).float()
+
+
+def run(op, arguments, dtype=torch.float32):
+    """Outputs, then gradients of their sum to every floating tensor that asks for one."""
+    arguments = [
+        a.detach().to(dtype).requires_grad_(a.requires_grad)
+        if isinstance(a, torch.Tensor) and a.is_floating_point()
+        else a
+        for a in arguments
+    ]
+    out = op(*arguments)
+    out = [out] if isinstance(out, torch.Tensor) else list(out)
+    leaves = [a for a in arguments if isinstance(a, torch.Tensor) and a.requires_grad]
+    through = [o for o in out if o.requires_grad]
+    grads = torch.autograd.grad(through, leaves, [torch.ones_like(o) for o in through])
+    return [*(o.detach() for o in out), *(g.to_dense() if g.is_sparse else g for g in grads)]
+
+
+def check_finite(op, reference, arguments):
+    for got, want in zip(
+        run(op, arguments),
+        run(reference, arguments, torch.float64),
+        strict=True,
+    ):
+        assert got.shape == want.shape
+        lost = want.isfinite() & (want.abs() < REACH) & ~got.isfinite()
+        assert not lost.any(), f"{got[lost][:4]}, in float64 {want[lost][:4]}"
+
+
+def same(a, b):
+    """Equal numbers, NaN equal to NaN."""
+    return torch.equal(torch.nan_to_num(a, 12345.0), torch.nan_to_num(b, 12345.0)) and torch.equal(
+        a.isnan(), b.isnan()
+    )
+
+
+# --- composite
+
+
+def packed_rays(seed, counts, n_channels):
+    g = torch.Generator().manual_seed(seed)
+    offsets = torch.tensor([0, *counts]).cumsum(0)
+    m = int(offsets[-1])
+    alpha = pick(g, (0.0, 1.0, 1e-45, 1e-8, 1 - 6e-8, 0.5), m).abs().clamp(0, 1)
+    value = pick(g, WILD, m, n_channels)
+    return alpha.requires_grad_(), value.requires_grad_(), offsets
+
+
+counts = st.lists(st.integers(0, 6), max_size=5)
+
+
+@few
+@given(seeds, counts, channels, st.sampled_from([0.0, 1e-3, 1.0]))
+def test_composite_is_finite(seed, counts, n_channels, early_stop):
+    arguments = (*packed_rays(seed, counts, n_channels), early_stop)
+    check_finite(ops.composite, ops.composite_reference, arguments)
+
+
+@few
+@given(seeds, channels, st.integers(0, 2), st.booleans())
+def test_composite_keeps_nan_in_its_ray(seed, n_channels, sample, in_alpha):
+    alpha, value, offsets = packed_rays(seed, [2, 0, 3, 2], n_channels)
+    before = run(ops.composite, (alpha, value, offsets))
+    with torch.no_grad():
+        (alpha if in_alpha else value)[2 + sample] = math.nan  # of the third ray
+    after = run(ops.composite, (alpha, value, offsets))
+    others = torch.tensor([0, 1, 5, 6])
+    assert same(before[0][[0, 1, 3]], after[0][[0, 1, 3]])
+    for a, b in zip(before[1:], after[1:], strict=True):
+        assert same(a[others], b[others])
+
+
+# --- sample_dense
+
+
+def lattice(seed, shape, n_channels, n_points):
+    g = torch.Generator().manual_seed(seed)
+    sdf, features = pick(g, WILD, *shape), pick(g, WILD, *shape, n_channels)
+    points = pick(g, (*WILD, math.inf, -math.inf, 2.0, 3.0), n_points, 3)
+    return sdf.requires_grad_(), features.requires_grad_(), points.requires_grad_()
+
+
+@few
+@given(seeds, st.tuples(*[st.integers(1, 11)] * 3), channels, st.integers(0, 40), st.booleans())
+def test_sample_dense_is_finite(seed, shape, n_channels, n_points, sparse):
+    sdf, features, points = lattice(seed, shape, n_channels, n_points)
+    place = ((-0.5, 0.0, 1e-3), 1.0)
+
+    def op(*arguments):
+        return ops.sample_dense(*arguments, *place, sparse_grad=sparse)
+
+    def reference(*arguments):
+        return ops.sample_dense_reference(*arguments, *place)
+
+    check_finite(op, reference, (sdf, features, points))
+
+
+@few
+@given(seeds, st.integers(0, 29), st.integers(0, 2), st.booleans())
+def test_sample_dense_keeps_nan_at_its_point(seed, lost, axis, sparse):
+    def op(sdf, features, points):
+        return ops.sample_dense(sdf, features, points, (0.0, 0.0, 0.0), 1.0, sparse_grad=sparse)
+
+    sdf, features, points = lattice(seed, (9, 3, 12), 3, 30)
+    kept = torch.arange(30) != lost
+    without = run(op, (sdf, features, points.detach()[kept].requires_grad_()))
+    with torch.no_grad():
+        points[lost, axis] = math.nan
+    found = run(op, (sdf, features, points))
+    for i in (0, 1, 2, 5):  # value, gradient, feature, gradient to the points
+        assert same(found[i][kept], without[i])
+    assert found[0][lost].isnan()
+    # Its gradient reaches no node: the grid's are what the other points alone give.
+    assert same(found[3], without[3])
+    assert same(found[4], without[4])
+
+
+@few
+@given(seeds, st.booleans())
+def test_sample_dense_keeps_a_nan_gradient_near_its_point(seed, sparse):
+    g = torch.Generator().manual_seed(seed)
+    sdf = torch.randn(9, 3, 12, generator=g).requires_grad_()
+    features = torch.randn(9, 3, 12, 2, generator=g).requires_grad_()
+    points = torch.rand(30, 3, generator=g) * torch.tensor([8.0, 2.0, 11.0])
+    value, _, feature = ops.sample_dense(
+        sdf, features, points, (0.0, 0.0, 0.0), 1.0, sparse_grad=sparse
+    )
+    (value[0] * math.nan + value.sum() + feature[0, 0] * math.nan + feature.sum()).backward()
+    node = torch.cartesian_prod(*[torch.arange(n) for n in sdf.shape])
+    far = ((node - points[0]).abs() >= 2).any(1)  # value and slope reach less than two nodes
+    for leaf in (sdf, features):
+        grad = leaf.grad.to_dense() if sparse else leaf.grad
+        assert grad.flatten(0, 2)[far].isfinite().all()
+
+
+# --- shade_sg
+
+
+def shading(seed, n, k):
+    g = torch.Generator().manual_seed(seed)
+
+    def unit(*size):
+        v = torch.nn.functional.normalize(torch.randn(*size, 3, generator=g), dim=-1)
+        poles = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, -0.0, -0.0], [1, 0, 0], [1e-20, 0, 1]])
+        chosen = poles[torch.randint(len(poles), size, generator=g)]
+        return torch.where(torch.rand(*size, 1, generator=g) < 0.4, chosen, v)
+
+    normal = unit(n)
+    towards = torch.tensor([1.0, -1.0])[torch.randint(2, (n, 1), generator=g)]
+    wo = torch.where(torch.rand(n, 1, generator=g) < 0.3, normal * towards, unit(n))
+    sharpness = pick(g, (0.0, 1e-45, 1e-3, 30.0, 1e6, 1e30), n, k).abs()
+    amplitude = pick(g, (0.0, 1e-45, 1.0, 1e6), n, k, 3).abs()
+    albedo = pick(g, (0.0, 1.0, 1e-45), n, 3).clamp(0, 1)
+    roughness = pick(g, (0.0, 1.0, 1e-45, 0.03), n).clamp(0, 1)
+    parameters = (unit(n, k), sharpness, amplitude, normal, wo, albedo, roughness)
+    directions = sphere.fibonacci_hemisphere(32)
+    rotation = pick(g, (0.0, 6.2831853, -1e4), n)
+    return [p.requires_grad_() for p in parameters] + [directions, rotation]
+
+
+@few
+@given(seeds, st.integers(0, 5), st.integers(0, 3), st.sampled_from([0.0, 0.04, 1.0]))
+def test_shade_sg_is_finite(seed, n, k, f0):
+    check_finite(ops.shade_sg, ops.shade_sg_reference, (*shading(seed, n, k), f0))
+
+
+@few
+@given(seeds, st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 4, 5, 6, 8]))
+def test_shade_sg_keeps_nan_at_its_point(seed, point, argument):
+    arguments = shading(seed, 4, 2)
+    before = run(ops.shade_sg, arguments)
+    with torch.no_grad():
+        arguments[argument][point] = math.nan
+    after = run(ops.shade_sg, arguments)
+    others = torch.arange(4) != point
+    for a, b in zip(before, after, strict=True):
+        assert same(a[others], b[others])
+
+
+# --- march
+
+
+def rays_and_ball(seed, n):
+    g = torch.Generator().manual_seed(seed)
+    axes = [torch.arange(float(s)) for s in (14, 9, 11)]
+    x, y, z = torch.meshgrid(*axes, indexing="ij")
+    sdf = ((x - 6.5) ** 2 + (y - 4) ** 2 + (z - 5) ** 2).sqrt() - 3
+    origin = pick(g, (*WILD, math.inf, math.nan, 4.0), n, 3)
+    direction = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
+    odd = pick(g, (*WILD, math.inf, math.nan), n, 3)
+    direction = torch.where(torch.rand(n, 1, generator=g) < 0.3, odd, direction)
+    jitter = torch.rand(n, generator=g)
+    return sdf, origin, direction, jitter
+
+
+def march(sdf, origin, direction, jitter, **more):
+    options = {"step": 0.5, "inv_s": 2.0} | more
+    least = ops.brick_minimum(sdf)
+    return ops.march(sdf, least, origin, direction, jitter, (0.0, 0.0, 0.0), 1.0, **options)
+
+
+@few
+@given(seeds, st.integers(0, 60), st.sampled_from([1e-30, 1e-3, 2.0, 1e6, 1e30]))
+def test_march_survives(seed, n, inv_s):
+    samples = march(*rays_and_ball(seed, n), inv_s=inv_s)
+    assert samples.t.isfinite().all()
+    assert (samples.t >= 0).all()
+    assert samples.offsets[0] == 0
+    assert (samples.offsets.diff() >= 0).all()
+    assert samples.offsets[-1] == len(samples.t) == len(samples.connected)
+
+
+def test_march_refuses_rays_that_never_arrive():
+    sdf, *_ = rays_and_ball(0, 1)
+    origin = torch.tensor([[-1.0, 4.0, 5.0]]).expand(5, 3)
+    length = torch.tensor([1.0, 1e-12, 0.0, 1e-30, 1.0])
+    direction = length[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    samples = march(sdf, origin, direction, torch.zeros(5))
+    counts = samples.offsets.diff()
+    assert counts[0] == counts[4] > 0
+    assert counts[1:4].tolist() == [0, 0, 0]
+
+
+@few
+@given(seeds, st.integers(0, 3))
+def test_march_keeps_nan_in_its_ray(seed, argument):
+    sdf, origin, direction, jitter = rays_and_ball(seed, 20)
+    before = march(sdf, origin, direction, jitter)
+    for tensor in (origin, direction, jitter)[: 1 + argument % 3]:
+        tensor[7] = math.nan
+    after = march(sdf, origin, direction, jitter)
+    counts = after.offsets.diff()
+    assert counts[7] == 0
+    kept = torch.repeat_interleave(before.offsets.diff()) != 7
+    assert torch.equal(before.t[kept], after.t)
+    assert torch.equal(before.connected[kept], after.connected)
+
+
+def test_march_takes_rays_past_a_nan_node_as_before():
+    sdf, *_ = rays_and_ball(0, 1)
+    y, z = torch.meshgrid(torch.arange(8) + 0.5, torch.arange(10) + 0.5, indexing="ij")
+    origin = torch.stack([torch.full_like(y, -1.0), y, z], -1).reshape(-1, 3)
+    direction = torch.tensor([1.0, 0.0, 0.0]).expand(80, 3)
+    jitter = torch.zeros(80)
+    before = march(sdf, origin, direction, jitter)
+    sdf[4, 4, 5] = math.nan
+    after = march(sdf, origin, direction, jitter)
+    near = ((origin[:, 1:] - torch.tensor([4.0, 5.0])).abs() < 1).all(1)
+
+    def far(samples):
+        return samples.t[~near[torch.repeat_interleave(samples.offsets.diff())]]
+
+    assert near.sum() == 4
+    assert torch.equal(far(before), far(after))
+
+
+# --- smooth_rows_, adam_rows_
+
+
+@few
+@given(seeds, st.tuples(*[st.integers(1, 9)] * 3), channels, st.sampled_from([1, 2]))
+def test_smooth_rows_is_finite(seed, shape, n_channels, order):
+    g = torch.Generator().manual_seed(seed)
+    grid = pick(g, WILD, *shape, n_channels)
+    rows = torch.randperm(math.prod(shape), generator=g)[: int(torch.randint(99, (), generator=g))]
+    assert ops.smooth_rows_(grid.clone(), rows, 0.5, order).isfinite().all()
+    holed = grid.clone()
+    holed[0, 0, 0] = math.nan
+    got = ops.smooth_rows_(holed, rows, 0.5, order)
+    node = torch.cartesian_prod(*[torch.arange(n) for n in shape]).sum(1)
+    want = ops.smooth_rows_(grid.clone(), rows, 0.5, order)
+    far = node > order  # in steps from the hole
+    assert same(got.flatten(0, 2)[far], want.flatten(0, 2)[far])
+
+
+@few
+@given(seeds, st.integers(1, 9), channels, st.sampled_from([0.0, 1e-12, 1.0]))
+def test_adam_rows_keeps_nan_in_its_row(seed, n, n_channels, eps):
+    # Squares of gradients above 1.8e19 leave float32, here as in torch.optim.Adam.
+    g = torch.Generator().manual_seed(seed)
+    values = (0.0, 1e-45, 1e-30, 1.0, 1e18)
+    state = [pick(g, values, 12, n_channels), pick(g, values, 12, n_channels)]
+    state.append(pick(g, (0.0, 1e-45, 1.0, 1e36), 12, n_channels).abs())
+    rows = torch.randperm(12, generator=g)[:n]
+    grad = pick(g, values, n, n_channels)
+
+    def step(grad):
+        now = [t.clone() for t in state]
+        ops.adam_rows_(*now, rows, grad, 0.1, 0.9, 0.99, eps, 3)
+        return now
+
+    clean = step(grad)
+    wanted = [t.double() for t in state]
+    ops.adam_rows_reference_(*wanted, rows, grad.double(), 0.1, 0.9, 0.99, eps, 3)
+    if eps:  # without it a row that never met a gradient is 0 / 0
+        for got, want in zip(clean, wanted, strict=True):
+            assert (got.isfinite() | ~want.isfinite()).all()
+    grad[0] = math.nan
+    others = torch.arange(12) != rows[0]
+    for a, b in zip(clean, step(grad), strict=True):
+        assert same(a[others], b[others])
+
+
+# --- visibility
+
+
+@pytest.mark.skipif(
+    native.core is None or not native.core.embree_version(), reason="built without Embree"
+)
+@few
+@given(seeds, st.integers(0, 40))
+def test_rays_at_the_edge_meet_what_they_should(seed, n):
+    g = torch.Generator().manual_seed(seed)
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1e-40, 0, 0], [1e15, 0, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 0, 0], [0, 3, 1], [0, 4, 1]])  # three without area
+    scene = ops.VisibilityScene(vertices, faces)
+    values = (*WILD, math.inf, -math.inf, math.nan)
+    origin, direction = pick(g, values, n + 1, 3), pick(g, values, n + 1, 3)
+    origin[n], direction[n] = torch.tensor([0.2, 0.2, 1.0]), torch.tensor([0.0, 0.0, -1.0])
+    hit = scene.closest_hit(origin, direction)
+    assert not hit.t.isnan().any()
+    assert ((hit.face >= -1) & (hit.face < 4)).all()
+    assert scene.occluded(origin, direction).shape == (n + 1,)
+    assert hit.face[n] == 0
+    assert hit.t[n] == 1
+
+
+# --- strides
+
+
+@few
+@given(seeds, st.integers(0, 6))
+def test_strided_arguments_give_the_same_bits(seed, n):
+    def strided(t):
+        wide = torch.empty(*[2 * s for s in t.shape], dtype=t.dtype)
+        view = wide[tuple(slice(None, None, 2) for _ in t.shape)]
+        return view.copy_(t.detach())
+
+    dense = shading(seed, n, 2)
+    assert same(ops.shade_sg(*dense), ops.shade_sg(*map(strided, dense)))
+    alpha, value, offsets = packed_rays(seed, [n, 0, 2], 3)
+    for a, b in zip(
+        ops.composite(alpha, value, offsets),
+        ops.composite(*map(strided, (alpha, value, offsets))),
+        strict=True,
+    ):
+        assert same(a, b)
+    grid = lattice(seed, (3, 4, 5), 2, n)
+    place = ((0.0, 0.0, 0.0), 1.0)
+    for a, b in zip(
+        ops.sample_dense(*grid, *place), ops.sample_dense(*map(strided, grid), *place), strict=True
+    ):
+        assert same(a, b)
+    rays = rays_and_ball(seed, n)
+    rays[2][:] = torch.tensor([0.6, 0.0, 0.8])
+    assert torch.equal(march(*rays).t, march(*map(strided, rays)).t)

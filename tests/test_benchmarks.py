@@ -1,0 +1,13 @@
+"""The benchmarks' own machinery: a contender that dies must not take the run with it."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+def test_a_dying_contender_leaves_the_run_alone(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
+    workers = pytest.importorskip("workers")
+    with pytest.raises(RuntimeError, match="ended with -6"):
+        workers.Worker(os.abort)
