@@ -202,9 +202,12 @@ def _changed(config, changes: list[str]):
     import ast
     import dataclasses
 
+    def fields(node) -> list[str]:
+        return [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
+
     def replace(node, path: list[str], change: str, text: str):
         name, *rest = path
-        known = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
+        known = fields(node)
         if name not in known:
             raise ValueError(
                 f"--set {change}: no field {name!r}, there are: {', '.join(known) or 'none'}"

@@ -184,6 +184,7 @@ def smooth(field: DenseField, stage: StageConfig) -> None:
         (field.features.data, 1, stage.diffusion * SMOOTH_EVERY),
     ):
         grad = field.sdf.grad if order == 2 else field.features.grad
+        assert grad is not None
         x, y, z = grad._indices()  # coalesced by the op; autograd only forgets the flag
         rows = (x * grid.shape[1] + y) * grid.shape[2] + z
         smooth_rows_(grid, rows, amount, order)
