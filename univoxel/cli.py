@@ -10,7 +10,6 @@ import contextlib
 import dataclasses
 import functools
 import io
-import itertools
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -207,9 +206,14 @@ def _deferred(command: Callable[..., None]) -> Callable[..., functools.partial[N
 
 
 def _gist(box: str) -> str:
-    """The message alone of the box that tyro draws around an error, on one line."""
-    lines = [line.strip("│ \n") for line in box.splitlines() if not line.startswith(("╭", "╰"))]
-    message = itertools.takewhile(lambda line: not line.startswith("──"), lines)
+    """The message alone, on one line, of the box that tyro draws around an error.
+
+    The box has a title, the message and hints, with rules between them.
+    """
+    lines = [line.strip("│╰╯ ") for line in box.splitlines()][1:]
+    ruled = [bool(line) and not line.strip("─-") for line in lines]
+    begin = ruled[:1] == [True]  # without UTF-8 there is a rule under the title
+    message = lines[begin : ruled.index(True, begin)] if True in ruled[begin:] else lines
     return " ".join(" ".join(message).split()).rstrip(".")
 
 

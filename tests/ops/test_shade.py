@@ -1,4 +1,4 @@
-"""Shading from given directions: native against reference, closed forms, extremes, bad arguments."""
+"""Shading from given directions: native against reference, closed forms, bad arguments."""
 
 import math
 
