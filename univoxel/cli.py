@@ -13,7 +13,7 @@ import io
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
@@ -227,7 +227,7 @@ def _kept(call: functools.partial[None]) -> str:
     return f"; nothing was saved in {out} yet"
 
 
-def _changed(config, changes: Iterable[str]):
+def _changed(config: Any, changes: Iterable[str]) -> Any:
     """A frozen config with fields replaced: changes are "field.field=value".
 
     Raises:
@@ -244,7 +244,7 @@ def _changed(config, changes: Iterable[str]):
     return config
 
 
-def _replaced(node, path: list[str], text: str):
+def _replaced(node: Any, path: list[str], text: str) -> Any:
     """A config, or a tuple of configs, in which the value at the path is what the text says."""
     if not path:
         return _value(node, text)
