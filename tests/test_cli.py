@@ -18,6 +18,12 @@ class LossConfig:
 
 
 @dataclass(frozen=True)
+class StageConfig:
+    voxels: float = 1.0
+    rates: tuple[float, float] = (0.1, 0.01)
+
+
+@dataclass(frozen=True)
 class Config:
     data: Path
     out: Path
@@ -25,6 +31,7 @@ class Config:
     minutes: float = 4.0
     seed: int = 0
     loss: LossConfig = LossConfig()
+    stages: tuple[StageConfig, ...] = (StageConfig(), StageConfig())
 
 
 @pytest.fixture
@@ -53,7 +60,7 @@ def calls(monkeypatch):
         stand_in(f"univoxel.tasks.{name}", **{name: task(name, result)})
 
     stand_in("univoxel.config", preset=lambda name, data, out: Config(data, out, name))
-    replace("train", None)
+    replace("train", Path("run"))
     replace("evaluate", {"psnr": 31.25, "views": 5})
     replace("relight", None)
     replace("export", None)
@@ -61,11 +68,14 @@ def calls(monkeypatch):
     return types.SimpleNamespace(noted=noted, replace=replace)
 
 
-def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path):
+def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     out = tmp_path / "run"
-    options = ["--preset", "draft", "--minutes", "2", "--set", "loss.radiance=2", "--set", "seed=7"]
+    changes = ["loss.radiance=2", "seed=7", "stages.1.voxels=3", "stages.0.rates=(0.5, 0.1)"]
+    options = ["--preset", "draft", "--minutes", "2", *(f"--set={change}" for change in changes)]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
-    expected = Config(Path("photos"), out, "draft", 2.0, 7, LossConfig(2.0))
+    stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0)
+    expected = Config(Path("photos"), out, "draft", 2.0, 7, LossConfig(2.0), stages)
+    assert capsys.readouterr().out == "run\n"
     assert calls.noted == [("train", (expected,), {"resume": False})]
 
 
@@ -83,9 +93,16 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
 
 
 def test_eval(calls):
-    assert main(["eval", "run", "--data", "photos", "--save", "dir", "--json", "m.json"]) == 0
+    options = ["--samples", "8", "--bounces", "0"]
     paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
-    assert calls.noted == [("evaluate", (Path("run"),), paths)]
+    named = [str(part) for name, path in paths.items() for part in (f"--{name}", path)]
+    assert main(["eval", "run", *named, *options]) == 0
+    assert main(["eval", "run"]) == 0
+    default = {"data": None, "save": None, "json": None, "samples": 64, "bounces": 2}
+    assert calls.noted == [
+        ("evaluate", (Path("run"),), {**paths, "samples": 8, "bounces": 0}),
+        ("evaluate", (Path("run"),), default),
+    ]
 
 
 def test_relight_export_and_demo(calls, capsys):
@@ -109,6 +126,7 @@ def test_relight_export_and_demo(calls, capsys):
         FileNotFoundError("bad input"),
         RuntimeError("bad input"),
         ImportError("bad input"),
+        FloatingPointError("bad input"),
     ],
 )
 def test_a_mistake_is_one_line(calls, capsys, error):
@@ -128,12 +146,13 @@ def test_a_bug_is_no_mistake_of_the_user(calls):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--minutes", "0"], "--minutes must be above 0, got 0.0"),
+        (["--minutes", "0"], "--minutes must be above 0, got 0"),
         (["--minutes", "nan"], "--minutes must be above 0, got nan"),
         (["--set", "seed"], "--set seed: expected FIELD=VALUE"),
         (["--set", "sede=1"], "--set sede=1: no field 'sede', there are: data, out, preset"),
         (["--set", "seed.x=1"], "--set seed.x=1: no field 'x', there are: none"),
-        (["--set", "seed=fast"], "--set seed=fast: seed is a int such as 0, got 'fast'"),
+        (["--set", "seed=fast"], "--set seed=fast: expected a int such as 0, got 'fast'"),
+        (["--set", "stages.2.voxels=1"], "--set stages.2.voxels=1: no field '2', there are: 0, 1"),
     ],
 )
 def test_bad_options(calls, tmp_path, capsys, options, message):
@@ -142,11 +161,26 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
     assert calls.noted == []
 
 
-@pytest.mark.parametrize("arguments", [["train"], ["train", "x", "--out", "y", "--preset", "z"]])
-def test_unknown_arguments_exit_with_2(calls, capsys, arguments):
-    with pytest.raises(SystemExit) as exit_:
-        main(arguments)
-    assert exit_.value.code == 2
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train"], "Missing from univoxel train: DATA "),
+        (
+            ["train", "x", "--out", "y", "--preset", "z"],
+            "invalid choice 'z' for argument '--preset'. Expected one of ('draft', 'fast', 'full')",
+        ),
+        (["train", "x", "--out", "y", "--minutes", "a"], "Error parsing --minutes: "),
+        (["sing"], "Unrecognized options: sing"),
+        ([], "Expected one of {train, eval, relight, export, demo}"),
+    ],
+)
+def test_wrong_usage_is_one_line(calls, capsys, arguments, message):
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith(f"univoxel: {message}")
+    assert err.endswith("; see univoxel --help\n")
+    assert err.count("\n") == 1
+    assert not out
     assert calls.noted == []
 
 
@@ -163,7 +197,7 @@ def test_an_interrupt_says_what_was_kept(calls, tmp_path, capsys):
 def test_help_does_not_wait_for_torch():
     code = (
         "import sys\nfrom univoxel.cli import main\n"
-        "try: main(['train', '--help'])\nexcept SystemExit as e: assert not e.code\n"
+        "assert main(['train', '--help']) == 0\n"
         "assert 'torch' not in sys.modules"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

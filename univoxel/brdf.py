@@ -108,7 +108,7 @@ def specular_albedo(n_dot_v: Tensor, roughness: Tensor, f0: Tensor | float = 0.0
     powers = torch.arange(5, device=v.device)
     v, roughness, u = torch.broadcast_tensors(v, roughness, v / (v + alpha))
     exponent = torch.tensor(_EXPONENTS, device=v.device).T
-    monomials = 1.0
+    monomials = v.new_ones(())
     for variable, e in zip((v, roughness, u), exponent, strict=True):
         # x ** 0 has gradient 0 everywhere, also at x = 0
         monomials = monomials * (variable[..., None] ** powers)[..., e]

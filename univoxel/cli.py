@@ -5,11 +5,15 @@ Tasks are imported by the command that runs them: `univoxel --help` does not wai
 
 from __future__ import annotations
 
+import ast
+import contextlib
+import dataclasses
 import functools
+import io
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
@@ -41,18 +45,20 @@ def train(
         preset: how much work goes in: draft is a look, fast the usual, full the best
         minutes: wall-clock limit, above 0; training ends in time with what it has
         resume: go on with the run in --out
-        set: for experts: one field of the configuration, such as loss.radiance=0.5
+        set: for experts: one field of the configuration, such as loss.radiance=0.5 or
+            stages.1.voxels=3; config.json in a run's folder holds them all
     """
     from univoxel.config import preset as preset_config
     from univoxel.tasks import train as task
 
     if minutes is not None and not minutes > 0:
-        raise ValueError(f"--minutes must be above 0, got {minutes}")
+        raise ValueError(f"--minutes must be above 0, got {minutes:g}")
     if not resume and (out / "scene.safetensors").exists():
         raise FileExistsError(f"{out} holds a run already: add --resume, or choose another --out")
     config = preset_config(preset, data=data, out=out)
-    limit = [] if minutes is None else [f"minutes={minutes}"]
-    task.train(_changed(config, [*limit, *set]), resume=resume)
+    if minutes is not None:
+        config = dataclasses.replace(config, minutes=minutes)
+    print(task.train(_changed(config, set), resume=resume))
 
 
 def evaluate(
@@ -67,6 +73,8 @@ def evaluate(
     json: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: only printed)")
     ] = None,
+    samples: int = 64,
+    bounces: int = 2,
 ) -> None:
     """Measure a run on the test views and print the table.
 
@@ -75,10 +83,12 @@ def evaluate(
         data: folder of the photographs
         save: folder for the rendered pictures
         json: file for the measures
+        samples: of the light, per pixel of relit pictures
+        bounces: reflections between parts of the object in relit pictures, 0 for none
     """
     from univoxel.tasks import evaluate as task
 
-    task.evaluate(run, data=data, save=save, json=json)
+    task.evaluate(run, data=data, save=save, json=json, samples=samples, bounces=bounces)
 
 
 def relight(
@@ -140,6 +150,10 @@ COMMANDS: dict[str, Callable[..., None]] = {
 }
 
 
+# What a command raises for a mistake of its user; all else is a bug and keeps its traceback.
+MISTAKES = (ValueError, OSError, RuntimeError, ImportError, FloatingPointError, MemoryError)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 for a user's mistake, 130 when interrupted.
 
@@ -152,19 +166,27 @@ def main(argv: list[str] | None = None) -> int:
     traceback = "--traceback" in arguments
     arguments = [a for a in arguments if a != "--traceback"]
     # Parse alone first: what a command raises must not pass for an error of its arguments.
-    call = tyro.extras.subcommand_cli_from_dict(
-        {name: _deferred(command) for name, command in COMMANDS.items()},
-        prog="univoxel",
-        description="From posed photographs to a relightable object, on a plain CPU.",
-        args=arguments,
-        config=(FlagCreatePairsOff,),
-    )
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            call = tyro.extras.subcommand_cli_from_dict(
+                {name: _deferred(command) for name, command in COMMANDS.items()},
+                prog="univoxel",
+                description="From posed photographs to a relightable object, on a plain CPU.",
+                args=arguments,
+                config=(FlagCreatePairsOff,),
+            )
+    except SystemExit as end:
+        if end.code:
+            print(f"univoxel: {_gist(said.getvalue())}; see univoxel --help", file=sys.stderr)
+            return 2
+        return 0
     try:
         call()
     except KeyboardInterrupt:
         print(f"univoxel {arguments[0]}: interrupted{_kept(call)}", file=sys.stderr)
         return 130
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
+    except MISTAKES as error:
         if traceback:
             raise
         message = " ".join(str(error).split()) or type(error).__name__
@@ -183,6 +205,18 @@ def _deferred(command: Callable[..., None]) -> Callable[..., functools.partial[N
     return prepare
 
 
+def _gist(box: str) -> str:
+    """The message alone, on one line, of the box that tyro draws around an error.
+
+    The box has a title, the message and hints, with rules between them.
+    """
+    lines = [line.strip("│╰╯ ") for line in box.splitlines()][1:]
+    ruled = [bool(line) and not line.strip("─-") for line in lines]
+    begin = ruled[:1] == [True]  # without UTF-8 there is a rule under the title
+    message = lines[begin : ruled.index(True, begin)] if True in ruled[begin:] else lines
+    return " ".join(" ".join(message).split()).rstrip(".")
+
+
 def _kept(call: functools.partial[None]) -> str:
     """What an interrupted command left behind."""
     out = call.keywords.get("out")
@@ -193,45 +227,54 @@ def _kept(call: functools.partial[None]) -> str:
     return f"; nothing was saved in {out} yet"
 
 
-def _changed(config, changes: list[str]):
+def _changed(config: Any, changes: Iterable[str]) -> Any:
     """A frozen config with fields replaced: changes are "field.field=value".
 
     Raises:
         ValueError: no such field, or a value of another type than the field has.
     """
-    import ast
-    import dataclasses
-
-    def replace(node, path: list[str], change: str, text: str):
-        name, *rest = path
-        known = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
-        if name not in known:
-            raise ValueError(
-                f"--set {change}: no field {name!r}, there are: {', '.join(known) or 'none'}"
-            )
-        old = getattr(node, name)
-        if rest:
-            return dataclasses.replace(node, **{name: replace(old, rest, change, text)})
-        try:
-            new = ast.literal_eval(text)
-        except (ValueError, SyntaxError):
-            new = text
-        if isinstance(old, float) and isinstance(new, int) and not isinstance(new, bool):
-            new = float(new)
-        if isinstance(old, Path) and isinstance(new, str):
-            new = Path(new)
-        if old is not None and type(new) is not type(old):
-            raise ValueError(
-                f"--set {change}: {name} is a {type(old).__name__} such as {old!r}, got {text!r}"
-            )
-        return dataclasses.replace(node, **{name: new})
-
     for change in changes:
         path, equals, text = change.partition("=")
         if not equals:
             raise ValueError(f"--set {change}: expected FIELD=VALUE")
-        config = replace(config, path.split("."), change, text)
+        try:
+            config = _replaced(config, path.split("."), text)
+        except ValueError as error:
+            raise ValueError(f"--set {change}: {error}") from None
     return config
+
+
+def _replaced(node: Any, path: list[str], text: str) -> Any:
+    """A config, or a tuple of configs, in which the value at the path is what the text says."""
+    if not path:
+        return _value(node, text)
+    name, *rest = path
+    known = [str(i) for i in range(len(node))] if isinstance(node, tuple) else _fields(node)
+    if name not in known:
+        raise ValueError(f"no field {name!r}, there are: {', '.join(known) or 'none'}")
+    if isinstance(node, tuple):
+        i = int(name)
+        return (*node[:i], _replaced(node[i], rest, text), *node[i + 1 :])
+    return dataclasses.replace(node, **{name: _replaced(getattr(node, name), rest, text)})
+
+
+def _fields(node) -> list[str]:
+    return [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
+
+
+def _value(old, text: str):
+    """The text as a value of the same type as the old one."""
+    if isinstance(old, Path):
+        return Path(text)
+    try:
+        new = ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        new = text
+    if isinstance(old, float) and type(new) is int:
+        new = float(new)
+    if type(new) is not type(old):
+        raise ValueError(f"expected a {type(old).__name__} such as {old!r}, got {text!r}")
+    return new
 
 
 if __name__ == "__main__":

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from univoxel.data.images import replacing
 from univoxel.scene import SceneConfig
 
 
@@ -14,22 +18,35 @@ from univoxel.scene import SceneConfig
 class StageConfig:
     """One stage of training, on a grid of its own resolution."""
 
-    voxels: float  # millions of voxels in the object's box
-    iterations: int  # optimisation steps, fewer when time runs out
+    voxels: float  # millions of voxels in the object's box, > 0
+    iterations: int  # optimisation steps, >= 1; fewer when time runs out
     share: float  # of the time budget, (0, 1]
-    rays: int = 2048  # per step
+    rays: int = 2048  # per step, >= 1
     sharpness: tuple[float, float] = (0.5, 0.5)  # s of the NeuS density at begin and end, voxels
-    lr_sdf: tuple[float, float] = (0.2, 0.02)  # at begin and end, voxels per step
+    lr_sdf: tuple[float, float] = (0.2, 0.02)  # at begin and end, voxels per step; all rates > 0
     lr_features: tuple[float, float] = (0.1, 0.01)
     lr_networks: tuple[float, float] = (3e-3, 3e-4)
     plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.5]
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 1]
     physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
 
+    def __post_init__(self):
+        _check(self, "above 0", lambda x: 0 < x < math.inf, "voxels")
+        _check(self, "at least 1", lambda x: x >= 1, "iterations", "rays")
+        _check(self, "in (0, 1]", lambda x: 0 < x <= 1, "share")
+        _check(
+            self,
+            "two numbers above 0",
+            lambda x: len(x) == 2 and all(0 < v < math.inf for v in x),
+            *("sharpness", "lr_sdf", "lr_features", "lr_networks"),
+        )
+        _check(self, "in [0, 0.5]", lambda x: 0 <= x <= 0.5, "plate")
+        _check(self, "in [0, 1]", lambda x: 0 <= x <= 1, "diffusion", "physical_from")
+
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the losses; the photometric loss of the physically based render has 1."""
+    """Weights >= 0 of the losses; the photometric loss of the physically based render has 1."""
 
     radiance: float = 1.0
     silhouette: float = 0.1
@@ -38,22 +55,47 @@ class LossConfig:
     light_smoothness: float = 0.1
     white_light: float = 0.01
 
+    def __post_init__(self):
+        names = [f.name for f in dataclasses.fields(self)]
+        _check(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
+
 
 @dataclass(frozen=True)
 class TrainConfig:
     data: Path  # folder of the data set
     out: Path  # folder of the run
     stages: tuple[StageConfig, ...]
-    minutes: float  # training ends in time, with what it has
+    minutes: float  # > 0; training ends in time, with what it has
     seed: int = 0
     scene: SceneConfig = field(default_factory=SceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
 
+    def __post_init__(self):
+        _check(self, "a path", lambda x: isinstance(x, Path), "data", "out")
+        _check(self, "at least one", lambda x: len(x) >= 1, "stages")
+        _check(self, "above 0", lambda x: x > 0, "minutes")
+
+
+def _check(config: object, wanted: str, holds: Callable[[Any], bool], *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        try:
+            held = holds(value)
+        except TypeError:
+            held = False
+        if not held:
+            raise ValueError(f"{type(config).__name__}: {name} must be {wanted}, got {value!r}")
+
 
 def save_config(cfg: TrainConfig) -> None:
-    """Write the resolved configuration to config.json in the run's folder."""
+    """Write the resolved configuration to config.json in the run's folder, whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     text = json.dumps(dataclasses.asdict(cfg), indent=2, default=str)
-    (cfg.out / "config.json").write_text(text + "\n")
+    with replacing(cfg.out / "config.json") as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def preset(name: str, data: Path, out: Path) -> TrainConfig:

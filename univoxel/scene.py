@@ -25,10 +25,22 @@ FILE = "scene.safetensors"
 class SceneConfig:
     """Sizes of the model."""
 
-    channels: int = 16  # features per voxel
-    material_channels: int = 8  # of them, that albedo and roughness are decoded from
-    hidden: int = 64  # width of the material and radiance heads
+    channels: int = 16  # features per voxel, >= 1
+    material_channels: int = 8  # of them, that albedo and roughness are decoded from, >= 1
+    hidden: int = 64  # width of the material and radiance heads, >= 1
     light: SGConfig = field(default_factory=SGConfig)
+
+    def __post_init__(self):
+        for name in ("channels", "material_channels", "hidden"):
+            if getattr(self, name) < 1:
+                raise ValueError(
+                    f"SceneConfig: {name} must be at least 1, got {getattr(self, name)}"
+                )
+        if self.material_channels > self.channels:
+            raise ValueError(
+                f"SceneConfig: material_channels must be at most channels ({self.channels}), "
+                f"got {self.material_channels}"
+            )
 
 
 class Scene(nn.Module):

@@ -70,9 +70,6 @@ def folders(tmp_path):
     corner = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     np.savez(data / "points.npz", points=corner.numpy() / 3 + np.float32([0, 0, 2]))
     (run / "config.json").write_text(json.dumps({"data": str(data)}))
-    (run / "log.jsonl").write_text(
-        '{"seconds": 1.0}\n{"seconds": 8.5, "threads": 2, "peak_rss_mb": 700.0}\n'
-    )
     (run / "scene.safetensors").write_bytes(bytes(123))
     return SimpleNamespace(data=data, run=run)
 
@@ -116,7 +113,8 @@ def relit_calls(monkeypatch):
     monkeypatch.setattr(layers_module, "shade", lambda scene, surface, wo: surface.albedo * SCALE)
     monkeypatch.setattr(layers_module, "relight_surface", relight_surface)
     monkeypatch.setattr(task, "extract_mesh", extract_mesh)
-    monkeypatch.setattr(task, "load_scene", lambda run: scene)
+    state = {"seconds": 8.5, "threads": 2, "peak_rss_mb": 700.0}
+    monkeypatch.setattr(task, "load_checkpoint", lambda run: (scene, state))
     return calls
 
 
@@ -213,10 +211,10 @@ def test_without_truth_measures_are_null(folders, relit_calls, tmp_path):
         path.unlink()
     (folders.data / "relight" / "dim").rmdir()
     (folders.data / "points.npz").unlink()
-    (folders.run / "log.jsonl").unlink()
     result = task.evaluate(folders.run, save=tmp_path / "out")
     missing = {key for key, value in result.items() if value is None}
-    assert missing == set(task.MEASURES) - {"nvs_psnr", "nvs_ssim", "parameters", "model_bytes"}
+    training = {"train_seconds", "threads", "peak_rss_mb", "parameters", "model_bytes"}
+    assert missing == set(task.MEASURES) - training - {"nvs_psnr", "nvs_ssim"}
     assert not relit_calls
     assert (tmp_path / "out" / "contact_sheet.png").is_file()
 
@@ -250,7 +248,6 @@ def broken_relit(folders):
         ),
         (lambda f: (f.run / "config.json").write_text("{}"), "config.json: .* the key data"),
         (lambda f: (f.run / "config.json").write_text("{"), "config.json: .* JSON"),
-        (lambda f: (f.run / "log.jsonl").write_text("{}\n{"), "log.jsonl: .* last line"),
         (
             lambda f: (f.data / "envmaps" / "dim.hdr").write_bytes(b"#?"),
             r"dim\.hdr: expected a header",

@@ -68,7 +68,7 @@ def test_albedo_tells_the_sides_apart(run):
 
 
 def test_time_ends_a_run_with_a_usable_result(data, tmp_path):
-    out = train(config(data, tmp_path / "run", minutes=0.0))
+    out = train(config(data, tmp_path / "run", minutes=1e-3))
     assert extract_mesh(load_scene(out)).faces.numel() > 0
 
 

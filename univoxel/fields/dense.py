@@ -40,11 +40,10 @@ class DenseField(AbstractField):
         )
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
-        if self._brick_min is None:
-            self.refresh()
+        brick_min = self.refresh() if self._brick_min is None else self._brick_min
         return march(
             self.sdf.detach(),
-            self._brick_min,
+            brick_min,
             rays.origin,
             rays.direction,
             jitter,
@@ -54,9 +53,10 @@ class DenseField(AbstractField):
             inv_s=inv_s,
         )
 
-    def refresh(self) -> None:
-        """Look again which bricks are empty: after the sdf has moved or was loaded."""
+    def refresh(self) -> Tensor:
+        """Look again which bricks are empty, after the sdf has moved: the least sdf of each."""
         self._brick_min = brick_minimum(self.sdf.detach())
+        return self._brick_min
 
     def isosurface(self) -> tuple[Tensor, Tensor]:
         """Vertices [P, 3] float32 and faces [F, 3] int32 of the zero level (marching cubes,

@@ -25,9 +25,11 @@ class MaterialHead(nn.Module):
         super().__init__()
         self.channels = channels
         self.net = mlp([channels, hidden, hidden, 4])
+        last = self.net[-1]
+        assert isinstance(last, nn.Linear)
         with torch.no_grad():  # start mid-grey and rather rough, whatever the features
-            self.net[-1].weight.mul_(0.1)
-            self.net[-1].bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.5]))
+            last.weight.mul_(0.1)
+            last.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.5]))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         out = torch.sigmoid(self.net(features[:, : self.channels]))

@@ -40,7 +40,8 @@ def fit_grid(lower: Tensor, upper: Tensor, voxels: int) -> GridShape:
     voxel_size = float((extent.prod() / voxels) ** (1 / 3))
     cells = (extent / voxel_size).ceil().clamp_min(2)
     origin = (lower + upper).double() / 2 - cells * voxel_size / 2
-    return GridShape(tuple(origin.tolist()), voxel_size, tuple(int(c) + 1 for c in cells.tolist()))
+    x, y, z = (int(c) + 1 for c in cells.tolist())
+    return GridShape(tuple(origin.tolist()), voxel_size, (x, y, z))
 
 
 def mask_distances(alpha: Tensor) -> Tensor:
@@ -55,8 +56,8 @@ def mask_distances(alpha: Tensor) -> Tensor:
             result[v] = max(a.shape)  # nothing seen: everything is far outside
             continue
         padded = np.pad(inside, 1)  # what leaves the picture ends there
-        d = ndimage.distance_transform_edt(~padded) - ndimage.distance_transform_edt(padded)
-        d = d[1:-1, 1:-1]
+        outside, depth = (ndimage.distance_transform_edt(m) for m in (~padded, padded))
+        d = (np.asarray(outside) - np.asarray(depth))[1:-1, 1:-1]
         # Next to the edge the distance to pixel centres is 1; coverage says where in between.
         edge = np.abs(d) <= 1
         d = d - np.sign(d) * 0.5
@@ -131,8 +132,8 @@ def visual_hull(distance: Tensor, cameras: Cameras, grid: GridShape) -> Tensor:
 
 def fit_coarse(grid: GridShape, stride: int) -> GridShape:
     """A grid from the same origin with voxels `stride` times as wide that covers the same box."""
-    size = tuple(-(-(n - 1) // stride) + 1 for n in grid.size)
-    return GridShape(grid.origin, grid.voxel_size * stride, size)
+    x, y, z = (-(-(n - 1) // stride) + 1 for n in grid.size)
+    return GridShape(grid.origin, grid.voxel_size * stride, (x, y, z))
 
 
 def resample(values: Tensor, source: GridShape, target: GridShape) -> Tensor:

@@ -14,6 +14,8 @@ class DistantLight(nn.Module):
     """Radiance at D directions of a Fibonacci sphere, 4 pi / D steradians each; kept as logarithm,
     so that it stays positive and a bright sun is as far away as a dark wall."""
 
+    direction: Tensor
+
     def __init__(self, count: int, radiance: float = 1.0):
         super().__init__()
         self.log_radiance = nn.Parameter(torch.full((count, 3), radiance).log())  # [D, 3]

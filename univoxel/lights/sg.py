@@ -72,13 +72,13 @@ class LocalSG(AbstractLight):
         stack: list[nn.Module] = []
         for before, after in itertools.pairwise(sizes):
             stack += [nn.Linear(before, after), nn.ReLU()]
-        stack.append(nn.Linear(sizes[-1], 7 * config.lobes))
-        self.head = nn.Sequential(*stack)
+        last = nn.Linear(sizes[-1], 7 * config.lobes)
+        self.head = nn.Sequential(*stack, last)
         for layer in self.head:
             if isinstance(layer, nn.Linear):
                 nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
                 nn.init.zeros_(layer.bias)
-        nn.init.zeros_(self.head[-1].weight)  # the global light is the starting point
+        nn.init.zeros_(last.weight)  # the global light is the starting point
         self.base = nn.Parameter(_white_light(config))  # [K, 7]
 
     def raw(self, surface: Surface) -> Tensor:

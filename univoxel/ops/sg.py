@@ -142,7 +142,7 @@ def _shade_sg_backward(
     native.require().shade_sg_backward(
         *native.arrays(*inputs, grad_rgb, *grads), f0, native.threads()
     )
-    return grads
+    return grads  # pyright: ignore[reportReturnType]  there are seven
 
 
 @_shade_sg.register_fake

@@ -104,13 +104,12 @@ def shade_map(
 
     Differentiable in: map, albedo, roughness. Second order raises.
     """
-    bytes_or_map = (torch.uint8,) if _is(visibility, torch.uint8) else ()
-    half_or_map = (torch.float16,) if _is(indirect, torch.float16) else ()
+    as_bytes, as_half = _is(visibility, torch.uint8), _is(indirect, torch.float16)
     check(
         "shade_map",
         map=(map, "D 3"),
-        visibility=(visibility, "P D", *bytes_or_map),
-        indirect=(indirect, "P D 3", *half_or_map),
+        visibility=(visibility, "P D", torch.uint8) if as_bytes else (visibility, "P D"),
+        indirect=(indirect, "P D 3", torch.float16) if as_half else (indirect, "P D 3"),
         index=(index, "N", torch.int64),
         normal=(normal, "N 3"),
         wo=(wo, "N 3"),

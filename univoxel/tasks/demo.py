@@ -4,33 +4,55 @@ from __future__ import annotations
 
 import base64
 import html
-import time
+from dataclasses import replace
 from pathlib import Path
 
 from univoxel.config import preset
-from univoxel.tasks.evaluate import evaluate
+from univoxel.data.images import replacing
+from univoxel.scene import FILE
+from univoxel.tasks.evaluate import MEASURES, evaluate
 from univoxel.tasks.export import export
 from univoxel.tasks.relight import relight
 from univoxel.tasks.train import train
 
 SCENE = Path(__file__).parent.parent / "example_data" / "tiny"
 MAPS = ("city", "sunset")
+VOXELS = 0.3, 0.6  # millions, of the two stages
+MINUTES = 2.0  # of training: the whole takes less than twice that on two cores
 
 _PAGE = """<!doctype html>
+<html lang="en">
 <meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
 <title>univoxel demo</title>
 <style>
-body {{ font: 16px/1.5 sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em }}
-img {{ min-width: 200px; max-width: 100%; image-rendering: pixelated; background: #000 }}
-figure {{ display: inline-block; margin: 4px; text-align: center; font-size: 13px }}
+body {{ font: 16px/1.5 sans-serif; max-width: 72em; margin: 2em auto; padding: 0 1em }}
+img {{ display: block; max-width: 100%; background: #000 }}
+img.small {{ width: 200px; image-rendering: pixelated }}
+img.wide {{ width: 100% }}
+div.wide {{ overflow-x: auto }}
+div.wide img {{ max-width: none }}
+.row {{ display: flex; flex-wrap: wrap; gap: 6px; align-items: center; margin: 6px 0 }}
+.row b {{ width: 5em; font-weight: normal }}
 td {{ padding-right: 2em }}
+td:last-child {{ text-align: right }}
 </style>
 <h1>univoxel: from {photos} photographs to a relightable object</h1>
-<p>Trained in {minutes:.1f} minutes on this machine's CPU. Beside this page: the run
-(<code>run/</code>) and its mesh (<code>mesh.ply</code>).</p>
-{sections}
+<p>Trained in {seconds:.0f} seconds on this machine's CPU. Beside this page lie the run
+(<code>run/</code>), its surface (<code>mesh.ply</code>), the test views as layers
+(<code>test/</code>) and the relit frames (<code>relight/</code>).</p>
+<h2>A view</h2>
+<p>Photograph, render, albedo, roughness, normal.</p>
+{preview}
+<h2>Under other light</h2>
+<p>Test views, lit by environment maps that the training never saw; truth is what a path tracer
+makes of the true object.</p>
+{relit}
 <h2>Measures on the test views</h2>
-<table>{rows}</table>
+<table>{measures}</table>
+<h2>Test views, their truth and the error</h2>
+<div class="wide">{sheet}</div>
+</html>
 """
 
 
@@ -38,57 +60,57 @@ def demo(out: Path) -> Path:
     """Train on the bundled scene, evaluate, relight under two maps; returns the page to open.
 
     Writes into `out`: run/, test/ (what `univoxel eval --save` writes), relight/<map>/, mesh.ply
-    and index.html, which holds its pictures and needs no other file.
+    and index.html, which holds its pictures and needs no other file. A run that is there already is
+    trained to its end and not again.
 
     Raises:
         OSError: `out` cannot be written.
+        ValueError: the run that is there cannot be read.
     """
-    out.mkdir(parents=True, exist_ok=True)
     run = out / "run"
-    start = time.monotonic()
-    train(preset("fast", data=SCENE, out=run))
-    minutes = (time.monotonic() - start) / 60
+    config = preset("fast", data=SCENE, out=run)
+    # A voxel as wide as a pixel of these small pictures: finer ones would only fit noise.
+    stages = tuple(replace(s, voxels=v) for s, v in zip(config.stages, VOXELS, strict=True))
+    config = replace(config, stages=stages, minutes=MINUTES)
+    train(config, resume=(run / FILE).exists())
     measures = evaluate(run, save=out / "test")
-    for name in MAPS:
-        relight(run, SCENE / "envmaps" / f"{name}.hdr", out / "relight" / name, cameras="test")
+    relight(run, [SCENE / "envmaps" / f"{name}.hdr" for name in MAPS], out / "relight")
     export(run, out / "mesh.ply")
 
-    views = sorted(p.stem for p in (SCENE / "test").glob("*.png"))
-    sections = [
-        _section("Test views, never trained on", out / "test", ["contact_sheet"]),
-        _section("Photographs of these views", SCENE / "test", views),
-    ]
-    for name in MAPS:
-        sections.append(_section(f"Relit: {name}", out / "relight" / name, views))
-        sections.append(_section(f"Truth: {name}", SCENE / "relight" / name, views))
-    rows = (
-        f"<tr><td>{html.escape(str(name))}<td>{_text(value)}" for name, value in measures.items()
-    )
     page = out / "index.html"
-    page.write_text(
-        _PAGE.format(
-            photos=len(list((SCENE / "train").glob("*.png"))),
-            minutes=minutes,
-            sections="\n".join(sections),
-            rows="\n".join(rows),
+    text = _PAGE.format(
+        photos=len(list((SCENE / "train").glob("*.png"))),
+        seconds=measures["train_seconds"] or 0,
+        preview=_image(run / "preview.png", "wide"),
+        relit="\n".join(_relit(out / "relight" / name, name) for name in MAPS),
+        measures="\n".join(
+            f"<tr><td>{html.escape(meaning)}<td>{_text(measures[key])}"
+            for key, meaning in MEASURES.items()
         ),
-        encoding="utf-8",
+        sheet=_image(out / "test" / "contact_sheet.png"),
     )
+    with replacing(page) as temporary:
+        temporary.write_text(text, encoding="utf-8")
     return page
 
 
-def _section(title: str, folder: Path, views: list[str]) -> str:
-    """A heading and the pictures of a folder, embedded, view by view."""
-    figures = [
-        f'<figure><img alt="{path.stem}" src="data:image/png;base64,'
-        f'{base64.b64encode(path.read_bytes()).decode()}"><br>'
-        f"{html.escape(path.relative_to(folder).with_suffix('').as_posix())}</figure>"
-        for view in views
-        for path in sorted(folder.rglob(f"{view}*.png"))
-        if "gt" not in path.relative_to(folder).parts
-    ]
-    return f"<h2>{html.escape(title)}</h2>\n" + "\n".join(figures)
+def _relit(folder: Path, name: str) -> str:
+    """The frames under a map in one row, their truth in another."""
+    views = sorted(path.stem for path in (SCENE / "test").glob("*.png"))
+    rows = [f"<h3>{html.escape(name)}</h3>"]
+    for what, pictures in (("univoxel", folder), ("truth", SCENE / "relight" / name)):
+        images = "".join(_image(pictures / f"{view}.png", "small") for view in views)
+        rows.append(f'<div class="row"><b>{what}</b>{images}</div>')
+    return "\n".join(rows)
 
 
-def _text(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else html.escape(str(value))
+def _image(path: Path, kind: str = "") -> str:
+    """A picture, embedded."""
+    data = base64.b64encode(path.read_bytes()).decode()
+    return f'<img class="{kind}" alt="{html.escape(path.stem)}" src="data:image/png;base64,{data}">'
+
+
+def _text(value: float | int | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else f"{value:,}"

@@ -30,7 +30,7 @@ from univoxel.data.images import read_image, replacing, write_exr, write_png
 from univoxel.envmap import EnvMap
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh, surface_of_view
-from univoxel.scene import Scene, load_scene
+from univoxel.scene import FILE, Scene, load_checkpoint
 from univoxel.tasks.contact_sheet import Panel, contact_sheet, shrink
 from univoxel.tasks.layers import Layers, Relighting, exr_channels, render_layers
 
@@ -118,15 +118,16 @@ def evaluate(
         raise ValueError(
             f"evaluate: expected samples >= 1 and bounces >= 0, got {samples} and {bounces}"
         )
-    report = _training_report(run)
+    run = Path(run)
     folder = data or _trained_on(run)
     photos = load_photos(folder, "test")
     relit = _relit_photos(photos)
     points = load_points(folder)
     maps = {name: _read_map(path) for name, path in relight_maps(folder).items()}
-    scene = load_scene(run)
-    if save:
-        save.mkdir(parents=True, exist_ok=True)
+    scene, report = load_checkpoint(run)
+    for place in (save, json and json.parent):
+        if place:
+            place.mkdir(parents=True, exist_ok=True)
 
     mesh = extract_mesh(scene) if maps or points is not None else None
     scales = _albedo_scales(scene, photos)
@@ -157,7 +158,7 @@ def evaluate(
         "threads": report.get("threads"),
         "peak_rss_mb": report.get("peak_rss_mb"),
         "parameters": sum(p.numel() for p in scene.parameters()),
-        "model_bytes": (run / "scene.safetensors").stat().st_size,
+        "model_bytes": (run / FILE).stat().st_size,
     }
     print(_table(result))
     if json:
@@ -325,18 +326,6 @@ def _trained_on(run: Path) -> Path:
         raise DataError(f"{run}: expected the folder of a run, got no {path.name}") from None
     except (KeyError, TypeError, JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: expected JSON with the key data: {error!r}") from None
-
-
-def _training_report(run: Path) -> dict:
-    """The last line of log.jsonl; empty where a run has no log."""
-    path = run / "log.jsonl"
-    if not path.is_file():
-        return {}
-    lines = path.read_text(encoding="utf-8").splitlines()
-    try:
-        return loads(lines[-1]) if lines else {}
-    except JSONDecodeError as error:
-        raise DataError(f"{path}: expected JSON in the last line: {error}") from None
 
 
 def _table(result: dict[str, float | int | None]) -> Table:

@@ -18,7 +18,6 @@ from torch import Tensor
 from univoxel import brdf, losses
 from univoxel.config import JointConfig
 from univoxel.data import Photos
-from univoxel.lights.distant import DistantLight
 from univoxel.ops import VisibilityScene, shade_map
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import extract_mesh

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import resource
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import torch
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
@@ -96,8 +99,7 @@ class Progress:
         rate = (self.step - self._told_step) * stage.rays / (now - self._told)
         self._told, self._told_step = now, self.step
         line = self.state() | {"losses": losses, "held_out_psnr": psnr, "rays_per_second": rate}
-        with self._log.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        append_line(self._log, json.dumps(line))
         shares = [s.share for s in self.cfg.stages]
         by_stage = sum(shares[: self.stage]) + shares[self.stage] * self.done
         whole = max(by_stage / sum(shares), min(self.seconds / (60 * self.cfg.minutes), 1.0))
@@ -109,3 +111,21 @@ class Progress:
             facts=f"loss {sum(losses.values()):.4f}  held-out {psnr:.1f} dB  "
             f"{rate / 1e3:.0f}k rays/s  {remaining / 60:.0f}:{remaining % 60:02.0f} left ",
         )
+
+
+def append_line(path: Path, line: str) -> None:
+    """Append a line to a file, whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written; it is as it was.
+    """
+    before = path.stat().st_size if path.exists() else 0
+    try:
+        with path.open("ab", buffering=0) as file:
+            text = f"{line}\n".encode()
+            if file.write(text) < len(text):  # what fits is written; the next write would fail
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    except OSError as error:
+        if path.exists() and path.stat().st_size > before:
+            os.truncate(path, before)
+        raise OSError(error.errno, f"cannot write: {error.strerror}", str(path)) from error

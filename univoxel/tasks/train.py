@@ -13,7 +13,7 @@ from univoxel import losses
 from univoxel.camera import pixel_rays
 from univoxel.color import linear_to_srgb
 from univoxel.config import LossConfig, StageConfig, TrainConfig, save_config
-from univoxel.data import Photos, load_photos
+from univoxel.data import DataError, Photos, load_photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
 from univoxel.ops import smooth_rows_
@@ -55,19 +55,21 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
         DataError: input that cannot be used.
         FileExistsError: cfg.out holds a run already and resume is False.
         FloatingPointError: the loss is not a number any more.
-        OSError: the folder cannot be written.
+        OSError: a file of the run cannot be written; what was there before stays.
+        FileNotFoundError, ValueError: with resume, there is no checkpoint that can be read.
     """
     begin = time.monotonic()
     torch.manual_seed(cfg.seed)
     photos = load_photos(cfg.data, "train")
     if not resume and (cfg.out / FILE).exists():
         raise FileExistsError(f"{cfg.out} holds a run already: pass --resume or another --out")
-    cfg.out.mkdir(parents=True, exist_ok=True)
-    save_config(cfg)
 
     distance = mask_distances(photos.coverage())
     pixels, held_out = split_pixels(distance)
-    lower, upper = estimate_bounds(distance, photos.cameras)
+    try:
+        lower, upper = estimate_bounds(distance, photos.cameras)
+    except ValueError as error:
+        raise DataError(f"{cfg.data}: {error}") from None
     grids = [fit_grid(lower, upper, round(1e6 * stage.voxels)) for stage in cfg.stages]
     if resume:
         scene, state = load_checkpoint(cfg.out)
@@ -79,6 +81,8 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
         scene = Scene(replace(cfg.scene, light=light), field)
         state = {"stage": 0, "progress": 0.0, "step": 0}
 
+    cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
+    save_config(cfg)
     with Progress(cfg, begin, state) as progress:
         for index in range(state["stage"], len(cfg.stages)):
             if scene.field.grid != grids[index]:
@@ -184,6 +188,7 @@ def smooth(field: DenseField, stage: StageConfig) -> None:
         (field.features.data, 1, stage.diffusion * SMOOTH_EVERY),
     ):
         grad = field.sdf.grad if order == 2 else field.features.grad
+        assert grad is not None
         x, y, z = grad._indices()  # coalesced by the op; autograd only forgets the flag
         rows = (x * grid.shape[1] + y) * grid.shape[2] + z
         smooth_rows_(grid, rows, amount, order)

@@ -1,0 +1,75 @@
+"""The decoding networks: ranges, the start of training, what each may and may not see."""
+
+import pytest
+import torch
+from torch import nn
+
+from univoxel.fields.heads import MaterialHead, RadianceHead, mlp
+
+
+@pytest.fixture(autouse=True)
+def seed():
+    torch.manual_seed(0)
+
+
+def directions(n):
+    return nn.functional.normalize(torch.randn(n, 3), dim=1)
+
+
+def test_mlp_ends_linear():
+    net = mlp([5, 7, 7, 2])
+    assert [type(layer) for layer in net] == [nn.Linear, nn.ReLU, nn.Linear, nn.ReLU, nn.Linear]
+    assert net(torch.randn(3, 5)).shape == (3, 2)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4])  # of the features: sigmoids saturate, ranges hold
+def test_materials_stay_in_their_ranges(size):
+    albedo, roughness = MaterialHead(4, 8)(size * torch.randn(200, 6))
+    assert albedo.shape == (200, 3)
+    assert roughness.shape == (200,)
+    assert ((albedo >= 0) & (albedo <= 1)).all()
+    assert ((roughness >= MaterialHead.min_roughness) & (roughness <= 1)).all()
+
+
+def test_materials_start_mid_grey_and_rather_rough():
+    albedo, roughness = MaterialHead(8, 64)(torch.zeros(1, 8))
+    # The last layer's weights start at a tenth: what its hidden units give is small.
+    torch.testing.assert_close(albedo, torch.full((1, 3), 0.5), atol=0.05, rtol=0)
+    assert 0.55 < roughness < 0.75
+
+
+def test_materials_see_their_channels_only():
+    head, features = MaterialHead(4, 8), torch.randn(10, 6)
+    others = torch.cat([features[:, :4], torch.randn(10, 2)], 1)
+    for a, b in zip(head(features), head(others), strict=True):
+        assert torch.equal(a, b)
+    features.requires_grad_()
+    head(features)[0].sum().backward()
+    assert features.grad[:, :4].any()
+    assert not features.grad[:, 4:].any()
+
+
+def test_radiance_is_a_colour_that_depends_on_the_view():
+    head, n = RadianceHead(6, 16), 50
+    features, normal, wo = torch.randn(n, 6), directions(n), directions(n)
+    color = head(features, normal, wo)
+    assert color.shape == (n, 3)
+    assert ((color > 0) & (color < 1)).all()
+    assert (head(features, normal, directions(n)) - color).abs().max() > 1e-3
+
+
+def test_radiance_mirrors_the_view_about_the_normal():
+    """Seen from wo and from its mirror image at the same point only the mirrored direction
+    differs; along the normal both coincide."""
+    head, features, normal = RadianceHead(2, 8), torch.randn(1, 2), directions(1)
+    torch.testing.assert_close(
+        head(features, normal, normal),
+        torch.sigmoid(
+            head.net(
+                torch.cat(
+                    [features, normal, normal, (2 * normal).sin(), (2 * normal).cos(),
+                     torch.ones(1, 1)], 1,
+                )
+            )
+        ),
+    )  # fmt: skip

@@ -1,0 +1,111 @@
+"""The budget of a run, on a clock of our own."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from univoxel.config import StageConfig, TrainConfig
+from univoxel.tasks import progress as module
+from univoxel.tasks.progress import RESERVE_SECONDS, Progress, append_line
+
+START = {"stage": 0, "progress": 0.0, "step": 0}
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that pass when a test says so."""
+
+    class Clock:
+        now = 1000.0
+
+        def monotonic(self):
+            return self.now
+
+    clock = Clock()
+    monkeypatch.setattr(module, "time", clock)
+    return clock
+
+
+def config(out, *shares, iterations=10, minutes=1.0):
+    stages = tuple(StageConfig(voxels=1.0, iterations=iterations, share=s) for s in shares)
+    return TrainConfig(Path("photos"), out, stages, minutes)
+
+
+def steps(progress, clock, seconds):
+    """The schedule of a stage whose steps take so many seconds."""
+    done = []
+    for x in progress.steps():
+        done.append(x)
+        clock.now += seconds
+    return done
+
+
+def test_a_fast_machine_makes_every_step(tmp_path, clock):
+    progress = Progress(config(tmp_path, 0.5, 0.5), clock.now, START)
+    assert steps(progress, clock, 0.01) == pytest.approx([i / 10 for i in range(10)])
+    assert (progress.stage, progress.done, progress.step) == (1, 0.0, 10)
+
+
+def test_a_slow_machine_runs_through_the_whole_schedule_in_time(tmp_path, clock):
+    cfg, begin = config(tmp_path, 0.25, 0.75, iterations=1000), clock.now
+    progress = Progress(cfg, begin, START)
+    budget = 60 - RESERVE_SECONDS
+    first = steps(progress, clock, 0.5)
+    assert clock.now - begin == pytest.approx(0.25 * budget, abs=0.5)  # a step ends late at most
+    second = steps(progress, clock, 0.5)
+    assert clock.now - begin == pytest.approx(budget, abs=0.5)
+    for done in (first, second):
+        assert done == sorted(done)
+        assert done[0] == 0
+        assert done[-1] > 0.9
+
+
+def test_time_that_a_stage_leaves_goes_to_the_next(tmp_path, clock):
+    cfg, begin = config(tmp_path, 0.5, 0.5, iterations=100), clock.now
+    progress = Progress(cfg, begin, START)
+    steps(progress, clock, 0.01)  # all its steps in a second of 28
+    assert len(steps(progress, clock, 0.5)) == 100  # 50 s, more than its half of the budget
+
+
+def test_no_time_is_no_step(tmp_path, clock):
+    progress = Progress(config(tmp_path, 1.0, minutes=0.01), clock.now, START)
+    assert steps(progress, clock, 1.0) == []
+    assert progress.stage == 1
+
+
+def test_a_later_sitting_goes_on_where_the_first_stopped(tmp_path, clock):
+    state = {"stage": 1, "progress": 0.6, "step": 160}
+    progress = Progress(config(tmp_path, 0.5, 0.5), clock.now - 30, state)
+    assert progress.seconds == pytest.approx(30)
+    done = steps(progress, clock, 0.01)
+    assert done == pytest.approx([0.6, 0.7, 0.8, 0.9], abs=0.01)
+    assert progress.step == 164
+
+
+def test_reports_and_checkpoints_come_by_the_clock(tmp_path, clock):
+    progress = Progress(config(tmp_path, 1.0), clock.now, START)
+    assert not progress.due()
+    assert not progress.checkpoint_due()
+    clock.now += 61
+    assert progress.due()
+    assert progress.checkpoint_due()
+    assert not progress.checkpoint_due()  # it counts from the last one
+    progress.step += 5
+    progress.report({"radiance": 0.25}, 31.0)
+    assert not progress.due()
+    line = json.loads((tmp_path / "log.jsonl").read_text())
+    assert line["step"] == 5
+    assert line["seconds"] == pytest.approx(61)
+    assert line["losses"] == {"radiance": 0.25}
+    assert line["held_out_psnr"] == 31.0
+    assert line["rays_per_second"] == pytest.approx(5 * 2048 / 61)
+
+
+def test_a_line_is_appended_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "log.jsonl"
+    append_line(path, "one")
+    append_line(path, "two")
+    assert path.read_text() == "one\ntwo\n"
+    with pytest.raises(OSError, match=r"cannot write: No such file.*missing"):
+        append_line(tmp_path / "missing" / "log.jsonl", "three")

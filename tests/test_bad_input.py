@@ -1,0 +1,291 @@
+"""Every mistake of a user ends, from the command line, in one line, exit code 2 and no debris."""
+
+import json
+import os
+import re
+import resource
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic import write_scene
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from univoxel.cli import main
+from univoxel.data.images import read_image, write_exr, write_png
+from univoxel.scene import FILE
+from univoxel.tasks import progress
+
+SMALL = [
+    f"--set={change}"
+    for change in (
+        *(f"stages.{i}.{name}" for i in (0, 1) for name in ("voxels=0.004", "rays=64")),
+        *("stages.0.iterations=2", "stages.1.iterations=20", "stages.1.physical_from=0.0"),
+        *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
+        *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
+    )
+]
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory):
+    """A small data set, and a run trained on it for a moment."""
+    folder = tmp_path_factory.mktemp("bad_input")
+    data = write_scene(folder / "data", views=6, size=16)
+    assert main(["train", str(data), "--out", str(folder / "run"), *SMALL]) == 0
+    return folder
+
+
+@pytest.fixture
+def data(template, tmp_path):
+    return Path(shutil.copytree(template / "data", tmp_path / "data"))
+
+
+@pytest.fixture
+def run(template, data, tmp_path):
+    run = Path(shutil.copytree(template / "run", tmp_path / "run"))
+    config = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps(config | {"data": str(data)}))
+    return run
+
+
+@pytest.fixture
+def refused(capsys):
+    """Run a command that must end in one line that matches, and in nothing else."""
+
+    def check(message: str, *arguments: object) -> None:
+        capsys.readouterr()
+        assert main([str(a) for a in arguments]) == 2
+        out, err = capsys.readouterr()
+        assert err.count("\n") == 1, err
+        assert re.search(message, err), err
+        assert "Traceback" not in out + err
+
+    return check
+
+
+def edit(change):
+    """A change of the parsed transforms_train.json."""
+
+    def apply(data):
+        path = data / "transforms_train.json"
+        transforms = json.loads(path.read_text())
+        change(transforms)
+        path.write_text(json.dumps(transforms))
+
+    return apply
+
+
+def matrix(change):
+    """A change of the second frame's camera."""
+
+    def apply(transforms):
+        pose = np.array(transforms["frames"][1]["transform_matrix"])
+        change(pose)
+        transforms["frames"][1]["transform_matrix"] = pose.tolist()
+
+    return edit(apply)
+
+
+def empty(data):
+    shutil.rmtree(data)
+    data.mkdir()
+
+
+def transparent(data):
+    for path in (data / "train").iterdir():
+        write_png(path, np.zeros((16, 16, 4), np.uint8))
+
+
+def exr_with(value):
+    def apply(data):
+        channels = {c: np.full((16, 16), 0.5, np.float32) for c in "RGBA"}
+        channels["G"][3, 4] = value
+        (data / "train" / "r_0.png").unlink()
+        write_exr(data / "train" / "r_0.exr", channels, half=False)  # halves are clipped
+
+    return apply
+
+
+def frame_two_away(pose):
+    pose[:3, 3] += 100
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (shutil.rmtree, r"data: expected a folder with a scene, got nothing there"),
+        (empty, r"data: expected transforms_train\.json, got an empty folder"),
+        (
+            lambda d: (d / "transforms_train.json").write_text('{"frames": [}'),
+            r"transforms_train\.json: broken JSON in line 1, column 13",
+        ),
+        (edit(lambda t: t.update(frames=[])), r"json: expected a list of frames, got \[\]"),
+        (
+            edit(lambda t: t["frames"][2].update(file_path=7)),
+            r"frame 2: expected an object with a file_path",
+        ),
+        (lambda d: (d / "train" / "r_3.png").unlink(), r"frame 3: no picture .*train/r_3"),
+        (
+            lambda d: write_png(d / "train" / "r_1.png", np.zeros((8, 16, 4), np.uint8)),
+            r"r_1\.png: expected 16x16 pixels like r_0, got 16x8",
+        ),
+        (
+            lambda d: (d / "train" / "r_1.png").write_bytes(b"no picture"),
+            r"r_1\.png: expected a PNG or JPEG",
+        ),
+        (transparent, r"transforms_train\.json: all 6 pictures are fully transparent"),
+        (exr_with(np.nan), r"r_0\.exr: NaN or infinity at row 3, column 4"),
+        (exr_with(np.inf), r"r_0\.exr: NaN or infinity at row 3, column 4"),
+        (matrix(lambda m: m.fill(0)), r"frame 1: expected the last row 0 0 0 1"),
+        (
+            matrix(lambda m: m[:3, :3].fill(0)),
+            r"frame 1: expected a rigid transform_matrix .*scales by 0, 0, 0",
+        ),
+        (
+            matrix(lambda m: m[:3, :3].__imul__(2)),
+            r"frame 1: expected a rigid transform_matrix .*scales by 2, 2, 2",
+        ),
+        (matrix(lambda m: m[0].__imul__(-1)), r"frame 1: expected a rotation .* a reflection"),
+        (matrix(frame_two_away), r"data: the silhouettes of the photographs share no volume"),
+    ],
+)
+def test_data_that_cannot_be_used(data, tmp_path, refused, change, message):
+    change(data)
+    refused(f"^univoxel train: .*{message}", "train", data, "--out", tmp_path / "new" / "run")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--minutes", "0"], "--minutes must be above 0, got 0"),
+        (["--minutes", "-3"], "--minutes must be above 0, got -3"),
+        (["--set=stages.1.rays=0"], "StageConfig: rays must be at least 1, got 0"),
+        (["--set=stages.0.iterations=0"], "StageConfig: iterations must be at least 1, got 0"),
+        (["--set=stages.0.share=1.5"], r"StageConfig: share must be in \(0, 1\], got 1.5"),
+        (["--set=scene.channels=0"], "SceneConfig: channels must be at least 1, got 0"),
+        (["--set=scene.light.lobes=0"], "SGConfig: lobes must be >= 1, got 0"),
+        (["--set=loss.radiance=-1"], "LossConfig: radiance must be at least 0, got -1.0"),
+        (["--preset", "best"], "'best' for argument '--preset'"),
+        (["--minuts", "3"], "Unrecognized options: --minuts, 3"),
+    ],
+)
+def test_settings_out_of_range(data, tmp_path, refused, options, message):
+    refused(message, "train", data, "--out", tmp_path / "out", *options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_number_where_a_path_is_wanted(run, tmp_path, refused):
+    refused("univoxel train: 42: expected a folder", "train", 42, "--out", tmp_path / "out")
+    refused("univoxel eval: 42: expected the folder of a run", "eval", 42)
+    refused("univoxel eval: 42: expected a folder with a scene", "eval", run, "--data", 42)
+    refused("univoxel relight: 42: expected a picture", "relight", run, "--envmap", 42)
+    refused(r"ends in \.ply, got 42", "export", run, "--mesh", 42)
+
+
+def another_version(path):
+    with safe_open(path, "pt") as file:
+        meta = json.loads(file.metadata()["univoxel"])
+    save_file(load_file(path), path, {"univoxel": json.dumps(meta | {"format": 99})})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (another_version, r"scene\.safetensors: expected checkpoint format \d+, got 99"),
+        (lambda p: p.write_bytes(p.read_bytes()[:-9]), r"scene\.safetensors: damaged or cut short"),
+        (lambda p: p.write_bytes(b""), r"scene\.safetensors: damaged or cut short"),
+        (Path.unlink, r"no checkpoint in .*run .*univoxel train"),
+    ],
+)
+def test_checkpoints_that_cannot_be_used(run, data, tmp_path, refused, change, message):
+    change(run / FILE)
+    before = sorted(run.iterdir()), (run / "config.json").read_bytes()
+    refused(message, "eval", run, "--save", tmp_path / "out")
+    refused(message, "export", run, "--mesh", tmp_path / "out" / "a.ply")
+    refused(message, "train", data, "--out", run, "--resume")
+    assert not (tmp_path / "out").exists()
+    assert before == (sorted(run.iterdir()), (run / "config.json").read_bytes())
+
+
+def test_an_environment_map_of_another_shape(run, data, tmp_path, refused):
+    square = tmp_path / "square.exr"
+    write_exr(square, {c: np.ones((8, 8), np.float32) for c in "RGB"})
+    refused(
+        r"square\.exr: .* twice as wide as high .* got \[8, 8, 3\]",
+        *("relight", run, "--envmap", square, "--out", tmp_path / "out"),
+    )
+    (data / "envmaps").mkdir()
+    square.rename(data / "envmaps" / "square.exr")
+    shutil.copytree(data / "test", data / "relight" / "square")
+    refused(r"square\.exr: .* twice as wide as high", "eval", run, "--save", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@contextmanager
+def full_disk(room: int):
+    """Files stop growing at `room` bytes: a write is cut there, the next one fails."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize(
+    ("room", "report", "message", "left"),
+    [
+        (100, 99.0, r"cannot write: .*config\.json", set()),
+        (4000, 0.0, r"cannot write: .*log\.jsonl", {"config.json", "log.jsonl"}),
+        (4000, 99.0, r"scene\.safetensors: cannot write the checkpoint", {"config.json"}),
+    ],
+)
+def test_training_on_a_full_disk(data, tmp_path, refused, monkeypatch, room, report, message, left):
+    monkeypatch.setattr(progress, "REPORT_SECONDS", report)
+    out = tmp_path / "out"
+    with full_disk(room):
+        refused(message, "train", data, "--out", out, *SMALL, "--set=stages.0.iterations=40")
+    assert {p.name for p in out.iterdir()} == left
+    for path in out.iterdir():
+        for line in path.read_text().splitlines() if path.suffix == ".jsonl" else []:
+            json.loads(line)
+
+
+def test_results_on_a_full_disk(run, tmp_path, refused):
+    map = tmp_path / "map.exr"
+    write_exr(map, {c: np.ones((4, 8), np.float32) for c in "RGB"})
+    out = tmp_path / "out"
+    with full_disk(100):
+        refused(r"cannot write: .*r_0\.exr", "eval", run, "--save", out)
+        refused(r"cannot write: .*a\.json", "eval", run, "--json", out / "a.json")
+        refused(r"cannot write: .*a\.ply", "export", run, "--mesh", out / "a.ply")
+        refused(r"cannot write: .*r_0\.", "relight", run, "--envmap", map, "--out", out)
+    assert not list(out.iterdir())
+
+
+def test_folders_that_cannot_be_made(data, run, tmp_path, refused, monkeypatch):
+    (tmp_path / "file").touch()
+    refused("Not a directory: .*file/out", "train", data, "--out", tmp_path / "file" / "out")
+    refused("Not a directory: .*file/out", "eval", run, "--save", tmp_path / "file" / "out")
+
+    def denied(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(os, "mkdir", denied)  # permissions do not bind root
+    refused("Permission denied: .*new", "train", data, "--out", tmp_path / "new")
+    refused("Permission denied: .*new", "eval", run, "--json", tmp_path / "new" / "a.json")
+    refused("Permission denied: .*new", "export", run, "--mesh", tmp_path / "new" / "a.ply")
+
+
+def test_the_template_is_sound(run, tmp_path):
+    """What the tests above break works when it is whole."""
+    out = tmp_path / "out"
+    arguments = ["--save", str(out), "--json", str(out / "a.json"), "--samples", "1"]
+    assert main(["eval", str(run), *arguments]) == 0
+    assert {"a.json", "contact_sheet.png", "r_0.exr", "r_1.exr"} == {p.name for p in out.iterdir()}
+    assert read_image(run / "preview.png").shape == (16, 5 * 16, 3)

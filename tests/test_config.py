@@ -1,0 +1,75 @@
+"""Configurations: presets, their file, and every range that is checked."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from univoxel.config import LossConfig, StageConfig, TrainConfig, preset, save_config
+from univoxel.lights.sg import LocalSG, SGConfig
+from univoxel.scene import SceneConfig
+
+STAGE = StageConfig(voxels=1.0, iterations=10, share=1.0)
+CONFIG = TrainConfig(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
+
+
+@pytest.mark.parametrize("name", ["draft", "fast", "full"])
+def test_presets(name):
+    config = preset(name, Path("photos"), Path("run"))
+    assert (config.data, config.out) == (Path("photos"), Path("run"))
+    assert sum(stage.share for stage in config.stages) == pytest.approx(1)
+    voxels = [stage.voxels for stage in config.stages]
+    assert voxels == sorted(voxels)
+    assert config.stages[-1].physical_from < 1  # or materials would never be learned
+
+
+def test_presets_differ_in_work():
+    minutes = [preset(n, Path("a"), Path("b")).minutes for n in ("draft", "fast", "full")]
+    assert minutes == sorted(set(minutes))
+
+
+def test_the_file_holds_every_field(tmp_path):
+    config = replace(CONFIG, out=tmp_path, seed=7)
+    save_config(config)
+    stored = json.loads((tmp_path / "config.json").read_text())
+    assert stored["seed"] == 7
+    assert stored["data"] == "photos"
+    assert stored["stages"][0]["lr_sdf"] == list(STAGE.lr_sdf)
+    assert stored["scene"]["light"]["lobes"] == SGConfig().lobes
+    assert [p.name for p in tmp_path.iterdir()] == ["config.json"]
+
+
+@pytest.mark.parametrize(
+    ("config", "change", "message"),
+    [
+        (STAGE, {"voxels": 0.0}, "voxels must be above 0, got 0.0"),
+        (STAGE, {"voxels": float("nan")}, "voxels must be above 0, got nan"),
+        (STAGE, {"iterations": 0}, "iterations must be at least 1, got 0"),
+        (STAGE, {"rays": -1}, "rays must be at least 1, got -1"),
+        (STAGE, {"share": 0.0}, r"share must be in \(0, 1\], got 0.0"),
+        (STAGE, {"sharpness": (0.5, 0.0)}, "sharpness must be two numbers above 0"),
+        (STAGE, {"lr_sdf": (0.1,)}, r"lr_sdf must be two numbers above 0, got \(0.1,\)"),
+        (STAGE, {"lr_features": 0.1}, "lr_features must be two numbers above 0, got 0.1"),
+        (STAGE, {"lr_networks": (-1.0, 1.0)}, "lr_networks must be two numbers above 0"),
+        (STAGE, {"plate": 0.6}, r"plate must be in \[0, 0.5\], got 0.6"),
+        (STAGE, {"diffusion": -0.1}, r"diffusion must be in \[0, 1\], got -0.1"),
+        (STAGE, {"physical_from": 2.0}, r"physical_from must be in \[0, 1\], got 2.0"),
+        (LossConfig(), {"silhouette": -1.0}, "silhouette must be at least 0, got -1.0"),
+        (CONFIG, {"data": 42}, "data must be a path, got 42"),
+        (CONFIG, {"out": None}, "out must be a path, got None"),
+        (CONFIG, {"stages": ()}, r"stages must be at least one, got \(\)"),
+        (CONFIG, {"minutes": 0.0}, "minutes must be above 0, got 0.0"),
+        (SceneConfig(), {"channels": 0}, "channels must be at least 1, got 0"),
+        (SceneConfig(), {"hidden": 0}, "hidden must be at least 1, got 0"),
+        (SceneConfig(), {"material_channels": 99}, r"at most channels \(16\), got 99"),
+    ],
+)
+def test_values_out_of_range(config, change, message):
+    with pytest.raises(ValueError, match=f"^{type(config).__name__}: .*{message}"):
+        replace(config, **change)
+
+
+def test_light_is_checked_when_it_is_made():
+    with pytest.raises(ValueError, match="SGConfig: lobes must be >= 1, got 0"):
+        LocalSG(4, SGConfig(lobes=0))
