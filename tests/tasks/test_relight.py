@@ -14,6 +14,7 @@ from univoxel.data.images import read_exr, read_image, write_exr
 from univoxel.ops import VisibilityScene
 from univoxel.records import Mesh, Surface
 from univoxel.tasks import relight as task
+from univoxel.tasks.frames import orbit
 
 SIZE, RADIUS, ALBEDO = 24, 0.5, 0.6
 
@@ -147,7 +148,7 @@ def test_resume_keeps_what_is_there(run):
 def test_orbit_sees_all_of_the_object(run):
     names = frames(run, cameras="orbit 3", resolution=16)
     assert names == [f"orbit_{i:04d}.{s}" for i in range(3) for s in ("exr", "png")]
-    cameras = task.orbit(sphere(), 5, 64)
+    cameras = orbit(sphere(), 5, 64)
     assert len(cameras) == 5
     for view in range(5):
         pixel, depth = project(cameras, view, sphere().vertices)
@@ -186,9 +187,16 @@ def test_test_views_come_from_the_data_of_the_run(run):
         ({"samples": 0}, ValueError, "samples must be at least 1, got 0"),
         ({"resolution": 0}, ValueError, "resolution must be at least 1, got 0"),
         ({"bounces": -1}, ValueError, "bounces must be at least 0, got -1"),
-        ({"exposure": -1.0}, DataError, r"white\.exr: .*exposure must be"),
+        ({"exposure": -1.0}, ValueError, "exposure must be finite and at least 0, got -1.0"),
         ({"maps": ["white", "white"]}, ValueError, "maps of different names"),
-        ({"maps": []}, ValueError, "maps of different names"),
+        ({"maps": []}, ValueError, "expected an environment map, a sun or a lamp, got none"),
+        ({"rotate": math.inf}, ValueError, "rotate must be finite"),
+        ({"noise": 0.0}, ValueError, "noise must be above 0, got 0.0"),
+        ({"turn": 0}, ValueError, "turn must be at least 1 frame, got 0"),
+        ({"background": "white"}, ValueError, "background must be .*, got 'white'"),
+        ({"ground": math.nan}, ValueError, "ground must be finite, got nan"),
+        ({"animation": ["avi"]}, ValueError, "animation must be gif or mp4, got 'avi'"),
+        ({"cameras": "orbit 2", "elevation": 90.0}, ValueError, r"elevation must be in \(-90, 90"),
         ({"cameras": "orbit many"}, ValueError, "expected orbit or orbit N"),
         ({"cameras": "nowhere.json"}, DataError, r"nowhere\.json: expected a file of cameras"),
     ],
