@@ -31,7 +31,11 @@ class EnvMap {
     explicit EnvMap(const EnvMapTables& tables) : t_(tables), edge_(tables.height + 1) {
         for (int64_t r = 0; r <= t_.height; ++r)
             edge_[r] = static_cast<float>(std::cos(kPi64 * r / t_.height));
+        const float* end = t_.radiance + 3 * t_.height * t_.width;
+        black_ = std::none_of(t_.radiance, end, [](float value) { return value > 0; });
     }
+
+    bool black() const { return black_; }
 
     /// Draw a direction from two numbers in [0, 1): the texel by inverting both tables, then a
     /// place uniform in solid angle within it.
@@ -93,6 +97,7 @@ class EnvMap {
 
     EnvMapTables t_;
     std::vector<float> edge_;  // [H + 1] z of the rows' borders, from 1 to -1
+    bool black_;
 };
 
 }  // namespace univoxel

@@ -28,10 +28,11 @@ HELPERS = {
     "fields": {"base", "hull"},
     "lights": {"base", "quadrature"},
     "data": {"base", "images", "radiance"},
-    "render": {"density", "pipeline"},
-    "tasks": {"contact_sheet", "layers", "progress"},
+    "render": {"density", "pipeline", "relight"},
+    "tasks": {"animation", "contact_sheet", "frames", "layers", "progress"},
 }
-OPTIONAL = {"matplotlib", "trimesh", "viser"}  # extras: imported inside the function that needs one
+# Extras: imported inside the function that needs one
+OPTIONAL = {"imageio_ffmpeg", "matplotlib", "trimesh", "viser"}
 # The one file or folder of csrc/ that includes it; no header of ours passes it on to others.
 INCLUDES = {r"embree\d?/": "visibility.cpp", r"pybind11/": "bindings"}
 

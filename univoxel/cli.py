@@ -94,26 +94,88 @@ def evaluate(
 def relight(
     run: Run,
     /,
-    envmap: Annotated[Path, arg(metavar="MAP")],
+    envmap: Annotated[tuple[Path, ...], arg(metavar="MAP [MAP ...]")] = (),
+    sun: Annotated[
+        UseAppendAction[tuple[tuple[float, ...], ...]],
+        arg(metavar="AZIMUTH ELEVATION IRRADIANCE [ANGLE]"),
+    ] = (),
+    point: Annotated[
+        UseAppendAction[tuple[tuple[float, float, float, float], ...]],
+        arg(metavar="X Y Z INTENSITY"),
+    ] = (),
     out: Annotated[
-        Path | None, arg(metavar="DIR", help_behavior_hint="(default: RUN/relight/MAP)")
+        Path | None, arg(metavar="DIR", help_behavior_hint="(default: in RUN/relight)")
     ] = None,
     cameras: Annotated[str, arg(metavar="test|orbit|FILE")] = "test",
+    orbit: Annotated[int | None, arg(metavar="FRAMES")] = None,
+    elevation: Annotated[float, arg(metavar="DEGREES")] = 25.0,
+    turn: Annotated[int | None, arg(metavar="FRAMES")] = None,
+    resolution: Annotated[
+        int | None, arg(metavar="PIXELS", help_behavior_hint="(default: the data's; orbits: 512)")
+    ] = None,
     rotate: Annotated[float, arg(metavar="DEGREES")] = 0.0,
+    exposure: Annotated[float, arg(metavar="FACTOR")] = 1.0,
+    samples: int = 64,
+    noise: Annotated[float | None, arg(metavar="SHARE")] = None,
+    bounces: int = 2,
+    background: Literal["transparent", "map", "black"] = "transparent",
+    ground: Annotated[str | None, arg(metavar="lowest|HEIGHT")] = None,
+    animation: tuple[Literal["gif", "mp4"], ...] = (),
+    resume: bool = False,
 ) -> None:
-    """Render a run under another environment map.
+    """Render a run under other light: environment maps, suns, points.
 
     Args:
         run: folder of a trained run
-        envmap: equirectangular map, twice as wide as high, .exr or .hdr, linear radiance
-        out: folder for the pictures
-        cameras: the test views, an orbit around the object, or a transforms.json
-        rotate: turn the map counter-clockwise about +Z, degrees
+        envmap: equirectangular maps, twice as wide as high, .exr or .hdr, linear radiance
+        sun: a far light: degrees from +X counter-clockwise and above the horizon, irradiance,
+            degrees across (0.53 if not given; 0: hard shadows); repeatable
+        point: a near light: where it stands, irradiance at distance 1; repeatable
+        out: folder for the pictures, with a folder for each map where there are several
+        cameras: the test views, an orbit around the object, or a path in a transforms.json
+        orbit: frames of an orbit; the same as --cameras "orbit FRAMES"
+        elevation: of an orbit above the horizon, degrees
+        turn: frames of a turn of the light under the first camera
+        resolution: width of the pictures
+        rotate: turn maps and suns counter-clockwise about +Z, degrees
+        exposure: factor on all light
+        samples: of the light, per pixel
+        noise: instead of --samples: as many as bring the relative noise below this, such as 0.02
+        bounces: reflections between parts of the object
+        background: what stands behind the object
+        ground: z of a floor that catches the object's shadow, or lowest for its lowest point
+        animation: the frames as a moving picture too
+        resume: keep the frames that are there
     """
     from univoxel.tasks import relight as task
+    from univoxel.tasks.lights import parse_ground, point_light, sun_light
 
-    out = out or run / "relight" / envmap.stem
-    task.relight(run, envmap, out, cameras=cameras, rotate=rotate)
+    if orbit is not None:
+        if cameras != "test":
+            raise ValueError(f"expected --orbit or --cameras, got {orbit} and {cameras}")
+        cameras = f"orbit {orbit}"
+    if out is None:
+        out = run / "relight" / envmap[0].stem if len(envmap) == 1 else run / "relight"
+    task.relight(
+        run,
+        envmap[0] if len(envmap) == 1 else envmap,
+        out,
+        suns=[sun_light(values) for values in sun],
+        lamps=[point_light(values) for values in point],
+        cameras=cameras,
+        elevation=elevation,
+        turn=turn,
+        resolution=resolution,
+        rotate=rotate,
+        exposure=exposure,
+        samples=samples,
+        noise=noise,
+        bounces=bounces,
+        background=background,
+        ground=parse_ground(ground),
+        animation=animation,
+        resume=resume,
+    )
     print(out)
 
 

@@ -96,6 +96,11 @@ def tables(envmap: EnvMap) -> EnvTables:
     )
 
 
+def background(tables: EnvTables, direction: Tensor) -> Tensor:
+    """Radiance [N, 3] of the map that tables were made of, exposure and rotation included."""
+    return lookup(EnvMap(tables.radiance, math.degrees(tables.rotation)), direction)
+
+
 def sample(tables: EnvTables, uniform: Tensor) -> tuple[Tensor, Tensor]:
     """Draw directions [N, 3] and give their density [N] per steradian.
 

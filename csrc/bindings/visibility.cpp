@@ -69,11 +69,13 @@ void bind_integrator(py::module_& m) {
         "relight",
         [](const VisibilityScene& scene, const optional_array& vertex_normal,
            const optional_array& vertex_albedo, const optional_array& vertex_roughness,
-           const array<float>& radiance, const array<float>& row_cdf,
-           const array<float>& column_cdf, float rotation, const array<float>& position,
+           const optional_array& vertex_f0, const array<float>& radiance,
+           const array<float>& row_cdf, const array<float>& column_cdf, float rotation,
+           const array<float>& sun, const array<float>& lamp, const array<float>& position,
            const array<float>& normal, const array<float>& wo, const array<float>& albedo,
-           const array<float>& roughness, array<float>& rgb, float offset, int samples, int bounces,
-           uint32_t seed, Strategy strategy, int threads) {
+           const array<float>& roughness, const optional_array& f0, array<float>& rgb, float offset,
+           uint32_t first, int samples, int bounces, uint32_t seed, Strategy strategy,
+           int threads) {
             const int64_t n = roughness.size(), h = radiance.shape(0), w = radiance.shape(1);
             require(row_cdf.size() == h + 1 && column_cdf.size() == h * (w + 1),
                     "relight: the tables do not belong to this map");
@@ -82,19 +84,25 @@ void bind_integrator(py::module_& m) {
                 require(a->size() == 3 * n, "relight: points differ in number");
             require(bounces == 0 || (vertex_normal && vertex_albedo && vertex_roughness),
                     "relight: bounces need materials");
+            require(sun.size() % 7 == 0 && lamp.size() % 6 == 0 && (!f0 || f0->size() == 3 * n),
+                    "relight: lights or f0 of another size");
             const auto data = [](const optional_array& a) { return a ? a->data() : nullptr; };
             const Relight in{&scene,
                              data(vertex_normal),
                              data(vertex_albedo),
                              data(vertex_roughness),
+                             data(vertex_f0),
                              {radiance.data(), row_cdf.data(), column_cdf.data(), h, w, rotation},
+                             {sun.data(), lamp.data(), sun.size() / 7, lamp.size() / 6},
                              position.data(),
                              normal.data(),
                              wo.data(),
                              albedo.data(),
                              roughness.data(),
+                             data(f0),
                              n,
                              offset,
+                             first,
                              samples,
                              bounces,
                              seed,
@@ -105,12 +113,13 @@ void bind_integrator(py::module_& m) {
         },
         py::arg("scene"), py::arg("vertex_normal").noconvert(),
         py::arg("vertex_albedo").noconvert(), py::arg("vertex_roughness").noconvert(),
-        py::arg("radiance").noconvert(), py::arg("row_cdf").noconvert(),
-        py::arg("column_cdf").noconvert(), py::arg("rotation"), py::arg("position").noconvert(),
+        py::arg("vertex_f0").noconvert(), py::arg("radiance").noconvert(),
+        py::arg("row_cdf").noconvert(), py::arg("column_cdf").noconvert(), py::arg("rotation"),
+        py::arg("sun").noconvert(), py::arg("lamp").noconvert(), py::arg("position").noconvert(),
         py::arg("normal").noconvert(), py::arg("wo").noconvert(), py::arg("albedo").noconvert(),
-        py::arg("roughness").noconvert(), py::arg("rgb").noconvert(), py::arg("offset"),
-        py::arg("samples"), py::arg("bounces"), py::arg("seed"), py::arg("strategy"),
-        py::arg("threads"));
+        py::arg("roughness").noconvert(), py::arg("f0").noconvert(), py::arg("rgb").noconvert(),
+        py::arg("offset"), py::arg("first"), py::arg("samples"), py::arg("bounces"),
+        py::arg("seed"), py::arg("strategy"), py::arg("threads"));
 }
 
 }  // namespace

@@ -98,10 +98,12 @@ def relit_calls(monkeypatch):
         wo = torch.tensor([0.6, 0.0, 0.8]).expand(n, 3)
         return surface, wo
 
-    def relight_surface(surface, wo, mesh, envmap, *, samples, bounces, offset, seed):
-        calls.append(SimpleNamespace(mesh=mesh, samples=samples, bounces=bounces, offset=offset))
+    def relight_surface(surface, wo, stage, lighting, *, samples, bounces):
+        calls.append(
+            SimpleNamespace(mesh=stage.mesh, samples=samples, bounces=bounces, offset=stage.offset)
+        )
         assert len(surface.opacity) == int(inside().sum())  # nothing outside is shaded
-        return surface.albedo * envmap.radiance.mean()
+        return surface.albedo * lighting.tables.radiance.mean()
 
     def extract_mesh(scene):
         corner = torch.tensor([[0.0, 0.0, 0.0], [1e-3, 0.0, 0.0], [0.0, 1e-3, 0.0]])

@@ -11,9 +11,11 @@ from univoxel.camera import image_rays, project
 from univoxel.color import linear_to_srgb
 from univoxel.data import DataError
 from univoxel.data.images import read_exr, read_image, write_exr
-from univoxel.ops import VisibilityScene
+from univoxel.envmap import EnvMap
+from univoxel.ops import Sun, VisibilityScene
 from univoxel.records import Mesh, Surface
 from univoxel.tasks import relight as task
+from univoxel.tasks.frames import orbit
 
 SIZE, RADIUS, ALBEDO = 24, 0.5, 0.6
 
@@ -147,7 +149,7 @@ def test_resume_keeps_what_is_there(run):
 def test_orbit_sees_all_of_the_object(run):
     names = frames(run, cameras="orbit 3", resolution=16)
     assert names == [f"orbit_{i:04d}.{s}" for i in range(3) for s in ("exr", "png")]
-    cameras = task.orbit(sphere(), 5, 64)
+    cameras = orbit(sphere(), 5, 64)
     assert len(cameras) == 5
     for view in range(5):
         pixel, depth = project(cameras, view, sphere().vertices)
@@ -186,9 +188,16 @@ def test_test_views_come_from_the_data_of_the_run(run):
         ({"samples": 0}, ValueError, "samples must be at least 1, got 0"),
         ({"resolution": 0}, ValueError, "resolution must be at least 1, got 0"),
         ({"bounces": -1}, ValueError, "bounces must be at least 0, got -1"),
-        ({"exposure": -1.0}, DataError, r"white\.exr: .*exposure must be"),
+        ({"exposure": -1.0}, ValueError, "exposure must be finite and at least 0, got -1.0"),
         ({"maps": ["white", "white"]}, ValueError, "maps of different names"),
-        ({"maps": []}, ValueError, "maps of different names"),
+        ({"maps": []}, ValueError, "expected an environment map, a sun or a lamp, got none"),
+        ({"rotate": math.inf}, ValueError, "rotate must be finite"),
+        ({"noise": 0.0}, ValueError, "noise must be above 0, got 0.0"),
+        ({"turn": 0}, ValueError, "turn must be at least 1 frame, got 0"),
+        ({"background": "white"}, ValueError, "background must be .*, got 'white'"),
+        ({"ground": math.nan}, ValueError, "ground must be finite, got nan"),
+        ({"animation": ["avi"]}, ValueError, "animation must be gif or mp4, got 'avi'"),
+        ({"cameras": "orbit 2", "elevation": 90.0}, ValueError, r"elevation must be in \(-90, 90"),
         ({"cameras": "orbit many"}, ValueError, "expected orbit or orbit N"),
         ({"cameras": "nowhere.json"}, DataError, r"nowhere\.json: expected a file of cameras"),
     ],
@@ -210,3 +219,49 @@ def test_bad_maps_and_cameras_name_the_file(run):
         (run / "bad.json").write_text(content)
         with pytest.raises(DataError, match=rf"bad\.json.*{message}"):
             frames(run, cameras=str(run / "bad.json"))
+
+
+def test_light_turns_under_a_still_camera(run):
+    sun = torch.zeros(16, 32)
+    sun[7:9, 15:17] = 50.0
+    write_exr(run / "sun.exr", {c: sun for c in "RGB"})
+    names = frames(run, maps="sun", turn=4, animation=["gif"])
+    assert names == ["animation.gif", *(f"turn_{i:04d}.{s}" for i in range(4)
+                                        for s in ("exr", "png"))]  # fmt: skip
+    lit = [read_exr(run / "out" / f"turn_{i:04d}.exr")["rgb.R"].sum() for i in range(4)]
+    assert lit[0] > 2 * lit[1] > 2 * lit[2]  # towards the camera, beside, behind
+    assert lit[1] == pytest.approx(lit[3], rel=0.2)
+    seen = [read_exr(run / "out" / f"turn_{i:04d}.exr")["alpha"] for i in range(4)]
+    assert all((s == seen[0]).all() for s in seen)
+
+
+def test_suns_alone_and_a_floor(run):
+    sun = Sun((1.0, 0.0, 1.0), (3.0, 3.0, 3.0), 0.0)
+    names = frames(run, maps=[], suns=[sun], ground="lowest", samples=2)
+    assert names == ["r_0.exr", "r_0.png", "r_1.exr", "r_1.png"]
+    layers = read_exr(run / "out" / "r_0.exr")
+    assert layers["rgb.R"].max() > 0.1
+    assert set(layers["shadow"].ravel().tolist()) == {0.0}  # level cameras do not see the floor
+
+
+def test_pictures_as_tensors(run):
+    white = EnvMap(torch.ones(4, 8, 3))
+    made = task.images(run / "run", white, str(run / "cameras.json"), samples=8, noise=0.2)
+    assert made.shape == (2, SIZE, SIZE, 4)
+    inside = made[..., 3] > 0
+    assert made[inside][:, 0].mean() == pytest.approx(ALBEDO + 0.02, abs=0.05)
+    assert made[~inside].eq(0).all()
+    cameras = orbit(sphere(), 2, 16)
+    again = task.images(run / "run", run / "white.exr", cameras, samples=1, background="map")
+    assert again.shape == (2, 16, 16, 4)
+    assert again[..., 3].eq(1).all()
+    torch.testing.assert_close(again[:, 0, 0, :3], torch.ones(2, 3))
+
+
+def test_a_killed_run_leaves_no_half_frames(run, monkeypatch):
+    """Killed between the two files of a frame, the frame is made anew."""
+    monkeypatch.setattr(task, "write_png", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        frames(run)
+    monkeypatch.undo()
+    assert [p.name for p in (run / "out").iterdir()] == ["r_0.exr"]

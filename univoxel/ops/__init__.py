@@ -3,7 +3,7 @@
 from univoxel.ops.adam import adam_rows_, adam_rows_reference_
 from univoxel.ops.composite import composite, composite_reference
 from univoxel.ops.dense_grid import sample_dense, sample_dense_reference
-from univoxel.ops.integrator import EnvTables, relight
+from univoxel.ops.integrator import EnvTables, Lamp, Sun, relight
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.native import use_backend
 from univoxel.ops.sg import shade_sg, shade_sg_reference
@@ -19,6 +19,8 @@ from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference,
 __all__ = [
     "EnvTables",
     "Hit",
+    "Lamp",
+    "Sun",
     "VisibilityScene",
     "adam_rows_",
     "adam_rows_reference_",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,6 +28,47 @@ class EnvTables:
     rotation: float  # radians, counter-clockwise about +Z
 
 
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Sun:
+    """A disc of even light far away.
+
+    Raises:
+        ValueError: a number is not finite, the direction has no length, the irradiance is below 0,
+            or the angle is not in [0, 180).
+    """
+
+    direction: Triple  # to it, world; any length above 0
+    irradiance: Triple  # linear, on a surface that faces it
+    angle: float = 0.53  # degrees across; 0 casts hard shadows
+
+    def __post_init__(self) -> None:
+        if not 0 < math.hypot(*self.direction) < math.inf:
+            raise ValueError(f"sun: direction must have a length, got {self.direction}")
+        _check_power("sun: irradiance", self.irradiance)
+        if not 0 <= self.angle < 180:
+            raise ValueError(f"sun: angle must be in [0, 180) degrees, got {self.angle}")
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A point that shines evenly all around; irradiance falls with the distance squared.
+
+    Raises:
+        ValueError: a number is not finite, or the intensity is below 0.
+    """
+
+    position: Triple  # world
+    intensity: Triple  # radiant intensity, linear: irradiance at distance 1
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(sum(self.position)):
+            raise ValueError(f"lamp: position must be finite, got {self.position}")
+        _check_power("lamp: intensity", self.intensity)
+
+
 def relight(
     scene: VisibilityScene,
     mesh: Mesh,
@@ -40,17 +82,23 @@ def relight(
     offset: float,
     samples: int,
     bounces: int = 0,
+    suns: Sequence[Sun] = (),
+    lamps: Sequence[Lamp] = (),
+    f0: Tensor | None = None,
+    mesh_f0: Tensor | None = None,
+    first: int = 0,
     seed: int = 0,
     strategy: Strategy = "mis",
 ) -> Tensor:
-    """Radiance that surface points send along wo under an environment map.
+    """Radiance that surface points send along wo under an environment map and other lights.
 
         L(wo) = integral over the half-sphere of f(wi, wo) L_i(wi) (n.wi) dwi
 
-    L_i is the map where nothing stands in the way, else what the mesh sends back, up to `bounces`
-    times. Each sample draws one direction from the map and one from the BRDF at every vertex of
-    its path and weighs both by the power heuristic; points come from Sobol's sequence with a
-    scramble of its own per point. Paths end at random where they carry little.
+    L_i is the light where nothing stands in the way, else what the mesh sends back, up to `bounces`
+    times. At every vertex of a path each sun and lamp is looked at once; of the map one direction
+    is drawn in proportion to its light and one from the BRDF, weighed by the power heuristic. The
+    points are Sobol's sequence with an Owen scramble of its own per surface point. Paths end at
+    random where they carry little.
 
     Points given come from volume rendering and lie on the mesh only about: their rays start at
     position + offset * normal and pass through whatever is nearer than `offset` from there. Later
@@ -69,6 +117,12 @@ def relight(
         offset: world units, about one voxel, >= 0.
         samples: paths per point, >= 1; powers of 2 are best.
         bounces: reflections after the first point, >= 0; 0 is direct light only.
+        suns, lamps: lights besides the map.
+        f0: [N, 3] float32 in [0, 1], reflectance at normal incidence; 0.04 when left out. A metal
+            has its colour here and albedo 0.
+        mesh_f0: [P, 3] likewise at the mesh's vertices, for bounces.
+        first: number of the first sample in the sequence, >= 0: the mean of samples 0 .. 63 is that
+            of 0 .. 31 and 32 .. 63.
         seed: another seed, other noise; in 0 .. 2^32 - 1.
         strategy: "map" or "brdf" draws from one of the two alone: the same mean, more noise.
 
@@ -102,12 +156,16 @@ def relight(
         ("offset must be finite and at least 0", offset, 0 <= offset < math.inf),
         ("samples must be at least 1", samples, samples >= 1),
         ("bounces must be at least 0", bounces, bounces >= 0),
+        ("first must be at least 0", first, first >= 0),
+        ("first + samples must be at most 2^31", first + samples, first + samples <= 2**31),
         ("seed must be in 0 .. 2^32 - 1", seed, 0 <= seed < 2**32),
         ("strategy must be mis, map or brdf", strategy, strategy in ("mis", "map", "brdf")),
     ):
         if not ok:
             raise ValueError(f"relight: {name}, got {value!r}")
-    materials = _materials(scene, mesh) if bounces else (None, None, None)
+    if f0 is not None:
+        check("relight", position=(position, "N 3", torch.float32), f0=(f0, "N 3", torch.float32))
+    materials = _materials(scene, mesh, mesh_f0) if bounces else (None,) * 4
     traced = scene.native()
     if traced is None:
         raise RuntimeError("relight: runs on the native backend only, got use_backend('reference')")
@@ -117,11 +175,15 @@ def relight(
     core = native.require()
     core.relight(
         traced,
-        *(m if m is None else native.arrays(m.contiguous())[0] for m in materials),
-        *native.arrays(*(t.contiguous() for t in light)),
+        *map(_array, materials),
+        *map(_array, light),
         tables.rotation,
-        *native.arrays(*(t.contiguous() for t in points), rgb),
+        *map(_array, (_pack_suns(suns), _pack_lamps(lamps))),
+        *map(_array, points),
+        _array(f0),
+        *native.arrays(rgb),
         offset,
+        first,
         samples,
         bounces,
         seed,
@@ -131,8 +193,8 @@ def relight(
     return rgb
 
 
-def _materials(scene: VisibilityScene, mesh: Mesh) -> tuple[Tensor, Tensor, Tensor]:
-    """Normals, albedo and roughness at the vertices of the scene's mesh."""
+def _materials(scene: VisibilityScene, mesh: Mesh, f0: Tensor | None) -> tuple[Tensor | None, ...]:
+    """Normals, albedo, roughness and F0, if any, at the vertices of the scene's mesh."""
     if mesh.normals is None or mesh.albedo is None or mesh.roughness is None:
         raise ValueError("relight: bounces need a mesh with normals, albedo and roughness")
     check(
@@ -141,5 +203,34 @@ def _materials(scene: VisibilityScene, mesh: Mesh) -> tuple[Tensor, Tensor, Tens
         mesh_normals=(mesh.normals, "P 3", torch.float32),
         mesh_albedo=(mesh.albedo, "P 3", torch.float32),
         mesh_roughness=(mesh.roughness, "P", torch.float32),
+        **({} if f0 is None else {"mesh_f0": (f0, "P 3", torch.float32)}),
     )
-    return mesh.normals, mesh.albedo, mesh.roughness
+    return mesh.normals, mesh.albedo, mesh.roughness, f0
+
+
+def _array(tensor: Tensor | None):
+    return None if tensor is None else native.arrays(tensor.contiguous())[0]
+
+
+def _pack_suns(suns: Sequence[Sun]) -> Tensor:
+    """[S, 7] as the kernel reads them: unit direction, irradiance, cosine of the radius."""
+    rows = [
+        [
+            *(x / math.hypot(*s.direction) for x in s.direction),
+            *s.irradiance,
+            math.cos(math.radians(s.angle / 2)),
+        ]
+        for s in suns
+    ]
+    return torch.tensor(rows, dtype=torch.float32).reshape(-1, 7)
+
+
+def _pack_lamps(lamps: Sequence[Lamp]) -> Tensor:
+    """[L, 6]: position, intensity."""
+    rows = [[*lamp.position, *lamp.intensity] for lamp in lamps]
+    return torch.tensor(rows, dtype=torch.float32).reshape(-1, 6)
+
+
+def _check_power(name: str, power: Triple) -> None:
+    if not all(0 <= x < math.inf for x in power):
+        raise ValueError(f"{name} must be finite and at least 0, got {power}")

@@ -1,46 +1,221 @@
-"""A surface under a new environment map."""
+"""A surface under new light: some paths, paths until the noise is low, shadows on a floor."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from univoxel import envmap as env
-from univoxel.ops import VisibilityScene, relight
-from univoxel.records import Mesh, Surface
+from univoxel.color import luminance
+from univoxel.ops import EnvTables, Lamp, Sun, VisibilityScene, relight
+from univoxel.records import Mesh, Rays, Surface
+
+FIRST_PASS = 4  # samples of either half of the first pass towards a noise limit
+MOST_SAMPLES = 4096  # per pixel, where a noise limit is out of reach
+SCOUTS = 64  # samples that look whether a place on the floor is shaded at all
+INTERVAL = 1.96  # standard deviations that hold 95 % of a normal distribution
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What light meets; `stage` makes it, once for any number of pictures."""
+
+    mesh: Mesh  # with materials at its vertices
+    visibility: VisibilityScene  # of the same mesh
+    offset: float  # from a surface, where rays start; world units
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """What lights a picture; `univoxel.envmap.tables` makes the tables, once for a map."""
+
+    tables: EnvTables
+    suns: tuple[Sun, ...] = ()
+    lamps: tuple[Lamp, ...] = ()
+
+
+def stage(mesh: Mesh, offset: float) -> Stage:
+    """Build the ray hierarchy of a mesh, some 0.3 s per million triangles."""
+    return Stage(mesh, VisibilityScene(mesh.vertices, mesh.faces), offset)
+
+
+def turned(lighting: Lighting, degrees: float) -> Lighting:
+    """The map and the suns turned counter-clockwise about +Z; lamps stay where they are."""
+    angle = math.radians(degrees)
+    c, s = math.cos(angle), math.sin(angle)
+    suns = tuple(
+        replace(sun, direction=(c * x - s * y, s * x + c * y, z))
+        for sun in lighting.suns
+        for x, y, z in [sun.direction]
+    )
+    tables = replace(lighting.tables, rotation=lighting.tables.rotation + angle)
+    return Lighting(tables, suns, lighting.lamps)
 
 
 @torch.no_grad()
 def relight_surface(
     surface: Surface,
     wo: Tensor,  # [N, 3]
-    mesh: Mesh,
-    envmap: env.EnvMap,
+    stage: Stage,
+    lighting: Lighting,
     *,
     samples: int,
     bounces: int,
-    offset: float,
+    first: int = 0,
     seed: int = 0,
 ) -> Tensor:
-    """Radiance [N, 3] that a surface sends along wo under a map, linear; black where opacity is 0.
+    """Radiance [N, 3] that a surface sends along wo, linear; black where its opacity is 0.
 
-    The mesh casts shadows and sends light on; it is built into a hierarchy once a call, some 0.3 s
-    per million triangles. Arguments, errors and sources as of `univoxel.ops.relight`.
+    The stage's mesh casts shadows and sends light on. Arguments, errors and sources as of
+    `univoxel.ops.relight`.
     """
     there = surface.opacity > 0
     rgb = surface.position.new_zeros(len(there), 3)
     rgb[there] = relight(
-        VisibilityScene(mesh.vertices, mesh.faces),
-        mesh,
-        env.tables(envmap),
+        stage.visibility,
+        stage.mesh,
+        lighting.tables,
         surface.position[there],
         surface.normal[there],
         wo[there],
         surface.albedo[there],
         surface.roughness[there],
-        offset=offset,
+        offset=stage.offset,
         samples=samples,
         bounces=bounces,
+        suns=lighting.suns,
+        lamps=lighting.lamps,
+        first=first,
         seed=seed,
     )
     return rgb
+
+
+@torch.no_grad()
+def relight_until(
+    surface: Surface,
+    wo: Tensor,  # [N, 3]
+    stage: Stage,
+    lighting: Lighting,
+    *,
+    noise: float,
+    bounces: int,
+    seed: int = 0,
+    report: Callable[[float], None] = lambda share: None,
+) -> tuple[Tensor, float, int]:
+    """`relight_surface` with as many samples as it takes; (rgb [N, 3], its noise, samples a pixel).
+
+    Two halves A and B with scrambles of their own grow side by side, doubling with every pass.
+    Their mean is the picture; the noise of it, relative to the picture, is
+
+        1.96 sqrt(mean over pixels of ((Y_A - Y_B) / 2)^2) / mean over pixels of (Y_A + Y_B) / 2
+
+    with Y the luminance times the opacity, over pixels with a surface: half the width of the 95 %
+    interval of a pixel's mean, in the root mean square, against the mean luminance. As (Y_A -
+    Y_B)^2 / 4 is an unbiased estimate of the variance of their mean, what the sequence gains over
+    independent samples counts in.
+
+    Args:
+        noise: passes end when the estimate is at most this, > 0, such as 0.02; or when
+            MOST_SAMPLES are reached.
+        report: called after each pass with the share of the work that is done, as estimated.
+    """
+    if not noise > 0:
+        raise ValueError(f"relight: noise must be above 0, got {noise}")
+    weight = surface.opacity[surface.opacity > 0]
+    halves = [torch.zeros_like(surface.position) for _ in range(2)]
+    done, more = 0, FIRST_PASS
+    while True:
+        for k, half in enumerate(halves):
+            # Seeds apart by an odd constant: those of other pictures count up from theirs.
+            own = (seed + k * 0x9E3779B9) % 2**32
+            rgb = relight_surface(
+                surface, wo, stage, lighting, samples=more, bounces=bounces, first=done, seed=own
+            )
+            half.mul_(done / (done + more)).add_(rgb, alpha=more / (done + more))
+        done += more
+        a, b = (luminance(half[surface.opacity > 0]) * weight for half in halves)
+        light = (a + b).sum() / 2
+        deviation = ((a - b) / 2).square().sum().mul(len(a)).sqrt()
+        error = float(INTERVAL * deviation / light) if light > 0 else 0.0
+        if error <= noise or 2 * done >= MOST_SAMPLES:
+            return (halves[0] + halves[1]) / 2, error, 2 * done
+        report((noise / error) ** 2)
+        more = done
+
+
+@torch.no_grad()
+def ground_shadow(
+    rays: Rays,
+    height: float,
+    stage: Stage,
+    lighting: Lighting,
+    *,
+    samples: int,
+    bounces: int,
+    hidden: Tensor | None = None,  # [N]
+    seed: int = 0,
+) -> Tensor:
+    """How much darker the object makes a matte white floor that rays meet: [N] in [0, 1].
+
+        1 - Y(floor with the object) / Y(floor without it)
+
+    with Y the luminance that the floor sends straight up; 0 where a ray misses it. Both are
+    rendered with the same samples, so that noise is where shadow is. Light that the object sends
+    to the floor counts in, but never above what its shadow takes.
+
+    Args:
+        height: z of the floor, world units. Rays from below do not meet it.
+        samples: of the light, per ray; SCOUTS where none of these meets the object.
+        hidden: [N] bool, rays that need no answer; they get 0.
+    """
+    meets = (rays.direction[:, 2] < 0) & (rays.origin[:, 2] > height)
+    if hidden is not None:
+        meets &= ~hidden
+    where = meets.nonzero()[:, 0]
+    origin, direction = rays.origin[where], rays.direction[where]
+    points = origin + (height - origin[:, 2:]) / direction[:, 2:] * direction
+    points[:, 2] = height
+    light = {"stage": stage, "lighting": lighting, "bounces": bounces, "seed": seed}
+    shadow = rays.origin.new_zeros(len(meets))
+    few = min(samples, SCOUTS)
+    alone, lit = _floor(points, first=0, samples=few, **light)
+    # Most of a floor lies in full light: only where a ray met the object are there more to trace.
+    if samples > few:
+        touched = (alone != lit).nonzero()[:, 0]
+        rest = _floor(points[touched], first=few, samples=samples - few, **light)
+        for total, more in zip((alone, lit), rest, strict=True):
+            total[touched] += (more - total[touched]) * (1 - few / samples)
+    shadow[where] = torch.where(alone > 0, 1 - lit / alone.clamp_min(1e-30), 0.0).clamp(0, 1)
+    return shadow
+
+
+def _floor(
+    points: Tensor, stage: Stage, lighting: Lighting, bounces: int, **options: int
+) -> tuple[Tensor, Tensor]:
+    """Luminance [N] that points of a white floor send up, without the object and with it."""
+    up = torch.tensor([0.0, 0.0, 1.0]).expand_as(points)
+    nothing = VisibilityScene(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int32))
+    alone, lit = (
+        relight(
+            visibility,
+            stage.mesh,
+            lighting.tables,
+            points,
+            up,
+            up,
+            torch.ones_like(points),
+            torch.ones(len(points)),
+            offset=0.0,
+            bounces=reflections,
+            suns=lighting.suns,
+            lamps=lighting.lamps,
+            f0=torch.zeros_like(points),
+            **options,
+        )
+        for visibility, reflections in ((nothing, 0), (stage.visibility, bounces))
+    )
+    return luminance(alone), luminance(lit)

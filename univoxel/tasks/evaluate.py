@@ -27,9 +27,10 @@ from univoxel.data import (
 )
 from univoxel.data.base import decode
 from univoxel.data.images import read_image, replacing, write_exr, write_png
-from univoxel.envmap import EnvMap
+from univoxel.envmap import EnvMap, tables
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh, surface_of_view
+from univoxel.render.relight import Lighting, stage
 from univoxel.scene import FILE, Scene, load_checkpoint
 from univoxel.tasks.contact_sheet import Panel, contact_sheet, shrink
 from univoxel.tasks.layers import Layers, Relighting, exr_channels, render_layers
@@ -133,7 +134,9 @@ def evaluate(
     scales = _albedo_scales(scene, photos)
     relighting = None
     if maps and mesh is not None:
-        relighting = Relighting(maps, mesh, scales.three, scene.field.voxel_size, samples, bounces)
+        lights = {name: Lighting(tables(envmap)) for name, envmap in maps.items()}
+        here = stage(mesh, scene.field.voxel_size)
+        relighting = Relighting(lights, here, scales.three, samples, bounces)
     found: dict[str, list[float]] = {key: [] for key in MEASURES}
     every = -(-len(photos) // SHEET_ROWS)
     rows = []

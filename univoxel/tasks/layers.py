@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from univoxel.camera import Cameras
-from univoxel.envmap import EnvMap
-from univoxel.records import Mesh, Surface
+from univoxel.records import Surface
 from univoxel.render.pipeline import shade, surface_of_view
-from univoxel.render.relight import relight_surface
+from univoxel.render.relight import Lighting, Stage, relight_surface
 from univoxel.scene import Scene
 
 
@@ -32,10 +31,9 @@ class Layers:
 class Relighting:
     """How relit layers are made."""
 
-    maps: dict[str, EnvMap]
-    mesh: Mesh  # casts shadows and sends bounces; carries materials at its vertices
+    lights: dict[str, Lighting]  # by the name of their map
+    stage: Stage  # casts shadows and sends bounces
     scale: Tensor  # [3] of the albedo, for the second set of pictures
-    offset: float  # from the surface, where rays start; world units
     samples: int  # of the light, per pixel
     bounces: int
 
@@ -59,12 +57,13 @@ def render_layers(
     if relighting:
         # A scale above 1 must not make a surface that reflects more than it receives.
         bright = replace(surface, albedo=(surface.albedo * relighting.scale).clamp_max(1))
-        mesh = relighting.mesh
+        mesh = relighting.stage.mesh
         if mesh.albedo is not None:
             mesh = replace(mesh, albedo=(mesh.albedo * relighting.scale).clamp_max(1))
-        for name in relighting.maps:
+        scaled_stage = replace(relighting.stage, mesh=mesh)
+        for name in relighting.lights:
             relit[name] = picture(opacity * _relight(relighting, name, surface, wo))
-            scaled = _relight(replace(relighting, mesh=mesh), name, bright, wo)
+            scaled = _relight(replace(relighting, stage=scaled_stage), name, bright, wo)
             relit_scaled[name] = picture(opacity * scaled)
     backward = cameras.camera_to_world[view, :, 2]
     return Layers(
@@ -93,10 +92,8 @@ def _relight(relighting: Relighting, name: str, surface: Surface, wo: Tensor) ->
     return relight_surface(
         surface,
         wo,
-        relighting.mesh,
-        relighting.maps[name],
+        relighting.stage,
+        relighting.lights[name],
         samples=relighting.samples,
         bounces=relighting.bounces,
-        offset=relighting.offset,
-        seed=0,
     )
