@@ -17,7 +17,7 @@ LAYERS = [
     {"envmap"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
-    {"distributed", "losses", "metrics", "render"},
+    {"assets", "distributed", "losses", "metrics", "render"},
     {"config"},
     {"tasks"},
     {"tasks.demo"},
@@ -29,6 +29,7 @@ HELPERS = {
     "lights": {"base", "quadrature"},
     "data": {"base", "images", "radiance"},
     "render": {"density", "pipeline"},
+    "assets": {"atlas", "base"},
     "tasks": {"contact_sheet", "layers", "progress"},
 }
 OPTIONAL = {"matplotlib", "trimesh", "viser"}  # extras: imported inside the function that needs one
