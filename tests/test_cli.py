@@ -93,9 +93,10 @@ def test_relight_export_and_demo(calls, capsys):
     assert main(["export", "run", "--mesh", "out.ply"]) == 0
     assert main(["demo", "--out", "demo"]) == 0
     paths = (Path("run"), Path("maps/hall.exr"), Path("run/relight/hall"))
+    options = {"faces": None, "texture_size": 1024, "watertight": False}
     assert calls.noted == [
         ("relight", paths, {"cameras": "test", "rotate": 90.0}),
-        ("export", (Path("run"), Path("out.ply")), {}),
+        ("export", (Path("run"), Path("out.ply")), options),
         ("demo", (Path("demo"),), {}),
     ]
     printed = capsys.readouterr().out.split()

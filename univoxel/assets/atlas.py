@@ -24,7 +24,8 @@ def unwrap(mesh: Mesh, size: int) -> tuple[Tensor, Tensor, Tensor]:
     atlas = xatlas.Atlas()
     atlas.add_mesh(mesh.vertices.numpy(), mesh.faces.numpy().astype(np.uint32))
     charts, pack = xatlas.ChartOptions(), xatlas.PackOptions()
-    charts.fix_winding = True  # no mirrored charts: not every program can light them
+    # No mirrored charts, not every program can light them; the packer rotates by a transposition.
+    charts.fix_winding, pack.rotate_charts = True, False
     pack.resolution, pack.padding, pack.bilinear = size, PADDING, True
     atlas.generate(charts, pack)
     source, faces, uv = atlas[0]

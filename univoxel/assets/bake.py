@@ -65,7 +65,8 @@ def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
     for some, w in zip(face.split(POINTS_AT_ONCE), weight.split(POINTS_AT_ONCE), strict=True):
         corner = faces[some].long()
         point, n, t = (
-            torch.einsum("mk,mkc->mc", w, values[corner]) for values in (vertices, normals, tangents)
+            torch.einsum("mk,mkc->mc", w, values[corner])
+            for values in (vertices, normals, tangents)
         )
         _, at = nearest_surface(scene.field, point)
         parts.append((*scene.material(at.features), in_frame(at.gradient, n, t)))

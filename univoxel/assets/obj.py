@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from univoxel.assets.base import TexturedMesh, albedo_picture, relief_picture, roughness_picture
 from univoxel.data.images import replacing, write_png
 
@@ -42,7 +40,7 @@ map_Pr {name}_roughness.png
 norm {name}_normal.png
 """
     _write_text(path.with_suffix(".mtl"), material)
-    corners = np.repeat(mesh.faces.numpy() + 1, 3, 1)  # v/vt/vn of each corner are the same
+    corners = (mesh.faces + 1).tolist()  # v/vt/vn of each corner are the same
     parts = [f"# univoxel: +Z up\nmtllib {name}.mtl\no object\n"]
     for line, values in (
         ("v %.7g %.7g %.7g\n", mesh.vertices),
@@ -51,7 +49,7 @@ norm {name}_normal.png
     ):
         parts += [line % tuple(row) for row in values.tolist()]
     parts.append("usemtl object\ns 1\n")
-    parts += ["f %d/%d/%d %d/%d/%d %d/%d/%d\n" % tuple(row) for row in corners.tolist()]
+    parts += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}\n" for a, b, c in corners]
     _write_text(path, "".join(parts))
 
 

@@ -5,6 +5,8 @@ Functions take and give the geometry alone; what a mesh carries at its vertices 
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import fast_simplification
 import numpy as np
 import torch
@@ -55,26 +57,19 @@ def close(mesh: Mesh) -> Mesh:
         ValueError: edges of more than two faces, or of faces that disagree about the outside,
             leave no closed surface.
     """
-    faces = mesh.faces.long().numpy()
-    border = _border(faces)
-    if len(border):
-        border_vertices, index = np.unique(border, return_inverse=True)
-        index = index.reshape(-1, 2)
-        hole, label = _components(index, len(border_vertices))
-        points = mesh.vertices.double().numpy()
-        middle = np.zeros((hole, 3))
-        np.add.at(middle, label, points[border_vertices])
-        middle /= np.bincount(label, minlength=hole)[:, None]
-        # The border is a cycle, so the fans' inner edges cancel, however its loops touch.
-        fan = np.stack([border[:, 1], border[:, 0], len(points) + label[index[:, 0]]], 1)
-        mesh = _mesh(np.concatenate([points, middle]), np.concatenate([faces, fan]))
+    vertices, faces = mesh.vertices.double().numpy(), mesh.faces.long().numpy()
+    for loop in _loops(_border(faces).tolist()):
+        fan = [[b, a, len(vertices)] for a, b in pairwise([*loop, loop[0]])]
+        faces = np.concatenate([faces, fan])
+        vertices = np.concatenate([vertices, vertices[loop].mean(0, keepdims=True)])
+    mesh = _mesh(vertices, faces)
     if bad := open_edges(mesh):
         raise ValueError(f"the mesh cannot be made watertight: {bad} edges do not join two faces")
     return mesh
 
 
 def open_edges(mesh: Mesh) -> int:
-    """How many directed edges are not met by exactly one in the other direction; 0 if watertight."""
+    """How many directed edges do not meet exactly one in the other direction; 0: watertight."""
     edges = _edges(mesh.faces.long().numpy())
     key, count = np.unique(_keys(edges), return_counts=True)
     return int((count > 1).sum() + (~np.isin(key, _keys(edges[:, ::-1]))).sum())
@@ -100,6 +95,25 @@ def _border(faces: np.ndarray) -> np.ndarray:
     """Directed edges [E, 2] that have none in the other direction."""
     edges = _edges(faces)
     return edges[~np.isin(_keys(edges), _keys(edges[:, ::-1]))]
+
+
+def _loops(edges: list[list[int]]) -> list[list[int]]:
+    """Loops that pass each of their vertices once, together of all directed edges that form any."""
+    onward: dict[int, list[int]] = {}
+    for a, b in edges:
+        onward.setdefault(a, []).append(b)
+    loops = []
+    for start in onward:
+        path = [start]
+        while onward.get(path[-1]):
+            b = onward[path[-1]].pop()
+            if b in path:
+                at = path.index(b)
+                loops.append(path[at:])
+                del path[at + 1 :]
+            else:
+                path.append(b)
+    return loops
 
 
 def _components(edges: np.ndarray, vertices: int) -> tuple[int, np.ndarray]:
