@@ -133,9 +133,11 @@ def test_glb(written):
     shaded = torch.tensor(to_world(shaded)).float()
     _, true, gap = surface_of_balls(torch.tensor(to_world(position)).float())
     error = torch.rad2deg(torch.nn.functional.cosine_similarity(shaded, true).clamp(-1, 1).acos())
-    # 8 bits are worth 0.5 degrees; the field's own gradient 1.8
-    assert error[gap > 0.06].max() < 4.0
-    assert error[gap > 0.06].median() < 1.0
+    error = error[gap > 0.06]
+    # 8 bits are worth 0.4 degrees, the field's gradient as much again; slivers without a
+    # texel of their own see their neighbours' frame.
+    assert error.median() < 0.5
+    assert error.quantile(0.99) < 1.6
 
 
 def test_other_readers_see_the_object_where_it_is(written):

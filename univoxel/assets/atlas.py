@@ -123,10 +123,11 @@ def dilated(texel: Tensor, size: int) -> Tensor:
     """
     empty = np.ones((size, size), bool)
     empty.reshape(-1)[texel.numpy()] = False
-    row, column = distance_transform_edt(empty, return_distances=False, return_indices=True)
+    nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
+    row, column = np.asarray(nearest, np.int64)
     place = np.zeros(size * size, np.int64)
     place[texel.numpy()] = np.arange(len(texel))
-    return torch.from_numpy(place[row.astype(np.int64) * size + column])
+    return torch.from_numpy(place[row * size + column])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -46,7 +46,7 @@ def simplify(mesh: Mesh, faces: int) -> Mesh:
         return Mesh(mesh.vertices, mesh.faces)
     vertices, index = fast_simplification.simplify(
         mesh.vertices.double().numpy(), mesh.faces.numpy(), target_count=faces
-    )
+    )[:2]
     return clean(_mesh(vertices, index))
 
 
