@@ -110,10 +110,11 @@ def test_relight_export_and_demo(calls, capsys):
     assert main(["export", "run", "--mesh", "out.ply"]) == 0
     assert main(["demo", "--out", "demo"]) == 0
     paths = (Path("run"), Path("maps/hall.exr"), Path("run/relight/hall"))
-    (name, given, options), *others = calls.noted
-    assert (name, given, options["cameras"], options["rotate"]) == ("relight", paths, "test", 90.0)
+    options = {"faces": None, "texture_size": 1024, "watertight": False}
+    (name, given, chosen), *others = calls.noted
+    assert (name, given, chosen["cameras"], chosen["rotate"]) == ("relight", paths, "test", 90.0)
     assert others == [
-        ("export", (Path("run"), Path("out.ply")), {}),
+        ("export", (Path("run"), Path("out.ply")), options),
         ("demo", (Path("demo"),), {}),
     ]
     printed = capsys.readouterr().out.split()

@@ -17,7 +17,7 @@ LAYERS = [
     {"envmap"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
-    {"distributed", "losses", "metrics", "render"},
+    {"assets", "distributed", "losses", "metrics", "render"},
     {"config"},
     {"tasks"},
     {"tasks.demo"},
@@ -29,7 +29,8 @@ HELPERS = {
     "lights": {"base", "quadrature"},
     "data": {"base", "images", "radiance"},
     "render": {"density", "pipeline", "relight"},
-    "tasks": {"animation", "contact_sheet", "frames", "layers", "progress"},
+    "assets": {"atlas", "base"},
+    "tasks": {"animation", "contact_sheet", "frames", "joint", "layers", "progress"},
 }
 # Extras: imported inside the function that needs one
 OPTIONAL = {"imageio_ffmpeg", "matplotlib", "trimesh", "viser"}

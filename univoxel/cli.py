@@ -179,16 +179,29 @@ def relight(
     print(out)
 
 
-def export(run: Run, /, mesh: Annotated[Path, arg(metavar="FILE.ply")]) -> None:
-    """Write the surface as a mesh with albedo and roughness at its vertices.
+def export(
+    run: Run,
+    /,
+    mesh: Annotated[Path, arg(metavar="FILE.glb|obj|ply")],
+    faces: Annotated[
+        int | None,
+        arg(metavar="N", help_behavior_hint="(default: 20000 with textures, all without)"),
+    ] = None,
+    texture_size: Annotated[int, arg(metavar="TEXELS")] = 1024,
+    watertight: bool = False,
+) -> None:
+    """Write the surface as a mesh with its materials, for any renderer.
 
     Args:
         run: folder of a trained run
-        mesh: the file to write
+        mesh: the file to write: .glb and .obj hold textures, .ply materials at the vertices
+        faces: most triangles, at least 4
+        texture_size: width of the square textures, a power of 2
+        watertight: close holes, or fail
     """
     from univoxel.tasks import export as task
 
-    task.export(run, mesh)
+    task.export(run, mesh, faces=faces, texture_size=texture_size, watertight=watertight)
     print(mesh)
 
 

@@ -4,76 +4,67 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-import torch
-
-from univoxel.color import linear_to_srgb
-from univoxel.data.images import replacing
+from univoxel.assets.bake import bake, with_materials
+from univoxel.assets.gltf import write_glb
+from univoxel.assets.obj import write_obj
+from univoxel.assets.ply import write_ply
+from univoxel.assets.topology import clean, close, simplify
 from univoxel.records import Mesh
-from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import load_scene
 
+SUFFIXES = (".glb", ".obj", ".ply")
+TEXTURED_FACES = 20_000  # of textured meshes: the texture holds what they are too coarse for
+TEXTURE_SIZES = (16, 8192)
 
-def export(run: Path, mesh: Path) -> None:
-    """Write the zero level of a scene's sdf with its materials at the vertices.
+
+def export(
+    run: Path,
+    mesh: Path,
+    *,
+    faces: int | None = None,
+    texture_size: int = 1024,
+    watertight: bool = False,
+) -> None:
+    """Write the zero level of a scene's sdf with its materials; see docs/export.md.
 
     Args:
         run: folder of the trained scene.
-        mesh: the file to write, .ply, whole or not at all.
+        mesh: the file to write, whole or not at all: .glb and .obj hold textures, .ply holds
+            materials at the vertices.
+        faces: most triangles, at least 4; when left out 20000 with textures, all without.
+        texture_size: texels along a side of each texture, a power of 2 from 16 to 8192.
+        watertight: close holes.
 
     Raises:
-        FileNotFoundError, ValueError: the run cannot be used, or `mesh` does not end in .ply.
-        OSError: the file cannot be written.
+        FileNotFoundError, ValueError: the run cannot be used, an argument is out of range, there is
+            no surface, or none that can be closed.
+        OSError: a file cannot be written.
     """
     mesh = Path(mesh)
-    if mesh.suffix.lower() != ".ply":
-        raise ValueError(f"export: expected a file that ends in .ply, got {mesh}")
-    surface = extract_mesh(load_scene(run))
+    suffix = mesh.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"export: expected a file that ends in {', '.join(SUFFIXES)}, got {mesh}")
+    if faces is not None and faces < 4:
+        raise ValueError(f"export: faces must be at least 4, got {faces}")
+    low, high = TEXTURE_SIZES
+    if not low <= texture_size <= high or texture_size & (texture_size - 1):
+        raise ValueError(
+            f"export: texture_size must be a power of 2 from {low} to {high}, got {texture_size}"
+        )
+    scene = load_scene(run)
+    surface = clean(Mesh(*scene.field.isosurface()))
+    if watertight:
+        surface = close(surface)
+    most = TEXTURED_FACES if faces is None and suffix != ".ply" else faces
+    if most is not None:
+        surface = simplify(surface, most)
+    if watertight:
+        surface = close(surface)  # what decimation has torn
     mesh.parent.mkdir(parents=True, exist_ok=True)
-    write_ply(mesh, surface)
-
-
-def write_ply(path: Path, mesh: Mesh) -> None:
-    """Write a mesh as binary little-endian PLY, whole or not at all.
-
-    Per vertex, as far as the mesh has them: x y z, nx ny nz and roughness (float), albedo as
-    red green blue (uchar, sRGB), which is where other programs look for colour.
-
-    Raises:
-        OSError: the file cannot be written; nothing is left behind.
-    """
-    columns: list[tuple[str, np.ndarray]] = []
-
-    def add(names: str, values: torch.Tensor, dtype: str) -> None:
-        array = values.detach().numpy().astype(dtype)
-        array = array[:, None] if array.ndim == 1 else array
-        columns.extend(zip(names.split(), array.T, strict=True))
-
-    add("x y z", mesh.vertices, "<f4")
-    if mesh.normals is not None:
-        add("nx ny nz", mesh.normals, "<f4")
-    if mesh.albedo is not None:
-        add("red green blue", (linear_to_srgb(mesh.albedo) * 255).round(), "u1")
-    if mesh.roughness is not None:
-        add("roughness", mesh.roughness, "<f4")
-    vertex = np.empty(len(mesh.vertices), [(name, column.dtype) for name, column in columns])
-    for name, column in columns:
-        vertex[name] = column
-    face = np.empty(len(mesh.faces), [("corners", "u1"), ("index", "<i4", (3,))])
-    face["corners"], face["index"] = 3, mesh.faces.numpy()
-
-    kinds = {"<f4": "float", "|u1": "uchar"}
-    properties = [f"property {kinds[column.dtype.str]} {name}" for name, column in columns]
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment univoxel: red green blue are the albedo in sRGB",
-        f"element vertex {len(vertex)}",
-        *properties,
-        f"element face {len(face)}",
-        "property list uchar int vertex_indices",
-        "end_header",
-    ]
-    with replacing(path) as temporary:
-        text = "".join(line + "\n" for line in header).encode("ascii")
-        temporary.write_bytes(text + vertex.tobytes() + face.tobytes())
+    match suffix:
+        case ".glb":
+            write_glb(mesh, bake(scene, surface, texture_size))
+        case ".obj":
+            write_obj(mesh, bake(scene, surface, texture_size))
+        case ".ply":
+            write_ply(mesh, with_materials(scene, surface))
