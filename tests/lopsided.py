@@ -39,6 +39,6 @@ def lopsided(voxels: int = 48**3, change=None) -> Scene:
     field = DenseField(grid, 4, distance)
     with torch.no_grad():
         field.features.copy_(torch.cat([albedo(nodes), roughness(nodes)[..., None]], -1))
-    scene = Scene(SceneConfig(channels=4, hidden=8), field, inv_s=100.0)
+    scene = Scene(SceneConfig(channels=4, material_channels=2, hidden=8), field, inv_s=100.0)
     scene.material = Identity()
     return scene.eval()
