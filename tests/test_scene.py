@@ -1,9 +1,11 @@
 """Checkpoints: what goes in comes out; what is damaged is refused in one line."""
 
+import json
 import os
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from univoxel.fields.dense import DenseField
@@ -76,10 +78,19 @@ def test_not_a_checkpoint_of_ours(tmp_path):
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("change", [{"sky": 7}, {"channels": 0}])
+def test_a_description_that_says_nothing_to_us(tmp_path, change):
+    path = save_scene(small_scene(), tmp_path, {})
+    with safe_open(path, "pt") as file:
+        meta = json.loads(file.metadata()["univoxel"])
+    meta["scene"] |= change
+    save_file(load_file(path), path, {"univoxel": json.dumps(meta)})
+    with pytest.raises(ValueError, match=r"scene.safetensors: does not fit its own description"):
+        load_scene(tmp_path)
+
+
 def test_tensors_that_do_not_fit(tmp_path):
     path = save_scene(small_scene(), tmp_path, {})
-    from safetensors import safe_open
-
     with safe_open(path, "pt") as file:
         meta = file.metadata()
     tensors = load_file(path)

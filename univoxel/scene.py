@@ -108,21 +108,21 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
             f"{path}: expected checkpoint format {FORMAT}, got {meta.get('format')}; "
             "it was written by another version of univoxel"
         )
-    light = SGConfig(**meta["scene"].pop("light"))
-    cfg = SceneConfig(**meta["scene"], light=light)
-    grid = GridShape(
-        tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
-    )
-    scene = Scene(cfg, DenseField(grid, cfg.channels), meta["inv_s"])
-    rows, values = tensors.pop("field.feature_rows"), tensors.pop("field.feature_values")
-    features = torch.zeros(grid.nodes_count, cfg.channels)
-    features[rows.long()] = values
-    tensors["field.features"] = features.view(*grid.size, cfg.channels)
     try:
+        light = SGConfig(**meta["scene"].pop("light"))
+        cfg = SceneConfig(**meta["scene"], light=light)
+        grid = GridShape(
+            tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
+        )
+        scene = Scene(cfg, DenseField(grid, cfg.channels), meta["inv_s"])
+        rows, values = tensors.pop("field.feature_rows"), tensors.pop("field.feature_values")
+        features = torch.zeros(grid.nodes_count, cfg.channels)
+        features[rows.long()] = values
+        tensors["field.features"] = features.view(*grid.size, cfg.channels)
         scene.load_state_dict(tensors)
-    except RuntimeError as error:
+        return scene, meta["state"]
+    except (RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(f"{path}: does not fit its own description: {error}") from error
-    return scene, meta["state"]
 
 
 def load_scene(run: Path) -> Scene:
