@@ -6,9 +6,9 @@ import dataclasses
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from univoxel.data.images import replacing
 from univoxel.scene import SceneConfig
@@ -29,6 +29,7 @@ class StageConfig:
     plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.5]
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 1]
     physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
+    refit: bool = False  # geometry and materials stay; light and radiance follow them
 
     def __post_init__(self):
         _check(self, "above 0", lambda x: 0 < x < math.inf, "voxels")
@@ -42,6 +43,39 @@ class StageConfig:
         )
         _check(self, "in [0, 0.5]", lambda x: 0 <= x <= 0.5, "plate")
         _check(self, "in [0, 1]", lambda x: 0 <= x <= 1, "diffusion", "physical_from")
+
+
+@dataclass(frozen=True)
+class JointConfig:
+    """The stage that solves for one environment map and the materials, see tasks/joint.py."""
+
+    iterations: int = 700  # Adam steps in all rounds, >= 1; fewer when time runs out
+    share: float = 0.4  # of the time budget, (0, 1]
+    rays: int = 4096  # sightings per step, >= views
+    views: int = 4  # sightings of a point per step, >= 1
+    rounds: int = 3  # of Adam, >= 1, with Newton steps on the map between them
+    points: int = 20000  # on the surface, >= 1
+    tracing: int = 2  # visibility rays per point and direction, >= 1
+    lr_features: float = 0.03  # at the begin of a round; all rates > 0
+    lr_networks: float = 3e-3
+    lr_map: float = 0.05  # of the log map
+    albedo_smoothness: float = 0.005  # weights >= 0
+    roughness_smoothness: float = 0.02
+    newton_steps: int = 4  # between rounds, >= 0
+    newton_points: int = 6000  # of the points, >= 1
+    newton_views: int = 8  # sightings of each, >= 2
+    newton_smooth: float = 1e-7  # Laplacian on the log map against the mean squared residual, > 0
+
+    def __post_init__(self):
+        counts = ("iterations", "views", "rounds", "points", "tracing", "newton_points")
+        _check(self, "at least 1", lambda x: x >= 1, *counts)
+        _check(self, "in (0, 1]", lambda x: 0 < x <= 1, "share")
+        _check(self, "at least views", lambda x: x >= self.views, "rays")
+        rates = ("lr_features", "lr_networks", "lr_map", "newton_smooth")
+        _check(self, "above 0", lambda x: 0 < x < math.inf, *rates)
+        weights = ("albedo_smoothness", "roughness_smoothness", "newton_steps")
+        _check(self, "at least 0", lambda x: 0 <= x < math.inf, *weights)
+        _check(self, "at least 2", lambda x: x >= 2, "newton_views")
 
 
 @dataclass(frozen=True)
@@ -64,7 +98,7 @@ class LossConfig:
 class TrainConfig:
     data: Path  # folder of the data set
     out: Path  # folder of the run
-    stages: tuple[StageConfig, ...]
+    stages: tuple[StageConfig | JointConfig, ...]
     minutes: float  # > 0; training ends in time, with what it has
     seed: int = 0
     scene: SceneConfig = field(default_factory=SceneConfig)
@@ -98,8 +132,14 @@ def save_config(cfg: TrainConfig) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def preset(name: str, data: Path, out: Path) -> TrainConfig:
+def preset(
+    name: str, data: Path, out: Path, light: Literal["hybrid", "sg"] = "hybrid"
+) -> TrainConfig:
     """The configuration of a preset: draft (1 minute), fast (4) or full (12) on two cores.
+
+    Args:
+        light: "sg", local lobes as published; "hybrid", local lobes while geometry forms, then one
+            environment map with traced visibility for the materials, then lobes that follow them.
 
     Raises:
         ValueError: an unknown name.
@@ -114,15 +154,36 @@ def preset(name: str, data: Path, out: Path) -> TrainConfig:
         case _:
             raise ValueError(f"preset must be draft, fast or full, got {name!r}")
     coarse = StageConfig(
-        voxels=0.9, iterations=steps // 2, share=0.2, rays=rays // 2, sharpness=(0.7, 0.35)
+        voxels=0.9, iterations=steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35)
     )
     fine = StageConfig(
         voxels=voxels,
         iterations=steps,
-        share=0.8,
+        share=0.85,
         rays=rays,
         sharpness=(0.5, 0.3),
         lr_sdf=(0.05, 0.005),
         physical_from=0.3,
     )
-    return TrainConfig(data, out, (coarse, fine), minutes)
+    match light:
+        case "sg":
+            scene = SceneConfig(sky_nodes=0)
+            return TrainConfig(data, out, (coarse, fine), minutes, scene=scene)
+        case "hybrid":
+            coarse, fine = replace(coarse, share=0.1), replace(fine, share=0.4)
+            joint = JointConfig(iterations=steps * 3 // 4, share=0.35)
+            refit = StageConfig(
+                voxels=voxels,
+                iterations=steps // 3,
+                share=0.15,
+                rays=rays,
+                sharpness=(0.3, 0.3),
+                lr_features=(0.01, 0.001),
+                plate=0.0,
+                diffusion=0.0,
+                physical_from=0.0,
+                refit=True,
+            )
+            return TrainConfig(data, out, (coarse, fine, joint, refit), minutes)
+        case _:
+            raise ValueError(f"light must be hybrid or sg, got {light!r}")

@@ -15,6 +15,7 @@ from torch import nn
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.fields.hull import GridShape
+from univoxel.lights.distant import DistantLight
 from univoxel.lights.sg import LocalSG, SGConfig
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
@@ -28,6 +29,7 @@ class SceneConfig:
     channels: int = 16  # features per voxel, >= 1
     material_channels: int = 8  # of them, that albedo and roughness are decoded from, >= 1
     hidden: int = 64  # width of the material and radiance heads, >= 1
+    sky_nodes: int = 512  # directions of the environment map, >= 0; 0: the scene has none
     light: SGConfig = field(default_factory=SGConfig)
 
     def __post_init__(self):
@@ -54,6 +56,7 @@ class Scene(nn.Module):
         self.material = MaterialHead(cfg.material_channels, cfg.hidden)
         self.radiance = RadianceHead(cfg.channels, cfg.hidden)
         self.light = LocalSG(cfg.channels, cfg.light)
+        self.sky = DistantLight(cfg.sky_nodes) if cfg.sky_nodes else None
 
 
 def save_scene(scene: Scene, run: Path, state: dict) -> Path:

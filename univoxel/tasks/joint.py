@@ -9,7 +9,6 @@ map and materials alternate with Gauss-Newton steps on the map.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -30,8 +29,10 @@ from univoxel.render.transport import (
     trace,
 )
 from univoxel.scene import Scene
+from univoxel.tasks.progress import Progress
 
 CLIPPED = 0.97  # sRGB; brighter pixels are lower bounds
+NEWTON_CHUNK = 256  # points whose equations are built at once
 CAUCHY = 0.05  # sRGB; residuals beyond are taken for what the model cannot explain
 
 
@@ -60,7 +61,7 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     position, normal = surface_points(mesh, cfg.points, generator)
     seen = observe(position, normal, photos, tracer, offset)
     direction = scene.sky.direction
-    transport = trace(seen, tracer, mesh, bright, direction, cfg.rays, offset, generator)
+    transport = trace(seen, tracer, mesh, bright, direction, cfg.tracing, offset, generator)
     return Problem(seen, transport, losses.encode(seen.color), offset)
 
 
@@ -74,92 +75,76 @@ def draw(problem: Problem, points: int, views: int) -> tuple[Tensor, Tensor]:
     return point.repeat_interleave(views), sighting.reshape(-1)
 
 
-def adam_round(
-    scene: Scene, problem: Problem, cfg: JointConfig, steps: int, rates: tuple[float, float, float]
-) -> Iterator[float]:
-    """Adam on features, material head and map (in that order of rates); yields the loss."""
-    seen, transport = problem.seen, problem.transport
-    optimizer = RowAdam(
-        [
-            {"params": [scene.field.features], "eps": 1e-8, "lr": rates[0]},
-            {"params": list(scene.material.parameters()), "lr": rates[1]},
-            {"params": [scene.sky.log_radiance], "lr": rates[2]},
-        ],
-        betas=(0.9, 0.99),
-    )
-    initial = [group["lr"] for group in optimizer.param_groups]
-    for step in range(steps):
-        for group, rate in zip(optimizer.param_groups, initial, strict=True):
-            group["lr"] = rate * 0.1 ** (step / steps)
-        index, sighting = draw(problem, cfg.batch_points, cfg.batch_views)
-        points = index[:: cfg.batch_views]
-        features = scene.field.sample(seen.position[points]).features
-        albedo, roughness = scene.material(features)
-        repeat = torch.arange(len(points)).repeat_interleave(cfg.batch_views)
-        rgb = shade_map(
-            scene.sky.radiance,
-            transport.open,
-            transport.indirect,
-            index,
-            seen.normal[index],
-            seen.wo[sighting],
-            albedo[repeat],
-            roughness[repeat],
-            transport.direction,
-            problem.solid_angle,
-        )
-        beside = seen.position[points]
-        beside = beside + 2 * problem.voxel_size * torch.randn_like(beside)
-        albedo_near, roughness_near = scene.material(scene.field.sample(beside).features)
-        loss = (
-            losses.photometric(losses.encode(rgb), problem.target[sighting], clipped=CLIPPED)
-            + cfg.albedo_smoothness * losses.smoothness(albedo, albedo_near)
-            + cfg.roughness_smoothness * losses.smoothness(roughness, roughness_near)
-        )
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-        yield loss.item()
-
-
-@torch.no_grad()
-def newton_round(scene: Scene, problem: Problem, cfg: JointConfig, steps: int) -> Iterator[float]:
-    """Gauss-Newton steps on the log map, with the albedo of every point eliminated.
-
-    The normal equations for log map x and log albedo of the points are block diagonal in the
-    albedo; its Schur complement is D x D. What then speaks for the map is only what no albedo can
-    explain: how a point's brightness changes from view to view, and with it the absolute scale,
-    from highlights of known reflectance. Residuals are in sRGB-encoded colour with Cauchy weights;
-    a graph Laplacian keeps the log map smooth. Yields the mean weighted squared residual.
-    """
-    seen, sky = problem.seen, scene.sky
-    counts = seen.offsets.diff()
-    rich = (counts >= cfg.newton_views // 2).nonzero()[:, 0]
-    chosen = rich[torch.randperm(len(rich))[: cfg.newton_points]]
-    albedo, roughness = scene.material(scene.field.sample(seen.position[chosen]).features)
-    log_albedo = albedo.clamp_min(1e-3).log()
-    which = (torch.rand(len(chosen), cfg.newton_views) * counts[chosen][:, None]).long()
-    sighting = seen.offsets[chosen][:, None] + which
-    smooth = graph_laplacian(sky.direction)
-    for _ in range(steps):
-        blocks = [
-            normal_equations(
-                problem, sky.radiance, chosen[k], sighting[k], log_albedo[k], roughness[k]
+def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
+    """Fit scene.sky and the materials to the photographs; geometry and other heads stay."""
+    problem = pose(scene, photos, cfg, seed)
+    turn = 0  # rounds begun
+    for done in progress.steps():
+        if done >= turn / cfg.rounds:
+            if turn:
+                newton_round(scene, problem, cfg)
+            optimizer = RowAdam(
+                [
+                    {"params": [scene.field.features], "eps": 1e-8},
+                    {"params": list(scene.material.parameters())},
+                    {"params": [scene.sky.log_radiance]},
+                ],
+                betas=(0.9, 0.99),
             )
-            for k in torch.arange(len(chosen)).split(cfg.newton_chunk)
-        ]
-        rows = sighting.numel()
-        hessian = sum(b.hessian for b in blocks) / rows
-        gradient = sum(b.gradient for b in blocks) / rows
-        x = sky.log_radiance.T  # [3, D]
-        system = hessian + cfg.newton_smooth * smooth
-        system.diagonal(dim1=1, dim2=2).add_(cfg.newton_damping)
-        right = gradient - cfg.newton_smooth * x @ smooth
-        step = torch.linalg.solve(system, right[..., None])[..., 0].clamp(-1, 1)
-        sky.log_radiance += step.T
-        change = [(b.own - torch.einsum("cpd,cd->pc", b.cross, step)) / b.norm for b in blocks]
-        log_albedo = (log_albedo + torch.cat(change).clamp(-0.5, 0.5)).clamp(-7.0, 0.0)
-        yield sum(b.cost for b in blocks) / rows
+            turn += 1
+        fade = 0.1 ** (done * cfg.rounds - (turn - 1))
+        # After a Newton round the map is better than what Adam would make of it: it moves slowly
+        rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * (1.0 if turn == 1 else 0.1))
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate * fade
+        terms = objective(scene, problem, cfg)
+        optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(terms.values())).sum().backward()
+        optimizer.step()
+        if progress.due():
+            progress.report({k: v.item() for k, v in terms.items()}, None)
+
+
+def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Tensor]:
+    """The weighted losses of a random batch of sightings."""
+    seen, transport = problem.seen, problem.transport
+    index, sighting = draw(problem, cfg.rays // cfg.views, cfg.views)
+    points = index[:: cfg.views]
+    albedo, roughness = scene.material(scene.field.sample(seen.position[points]).features)
+    repeat = torch.arange(len(points)).repeat_interleave(cfg.views)
+    rgb = shade_map(
+        scene.sky.radiance,
+        transport.open,
+        transport.indirect,
+        index,
+        seen.normal[index],
+        seen.wo[sighting],
+        albedo[repeat],
+        roughness[repeat],
+        transport.direction,
+        problem.solid_angle,
+    )
+    beside = seen.position[points]
+    beside = beside + 2 * problem.voxel_size * torch.randn_like(beside)
+    albedo_near, roughness_near = scene.material(scene.field.sample(beside).features)
+    encoded, target = losses.encode(rgb), problem.target[sighting]
+    return {
+        "joint": losses.photometric(encoded, target, clipped=CLIPPED),
+        "albedo": cfg.albedo_smoothness * losses.smoothness(albedo, albedo_near),
+        "roughness": cfg.roughness_smoothness * losses.smoothness(roughness, roughness_near),
+    }
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What light does at V sightings of each of P points, linear in the map: constant in a round."""
+
+    diffuse: Tensor  # [P, D] sky into irradiance: cosine, open share and solid angle
+    through: Tensor  # [P, V] irradiance into radiance, for albedo 1
+    shine: Tensor  # [P, V, D] sky into specular radiance
+    diffuse_blocked: Tensor  # [P, V, 3] radiance from the blocked share, for albedo 1
+    shine_blocked: Tensor  # [P, V, 3]
+    target: Tensor  # [P, V, 3] sRGB-encoded
 
 
 @dataclass(frozen=True)
@@ -169,46 +154,94 @@ class Block:
     hessian: Tensor  # [3, D, D]
     gradient: Tensor  # [3, D]
     cross: Tensor  # [3, P, D] map against log albedo
-    own: Tensor  # [P, 3] gradient of log albedo
-    norm: Tensor  # [P, 3] curvature of log albedo
+    own: Tensor  # [3, P] gradient of log albedo
+    norm: Tensor  # [3, P] curvature of log albedo
     cost: float
 
 
-def normal_equations(
-    problem: Problem,
-    light: Tensor,  # [D, 3]
-    point: Tensor,  # [P]
-    sighting: Tensor,  # [P, V]
-    log_albedo: Tensor,  # [P, 3]
-    roughness: Tensor,  # [P]
-) -> Block:
+@torch.no_grad()
+def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float]:
+    """Gauss-Newton steps on the log map, with the albedo of every point eliminated.
+
+    The normal equations for log map and log albedo of the points are block diagonal in the albedo;
+    its Schur complement is D x D. What then speaks for the map is only what no albedo can explain:
+    how a point's brightness changes from view to view, and with it the absolute scale, from
+    highlights of known reflectance. Residuals are in sRGB-encoded colour with Cauchy weights; a
+    graph Laplacian keeps the log map smooth. Returns the mean weighted squared residual before each
+    step.
+    """
+    seen, sky = problem.seen, scene.sky
+    counts = seen.offsets.diff()
+    rich = (counts >= cfg.newton_views // 2).nonzero()[:, 0]
+    chosen = rich[torch.randperm(len(rich))[: cfg.newton_points]]
+    if not len(chosen):
+        return []
+    albedo, roughness = scene.material(scene.field.sample(seen.position[chosen]).features)
+    log_albedo = albedo.clamp_min(1e-3).log()
+    which = (torch.rand(len(chosen), cfg.newton_views) * counts[chosen][:, None]).long()
+    sighting = seen.offsets[chosen][:, None] + which
+    parts = torch.arange(len(chosen)).split(NEWTON_CHUNK)
+    rows = [light_rows(problem, chosen[k], sighting[k], roughness[k]) for k in parts]
+    smooth = cfg.newton_smooth * graph_laplacian(sky.direction)
+    costs = []
+    for _ in range(cfg.newton_steps):
+        blocks = [
+            normal_equations(r, sky.radiance, log_albedo[k])
+            for r, k in zip(rows, parts, strict=True)
+        ]
+        x = sky.log_radiance.T  # [3, D]
+        system = torch.stack([b.hessian for b in blocks]).sum(0) / sighting.numel() + smooth
+        system.diagonal(dim1=1, dim2=2).add_(cfg.newton_smooth)
+        right = torch.stack([b.gradient for b in blocks]).sum(0) / sighting.numel() - x @ smooth
+        step = torch.linalg.solve(system, right[..., None])[..., 0].clamp(-1, 1)
+        sky.log_radiance += step.T
+        change = [(b.own - torch.einsum("cpd,cd->cp", b.cross, step)) / b.norm for b in blocks]
+        log_albedo = (log_albedo + torch.cat(change, 1).T.clamp(-0.5, 0.5)).clamp(-7.0, 0.0)
+        costs.append(sum(b.cost for b in blocks) / sighting.numel())
+    return costs
+
+
+def light_rows(problem: Problem, point: Tensor, sighting: Tensor, roughness: Tensor) -> Rows:
+    """Rows for points [P], sightings [P, V] and roughness [P]."""
     transport, seen = problem.transport, problem.seen
     normal, wo = seen.normal[point][:, None], seen.wo[sighting]
     cosine = (normal @ transport.direction.T).clamp_min(0) * problem.solid_angle  # [P, 1, D]
-    through = 1 - brdf.specular_albedo((normal * wo).sum(2), roughness[:, None])  # [P, V]
+    through = 1 - brdf.specular_albedo((normal * wo).sum(2), roughness[:, None])
     shine = cosine * brdf.specular(
         normal[:, :, None], wo[:, :, None], transport.direction, roughness[:, None, None]
-    )  # [P, V, D]
-    open_share = transport.open[point].float()[:, None] / 255
+    )
+    share = transport.open[point].float()[:, None] / 255
     blocked = transport.indirect[point].float()  # [P, D, 3]
-    base = (through / math.pi)[..., None] * cosine  # [P, V, D] for albedo 1
+    through = through / math.pi
+    return Rows(
+        (cosine * share)[:, 0],
+        through,
+        shine * share,
+        through[..., None] * (cosine @ blocked),
+        shine @ blocked,
+        problem.target[sighting],
+    )
+
+
+def normal_equations(rows: Rows, light: Tensor, log_albedo: Tensor) -> Block:
+    """The block of some points for map `light` [D, 3] and `log_albedo` [P, 3]."""
     hessian, gradient, cross, own, norm, cost = [], [], [], [], [], 0.0
     for c in range(3):
-        albedo = log_albedo[:, c].exp()[:, None]
-        arrives = open_share * light[:, c] + blocked[:, None, :, c]  # [P, 1, D]
-        diffuse = albedo * (base * arrives).sum(2)
-        drawn = diffuse + (shine * arrives).sum(2)
-        target = problem.target[sighting][..., c]
-        slope = encoded_slope(drawn)
+        albedo = log_albedo[:, c, None].exp()
+        sky = rows.through * (rows.diffuse @ light[:, c])[:, None]
+        diffuse = albedo * (sky + rows.diffuse_blocked[..., c])
+        drawn = diffuse + rows.shine @ light[:, c] + rows.shine_blocked[..., c]
+        target = rows.target[..., c]
         residual = target - losses.encode(drawn)
         weight = 1 / (1 + (residual / CAUCHY).square())
         weight = weight.masked_fill((target > CLIPPED) & (residual < 0), 0.0)
         root = weight.sqrt()
-        jacobian = (albedo[..., None] * base + shine) * (open_share * light[:, c])
-        jacobian = jacobian * (root * slope)[..., None]
-        self_ = root * slope * diffuse
+        slope = root * encoded_slope(drawn)
         r = root * residual
-        n = self_.square().sum(1) + 1e-6
+        jacobian = (albedo * rows.through)[..., None] * rows.diffuse[:, None] + rows.shine
+        jacobian = jacobian * slope[..., None] * light[:, c]
+        self_ = slope * diffuse
+        n = self_.square().sum(1) + 1e-6  # a point that shows no diffuse light keeps its albedo
         tie = torch.einsum("pvd,pv->pd", jacobian, self_)
         g = (self_ * r).sum(1)
         flat, low = jacobian.flatten(0, 1), tie / n.sqrt()[:, None]
@@ -218,12 +251,7 @@ def normal_equations(
         own.append(g)
         norm.append(n)
         cost += r.square().sum().item()
-    return Block(
-        *(torch.stack(t) for t in (hessian, gradient, cross)),
-        torch.stack(own, 1),
-        torch.stack(norm, 1),
-        cost,
-    )
+    return Block(*(torch.stack(t) for t in (hessian, gradient, cross, own, norm)), cost)
 
 
 def encoded_slope(linear: Tensor) -> Tensor:

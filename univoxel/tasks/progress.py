@@ -93,7 +93,7 @@ class Progress:
         self._saved = time.monotonic()
         return True
 
-    def report(self, losses: dict[str, float], psnr: float) -> None:
+    def report(self, losses: dict[str, float], psnr: float | None) -> None:
         """Move the bar and append a line to the log."""
         now, stage = time.monotonic(), self.cfg.stages[self.stage]
         rate = (self.step - self._told_step) * stage.rays / (now - self._told)
@@ -104,11 +104,12 @@ class Progress:
         by_stage = sum(shares[: self.stage]) + shares[self.stage] * self.done
         whole = max(by_stage / sum(shares), min(self.seconds / (60 * self.cfg.minutes), 1.0))
         remaining = self.seconds * (1 - whole) / max(whole, 1e-3)
+        quality = "" if psnr is None else f"held-out {psnr:.1f} dB  "
         self._bar.update(
             self._task,
             completed=whole,
             description=f"stage {self.stage + 1}/{len(shares)}",
-            facts=f"loss {sum(losses.values()):.4f}  held-out {psnr:.1f} dB  "
+            facts=f"loss {sum(losses.values()):.4f}  {quality}"
             f"{rate / 1e3:.0f}k rays/s  {remaining / 60:.0f}:{remaining % 60:02.0f} left ",
         )
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from univoxel import losses
 from univoxel.camera import pixel_rays
 from univoxel.color import linear_to_srgb
-from univoxel.config import LossConfig, StageConfig, TrainConfig, save_config
+from univoxel.config import JointConfig, LossConfig, StageConfig, TrainConfig, save_config
 from univoxel.data import DataError, Photos, load_photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
@@ -22,6 +22,7 @@ from univoxel.records import Rays, Surface
 from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
+from univoxel.tasks import joint
 from univoxel.tasks.progress import Progress
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
@@ -70,7 +71,8 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
         lower, upper = estimate_bounds(distance, photos.cameras)
     except ValueError as error:
         raise DataError(f"{cfg.data}: {error}") from None
-    grids = [fit_grid(lower, upper, round(1e6 * stage.voxels)) for stage in cfg.stages]
+    voxels = [s.voxels if isinstance(s, StageConfig) else None for s in cfg.stages]
+    grids = [v and fit_grid(lower, upper, round(1e6 * v)) for v in voxels]
     if resume:
         scene, state = load_checkpoint(cfg.out)
         begin -= state["seconds"]
@@ -85,9 +87,13 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
     save_config(cfg)
     with Progress(cfg, begin, state) as progress:
         for index in range(state["stage"], len(cfg.stages)):
-            if scene.field.grid != grids[index]:
-                scene.field = scene.field.resized(grids[index])
-            run_stage(scene, cfg, cfg.stages[index], photos, pixels, held_out, progress)
+            stage, grid = cfg.stages[index], grids[index]
+            if isinstance(stage, JointConfig):
+                joint.solve(scene, photos, stage, cfg.seed, progress)
+            else:
+                if scene.field.grid != grid:
+                    scene.field = scene.field.resized(grid)
+                run_stage(scene, cfg, stage, photos, pixels, held_out, progress)
             save_scene(scene, cfg.out, progress.state())
             preview(scene, photos, cfg.out / "preview.png")
     return cfg.out
@@ -104,11 +110,14 @@ def run_stage(
 ) -> None:
     """Optimise the scene on its present grid until the stage's steps or its time are over."""
     field = scene.field
+    field.sdf.requires_grad_(not stage.refit)
+    scene.material.requires_grad_(not stage.refit)
+    networks = [scene.material, scene.radiance, scene.light]
     optimizer = RowAdam(
         [
             {"params": [field.sdf], "eps": EPS_SDF},
             {"params": [field.features], "eps": EPS_FEATURES},
-            {"params": [p for n, p in scene.named_parameters() if not n.startswith("field.")]},
+            {"params": [p for net in networks for p in net.parameters()]},
         ],
         betas=MOMENTS,
     )
@@ -133,8 +142,10 @@ def run_stage(
             raise FloatingPointError(f"the loss is {loss.item()} at step {progress.step}")
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        if stage.refit:
+            field.features.grad._values()[:, : scene.material.channels] = 0
         optimizer.step()
-        if progress.step % SMOOTH_EVERY == 0:
+        if progress.step % SMOOTH_EVERY == 0 and not stage.refit:
             smooth(field, stage)
         if progress.due():
             quality = held_out_psnr(scene, photos, held_out, physical)
