@@ -196,7 +196,7 @@ def export(
         run: folder of a trained run
         mesh: the file to write: .glb and .obj hold textures, .ply materials at the vertices
         faces: most triangles, at least 4
-        texture_size: width of the square textures, a power of 2
+        texture_size: width of the square textures, a power of 2 up to 4096
         watertight: close holes, or fail
     """
     from univoxel.tasks import export as task

@@ -14,7 +14,7 @@ from univoxel.scene import load_scene
 
 SUFFIXES = (".glb", ".obj", ".ply")
 TEXTURED_FACES = 20_000  # of textured meshes: the texture holds what they are too coarse for
-TEXTURE_SIZES = (16, 8192)
+TEXTURE_SIZES = (16, 4096)
 
 
 def export(
@@ -32,7 +32,7 @@ def export(
         mesh: the file to write, whole or not at all: .glb and .obj hold textures, .ply holds
             materials at the vertices.
         faces: most triangles, at least 4; when left out 20000 with textures, all without.
-        texture_size: texels along a side of each texture, a power of 2 from 16 to 8192.
+        texture_size: texels along a side of each texture, a power of 2 from 16 to 4096.
         watertight: close holes.
 
     Raises:
