@@ -26,6 +26,12 @@ struct LightSample {
     float pdf;  // per steradian
 };
 
+struct LightDraw {
+    vec3<float> direction;
+    float pdf;  // per steradian
+    float x;    // across the map, in [0, 1)
+};
+
 class EnvMap {
   public:
     explicit EnvMap(const EnvMapTables& tables) : t_(tables), edge_(tables.height + 1) {
@@ -38,17 +44,20 @@ class EnvMap {
     bool black() const { return black_; }
 
     /// Draw a direction from two numbers in [0, 1): the texel by inverting both tables, then a
-    /// place uniform in solid angle within it.
-    LightSample sample(float u, float v) const {
+    /// place uniform in solid angle within it. `radiance` of it is for the caller to ask: half of
+    /// all draws lie below the horizon.
+    LightDraw sample(float u, float v) const {
         const int64_t r = find(t_.row_cdf, t_.height, v);
         const int64_t c = find(t_.column_cdf + r * (t_.width + 1), t_.width, u);
         const float z = edge_[r] + v * (edge_[r + 1] - edge_[r]);
         const float x = (c + u) / t_.width;
         const float phi = kPi32 * (1 - 2 * x) + t_.rotation;
         const float radius = std::sqrt(std::max(0.f, 1 - z * z));
-        return {{radius * std::cos(phi), radius * std::sin(phi), z},
-                radiance(x, 0.5f - std::asin(z) / kPi32),
-                texel_pdf(r, c)};
+        return {{radius * std::cos(phi), radius * std::sin(phi), z}, texel_pdf(r, c), x};
+    }
+
+    vec3<float> radiance(const LightDraw& s) const {
+        return radiance(s.x, 0.5f - std::asin(s.direction.z) / kPi32);
     }
 
     /// Radiance from a unit direction, and the density with which `sample` draws it.

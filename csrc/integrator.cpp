@@ -190,13 +190,13 @@ vec trace(const Relight& in, const EnvMap& map, Vertex v, uint32_t index, uint32
         // Sample the map and look whether its light arrives.
         if (in.strategy != Strategy::brdf && !map.black()) {
             const Point2 u = sobol2(index, hash(own, 0));
-            const LightSample s = map.sample(u.x, u.y);
+            const LightDraw s = map.sample(u.x, u.y);
             const Brdf::Value value = v.brdf.evaluate(v.frame.to_local(s.direction));
-            const float weight = in.strategy == Strategy::mis ? mis_weight(s.pdf, value.pdf) : 1.f;
-            if (s.pdf > 0) {
-                const vec arriving = throughput * value.f_cos * s.radiance * (weight / s.pdf);
-                if (largest(arriving) > 0 && above(v, s.direction) &&
-                    !in.scene->occluded(v.origin, s.direction, v.t_min))
+            if (s.pdf > 0 && largest(value.f_cos) > 0 && above(v, s.direction)) {
+                const float weight =
+                    in.strategy == Strategy::mis ? mis_weight(s.pdf, value.pdf) : 1.f;
+                const vec arriving = throughput * value.f_cos * map.radiance(s) * (weight / s.pdf);
+                if (largest(arriving) > 0 && !in.scene->occluded(v.origin, s.direction, v.t_min))
                     light += arriving;
             }
         }
