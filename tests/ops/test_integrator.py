@@ -54,6 +54,15 @@ def test_furnace_of_many_bounces_between_surfaces():
     assert direct.mean() < once.mean() < full.mean()
 
 
+@pytest.mark.parametrize("strategy", ["mis", "map", "brdf"])
+def test_furnace_within_half_a_percent(strategy):
+    """The mean over points and eyes of (1 - E) + E, whichever directions are drawn."""
+    mesh, scene = octahedron()
+    normal, wo = sphere_points(400, seed=8)
+    rgb = shade(mesh, scene, WHITE, normal, wo, 1.0, 0.6, samples=512, strategy=strategy)
+    assert rgb.mean() == pytest.approx(1.0, abs=5e-3)
+
+
 def spotted_map(height=16, seed=3):
     g = torch.Generator().manual_seed(seed)
     radiance = torch.rand(height, 2 * height, 3, generator=g) ** 3
