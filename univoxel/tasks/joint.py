@@ -137,7 +137,7 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
 
 @dataclass(frozen=True)
 class Rows:
-    """What light does at V sightings of each of P points, linear in the map: constant in a round."""
+    """What light does at V sightings of P points, linear in the map; constant in a round."""
 
     diffuse: Tensor  # [P, D] sky into irradiance: cosine, open share and solid angle
     through: Tensor  # [P, V] irradiance into radiance, for albedo 1
