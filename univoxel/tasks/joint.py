@@ -193,7 +193,8 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
         system = torch.stack([b.hessian for b in blocks]).sum(0) / sighting.numel() + smooth
         system.diagonal(dim1=1, dim2=2).add_(cfg.newton_smooth)
         right = torch.stack([b.gradient for b in blocks]).sum(0) / sighting.numel() - x @ smooth
-        step = torch.linalg.solve(system, right[..., None])[..., 0].clamp(-1, 1)
+        factor = torch.linalg.cholesky(system.double())
+        step = torch.cholesky_solve(right.double()[..., None], factor)[..., 0].float().clamp(-1, 1)
         sky.log_radiance += step.T
         change = [(b.own - torch.einsum("cpd,cd->cp", b.cross, step)) / b.norm for b in blocks]
         log_albedo = (log_albedo + torch.cat(change, 1).T.clamp(-0.5, 0.5)).clamp(-7.0, 0.0)
