@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from univoxel.config import LossConfig, StageConfig, TrainConfig, preset, save_config
+from univoxel.config import JointConfig, LossConfig, StageConfig, TrainConfig, preset, save_config
 from univoxel.lights.sg import LocalSG, SGConfig
 from univoxel.scene import SceneConfig
 
@@ -19,9 +19,10 @@ def test_presets(name):
     config = preset(name, Path("photos"), Path("run"))
     assert (config.data, config.out) == (Path("photos"), Path("run"))
     assert sum(stage.share for stage in config.stages) == pytest.approx(1)
-    voxels = [stage.voxels for stage in config.stages]
+    grids = [stage for stage in config.stages if isinstance(stage, StageConfig)]
+    voxels = [stage.voxels for stage in grids]
     assert voxels == sorted(voxels)
-    assert config.stages[-1].physical_from < 1  # or materials would never be learned
+    assert grids[-1].physical_from < 1  # or materials would never be learned
 
 
 def test_presets_differ_in_work():
@@ -58,7 +59,18 @@ def test_the_file_holds_every_field(tmp_path):
         (LossConfig(), {"silhouette": -1.0}, "silhouette must be at least 0, got -1.0"),
         (CONFIG, {"data": 42}, "data must be a path, got 42"),
         (CONFIG, {"out": None}, "out must be a path, got None"),
-        (CONFIG, {"stages": ()}, r"stages must be at least one, got \(\)"),
+        (CONFIG, {"stages": ()}, r"stages must be a StageConfig first, .*got \(\)"),
+        (CONFIG, {"stages": (JointConfig(),)}, "stages must be a StageConfig first"),
+        (
+            CONFIG,
+            {"stages": (STAGE, JointConfig()), "scene": SceneConfig(sky_nodes=0)},
+            "sky_nodes",
+        ),
+        (JointConfig(), {"rounds": 0}, "rounds must be at least 1, got 0"),
+        (JointConfig(), {"rays": 3}, "rays must be at least views, got 3"),
+        (JointConfig(), {"lr_map": 0.0}, "lr_map must be above 0, got 0.0"),
+        (JointConfig(), {"newton_steps": -1}, "newton_steps must be at least 0, got -1"),
+        (JointConfig(), {"newton_views": 1}, "newton_views must be at least 2, got 1"),
         (CONFIG, {"minutes": 0.0}, "minutes must be above 0, got 0.0"),
         (SceneConfig(), {"channels": 0}, "channels must be at least 1, got 0"),
         (SceneConfig(), {"hidden": 0}, "hidden must be at least 1, got 0"),

@@ -106,7 +106,16 @@ class TrainConfig:
 
     def __post_init__(self):
         _check(self, "a path", lambda x: isinstance(x, Path), "data", "out")
-        _check(self, "at least one", lambda x: len(x) >= 1, "stages")
+        _check(
+            self,
+            "a StageConfig first, which makes the grid",
+            lambda x: len(x) >= 1 and isinstance(x[0], StageConfig),
+            "stages",
+        )
+        if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
+            raise ValueError(
+                "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
+            )
         _check(self, "above 0", lambda x: x > 0, "minutes")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -179,14 +180,14 @@ def ground_shadow(
     origin, direction = rays.origin[where], rays.direction[where]
     points = origin + (height - origin[:, 2:]) / direction[:, 2:] * direction
     points[:, 2] = height
-    light = {"stage": stage, "lighting": lighting, "bounces": bounces, "seed": seed}
+    floor = partial(_floor, stage=stage, lighting=lighting, bounces=bounces, seed=seed)
     shadow = rays.origin.new_zeros(len(meets))
     few = min(samples, SCOUTS)
-    alone, lit = _floor(points, first=0, samples=few, **light)
+    alone, lit = floor(points, first=0, samples=few)
     # Most of a floor lies in full light: only where a ray met the object are there more to trace.
     if samples > few:
         touched = (alone != lit).nonzero()[:, 0]
-        rest = _floor(points[touched], first=few, samples=samples - few, **light)
+        rest = floor(points[touched], first=few, samples=samples - few)
         for total, more in zip((alone, lit), rest, strict=True):
             total[touched] += (more - total[touched]) * (1 - few / samples)
     shadow[where] = torch.where(alone > 0, 1 - lit / alone.clamp_min(1e-30), 0.0).clamp(0, 1)
@@ -194,7 +195,14 @@ def ground_shadow(
 
 
 def _floor(
-    points: Tensor, stage: Stage, lighting: Lighting, bounces: int, **options: int
+    points: Tensor,
+    *,
+    stage: Stage,
+    lighting: Lighting,
+    bounces: int,
+    first: int,
+    samples: int,
+    seed: int,
 ) -> tuple[Tensor, Tensor]:
     """Luminance [N] that points of a white floor send up, without the object and with it."""
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(points)
@@ -214,7 +222,9 @@ def _floor(
             suns=lighting.suns,
             lamps=lighting.lamps,
             f0=torch.zeros_like(points),
-            **options,
+            first=first,
+            samples=samples,
+            seed=seed,
         )
         for visibility, reflections in ((nothing, 0), (stage.visibility, bounces))
     )

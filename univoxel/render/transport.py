@@ -50,6 +50,7 @@ def surface_points(mesh: Mesh, count: int, generator: torch.Generator) -> tuple[
     u, v = torch.where(u + v > 1, 1 - u, u), torch.where(u + v > 1, 1 - v, v)
     weight = torch.stack([1 - u - v, u, v], 1)[..., None]
     corner = mesh.faces[face].long()
+    assert mesh.normals is not None
     position = (mesh.vertices[corner] * weight).sum(1)
     return position, normalize((mesh.normals[corner] * weight).sum(1), dim=1)
 

@@ -7,7 +7,7 @@ import html
 from dataclasses import replace
 from pathlib import Path
 
-from univoxel.config import preset
+from univoxel.config import StageConfig, preset
 from univoxel.data.images import replacing
 from univoxel.scene import FILE
 from univoxel.tasks.evaluate import MEASURES, evaluate
@@ -17,7 +17,7 @@ from univoxel.tasks.train import train
 
 SCENE = Path(__file__).parent.parent / "example_data" / "tiny"
 MAPS = ("city", "sunset")
-VOXELS = 0.3, 0.6  # millions, of the two stages
+FINENESS = 0.3  # of the preset's voxels
 MINUTES = 2.0  # of training: the whole takes less than twice that on two cores
 
 _PAGE = """<!doctype html>
@@ -70,7 +70,10 @@ def demo(out: Path) -> Path:
     run = out / "run"
     config = preset("fast", data=SCENE, out=run)
     # A voxel as wide as a pixel of these small pictures: finer ones would only fit noise.
-    stages = tuple(replace(s, voxels=v) for s, v in zip(config.stages, VOXELS, strict=True))
+    stages = tuple(
+        replace(stage, voxels=FINENESS * stage.voxels) if isinstance(stage, StageConfig) else stage
+        for stage in config.stages
+    )
     config = replace(config, stages=stages, minutes=MINUTES)
     train(config, resume=(run / FILE).exists())
     measures = evaluate(run, save=out / "test")

@@ -55,6 +55,8 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     """Sample the surface, gather its sightings and trace what light can reach it."""
     generator = torch.Generator().manual_seed(seed)
     mesh = extract_mesh(scene)
+    assert mesh.normals is not None
+    assert scene.sky is not None
     tracer = VisibilityScene(mesh.vertices, mesh.faces)
     offset = scene.field.voxel_size
     bright = mean_colors(observe(mesh.vertices, mesh.normals, photos, tracer, offset))
@@ -77,6 +79,7 @@ def draw(problem: Problem, points: int, views: int) -> tuple[Tensor, Tensor]:
 
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
     """Fit scene.sky and the materials to the photographs; geometry and other heads stay."""
+    assert scene.sky is not None
     problem = pose(scene, photos, cfg, seed)
     turn = 0  # rounds begun
     for done in progress.steps():
@@ -108,6 +111,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
 def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Tensor]:
     """The weighted losses of a random batch of sightings."""
     seen, transport = problem.seen, problem.transport
+    assert scene.sky is not None
     index, sighting = draw(problem, cfg.rays // cfg.views, cfg.views)
     points = index[:: cfg.views]
     albedo, roughness = scene.material(scene.field.sample(seen.position[points]).features)
@@ -171,6 +175,7 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
     step.
     """
     seen, sky = problem.seen, scene.sky
+    assert sky is not None
     counts = seen.offsets.diff()
     rich = (counts >= cfg.newton_views // 2).nonzero()[:, 0]
     chosen = rich[torch.randperm(len(rich))[: cfg.newton_points]]
@@ -252,7 +257,14 @@ def normal_equations(rows: Rows, light: Tensor, log_albedo: Tensor) -> Block:
         own.append(g)
         norm.append(n)
         cost += r.square().sum().item()
-    return Block(*(torch.stack(t) for t in (hessian, gradient, cross, own, norm)), cost)
+    return Block(
+        torch.stack(hessian),
+        torch.stack(gradient),
+        torch.stack(cross),
+        torch.stack(own),
+        torch.stack(norm),
+        cost,
+    )
 
 
 def encoded_slope(linear: Tensor) -> Tensor:

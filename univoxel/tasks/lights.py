@@ -19,13 +19,13 @@ def sun_light(values: tuple[float, ...]) -> Sun:
     azimuth, elevation = (math.radians(x) for x in values[:2])
     across = math.cos(elevation)
     direction = (across * math.cos(azimuth), across * math.sin(azimuth), math.sin(elevation))
-    return Sun(direction, (values[2],) * 3, *values[3:])
+    return Sun(direction, (values[2], values[2], values[2]), *values[3:])
 
 
 def point_light(values: tuple[float, float, float, float]) -> Lamp:
     """A white lamp from x, y, z and its intensity."""
     x, y, z, intensity = values
-    return Lamp((x, y, z), (intensity,) * 3)
+    return Lamp((x, y, z), (intensity, intensity, intensity))
 
 
 def parse_ground(text: str | None) -> float | Literal["lowest"] | None:

@@ -72,13 +72,15 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
     except ValueError as error:
         raise DataError(f"{cfg.data}: {error}") from None
     voxels = [s.voxels if isinstance(s, StageConfig) else None for s in cfg.stages]
-    grids = [v and fit_grid(lower, upper, round(1e6 * v)) for v in voxels]
+    grids = [None if v is None else fit_grid(lower, upper, round(1e6 * v)) for v in voxels]
     if resume:
         scene, state = load_checkpoint(cfg.out)
         begin -= state["seconds"]
     else:
-        hull = visual_hull(distance, photos.cameras, grids[0])
-        field = DenseField(grids[0], cfg.scene.channels, hull)
+        first = grids[0]
+        assert first is not None
+        hull = visual_hull(distance, photos.cameras, first)
+        field = DenseField(first, cfg.scene.channels, hull)
         light = replace(cfg.scene.light, scale=float((upper - lower).max()) / 2)
         scene = Scene(replace(cfg.scene, light=light), field)
         state = {"stage": 0, "progress": 0.0, "step": 0}
@@ -91,6 +93,7 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
             if isinstance(stage, JointConfig):
                 joint.solve(scene, photos, stage, cfg.seed, progress)
             else:
+                assert grid is not None
                 if scene.field.grid != grid:
                     scene.field = scene.field.resized(grid)
                 run_stage(scene, cfg, stage, photos, pixels, held_out, progress)
@@ -143,6 +146,7 @@ def run_stage(
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         if stage.refit:
+            assert field.features.grad is not None
             field.features.grad._values()[:, : scene.material.channels] = 0
         optimizer.step()
         if progress.step % SMOOTH_EVERY == 0 and not stage.refit:
