@@ -53,7 +53,7 @@ class JointConfig:
     share: float = 0.4  # of the time budget, (0, 1]
     rays: int = 4096  # sightings per step, >= views
     views: int = 4  # sightings of a point per step, >= 1
-    rounds: int = 3  # of Adam, >= 1, with Newton steps on the map between them
+    rounds: int = 4  # of Adam, >= 1, with Newton steps on the map between them
     points: int = 20000  # on the surface, >= 1
     tracing: int = 2  # visibility rays per point and direction, >= 1
     lr_features: float = 0.03  # at the begin of a round; all rates > 0
@@ -180,7 +180,7 @@ def preset(
             return TrainConfig(data, out, (coarse, fine), minutes, scene=scene)
         case "hybrid":
             coarse, fine = replace(coarse, share=0.1), replace(fine, share=0.4)
-            joint = JointConfig(iterations=steps * 3 // 4, share=0.35)
+            joint = JointConfig(iterations=steps, share=0.35)
             refit = StageConfig(
                 voxels=voxels,
                 iterations=steps // 3,
