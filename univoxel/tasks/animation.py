@@ -74,7 +74,7 @@ def _on_white(path: Path) -> Image.Image:
 
 def _ffmpeg():
     try:
-        import imageio_ffmpeg
+        import imageio_ffmpeg  # pyright: ignore[reportMissingImports]  the extra `video`
     except ImportError:
         raise ImportError(
             "relight: an MP4 needs imageio-ffmpeg: pip install 'univoxel[video]', or choose gif"

@@ -201,7 +201,7 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
         right = torch.stack([b.gradient for b in blocks]).sum(0) / sighting.numel() - x @ smooth
         factor = torch.linalg.cholesky(system.double())
         step = torch.cholesky_solve(right.double()[..., None], factor)[..., 0].float().clamp(-1, 1)
-        sky.log_radiance += step.T
+        sky.log_radiance.add_(step.T)
         change = [(b.own - torch.einsum("cpd,cd->cp", b.cross, step)) / b.norm for b in blocks]
         log_albedo = (log_albedo + torch.cat(change, 1).T.clamp(-0.5, 0.5)).clamp(-7.0, 0.0)
         costs.append(sum(b.cost for b in blocks) / sighting.numel())
