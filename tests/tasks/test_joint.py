@@ -1,0 +1,357 @@
+"""The stage that solves for one map: its equations against autograd, its answers against truth."""
+
+import dataclasses
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from analytic import RADIUS, cameras_around, sphere_normals, sphere_scene, write_scene
+from torch.nn.functional import normalize
+
+from univoxel import losses
+from univoxel.color import linear_to_srgb
+from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.data import Photos
+from univoxel.lights.sg import SGConfig
+from univoxel.ops import shade_map
+from univoxel.render.pipeline import extract_mesh
+from univoxel.render.transport import Observations, Transport
+from univoxel.scene import SceneConfig
+from univoxel.sphere import fibonacci_sphere
+from univoxel.tasks import joint
+from univoxel.tasks import train as train_task
+
+
+def facing(normal: torch.Tensor, least: float) -> torch.Tensor:
+    """Random unit directions [N, 3] at a cosine of at least about `least` to the normals."""
+    wo = normalize(torch.randn_like(normal), dim=1)
+    wo = wo * (wo * normal).sum(1, keepdim=True).sign()
+    return normalize(wo + least * normal, dim=1)
+
+
+def problem_on_a_sphere(points: int, views: int, nodes: int) -> joint.Problem:
+    """Points that see everything above their horizon, and black photographs of them."""
+    normal = normalize(torch.randn(points, 3), dim=1)
+    wo = facing(normal.repeat_interleave(views, 0), 0.3)
+    offsets = torch.arange(points + 1) * views
+    black = torch.zeros(points * views, 3)
+    seen = Observations(RADIUS * normal, normal, offsets, wo, black)
+    open_share = torch.full((points, nodes), 255, dtype=torch.uint8)
+    indirect = torch.zeros(points, nodes, 3, dtype=torch.float16)
+    transport = Transport(fibonacci_sphere(nodes), open_share, indirect)
+    return joint.Problem(seen, transport, black, 0.05)
+
+
+def photographed(problem: joint.Problem, map, albedo, roughness) -> joint.Problem:
+    """The same with the sightings that a map [D, 3] and materials [P, 3], [P] make."""
+    point = torch.repeat_interleave(problem.seen.offsets.diff())
+    t, seen = problem.transport, problem.seen
+    color = shade_map(
+        map, t.open, t.indirect, point, seen.normal[point], seen.wo, albedo[point],
+        roughness[point], t.direction, problem.solid_angle,
+    )  # fmt: skip
+    seen = replace(seen, color=color)
+    return replace(problem, seen=seen, target=losses.encode(color))
+
+
+def random_problem(points: int = 5, views: int = 4, nodes: int = 12) -> joint.Problem:
+    """With half-open directions and light from what blocks them."""
+    torch.manual_seed(1)
+    problem = problem_on_a_sphere(points, views, nodes)
+    open_share = torch.randint(0, 256, (points, nodes), dtype=torch.uint8)
+    indirect = torch.rand(points, nodes, 3).half()
+    transport = Transport(problem.transport.direction, open_share, indirect)
+    return replace(problem, transport=transport)
+
+
+@pytest.fixture
+def rows_and_map():
+    """Rows in double, a map and albedos that do not explain them, some sightings clipped."""
+    problem = random_problem()
+    map, albedo = 0.7 + 2.5 * torch.rand(12, 3), 0.2 + 0.6 * torch.rand(5, 3)
+    problem = photographed(problem, map, albedo, torch.full((5,), 0.3))
+    target = problem.target + 0.03 * torch.randn_like(problem.target)
+    target = target.clamp_max(1.0)  # as photographs are
+    problem = replace(problem, target=target)
+    sighting = torch.arange(20).view(5, 4)
+    rows = joint.light_rows(problem, torch.arange(5), sighting, torch.full((5,), 0.3))
+    rows = joint.Rows(**{f.name: getattr(rows, f.name).double() for f in dataclasses.fields(rows)})
+    map = map * torch.linspace(1.6, 0.9, 12)[:, None]
+    return rows, map.double(), albedo.log().double()
+
+
+def test_rows_draw_what_the_shading_draws():
+    problem = random_problem()
+    map, albedo, roughness = torch.rand(12, 3), torch.rand(5, 3), 0.2 + 0.6 * torch.rand(5)
+    problem = photographed(problem, map, albedo, roughness)
+    which = torch.tensor([[3, 1], [9, 8], [18, 18]])
+    rows = joint.light_rows(problem, torch.tensor([0, 2, 4]), which, roughness[[0, 2, 4]])
+    drawn = drawn_by(rows, map, albedo[[0, 2, 4]])
+    assert torch.allclose(drawn, problem.seen.color[which], rtol=1e-4, atol=1e-6)
+    assert torch.equal(rows.target, problem.target[which])
+
+
+def drawn_by(rows: joint.Rows, map: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
+    sky = rows.through[..., None] * (rows.diffuse @ map)[:, None]
+    return albedo[:, None] * (sky + rows.diffuse_blocked) + rows.shine @ map + rows.shine_blocked
+
+
+def weights(rows: joint.Rows, map: torch.Tensor, log_albedo: torch.Tensor) -> torch.Tensor:
+    residual = rows.target - losses.encode(drawn_by(rows, map, log_albedo.exp()))
+    weight = 1 / (1 + (residual / joint.CAUCHY) ** 2)
+    return torch.where((rows.target > joint.CLIPPED) & (residual < 0), 0.0, weight)
+
+
+def test_equations_are_the_schur_complement_of_the_dense_system(rows_and_map):
+    rows, map, log_albedo = rows_and_map
+    weight = weights(rows, map, log_albedo)
+    assert 0 < int((weight == 0).sum()) < weight.numel() / 2  # clipped sightings are among them
+    block = joint.normal_equations(rows, map, log_albedo)
+    cost = 0.0
+    for c in range(3):
+
+        def encoded(x, a, c=c):
+            light, albedo = map.clone(), log_albedo.exp()
+            light[:, c], albedo[:, c] = x.exp(), a.exp()
+            return losses.encode(drawn_by(rows, light, albedo))[..., c].flatten()
+
+        x, a = map[:, c].log(), log_albedo[:, c]
+        j_map, j_albedo = torch.autograd.functional.jacobian(encoded, (x, a))
+        w = weight[..., c].flatten()
+        residual = rows.target[..., c].flatten() - encoded(x, a)
+        cost += (w * residual**2).sum()
+        full = torch.cat([j_map, j_albedo], 1)
+        hessian, gradient = full.T @ (w[:, None] * full), full.T @ (w * residual)
+        own = hessian[12:, 12:] + 1e-6 * torch.eye(5)
+        cross, inverse = hessian[:12, 12:], torch.linalg.inv(own)
+        exact = {"rtol": 1e-6, "atol": 1e-9}  # double, but for float32 constants of the curve
+        assert torch.allclose(
+            block.hessian[c], hessian[:12, :12] - cross @ inverse @ cross.T, **exact
+        )
+        assert torch.allclose(
+            block.gradient[c], gradient[:12] - cross @ inverse @ gradient[12:], **exact
+        )
+        assert torch.allclose(block.own[c], gradient[12:], **exact)
+        assert torch.allclose(block.norm[c], own.diagonal(), **exact)
+        assert torch.allclose(block.cross[c], cross.T, **exact)
+
+        # One step of the eliminated system and what it says of the albedo: the dense solution
+        damping = 1e-4 * torch.eye(12)
+        dense = hessian.clone()
+        dense[12:, 12:], dense[:12, :12] = own, hessian[:12, :12] + damping
+        solution = torch.linalg.solve(dense, gradient)
+        step = torch.linalg.solve(block.hessian[c] + damping, block.gradient[c])
+        change = (block.own[c] - block.cross[c] @ step) / block.norm[c]
+        assert torch.allclose(step, solution[:12], rtol=1e-4, atol=1e-7)
+        assert torch.allclose(change, solution[12:], rtol=1e-4, atol=1e-7)
+    assert block.cost == pytest.approx(float(cost), rel=1e-9)
+
+
+def test_the_gradient_is_that_of_the_cost_at_fixed_weights(rows_and_map):
+    rows, map, log_albedo = rows_and_map
+    weight = weights(rows, map, log_albedo)
+
+    def cost(log_map, log_albedo):
+        residual = rows.target - losses.encode(drawn_by(rows, log_map.exp(), log_albedo.exp()))
+        return (weight * residual**2).sum()
+
+    x, a = map.log(), log_albedo
+    block = joint.normal_equations(rows, map, log_albedo)
+    h = 1e-5
+    for node, c in ((0, 0), (5, 1), (11, 2)):
+        step = torch.zeros_like(x)
+        step[node, c] = h
+        slope = (cost(x + step, a) - cost(x - step, a)) / (2 * h)
+        # The elimination's share of the gradient put back
+        g = block.gradient[c] + block.cross[c].T @ (block.own[c] / block.norm[c])
+        assert g[node].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
+    step = torch.zeros_like(a)
+    step[3, 1] = h
+    slope = (cost(x, a + step) - cost(x, a - step)) / (2 * h)
+    assert block.own[1, 3].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
+
+
+def test_slope_is_the_derivative_of_the_curve():
+    x = torch.tensor([0.0, 0.001, 0.00313, 0.0032, 0.1, 0.9, 3.0], dtype=torch.float64)
+    x.requires_grad_()
+    (slope,) = torch.autograd.grad(losses.encode(x[1:]).sum(), x)
+    assert torch.allclose(joint.encoded_slope(x.detach())[1:], slope[1:], rtol=1e-6)
+    assert joint.encoded_slope(x.detach())[0] == 12.92
+
+
+def test_laplacian():
+    direction = fibonacci_sphere(200)
+    matrix = joint.graph_laplacian(direction)
+    assert (matrix.sum(1) == 0).all()
+    assert torch.equal(matrix, matrix.T)
+    assert (matrix.diagonal() >= 6).all()
+    near = (direction[0] @ direction.T).topk(7).indices[1:]
+    assert (matrix[0, near] == -1).all()
+    assert (matrix - torch.diag(matrix.diagonal()) <= 0).all()
+    # A smooth function costs little, an uneven one much: x' L x sums squared differences
+    smooth, rough = direction[:, 2], torch.arange(200) % 2 * 2.0 - 1
+    edges = 0.5 * (matrix.diagonal().sum())
+    assert smooth @ matrix @ smooth < 0.1 * edges
+    assert rough @ matrix @ rough > edges
+
+
+def test_draw_takes_points_that_are_seen_and_their_own_sightings():
+    torch.manual_seed(0)
+    problem = problem_on_a_sphere(6, 1, 8)
+    counts = torch.tensor([3, 0, 1, 0, 0, 5])
+    offsets = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
+    problem = replace(problem, seen=replace(problem.seen, offsets=offsets))
+    point, sighting = joint.draw(problem, 300, 4)
+    assert point.shape == sighting.shape == (1200,)
+    assert (point.view(300, 4) == point.view(300, 4)[:, :1]).all()
+    owner = torch.repeat_interleave(counts)
+    assert torch.equal(owner[sighting], point)
+    assert set(sighting.tolist()) == set(range(9))  # each is drawn at times
+
+
+def scene_of(albedo, roughness: float, nodes: int):
+    """The sphere with one material everywhere, under a grey map."""
+    scene = sphere_scene(nodes)
+    last = scene.material.net[-1]
+    low = scene.material.min_roughness
+    wanted = torch.tensor([*albedo, (roughness - low) / (1 - low)])
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.copy_(torch.logit(wanted))
+    return scene
+
+
+CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
+
+
+def test_newton_recovers_a_known_map():
+    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.4, 64
+    scene = scene_of(albedo, roughness, nodes)
+    problem = problem_on_a_sphere(400, 12, nodes)
+    torch.manual_seed(2)
+    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
+    problem = photographed(
+        problem, true, torch.tensor(albedo).expand(400, 3), torch.full((400,), roughness)
+    )
+    costs = joint.newton_round(scene, problem, CFG)
+    costs += joint.newton_round(scene, problem, CFG)
+    assert len(costs) == 2 * CFG.newton_steps
+    error = scene.sky.log_radiance.detach() - true.log()
+    assert costs[-1] < 1e-3 * costs[0]
+    # What is left is the smoothness, which this uneven map has none of
+    assert error.abs().mean() < 0.15 * true.log().abs().mean()
+
+
+def test_newton_without_rich_points_leaves_the_map():
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
+    problem = problem_on_a_sphere(20, 3, 32)  # of at least 4 sightings is asked
+    assert joint.newton_round(scene, problem, CFG) == []
+    assert (scene.sky.log_radiance == 0).all()
+
+
+class Steps:
+    """A clock that lets a stage run through."""
+
+    def __init__(self, count: int):
+        self.count = count
+
+    def steps(self):
+        yield from (i / self.count for i in range(self.count))
+
+    def due(self) -> bool:
+        return False
+
+
+RED, BLUE = torch.tensor([0.6, 0.2, 0.15]), torch.tensor([0.15, 0.25, 0.6])
+
+
+def photographs_under(map, roughness: float, views: int = 16, size: int = 48) -> Photos:
+    """The sphere, red on +X and blue on -X, under a map [D, 3]."""
+    cameras = cameras_around(views, size)
+    direction = fibonacci_sphere(len(map))
+    color, alpha = [], []
+    for v in range(views):
+        normal, hit = sphere_normals(cameras, v)
+        n = normal[hit]
+        wo = normalize(cameras.camera_to_world[v, :, 3] - RADIUS * n, dim=1)
+        count = len(n)
+        albedo = torch.where(n[:, :1] > 0, RED, BLUE)
+        rgb = shade_map(
+            map, torch.full((count, len(map)), 255, dtype=torch.uint8),
+            torch.zeros(count, len(map), 3).half(), torch.arange(count), n, wo, albedo,
+            torch.full((count,), roughness), direction, 4 * math.pi / len(map),
+        )  # fmt: skip
+        picture = torch.zeros(size, size, 3)
+        picture[hit] = rgb
+        color.append((255 * linear_to_srgb(picture)).round().to(torch.uint8))
+        alpha.append(hit.float())
+    names = [f"r_{v}" for v in range(views)]
+    return Photos(Path("sphere"), names, torch.stack(color), torch.stack(alpha), cameras)
+
+
+def test_solve_recovers_albedo_and_map():
+    nodes, roughness = 128, 0.35
+    direction = fibonacci_sphere(nodes)
+    true = torch.full((nodes, 3), 0.35)
+    for axis in ([1.0, -1.0, 1.0], [-1.0, 0.2, 0.5], [0.0, 1.0, 0.3]):  # lamps make highlights
+        lobe = (12 * (direction @ normalize(torch.tensor(axis), dim=0) - 1)).exp()
+        true += lobe[:, None] * torch.tensor([3.3, 3.0, 2.7])
+    photos = photographs_under(true, roughness)
+    scene = sphere_scene(nodes)
+    before = {k: v.clone() for k, v in scene.state_dict().items()}
+    cfg = JointConfig(points=1500, newton_points=1000, rays=1024, tracing=1)
+    joint.solve(scene, photos, cfg, 0, Steps(700))
+    after = scene.state_dict()
+    changed = {k.split(".")[0] for k in after if not torch.equal(after[k], before[k])}
+    assert changed == {"field", "material", "sky"}
+    assert torch.equal(after["field.sdf"], before["field.sdf"])
+
+    mesh = extract_mesh(scene)
+    x = mesh.vertices[:, 0]
+    ratio = torch.stack([mesh.albedo[x > 0.1].mean(0) / RED, mesh.albedo[x < -0.1].mean(0) / BLUE])
+    # Only the highlights tell how bright light and albedo are apart, and roughness blurs them:
+    # one factor, the inverse of the light's, is far less certain than all the rest
+    scale = ratio.mean()
+    assert 0.65 < scale < 1.4
+    assert (ratio / scale - 1).abs().max() < 0.08
+    assert mesh.albedo[x > 0.1].std(0).max() < 0.05
+    error = (scene.sky.radiance.detach() * scale / true).log()
+    assert error.mean().abs() < 0.1
+    assert error.std() < 0.3  # of a map whose logarithm varies by 0.7
+    assert true.log().std() > 0.6
+
+
+def test_a_refit_leaves_geometry_and_materials_bit_for_bit(tmp_path, monkeypatch):
+    data = write_scene(tmp_path / "data", views=8, size=24)
+    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
+    stage = StageConfig(voxels=0.01, iterations=30, share=0.4, rays=256, physical_from=0.5)
+    stages = (
+        stage,
+        JointConfig(iterations=20, points=300, newton_points=100, rays=256, tracing=1),
+        replace(stage, iterations=10, refit=True, physical_from=0.0),
+    )
+    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, sky_nodes=32, light=light)
+    run_stage, states = train_task.run_stage, []
+
+    def watched(scene, *rest):
+        states.append({k: v.clone() for k, v in scene.state_dict().items()})
+        run_stage(scene, *rest)
+        states.append({k: v.clone() for k, v in scene.state_dict().items()})
+
+    monkeypatch.setattr(train_task, "run_stage", watched)
+    train_task.train(TrainConfig(data, tmp_path / "run", stages, minutes=2.0, scene=sizes))
+    start, formed, before, after = states
+    kept = {k for k in after if torch.equal(before[k], after[k])}
+    assert {"field.sdf", "sky.log_radiance"} <= kept
+    assert {k for k in after if k.startswith("material.")} <= kept
+    assert not {k for k in after if k.startswith(("light.", "radiance.")) and "weight" in k} & kept
+    features = before["field.features"], after["field.features"]
+    assert torch.equal(features[0][..., :2], features[1][..., :2])
+    assert not torch.equal(features[0][..., 2:], features[1][..., 2:])
+    # The stages before are what these could have stood still through
+    assert not torch.equal(start["field.sdf"], formed["field.sdf"])
+    assert torch.equal(formed["field.sdf"], before["field.sdf"])
+    assert not torch.equal(formed["field.features"], before["field.features"])
+    assert not torch.equal(formed["sky.log_radiance"], before["sky.log_radiance"])
