@@ -28,6 +28,7 @@ class Config:
     data: Path
     out: Path
     preset: str
+    light: str
     minutes: float = 4.0
     seed: int = 0
     loss: LossConfig = LossConfig()
@@ -59,7 +60,9 @@ def calls(monkeypatch):
     def replace(name, result):
         stand_in(f"univoxel.tasks.{name}", **{name: task(name, result)})
 
-    stand_in("univoxel.config", preset=lambda name, data, out: Config(data, out, name))
+    stand_in(
+        "univoxel.config", preset=lambda name, data, out, light: Config(data, out, name, light)
+    )
     replace("train", Path("run"))
     replace("evaluate", {"psnr": 31.25, "views": 5})
     replace("relight", None)
@@ -71,10 +74,18 @@ def calls(monkeypatch):
 def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     out = tmp_path / "run"
     changes = ["loss.radiance=2", "seed=7", "stages.1.voxels=3", "stages.0.rates=(0.5, 0.1)"]
-    options = ["--preset", "draft", "--minutes", "2", *(f"--set={change}" for change in changes)]
+    options = [
+        "--preset",
+        "draft",
+        "--light",
+        "sg",
+        "--minutes",
+        "2",
+        *(f"--set={change}" for change in changes),
+    ]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
     stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0)
-    expected = Config(Path("photos"), out, "draft", 2.0, 7, LossConfig(2.0), stages)
+    expected = Config(Path("photos"), out, "draft", "sg", 2.0, 7, LossConfig(2.0), stages)
     assert capsys.readouterr().out == "run\n"
     assert calls.noted == [("train", (expected,), {"resume": False})]
 

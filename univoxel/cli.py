@@ -28,6 +28,7 @@ def train(
     /,
     out: Annotated[Path, arg(metavar="RUN")],
     preset: Literal["draft", "fast", "full"] = "fast",
+    light: Literal["hybrid", "sg"] = "hybrid",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
@@ -43,6 +44,8 @@ def train(
         data: folder of the photographs and their cameras
         out: folder that the run is written to
         preset: how much work goes in: draft is a look, fast the usual, full the best
+        light: sg, local lobes as published; hybrid, then one environment map with traced
+            visibility, which cleans shadows from the albedo
         minutes: wall-clock limit, above 0; training ends in time with what it has
         resume: go on with the run in --out
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
@@ -55,7 +58,7 @@ def train(
         raise ValueError(f"--minutes must be above 0, got {minutes:g}")
     if not resume and (out / "scene.safetensors").exists():
         raise FileExistsError(f"{out} holds a run already: add --resume, or choose another --out")
-    config = preset_config(preset, data=data, out=out)
+    config = preset_config(preset, data=data, out=out, light=light)
     if minutes is not None:
         config = dataclasses.replace(config, minutes=minutes)
     print(task.train(_changed(config, set), resume=resume))

@@ -227,13 +227,17 @@ CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
 
 
 def test_newton_recovers_a_known_map():
-    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.4, 64
+    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
     scene = scene_of(albedo, roughness, nodes)
     problem = problem_on_a_sphere(400, 12, nodes)
     torch.manual_seed(2)
     true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
     problem = photographed(
-        problem, true, torch.tensor(albedo).expand(400, 3), torch.full((400,), roughness)
+        problem,
+        true,
+        torch.tensor(albedo).expand(400, 3),
+        # a node is a patch of sky, not a point: as the solve has it
+        joint.widened(torch.full((400,), roughness), nodes),
     )
     costs = joint.newton_round(scene, problem, CFG)
     costs += joint.newton_round(scene, problem, CFG)
@@ -281,7 +285,7 @@ def photographs_under(map, roughness: float, views: int = 16, size: int = 48) ->
         rgb = shade_map(
             map, torch.full((count, len(map)), 255, dtype=torch.uint8),
             torch.zeros(count, len(map), 3).half(), torch.arange(count), n, wo, albedo,
-            torch.full((count,), roughness), direction, 4 * math.pi / len(map),
+            joint.widened(torch.full((count,), roughness), len(map)), direction, 4 * math.pi / len(map),
         )  # fmt: skip
         picture = torch.zeros(size, size, 3)
         picture[hit] = rgb
@@ -292,7 +296,7 @@ def photographs_under(map, roughness: float, views: int = 16, size: int = 48) ->
 
 
 def test_solve_recovers_albedo_and_map():
-    nodes, roughness = 128, 0.35
+    nodes, roughness = 128, 0.29
     direction = fibonacci_sphere(nodes)
     true = torch.full((nodes, 3), 0.35)
     for axis in ([1.0, -1.0, 1.0], [-1.0, 0.2, 0.5], [0.0, 1.0, 0.3]):  # lamps make highlights
@@ -301,7 +305,7 @@ def test_solve_recovers_albedo_and_map():
     photos = photographs_under(true, roughness)
     scene = sphere_scene(nodes)
     before = {k: v.clone() for k, v in scene.state_dict().items()}
-    cfg = JointConfig(points=1500, newton_points=1000, rays=1024, tracing=1)
+    cfg = JointConfig(points=1500, newton_points=1000, rays=1024, tracing=1, rounds=3)
     joint.solve(scene, photos, cfg, 0, Steps(700))
     after = scene.state_dict()
     changed = {k.split(".")[0] for k in after if not torch.equal(after[k], before[k])}
