@@ -67,6 +67,7 @@ def calls(monkeypatch):
     replace("evaluate", {"psnr": 31.25, "views": 5})
     replace("relight", None)
     replace("export", None)
+    replace("envmap", None)
     replace("demo", Path("demo/index.html"))
     return types.SimpleNamespace(noted=noted, replace=replace)
 
@@ -132,6 +133,19 @@ def test_relight_export_and_demo(calls, capsys):
     assert printed == ["run/relight/hall", "out.ply", "demo/index.html"]
 
 
+def test_envmap(calls, capsys):
+    assert main(["envmap", "run", "--out", "map.exr"]) == 0
+    assert calls.noted == [("envmap", (Path("run"), Path("map.exr")), {"height": 128})]
+    assert capsys.readouterr().out == "map.exr\n"
+    found = types.SimpleNamespace(ball_psnr=31.24, brightest_degrees=4.0)
+    calls.replace("envmap", found)
+    assert main(["envmap", "run", "--out", "map.exr", "--height", "32"]) == 0
+    assert calls.noted[-1][2] == {"height": 32}
+    _, ball, brightest = capsys.readouterr().out.splitlines()
+    assert "31.2 dB" in ball
+    assert "4.0 degrees" in brightest
+
+
 @pytest.mark.parametrize(
     "error",
     [
@@ -184,7 +198,7 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         ),
         (["train", "x", "--out", "y", "--minutes", "a"], "Error parsing --minutes: "),
         (["sing"], "Unrecognized options: sing"),
-        ([], "Expected one of {train, eval, relight, export, demo}"),
+        ([], "Expected one of {train, eval, relight, export, envmap, demo}"),
     ],
 )
 def test_wrong_usage_is_one_line(calls, capsys, arguments, message):

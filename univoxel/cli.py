@@ -208,6 +208,29 @@ def export(
     print(mesh)
 
 
+def envmap(
+    run: Run,
+    /,
+    out: Annotated[Path, arg(metavar="FILE.exr")],
+    height: Annotated[int, arg(metavar="ROWS")] = 128,
+) -> None:
+    """Write the light that the photographs were taken in, as an environment map.
+
+    Args:
+        run: folder of a trained run
+        out: the map, linear radiance; a picture of it goes beside, with the true map if the data
+            set has it
+        height: rows of the map; it is twice as wide
+    """
+    from univoxel.tasks import envmap as task
+
+    found = task.envmap(run, out, height=height)
+    print(out)
+    if found:
+        print(f"grey ball under it: PSNR {found.ball_psnr:.1f} dB, a scale per channel")
+        print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
+
+
 def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> None:
     """Train, evaluate and relight the small scene that comes with the package, in minutes.
 
@@ -224,6 +247,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "eval": evaluate,
     "relight": relight,
     "export": export,
+    "envmap": envmap,
     "demo": demo,
 }
 

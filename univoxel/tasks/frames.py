@@ -90,7 +90,7 @@ def views_of(
         names = [f"orbit_{i:04d}" for i in range(frames)]
         return names, orbit(mesh, frames, resolution or ORBIT_SIZE, elevation)
     if word == "test":
-        photos = load_photos(_trained_on(run), "test")
+        photos = load_photos(trained_on(run), "test")
         names, views = photos.names, photos.cameras
     else:
         names, views = load_cameras(cameras, ORBIT_SIZE)
@@ -106,7 +106,7 @@ def resize(cameras: Cameras, width: int) -> Cameras:
     )
 
 
-def _trained_on(run: Path) -> Path:
+def trained_on(run: Path) -> Path:
     """The data set that a run's config.json names."""
     path = run / "config.json"
     try:

@@ -1,0 +1,149 @@
+"""The recovered environment map as a file, and how far it is from the true one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
+
+from univoxel import metrics
+from univoxel.color import linear_to_srgb, luminance
+from univoxel.data import DataError
+from univoxel.data.images import read_image, write_exr, write_png
+from univoxel.envmap import EnvMap, lookup
+from univoxel.scene import load_scene
+from univoxel.sphere import fibonacci_sphere, latlong_direction, texel_solid_angles
+from univoxel.tasks.frames import trained_on
+
+GREY = 0.5  # albedo of the ball
+TEXELS = 64  # rows of the map that light is summed over
+BLUR = math.radians(10.0)  # before the brightest direction is looked for: a light, not a texel
+NORMALS = 2048  # on the whole ball
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A recovered map against the true one, after one factor per channel."""
+
+    ball_psnr: float  # dB, sRGB of a grey ball seen from everywhere, brightest 1 under the truth
+    brightest_degrees: float  # between the brightest directions
+
+
+@torch.no_grad()
+def envmap(run: Path, out: Path, height: int = 128) -> Comparison | None:
+    """Write the recovered map of a run, and a picture of it beside; compare it with the true one.
+
+    Light and albedo share a factor per channel that photographs hardly fix; the comparison takes it
+    out, the file holds the map as it is. The true map is envmaps/train.hdr or .exr in the data set.
+
+    Args:
+        run: folder of a trained run.
+        out: .exr, [height, 2 height] of 32-bit linear R, G, B; the picture goes to the same name
+            with .png: a row for the recovered map and one for the true map, each with a grey and a
+            mirror ball seen from +X, +Z up.
+        height: rows of the map, >= 1.
+
+    Returns:
+        None where the data set has no true map.
+
+    Raises:
+        DataError: run or true map cannot be read.
+        ValueError: the run has no map; an argument out of range.
+        OSError: a file cannot be written.
+    """
+    if height < 1:
+        raise ValueError(f"--height must be at least 1, got {height}")
+    if out.suffix.lower() != ".exr":
+        raise ValueError(f"--out: expected a name that ends in .exr, got {out}")
+    sky = load_scene(run).sky
+    if sky is None:
+        raise ValueError(f"{run}: this run has no environment map: it was trained with sky_nodes 0")
+    recovered, true = sky.latlong(height), _true_map(trained_on(run))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_exr(out, dict(zip("RGB", recovered.unbind(2), strict=True)), half=False)
+    rows, result = [recovered], None
+    if true is not None:
+        recovered = recovered * _scale(recovered, true)
+        rows, result = [recovered, true], compare(recovered, true)
+    exposure = 1 / luminance(rows[-1]).quantile(0.9).clamp_min(1e-6)
+    picture = [torch.cat(_tiles(row * exposure, height), 1) for row in rows]
+    write_png(out.with_suffix(".png"), linear_to_srgb(torch.cat(picture)))
+    return result
+
+
+def compare(recovered: Tensor, true: Tensor) -> Comparison:
+    """Maps [H, 2 H, 3] of any two sizes, of one scale."""
+    normal = fibonacci_sphere(NORMALS)
+    balls = torch.stack([grey_ball(m, normal) for m in (recovered, true)])
+    encoded = linear_to_srgb(balls / balls[1].max())
+    a, b = brightest(recovered), brightest(true)
+    angle = 2 * torch.atan2((a - b).norm(), (a + b).norm())  # exact at small angles too
+    psnr = metrics.psnr(encoded[0][None], encoded[1][None])
+    return Comparison(psnr, float(angle.rad2deg()))
+
+
+def grey_ball(map: Tensor, normal: Tensor) -> Tensor:
+    """Radiance [N, 3] of a Lambertian ball of albedo GREY at unit normals [N, 3]."""
+    direction, light = _light(map)
+    return GREY / math.pi * (normal @ direction.T).clamp_min(0) @ light
+
+
+def brightest(map: Tensor) -> Tensor:
+    """Unit direction [3] of the brightest place after a Gaussian blur."""
+    direction, light = _light(map)
+    place = fibonacci_sphere(2 * NORMALS)
+    near = ((place @ direction.T - 1) / BLUR**2).exp()
+    return place[(near @ luminance(light)).argmax()]
+
+
+def _light(map: Tensor) -> tuple[Tensor, Tensor]:
+    """Directions [M, 3] and radiance times solid angle [M, 3] of a map, pooled to few texels."""
+    height, width, _ = map.shape
+    rows = min(height, TEXELS)
+    light = (map * texel_solid_angles(height, width)[..., None]).movedim(2, 0)
+    pooled = adaptive_avg_pool2d(light, (rows, 2 * rows)).flatten(1).T
+    return _directions(rows).flatten(0, 1), pooled * (light[0].numel() / len(pooled))
+
+
+def _directions(height: int) -> Tensor:
+    """Of the texels of a map: [height, 2 height, 3]."""
+    v, u = (torch.arange(height) + 0.5) / height, (torch.arange(2 * height) + 0.5) / (2 * height)
+    return latlong_direction(torch.stack(torch.meshgrid(v, u, indexing="ij")[::-1], -1))
+
+
+def _scale(recovered: Tensor, true: Tensor) -> Tensor:
+    """The factor [3] that brings the grey ball's light to the true one."""
+    normal = fibonacci_sphere(NORMALS)
+    truth, ball = grey_ball(true, normal), grey_ball(recovered, normal)
+    return metrics.albedo_scale(truth, ball, torch.ones(NORMALS, dtype=torch.bool))
+
+
+def _tiles(map: Tensor, height: int) -> list[Tensor]:
+    """A map, and a grey and a mirror ball under it; linear, `height` rows each."""
+    y, z = torch.meshgrid(*2 * [(2 * torch.arange(height) + 1) / height - 1], indexing="xy")
+    z = -z
+    inside = y * y + z * z < 1
+    normal = torch.stack([(1 - y * y - z * z).clamp_min(0).sqrt(), y, z], -1)
+    mirrored = 2 * normal[..., :1] * normal - torch.tensor([1.0, 0.0, 0.0])
+    light = EnvMap(map)
+    grey = grey_ball(map, normal.flatten(0, 1)).view(height, height, 3)
+    balls = [torch.where(inside[..., None], b, 0.0) for b in (grey, lookup(light, mirrored))]
+    return [lookup(light, _directions(height)), *balls]
+
+
+def _true_map(data: Path) -> Tensor | None:
+    """The light of the photographs, where the data set has it."""
+    for suffix in (".hdr", ".exr"):
+        path = data / "envmaps" / f"train{suffix}"
+        if path.is_file():
+            try:
+                return EnvMap(read_image(path)).radiance
+            except DataError:
+                raise
+            except ValueError as error:
+                raise DataError(f"{path}: {error}") from None
+    return None
