@@ -26,7 +26,7 @@ class StageConfig:
     lr_sdf: tuple[float, float] = (0.2, 0.02)  # at begin and end, voxels per step; all rates > 0
     lr_features: tuple[float, float] = (0.1, 0.01)
     lr_networks: tuple[float, float] = (3e-3, 3e-4)
-    plate: float = 0.01  # thin-plate smoothing of touched sdf nodes per step, [0, 0.5]
+    plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.5]
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 1]
     physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
     refit: bool = False  # geometry and materials stay; light and radiance follow them
