@@ -141,6 +141,26 @@ def save_config(cfg: TrainConfig) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
+def check_same(cfg: TrainConfig) -> None:
+    """Refuse to go on with the run in cfg.out under stages or a model that it did not begin with.
+
+    Raises:
+        ValueError: they differ, or config.json cannot be read.
+    """
+    path = cfg.out / "config.json"
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: cannot be read, so the run cannot go on: {error}") from None
+    now = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
+    for name in ("stages", "scene"):
+        if not isinstance(before, dict) or before.get(name) != now[name]:
+            raise ValueError(
+                f"{path}: the run began with other {name}: resume with the same --preset, --light "
+                "and --set as then"
+            )
+
+
 def preset(
     name: str, data: Path, out: Path, light: Literal["hybrid", "sg"] = "hybrid"
 ) -> TrainConfig:

@@ -92,6 +92,13 @@ def test_resume_goes_on_where_it_stopped(data, tmp_path, monkeypatch):
     assert load_scene(cfg.out).field.grid != first.field.grid  # the second stage's resolution
 
 
+def test_resume_refuses_another_configuration(run, data):
+    cfg = config(data, run)
+    with pytest.raises(ValueError, match="the run began with other stages: resume with the same"):
+        train(dataclasses.replace(cfg, stages=cfg.stages[:1]), resume=True)
+    train(dataclasses.replace(cfg, minutes=5.0), resume=True)  # more time is no other run
+
+
 def test_a_run_is_not_overwritten(run, data):
     with pytest.raises(FileExistsError, match="holds a run already: pass --resume"):
         train(config(data, run))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from json import JSONDecodeError, dumps, loads
+from json import dumps
 from pathlib import Path
 from statistics import fmean
 
@@ -33,6 +33,7 @@ from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, stage
 from univoxel.scene import FILE, Scene, load_checkpoint
 from univoxel.tasks.contact_sheet import Panel, contact_sheet, shrink
+from univoxel.tasks.frames import trained_on
 from univoxel.tasks.layers import Layers, Relighting, exr_channels, render_layers
 
 # key: what the table says of it
@@ -120,7 +121,7 @@ def evaluate(
             f"evaluate: expected samples >= 1 and bounces >= 0, got {samples} and {bounces}"
         )
     run = Path(run)
-    folder = data or _trained_on(run)
+    folder = data or trained_on(run)
     photos = load_photos(folder, "test")
     relit = _relit_photos(photos)
     points = load_points(folder)
@@ -318,17 +319,6 @@ def _panels(layers: Layers, expected: Expected, scales: Scales) -> list[Panel]:
         for name, photo in expected.relit.items()
     ]
     return [shrink(panel) for panel in panels]
-
-
-def _trained_on(run: Path) -> Path:
-    """The data set that a run's config.json names."""
-    path = run / "config.json"
-    try:
-        return Path(loads(path.read_text(encoding="utf-8"))["data"])
-    except FileNotFoundError:
-        raise DataError(f"{run}: expected the folder of a run, got no {path.name}") from None
-    except (KeyError, TypeError, JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: expected JSON with the key data: {error!r}") from None
 
 
 def _table(result: dict[str, float | int | None]) -> Table:

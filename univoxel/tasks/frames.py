@@ -111,5 +111,7 @@ def trained_on(run: Path) -> Path:
     path = run / "config.json"
     try:
         return Path(loads(path.read_text(encoding="utf-8"))["data"])
+    except FileNotFoundError:
+        raise DataError(f"{run}: expected the folder of a run, got no {path.name}") from None
     except (KeyError, TypeError, JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: expected JSON with the key data: {error!r}") from None

@@ -12,7 +12,14 @@ from torch import Tensor
 from univoxel import losses
 from univoxel.camera import pixel_rays
 from univoxel.color import linear_to_srgb
-from univoxel.config import JointConfig, LossConfig, StageConfig, TrainConfig, save_config
+from univoxel.config import (
+    JointConfig,
+    LossConfig,
+    StageConfig,
+    TrainConfig,
+    check_same,
+    save_config,
+)
 from univoxel.data import DataError, Photos, load_photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
@@ -57,7 +64,8 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
         FileExistsError: cfg.out holds a run already and resume is False.
         FloatingPointError: the loss is not a number any more.
         OSError: a file of the run cannot be written; what was there before stays.
-        FileNotFoundError, ValueError: with resume, there is no checkpoint that can be read.
+        FileNotFoundError, ValueError: with resume, there is no checkpoint that can be read, or it
+            belongs to another configuration.
     """
     begin = time.monotonic()
     torch.manual_seed(cfg.seed)
@@ -75,6 +83,7 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
     grids = [None if v is None else fit_grid(lower, upper, round(1e6 * v)) for v in voxels]
     if resume:
         scene, state = load_checkpoint(cfg.out)
+        check_same(cfg)
         begin -= state["seconds"]
     else:
         first = grids[0]
