@@ -26,6 +26,7 @@ inline void require(bool ok, const std::string& message) {
 void bind_composite_ops(py::module_& m);
 void bind_dense_grid_ops(py::module_& m);
 void bind_march_ops(py::module_& m);
+void bind_mlp_ops(py::module_& m);
 void bind_rows_ops(py::module_& m);
 void bind_sg_ops(py::module_& m);
 void bind_shade_ops(py::module_& m);

@@ -5,6 +5,7 @@ PYBIND11_MODULE(_core, m) {
     univoxel::bind_composite_ops(m);
     univoxel::bind_dense_grid_ops(m);
     univoxel::bind_march_ops(m);
+    univoxel::bind_mlp_ops(m);
     univoxel::bind_rows_ops(m);
     univoxel::bind_sg_ops(m);
     univoxel::bind_shade_ops(m);

@@ -5,6 +5,7 @@ from univoxel.ops.composite import composite, composite_reference
 from univoxel.ops.dense_grid import sample_dense, sample_dense_reference
 from univoxel.ops.integrator import EnvTables, Lamp, Sun, relight
 from univoxel.ops.march import brick_minimum, march, march_reference
+from univoxel.ops.mlp import mlp, mlp_reference
 from univoxel.ops.native import use_backend
 from univoxel.ops.sg import shade_sg, shade_sg_reference
 from univoxel.ops.shade import (
@@ -30,6 +31,8 @@ __all__ = [
     "composite_reference",
     "march",
     "march_reference",
+    "mlp",
+    "mlp_reference",
     "occluded_reference",
     "relight",
     "sample_dense",
