@@ -50,10 +50,14 @@ format: $(SETUP)
 	$(BIN)/clang-format -i csrc/*.* csrc/*/*
 
 .venv/.bench: $(SETUP)
-	$(BIN)/pip install -q -c constraints.txt -e '.[bench]'
+	scripts/venv.sh $(PYTHON) bench
 	@touch $@
 
-bench: dev .venv/.bench
+build/.bench: build/.installed benchmarks/bare_embree.cpp
+	scripts/build.sh build . -DUNIVOXEL_BENCHMARKS=ON
+	@touch $@
+
+bench: dev .venv/.bench build/.bench
 	$(BIN)/python benchmarks/ops.py
 	$(BIN)/python benchmarks/charts.py
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import peers
 import torch
@@ -22,11 +24,12 @@ class Case:
     op: str
     size: str
     ours: Callable
-    reference: Callable
+    reference: Callable | None  # None: too slow to be timed; then `error` says how right ours is
     arguments: tuple  # float32
     work: dict[str, float]  # least work, forward and backward, in the units of limits.measure
     peers: peers.Peers = field(default_factory=dict)
     tolerance: float = 1e-4  # relative L2 error against float64: sums of hundreds in float32
+    error: Callable[[], float] | None = None
 
 
 def composite(channels: int = 12) -> Case:
@@ -172,6 +175,71 @@ def adam_rows(table: int = 256**3, rows: int = 256**3 // 50, channels: int = 8) 
     )
 
 
+def mlp(rows: int, *sizes: int) -> Case:
+    g = torch.Generator().manual_seed(0)
+    layers = list(pairwise(sizes))
+    x = torch.randn(rows, sizes[0], generator=g)
+    weights = [torch.randn(o, i, generator=g) * (2 / i) ** 0.5 for i, o in layers]
+    biases = [torch.randn(o, generator=g) for _, o in layers]
+
+    def flat(op):
+        def run(x, *parameters):
+            return op(x, parameters[: len(layers)], parameters[len(layers) :])
+
+        return run
+
+    return Case(
+        "mlp",
+        f"{rows:,} rows, {'-'.join(map(str, sizes))}",
+        flat(ops.mlp),
+        flat(ops.mlp_reference),
+        tuple(t.requires_grad_() for t in (x, *weights, *biases)),
+        # each weight takes part in a product forward, and in two backward
+        {"fma": 3 * 2.0 * rows * sum(i * o for i, o in layers)},
+    )
+
+
+def occluded(rays: int = 262_144, columns: int = 224) -> Case:
+    """Half-sphere rays in random order from the vertices of a bumpy ball of 100,352 triangles."""
+    g = torch.Generator().manual_seed(0)
+    u, v = torch.meshgrid(
+        torch.arange(columns + 1) / columns * 2 * math.pi,
+        (torch.arange(columns + 1) + 0.5) / (columns + 1) * math.pi,
+        indexing="ij",
+    )
+    outwards = torch.stack([v.sin() * u.cos(), v.sin() * u.sin(), v.cos()], -1)
+    radius = 1 + 0.1 * (9 * u).sin() * (7 * v).sin() * v.sin()
+    vertices = (radius[..., None] * outwards).reshape(-1, 3).contiguous()
+    node = torch.arange(len(vertices)).view(columns + 1, columns + 1)
+    a, b, c, d = node[:-1, :-1], node[1:, :-1], node[1:, 1:], node[:-1, 1:]
+    faces = torch.stack([torch.stack([a, b, c], -1), torch.stack([a, c, d], -1)])
+    faces = faces.reshape(-1, 3).int().contiguous()
+    start = torch.randint(len(vertices), (rays,), generator=g)
+    up = outwards.reshape(-1, 3)[start]
+    origin = (vertices[start] + 1e-3 * up).contiguous()
+    direction = torch.nn.functional.normalize(torch.randn(rays, 3, generator=g), dim=1)
+    direction *= torch.where((direction * up).sum(1, keepdim=True) < 0, -1.0, 1.0)
+    scene = ops.VisibilityScene(vertices, faces)
+
+    def error() -> float:
+        """Share of rays that the reference sees otherwise, of a few."""
+        some = torch.arange(512)
+        want = ops.occluded_reference(vertices, faces, origin[some], direction[some])
+        return float((scene.occluded(origin[some], direction[some]) != want).float().mean())
+
+    return Case(
+        "occluded",
+        f"{rays:,} half-sphere rays, {len(faces):,} triangles",
+        scene.occluded,
+        None,
+        (origin, direction),
+        {},
+        peers.occluded(vertices, faces, origin, direction),
+        tolerance=0.01,  # rays through edges, in float32 both
+        error=error,
+    )
+
+
 def _ellipsoid(size: tuple[int, int, int]) -> tuple[Tensor, list[float], float]:
     """About the distance to one, on a grid whose first axis is 1 long: sdf, origin, voxel size."""
     h = 1.0 / (size[0] - 1)
@@ -233,6 +301,11 @@ CASES: list[tuple[str, Callable[[], Case]]] = [
     ("sample_dense", lambda: sample_dense(160)),
     ("sample_dense", lambda: sample_dense(256)),
     ("shade_sg", shade_sg),
+    ("mlp", lambda: mlp(65_536, 28, 128, 128, 4)),
+    ("mlp", lambda: mlp(4096, 8, 64, 64, 4)),
+    ("mlp", lambda: mlp(4096, 29, 64, 64, 3)),
+    ("mlp", lambda: mlp(4096, 37, 64, 64, 112)),
+    ("occluded", occluded),
     ("adam_rows_", adam_rows),
     ("march", march),
     ("smooth_rows_", smooth_rows),

@@ -5,9 +5,11 @@ A package is imported by the function that sets its work up, which runs in a pro
 
 from __future__ import annotations
 
+import ctypes
 import importlib.metadata
 import importlib.util
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -22,6 +24,45 @@ def _there(package: str) -> bool:
 def versions() -> dict[str, str]:
     """Of the peers that are there."""
     return {name: importlib.metadata.version(name) for name in ("jax", "drjit") if _there(name)}
+
+
+# Built by `make bench`: CMake's option UNIVOXEL_BENCHMARKS.
+BARE_EMBREE = Path(__file__).parent.parent / "build" / "libbare_embree.so"
+
+
+def occluded(vertices: Tensor, faces: Tensor, origin: Tensor, direction: Tensor) -> Peers:
+    """rtcOccluded1 in a bare loop, on the same kind of scene and without its ROBUST flag, which
+    lets rays through between triangles."""
+    if not BARE_EMBREE.exists():
+        return {}
+    rays = (vertices, faces, origin, direction)
+    return {
+        "bare rtcOccluded1": lambda: _bare_embree(*rays, robust=True),
+        "bare rtcOccluded1, not robust": lambda: _bare_embree(*rays, robust=False),
+    }
+
+
+def _bare_embree(vertices: Tensor, faces: Tensor, origin: Tensor, direction: Tensor, robust: bool):
+    library = ctypes.CDLL(str(BARE_EMBREE))
+    library.bare_scene.restype = ctypes.c_void_p
+    out = torch.empty(len(origin), dtype=torch.bool)
+
+    def pointer(tensor: Tensor) -> ctypes.c_void_p:
+        return ctypes.c_void_p(tensor.data_ptr())
+
+    scene = ctypes.c_void_p(
+        library.bare_scene(
+            pointer(vertices),
+            ctypes.c_int64(len(vertices)),
+            pointer(faces),
+            ctypes.c_int64(len(faces)),
+            ctypes.c_int(robust),
+        )
+    )
+    rays = (pointer(origin), pointer(direction), ctypes.c_int64(len(origin)), pointer(out))
+    threads = ctypes.c_int(torch.get_num_threads())
+    kept = (origin, direction, out)  # pointers keep nothing alive
+    return lambda: (library.bare_occluded(scene, *rays, threads), kept)
 
 
 def composite(alpha: Tensor, value: Tensor, n_rays: int) -> Peers:

@@ -14,7 +14,7 @@ LAYERS = [
     {"records"},
     {"brdf", "camera", "color", "sphere"},
     {"ops"},
-    {"envmap"},
+    {"envmap", "networks"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
     {"assets", "distributed", "losses", "metrics", "render"},

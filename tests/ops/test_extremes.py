@@ -332,6 +332,47 @@ def test_adam_rows_keeps_nan_in_its_row(seed, n, n_channels, eps):
         assert same(a[others], b[others])
 
 
+# --- mlp
+
+
+def network(seed, n, *sizes, values=WILD):
+    g = torch.Generator().manual_seed(seed)
+    layers = list(zip(sizes[1:], sizes[:-1], strict=True))
+    tensors = [pick(g, values, n, sizes[0])]
+    tensors += [pick(g, values, o, i) for o, i in layers] + [pick(g, values, o) for o, _ in layers]
+    return [t.requires_grad_() for t in tensors]
+
+
+def flat(op):
+    return lambda x, *layers: op(x, layers[: len(layers) // 2], layers[len(layers) // 2 :])
+
+
+sizes = st.lists(st.integers(1, 40), min_size=2, max_size=4)
+
+
+@few
+@given(seeds, st.integers(0, 20), sizes)
+def test_mlp_is_finite(seed, n, sizes):
+    # Sums on the way to a small result may leave float32, here as in torch: nothing above 1e7.
+    values = (0.0, -0.0, 1e-45, -1e-40, 1.2e-38, 1e-7, 1.0, -1.0, 1e4, -1e7)
+    arguments = network(seed, n, *sizes, values=values)
+    check_finite(flat(ops.mlp), flat(ops.mlp_reference), arguments)
+
+
+@few
+@given(seeds, st.integers(0, 14), sizes)
+def test_mlp_keeps_nan_in_its_row(seed, row, sizes):
+    arguments = network(seed, 15, *sizes)
+    before = run(flat(ops.mlp), arguments)
+    with torch.no_grad():
+        arguments[0][row, 0] = math.nan
+    after = run(flat(ops.mlp), arguments)
+    others = torch.arange(15) != row
+    for a, b in zip(before[:2], after[:2], strict=True):  # value, gradient to x
+        assert same(a[others], b[others])
+    assert after[0][row].isnan().any()
+
+
 # --- visibility
 
 
@@ -382,6 +423,8 @@ def test_strided_arguments_give_the_same_bits(seed, n):
         ops.sample_dense(*grid, *place), ops.sample_dense(*map(strided, grid), *place), strict=True
     ):
         assert same(a, b)
+    net = network(seed, n, 3, 5, 2)
+    assert same(flat(ops.mlp)(*net), flat(ops.mlp)(*map(strided, net)))
     rays = rays_and_ball(seed, n)
     rays[2][:] = torch.tensor([0.6, 0.0, 0.8])
     assert torch.equal(march(*rays).t, march(*map(strided, rays)).t)

@@ -127,9 +127,7 @@ def test_strided_inputs():
     x, w, b = network(5, 3, 4)
     wide = x.repeat(1, 2)[:, ::2]
     assert not wide.is_contiguous()
-    torch.testing.assert_close(
-        mlp(wide, [w.T.contiguous().T], [b]), mlp_reference(wide, [w], [b])
-    )
+    torch.testing.assert_close(mlp(wide, [w.T.contiguous().T], [b]), mlp_reference(wide, [w], [b]))
 
 
 @pytest.mark.parametrize(

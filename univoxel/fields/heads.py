@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import torch
 from torch import Tensor, nn
 
-
-def mlp(sizes: list[int]) -> nn.Sequential:
-    """Linear layers with ReLU between them."""
-    layers: list[nn.Module] = []
-    for i, o in pairwise(sizes):
-        layers += [nn.Linear(i, o), nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
+from univoxel.networks import MLP
 
 
 class MaterialHead(nn.Module):
@@ -24,9 +16,8 @@ class MaterialHead(nn.Module):
     def __init__(self, channels: int, hidden: int):
         super().__init__()
         self.channels = channels
-        self.net = mlp([channels, hidden, hidden, 4])
-        last = self.net[-1]
-        assert isinstance(last, nn.Linear)
+        self.net = MLP([channels, hidden, hidden, 4])
+        last = self.net.linear[-1]
         with torch.no_grad():  # start mid-grey and rather rough, whatever the features
             last.weight.mul_(0.1)
             last.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.5]))
@@ -46,7 +37,7 @@ class RadianceHead(nn.Module):
 
     def __init__(self, channels: int, hidden: int):
         super().__init__()
-        self.net = mlp([channels + 3 + 9 + 1, hidden, hidden, 3])
+        self.net = MLP([channels + 3 + 9 + 1, hidden, hidden, 3])
 
     def forward(self, features: Tensor, normal: Tensor, wo: Tensor) -> Tensor:
         cosine = (normal * wo).sum(1, keepdim=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 
@@ -12,6 +11,7 @@ from torch import Tensor, nn
 from univoxel import ops, sphere
 from univoxel.lights import quadrature
 from univoxel.lights.base import AbstractLight
+from univoxel.networks import MLP
 from univoxel.records import Surface
 
 _MIN_SHARPNESS = 0.1
@@ -68,16 +68,9 @@ class LocalSG(AbstractLight):
             if not getattr(config, name) > 0:
                 raise ValueError(f"SGConfig: {name} must be > 0, got {getattr(config, name)}")
         self.features = features
-        sizes = [features + 3 + 6 * _FREQUENCIES] + [config.hidden] * config.layers
-        stack: list[nn.Module] = []
-        for before, after in itertools.pairwise(sizes):
-            stack += [nn.Linear(before, after), nn.ReLU()]
-        last = nn.Linear(sizes[-1], 7 * config.lobes)
-        self.head = nn.Sequential(*stack, last)
-        for layer in self.head:
-            if isinstance(layer, nn.Linear):
-                nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
-                nn.init.zeros_(layer.bias)
+        sizes = [features + 3 + 6 * _FREQUENCIES, *[config.hidden] * config.layers]
+        self.head = MLP([*sizes, 7 * config.lobes], generator or torch.default_generator)
+        last = self.head.linear[-1]
         nn.init.zeros_(last.weight)  # the global light is the starting point
         self.base = nn.Parameter(_white_light(config))  # [K, 7]
 

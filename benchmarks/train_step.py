@@ -1,0 +1,196 @@
+"""Where a training step's time goes, stage by stage, with the kernels and with the references.
+
+    python benchmarks/train_step.py [--rays 4096] [--out benchmarks/results/train_step.json]
+
+The bundled scene is trained natively for some steps, then the loop of univoxel.tasks.train itself
+runs on, once on each backend: its stages are timed where they are called. A node of the backward
+pass belongs to the stage in which its forward was called.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import torch
+
+from univoxel import losses, ops
+from univoxel.config import preset
+from univoxel.data import load_photos
+from univoxel.fields.dense import DenseField
+from univoxel.fields.heads import MaterialHead, RadianceHead
+from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
+from univoxel.lights.sg import LocalSG
+from univoxel.optim import RowAdam
+from univoxel.render import pipeline
+from univoxel.scene import Scene
+from univoxel.tasks import train
+
+HERE = Path(__file__).parent
+DATA = HERE.parent / "univoxel" / "example_data" / "tiny"
+STAGES = {
+    "rays": [(train, "random_batch")],
+    "march": [(DenseField, "march")],
+    "sample": [(DenseField, "sample")],
+    "composite": [(pipeline, "composite")],
+    "heads": [(MaterialHead, "forward"), (RadianceHead, "forward"), (LocalSG, "raw")],
+    "light": [(LocalSG, "reflected"), (LocalSG, "lobes_from_raw")],
+    "losses": [(losses, n) for n in ("photometric", "silhouette", "smoothness", "white_light")],
+    "optimiser": [(RowAdam, "step")],
+    "smoothing": [(train, "smooth")],
+    "refresh": [(DenseField, "refresh")],
+}
+OTHER = "other"  # points along rays, normals, opacities, gradients of what is used twice
+COUNT = {"native": 64, "reference": 4}  # steps: of 16, one refreshes and four smooth
+
+
+class Clock:
+    """Seconds by stage, forward and backward, of every call between `start` and `stop`."""
+
+    def __init__(self) -> None:
+        self.forward: dict[str, float] = defaultdict(float)
+        self.backward: dict[str, float] = defaultdict(float)
+        self._inner = [0.0]  # seconds in stages called from the present one
+        self._ranges: list[tuple[int, int, str]] = []  # numbers of the nodes a stage made
+
+    def timed(self, name: str, function):
+        def call(*arguments, **options):
+            number = torch._C._autograd._get_sequence_nr
+            first, begin = number(), time.perf_counter()
+            self._inner.append(0.0)
+            try:
+                return function(*arguments, **options)
+            finally:
+                seconds = time.perf_counter() - begin
+                self.forward[name] += seconds - self._inner.pop()
+                self._inner[-1] += seconds
+                self._ranges.append((first, number(), name))
+
+        return call
+
+    def add_backward(self, events) -> None:
+        """Sort the profiler's backward nodes into stages: innermost ranges were noted first."""
+        for event in events:
+            if not event.name.startswith("autograd::engine::evaluate_function"):
+                continue
+            number = event.sequence_nr
+            found = (name for low, high, name in self._ranges if low <= number < high)
+            self.backward[next(found, OTHER)] += event.cpu_time_total / 1e6
+
+
+def hull_scene(voxels: float) -> tuple[Scene, tuple]:
+    """The scene as training starts it, and what a stage needs of the photographs."""
+    photos = load_photos(DATA, "train")
+    distance = mask_distances(photos.coverage())
+    lower, upper = estimate_bounds(distance, photos.cameras)
+    grid = fit_grid(lower, upper, round(1e6 * voxels))
+    cfg = preset("fast", DATA, DATA)
+    field = DenseField(grid, cfg.scene.channels, visual_hull(distance, photos.cameras, grid))
+    light = replace(cfg.scene.light, scale=float((upper - lower).max()) / 2)
+    return Scene(replace(cfg.scene, light=light), field), (
+        photos,
+        *train.split_pixels(distance),
+    )
+
+
+def run_steps(scene: Scene, views: tuple, rays: int, count: int, begin: float = 0.5) -> None:
+    """`count` steps of the training loop, with every term of the loss; `begin`: of its schedule."""
+    cfg = preset("fast", DATA, DATA)
+    stage = replace(cfg.stages[1], rays=rays, physical_from=0.0)
+    progress = SimpleNamespace(step=0, due=lambda: False, checkpoint_due=lambda: False)
+
+    def steps():
+        for i in range(count):
+            progress.step = i
+            yield begin + (1 - begin) * i / count
+
+    progress.steps = steps
+    train.run_stage(scene, cfg, stage, *views, progress)
+
+
+def profile(scene: Scene, views: tuple, rays: int, count: int) -> dict:
+    """Milliseconds a step, whole (no profiler) and by stage."""
+    run_steps(scene, views, rays, 1)
+    start = time.perf_counter()
+    run_steps(scene, views, rays, count)
+    whole = time.perf_counter() - start
+
+    clock, originals = Clock(), []
+    for name, places in STAGES.items():
+        for owner, attribute in places:
+            originals.append((owner, attribute, getattr(owner, attribute)))
+            setattr(owner, attribute, clock.timed(name, originals[-1][2]))
+    start = time.perf_counter()
+    with torch.autograd.profiler.profile(use_kineto=True) as events:
+        run_steps(scene, views, rays, count)
+    profiled = time.perf_counter() - start
+    for owner, attribute, original in originals:
+        setattr(owner, attribute, original)
+    clock.add_backward(events.function_events)
+    named = sum(clock.forward.values()) + sum(clock.backward.values())
+    clock.forward[OTHER] = profiled - named
+    return {
+        "step_ms": 1e3 * whole / count,
+        "stages": {
+            name: {
+                "forward_ms": 1e3 * clock.forward[name] / count,
+                "backward_ms": 1e3 * clock.backward[name] / count,
+            }
+            for name in (*STAGES, OTHER)
+        },
+    }
+
+
+def table(result: dict) -> str:
+    """Markdown."""
+    native, reference = result["native"], result["reference"]
+    lines = [
+        "| stage | references, ms | kernels, ms: forward | backward | share |",
+        "|---|---|---|---|---|",
+    ]
+    total = sum(sum(t.values()) for t in native["stages"].values())
+    for name, ms in native["stages"].items():
+        before = sum(reference["stages"][name].values())
+        lines.append(
+            f"| {name} | {before:.1f} | {ms['forward_ms']:.1f} | {ms['backward_ms']:.1f} | "
+            f"{100 * sum(ms.values()) / total:.0f} % |"
+        )
+    lines.append(
+        f"| whole step | {reference['step_ms']:.0f} | {native['step_ms']:.0f} | | "
+        f"{reference['step_ms'] / native['step_ms']:.1f} x faster |"
+    )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rays", type=int, default=4096, help="per step (default: 4096)")
+    parser.add_argument("--voxels", type=float, default=2.0, help="millions (default: 2)")
+    parser.add_argument("--warm-up", type=int, default=96, help="steps of training before")
+    parser.add_argument("--out", type=Path, default=HERE / "results" / "train_step.json")
+    options = parser.parse_args()
+    torch.manual_seed(0)
+    scene, views = hull_scene(options.voxels)
+    run_steps(scene, views, options.rays, options.warm_up, begin=0.0)
+    result = {
+        "rays": options.rays,
+        "grid": list(scene.field.grid.size),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+    }
+    for backend, count in COUNT.items():
+        with ops.use_backend(backend):
+            result[backend] = profile(scene, views, options.rays, count)
+    result["load_average"] = os.getloadavg()[0]
+    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    print(table(result))
+
+
+if __name__ == "__main__":
+    main()
