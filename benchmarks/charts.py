@@ -1,4 +1,4 @@
-"""Draw benchmarks/results/*.json, from the files alone: one PNG and one SVG each.
+"""Draw the results of benchmarks/ops.py, from the file alone: PNG and SVG beside it.
 
 python benchmarks/charts.py [RESULTS.json ...]
 """
@@ -61,5 +61,5 @@ def draw(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    for file in sys.argv[1:] or sorted((HERE / "results").glob("*.json")):
+    for file in sys.argv[1:] or [HERE / "results" / "ops.json"]:
         draw(Path(file))

@@ -208,6 +208,45 @@ def test_shade_sg_keeps_nan_at_its_point(seed, point, argument):
         assert same(a[others], b[others])
 
 
+# --- shade_radiance, shade_map
+
+
+def under_light(seed, n, count=16):
+    """Light, then what shade_radiance and shade_map share; normals and eyes of `shading`."""
+    g = torch.Generator().manual_seed(seed)
+    _, _, _, normal, wo, albedo, roughness, *_ = shading(seed, n, 1)
+    light = pick(g, (0.0, 1e-45, 1.0, 1e6), n, count, 3).abs().requires_grad_()
+    directions = sphere.fibonacci_sphere(count)
+    rest = (normal.detach(), wo.detach(), albedo, roughness, directions, 4 * math.pi / count)
+    return light, rest
+
+
+@few
+@given(seeds, st.integers(0, 5), st.sampled_from([0.0, 0.04, 1.0]))
+def test_shade_under_given_light_is_finite(seed, n, f0):
+    light, rest = under_light(seed, n)
+    check_finite(ops.shade_radiance, ops.shade_radiance_reference, (light, *rest, f0))
+    g = torch.Generator().manual_seed(seed)
+    visibility = torch.rand(4, 16, generator=g).round(decimals=1)
+    indirect = pick(g, (0.0, 1e-45, 1.0, 1e6), 4, 16, 3).abs()
+    map = pick(g, (0.0, 1e-45, 1.0, 1e6), 16, 3).abs().requires_grad_()
+    mapped = (map, visibility, indirect, torch.arange(n) % 4, *rest, f0)
+    check_finite(ops.shade_map, ops.shade_map_reference, mapped)
+
+
+@few
+@given(seeds, st.integers(0, 3), st.sampled_from(["light", 0, 1, 2, 3]))
+def test_shade_under_given_light_keeps_nan_at_its_point(seed, point, argument):
+    light, rest = under_light(seed, 4)
+    before = run(ops.shade_radiance, (light, *rest))
+    with torch.no_grad():
+        (light if argument == "light" else rest[argument])[point] = math.nan
+    after = run(ops.shade_radiance, (light, *rest))
+    others = torch.arange(4) != point
+    for a, b in zip(before, after, strict=True):
+        assert same(a[others], b[others])
+
+
 # --- march
 
 
