@@ -13,57 +13,65 @@ namespace {
 
 constexpr int64_t kPointsPerChunk = 64;
 
-// exp for loops that vectorise, which std::exp does not without -ffast-math. x = k ln 2 + f with
-// |f| <= ln 2 / 2: 2^k goes into the exponent bits, exp(f) is a polynomial. Adding `magic` rounds
-// to an integer and leaves it in the low bits. Within 2 ulp; x is clamped to where the result is
-// a normal number. NaN stays NaN.
+// 2^x for loops that vectorise, which std::exp2 does not without -ffast-math. x = k + f, |f| <=
+// 1/2: adding `magic` rounds to the integer k and leaves k + bias in the low bits, which become the
+// exponent; 2^f is a polynomial, minimax in float and Taylor's in double, summed as a tree. A short
+// chain of dependent operations is what counts: the processor overlaps as many iterations as its
+// scheduler holds. x is clamped to where the result is a normal number, within 2 ulp; NaN stays
+// NaN.
 
-inline float simd_exp(float x) {
-    constexpr float magic = 12582912.0f;  // 1.5 * 2^23
-    x = std::min(std::max(x, -87.0f), 88.0f);
-    const float shifted = x * 1.44269504f + magic, k = shifted - magic;
-    // ln 2 in two parts: k times the first is exact
-    const float f = (x - k * 0.693359375f) + k * 2.12194440e-4f;
+constexpr double kLog2E = 1.4426950408889634;
+
+/// What 2^x is clamped to. Not constants: the compiler would follow each as a path of its own.
+template <class T>
+struct Clamp {
+    T low, high;
+};
+volatile float exponent_low = -125, exponent_high = 126;
+template <class T>
+Clamp<T> clamp_of() {
+    constexpr T wider = sizeof(T) == 8 ? 8 : 1;
+    return {wider * T(exponent_low), wider * T(exponent_high)};
+}
+
+inline float simd_exp2(float x, Clamp<float> clamp) {
+    constexpr float magic = 12582912.0f + 127.0f;  // 1.5 * 2^23
+    x = std::min(std::max(x, clamp.low), clamp.high);
+    const float shifted = x + magic, f = x - (shifted - magic), f2 = f * f;
     uint32_t bits;
     std::memcpy(&bits, &shifted, sizeof bits);
-    bits = (bits << 23) + (127u << 23);
+    bits <<= 23;
     float scale;
     std::memcpy(&scale, &bits, sizeof scale);
-    float p = 1.0f / 720;
-    p = p * f + 1.0f / 120;
-    p = p * f + 1.0f / 24;
-    p = p * f + 1.0f / 6;
-    p = p * f + 0.5f;
-    p = p * f + 1.0f;
-    p = p * f + 1.0f;
+    const float p = (1.0f + 0.693146978f * f) + f2 * ((0.240222421f + 0.0555073374f * f) +
+                                                      f2 * (0.00967151269f + 0.00132647272f * f));
     return p * scale;
 }
 
-inline double simd_exp(double x) {
-    constexpr double magic = 6755399441055744.0;  // 1.5 * 2^52
-    x = std::min(std::max(x, -708.0), 709.0);
-    const double shifted = x * 1.4426950408889634 + magic, k = shifted - magic;
-    const double f = (x - k * 6.93145751953125e-1) - k * 1.42860682030941723212e-6;
+/// ln(2)^n / n!
+constexpr double exp2_term(int n) {
+    double term = 1;
+    for (int i = 1; i <= n; ++i) term *= 0.69314718055994530942 / i;
+    return term;
+}
+
+inline double simd_exp2(double x, Clamp<double> clamp) {
+    constexpr double magic = 6755399441055744.0 + 1023.0;  // 1.5 * 2^52
+    constexpr double c1 = exp2_term(1), c2 = exp2_term(2), c3 = exp2_term(3), c4 = exp2_term(4),
+                     c5 = exp2_term(5), c6 = exp2_term(6), c7 = exp2_term(7), c8 = exp2_term(8),
+                     c9 = exp2_term(9), c10 = exp2_term(10), c11 = exp2_term(11),
+                     c12 = exp2_term(12), c13 = exp2_term(13);
+    x = std::min(std::max(x, clamp.low), clamp.high);
+    const double shifted = x + magic, f = x - (shifted - magic), f2 = f * f, f4 = f2 * f2;
     uint64_t bits;
     std::memcpy(&bits, &shifted, sizeof bits);
-    bits = (bits << 52) + (uint64_t{1023} << 52);
+    bits <<= 52;
     double scale;
     std::memcpy(&scale, &bits, sizeof scale);
-    double p = 1.0 / 6227020800.0;
-    p = p * f + 1.0 / 479001600.0;
-    p = p * f + 1.0 / 39916800.0;
-    p = p * f + 1.0 / 3628800.0;
-    p = p * f + 1.0 / 362880.0;
-    p = p * f + 1.0 / 40320.0;
-    p = p * f + 1.0 / 5040.0;
-    p = p * f + 1.0 / 720.0;
-    p = p * f + 1.0 / 120.0;
-    p = p * f + 1.0 / 24.0;
-    p = p * f + 1.0 / 6.0;
-    p = p * f + 0.5;
-    p = p * f + 1.0;
-    p = p * f + 1.0;
-    return p * scale;
+    const double low = (1 + c1 * f) + f2 * (c2 + c3 * f);
+    const double middle = (c4 + c5 * f) + f2 * (c6 + c7 * f);
+    const double high = (c8 + c9 * f) + f2 * (c10 + c11 * f) + f4 * (c12 + c13 * f);
+    return (low + f4 * (middle + f4 * high)) * scale;
 }
 
 /// The directions, which are the same for every point in its own frame.
@@ -115,15 +123,26 @@ struct LobeSums {
     T diffuse, layer;  // against max(n.w, 0) and the specular layer
 };
 
+/// A lobe's exponent over log2 e as a plane: x . w + offset.
 template <class T>
-LobeSums<T> lobe_forward(const Directions<T>& dir, const vec3<T>& axis, T sharpness) {
+struct Exponent {
+    T x, y, z, offset;
+
+    Exponent(const vec3<T>& axis, T sharpness) {
+        const T s = sharpness * T(kLog2E);
+        x = s * axis.x, y = s * axis.y, z = s * axis.z, offset = -s;
+    }
+    T operator()(T wx, T wy, T wz) const { return z * wz + (y * wy + (x * wx + offset)); }
+};
+
+template <class T>
+LobeSums<T> lobe_forward(const Directions<T>& dir, const Exponent<T>& exponent, Clamp<T> clamp) {
     const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *layer = dir.layer;
-    const T ex = axis.x * sharpness, ey = axis.y * sharpness, ez = axis.z * sharpness;
     const int64_t count = dir.count;
     T diffuse = 0, specular = 0;
 #pragma omp simd reduction(+ : diffuse, specular)
     for (int64_t d = 0; d < count; ++d) {
-        const T g = simd_exp(ex * x[d] + ey * y[d] + ez * z[d] - sharpness);
+        const T g = simd_exp2(exponent(x[d], y[d], z[d]), clamp);
         diffuse += g * cosine[d];
         specular += g * layer[d];
     }
@@ -132,21 +151,22 @@ LobeSums<T> lobe_forward(const Directions<T>& dir, const vec3<T>& axis, T sharpn
 
 /// The same; adds grad_layer_scale * lobe to the layer's gradient, and returns in `moment` the sum
 /// of grad_lobe * lobe * w with grad_lobe = grad_cosine_scale * cosine + grad_layer_scale * layer.
+/// Two loops, `lobe` between them: iterations of one would be too long to overlap.
 template <class T>
-LobeSums<T> lobe_backward(Directions<T>& dir, const vec3<T>& axis, T sharpness, T grad_cosine_scale,
-                          T grad_layer_scale, vec3<T>& moment) {
+LobeSums<T> lobe_backward(Directions<T>& dir, const Exponent<T>& exponent, Clamp<T> clamp,
+                          T grad_cosine_scale, T grad_layer_scale, vec3<T>& moment) {
     const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *layer = dir.layer;
-    T* grad_layer = dir.grad_layer;
-    const T ex = axis.x * sharpness, ey = axis.y * sharpness, ez = axis.z * sharpness;
+    T *grad_layer = dir.grad_layer, *lobe = dir.lobe;
     const int64_t count = dir.count;
+#pragma omp simd
+    for (int64_t d = 0; d < count; ++d) lobe[d] = simd_exp2(exponent(x[d], y[d], z[d]), clamp);
     T diffuse = 0, specular = 0, mx = 0, my = 0, mz = 0;
 #pragma omp simd reduction(+ : diffuse, specular, mx, my, mz)
     for (int64_t d = 0; d < count; ++d) {
-        const T g = simd_exp(ex * x[d] + ey * y[d] + ez * z[d] - sharpness);
-        const T gc = g * cosine[d], gl = g * layer[d];
-        const T w = grad_cosine_scale * gc + grad_layer_scale * gl;
-        diffuse += gc;
-        specular += gl;
+        const T g = lobe[d];
+        const T w = g * (grad_cosine_scale * cosine[d] + grad_layer_scale * layer[d]);
+        diffuse += g * cosine[d];
+        specular += g * layer[d];
         mx += w * x[d];
         my += w * y[d];
         mz += w * z[d];
@@ -162,6 +182,7 @@ template <class T>
 void shade_sg_forward(const ShadeSG<T>& in, T* rgb, int threads) {
     const int64_t K = in.n_lobes;
     const T weight = T(2 * kPi) / T(in.n_directions);
+    const Clamp<T> clamp = clamp_of<T>();
     parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
         Directions<T> dir = canonical(in);
         for (int64_t i = begin; i < end; ++i) {
@@ -169,7 +190,8 @@ void shade_sg_forward(const ShadeSG<T>& in, T* rgb, int threads) {
             specular_layer(p.brdf, in.f0, dir);
             vec3<T> sum(0);
             for (int64_t k = i * K; k < (i + 1) * K; ++k) {
-                const auto s = lobe_forward(dir, p.local(load3(in.axis, k)), in.sharpness[k]);
+                const Exponent<T> exponent(p.local(load3(in.axis, k)), in.sharpness[k]);
+                const auto s = lobe_forward(dir, exponent, clamp);
                 sum += load3(in.amplitude, k) * (p.brdf.diffuse * s.diffuse + s.layer);
             }
             store3(rgb, i, weight * sum);
@@ -185,6 +207,7 @@ void shade_sg_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGra
                        int threads) {
     const int64_t K = in.n_lobes;
     const T weight = T(2 * kPi) / T(in.n_directions);
+    const Clamp<T> clamp = clamp_of<T>();
     parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
         Directions<T> dir = canonical(in);
         for (int64_t i = begin; i < end; ++i) {
@@ -207,7 +230,8 @@ void shade_sg_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGra
                 const vec3<T> amplitude = load3(in.amplitude, k), ga = g * amplitude;
                 const T to_cosine = glm::dot(ga, p.brdf.diffuse), to_layer = ga.x + ga.y + ga.z;
                 vec3<T> moment;
-                const auto s = lobe_backward(dir, axis, sharpness, to_cosine, to_layer, moment);
+                const auto s = lobe_backward(dir, Exponent<T>(axis, sharpness), clamp, to_cosine,
+                                             to_layer, moment);
                 store3(grad.amplitude, k, g * (p.brdf.diffuse * s.diffuse + s.layer));
                 grad_diffuse += ga * s.diffuse;
                 grad.sharpness[k] =

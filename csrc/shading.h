@@ -13,21 +13,27 @@
 namespace univoxel {
 
 /// Directions in the frame of a normal, each coordinate in a row of its own, and scratch rows of
-/// the same length.
+/// the same length. Rows begin at cache lines: a vector that straddles two takes two loads.
 template <class T>
 struct Directions {
     int64_t count;
     std::vector<T> buffer;
-    T *x, *y, *z, *cosine, *held, *layer, *grad_layer;
+    T *x, *y, *z, *cosine, *held, *layer, *grad_layer, *lobe;
 
-    explicit Directions(int64_t n) : count(n), buffer(7 * n) {
-        T* rows[7];
-        for (int i = 0; i < 7; ++i) rows[i] = buffer.data() + i * count;
+    explicit Directions(int64_t n) : count(n) {
+        constexpr int64_t kLine = 64 / sizeof(T);
+        const int64_t step = (n + kLine - 1) / kLine * kLine;
+        buffer.resize(8 * step + kLine);
+        const auto past = reinterpret_cast<uintptr_t>(buffer.data()) / sizeof(T) % kLine;
+        T* first = buffer.data() + (kLine - past) % kLine;
+        T* rows[8];
+        for (int i = 0; i < 8; ++i) rows[i] = first + i * step;
         x = rows[0], y = rows[1], z = rows[2];
         cosine = rows[3];  // max(n.w, 0)
         held = rows[4];   // n.w held above kCosMin; std::max of z[d] in a loop would keep it scalar
         layer = rows[5];  // D F V max(n.w, 0)
         grad_layer = rows[6];  // its gradient
+        lobe = rows[7];        // of a spherical Gaussian
     }
     Directions(Directions&&) = default;  // a copy's rows would point into the original
 };
