@@ -1,6 +1,61 @@
 """Lights: each says what falls on a surface point and what the point reflects."""
 
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+import torch
+
 from univoxel.lights.base import AbstractLight
 from univoxel.lights.sg import LocalSG, SGConfig
 
-__all__ = ["AbstractLight", "LocalSG", "SGConfig"]
+LightConfig: TypeAlias = SGConfig
+
+__all__ = [
+    "AbstractLight",
+    "LightConfig",
+    "LocalSG",
+    "SGConfig",
+    "build",
+    "read_config",
+    "scaled",
+]
+
+
+def build(
+    features: int, config: LightConfig, generator: torch.Generator | None = None
+) -> AbstractLight:
+    """The light that a configuration describes.
+
+    Args:
+        features: C of Surface.features, that local lights read.
+        generator: draws the first weights of networks.
+
+    Raises:
+        ValueError: a number outside its range; the message names it.
+    """
+    match config:
+        case SGConfig():
+            return LocalSG(features, config, generator)
+
+
+def scaled(config: LightConfig, scale: float) -> LightConfig:
+    """The configuration for an object of half extent `scale`, world units, where it has one."""
+    match config:
+        case SGConfig():
+            return replace(config, scale=scale)
+
+
+def read_config(values: dict[str, Any]) -> LightConfig:
+    """The configuration that dataclasses.asdict made a dictionary of.
+
+    Raises:
+        ValueError, TypeError: no such light; a field that it has not.
+    """
+    values = dict(values)
+    kind = values.pop("kind", "sg")  # files from before there were others do not say
+    kinds = {c.kind: c for c in (SGConfig,)}
+    if kind not in kinds:
+        raise ValueError(f"light must be one of {', '.join(kinds)}, got {kind!r}")
+    return kinds[kind](**values)

@@ -16,7 +16,7 @@ from univoxel.data import DataError
 from univoxel.data.images import read_image, write_exr, write_png
 from univoxel.envmap import EnvMap, lookup
 from univoxel.scene import load_scene
-from univoxel.sphere import fibonacci_sphere, latlong_direction, texel_solid_angles
+from univoxel.sphere import fibonacci_sphere, latlong_directions, texel_solid_angles
 from univoxel.tasks.frames import trained_on
 
 GREY = 0.5  # albedo of the ball
@@ -106,13 +106,7 @@ def _light(map: Tensor) -> tuple[Tensor, Tensor]:
     rows = min(height, TEXELS)
     light = (map * texel_solid_angles(height, width)[..., None]).movedim(2, 0)
     pooled = adaptive_avg_pool2d(light, (rows, 2 * rows)).flatten(1).T
-    return _directions(rows).flatten(0, 1), pooled * (light[0].numel() / len(pooled))
-
-
-def _directions(height: int) -> Tensor:
-    """Of the texels of a map: [height, 2 height, 3]."""
-    v, u = (torch.arange(height) + 0.5) / height, (torch.arange(2 * height) + 0.5) / (2 * height)
-    return latlong_direction(torch.stack(torch.meshgrid(v, u, indexing="ij")[::-1], -1))
+    return latlong_directions(rows).flatten(0, 1), pooled * (light[0].numel() / len(pooled))
 
 
 def _scale(recovered: Tensor, true: Tensor) -> Tensor:
@@ -132,7 +126,7 @@ def _tiles(map: Tensor, height: int) -> list[Tensor]:
     light = EnvMap(map)
     grey = grey_ball(map, normal.flatten(0, 1)).view(height, height, 3)
     balls = [torch.where(inside[..., None], b, 0.0) for b in (grey, lookup(light, mirrored))]
-    return [lookup(light, _directions(height)), *balls]
+    return [lookup(light, latlong_directions(height)), *balls]
 
 
 def _true_map(data: Path) -> Tensor | None:
