@@ -9,14 +9,17 @@ import torch
 
 from univoxel.lights.base import AbstractLight
 from univoxel.lights.sg import LocalSG, SGConfig
+from univoxel.lights.sh import LocalSH, SHConfig
 
-LightConfig: TypeAlias = SGConfig
+LightConfig: TypeAlias = SGConfig | SHConfig
 
 __all__ = [
     "AbstractLight",
     "LightConfig",
     "LocalSG",
+    "LocalSH",
     "SGConfig",
+    "SHConfig",
     "build",
     "read_config",
     "scaled",
@@ -38,12 +41,14 @@ def build(
     match config:
         case SGConfig():
             return LocalSG(features, config, generator)
+        case SHConfig():
+            return LocalSH(features, config, generator)
 
 
 def scaled(config: LightConfig, scale: float) -> LightConfig:
     """The configuration for an object of half extent `scale`, world units, where it has one."""
     match config:
-        case SGConfig():
+        case SGConfig() | SHConfig():
             return replace(config, scale=scale)
 
 
@@ -55,7 +60,7 @@ def read_config(values: dict[str, Any]) -> LightConfig:
     """
     values = dict(values)
     kind = values.pop("kind", "sg")  # files from before there were others do not say
-    kinds = {c.kind: c for c in (SGConfig,)}
+    kinds = {c.kind: c for c in (SGConfig, SHConfig)}
     if kind not in kinds:
         raise ValueError(f"light must be one of {', '.join(kinds)}, got {kind!r}")
     return kinds[kind](**values)
