@@ -8,16 +8,19 @@ from typing import Any, TypeAlias
 import torch
 
 from univoxel.lights.base import AbstractLight
+from univoxel.lights.mlp import LocalMLP, MLPLightConfig
 from univoxel.lights.sg import LocalSG, SGConfig
 from univoxel.lights.sh import LocalSH, SHConfig
 
-LightConfig: TypeAlias = SGConfig | SHConfig
+LightConfig: TypeAlias = SGConfig | SHConfig | MLPLightConfig
 
 __all__ = [
     "AbstractLight",
     "LightConfig",
+    "LocalMLP",
     "LocalSG",
     "LocalSH",
+    "MLPLightConfig",
     "SGConfig",
     "SHConfig",
     "build",
@@ -43,12 +46,14 @@ def build(
             return LocalSG(features, config, generator)
         case SHConfig():
             return LocalSH(features, config, generator)
+        case MLPLightConfig():
+            return LocalMLP(features, config, generator)
 
 
 def scaled(config: LightConfig, scale: float) -> LightConfig:
     """The configuration for an object of half extent `scale`, world units, where it has one."""
     match config:
-        case SGConfig() | SHConfig():
+        case SGConfig() | SHConfig() | MLPLightConfig():
             return replace(config, scale=scale)
 
 
@@ -60,7 +65,7 @@ def read_config(values: dict[str, Any]) -> LightConfig:
     """
     values = dict(values)
     kind = values.pop("kind", "sg")  # files from before there were others do not say
-    kinds = {c.kind: c for c in (SGConfig, SHConfig)}
+    kinds = {c.kind: c for c in (SGConfig, SHConfig, MLPLightConfig)}
     if kind not in kinds:
         raise ValueError(f"light must be one of {', '.join(kinds)}, got {kind!r}")
     return kinds[kind](**values)
