@@ -15,7 +15,7 @@ from torch import nn
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.fields.hull import GridShape
-from univoxel.lights import LightConfig, SGConfig, build, read_config
+from univoxel.lights import EnvmapLight, EnvmapSGLight, LightConfig, SGConfig, build, read_config
 from univoxel.lights.distant import DistantLight
 from univoxel.ops import VisibilityScene
 
@@ -73,6 +73,12 @@ class Scene(nn.Module):
     def surface_moved(self) -> None:
         """Say that the field has changed: `occluder` looks at it anew."""
         self._occluder = None
+
+    def environment(self) -> DistantLight | EnvmapLight | EnvmapSGLight | None:
+        """The one distant map that the scene stood in, where it has one."""
+        if isinstance(self.light, EnvmapLight | EnvmapSGLight):
+            return self.light
+        return self.sky
 
 
 def save_scene(scene: Scene, run: Path, state: dict) -> Path:

@@ -8,14 +8,20 @@ from typing import Any, TypeAlias
 import torch
 
 from univoxel.lights.base import AbstractLight
+from univoxel.lights.envmap import EnvmapConfig, EnvmapLight
+from univoxel.lights.envmap_sg import EnvmapSGConfig, EnvmapSGLight
 from univoxel.lights.mlp import LocalMLP, MLPLightConfig
 from univoxel.lights.sg import LocalSG, SGConfig
 from univoxel.lights.sh import LocalSH, SHConfig
 
-LightConfig: TypeAlias = SGConfig | SHConfig | MLPLightConfig
+LightConfig: TypeAlias = SGConfig | SHConfig | MLPLightConfig | EnvmapSGConfig | EnvmapConfig
 
 __all__ = [
     "AbstractLight",
+    "EnvmapConfig",
+    "EnvmapLight",
+    "EnvmapSGConfig",
+    "EnvmapSGLight",
     "LightConfig",
     "LocalMLP",
     "LocalSG",
@@ -48,6 +54,10 @@ def build(
             return LocalSH(features, config, generator)
         case MLPLightConfig():
             return LocalMLP(features, config, generator)
+        case EnvmapSGConfig():
+            return EnvmapSGLight(config)
+        case EnvmapConfig():
+            return EnvmapLight(config)
 
 
 def scaled(config: LightConfig, scale: float) -> LightConfig:
@@ -55,6 +65,8 @@ def scaled(config: LightConfig, scale: float) -> LightConfig:
     match config:
         case SGConfig() | SHConfig() | MLPLightConfig():
             return replace(config, scale=scale)
+        case EnvmapSGConfig() | EnvmapConfig():
+            return config
 
 
 def read_config(values: dict[str, Any]) -> LightConfig:
@@ -65,7 +77,7 @@ def read_config(values: dict[str, Any]) -> LightConfig:
     """
     values = dict(values)
     kind = values.pop("kind", "sg")  # files from before there were others do not say
-    kinds = {c.kind: c for c in (SGConfig, SHConfig, MLPLightConfig)}
+    kinds = {c.kind: c for c in (SGConfig, SHConfig, MLPLightConfig, EnvmapSGConfig, EnvmapConfig)}
     if kind not in kinds:
         raise ValueError(f"light must be one of {', '.join(kinds)}, got {kind!r}")
     return kinds[kind](**values)
