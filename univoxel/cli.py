@@ -28,7 +28,7 @@ def train(
     /,
     out: Annotated[Path, arg(metavar="RUN")],
     preset: Literal["draft", "fast", "full"] = "fast",
-    light: Literal["hybrid", "sg"] = "hybrid",
+    light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
@@ -45,7 +45,8 @@ def train(
         out: folder that the run is written to
         preset: how much work goes in: draft is a look, fast the usual, full the best
         light: sg, local lobes as published; hybrid, then one environment map with traced
-            visibility, which cleans shadows from the albedo
+            visibility, which cleans shadows from the albedo; others to compare with: sh and mlp,
+            local too, envmap-sg and envmap, one map from the beginning
         minutes: wall-clock limit, above 0; training ends in time with what it has
         resume: go on with the run in --out
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or

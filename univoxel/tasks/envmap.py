@@ -59,9 +59,13 @@ def envmap(run: Path, out: Path, height: int = 128) -> Comparison | None:
         raise ValueError(f"--height must be at least 1, got {height}")
     if out.suffix.lower() != ".exr":
         raise ValueError(f"--out: expected a name that ends in .exr, got {out}")
-    sky = load_scene(run).sky
+    scene = load_scene(run)
+    sky = scene.environment()
     if sky is None:
-        raise ValueError(f"{run}: this run has no environment map: it was trained with sky_nodes 0")
+        raise ValueError(
+            f"{run}: this run has no environment map: it was trained with local light, "
+            f"{scene.cfg.light.kind}, alone"
+        )
     recovered, true = sky.latlong(height), _true_map(trained_on(run))
     out.parent.mkdir(parents=True, exist_ok=True)
     write_exr(out, dict(zip("RGB", recovered.unbind(2), strict=True)), half=False)
