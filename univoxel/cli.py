@@ -232,6 +232,29 @@ def envmap(
         print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
 
 
+def inspect(
+    run: Run,
+    /,
+    view: Annotated[str, arg(metavar="VIEW")],
+    pixel: Annotated[str, arg(metavar="COLUMN,ROW")],
+    out: Annotated[
+        Path | None,
+        arg(metavar="FILE.png", help_behavior_hint="(default: in RUN/inspect)"),
+    ] = None,
+) -> None:
+    """Draw the light that falls on one point of the surface, beside the truth where it is known.
+
+    Args:
+        run: folder of a trained run
+        view: name or number of a test view
+        pixel: whose surface point; 0,0 is the top left
+        out: the picture; an .exr file with the layers goes beside
+    """
+    from univoxel.tasks import inspect as task
+
+    print(task.inspect(run, view, task.parse_pixel(pixel), out))
+
+
 def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> None:
     """Train, evaluate and relight the small scene that comes with the package, in minutes.
 
@@ -249,6 +272,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "relight": relight,
     "export": export,
     "envmap": envmap,
+    "inspect": inspect,
     "demo": demo,
 }
 

@@ -8,6 +8,7 @@ from torch.nn.functional import normalize
 
 from univoxel.color import srgb_to_linear
 from univoxel.lights.quadrature import half_sphere
+from univoxel.ops import VisibilityScene
 from univoxel.records import Occlusion, Surface
 from univoxel.scene import Scene
 
@@ -27,17 +28,34 @@ def occlusion(scene: Scene, surface: Surface, directions: int, rotation: Tensor)
         ValueError: the scene has no surface.
     """
     wi = half_sphere(surface, directions, rotation)
-    # A voxel off the surface: rendered points lie only about on the mesh
+    open_, indirect = look(scene, *starts(scene, surface, wi))
+    return Occlusion(rotation, open_.to(wi.dtype).view(wi.shape[:2]), indirect.view_as(wi))
+
+
+def starts(scene: Scene, surface: Surface, wi: Tensor) -> tuple[Tensor, Tensor]:
+    """Rays from N points along wi [N, D, 3]: origins and directions, [N D, 3] each.
+
+    They begin a voxel off the surface: rendered points lie only about on the mesh.
+    """
     start = surface.position + scene.field.voxel_size * surface.normal
-    start, away = start[:, None].expand_as(wi).reshape(-1, 3), wi.reshape(-1, 3)
-    hit = scene.occluder().closest_hit(start, away)
+    return start[:, None].expand_as(wi).reshape(-1, 3), wi.reshape(-1, 3)
+
+
+@torch.no_grad()
+def look(
+    scene: Scene, start: Tensor, away: Tensor, tracer: VisibilityScene | None = None
+) -> tuple[Tensor, Tensor]:
+    """Which of M rays meet nothing [M], and the radiance [M, 3] that comes from what others meet.
+
+    Args:
+        tracer: of another mesh than the scene's own.
+    """
+    hit = (tracer or scene.occluder()).closest_hit(start, away)
     blocked = (hit.face >= 0).nonzero()[:, 0]
     indirect = torch.zeros_like(away)
-    indirect[blocked] = outgoing(
-        scene, start[blocked] + hit.t[blocked, None] * away[blocked], -away[blocked]
-    )
-    visibility = (hit.face < 0).to(away.dtype).view(wi.shape[:2])
-    return Occlusion(rotation, visibility, indirect.view_as(wi))
+    place = start[blocked] + hit.t[blocked, None] * away[blocked]
+    indirect[blocked] = outgoing(scene, place, -away[blocked])
+    return hit.face < 0, indirect
 
 
 def outgoing(scene: Scene, points: Tensor, wo: Tensor) -> Tensor:

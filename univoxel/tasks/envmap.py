@@ -66,7 +66,7 @@ def envmap(run: Path, out: Path, height: int = 128) -> Comparison | None:
             f"{run}: this run has no environment map: it was trained with local light, "
             f"{scene.cfg.light.kind}, alone"
         )
-    recovered, true = sky.latlong(height), _true_map(trained_on(run))
+    recovered, true = sky.latlong(height), true_map(trained_on(run))
     out.parent.mkdir(parents=True, exist_ok=True)
     write_exr(out, dict(zip("RGB", recovered.unbind(2), strict=True)), half=False)
     rows, result = [recovered], None
@@ -104,6 +104,20 @@ def brightest(map: Tensor) -> Tensor:
     return place[(near @ luminance(light)).argmax()]
 
 
+def true_map(data: Path) -> Tensor | None:
+    """The light of the photographs, where the data set has it."""
+    for suffix in (".hdr", ".exr"):
+        path = data / "envmaps" / f"train{suffix}"
+        if path.is_file():
+            try:
+                return EnvMap(read_image(path)).radiance
+            except DataError:
+                raise
+            except ValueError as error:
+                raise DataError(f"{path}: {error}") from None
+    return None
+
+
 def _light(map: Tensor) -> tuple[Tensor, Tensor]:
     """Directions [M, 3] and radiance times solid angle [M, 3] of a map, pooled to few texels."""
     height, width, _ = map.shape
@@ -131,17 +145,3 @@ def _tiles(map: Tensor, height: int) -> list[Tensor]:
     grey = grey_ball(map, normal.flatten(0, 1)).view(height, height, 3)
     balls = [torch.where(inside[..., None], b, 0.0) for b in (grey, lookup(light, mirrored))]
     return [lookup(light, latlong_directions(height)), *balls]
-
-
-def _true_map(data: Path) -> Tensor | None:
-    """The light of the photographs, where the data set has it."""
-    for suffix in (".hdr", ".exr"):
-        path = data / "envmaps" / f"train{suffix}"
-        if path.is_file():
-            try:
-                return EnvMap(read_image(path)).radiance
-            except DataError:
-                raise
-            except ValueError as error:
-                raise DataError(f"{path}: {error}") from None
-    return None
