@@ -12,7 +12,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import GridShape
-from univoxel.lights.sg import SGConfig
+from univoxel.lights import LightConfig, SGConfig
 from univoxel.scene import Scene, SceneConfig
 
 RADIUS = 0.5
@@ -80,14 +80,16 @@ def write_scene(folder: Path, views: int = 12, size: int = 32) -> Path:
     return folder
 
 
-def sphere_scene(sky_nodes: int, voxel_size: float = 0.05, seed: int = 0) -> Scene:
+def sphere_scene(
+    sky_nodes: int, voxel_size: float = 0.05, seed: int = 0, light: LightConfig | None = None
+) -> Scene:
     """A scene whose surface is the sphere, exactly but for the grid; its heads are untrained."""
     torch.manual_seed(seed)
     size = 2 * math.ceil(1.4 * RADIUS / voxel_size) + 1
     axis = (torch.arange(size) - size // 2) * voxel_size
     node = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
     grid = GridShape((float(axis[0]),) * 3, voxel_size, (size,) * 3)
-    light = SGConfig(lobes=2, hidden=4, directions=8, directions_eval=8)
+    light = light or SGConfig(lobes=2, hidden=4, directions=8, directions_eval=8)
     cfg = SceneConfig(4, material_channels=2, hidden=8, sky_nodes=sky_nodes, light=light)
     return Scene(cfg, DenseField(grid, cfg.channels, node.norm(dim=-1) - RADIUS))
 

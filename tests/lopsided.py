@@ -4,6 +4,7 @@ import torch
 
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import fit_grid
+from univoxel.lights import SGConfig
 from univoxel.scene import Scene, SceneConfig
 
 # Balls of these centres and radii, united.
@@ -31,7 +32,7 @@ class Identity(torch.nn.Module):
         return features[:, :3], features[:, 3]
 
 
-def lopsided(voxels: int = 48**3, change=None) -> Scene:
+def lopsided(voxels: int = 48**3, change=None, light=None) -> Scene:
     """The scene; `change(points, sdf)` gives another sdf at the grid's nodes."""
     grid = fit_grid(torch.tensor([-0.5, -0.5, -0.5]), torch.tensor([0.65, 0.5, 0.65]), voxels)
     nodes = grid.nodes()
@@ -39,6 +40,7 @@ def lopsided(voxels: int = 48**3, change=None) -> Scene:
     field = DenseField(grid, 4, distance)
     with torch.no_grad():
         field.features.copy_(torch.cat([albedo(nodes), roughness(nodes)[..., None]], -1))
-    scene = Scene(SceneConfig(channels=4, material_channels=2, hidden=8), field, inv_s=100.0)
+    cfg = SceneConfig(channels=4, material_channels=2, hidden=8, light=light or SGConfig())
+    scene = Scene(cfg, field, inv_s=100.0)
     scene.material = Identity()
     return scene.eval()

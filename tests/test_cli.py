@@ -57,8 +57,8 @@ def calls(monkeypatch):
 
         return call
 
-    def replace(name, result):
-        stand_in(f"univoxel.tasks.{name}", **{name: task(name, result)})
+    def replace(name, result, **others):
+        stand_in(f"univoxel.tasks.{name}", **{name: task(name, result)}, **others)
 
     stand_in(
         "univoxel.config", preset=lambda name, data, out, light: Config(data, out, name, light)
@@ -146,6 +146,14 @@ def test_envmap(calls, capsys):
     assert "4.0 degrees" in brightest
 
 
+def test_inspect(calls, tmp_path, capsys):
+    out = tmp_path / "light.png"
+    calls.replace("inspect", out, parse_pixel=lambda text: text.split(","))
+    assert main(["inspect", "run", "--view", "r_1", "--pixel", "3,4", "--out", str(out)]) == 0
+    assert calls.noted == [("inspect", (Path("run"), "r_1", ["3", "4"], out), {})]
+    assert capsys.readouterr().out == f"{out}\n"
+
+
 @pytest.mark.parametrize(
     "error",
     [
@@ -198,7 +206,7 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         ),
         (["train", "x", "--out", "y", "--minutes", "a"], "Error parsing --minutes: "),
         (["sing"], "Unrecognized options: sing"),
-        ([], "Expected one of {train, eval, relight, export, envmap, demo}"),
+        ([], "Expected one of {train, eval, relight, export, envmap, inspect, demo}"),
     ],
 )
 def test_wrong_usage_is_one_line(calls, capsys, arguments, message):

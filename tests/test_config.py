@@ -25,6 +25,20 @@ def test_presets(name):
     assert grids[-1].physical_from < 1  # or materials would never be learned
 
 
+@pytest.mark.parametrize("light", ["sg", "sh", "mlp", "envmap-sg", "envmap"])
+def test_a_light_alone(light):
+    config = preset("draft", Path("photos"), Path("run"), light)
+    assert config.scene.light.kind == light
+    assert config.scene.sky_nodes == 0
+    assert all(isinstance(stage, StageConfig) for stage in config.stages)
+    assert sum(stage.share for stage in config.stages) == pytest.approx(1)
+
+
+def test_an_unknown_light():
+    with pytest.raises(ValueError, match=r"light must be one of hybrid, sg, .*, got 'candle'"):
+        preset("draft", Path("photos"), Path("run"), "candle")
+
+
 def test_presets_differ_in_work():
     minutes = [preset(n, Path("a"), Path("b")).minutes for n in ("draft", "fast", "full")]
     assert minutes == sorted(set(minutes))
@@ -38,6 +52,7 @@ def test_the_file_holds_every_field(tmp_path):
     assert stored["data"] == "photos"
     assert stored["stages"][0]["lr_sdf"] == list(STAGE.lr_sdf)
     assert stored["scene"]["light"]["lobes"] == SGConfig().lobes
+    assert stored["scene"]["light"]["kind"] == "sg"
     assert [p.name for p in tmp_path.iterdir()] == ["config.json"]
 
 
@@ -57,6 +72,7 @@ def test_the_file_holds_every_field(tmp_path):
         (STAGE, {"diffusion": -0.1}, r"diffusion must be in \[0, 1\], got -0.1"),
         (STAGE, {"physical_from": 2.0}, r"physical_from must be in \[0, 1\], got 2.0"),
         (LossConfig(), {"silhouette": -1.0}, "silhouette must be at least 0, got -1.0"),
+        (LossConfig(), {"map_smoothness": -1.0}, "map_smoothness must be at least 0, got -1.0"),
         (CONFIG, {"data": 42}, "data must be a path, got 42"),
         (CONFIG, {"out": None}, "out must be a path, got None"),
         (CONFIG, {"stages": ()}, r"stages must be a StageConfig first, .*got \(\)"),

@@ -26,11 +26,11 @@ LAYERS = [
 HELPERS = {
     "ops": {"checks", "native", "visibility"},
     "fields": {"base", "hull"},
-    "lights": {"base", "quadrature"},
+    "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
     "data": {"base", "images", "radiance"},
-    "render": {"density", "pipeline", "relight"},
+    "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
-    "tasks": {"animation", "contact_sheet", "frames", "joint", "layers", "progress"},
+    "tasks": {"animation", "contact_sheet", "envmap", "frames", "joint", "layers", "progress"},
 }
 # Extras: imported inside the function that needs one
 OPTIONAL = {"imageio_ffmpeg", "matplotlib", "trimesh", "viser"}

@@ -31,13 +31,3 @@ def test_silhouette_and_smoothness_vanish_where_equal():
     assert losses.smoothness(a, a) == 0
     assert losses.silhouette(a + 0.5, a).item() == pytest.approx(0.25)
     assert losses.smoothness(a + 0.5, a).item() == pytest.approx(0.5)
-
-
-def test_white_light_sees_the_chroma_of_the_sum_only():
-    red, cyan = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 1.0])
-    white_together = torch.stack([red, cyan])[None]
-    assert losses.white_light(white_together).item() == pytest.approx(0.0, abs=1e-6)
-    assert losses.white_light(red.expand(1, 2, 3)).item() > 0.5
-    # not the brightness: twice the light has the same chroma
-    tinted = torch.tensor([[[1.0, 0.9, 0.8]]])
-    assert losses.white_light(2 * tinted).item() == pytest.approx(losses.white_light(tinted).item())

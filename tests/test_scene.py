@@ -10,29 +10,89 @@ from safetensors.torch import load_file, save_file
 
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import fit_grid
+from univoxel.lights import (
+    EnvmapConfig,
+    EnvmapSGConfig,
+    MLPLightConfig,
+    SGConfig,
+    SHConfig,
+    build,
+    read_config,
+    scaled,
+)
 from univoxel.scene import FILE, Scene, SceneConfig, load_checkpoint, load_scene, save_scene
 
+LIGHTS = [
+    SGConfig(lobes=3),
+    SHConfig(order=4),
+    MLPLightConfig(rank=5),
+    EnvmapSGConfig(lobes=7),
+    EnvmapConfig(rows=16),
+]
 
-def small_scene():
+
+def small_scene(light=None):
     torch.manual_seed(0)
     grid = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 12**3)
     field = DenseField(grid, 4, grid.nodes().norm(dim=-1) - 0.5)
     with torch.no_grad():
         field.features[3:6, 3:6, 3:6] = torch.randn(3, 3, 3, 4)
-    return Scene(SceneConfig(channels=4, material_channels=2, hidden=8), field, inv_s=20.0)
+    light = light or SGConfig()
+    cfg = SceneConfig(channels=4, material_channels=2, hidden=8, light=light)
+    return Scene(cfg, field, inv_s=20.0)
 
 
-def test_a_checkpoint_gives_the_same_scene(tmp_path):
-    scene = small_scene()
+@pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.kind)
+def test_a_checkpoint_gives_the_same_scene(tmp_path, light):
+    scene = small_scene(light)
+    assert scene.training
     save_scene(scene, tmp_path, {"step": 7})
     again, state = load_checkpoint(tmp_path)
     assert state == {"step": 7}
     assert again.inv_s == scene.inv_s
+    assert again.cfg == scene.cfg
+    assert not again.training
     assert again.field.grid == scene.field.grid
     for (name, a), (_, b) in zip(
         scene.state_dict().items(), again.state_dict().items(), strict=True
     ):
         assert torch.equal(a, b), name
+
+
+def test_lights_of_older_files_are_lobes():
+    assert read_config({"lobes": 4}) == SGConfig(lobes=4)
+
+
+def test_an_unknown_light():
+    with pytest.raises(ValueError, match=r"light must be one of sg, sh, .*, got 'candle'"):
+        read_config({"kind": "candle"})
+
+
+@pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.kind)
+def test_local_light_knows_how_large_the_object_is(light):
+    of_size = scaled(light, 3.0)
+    assert getattr(of_size, "scale", None) == (None if build(4, light).traced else 3.0)
+
+
+def test_the_environment_is_the_map_there_is():
+    assert small_scene(LIGHTS[0]).environment() is not None  # its sky
+    for config in LIGHTS[3:]:
+        scene = small_scene(config)
+        assert scene.environment() is scene.light
+        assert scene.environment().latlong(4).shape == (4, 8, 3)
+
+
+def test_the_occluder_follows_the_surface_when_told():
+    scene = small_scene()
+    before = scene.occluder()
+    assert scene.occluder() is before
+    with torch.no_grad():
+        scene.field.sdf += 0.2  # a ball of 0.5 to one of 0.3
+    assert scene.occluder() is before
+    scene.surface_moved()
+    after = scene.occluder().vertices.norm(dim=1)
+    assert before.vertices.norm(dim=1).mean() > 0.45
+    assert after.mean() < 0.35
 
 
 def test_untouched_features_take_no_room(tmp_path):
@@ -78,7 +138,15 @@ def test_not_a_checkpoint_of_ours(tmp_path):
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize("change", [{"sky": 7}, {"channels": 0}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"sky": 7},
+        {"channels": 0},
+        {"light": {"kind": "candle"}},
+        {"light": {"kind": "sh", "rank": 1}},
+    ],
+)
 def test_a_description_that_says_nothing_to_us(tmp_path, change):
     path = save_scene(small_scene(), tmp_path, {})
     with safe_open(path, "pt") as file:

@@ -28,7 +28,7 @@ def train(
     /,
     out: Annotated[Path, arg(metavar="RUN")],
     preset: Literal["draft", "fast", "full"] = "fast",
-    light: Literal["hybrid", "sg"] = "hybrid",
+    light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
@@ -45,7 +45,8 @@ def train(
         out: folder that the run is written to
         preset: how much work goes in: draft is a look, fast the usual, full the best
         light: sg, local lobes as published; hybrid, then one environment map with traced
-            visibility, which cleans shadows from the albedo
+            visibility, which cleans shadows from the albedo; others to compare with: sh and mlp,
+            local too, envmap-sg and envmap, one map from the beginning
         minutes: wall-clock limit, above 0; training ends in time with what it has
         resume: go on with the run in --out
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
@@ -231,6 +232,29 @@ def envmap(
         print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
 
 
+def inspect(
+    run: Run,
+    /,
+    view: Annotated[str, arg(metavar="VIEW")],
+    pixel: Annotated[str, arg(metavar="COLUMN,ROW")],
+    out: Annotated[
+        Path | None,
+        arg(metavar="FILE.png", help_behavior_hint="(default: in RUN/inspect)"),
+    ] = None,
+) -> None:
+    """Draw the light that falls on one point of the surface, beside the truth where it is known.
+
+    Args:
+        run: folder of a trained run
+        view: name or number of a test view
+        pixel: whose surface point; 0,0 is the top left
+        out: the picture; an .exr file with the layers goes beside
+    """
+    from univoxel.tasks import inspect as task
+
+    print(task.inspect(run, view, task.parse_pixel(pixel), out))
+
+
 def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> None:
     """Train, evaluate and relight the small scene that comes with the package, in minutes.
 
@@ -248,6 +272,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "relight": relight,
     "export": export,
     "envmap": envmap,
+    "inspect": inspect,
     "demo": demo,
 }
 

@@ -8,10 +8,20 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 from univoxel.data.images import replacing
+from univoxel.lights import (
+    EnvmapConfig,
+    EnvmapSGConfig,
+    LightConfig,
+    MLPLightConfig,
+    SGConfig,
+    SHConfig,
+)
 from univoxel.scene import SceneConfig
+
+LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
 
 
 @dataclass(frozen=True)
@@ -88,6 +98,7 @@ class LossConfig:
     roughness_smoothness: float = 0.02
     light_smoothness: float = 0.1
     white_light: float = 0.01
+    map_smoothness: float = 1e-3  # total variation of the log map
 
     def __post_init__(self):
         names = [f.name for f in dataclasses.fields(self)]
@@ -161,14 +172,14 @@ def check_same(cfg: TrainConfig) -> None:
             )
 
 
-def preset(
-    name: str, data: Path, out: Path, light: Literal["hybrid", "sg"] = "hybrid"
-) -> TrainConfig:
+def preset(name: str, data: Path, out: Path, light: LightName = "hybrid") -> TrainConfig:
     """The configuration of a preset: draft (1 minute), fast (4) or full (12) on two cores.
 
     Args:
         light: "sg", local lobes as published; "hybrid", local lobes while geometry forms, then one
-            environment map with traced visibility for the materials, then lobes that follow them.
+            environment map with traced visibility for the materials, then lobes that follow them;
+            "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
+            traced visibility from the beginning. docs/lights.md tells them apart.
 
     Raises:
         ValueError: an unknown name.
@@ -194,10 +205,11 @@ def preset(
         lr_sdf=(0.05, 0.005),
         physical_from=0.3,
     )
+    alone: dict[str, LightConfig] = {
+        c.kind: c
+        for c in (SGConfig(), SHConfig(), MLPLightConfig(), EnvmapSGConfig(), EnvmapConfig())
+    }
     match light:
-        case "sg":
-            scene = SceneConfig(sky_nodes=0)
-            return TrainConfig(data, out, (coarse, fine), minutes, scene=scene)
         case "hybrid":
             coarse, fine = replace(coarse, share=0.1), replace(fine, share=0.4)
             joint = JointConfig(iterations=steps, share=0.35)
@@ -214,5 +226,9 @@ def preset(
                 refit=True,
             )
             return TrainConfig(data, out, (coarse, fine, joint, refit), minutes)
+        case _ if light in alone:
+            scene = SceneConfig(sky_nodes=0, light=alone[light])
+            return TrainConfig(data, out, (coarse, fine), minutes, scene=scene)
         case _:
-            raise ValueError(f"light must be hybrid or sg, got {light!r}")
+            names = ", ".join(("hybrid", *alone))
+            raise ValueError(f"light must be one of {names}, got {light!r}")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from univoxel.color import luminance
 from univoxel.ops.integrator import EnvTables
@@ -56,18 +57,19 @@ def lookup(envmap: EnvMap, direction: Tensor) -> Tensor:
     Bilinear between pixel centres, around the border in phi, clamped at the poles.
     Differentiable in: radiance, direction.
     """
-    height, width, _ = envmap.radiance.shape
+    width = envmap.radiance.shape[1]
     turn = direction.new_tensor(-math.radians(envmap.rotation))
     u, v = direction_to_latlong(rotate_z(direction, turn)).unbind(-1)
-    column, row = u * width - 0.5, (v * height - 0.5).clamp(0, height - 1)
-    left, top = column.floor(), row.floor()
-    fc, fr = (column - left)[..., None], (row - top)[..., None]
-    c0, r0 = left.long() % width, top.long()
-    c1, r1 = (c0 + 1) % width, (r0 + 1).clamp_max(height - 1)
-    texel = envmap.radiance
-    upper = (1 - fc) * texel[r0, c0] + fc * texel[r0, c1]
-    lower = (1 - fc) * texel[r1, c0] + fc * texel[r1, c1]
-    return envmap.exposure * ((1 - fr) * upper + fr * lower)
+    # One column more on either side, from beyond the border: grid_sample knows no other way around
+    texel = torch.cat([envmap.radiance[:, -1:], envmap.radiance, envmap.radiance[:, :1]], 1)
+    place = torch.stack([2 * (u * width + 1) / (width + 2) - 1, 2 * v - 1], -1)
+    found = grid_sample(
+        texel.to(place.dtype).movedim(2, 0)[None],
+        place.reshape(1, 1, -1, 2),
+        padding_mode="border",
+        align_corners=False,
+    )
+    return envmap.exposure * found[0, :, 0].T.reshape(direction.shape)
 
 
 def tables(envmap: EnvMap) -> EnvTables:

@@ -35,12 +35,3 @@ def silhouette(opacity: Tensor, alpha: Tensor) -> Tensor:
 def smoothness(value: Tensor, near: Tensor) -> Tensor:
     """L1 between what is decoded at surface points and right beside them, [N, ...]."""
     return (value - near).abs().mean()
-
-
-def white_light(amplitude: Tensor) -> Tensor:
-    """Chroma of light: mean distance of RGB amplitudes [N, K, 3] from their own grey, relative to
-    the mean amplitude. Images fix albedo and light only up to a colour; a white light on average is
-    the likeliest guess."""
-    light = amplitude.sum(1)
-    grey = light.mean(1, keepdim=True)
-    return ((light - grey).abs() / grey.detach().mean().clamp_min(1e-6)).mean()

@@ -58,3 +58,15 @@ class Mesh:
     normals: Tensor | None = None  # [P, 3] float32 unit
     albedo: Tensor | None = None  # [P, 3] float32 linear
     roughness: Tensor | None = None  # [P] float32
+
+
+@dataclass(frozen=True)
+class Occlusion:
+    """What stands between N points and distant light, along D directions around each normal.
+
+    The directions are `lights.quadrature.half_sphere(surface, D, rotation)`.
+    """
+
+    rotation: Tensor  # [N] radians that the directions are turned by about the normal
+    visibility: Tensor  # [N, D] share of the distant light that arrives, in [0, 1]
+    indirect: Tensor  # [N, D, 3] linear radiance that arrives from what is in the way, >= 0

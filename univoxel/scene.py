@@ -15,8 +15,9 @@ from torch import nn
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.fields.hull import GridShape
+from univoxel.lights import EnvmapLight, EnvmapSGLight, LightConfig, SGConfig, build, read_config
 from univoxel.lights.distant import DistantLight
-from univoxel.lights.sg import LocalSG, SGConfig
+from univoxel.ops import VisibilityScene
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
 FILE = "scene.safetensors"
@@ -30,7 +31,7 @@ class SceneConfig:
     material_channels: int = 8  # of them, that albedo and roughness are decoded from, >= 1
     hidden: int = 64  # width of the material and radiance heads, >= 1
     sky_nodes: int = 512  # directions of the environment map, >= 0; 0: the scene has none
-    light: SGConfig = field(default_factory=SGConfig)
+    light: LightConfig = field(default_factory=SGConfig)
 
     def __post_init__(self):
         for name in ("channels", "material_channels", "hidden"):
@@ -55,8 +56,29 @@ class Scene(nn.Module):
         self.field = field
         self.material = MaterialHead(cfg.material_channels, cfg.hidden)
         self.radiance = RadianceHead(cfg.channels, cfg.hidden)
-        self.light = LocalSG(cfg.channels, cfg.light)
+        self.light = build(cfg.channels, cfg.light)
         self.sky = DistantLight(cfg.sky_nodes) if cfg.sky_nodes else None
+        self._occluder: VisibilityScene | None = None
+
+    def occluder(self) -> VisibilityScene:
+        """The surface, ready for rays: as it was when first asked for since `surface_moved`.
+
+        Raises:
+            ValueError: the scene has no surface.
+        """
+        if self._occluder is None:
+            self._occluder = VisibilityScene(*self.field.isosurface())
+        return self._occluder
+
+    def surface_moved(self) -> None:
+        """Say that the field has changed: `occluder` looks at it anew."""
+        self._occluder = None
+
+    def environment(self) -> DistantLight | EnvmapLight | EnvmapSGLight | None:
+        """The one distant map that the scene stood in, where it has one."""
+        if isinstance(self.light, EnvmapLight | EnvmapSGLight):
+            return self.light
+        return self.sky
 
 
 def save_scene(scene: Scene, run: Path, state: dict) -> Path:
@@ -89,7 +111,7 @@ def save_scene(scene: Scene, run: Path, state: dict) -> Path:
 
 
 def load_checkpoint(run: Path) -> tuple[Scene, dict]:
-    """The scene of a run and the state it was saved with.
+    """The scene of a run, in evaluation mode, and the state it was saved with.
 
     Raises:
         FileNotFoundError: no checkpoint there.
@@ -112,7 +134,7 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
             "it was written by another version of univoxel"
         )
     try:
-        light = SGConfig(**meta["scene"].pop("light"))
+        light = read_config(meta["scene"].pop("light"))
         cfg = SceneConfig(**meta["scene"], light=light)
         grid = GridShape(
             tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
@@ -123,7 +145,7 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
         features[rows.long()] = values
         tensors["field.features"] = features.view(*grid.size, cfg.channels)
         scene.load_state_dict(tensors)
-        return scene, meta["state"]
+        return scene.eval(), meta["state"]
     except (RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(f"{path}: does not fit its own description: {error}") from error
 

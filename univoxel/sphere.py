@@ -69,6 +69,24 @@ def to_world(local: Tensor, normal: Tensor) -> Tensor:
     return local[..., :1] * tangent + local[..., 1:2] * bitangent + local[..., 2:] * normal
 
 
+def to_local(world: Tensor, normal: Tensor) -> Tensor:
+    """The inverse of to_world for unit normals."""
+    axes = (*frame(normal), normal)
+    return torch.stack([(world * axis).sum(-1) for axis in axes], -1)
+
+
+def random_rotation(generator: torch.Generator) -> Tensor:
+    """A rotation [3, 3] evenly from all. Source: Shoemake 1992, "Uniform random rotations"."""
+    w, x, y, z = torch.nn.functional.normalize(torch.randn(4, generator=generator), dim=0).tolist()
+    return torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 def latlong_direction(uv: Tensor) -> Tensor:
     """Unit directions [..., 3] of places on an environment map.
 
@@ -79,6 +97,12 @@ def latlong_direction(uv: Tensor) -> Tensor:
     u, v = uv.unbind(-1)
     phi, theta = math.pi * (1 - 2 * u), math.pi * (0.5 - v)
     return torch.stack([theta.cos() * phi.cos(), theta.cos() * phi.sin(), theta.sin()], -1)
+
+
+def latlong_directions(height: int) -> Tensor:
+    """Unit directions [height, 2 height, 3] of the texels of an environment map."""
+    v, u = (torch.arange(height) + 0.5) / height, (torch.arange(2 * height) + 0.5) / (2 * height)
+    return latlong_direction(torch.stack(torch.meshgrid(v, u, indexing="ij")[::-1], -1))
 
 
 def direction_to_latlong(direction: Tensor) -> Tensor:

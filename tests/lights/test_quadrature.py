@@ -1,58 +1,126 @@
-"""The generic quadrature: a constant light, visibility, bad arguments."""
+"""The generic quadrature: a constant light, an occlusion, bad arguments; its two forms agree."""
+
+from dataclasses import replace
 
 import pytest
 import torch
+from balls import ball, views
 
 from univoxel import sphere
 from univoxel.lights import AbstractLight, quadrature
-from univoxel.records import Surface
+from univoxel.records import Occlusion
 
 
-class White(AbstractLight):
+class Ramp(AbstractLight):
+    """Radiance 1 + slope w.z from everywhere."""
+
+    traced = False
+    directions = 64
+
+    def __init__(self, slope):
+        super().__init__()
+        self.slope = slope
+
     def incident(self, surface, wi):
-        return torch.ones_like(wi)
+        return (1 + self.slope * wi[..., 2:]).expand(len(surface.normal), wi.shape[-2], 3)
 
-    def reflected(self, surface, wo, visibility=None, generator=None):
+    def reflected(self, surface, wo, occlusion=None, generator=None):
+        raise NotImplementedError
+
+    def regularisation(self, surface, near):
         raise NotImplementedError
 
 
-def surface(n=5, features=0, roughness=0.7):
-    normal = sphere.fibonacci_sphere(n)
-    return Surface(
-        position=normal,
-        normal=normal,
-        features=torch.zeros(n, features),
-        albedo=torch.full((n, 3), 1.0),
-        roughness=torch.full((n,), roughness),
-        opacity=torch.ones(n),
-        depth=torch.ones(n),
-    )
-
-
 def test_white_furnace():
-    s = surface()
+    s = ball(5, albedo=1.0, roughness=0.7)
     for generator in (None, torch.Generator().manual_seed(0)):
-        rgb = quadrature.reflected(White(), s, s.normal, 2048, generator=generator)
+        rgb = quadrature.reflected(Ramp(0.0), s, s.normal, 2048, generator=generator)
         # the fit of the layer's albedo is good to 0.005
         torch.testing.assert_close(rgb, torch.ones(5, 3), atol=0.006, rtol=0)
 
 
-def test_visibility_scales_the_light():
-    s = surface()
-    full = quadrature.reflected(White(), s, s.normal, 64)
-    half = quadrature.reflected(White(), s, s.normal, 64, torch.full((5, 64), 0.5))
-    torch.testing.assert_close(half, full / 2)
+@pytest.mark.parametrize("seed", [None, 3])
+def test_the_compiled_sum_is_the_eager_one(seed):
+    """With a gradient to normals the sum is eager, without it compiled, around one normal."""
+    s = ball(40, roughness=0.3)
+    wo = views(s)
+
+    def turns():
+        return None if seed is None else torch.Generator().manual_seed(seed)
+
+    s = replace(s, normal=s.normal.clone().requires_grad_())
+    eager = quadrature.reflected(Ramp(0.5), s, wo, 64, generator=turns())
+    (gradient,) = torch.autograd.grad(eager.sum(), s.normal)
+    assert gradient.abs().max() > 0
+    s = replace(s, normal=s.normal.detach())
+    compiled = quadrature.reflected(Ramp(0.5), s, wo, 64, generator=turns())
+    torch.testing.assert_close(compiled, eager.detach(), rtol=1e-4, atol=1e-6)
+
+
+def test_shared_directions_come_to_the_same_sum():
+    s = ball(50, roughness=0.5)
+    wo = views(s)
+    light = Ramp(0.5)
+    light.directions = 4096
+    wanted = quadrature.reflected(light, s, wo, 2048)
+    for generator in (None, torch.Generator().manual_seed(0)):
+        got = quadrature.reflected_shared(light, s, wo, generator=generator)
+        # both are off by their number of directions: about 1 / sqrt(D) of a highlight's share
+        torch.testing.assert_close(got, wanted, rtol=0.01, atol=0)
+
+
+def test_an_occlusion_takes_light_and_gives_other():
+    s = ball(5)
+    wo = s.normal
+    full = quadrature.reflected(Ramp(0.0), s, wo, 64)
+    rotation, nothing = torch.zeros(5), torch.zeros(5, 64, 3)
+    half = Occlusion(rotation, torch.full((5, 64), 0.5), nothing)
+    torch.testing.assert_close(quadrature.reflected(Ramp(0.0), s, wo, 64, half), full / 2)
+    other = Occlusion(rotation, torch.zeros(5, 64), nothing + 3)
+    torch.testing.assert_close(quadrature.reflected(Ramp(0.0), s, wo, 64, other), 3 * full)
+
+
+def test_an_occlusion_brings_its_directions():
+    """What hides one side of the turned directions hides light from that side of the world."""
+    s, wo = ball(20), ball(20).normal
+    rotation = torch.linspace(0, 6, 20)
+    wi = quadrature.half_sphere(s, 512, rotation)
+    above = (wi[..., 2] > 0).float()
+    seen = Occlusion(rotation, above, torch.zeros(20, 512, 3))
+    got = quadrature.reflected(Ramp(0.0), s, wo, 512, seen)
+    full = quadrature.reflected(Ramp(0.0), s, wo, 512)
+    # irradiance of the upper half of the sky is (1 + n.z) / 2 of the whole; seen from above, the
+    # rough highlight follows it nearly
+    expected = full * (0.5 + 0.5 * s.normal[:, 2:])
+    torch.testing.assert_close(got, expected, rtol=0, atol=0.02)
 
 
 def test_a_generator_turns_each_point():
-    turns = quadrature.rotations(surface(50), torch.Generator().manual_seed(0))
+    turns = quadrature.rotations(ball(50), torch.Generator().manual_seed(0))
     assert float(turns.std()) > 1
-    assert float(quadrature.rotations(surface(50), None).abs().max()) == 0
+    assert float(quadrature.rotations(ball(50), None).abs().max()) == 0
 
 
-def test_bad_arguments():
-    s = surface()
-    with pytest.raises(ValueError, match=r"visibility must be \[5, 64\], got \[5, 32\]"):
-        quadrature.reflected(White(), s, s.normal, 64, torch.ones(5, 32))
-    with pytest.raises(ValueError, match="visibility needs fixed directions"):
-        quadrature.reflected(White(), s, s.normal, 64, torch.ones(5, 64), torch.Generator())
+def test_the_shared_set_is_turned_as_a_whole():
+    still = quadrature.whole_sphere(64, None)
+    turned = quadrature.whole_sphere(64, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(turned @ turned.T, still @ still.T, atol=1e-5, rtol=0)
+    assert (turned - still).abs().max() > 0.1
+    assert torch.equal(still, sphere.fibonacci_sphere(64))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"visibility": torch.ones(5, 32)}, r"visibility must be \[5, 64\], got \[5, 32\]"),
+        ({"rotation": torch.zeros(4)}, r"rotation must be \[5\], got \[4\]"),
+        ({"indirect": torch.zeros(5, 64)}, r"indirect must be \[5, 64, 3\], got \[5, 64\]"),
+    ],
+)
+def test_an_occlusion_of_another_size(change, message):
+    s = ball(5)
+    seen = Occlusion(torch.zeros(5), torch.ones(5, 64), torch.zeros(5, 64, 3))
+    with pytest.raises(ValueError, match=message):
+        quadrature.reflected(Ramp(0.0), s, s.normal, 64, replace(seen, **change))
+    with pytest.raises(ValueError, match="occlusion has its own directions, got a generator too"):
+        quadrature.reflected(Ramp(0.0), s, s.normal, 64, seen, torch.Generator())

@@ -4,38 +4,11 @@ import dataclasses
 
 import pytest
 import torch
+from balls import ball, shaken, views
 
 from univoxel import ops, sphere
 from univoxel.lights import LocalSG, SGConfig, quadrature
-from univoxel.records import Surface
-
-
-def ball(n=200, features=4, albedo=0.5, seed=0):
-    g = torch.Generator().manual_seed(seed)
-    normal = sphere.fibonacci_sphere(n)
-    return Surface(
-        position=normal,
-        normal=normal,
-        features=torch.randn(n, features, generator=g),
-        albedo=torch.full((n, 3), albedo),
-        roughness=torch.full((n,), 0.5),
-        opacity=torch.ones(n),
-        depth=torch.ones(n),
-    )
-
-
-def views(surface, seed=1):
-    g = torch.Generator().manual_seed(seed)
-    offset = torch.nn.functional.normalize(torch.randn(surface.normal.shape, generator=g), dim=-1)
-    return torch.nn.functional.normalize(surface.normal + 0.7 * offset, dim=-1)
-
-
-def shaken(light, seed=0):
-    """The light with random weights in the last layer, so that points differ."""
-    g = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        light.head[-1].weight.normal_(0, 0.1, generator=g)
-    return light
+from univoxel.records import Occlusion, Surface
 
 
 @pytest.mark.parametrize("generator", [False, True])
@@ -54,10 +27,21 @@ def test_reflected_equals_the_quadrature_of_its_incident(generator):
     torch.testing.assert_close(light.reflected(surface, wo), wanted, rtol=2e-4, atol=1e-5)
 
 
-def test_visibility_hides_the_light():
+def test_an_occlusion_hides_the_light():
     surface, light = ball(10), LocalSG(4)
-    dark = light.reflected(surface, views(surface), visibility=torch.zeros(10, 128))
+    nothing = Occlusion(torch.zeros(10), torch.zeros(10, 128), torch.zeros(10, 128, 3))
+    dark = light.reflected(surface, views(surface), nothing)
     assert float(dark.detach().abs().max()) == 0
+
+
+def test_regularisation_sees_change_and_colour():
+    light, here, near = shaken(LocalSG(4)), ball(), ball(seed=1)
+    same, other = light.regularisation(here, here), light.regularisation(here, near)
+    assert same["light_smoothness"] == 0
+    assert other["light_smoothness"] > 0
+    with torch.no_grad():
+        light.base[:, 4] += 2.0
+    assert light.regularisation(here, near)["white_light"] > other["white_light"]
 
 
 @pytest.mark.parametrize("lobes", [1, 12, 16, 128])

@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from univoxel.data import DataError
 from univoxel.data.images import read_image, write_exr
+from univoxel.lights import EnvmapConfig, EnvmapSGConfig
 from univoxel.scene import save_scene
 from univoxel.sphere import fibonacci_sphere
 from univoxel.tasks.envmap import GREY, brightest, compare, envmap, grey_ball
@@ -40,6 +41,17 @@ def test_the_map_is_written_as_it_is(run):
     assert envmap(folder, out, height=32) is None
     assert torch.equal(read_image(out), map)
     assert read_image(out.with_suffix(".png")).shape == (32, 4 * 32, 3)
+
+
+@pytest.mark.parametrize("light", [EnvmapConfig(rows=32), EnvmapSGConfig(lobes=8)])
+def test_the_map_of_a_light_alone(tmp_path, light):
+    scene = sphere_scene(0, light=light)
+    map = scene.light.latlong(32).detach()
+    save_scene(scene, tmp_path, {})
+    (tmp_path / "config.json").write_text(json.dumps({"data": str(tmp_path / "data")}))
+    write_map(tmp_path / "data" / "envmaps" / "train.exr", map)
+    assert envmap(tmp_path, tmp_path / "map.exr", height=32).ball_psnr > 60
+    torch.testing.assert_close(read_image(tmp_path / "map.exr"), map)
 
 
 def test_the_truth_in_another_colour_is_met(run):
@@ -101,7 +113,9 @@ def test_compare_takes_maps_of_two_sizes(run):
 
 def test_a_run_without_a_map(tmp_path):
     save_scene(sphere_scene(0), tmp_path, {})
-    with pytest.raises(ValueError, match="has no environment map: it was trained with sky_nodes 0"):
+    with pytest.raises(
+        ValueError, match="has no environment map: it was trained with local light, sg"
+    ):
         envmap(tmp_path, tmp_path / "map.exr")
     assert not (tmp_path / "map.exr").exists()
 

@@ -1,6 +1,83 @@
 """Lights: each says what falls on a surface point and what the point reflects."""
 
-from univoxel.lights.base import AbstractLight
-from univoxel.lights.sg import LocalSG, SGConfig
+from __future__ import annotations
 
-__all__ = ["AbstractLight", "LocalSG", "SGConfig"]
+from dataclasses import replace
+from typing import Any, TypeAlias
+
+import torch
+
+from univoxel.lights.base import AbstractLight
+from univoxel.lights.envmap import EnvmapConfig, EnvmapLight
+from univoxel.lights.envmap_sg import EnvmapSGConfig, EnvmapSGLight
+from univoxel.lights.mlp import LocalMLP, MLPLightConfig
+from univoxel.lights.sg import LocalSG, SGConfig
+from univoxel.lights.sh import LocalSH, SHConfig
+
+LightConfig: TypeAlias = SGConfig | SHConfig | MLPLightConfig | EnvmapSGConfig | EnvmapConfig
+
+__all__ = [
+    "AbstractLight",
+    "EnvmapConfig",
+    "EnvmapLight",
+    "EnvmapSGConfig",
+    "EnvmapSGLight",
+    "LightConfig",
+    "LocalMLP",
+    "LocalSG",
+    "LocalSH",
+    "MLPLightConfig",
+    "SGConfig",
+    "SHConfig",
+    "build",
+    "read_config",
+    "scaled",
+]
+
+
+def build(
+    features: int, config: LightConfig, generator: torch.Generator | None = None
+) -> AbstractLight:
+    """The light that a configuration describes.
+
+    Args:
+        features: C of Surface.features, that local lights read.
+        generator: draws the first weights of networks.
+
+    Raises:
+        ValueError: a number outside its range; the message names it.
+    """
+    match config:
+        case SGConfig():
+            return LocalSG(features, config, generator)
+        case SHConfig():
+            return LocalSH(features, config, generator)
+        case MLPLightConfig():
+            return LocalMLP(features, config, generator)
+        case EnvmapSGConfig():
+            return EnvmapSGLight(config)
+        case EnvmapConfig():
+            return EnvmapLight(config)
+
+
+def scaled(config: LightConfig, scale: float) -> LightConfig:
+    """The configuration for an object of half extent `scale`, world units, where it has one."""
+    match config:
+        case SGConfig() | SHConfig() | MLPLightConfig():
+            return replace(config, scale=scale)
+        case EnvmapSGConfig() | EnvmapConfig():
+            return config
+
+
+def read_config(values: dict[str, Any]) -> LightConfig:
+    """The configuration that dataclasses.asdict made a dictionary of.
+
+    Raises:
+        ValueError, TypeError: no such light; a field that it has not.
+    """
+    values = dict(values)
+    kind = values.pop("kind", "sg")  # files from before there were others do not say
+    kinds = {c.kind: c for c in (SGConfig, SHConfig, MLPLightConfig, EnvmapSGConfig, EnvmapConfig)}
+    if kind not in kinds:
+        raise ValueError(f"light must be one of {', '.join(kinds)}, got {kind!r}")
+    return kinds[kind](**values)

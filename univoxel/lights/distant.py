@@ -39,10 +39,5 @@ class DistantLight(nn.Module):
 
     def latlong(self, height: int) -> Tensor:
         """An equirectangular map [height, 2 height, 3] in the axes of docs/conventions.md."""
-        v, u = torch.meshgrid(
-            (torch.arange(height) + 0.5) / height,
-            (torch.arange(2 * height) + 0.5) / (2 * height),
-            indexing="ij",
-        )
-        wi = sphere.latlong_direction(torch.stack([u, v], -1).reshape(-1, 2))
-        return self.incident(wi).reshape(height, 2 * height, 3)
+        wi = sphere.latlong_directions(height)
+        return self.incident(wi.flatten(0, 1)).reshape(height, 2 * height, 3)

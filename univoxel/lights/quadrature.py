@@ -1,15 +1,16 @@
-"""Reflection of any light, by quadrature over the half-sphere."""
+"""Reflection of any light, by quadrature over the half-sphere or the sphere."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from univoxel import brdf, sphere
+from univoxel import brdf, ops, sphere
 from univoxel.lights.base import AbstractLight
-from univoxel.records import Surface
+from univoxel.records import Occlusion, Surface
 
 
 def rotations(
@@ -33,40 +34,98 @@ def half_sphere(surface: Surface, count: int, rotation: Tensor) -> Tensor:
     )
 
 
+def whole_sphere(count: int, generator: torch.Generator | None) -> Tensor:
+    """Fibonacci directions [D, 3], 4 pi / D steradians each; with a generator turned as a whole."""
+    directions = sphere.fibonacci_sphere(count)
+    return directions if generator is None else directions @ sphere.random_rotation(generator).T
+
+
 def reflected(
     light: AbstractLight,
     surface: Surface,
     wo: Tensor,  # [N, 3]
     directions: int = 128,
-    visibility: Tensor | None = None,  # [N, D]
+    occlusion: Occlusion | None = None,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Radiance [N, 3] towards wo: (2 pi / D) sum_d V_d L(w_d) f(w_d, wo) max(n.w_d, 0).
+    """Radiance [N, 3] towards wo: (2 pi / D) sum_d L(w_d) f(w_d, wo) max(n.w_d, 0).
 
     Args:
         wo: [N, 3] unit, world, to the eye.
         directions: D >= 1, how many.
-        visibility: [N, D] share of the light that arrives, for half_sphere's directions without
-            rotation.
+        occlusion: makes L of the light's radiance: its open share plus what comes instead.
         generator: turns the directions at random for each point.
 
     Raises:
-        ValueError: visibility of another shape, or together with a generator: it belongs to
-            directions that are not turned.
+        ValueError: an occlusion of another size, or together with a generator: it brings the
+            directions that it was found for.
+
+    Differentiable in what the light is, and in the surface; where normal and wo need no gradient
+    a compiled op does the sum, many times faster.
     """
-    if visibility is not None:
-        wanted = (len(wo), directions)
-        if visibility.shape != wanted:
-            raise ValueError(
-                f"reflected: visibility must be {list(wanted)}, got {list(visibility.shape)}"
-            )
+    if occlusion is not None:
+        n = len(wo)
+        for name, wanted in (
+            ("rotation", (n,)), ("visibility", (n, directions)), ("indirect", (n, directions, 3))
+        ):  # fmt: skip
+            shape = getattr(occlusion, name).shape
+            if shape != wanted:
+                raise ValueError(f"reflected: {name} must be {list(wanted)}, got {list(shape)}")
         if generator is not None:
-            raise ValueError("reflected: visibility needs fixed directions, got a generator too")
-    wi = half_sphere(surface, directions, rotations(surface, generator))
+            raise ValueError("reflected: an occlusion has its own directions, got a generator too")
+    rotation = rotations(surface, generator) if occlusion is None else occlusion.rotation
+    wi = half_sphere(surface, directions, rotation)
     radiance = light.incident(surface, wi)
-    if visibility is not None:
-        radiance = radiance * visibility[..., None]
-    normal = surface.normal[:, None]
-    f = brdf.evaluate(normal, wo[:, None], wi, surface.albedo[:, None], surface.roughness[:, None])
-    cosine = (normal * wi).sum(-1, keepdim=True).clamp_min(0)
-    return (2 * math.pi / directions) * (radiance * f * cosine).sum(1)
+    if occlusion is not None:
+        radiance = occlusion.visibility[..., None] * radiance + occlusion.indirect
+    normal, solid_angle = surface.normal, 2 * math.pi / directions
+    if torch.is_grad_enabled() and (normal.requires_grad or wo.requires_grad):
+        normal = normal[:, None]
+        material = surface.albedo[:, None], surface.roughness[:, None]
+        f = brdf.evaluate(normal, wo[:, None], wi, *material)
+        cosine = (normal * wi).sum(-1, keepdim=True).clamp_min(0)
+        return solid_angle * (radiance * f * cosine).sum(1)
+    # Around its own normal, and turned back, every point has the same directions
+    up = torch.zeros_like(normal)
+    up[:, 2] = 1
+    return ops.shade_radiance(
+        radiance,
+        up,
+        sphere.rotate_z(sphere.to_local(wo, normal), -rotation),
+        surface.albedo,
+        surface.roughness,
+        sphere.fibonacci_hemisphere(directions, wo.dtype).to(wo.device),
+        solid_angle,
+    )
+
+
+def reflected_shared(
+    light: AbstractLight,
+    surface: Surface,
+    wo: Tensor,  # [N, 3]
+    occlusion: Occlusion | None = None,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Radiance [N, 3] towards wo: (4 pi / D) sum_d L(w_d) f(w_d, wo) max(n.w_d, 0).
+
+    All points share the D = light.directions directions, over the whole sphere, and
+    `light.incident` takes them as [D, 3]: what a light does per direction it does D times, not N D
+    times. Without gradient to normals. An occlusion goes by the directions around each normal.
+
+    Args:
+        generator: turns the directions at random, as a whole.
+    """
+    surface = replace(surface, normal=surface.normal.detach())
+    if occlusion is not None:
+        count = occlusion.visibility.shape[1]
+        return reflected(light, surface, wo, count, occlusion, generator)
+    directions = whole_sphere(light.directions, generator).to(wo)
+    return ops.shade_radiance(
+        light.incident(surface, directions),
+        surface.normal,
+        wo,
+        surface.albedo,
+        surface.roughness,
+        directions,
+        4 * math.pi / len(directions),
+    )

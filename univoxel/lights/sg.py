@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from univoxel import ops, sphere
-from univoxel.lights import quadrature
+from univoxel.lights import head, lobes, priors, quadrature
 from univoxel.lights.base import AbstractLight
-from univoxel.networks import MLP
-from univoxel.records import Surface
-
-_MIN_SHARPNESS = 0.1
-_FREQUENCIES = 3  # of the position: sines of 1, 2, 4 half-turns over the scale
+from univoxel.records import Occlusion, Surface
 
 
 @dataclass(frozen=True)
 class SGConfig:
     """Local spherical Gaussian light."""
 
+    kind: Literal["sg"] = field(default="sg", init=False)
     lobes: int = 16  # a point, >= 1
     hidden: int = 64  # width of the head, >= 1
     layers: int = 2  # hidden layers of the head, >= 0
@@ -41,6 +38,8 @@ class LocalSG(AbstractLight):
     mid-grey. Source: Wu et al. 2024 (UniVoxel), section 3.3; the sharpness range is InvRender's.
     """
 
+    traced = False
+
     def __init__(
         self,
         features: int,
@@ -57,40 +56,23 @@ class LocalSG(AbstractLight):
         """
         super().__init__()
         self.config = config = config or SGConfig()
-        for name, least in (
-            ("lobes", 1), ("hidden", 1), ("layers", 0), ("directions", 1), ("directions_eval", 1)
-        ):  # fmt: skip
-            if getattr(config, name) < least:
-                raise ValueError(
-                    f"SGConfig: {name} must be >= {least}, got {getattr(config, name)}"
-                )
-        for name in ("max_sharpness", "scale"):
-            if not getattr(config, name) > 0:
-                raise ValueError(f"SGConfig: {name} must be > 0, got {getattr(config, name)}")
-        self.features = features
-        sizes = [features + 3 + 6 * _FREQUENCIES, *[config.hidden] * config.layers]
-        self.head = MLP([*sizes, 7 * config.lobes], generator or torch.default_generator)
-        last = self.head.linear[-1]
-        nn.init.zeros_(last.weight)  # the global light is the starting point
-        self.base = nn.Parameter(_white_light(config))  # [K, 7]
+        least = {"lobes": 1, "hidden": 1, "layers": 0, "directions": 1, "directions_eval": 1}
+        head.check(config, least, "max_sharpness", "scale")
+        self.head = head.build(features, config.hidden, config.layers, 7 * config.lobes, generator)
+        self.base = nn.Parameter(lobes.white_light(config.lobes, config.max_sharpness))  # [K, 7]
+
+    @property
+    def directions(self) -> int:
+        return self.config.directions if self.training else self.config.directions_eval
 
     def raw(self, surface: Surface) -> Tensor:
-        """What the head adds to the global light at each point: [N, 7 K], for smoothness losses."""
-        angle = surface.position * (math.pi / self.config.scale)
-        waves = [
-            w for i in range(_FREQUENCIES) for w in ((angle * 2**i).sin(), (angle * 2**i).cos())
-        ]
-        position = surface.position / self.config.scale
-        return self.head(torch.cat([surface.features, position, *waves], -1))
+        """What the head adds to the global light at each point: [N, 7 K]."""
+        return self.head(head.encode(surface, self.config.scale))
 
     def lobes_from_raw(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Unit axis [N, K, 3], sharpness [N, K] and amplitude [N, K, 3] >= 0 of deviations."""
         parameters = self.base + raw.unflatten(-1, (self.config.lobes, 7))
-        vector, sharpness, amplitude = parameters.split([3, 1, 3], -1)
-        # rsqrt of a floored square: a zero vector keeps a finite gradient
-        axis = vector * ((vector * vector).sum(-1, keepdim=True).clamp_min(1e-12)).rsqrt()
-        sharpness = self.config.max_sharpness * sharpness[..., 0].sigmoid() + _MIN_SHARPNESS
-        return axis, sharpness, nn.functional.softplus(amplitude)
+        return lobes.decode(parameters, self.config.max_sharpness)
 
     def lobes(self, surface: Surface) -> tuple[Tensor, Tensor, Tensor]:
         """Axis [N, K, 3], sharpness [N, K] and amplitude [N, K, 3] at each point."""
@@ -106,17 +88,13 @@ class LocalSG(AbstractLight):
         self,
         surface: Surface,
         wo: Tensor,
-        visibility: Tensor | None = None,
+        occlusion: Occlusion | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Radiance [N, 3] towards wo; config.directions in training mode, else directions_eval.
-
-        The lobes hold visibility already; where it is given nevertheless, it multiplies them.
-        """
-        count = self.config.directions if self.training else self.config.directions_eval
-        if visibility is not None:
-            return quadrature.reflected(self, surface, wo, count, visibility, generator)
-        directions = sphere.fibonacci_hemisphere(count, wo.dtype).to(wo.device)
+        """Radiance [N, 3] towards wo; config.directions in training mode, else directions_eval."""
+        if occlusion is not None:
+            return quadrature.reflected(self, surface, wo, self.directions, occlusion, generator)
+        directions = sphere.fibonacci_hemisphere(self.directions, wo.dtype).to(wo.device)
         return ops.shade_sg(
             *self.lobes(surface),
             surface.normal,
@@ -127,18 +105,10 @@ class LocalSG(AbstractLight):
             quadrature.rotations(surface, generator),
         )
 
-
-def _white_light(config: SGConfig) -> Tensor:
-    """Parameters [K, 7] of lobes spread evenly: together radiance about 1/2 from everywhere."""
-    k = config.lobes
-    # As wide as the lobes lie apart, within the range: the sum is then nearly constant.
-    target = min(
-        max(k / 2, _MIN_SHARPNESS + 0.05 * config.max_sharpness), 0.8 * config.max_sharpness
-    )
-    share = (target - _MIN_SHARPNESS) / config.max_sharpness
-    # One lobe integrates to 2 pi / s (1 - exp(-2 s)) over the sphere; the mean radiance is K times
-    # that over 4 pi.
-    amplitude = 0.5 * 2 * target / (k * -math.expm1(-2 * target))
-    axis = sphere.fibonacci_sphere(k)
-    sharpness = torch.full((k, 1), math.log(share / (1 - share)))
-    return torch.cat([axis, sharpness, torch.full((k, 3), math.log(math.expm1(amplitude)))], -1)
+    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
+        raw = self.raw(surface)
+        _, _, amplitude = self.lobes_from_raw(raw)
+        return {
+            "light_smoothness": priors.smoothness(raw, self.raw(near)),
+            "white_light": priors.chroma(amplitude.sum(1)),
+        }

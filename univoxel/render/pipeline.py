@@ -6,12 +6,15 @@ import torch
 from torch import Tensor
 
 from univoxel.camera import Cameras, image_rays
+from univoxel.lights.quadrature import rotations
 from univoxel.ops import composite
 from univoxel.records import Mesh, Rays, Surface
 from univoxel.render.density import section_alpha
+from univoxel.render.occlusion import occlusion
 from univoxel.scene import Scene
 
 RAYS_AT_ONCE = 32768  # of pictures: bounds memory
+TRACED_AT_ONCE = 2**20  # rays towards light: likewise
 
 
 def surface_at(scene: Scene, rays: Rays, jitter: Tensor | None = None) -> Surface:
@@ -51,9 +54,23 @@ def at_rays(surface: Surface, index: Tensor) -> Surface:
     return Surface(**{name: value[index] for name, value in vars(surface).items()})
 
 
-def shade(scene: Scene, surface: Surface, wo: Tensor) -> Tensor:
-    """Physically based radiance [N, 3] that the surface sends along wo, linear."""
-    return scene.light.reflected(surface, wo)
+def shade(
+    scene: Scene, surface: Surface, wo: Tensor, generator: torch.Generator | None = None
+) -> Tensor:
+    """Physically based radiance [N, 3] that the surface sends along wo, linear.
+
+    Args:
+        generator: turns the directions that light is taken from at random.
+    """
+    light = scene.light
+    if not light.traced:
+        return light.reflected(surface, wo, generator=generator)
+    parts = []
+    for index in torch.arange(len(wo)).split(max(1, TRACED_AT_ONCE // light.directions)):
+        part = at_rays(surface, index)
+        seen = occlusion(scene, part, light.directions, rotations(part, generator))
+        parts.append(light.reflected(part, wo[index], seen))
+    return torch.cat(parts) if parts else torch.zeros_like(wo)
 
 
 @torch.no_grad()

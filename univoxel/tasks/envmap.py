@@ -16,7 +16,7 @@ from univoxel.data import DataError
 from univoxel.data.images import read_image, write_exr, write_png
 from univoxel.envmap import EnvMap, lookup
 from univoxel.scene import load_scene
-from univoxel.sphere import fibonacci_sphere, latlong_direction, texel_solid_angles
+from univoxel.sphere import fibonacci_sphere, latlong_directions, texel_solid_angles
 from univoxel.tasks.frames import trained_on
 
 GREY = 0.5  # albedo of the ball
@@ -59,10 +59,14 @@ def envmap(run: Path, out: Path, height: int = 128) -> Comparison | None:
         raise ValueError(f"--height must be at least 1, got {height}")
     if out.suffix.lower() != ".exr":
         raise ValueError(f"--out: expected a name that ends in .exr, got {out}")
-    sky = load_scene(run).sky
+    scene = load_scene(run)
+    sky = scene.environment()
     if sky is None:
-        raise ValueError(f"{run}: this run has no environment map: it was trained with sky_nodes 0")
-    recovered, true = sky.latlong(height), _true_map(trained_on(run))
+        raise ValueError(
+            f"{run}: this run has no environment map: it was trained with local light, "
+            f"{scene.cfg.light.kind}, alone"
+        )
+    recovered, true = sky.latlong(height), true_map(trained_on(run))
     out.parent.mkdir(parents=True, exist_ok=True)
     write_exr(out, dict(zip("RGB", recovered.unbind(2), strict=True)), half=False)
     rows, result = [recovered], None
@@ -100,19 +104,27 @@ def brightest(map: Tensor) -> Tensor:
     return place[(near @ luminance(light)).argmax()]
 
 
+def true_map(data: Path) -> Tensor | None:
+    """The light of the photographs, where the data set has it."""
+    for suffix in (".hdr", ".exr"):
+        path = data / "envmaps" / f"train{suffix}"
+        if path.is_file():
+            try:
+                return EnvMap(read_image(path)).radiance
+            except DataError:
+                raise
+            except ValueError as error:
+                raise DataError(f"{path}: {error}") from None
+    return None
+
+
 def _light(map: Tensor) -> tuple[Tensor, Tensor]:
     """Directions [M, 3] and radiance times solid angle [M, 3] of a map, pooled to few texels."""
     height, width, _ = map.shape
     rows = min(height, TEXELS)
     light = (map * texel_solid_angles(height, width)[..., None]).movedim(2, 0)
     pooled = adaptive_avg_pool2d(light, (rows, 2 * rows)).flatten(1).T
-    return _directions(rows).flatten(0, 1), pooled * (light[0].numel() / len(pooled))
-
-
-def _directions(height: int) -> Tensor:
-    """Of the texels of a map: [height, 2 height, 3]."""
-    v, u = (torch.arange(height) + 0.5) / height, (torch.arange(2 * height) + 0.5) / (2 * height)
-    return latlong_direction(torch.stack(torch.meshgrid(v, u, indexing="ij")[::-1], -1))
+    return latlong_directions(rows).flatten(0, 1), pooled * (light[0].numel() / len(pooled))
 
 
 def _scale(recovered: Tensor, true: Tensor) -> Tensor:
@@ -132,18 +144,4 @@ def _tiles(map: Tensor, height: int) -> list[Tensor]:
     light = EnvMap(map)
     grey = grey_ball(map, normal.flatten(0, 1)).view(height, height, 3)
     balls = [torch.where(inside[..., None], b, 0.0) for b in (grey, lookup(light, mirrored))]
-    return [lookup(light, _directions(height)), *balls]
-
-
-def _true_map(data: Path) -> Tensor | None:
-    """The light of the photographs, where the data set has it."""
-    for suffix in (".hdr", ".exr"):
-        path = data / "envmaps" / f"train{suffix}"
-        if path.is_file():
-            try:
-                return EnvMap(read_image(path)).radiance
-            except DataError:
-                raise
-            except ValueError as error:
-                raise DataError(f"{path}: {error}") from None
-    return None
+    return [lookup(light, latlong_directions(height)), *balls]

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from univoxel import losses
+from univoxel import lights, losses
 from univoxel.camera import pixel_rays
 from univoxel.color import linear_to_srgb
 from univoxel.config import (
@@ -36,6 +36,7 @@ MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones 
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
 SMOOTH_EVERY = 4  # steps between smoothings of what the step has touched
 REFRESH = 16  # steps between looks at which bricks are empty
+RETRACE = 100  # steps after which light is traced through the surface as it has become
 MOMENTS = (0.9, 0.99)
 # Adam's epsilon for the grids. Far above 0 on purpose: a node's gradient is then scaled by the
 # batch, not by its own history, and nodes that few rays see do not jump.
@@ -90,7 +91,7 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
         assert first is not None
         hull = visual_hull(distance, photos.cameras, first)
         field = DenseField(first, cfg.scene.channels, hull)
-        light = replace(cfg.scene.light, scale=float((upper - lower).max()) / 2)
+        light = lights.scaled(cfg.scene.light, float((upper - lower).max()) / 2)
         scene = Scene(replace(cfg.scene, light=light), field)
         state = {"stage": 0, "progress": 0.0, "step": 0}
 
@@ -122,6 +123,8 @@ def run_stage(
 ) -> None:
     """Optimise the scene on its present grid until the stage's steps or its time are over."""
     field = scene.field
+    scene.train()
+    scene.surface_moved()
     field.sdf.requires_grad_(not stage.refit)
     scene.material.requires_grad_(not stage.refit)
     networks = [scene.material, scene.radiance, scene.light]
@@ -145,6 +148,8 @@ def run_stage(
         scene.inv_s = 1 / (between(stage.sharpness, done) * field.voxel_size)
         if progress.step % REFRESH == 0:
             field.refresh()
+        if progress.step % RETRACE == 0 and not stage.refit:
+            scene.surface_moved()
 
         batch = random_batch(photos, pixels, stage.rays)
         surface = surface_at(scene, batch.rays, torch.rand(stage.rays))
@@ -166,6 +171,8 @@ def run_stage(
         if progress.checkpoint_due():
             save_scene(scene, cfg.out, progress.state())
     field.refresh()
+    scene.surface_moved()
+    scene.eval()
 
 
 def objective(
@@ -188,21 +195,18 @@ def objective(
 
     met = at_rays(surface, hit)
     opacity, behind, target = opacity[hit], behind[hit], target[hit]
-    shaded = shade(scene, met, batch.wo[hit])
+    shaded = shade(scene, met, batch.wo[hit], torch.default_generator)
     encoded = losses.encode(shaded * opacity + behind * (1 - opacity))
     beside = met.position.detach() + scene.field.voxel_size * torch.randn_like(met.position)
     near = scene.field.sample(beside).features
     albedo, roughness = scene.material(near)
-    lobes = scene.light.raw(met)
-    lobes_near = scene.light.raw(replace(met, features=near, position=beside))
+    prior = scene.light.regularisation(met, replace(met, features=near, position=beside))
     terms |= {
         "physical": losses.photometric(encoded, target),
         "albedo": weight.albedo_smoothness * losses.smoothness(met.albedo, albedo),
         "roughness": weight.roughness_smoothness * losses.smoothness(met.roughness, roughness),
-        "light": weight.light_smoothness * losses.smoothness(lobes, lobes_near),
-        "white": weight.white_light * losses.white_light(scene.light.lobes_from_raw(lobes)[2]),
     }
-    return terms
+    return terms | {name: getattr(weight, name) * value for name, value in prior.items()}
 
 
 def smooth(field: DenseField, stage: StageConfig) -> None:

@@ -1,0 +1,51 @@
+"""Points on a ball, for tests of lights: positions are normals."""
+
+import torch
+from torch.nn.functional import normalize
+
+from univoxel import sphere
+from univoxel.records import Surface
+
+
+def ball(n=200, features=4, albedo=0.5, roughness=0.5, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    normal = sphere.fibonacci_sphere(n)
+    return Surface(
+        position=normal,
+        normal=normal,
+        features=torch.randn(n, features, generator=g),
+        albedo=torch.full((n, 3), albedo),
+        roughness=torch.full((n,), roughness),
+        opacity=torch.ones(n),
+        depth=torch.ones(n),
+    )
+
+
+def views(surface, seed=1):
+    g = torch.Generator().manual_seed(seed)
+    offset = normalize(torch.randn(surface.normal.shape, generator=g), dim=-1)
+    return normalize(surface.normal + 0.7 * offset, dim=-1)
+
+
+def shaken(light, seed=0):
+    """A local light with random weights in the last layer of its head, so that points differ."""
+    g = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        light.head[-1].weight.normal_(0, 0.1, generator=g)
+    return light
+
+
+def fit(light, surface, wo, target, parameters, steps, lr, turned=True, map_smoothness=0.0):
+    """Minimise the squared error of what is reflected; the last error over the first."""
+    optimizer = torch.optim.Adam(parameters, lr=lr)
+    g = torch.Generator().manual_seed(0) if turned else None
+    errors = []
+    for i in range(steps):
+        optimizer.param_groups[0]["lr"] = lr * 0.1 ** (i / steps)
+        loss = (light.reflected(surface, wo, generator=g) - target).square().mean()
+        optimizer.zero_grad()
+        prior = light.regularisation(surface, surface).get("map_smoothness", 0.0)
+        (loss + map_smoothness * prior).backward()
+        optimizer.step()
+        errors.append(loss.item())
+    return errors[-1] / errors[0]

@@ -1,0 +1,90 @@
+"""Local light as networks: its two sums, the start, a known light found."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from balls import ball, fit, shaken, views
+
+from univoxel import sphere
+from univoxel.lights import LocalMLP, MLPLightConfig, quadrature
+
+
+def made(**changes):
+    return LocalMLP(4, MLPLightConfig(**changes), torch.Generator().manual_seed(0))
+
+
+def test_reflected_equals_the_quadrature_of_its_incident():
+    surface = ball(60)
+    light = shaken(made(directions=2048, directions_eval=1024, frequencies=2))
+    wo = views(surface)
+    wanted = quadrature.reflected(light, surface, wo, 2048).detach()
+    for generator in (None, torch.Generator().manual_seed(3)):
+        got = light.reflected(surface, wo, generator=generator).detach()
+        # either sum is off by its number of directions
+        torch.testing.assert_close(got, wanted, rtol=0.02, atol=1e-3)
+    light.eval()
+    assert light.directions == 1024
+    torch.testing.assert_close(light.reflected(surface, wo).detach(), wanted, rtol=0.05, atol=1e-3)
+
+
+def test_shared_directions_say_the_same_as_a_points_own():
+    surface, light, wi = ball(7), shaken(made()), sphere.fibonacci_sphere(12)
+    own = light.incident(surface, wi.expand(7, 12, 3))
+    torch.testing.assert_close(light.incident(surface, wi), own)
+
+
+def test_start_is_even():
+    surface, light = ball(), made()
+    radiance = light.incident(surface, sphere.fibonacci_sphere(40)).detach()
+    torch.testing.assert_close(radiance, torch.full((200, 40, 3), 0.5))
+
+
+def test_recovers_a_known_light():
+    """A ball under a lamp of 30 degrees in a dim room: found from what it reflects."""
+    surface = replace(ball(150, roughness=0.25), features=torch.zeros(150, 4))
+    wo = views(surface)
+    lamp = torch.nn.functional.normalize(torch.tensor([0.5, -0.3, 0.8]), dim=0)
+
+    def room(wi):
+        return 0.2 + 3 * (12 * (wi @ lamp - 1)).exp()[..., None] * torch.tensor([1.0, 1.0, 0.4])
+
+    light = made(directions=256)
+    truth = made()
+    truth.incident = lambda surface, wi: room(wi).expand(150, -1, 3).contiguous()
+    with torch.no_grad():
+        target = truth.eval().reflected(surface, wo)
+    # Not the head: what falls on the ball is the same everywhere, and a ball determines it
+    parameters = [light.base, *light.basis_net.parameters()]
+    assert fit(light, surface, wo, target, parameters, 200, 0.01) < 1e-2
+    wi = sphere.fibonacci_sphere(500)
+    got = light.incident(surface, wi)[0].detach()
+    # Reflection blurs light: a third of its norm is what it leaves open
+    assert float((got - room(wi)).norm() / room(wi).norm()) < 0.33
+
+
+def test_regularisation_sees_change_and_colour():
+    light, here, near = shaken(made()), ball(), ball(seed=1)
+    assert light.regularisation(here, here)["light_smoothness"] == 0
+    before = light.regularisation(here, near)
+    assert before["light_smoothness"] > 0
+    with torch.no_grad():
+        light.base[0, 0] += 5.0
+    assert light.regularisation(here, near)["white_light"] > before["white_light"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rank": 0}, "rank must be >= 1, got 0"),
+        ({"hidden": 0}, "hidden must be >= 1"),
+        ({"layers": -1}, "layers must be >= 0"),
+        ({"frequencies": -1}, "frequencies must be >= 0"),
+        ({"directions": 0}, "directions must be >= 1"),
+        ({"directions_eval": 0}, "directions_eval must be >= 1"),
+        ({"scale": -1.0}, "scale must be > 0"),
+    ],
+)
+def test_bad_config(change, message):
+    with pytest.raises(ValueError, match=f"MLPLightConfig: {message}"):
+        LocalMLP(4, MLPLightConfig(**change))

@@ -1,0 +1,104 @@
+"""One distant light for the whole object: an environment map of texels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from univoxel import envmap
+from univoxel.lights import distant_map, head, priors
+from univoxel.lights.base import AbstractLight
+from univoxel.records import Occlusion, Surface
+
+# The learning rate of networks moves log radiance that much faster: it must reach a sun
+GAIN = 30.0
+COARSEST = 4  # rows of the coarsest level, at least
+
+
+@dataclass(frozen=True)
+class EnvmapConfig:
+    """An environment map of texels, with traced visibility."""
+
+    kind: Literal["envmap"] = field(default="envmap", init=False)
+    rows: int = 256  # of the map, twice as wide, >= 1
+    directions: int = 64  # of the half-sphere, in training, >= 1
+    directions_eval: int = 256  # in evaluation, >= 1
+
+
+class EnvmapLight(AbstractLight):
+    """Radiance at the texels of a lat-long map, interpolated bilinearly between them.
+
+        log L = GAIN sum_l up(level_l)
+
+    Kept as logarithm, so that it stays positive and a bright sun is as far away as a dark wall; and
+    as a sum of levels, each four times as coarse as the one before and interpolated between its
+    texels. A step of Adam moves all parameters about equally far: the coarse ones bring whole parts
+    of the sky along, the fine ones what they leave. It starts at radiance 1/2 from everywhere.
+    Gradients go to the map and the materials, not to normals: the map is no smooth function of
+    direction.
+    """
+
+    traced = True
+
+    def __init__(self, config: EnvmapConfig | None = None) -> None:
+        """
+        Raises:
+            ValueError: a number outside its range; the message names it.
+        """
+        super().__init__()
+        self.config = config = config or EnvmapConfig()
+        head.check(config, {"rows": 1, "directions": 1, "directions_eval": 1})
+        rows = [config.rows]
+        while rows[-1] % 4 == 0 and rows[-1] >= 4 * COARSEST:
+            rows.append(rows[-1] // 4)
+        self.levels = nn.ParameterList(torch.zeros(r, 2 * r, 3) for r in rows)  # fine to coarse
+        self.levels[-1].data += math.log(0.5) / GAIN
+
+    @property
+    def directions(self) -> int:
+        return self.config.directions if self.training else self.config.directions_eval
+
+    @property
+    def log_radiance(self) -> Tensor:
+        """[H, 2 H, 3], in the axes of docs/conventions.md."""
+        fine, *coarse = self.levels
+        total = fine
+        for level in coarse:
+            total = total + _finer(level, len(fine) // len(level))
+        return GAIN * total
+
+    def incident(self, surface: Surface, wi: Tensor) -> Tensor:
+        """Radiance [N, D, 3] from unit directions wi [N, D, 3], the same for all points."""
+        return envmap.lookup(envmap.EnvMap(self.log_radiance.exp()), wi)
+
+    def reflected(
+        self,
+        surface: Surface,
+        wo: Tensor,
+        occlusion: Occlusion | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Radiance [N, 3] towards wo; no gradient to normals."""
+        return distant_map.reflected(self, surface, wo, occlusion, generator)
+
+    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
+        log_map = self.log_radiance
+        return {
+            "map_smoothness": priors.total_variation(log_map),
+            "white_light": distant_map.chroma(log_map.exp()),
+        }
+
+    def latlong(self, height: int) -> Tensor:
+        """The map [height, 2 height, 3], linear, in the axes of docs/conventions.md."""
+        return distant_map.resampled(self.log_radiance.exp(), height)
+
+
+def _finer(level: Tensor, factor: int) -> Tensor:
+    """A lat-long map [H, 2 H, 3] with `factor` times as many rows and columns, interpolated."""
+    around = torch.cat([level[:, -1:], level, level[:, :1]], 1).movedim(2, 0)[None]
+    finer = nn.functional.interpolate(around, scale_factor=factor, mode="bilinear")
+    return finer[0, :, :, factor:-factor].movedim(0, 2)

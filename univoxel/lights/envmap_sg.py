@@ -1,0 +1,93 @@
+"""One distant light for the whole object: an environment map of spherical Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from univoxel import envmap
+from univoxel.lights import distant_map, head, lobes, priors
+from univoxel.lights.base import AbstractLight
+from univoxel.records import Occlusion, Surface
+from univoxel.sphere import latlong_directions
+
+GAIN = 10.0  # the learning rate of networks moves the lobes that much faster: they must reach a sun
+
+
+@dataclass(frozen=True)
+class EnvmapSGConfig:
+    """An environment map of spherical Gaussians, with traced visibility."""
+
+    kind: Literal["envmap-sg"] = field(default="envmap-sg", init=False)
+    lobes: int = 128  # of the map, >= 1
+    max_sharpness: float = 100.0  # of a lobe, > 0; its half width is about sqrt(2 / sharpness) rad
+    rows: int = 64  # of the lat-long map that the lobes are summed on, >= 1
+    directions: int = 64  # of the half-sphere, in training, >= 1
+    directions_eval: int = 256  # in evaluation, >= 1
+
+
+class EnvmapSGLight(AbstractLight):
+    """K spherical Gaussians of direction, the same for all points.
+
+        L(w) = sum_k amplitude_k exp(sharpness_k (w . axis_k - 1))
+
+    N points under D directions would ask for K exponentials each; instead the sum is taken on the
+    texels of a small lat-long map and interpolated, which is off by at most
+    sharpness (pi / rows)^2 / 4 of a lobe's amplitude: 6 % for the sharpest at its very top. It
+    starts at radiance about 1/2 from everywhere. Gradients go to the lobes and the materials, not
+    to normals. Source: Zhang et al. 2021 (PhySG).
+    """
+
+    traced = True
+
+    def __init__(self, config: EnvmapSGConfig | None = None) -> None:
+        """
+        Raises:
+            ValueError: a number outside its range; the message names it.
+        """
+        super().__init__()
+        self.config = config = config or EnvmapSGConfig()
+        least = {"lobes": 1, "rows": 1, "directions": 1, "directions_eval": 1}
+        head.check(config, least, "max_sharpness")
+        start = lobes.white_light(config.lobes, config.max_sharpness)
+        self.raw = nn.Parameter(start / GAIN)  # [K, 7]
+
+    @property
+    def directions(self) -> int:
+        return self.config.directions if self.training else self.config.directions_eval
+
+    def lobes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Unit axis [K, 3], sharpness [K] and amplitude [K, 3] >= 0."""
+        return lobes.decode(GAIN * self.raw, self.config.max_sharpness)
+
+    def latlong(self, height: int) -> Tensor:
+        """The map [height, 2 height, 3], linear, in the axes of docs/conventions.md."""
+        axis, sharpness, amplitude = self.lobes()
+        wi = latlong_directions(height).to(axis).flatten(0, 1)
+        exponent = torch.addmm(-sharpness[None], wi, (sharpness[:, None] * axis).T)
+        # The floor is nothing beside any light, and spares products too small for normal numbers,
+        # over which processors take many times as long
+        return (exponent.clamp_min(-40).exp() @ amplitude).view(height, 2 * height, 3)
+
+    def incident(self, surface: Surface, wi: Tensor) -> Tensor:
+        """Radiance [N, D, 3] from unit directions wi [N, D, 3], the same for all points."""
+        return envmap.lookup(envmap.EnvMap(self.latlong(self.config.rows)), wi)
+
+    def reflected(
+        self,
+        surface: Surface,
+        wo: Tensor,
+        occlusion: Occlusion | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Radiance [N, 3] towards wo; no gradient to normals."""
+        return distant_map.reflected(self, surface, wo, occlusion, generator)
+
+    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
+        _, sharpness, amplitude = self.lobes()
+        # What a lobe sends altogether, over 2 pi
+        share = -torch.expm1(-2 * sharpness) / sharpness
+        return {"white_light": priors.chroma((share[:, None] * amplitude).sum(0)[None])}

@@ -1,0 +1,40 @@
+"""Spherical Gaussians as numbers without limits, for whichever light is made of them."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from univoxel import sphere
+
+_MIN_SHARPNESS = 0.1
+
+
+def decode(parameters: Tensor, max_sharpness: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit axis [..., K, 3], sharpness [..., K] and amplitude [..., K, 3] >= 0.
+
+    Args:
+        parameters: [..., K, 7] any numbers: three for the axis, one for the sharpness, three for
+            the amplitude.
+    """
+    vector, sharpness, amplitude = parameters.split([3, 1, 3], -1)
+    # rsqrt of a floored square: a zero vector keeps a finite gradient
+    axis = vector * ((vector * vector).sum(-1, keepdim=True).clamp_min(1e-12)).rsqrt()
+    sharpness = max_sharpness * sharpness[..., 0].sigmoid() + _MIN_SHARPNESS
+    return axis, sharpness, torch.nn.functional.softplus(amplitude)
+
+
+def white_light(count: int, max_sharpness: float) -> Tensor:
+    """Parameters [K, 7] of lobes spread evenly: together radiance about 1/2 from everywhere."""
+    # As wide as the lobes lie apart, within the range: the sum is then nearly constant.
+    target = min(max(count / 2, _MIN_SHARPNESS + 0.05 * max_sharpness), 0.8 * max_sharpness)
+    share = (target - _MIN_SHARPNESS) / max_sharpness
+    # One lobe integrates to 2 pi / s (1 - exp(-2 s)) over the sphere; the mean radiance is K times
+    # that over 4 pi.
+    amplitude = 0.5 * 2 * target / (count * -math.expm1(-2 * target))
+    axis = sphere.fibonacci_sphere(count)
+    sharpness = torch.full((count, 1), math.log(share / (1 - share)))
+    amplitudes = torch.full((count, 3), math.log(math.expm1(amplitude)))
+    return torch.cat([axis, sharpness, amplitudes], -1)

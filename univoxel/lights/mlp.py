@@ -1,0 +1,120 @@
+"""Light as a network of place and direction."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from univoxel import sphere
+from univoxel.lights import head, priors, quadrature
+from univoxel.lights.base import AbstractLight
+from univoxel.networks import MLP
+from univoxel.records import Occlusion, Surface
+
+_MEAN_OVER = 32  # directions that stand for the whole sphere where light is averaged
+_START = 0.5  # radiance from everywhere
+
+
+@dataclass(frozen=True)
+class MLPLightConfig:
+    """Local light as two networks."""
+
+    kind: Literal["mlp"] = field(default="mlp", init=False)
+    rank: int = 32  # functions of direction that a point's light is put together of, >= 1
+    hidden: int = 64  # width of both networks, >= 1
+    layers: int = 2  # hidden layers of both, >= 0
+    frequencies: int = 3  # of the direction: sines of 1, 2, 4 times its parts, >= 0
+    directions: int = 256  # over the whole sphere, in training, >= 1
+    directions_eval: int = 512  # in evaluation, >= 1
+    scale: float = 1.0  # world units: half the extent of what is lit, > 0
+
+
+class LocalMLP(AbstractLight):
+    """Incident light as a network of features, position and direction, kept affordable.
+
+        L(x, w) = softplus(code(x) . basis(w))
+
+    One network reads the point and gives a code, the other reads the direction and gives as many
+    basis functions, the first of them constant. All points share the directions: N points under D
+    directions cost N + D runs of a network and one matrix product, where a single network of both,
+    as in NeILF, costs N D runs. What is lost is what a code of `rank` numbers a channel cannot say.
+    It holds direct light, indirect light and visibility together, and starts at radiance 1/2 from
+    everywhere. No gradient goes to normals.
+
+    Source: Yao et al. 2022 (NeILF) for light as a network of place and direction.
+    """
+
+    traced = False
+
+    def __init__(
+        self,
+        features: int,
+        config: MLPLightConfig | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """
+        Args:
+            features: C of Surface.features, >= 0.
+            generator: draws the first weights.
+
+        Raises:
+            ValueError: a number outside its range; the message names it.
+        """
+        super().__init__()
+        self.config = config = config or MLPLightConfig()
+        least = {"rank": 1, "hidden": 1, "layers": 0, "frequencies": 0}
+        head.check(config, least | {"directions": 1, "directions_eval": 1}, "scale")
+        outputs = 3 * (config.rank + 1)
+        self.head = head.build(features, config.hidden, config.layers, outputs, generator)
+        sizes = [3 + 6 * config.frequencies, *[config.hidden] * config.layers, config.rank]
+        self.basis_net = MLP(sizes, generator or torch.default_generator)
+        base = torch.zeros(config.rank + 1, 3)
+        base[0] = math.log(math.expm1(_START))
+        self.base = nn.Parameter(base)  # [rank + 1, 3]
+
+    @property
+    def directions(self) -> int:
+        return self.config.directions if self.training else self.config.directions_eval
+
+    def code(self, surface: Surface) -> Tensor:
+        """[N, rank + 1, 3] at each point."""
+        raw = self.head(head.encode(surface, self.config.scale))
+        return self.base + raw.unflatten(-1, (-1, 3))
+
+    def basis(self, wi: Tensor) -> Tensor:
+        """[..., rank + 1] of unit directions [..., 3]; the first is 1."""
+        waves = [
+            w
+            for i in range(self.config.frequencies)
+            for w in ((wi * 2**i).sin(), (wi * 2**i).cos())
+        ]
+        encoded = torch.cat([wi, *waves], -1)
+        values = self.basis_net(encoded.flatten(0, -2)).unflatten(0, wi.shape[:-1])
+        return torch.cat([torch.ones_like(values[..., :1]), values], -1)
+
+    def incident(self, surface: Surface, wi: Tensor) -> Tensor:
+        """Radiance [N, D, 3] from unit directions wi [N, D, 3]; or [D, 3], the same for all."""
+        return nn.functional.softplus(self.basis(wi) @ self.code(surface))
+
+    def reflected(
+        self,
+        surface: Surface,
+        wo: Tensor,
+        occlusion: Occlusion | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Radiance [N, 3] towards wo, summed over the whole sphere; no gradient to normals."""
+        return quadrature.reflected_shared(self, surface, wo, occlusion, generator)
+
+    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
+        here, beside = self.code(surface), self.code(near)
+        wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)
+        light = nn.functional.softplus(self.basis(wi) @ here)
+        return {
+            "light_smoothness": priors.smoothness(here, beside),
+            "white_light": priors.chroma(light.mean(1)),
+        }

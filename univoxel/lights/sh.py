@@ -1,0 +1,137 @@
+"""Light as spherical harmonics that vary over the surface."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from univoxel import sphere
+from univoxel.lights import head, priors, quadrature
+from univoxel.lights.base import AbstractLight
+from univoxel.records import Occlusion, Surface
+
+_MEAN_OVER = 32  # directions that stand for the whole sphere where light is averaged
+_START = 0.5  # radiance from everywhere
+
+
+@dataclass(frozen=True)
+class SHConfig:
+    """Local light in spherical harmonics."""
+
+    kind: Literal["sh"] = field(default="sh", init=False)
+    order: int = 3  # the highest degree, >= 0: 3 (order + 1)^2 numbers a point
+    hidden: int = 64  # width of the head, >= 1
+    layers: int = 2  # hidden layers of the head, >= 0
+    directions: int = 256  # over the whole sphere, in training, >= 1
+    directions_eval: int = 512  # in evaluation, >= 1
+    scale: float = 1.0  # world units: half the extent of what is lit, > 0
+
+
+class LocalSH(AbstractLight):
+    """Real spherical harmonics a point: one global light plus what an MLP adds to it.
+
+        L(w) = softplus(sum_lm c_lm Y_lm(w))
+
+    The coefficients hold direct light, indirect light and visibility together. A bare sum swings
+    below zero beside every lamp. Clamped there, it would get no gradient and stay dark; softplus is
+    positive, follows the sum where light is bright, and lets a dark direction come back. It starts
+    at radiance 1/2 from everywhere.
+
+    Light is taken on directions that all points share, so the harmonics are evaluated once per
+    direction and a matrix product does the rest. No gradient goes to normals.
+    """
+
+    traced = False
+
+    def __init__(
+        self,
+        features: int,
+        config: SHConfig | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """
+        Args:
+            features: C of Surface.features, >= 0.
+            generator: draws the head's first weights.
+
+        Raises:
+            ValueError: a number outside its range; the message names it.
+        """
+        super().__init__()
+        self.config = config = config or SHConfig()
+        least = {"order": 0, "hidden": 1, "layers": 0, "directions": 1, "directions_eval": 1}
+        head.check(config, least, "scale")
+        count = (config.order + 1) ** 2
+        self.head = head.build(features, config.hidden, config.layers, 3 * count, generator)
+        base = torch.zeros(count, 3)
+        base[0] = math.log(math.expm1(_START)) * math.sqrt(4 * math.pi)  # Y_00 is 1 / sqrt(4 pi)
+        self.base = nn.Parameter(base)  # [(order + 1)^2, 3]
+
+    @property
+    def directions(self) -> int:
+        return self.config.directions if self.training else self.config.directions_eval
+
+    def coefficients(self, surface: Surface) -> Tensor:
+        """[N, (order + 1)^2, 3] of the sum that softplus is taken of."""
+        raw = self.head(head.encode(surface, self.config.scale))
+        return self.base + raw.unflatten(-1, (-1, 3))
+
+    def incident(self, surface: Surface, wi: Tensor) -> Tensor:
+        """Radiance [N, D, 3] from unit directions wi [N, D, 3]; or [D, 3], the same for all."""
+        harmonics = real_harmonics(self.config.order, wi)
+        return nn.functional.softplus(harmonics @ self.coefficients(surface))
+
+    def reflected(
+        self,
+        surface: Surface,
+        wo: Tensor,
+        occlusion: Occlusion | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Radiance [N, 3] towards wo, summed over the whole sphere; no gradient to normals."""
+        return quadrature.reflected_shared(self, surface, wo, occlusion, generator)
+
+    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
+        here, beside = self.coefficients(surface), self.coefficients(near)
+        wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)
+        light = nn.functional.softplus(real_harmonics(self.config.order, wi) @ here)
+        return {
+            "light_smoothness": priors.smoothness(here, beside),
+            "white_light": priors.chroma(light.mean(1)),
+        }
+
+
+def real_harmonics(order: int, direction: Tensor) -> Tensor:
+    """Orthonormal real spherical harmonics Y_lm of degrees l up to `order`.
+
+        Y_lm = N_lm Q_lm(z) Re (x + i y)^m,   m > 0;    Im (x + i y)^|m|, m < 0
+        Q_l^m(z) = P_l^m(z) / (1 - z^2)^(m / 2), a polynomial; no Condon-Shortley phase
+
+    Polynomials in x, y and z throughout: smooth at the poles too.
+
+    Args:
+        direction: [..., 3] unit.
+
+    Returns:
+        [..., (order + 1)^2], Y_lm at l^2 + l + m.
+    """
+    x, y, z = direction.unbind(-1)
+    real, imaginary = torch.ones_like(x), torch.zeros_like(x)  # of (x + i y)^m
+    diagonal = 1.0  # Q_mm = (2 m - 1)!!
+    found: dict[tuple[int, int], Tensor] = {}
+    for m in range(order + 1):
+        before, now = torch.zeros_like(z), torch.full_like(z, diagonal)  # Q_{l-1}^m and Q_l^m
+        for degree in range(m, order + 1):
+            square = (2 * degree + 1) / (4 * math.pi)
+            square *= math.factorial(degree - m) / math.factorial(degree + m)
+            value = math.sqrt(square * (2 if m else 1)) * now
+            found[degree, m], found[degree, -m] = value * real, value * (imaginary if m else real)
+            above = (2 * degree + 1) * z * now - (degree + m) * before
+            before, now = now, above / (degree + 1 - m)
+        diagonal *= 2 * m + 1
+        real, imaginary = x * real - y * imaginary, x * imaginary + y * real
+    return torch.stack([found[k] for k in sorted(found)], -1)
