@@ -12,12 +12,11 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from univoxel import metrics
 from univoxel.color import linear_to_srgb, luminance
-from univoxel.data import DataError
-from univoxel.data.images import read_image, write_exr, write_png
+from univoxel.data.images import write_exr, write_png
 from univoxel.envmap import EnvMap, lookup
 from univoxel.scene import load_scene
 from univoxel.sphere import fibonacci_sphere, latlong_direction, texel_solid_angles
-from univoxel.tasks.frames import trained_on
+from univoxel.tasks.frames import read_map, trained_on
 
 GREY = 0.5  # albedo of the ball
 TEXELS = 64  # rows of the map that light is summed over
@@ -140,10 +139,5 @@ def _true_map(data: Path) -> Tensor | None:
     for suffix in (".hdr", ".exr"):
         path = data / "envmaps" / f"train{suffix}"
         if path.is_file():
-            try:
-                return EnvMap(read_image(path)).radiance
-            except DataError:
-                raise
-            except ValueError as error:
-                raise DataError(f"{path}: {error}") from None
+            return read_map(path).radiance
     return None
