@@ -1,10 +1,11 @@
-"""Relighting: error against time and samples, against Mitsuba 3, and against rendered pictures.
+"""Relighting: error against time and samples, ray rates, Mitsuba 3, and rendered pictures.
 
-python benchmarks/relight.py OUT.json [--data SCENE]
+python benchmarks/relight.py OUT.json [--data SCENE] [--only rays,strategies,mitsuba,pictures]
 
-SCENE is a folder with mesh.ply, envmaps/, relight/ and per-pixel truth in test/gt. Without it only
-the table of strategies is measured, on a sphere over a plane. Needs trimesh with --data, and for
-the comparison mitsuba and DRJIT_LIBLLVM_PATH.
+SCENE is a folder with mesh.ply, envmaps/, relight/ and per-pixel truth in test/gt; it needs
+trimesh. Without it the scene is a sphere over a plane, and there are no pictures. The comparison
+needs mitsuba and a libLLVM of version 15 or later: in DRJIT_LIBLLVM_PATH, or that of a Rust
+toolchain in ~/.rustup.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from relight_scenes import TESTS, Scene, mesh_scene, sphere_scene, true_mesh
 from torch import Tensor
 
-from univoxel import brdf
+from univoxel import envmap as env
 from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data import load_photos
@@ -32,130 +34,140 @@ from univoxel.envmap import EnvMap, tables
 from univoxel.ops import VisibilityScene, relight
 from univoxel.records import Mesh
 
-TESTS = Path(__file__).parent.parent / "tests"
-SPP = [1, 4, 16, 64, 256, 1024]
-TRUTH_SPP = 8192
+SPP = [1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024]
+TRUTH_SPP = 16384
+THEIR_SPP = [16, 64, 256]
+COMMON = {"offset": 1e-3, "bounces": 2}
 
 
 def psnr(a: Tensor, b: Tensor) -> float:
     return float(-10 * torch.log10((a - b).square().mean()))
 
 
-def timed(work) -> tuple[Tensor, float]:
-    start = time.perf_counter()
-    result = work()
-    return result, time.perf_counter() - start
+def timed(work, repeat: int = 3) -> tuple[Tensor, float]:
+    """A result and the median time it takes."""
+    times = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        result = work()
+        times.append(time.perf_counter() - start)
+    return result, sorted(times)[repeat // 2]
 
 
-def sphere_scene(size: int) -> dict:
-    """Points that a camera sees of the sphere over a plane of the tests, and its light."""
-    sys.path[:0] = [str(TESTS), str(TESTS / "ops")]
-    import test_integrator_mitsuba as shared
+def ray_rates(scene: Scene, samples: int = 32) -> dict:
+    """Shadow rays a second within the integrator, and of bare Embree on rays like them.
 
-    vertices, faces, normals, part = shared.sphere_on_plane()
-    y, x = torch.meshgrid(*[torch.linspace(-0.45, 0.45, size)] * 2, indexing="ij")
-    direction = torch.nn.functional.normalize(
-        torch.stack([x, torch.ones_like(x), -0.25 - y], -1).reshape(-1, 3), dim=1
-    )
-    origin = torch.tensor([0.0, -5.0, 0.9]).expand_as(direction).contiguous()
-    scene = VisibilityScene(vertices, faces)
-    hit = scene.closest_hit(origin, direction)
-    met = hit.face >= 0
-    corner = faces.long()[hit.face[met]]
-    u, v = hit.barycentric[met].unbind(1)
-    weight = torch.stack([1 - u - v, u, v], 1)[..., None]
-    kind = part[corner[:, 0]]
-    cosine = torch.linspace(0, 1, 1025)
-    light = EnvMap(shared.sky_map(256, math.pi / 2 - math.pi * (torch.arange(256) + 0.5) / 256))
+    With the map's samples alone and no bounces every ray of the integrator is a shadow ray from a
+    sample above the horizon: as many, from the same points, in the same distribution and order, are
+    traced one by one with `VisibilityScene.occluded`, which does nothing else.
+    """
+    visibility, _, light, position, normal = scene.ours[:5]
+    uniform = torch.rand(len(position) * samples, 2, generator=torch.Generator().manual_seed(0))
+    direction = env.sample(light, uniform)[0].view(len(position), samples, 3)
+    above = (direction * normal[:, None]).sum(-1) > 0
+    origin = (position + COMMON["offset"] * normal)[:, None].expand_as(direction)[above]
+    rays = origin.contiguous(), direction[above].contiguous()
+    options = {"offset": COMMON["offset"], "samples": samples, "bounces": 0, "strategy": "map"}
+    bare, whole = [], []
+    for _ in range(5):  # in turns: the machine's speed drifts
+        bare.append(timed(lambda: visibility.occluded(*rays, COMMON["offset"]), 1)[1])
+        whole.append(timed(lambda: relight(*scene.ours, **options), 1)[1])
+    bare_rate, whole_rate = (len(rays[0]) / sorted(t)[2] for t in (bare, whole))
     return {
-        "ours": (
-            scene,
-            Mesh(vertices, faces, normals, shared.ALBEDO[part], shared.ROUGHNESS[part]),
-            tables(light),
-            origin[met] + hit.t[met, None] * direction[met],
-            torch.nn.functional.normalize((weight * normals[corner]).sum(1), dim=1),
-            -direction[met],
-            shared.ALBEDO[kind],
-            shared.ROUGHNESS[kind],
-        ),
-        "theirs": {
-            "vertices": vertices,
-            "faces": faces,
-            "normals": normals,
-            "part": part,
-            "albedo": shared.ALBEDO,
-            "roughness": shared.ROUGHNESS,
-            "layer": torch.stack(
-                [brdf.specular_albedo(cosine, r.expand(1025)) for r in shared.ROUGHNESS]
-            ),
-            "radiance": shared.sky_map(256, math.pi / 2 - math.pi * torch.arange(256) / 255),
-            "origin": origin[met],
-            "direction": direction[met],
-            "bounces": 3,
-        },
+        "rays": len(rays[0]),
+        "bare": bare_rate,
+        "integrator": whole_rate,
+        "ratio": whole_rate / bare_rate,
     }
 
 
-def strategies(scene: dict) -> list[dict]:
+def strategies(scene: Scene) -> list[dict]:
     """Relative root mean square error and time by strategy and samples per pixel."""
-    common = {"offset": 1e-3, "bounces": 2}
-    truth = relight(*scene["ours"], samples=TRUTH_SPP, seed=1, **common)
+    truth = relight(*scene.ours, samples=TRUTH_SPP, seed=1, **COMMON)
     rows = []
     for name in ("mis", "map", "brdf"):
         for samples in SPP:
-            options = common | {"samples": samples, "strategy": name}
-            rgb, seconds = timed(lambda o=options: relight(*scene["ours"], **o))
-            error = float((rgb - truth).square().mean().sqrt() / truth.mean())
-            rows.append({"strategy": name, "spp": samples, "error": error, "seconds": seconds})
+            options = COMMON | {"samples": samples, "strategy": name}
+            rgb, seconds = timed(lambda o=options: relight(*scene.ours, **o))
+            rows.append(
+                {"strategy": name, "spp": samples, "error": _error(rgb, truth), "seconds": seconds}
+            )
     return rows
 
 
-def against_mitsuba(scene: dict) -> dict | None:
-    """PSNR between the two at many samples; time of both at equal error. None: it cannot run."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder)
+def against_mitsuba(scene: Scene, ours: list[dict]) -> dict | None:
+    """PSNR between the two at many samples; time of both at equal error. None: it cannot run.
 
-        def theirs(samples: int) -> tuple[Tensor, float] | None:
-            np.savez(
-                path / "in.npz",
-                **{k: np.asarray(v) for k, v in scene["theirs"].items()},
-                samples=samples,
-            )
-            done = subprocess.run(
-                [
-                    sys.executable,
-                    str(TESTS / "mitsuba_reference.py"),
-                    path / "in.npz",
-                    path / "o.npy",
-                ],
-                capture_output=True,
-                text=True,
-                check=False,
-            )
-            if done.returncode:
-                print(f"mitsuba: {done.stderr.strip()[-200:]}", file=sys.stderr)
-                return None
-            return torch.from_numpy(np.load(path / "o.npy")), _seconds(done.stderr)
-
-        many = theirs(4096)
+    Once with our BRDF written for Mitsuba, which draws by the cosine, and once with its own
+    `principled`, each against its own picture of many samples.
+    """
+    truth = relight(*scene.ours, samples=TRUTH_SPP, seed=1, **COMMON)
+    own = [r for r in ours if r["strategy"] == "mis"]
+    times, errors = (np.log([r[key] for r in own]) for key in ("seconds", "error"))
+    found = {}
+    for principled in (False, True):
+        many = _by_mitsuba(scene, 4096, principled)
         if many is None:
             return None
-        common = {"offset": 1e-3, "bounces": 3}
-        ours, _ = timed(lambda: relight(*scene["ours"], samples=TRUTH_SPP, seed=1, **common))
-        agreement = psnr(ours.clamp_max(1), many[0].clamp_max(1))
-        few = theirs(256)
-        assert few is not None
-        wanted = float((few[0] - ours).square().mean())
-        for samples in SPP:
-            rgb, seconds = timed(lambda n=samples: relight(*scene["ours"], samples=n, **common))
-            if float((rgb - ours).square().mean()) <= wanted:
-                break
-    return {
-        "psnr_at_many_samples": agreement,
-        "error": math.sqrt(wanted),
-        "mitsuba": {"spp": 256, "seconds": few[1]},
-        "univoxel": {"spp": samples, "seconds": seconds},
-    }
+        rows = []
+        for samples in THEIR_SPP:
+            few = _by_mitsuba(scene, samples, principled)
+            assert few is not None
+            # The noise of their reference adds up to theirs: taken off again.
+            error = _error(few[0], many[0]) / math.sqrt(1 + samples / 4096)
+            equal = float(np.exp(np.interp(-np.log(error), -errors, times)))
+            rows.append(
+                {
+                    "spp": samples,
+                    "error": error,
+                    "seconds": few[1],
+                    "univoxel_seconds": equal,
+                    "ratio": few[1] / equal,
+                }
+            )
+            print(rows[-1], flush=True)
+        found["principled" if principled else "same_brdf"] = rows
+        if not principled:
+            found["psnr_at_many_samples"] = psnr(truth.clamp_max(1), many[0].clamp_max(1))
+    return found
+
+
+def _error(rgb: Tensor, truth: Tensor) -> float:
+    return float((rgb - truth).square().mean().sqrt() / truth.mean())
+
+
+def _by_mitsuba(scene: Scene, samples: int, principled: bool) -> tuple[Tensor, float] | None:
+    """Mitsuba's radiance along the same rays, and its seconds, compilation left out."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder)
+        arrays = {k: np.asarray(v) for k, v in scene.theirs.items()}
+        options = {"bounces": COMMON["bounces"], "samples": samples, "principled": principled}
+        np.savez(path / "in.npz", **arrays, **options)
+        script = TESTS / "mitsuba_reference.py"
+        done = subprocess.run(
+            [sys.executable, str(script), path / "in.npz", path / "o.npy"],
+            capture_output=True,
+            text=True,
+            check=False,
+            env=os.environ | _llvm(),
+        )
+        if done.returncode:
+            print(
+                f"no comparison: mitsuba ended with {done.returncode}; it has to be installed, and "
+                "DRJIT_LIBLLVM_PATH to name a libLLVM of version 15 or later: "
+                f"{done.stderr.strip()[-200:]}",
+                file=sys.stderr,
+            )
+            return None
+        return torch.from_numpy(np.load(path / "o.npy")), _seconds(done.stderr)
+
+
+def _llvm() -> dict[str, str]:
+    """Where drjit finds LLVM: as the environment says, else in a Rust toolchain."""
+    if "DRJIT_LIBLLVM_PATH" in os.environ:
+        return {}
+    found = sorted((Path.home() / ".rustup" / "toolchains").glob("stable*/lib/libLLVM.so.*"))
+    return {"DRJIT_LIBLLVM_PATH": str(found[-1])} if found else {}
 
 
 def _seconds(stderr: str) -> float:
@@ -170,13 +182,10 @@ def against_pictures(folder: Path, samples: int, every: int) -> list[dict]:
     vertices that no test view sees those of the nearest that are seen. Pixels are shaded with their
     own truth; at silhouettes by their coverage.
     """
-    import trimesh
     from scipy.spatial import cKDTree
 
     photos = load_photos(folder, "test")
-    loaded = trimesh.load(folder / "mesh.ply", process=False)
-    vertices = torch.tensor(np.asarray(loaded.vertices), dtype=torch.float32)
-    faces = torch.tensor(np.asarray(loaded.faces), dtype=torch.int32)
+    vertices, faces, normals = true_mesh(folder)
     scene = VisibilityScene(vertices, faces)
     truths = []
     for view, name in enumerate(photos.names):
@@ -202,14 +211,13 @@ def against_pictures(folder: Path, samples: int, every: int) -> list[dict]:
     )
     _, nearest = cKDTree(seen.numpy()).query(vertices.numpy(), k=4)
     material = known[torch.from_numpy(nearest)].mean(1)
-    normals = torch.tensor(np.asarray(loaded.vertex_normals).copy(), dtype=torch.float32)
     mesh = Mesh(vertices, faces, normals, material[:, :3].contiguous(), material[:, 3].contiguous())
     rows = []
     for path in sorted((folder / "envmaps").glob("*.hdr")):
         if not (folder / "relight" / path.stem).is_dir():
             continue
         light = tables(EnvMap(read_image(path)))
-        for bounces in (0, 1, 3):
+        for bounces in (0, 1, 2, 4):
             scores = []
             for view in range(0, len(photos), every):
                 met, position, wo, flat = truths[view]
@@ -244,16 +252,23 @@ def draw(path: Path) -> None:
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
 
-    rows = json.loads(path.read_text())["strategies"]
+    result = json.loads(path.read_text())
+    rows, theirs = result["strategies"], result.get("mitsuba")
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
-    for name in ("mis", "map", "brdf"):
+    names = {"mis": "both (MIS)", "map": "map alone", "brdf": "BRDF alone"}
+    for name, label in names.items():
         own = [r for r in rows if r["strategy"] == name]
         for axis, key in zip(axes, ("spp", "seconds"), strict=True):
-            axis.loglog([r[key] for r in own], [r["error"] for r in own], "o-", label=name)
+            axis.loglog([r[key] for r in own], [r["error"] for r in own], "o-", label=label)
+    if theirs:
+        for key, label in (("same_brdf", "Mitsuba"), ("principled", "Mitsuba, principled")):
+            for axis, x in zip(axes, ("spp", "seconds"), strict=True):
+                own = theirs[key]
+                axis.loglog([r[x] for r in own], [r["error"] for r in own], "s--", label=label)
     axes[0].set_xlabel("samples per pixel")
     axes[0].set_ylabel("RMS error over mean radiance")
-    axes[1].set_xlabel("seconds")
-    axes[1].legend()
+    axes[1].set_xlabel(f"seconds, {result['pixels']} pixels")
+    axes[0].legend()
     figure.tight_layout()
     figure.savefig(path.with_suffix(".png"), dpi=130)
 
@@ -262,21 +277,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--data", type=Path)
-    parser.add_argument("--size", type=int, default=96, help="pixels along the sphere's picture")
+    parser.add_argument("--size", type=int, default=128, help="pixels along the view")
     parser.add_argument("--samples", type=int, default=256, help="per pixel of the pictures")
     parser.add_argument("--every", type=int, default=1, help="take every n-th test view")
+    parser.add_argument("--only", default="rays,strategies,mitsuba,pictures")
     arguments = parser.parse_args()
-    scene = sphere_scene(arguments.size)
-    result = {
+    wanted = arguments.only.split(",")
+    data, size = arguments.data, arguments.size
+    result = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {}
+    scene = mesh_scene(data, size) if data else sphere_scene(size)
+    result |= {
         "threads": torch.get_num_threads(),
         "load": os.getloadavg()[0],
-        "pixels": len(scene["ours"][3]),
-        "strategies": strategies(scene),
-        "mitsuba": against_mitsuba(scene),
+        "scene": data.name if data else "sphere over a plane",
+        "triangles": len(scene.ours[1].faces),
+        "pixels": len(scene.ours[3]),
     }
-    print(result["mitsuba"], flush=True)
-    if arguments.data:
-        result["pictures"] = against_pictures(arguments.data, arguments.samples, arguments.every)
+    if "rays" in wanted:
+        result["rays"] = ray_rates(scene)
+        print(result["rays"], flush=True)
+    if "strategies" in wanted:
+        result["strategies"] = strategies(scene)
+    if "mitsuba" in wanted:
+        result["mitsuba"] = against_mitsuba(scene, result["strategies"])
+    if data and "pictures" in wanted:
+        result["pictures"] = against_pictures(data, arguments.samples, arguments.every)
     arguments.out.write_text(json.dumps(result, indent=1) + "\n")
     draw(arguments.out)
 

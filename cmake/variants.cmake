@@ -11,6 +11,11 @@ set(UNIVOXEL_FLAGS_avx512 -march=x86-64-v4 -mprefer-vector-width=512)
 
 function(add_core_variants)
     cmake_parse_arguments(ARG "" "" "BINDINGS;KERNELS" ${ARGN})
+    # The compiler takes gathers to be slow unless told of a processor where they are not.
+    if(CMAKE_SYSTEM_PROCESSOR MATCHES "x86_64|AMD64")
+        set_source_files_properties(csrc/integrator.cpp PROPERTIES
+            COMPILE_OPTIONS -mtune=icelake-server)
+    endif()
     add_library(univoxel_bindings OBJECT ${ARG_BINDINGS})
     target_include_directories(univoxel_bindings PRIVATE csrc)
     target_link_libraries(univoxel_bindings PRIVATE

@@ -5,108 +5,170 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <vector>
 
-#include "common.h"
+#include "angles.h"
 
 namespace univoxel {
 
 /// Buffers of a map; row-major, contiguous.
 struct EnvMapTables {
-    const float* radiance;    // [H, W, 3] linear
+    const float* texel;       // [H, W, 4] linear radiance, density per steradian of being drawn
     const float* row_cdf;     // [H + 1]     0 .. 1: which row
     const float* column_cdf;  // [H, W + 1]  0 .. 1: which column, given the row
     int64_t height, width;
     float rotation;  // radians, counter-clockwise about +Z
 };
 
-struct LightSample {
-    vec3<float> direction;
-    vec3<float> radiance;
-    float pdf;  // per steradian
+/// Columns of n draws.
+struct MapDraws {
+    float *u, *v;           // in: two numbers in [0, 1)
+    int32_t *row, *column;  // out: the texel
+    float *x, *z;           // out: across the map in texels, the height of the direction
+    int n;
 };
 
-struct LightDraw {
-    vec3<float> direction;
-    float pdf;  // per steradian
-    float x;    // across the map, in [0, 1)
+/// Where on the map a direction falls, in texels: inside it even if the direction is not finite.
+struct MapPlace {
+    float x, y;
 };
 
+/// Loops over many directions call these: all but `radiance` vectorise.
 class EnvMap {
   public:
-    explicit EnvMap(const EnvMapTables& tables) : t_(tables), edge_(tables.height + 1) {
+    explicit EnvMap(const EnvMapTables& tables)
+        : t_(tables),
+          width_(static_cast<int32_t>(tables.width)),
+          height_(static_cast<int32_t>(tables.height)),
+          turn_(static_cast<float>(tables.rotation / (2 * kPi64))),
+          edge_(tables.height + 1) {
         for (int64_t r = 0; r <= t_.height; ++r)
             edge_[r] = static_cast<float>(std::cos(kPi64 * r / t_.height));
-        const float* end = t_.radiance + 3 * t_.height * t_.width;
-        black_ = std::none_of(t_.radiance, end, [](float value) { return value > 0; });
+        guide_.resize(kGuide);
+        for (int32_t k = 0, row = 0; k < kGuide; ++k) {
+            const float v = static_cast<float>(k) / kGuide;
+            while (row + 1 < height_ && t_.row_cdf[row + 1] <= v) ++row;
+            guide_[k] = row;
+        }
+        // A black map has the density of its solid angle, or 0, but never light.
+        const int64_t n = t_.height * t_.width;
+        for (int64_t i = 0; i < n && black_; ++i)
+            black_ = !(t_.texel[4 * i] > 0 || t_.texel[4 * i + 1] > 0 || t_.texel[4 * i + 2] > 0);
     }
 
     bool black() const { return black_; }
 
-    /// Draw a direction from two numbers in [0, 1): the texel by inverting both tables, then a
-    /// place uniform in solid angle within it. `radiance` of it is for the caller to ask: half of
-    /// all draws lie below the horizon.
-    LightDraw sample(float u, float v) const {
-        const int64_t r = find(t_.row_cdf, t_.height, v);
-        const int64_t c = find(t_.column_cdf + r * (t_.width + 1), t_.width, u);
-        const float z = edge_[r] + v * (edge_[r + 1] - edge_[r]);
-        const float x = (c + u) / t_.width;
-        const float phi = kPi32 * (1 - 2 * x) + t_.rotation;
-        const float radius = std::sqrt(std::max(0.f, 1 - z * z));
-        return {{radius * std::cos(phi), radius * std::sin(phi), z}, texel_pdf(r, c), x};
+    /// Draw places: the texel by inverting both tables, then uniform in solid angle within it.
+    void draw(const MapDraws& d) const {
+        find_rows(d);
+        const int32_t pitch = width_ + 1;
+        const auto column = [&](int i, int32_t j) { return t_.column_cdf[d.row[i] * pitch + j]; };
+        find(width_, column, d.u, d.column, d.n);
+#pragma GCC ivdep
+        for (int i = 0; i < d.n; ++i) {
+            d.x[i] = d.column[i] + d.u[i];
+            const float top = edge_[d.row[i]], bottom = edge_[d.row[i] + 1];
+            d.z[i] = top + d.v[i] * (bottom - top);
+        }
     }
 
-    vec3<float> radiance(const LightDraw& s) const {
-        return radiance(s.x, 0.5f - std::asin(s.direction.z) / kPi32);
+    float3 direction(float x, float z) const {
+        return on_circle(0.5f - x / width_ + turn_, std::sqrt(std::max(0.f, 1 - z * z)), z);
     }
 
-    /// Radiance from a unit direction, and the density with which `sample` draws it.
-    LightSample lookup(const vec3<float>& direction) const {
-        const float z = std::min(std::max(direction.z, -1.f), 1.f);
-        float x = 0.5f - (std::atan2(direction.y, direction.x) - t_.rotation) / (2 * kPi32);
-        x -= std::floor(x);
-        const float y = 0.5f - std::asin(z) / kPi32;
-        return {direction, radiance(x, y),
-                texel_pdf(std::min<int64_t>(y * t_.height, t_.height - 1),
-                          std::min<int64_t>(x * t_.width, t_.width - 1))};
+    /// How far down the map, in texels, a direction of height z falls.
+    float down(float z) const {
+        return 2 * height_ * turns_of(std::sqrt(std::max(0.f, 1 - z * z)), z);
+    }
+
+    MapPlace place(const float3& d) const {
+        float x = 0.5f - (turns_of(d.y, d.x) - turn_);
+        x = (x - std::floor(x)) * width_;
+        const float y = 2 * height_ * turns_of(std::sqrt(d.x * d.x + d.y * d.y), d.z);
+        return {std::min(std::max(0.f, x), float(width_)),
+                std::min(std::max(0.f, y), float(height_))};
+    }
+
+    float pdf(int32_t row, int32_t column) const {
+        return t_.texel[4 * (row * width_ + column) + 3];
+    }
+
+    float pdf(const MapPlace& at) const {
+        return pdf(static_cast<int32_t>(std::min(at.y, height_ - 1.f)),
+                   static_cast<int32_t>(std::min(at.x, width_ - 1.f)));
+    }
+
+    /// Radiance, bilinear between pixel centres, around the border in x, clamped at the poles.
+    float3 radiance(const MapPlace& at) const {
+        const float column = at.x - 0.5f;
+        const float row = std::min(std::max(at.y - 0.5f, 0.f), height_ - 1.f);
+        const float left = std::floor(column);
+        int32_t c0 = static_cast<int32_t>(left), r0 = static_cast<int32_t>(row);
+        c0 = c0 < 0 ? c0 + width_ : c0;
+        c0 = c0 >= width_ ? c0 - width_ : c0;
+        const int32_t c1 = c0 + 1 < width_ ? c0 + 1 : 0, r1 = r0 + 1 < height_ ? r0 + 1 : r0;
+        const float fc = column - left, fr = row - r0;
+        const float w00 = (1 - fr) * (1 - fc), w01 = (1 - fr) * fc, w10 = fr * (1 - fc),
+                    w11 = fr * fc;
+        const float4 sum = w00 * texel(r0 * width_ + c0) + w01 * texel(r0 * width_ + c1) +
+                           w10 * texel(r1 * width_ + c0) + w11 * texel(r1 * width_ + c1);
+        return {sum[0], sum[1], sum[2]};
     }
 
   private:
     static constexpr double kPi64 = 3.14159265358979323846;
-    static constexpr float kPi32 = static_cast<float>(kPi64);
+    static constexpr int kGuide = 4096;
+    using float4 = float __attribute__((vector_size(16)));
 
-    /// The interval of a table that holds u; leaves in u the place within it, in [0, 1). An empty
-    /// interval is never found.
-    static int64_t find(const float* cdf, int64_t n, float& u) {
-        const float* above = std::upper_bound(cdf, cdf + n + 1, u);
-        const int64_t i = std::min<int64_t>(std::max<int64_t>(above - cdf - 1, 0), n - 1);
-        u = std::min((u - cdf[i]) / std::max(cdf[i + 1] - cdf[i], 1e-30f), 1 - 0x1p-24f);
-        return i;
+    /// Texel i of the radiance and its density.
+    float4 texel(int32_t i) const {
+        float4 out;
+        std::memcpy(&out, t_.texel + 4 * i, sizeof out);
+        return out;
     }
 
-    float texel_pdf(int64_t r, int64_t c) const {
-        const float* column = t_.column_cdf + r * (t_.width + 1) + c;
-        const float share = (t_.row_cdf[r + 1] - t_.row_cdf[r]) * (column[1] - column[0]);
-        return share * t_.width / (2 * kPi32 * (edge_[r] - edge_[r + 1]));
+    /// Rows are found from where `guide_` says; few have a step or more to go.
+    void find_rows(const MapDraws& d) const {
+        const float* cdf = t_.row_cdf;
+#pragma GCC ivdep
+        for (int i = 0; i < d.n; ++i) d.row[i] = guide_[static_cast<int32_t>(d.v[i] * kGuide)];
+        for (int i = 0; i < d.n; ++i)
+            while (cdf[d.row[i] + 1] <= d.v[i]) ++d.row[i];
+#pragma GCC ivdep
+        for (int i = 0; i < d.n; ++i) {
+            const float low = cdf[d.row[i]], width = cdf[d.row[i] + 1] - low;
+            d.v[i] = std::min((d.v[i] - low) / std::max(width, 1e-30f), 1 - 0x1p-24f);
+        }
     }
 
-    /// Bilinear between pixel centres, around the border in x, clamped at the poles; x, y in [0,
-    /// 1].
-    vec3<float> radiance(float x, float y) const {
-        const int64_t W = t_.width, H = t_.height;
-        const float column = x * W - 0.5f, row = std::min(std::max(y * H - 0.5f, 0.f), H - 1.f);
-        const float left = std::floor(column);
-        const int64_t c0 = (static_cast<int64_t>(left) + W) % W, c1 = (c0 + 1) % W;
-        const int64_t r0 = static_cast<int64_t>(row), r1 = std::min(r0 + 1, H - 1);
-        const float fc = column - left, fr = row - r0;
-        const auto at = [&](int64_t r, int64_t c) { return load3(t_.radiance, r * W + c); };
-        return (1 - fr) * ((1 - fc) * at(r0, c0) + fc * at(r0, c1)) +
-               fr * ((1 - fc) * at(r1, c0) + fc * at(r1, c1));
+    /// The intervals of tables `at` that hold u, of n; leaves in u the place within them, in [0,
+    /// 1). An empty interval is never found. All search in step: there is no branch to mispredict.
+    template <class F>
+    static void find(int32_t n, F&& at, float* u, int32_t* found, int count) {
+        std::fill(found, found + count, 0);
+        int32_t step = 1;
+        while (2 * step < n) step *= 2;
+        for (; step > 0; step /= 2) {
+#pragma GCC ivdep
+            for (int i = 0; i < count; ++i) {
+                const int32_t next = found[i] + step, j = next < n ? next : n - 1;
+                found[i] = at(i, j) <= u[i] ? j : found[i];
+            }
+        }
+#pragma GCC ivdep
+        for (int i = 0; i < count; ++i) {
+            const float low = at(i, found[i]), width = at(i, found[i] + 1) - low;
+            u[i] = std::min((u[i] - low) / std::max(width, 1e-30f), 1 - 0x1p-24f);
+        }
     }
 
     EnvMapTables t_;
-    std::vector<float> edge_;  // [H + 1] z of the rows' borders, from 1 to -1
-    bool black_;
+    int32_t width_, height_;
+    float turn_;                  // rotation in turns
+    std::vector<float> edge_;     // [H + 1] z of the rows' borders, from 1 to -1
+    std::vector<int32_t> guide_;  // [kGuide] the rows that hold 0, 1 / kGuide, 2 / kGuide, ...
+    bool black_ = true;
 };
 
 }  // namespace univoxel

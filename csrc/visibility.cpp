@@ -1,6 +1,8 @@
 #include "visibility.h"
 
+#include <algorithm>
 #include <cmath>
+#include <limits>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -19,6 +21,7 @@ namespace univoxel {
 namespace {
 
 constexpr int64_t kRaysPerChunk = 1024;
+[[maybe_unused]] const Hit kNothing{std::numeric_limits<float>::infinity(), 0, 0, -1, {0, 0, 0}};
 
 }  // namespace
 
@@ -48,6 +51,110 @@ bool usable(const vec3<float>& o, const vec3<float>& d) {
     return size < 1e18f;
 }
 
+// Embree's calls for packets, one name for all widths and versions.
+#if UNIVOXEL_EMBREE >= 4
+void trace(const int* valid, RTCScene scene, RTCRay8& rays) {
+    rtcOccluded8(valid, scene, &rays);
+}
+void trace(const int* valid, RTCScene scene, RTCRay16& rays) {
+    rtcOccluded16(valid, scene, &rays);
+}
+void trace(const int* valid, RTCScene scene, RTCRayHit8& rays) {
+    rtcIntersect8(valid, scene, &rays);
+}
+void trace(const int* valid, RTCScene scene, RTCRayHit16& rays) {
+    rtcIntersect16(valid, scene, &rays);
+}
+#else
+RTCIntersectContext make_context() {
+    RTCIntersectContext context;
+    rtcInitIntersectContext(&context);
+    return context;
+}
+void trace(const int* valid, RTCScene scene, RTCRay8& rays) {
+    RTCIntersectContext context = make_context();
+    rtcOccluded8(valid, scene, &context, &rays);
+}
+void trace(const int* valid, RTCScene scene, RTCRay16& rays) {
+    RTCIntersectContext context = make_context();
+    rtcOccluded16(valid, scene, &context, &rays);
+}
+void trace(const int* valid, RTCScene scene, RTCRayHit8& rays) {
+    RTCIntersectContext context = make_context();
+    rtcIntersect8(valid, scene, &context, &rays);
+}
+void trace(const int* valid, RTCScene scene, RTCRayHit16& rays) {
+    RTCIntersectContext context = make_context();
+    rtcIntersect16(valid, scene, &context, &rays);
+}
+#endif
+
+template <int W>
+struct PacketOf;
+template <>
+struct PacketOf<8> {
+    using Ray = RTCRay8;
+    using RayHit = RTCRayHit8;
+};
+template <>
+struct PacketOf<16> {
+    using Ray = RTCRay16;
+    using RayHit = RTCRayHit16;
+};
+
+/// Copy rays first .. first + W of a stream; the last ones again beyond its end, marked invalid.
+template <int W, class Ray>
+void load(const RayStream& rays, int first, Ray& packet, int* valid) {
+    for (int k = 0; k < W; ++k) {
+        const int i = std::min(first + k, rays.n - 1);
+        const vec3<float> o(rays.ox[i], rays.oy[i], rays.oz[i]);
+        const vec3<float> d(rays.dx[i], rays.dy[i], rays.dz[i]);
+        valid[k] = first + k < rays.n && usable(o, d) ? -1 : 0;
+        packet.org_x[k] = o.x, packet.org_y[k] = o.y, packet.org_z[k] = o.z;
+        packet.dir_x[k] = d.x, packet.dir_y[k] = d.y, packet.dir_z[k] = d.z;
+        packet.tnear[k] = rays.t_min, packet.time[k] = 0;
+        packet.tfar[k] = std::numeric_limits<float>::infinity();
+        packet.mask[k] = ~0u, packet.id[k] = 0, packet.flags[k] = 0;
+    }
+}
+
+template <int W>
+void occluded_in_packets(RTCScene scene, const RayStream& rays, const float* distance,
+                         uint8_t* out) {
+    alignas(64) int valid[W];
+    typename PacketOf<W>::Ray packet;
+    for (int first = 0; first < rays.n; first += W) {
+        load<W>(rays, first, packet, valid);
+        for (int k = 0; k < std::min(W, rays.n - first); ++k) packet.tfar[k] = distance[first + k];
+        trace(valid, scene, packet);
+        for (int k = 0; k < std::min(W, rays.n - first); ++k)
+            out[first + k] = valid[k] && packet.tfar[k] < 0;
+    }
+}
+
+template <int W>
+void closest_hit_in_packets(RTCScene scene, const RayStream& rays, Hit* out) {
+    alignas(64) int valid[W];
+    typename PacketOf<W>::RayHit packet;
+    for (int first = 0; first < rays.n; first += W) {
+        load<W>(rays, first, packet.ray, valid);
+        for (int k = 0; k < W; ++k) {
+            packet.hit.geomID[k] = RTC_INVALID_GEOMETRY_ID;
+            packet.hit.instID[0][k] = RTC_INVALID_GEOMETRY_ID;
+        }
+        trace(valid, scene, packet);
+        for (int k = 0; k < std::min(W, rays.n - first); ++k) {
+            const bool met = valid[k] && packet.hit.geomID[k] != RTC_INVALID_GEOMETRY_ID;
+            out[first + k] = met ? Hit{packet.ray.tfar[k],
+                                       packet.hit.u[k],
+                                       packet.hit.v[k],
+                                       static_cast<int64_t>(packet.hit.primID[k]),
+                                       {packet.hit.Ng_x[k], packet.hit.Ng_y[k], packet.hit.Ng_z[k]}}
+                                 : kNothing;
+        }
+    }
+}
+
 }  // namespace
 
 struct VisibilityScene::Impl {
@@ -55,6 +162,7 @@ struct VisibilityScene::Impl {
     std::vector<int32_t> faces;
     RTCDevice device = nullptr;
     RTCScene scene = nullptr;
+    int width = 1;  // rays that this processor traces in step
 
     ~Impl() {
         if (scene) rtcReleaseScene(scene);
@@ -81,6 +189,10 @@ VisibilityScene::VisibilityScene(const float* vertices, int64_t n_vertices, cons
     impl_->faces.resize(3 * n_faces + 4);
     impl_->device = rtcNewDevice(("threads=" + std::to_string(threads)).c_str());
     if (!impl_->device) fail(nullptr);
+    if (rtcGetDeviceProperty(impl_->device, RTC_DEVICE_PROPERTY_NATIVE_RAY8_SUPPORTED))
+        impl_->width = 8;
+    if (rtcGetDeviceProperty(impl_->device, RTC_DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED))
+        impl_->width = 16;
     impl_->scene = rtcNewScene(impl_->device);
     // Without it, 2 % of rays aimed at an edge slip through between its triangles.
     rtcSetSceneFlags(impl_->scene, RTC_SCENE_FLAG_ROBUST);
@@ -112,8 +224,7 @@ bool VisibilityScene::occluded(const vec3<float>& origin, const vec3<float>& dir
 
 Hit VisibilityScene::closest_hit(const vec3<float>& origin, const vec3<float>& direction,
                                  float t_min, float t_max) const {
-    const Hit none{std::numeric_limits<float>::infinity(), 0, 0, -1, {0, 0, 0}};
-    if (!usable(origin, direction)) return none;
+    if (!usable(origin, direction)) return kNothing;
     RTCRayHit query;
     query.ray = make_ray(origin, direction, t_min, t_max);
     query.hit.geomID = query.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
@@ -124,7 +235,7 @@ Hit VisibilityScene::closest_hit(const vec3<float>& origin, const vec3<float>& d
     rtcInitIntersectContext(&context);
     rtcIntersect1(impl_->scene, &context, &query);
 #endif
-    if (query.hit.geomID == RTC_INVALID_GEOMETRY_ID) return none;
+    if (query.hit.geomID == RTC_INVALID_GEOMETRY_ID) return kNothing;
     return {query.ray.tfar,
             query.hit.u,
             query.hit.v,
@@ -134,6 +245,22 @@ Hit VisibilityScene::closest_hit(const vec3<float>& origin, const vec3<float>& d
 
 const int32_t* VisibilityScene::faces() const {
     return impl_->faces.data();
+}
+
+void VisibilityScene::occluded(const RayStream& rays, const float* distance, uint8_t* out) const {
+    if (impl_->width == 16) return occluded_in_packets<16>(impl_->scene, rays, distance, out);
+    if (impl_->width == 8) return occluded_in_packets<8>(impl_->scene, rays, distance, out);
+    for (int i = 0; i < rays.n; ++i)
+        out[i] = occluded({rays.ox[i], rays.oy[i], rays.oz[i]},
+                          {rays.dx[i], rays.dy[i], rays.dz[i]}, rays.t_min, distance[i]);
+}
+
+void VisibilityScene::closest_hit(const RayStream& rays, Hit* out) const {
+    if (impl_->width == 16) return closest_hit_in_packets<16>(impl_->scene, rays, out);
+    if (impl_->width == 8) return closest_hit_in_packets<8>(impl_->scene, rays, out);
+    for (int i = 0; i < rays.n; ++i)
+        out[i] = closest_hit({rays.ox[i], rays.oy[i], rays.oz[i]},
+                             {rays.dx[i], rays.dy[i], rays.dz[i]}, rays.t_min);
 }
 
 #else  // without Embree every query is unreachable: there is no scene to ask
@@ -155,6 +282,10 @@ bool VisibilityScene::occluded(const vec3<float>&, const vec3<float>&, float, fl
 Hit VisibilityScene::closest_hit(const vec3<float>&, const vec3<float>&, float, float) const {
     return {};
 }
+
+void VisibilityScene::occluded(const RayStream&, const float*, uint8_t*) const {}
+
+void VisibilityScene::closest_hit(const RayStream&, Hit*) const {}
 
 const int32_t* VisibilityScene::faces() const {
     return nullptr;

@@ -17,6 +17,13 @@ struct Hit {
     vec3<float> normal;  // of the triangle by its winding, not unit
 };
 
+/// Rays as columns of n numbers.
+struct RayStream {
+    const float *ox, *oy, *oz, *dx, *dy, *dz;
+    float t_min;
+    int n;
+};
+
 /// Major version of the Embree behind this build, 0 where it was built without.
 int embree_version();
 
@@ -36,6 +43,12 @@ class VisibilityScene {
 
     Hit closest_hit(const vec3<float>& origin, const vec3<float>& direction, float t_min,
                     float t_max = std::numeric_limits<float>::infinity()) const;
+
+    /// The same for many rays at once, several in step: the nearer neighbours lie, the faster.
+    /// `distance` [n] holds t_max, out [n].
+    void occluded(const RayStream& rays, const float* distance, uint8_t* out) const;
+
+    void closest_hit(const RayStream& rays, Hit* out) const;
 
     const int32_t* faces() const;  // [F, 3]
 

@@ -70,14 +70,13 @@ mi.register_bsdf("layered", Layered)
 
 def load_mesh(name, vertices, faces, normals, albedo, roughness, layer):
     props = mi.Properties()
-    props["bsdf"] = mi.load_dict(
-        {
-            "type": "layered",
-            "albedo": mi.ScalarColor3f(albedo.tolist()),
-            "roughness": float(roughness),
-            "layer": mi.TensorXf(layer),
-        }
-    )
+    color = mi.ScalarColor3f(albedo.tolist())
+    if layer is None:
+        bsdf = {"type": "principled", "base_color": {"type": "rgb", "value": color}}
+        props["bsdf"] = mi.load_dict(bsdf | {"roughness": float(roughness), "specular": 0.5})
+    else:
+        bsdf = {"type": "layered", "albedo": color, "layer": mi.TensorXf(layer)}
+        props["bsdf"] = mi.load_dict(bsdf | {"roughness": float(roughness)})
     mesh = mi.Mesh(name, len(vertices), len(faces), props=props, has_vertex_normals=True)
     params = mi.traverse(mesh)
     params["vertex_positions"] = vertices.ravel()
@@ -100,8 +99,12 @@ def render(
     direction,
     bounces,
     samples,
+    principled=False,
 ):
-    """Radiance [N, 3] along rays. Vertices of part 0 come first, then those of part 1."""
+    """Radiance [N, 3] along rays. Vertices of part 0 come first, then those of part 1, if any.
+
+    With `principled` the materials are Mitsuba's own instead of ours.
+    """
     scene = {
         "type": "scene",
         "light": {
@@ -112,11 +115,10 @@ def render(
             ),
         },
     }
-    for k, name in enumerate(("sphere", "plane")):
+    for k, name in enumerate(("first", "second")[: len(albedo)]):
         own = faces[part[faces[:, 0]] == k] - np.argmax(part == k)
-        scene[name] = load_mesh(
-            name, vertices[part == k], own, normals[part == k], albedo[k], roughness[k], layer[k]
-        )
+        look = albedo[k], roughness[k], None if principled else layer[k]
+        scene[name] = load_mesh(name, vertices[part == k], own, normals[part == k], *look)
     scene = mi.load_dict(scene)
     integrator = mi.load_dict({"type": "path", "max_depth": int(bounces) + 2, "rr_depth": 100})
     each = int(samples) // PASSES

@@ -17,6 +17,7 @@ from torch import Tensor
 
 ALPHA_MIN = 1e-3  # smallest GGX alpha: below, a highlight is narrower than any quadrature
 COS_MIN = 1e-4  # cosines in denominators are held above this
+F0 = 0.04  # reflectance of dielectrics at normal incidence
 _HALF_EPSILON = 1e-7  # added to |wi + wo|^2, which is 0 where the light is opposite the eye
 
 # E with F0 = 0 and with F0 = 1 as polynomials of total degree 4 in cosine, roughness and
@@ -37,6 +38,24 @@ _ALBEDO_WHITE = [
     -6.60739, 9.15137, -7.20615, 7.20929, -7.59783, -0.86621, 0.162265,
 ]
 # fmt: on
+
+
+def split(base: Tensor, metallic: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Diffuse albedo [..., 3] and F0 [..., 3] of a base colour, as glTF defines them.
+
+        diffuse = base (1 - metallic),  F0 = 0.04 (1 - metallic) + base metallic
+
+    Args:
+        base: [..., 3] linear, in [0, 1].
+        metallic: [...] in [0, 1]; None is 0 everywhere, and gives the base and None, for 0.04.
+
+    Differentiable in: base, metallic.
+    Source: Khronos Group, glTF 2.0 Specification, appendix B.
+    """
+    if metallic is None:
+        return base, None
+    m = metallic[..., None]
+    return base * (1 - m), F0 * (1 - m) + base * m
 
 
 def ggx_alpha(roughness: Tensor) -> Tensor:
@@ -75,7 +94,7 @@ def specular(
     wo: Tensor,  # [..., 3]
     wi: Tensor,  # [..., 3]
     roughness: Tensor,  # [...] in [0, 1]
-    f0: Tensor | float = 0.04,
+    f0: Tensor | float = F0,
 ) -> Tensor:
     """The specular layer D F V, without the cosine: [...], >= 0; 0 for n.wi <= 0.
 
@@ -96,7 +115,7 @@ def specular(
     return torch.where(n_dot_l > 0, value, 0.0)
 
 
-def specular_albedo(n_dot_v: Tensor, roughness: Tensor, f0: Tensor | float = 0.04) -> Tensor:
+def specular_albedo(n_dot_v: Tensor, roughness: Tensor, f0: Tensor | float = F0) -> Tensor:
     """E, the share of light that the specular layer alone reflects, in [0, 1]: [...].
 
         E = integral over the half-sphere of D F V (n.wi) dwi
@@ -124,7 +143,7 @@ def evaluate(
     wi: Tensor,  # [..., 3]
     albedo: Tensor,  # [..., 3]
     roughness: Tensor,  # [...] in [0, 1]
-    f0: Tensor | float = 0.04,
+    f0: Tensor | float = F0,
 ) -> Tensor:
     """The whole BRDF, without the cosine: [..., 3]; 0 for n.wi <= 0.
 

@@ -90,10 +90,14 @@ def tables(envmap: EnvMap) -> EnvTables:
         share = solid
     # A row without light is never chosen; any table will do for it.
     share_in_row = torch.where(share.any(1, keepdim=True), share, 1.0)
+    row_cdf, column_cdf = _cdf(share.sum(1)), _cdf(share_in_row)
+    # What the tables in float32 do draw, which is what a sample has to be divided by.
+    drawn = row_cdf.diff()[:, None] * column_cdf.diff() / solid
+    radiance = envmap.exposure * envmap.radiance
     return EnvTables(
-        radiance=(envmap.exposure * envmap.radiance).contiguous(),
-        row_cdf=_cdf(share.sum(1)),
-        column_cdf=_cdf(share_in_row),
+        texel=torch.cat([radiance, drawn.float()[..., None]], -1).contiguous(),
+        row_cdf=row_cdf,
+        column_cdf=column_cdf,
         rotation=math.radians(envmap.rotation),
     )
 
@@ -119,7 +123,7 @@ def sample(tables: EnvTables, uniform: Tensor) -> tuple[Tensor, Tensor]:
     phi = math.pi - 2 * math.pi * (column + across) / width + tables.rotation
     radius = (1 - z * z).clamp_min(0).sqrt()
     direction = torch.stack([radius * phi.cos(), radius * phi.sin(), z], -1)
-    return direction, _texel_pdf(tables, row, column)
+    return direction, tables.texel[row, column, 3]
 
 
 def pdf(tables: EnvTables, direction: Tensor) -> Tensor:
@@ -129,7 +133,7 @@ def pdf(tables: EnvTables, direction: Tensor) -> Tensor:
     u, v = direction_to_latlong(rotate_z(direction, turn)).unbind(-1)
     row = (v * height).long().clamp_max(height - 1)
     column = (u * width).long().clamp_max(width - 1)
-    return _texel_pdf(tables, row, column)
+    return tables.texel[row, column, 3]
 
 
 def _cdf(share: Tensor) -> Tensor:
@@ -144,9 +148,3 @@ def _invert(cdf: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     i = i.clamp(0, cdf.shape[1] - 2)
     low, high = cdf.gather(1, i)[:, 0], cdf.gather(1, i + 1)[:, 0]
     return i[:, 0], ((u - low) / (high - low).clamp_min(1e-30)).clamp_max(1 - 2**-24)
-
-
-def _texel_pdf(tables: EnvTables, row: Tensor, column: Tensor) -> Tensor:
-    height, width, _ = tables.radiance.shape
-    share = tables.row_cdf.diff()[row] * tables.column_cdf.diff()[row, column]
-    return share / texel_solid_angles(height, width)[row, column]

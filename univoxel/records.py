@@ -43,10 +43,11 @@ class Surface:
     position: Tensor  # [N, 3] world
     normal: Tensor  # [N, 3] unit, world
     features: Tensor  # [N, C]
-    albedo: Tensor  # [N, 3] linear, in [0, 1]
+    albedo: Tensor  # [N, 3] linear, in [0, 1]; of a metal: its F0, see univoxel.brdf.split
     roughness: Tensor  # [N] perceptual, in [0, 1]; GGX alpha is its square
     opacity: Tensor  # [N] in [0, 1]; where it is 0 the rest means nothing
     depth: Tensor  # [N] distance along the ray, world units
+    metallic: Tensor | None = None  # [N] in [0, 1]; None: no metal anywhere
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class Mesh:
     normals: Tensor | None = None  # [P, 3] float32 unit
     albedo: Tensor | None = None  # [P, 3] float32 linear
     roughness: Tensor | None = None  # [P] float32
+    metallic: Tensor | None = None  # [P] float32 in [0, 1]; None: no metal anywhere
 
 
 @dataclass(frozen=True)

@@ -69,15 +69,15 @@ void bind_integrator(py::module_& m) {
         "relight",
         [](const VisibilityScene& scene, const optional_array& vertex_normal,
            const optional_array& vertex_albedo, const optional_array& vertex_roughness,
-           const optional_array& vertex_f0, const array<float>& radiance,
-           const array<float>& row_cdf, const array<float>& column_cdf, float rotation,
-           const array<float>& sun, const array<float>& lamp, const array<float>& position,
-           const array<float>& normal, const array<float>& wo, const array<float>& albedo,
-           const array<float>& roughness, const optional_array& f0, array<float>& rgb, float offset,
-           uint32_t first, int samples, int bounces, uint32_t seed, Strategy strategy,
-           int threads) {
-            const int64_t n = roughness.size(), h = radiance.shape(0), w = radiance.shape(1);
-            require(row_cdf.size() == h + 1 && column_cdf.size() == h * (w + 1),
+           const optional_array& vertex_f0, const array<float>& texel, const array<float>& row_cdf,
+           const array<float>& column_cdf, float rotation, const array<float>& sun,
+           const array<float>& lamp, const array<float>& position, const array<float>& normal,
+           const array<float>& wo, const array<float>& albedo, const array<float>& roughness,
+           const optional_array& f0, array<float>& rgb, float offset, uint32_t first, int samples,
+           int bounces, uint32_t seed, Strategy strategy, int threads) {
+            const int64_t n = roughness.size(), h = texel.shape(0), w = texel.shape(1);
+            require(texel.size() == 4 * h * w && row_cdf.size() == h + 1 &&
+                        column_cdf.size() == h * (w + 1),
                     "relight: the tables do not belong to this map");
             for (const array<float>* a :
                  {&position, &normal, &wo, &albedo, static_cast<const array<float>*>(&rgb)})
@@ -92,7 +92,7 @@ void bind_integrator(py::module_& m) {
                              data(vertex_albedo),
                              data(vertex_roughness),
                              data(vertex_f0),
-                             {radiance.data(), row_cdf.data(), column_cdf.data(), h, w, rotation},
+                             {texel.data(), row_cdf.data(), column_cdf.data(), h, w, rotation},
                              {sun.data(), lamp.data(), sun.size() / 7, lamp.size() / 6},
                              position.data(),
                              normal.data(),
@@ -113,7 +113,7 @@ void bind_integrator(py::module_& m) {
         },
         py::arg("scene"), py::arg("vertex_normal").noconvert(),
         py::arg("vertex_albedo").noconvert(), py::arg("vertex_roughness").noconvert(),
-        py::arg("vertex_f0").noconvert(), py::arg("radiance").noconvert(),
+        py::arg("vertex_f0").noconvert(), py::arg("texel").noconvert(),
         py::arg("row_cdf").noconvert(), py::arg("column_cdf").noconvert(), py::arg("rotation"),
         py::arg("sun").noconvert(), py::arg("lamp").noconvert(), py::arg("position").noconvert(),
         py::arg("normal").noconvert(), py::arg("wo").noconvert(), py::arg("albedo").noconvert(),

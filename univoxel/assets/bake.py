@@ -35,7 +35,7 @@ def nearest_surface(field: AbstractField, points: Tensor) -> tuple[Tensor, Field
 
 @torch.no_grad()
 def with_materials(scene: Scene, mesh: Mesh) -> Mesh:
-    """A mesh with the field's normal, albedo and roughness at its vertices, which stay in place."""
+    """A mesh with the field's normal and materials at its vertices, which stay in place."""
     parts = []
     for points in mesh.vertices.split(POINTS_AT_ONCE):
         _, at = nearest_surface(scene.field, points)
@@ -48,8 +48,8 @@ def with_materials(scene: Scene, mesh: Mesh) -> Mesh:
 def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
     """Textures of size x size texels for a mesh near the scene's surface.
 
-    Each texel's centre is a point of its triangle; the field at the surface beside it gives albedo,
-    roughness and normal. So relief that the triangles are too coarse for lies in the texture.
+    Each texel's centre is a point of its triangle; the field at the surface beside it gives normal
+    and materials. So relief that the triangles are too coarse for lies in the texture.
     Texels outside of the charts copy the nearest inside.
 
     Raises:
@@ -69,10 +69,10 @@ def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
             for values in (vertices, normals, tangents)
         )
         _, at = nearest_surface(scene.field, point)
-        parts.append((*scene.material(at.features), in_frame(at.gradient, n, t)))
+        parts.append((in_frame(at.gradient, n, t), *scene.material(at.features)))
     place = dilated(texel, size)
-    albedo, roughness, relief = (torch.cat(p)[place] for p in zip(*parts, strict=True))
-    return TexturedMesh(vertices, faces, normals, tangents, uv, albedo, roughness, relief)
+    textures = (torch.cat(p)[place] for p in zip(*parts, strict=True))
+    return TexturedMesh(vertices, faces, normals, tangents, uv, *textures)
 
 
 def in_frame(direction: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from univoxel.color import linear_to_srgb
@@ -27,9 +28,10 @@ class TexturedMesh:
     normals: Tensor  # [P, 3] float32 unit, of the triangles, smooth across them
     tangents: Tensor  # [P, 4] float32: unit, along +u; w is 1, or -1 where the chart is mirrored
     uv: Tensor  # [P, 2] float32 in [0, 1], u to the right and v upwards
-    albedo: Tensor  # [T, T, 3] float32 linear, in [0, 1]
-    roughness: Tensor  # [T, T] float32 perceptual, in [0, 1]
     relief: Tensor  # [T, T, 3] float32 unit, z > 0: the normal in the tangent frame
+    albedo: Tensor  # [T, T, 3] float32 linear, in [0, 1]; of a metal: its F0
+    roughness: Tensor  # [T, T] float32 perceptual, in [0, 1]
+    metallic: Tensor | None = None  # [T, T] float32 in [0, 1]; None: no metal anywhere
 
 
 def albedo_picture(mesh: TexturedMesh) -> np.ndarray:
@@ -40,6 +42,11 @@ def albedo_picture(mesh: TexturedMesh) -> np.ndarray:
 def roughness_picture(mesh: TexturedMesh) -> np.ndarray:
     """[T, T] uint8, linear."""
     return _bytes(mesh.roughness)
+
+
+def metallic_picture(mesh: TexturedMesh) -> np.ndarray:
+    """[T, T] uint8, linear; black where the mesh has no metal."""
+    return _bytes(torch.zeros_like(mesh.roughness) if mesh.metallic is None else mesh.metallic)
 
 
 def relief_picture(mesh: TexturedMesh) -> np.ndarray:

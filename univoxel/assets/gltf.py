@@ -11,7 +11,13 @@ import torch
 from PIL import Image
 
 from univoxel import __version__
-from univoxel.assets.base import TexturedMesh, albedo_picture, relief_picture, roughness_picture
+from univoxel.assets.base import (
+    TexturedMesh,
+    albedo_picture,
+    metallic_picture,
+    relief_picture,
+    roughness_picture,
+)
 from univoxel.data.images import replacing
 
 # glTF looks along -Z with +Y up, our world has +Z up: (x, y, z) -> (x, z, -y), a quarter turn.
@@ -22,7 +28,7 @@ def write_glb(path: Path, mesh: TexturedMesh) -> None:
     """Write a textured mesh as GLB, turned to +Y up, whole or not at all.
 
     One mesh with one metallic-roughness material: base colour (sRGB), roughness in green and
-    metallic 0 in blue (linear), and a normal map for the tangents that are written beside it.
+    metallic in blue (linear), and a normal map for the tangents that are written beside it.
 
     Raises:
         OSError: the file cannot be written; nothing is left behind.
@@ -31,7 +37,7 @@ def write_glb(path: Path, mesh: TexturedMesh) -> None:
     """
     roughness = roughness_picture(mesh)
     # Red holds ambient occlusion in files that have it: 255 is none.
-    packed = np.stack([np.full_like(roughness, 255), roughness, np.zeros_like(roughness)], 2)
+    packed = np.stack([np.full_like(roughness, 255), roughness, metallic_picture(mesh)], 2)
     tangents = torch.cat([mesh.tangents[:, :3] @ Y_UP.T, mesh.tangents[:, 3:]], 1)
     uv = torch.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], 1)  # glTF counts v downwards
     file = gltf.GLTF2(
@@ -45,7 +51,7 @@ def write_glb(path: Path, mesh: TexturedMesh) -> None:
                 pbrMetallicRoughness=gltf.PbrMetallicRoughness(
                     baseColorTexture=gltf.TextureInfo(index=0),
                     metallicRoughnessTexture=gltf.TextureInfo(index=1),
-                    metallicFactor=0.0,
+                    metallicFactor=0.0 if mesh.metallic is None else 1.0,
                     roughnessFactor=1.0,
                 ),
                 normalTexture=gltf.NormalMaterialTexture(index=2),

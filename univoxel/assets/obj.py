@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from univoxel.assets.base import TexturedMesh, albedo_picture, relief_picture, roughness_picture
+from univoxel.assets.base import (
+    TexturedMesh,
+    albedo_picture,
+    metallic_picture,
+    relief_picture,
+    roughness_picture,
+)
 from univoxel.data.images import replacing, write_png
 
 
 def write_obj(path: Path, mesh: TexturedMesh) -> None:
     """Write NAME.obj, NAME.mtl and NAME_{albedo,roughness,normal}.png, each whole or not at all.
 
-    Positions stay in the world's axes, +Z up. The .obj comes last: where it is, the others are.
-    Roughness and normal map stand in the widespread extension for physically based materials
-    (Pr, Pm, map_Pr, norm); OBJ has no tangents, programs compute their own.
+    A mesh with metal has a NAME_metallic.png besides. Positions stay in the world's axes, +Z up.
+    The .obj comes last: where it is, the others are. Roughness, metallic and normal map stand in
+    the widespread extension for physically based materials (Pr, Pm, map_Pr, map_Pm, norm); OBJ has
+    no tangents, programs compute their own.
 
     Raises:
         OSError: a file cannot be written.
@@ -22,17 +29,22 @@ def write_obj(path: Path, mesh: TexturedMesh) -> None:
     name = path.stem
     if name.split() != [name]:
         raise ValueError(f"{path}: readers of OBJ need a file name without spaces")
-    for kind, picture in (
-        ("albedo", albedo_picture(mesh)),
-        ("roughness", roughness_picture(mesh)),
-        ("normal", relief_picture(mesh)),
-    ):
+    pictures = {
+        "albedo": albedo_picture(mesh),
+        "roughness": roughness_picture(mesh),
+        "normal": relief_picture(mesh),
+    }
+    metal = "Pm 0"
+    if mesh.metallic is not None:
+        pictures["metallic"] = metallic_picture(mesh)
+        metal = f"Pm 1\nmap_Pm {name}_metallic.png"
+    for kind, picture in pictures.items():
         write_png(path.with_name(f"{name}_{kind}.png"), picture)
     material = f"""newmtl object
 Kd 1 1 1
 Ks 0 0 0
 Pr 1
-Pm 0
+{metal}
 Ni 1.5
 illum 2
 map_Kd {name}_albedo.png

@@ -15,8 +15,8 @@ from univoxel.records import Mesh
 def write_ply(path: Path, mesh: Mesh) -> None:
     """Write a mesh as binary little-endian PLY, whole or not at all.
 
-    Per vertex, as far as the mesh has them: x y z, nx ny nz and roughness (float), albedo as
-    red green blue (uchar, sRGB), which is where other programs look for colour.
+    Per vertex, as far as the mesh has them: x y z, nx ny nz, roughness and metallic (float), albedo
+    as red green blue (uchar, sRGB), which is where other programs look for colour.
 
     Raises:
         OSError: the file cannot be written; nothing is left behind.
@@ -35,6 +35,8 @@ def write_ply(path: Path, mesh: Mesh) -> None:
         add("red green blue", (linear_to_srgb(mesh.albedo) * 255).round(), "u1")
     if mesh.roughness is not None:
         add("roughness", mesh.roughness, "<f4")
+    if mesh.metallic is not None:
+        add("metallic", mesh.metallic, "<f4")
     vertex = np.empty(len(mesh.vertices), [(name, column.dtype) for name, column in columns])
     for name, column in columns:
         vertex[name] = column

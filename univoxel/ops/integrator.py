@@ -22,10 +22,15 @@ Strategy = Literal["mis", "map", "brdf"]
 class EnvTables:
     """An environment map as the integrator reads it; `univoxel.envmap.tables` makes them."""
 
-    radiance: Tensor  # [H, W, 3] float32 linear, >= 0
+    texel: Tensor  # [H, W, 4] float32: linear radiance, >= 0; density of being drawn, 1 / steradian
     row_cdf: Tensor  # [H + 1] float32 from 0 to 1: which row a sample falls in
     column_cdf: Tensor  # [H, W + 1] float32 from 0 to 1: which column, given the row
     rotation: float  # radians, counter-clockwise about +Z
+
+    @property
+    def radiance(self) -> Tensor:
+        """[H, W, 3]"""
+        return self.texel[..., :3]
 
 
 Triple = tuple[float, float, float]
@@ -146,7 +151,7 @@ def relight(
         wo=(wo, "N 3", torch.float32),
         albedo=(albedo, "N 3", torch.float32),
         roughness=(roughness, "N", torch.float32),
-        radiance=(tables.radiance, "H W 3", torch.float32),
+        texel=(tables.texel, "H W 4", torch.float32),
         row_cdf=(tables.row_cdf, "H+1", torch.float32),
         column_cdf=(tables.column_cdf, "H W+1", torch.float32),
     )
@@ -170,7 +175,7 @@ def relight(
     if traced is None:
         raise RuntimeError("relight: runs on the native backend only, got use_backend('reference')")
     rgb = torch.empty_like(position, memory_format=torch.contiguous_format)
-    light = (tables.radiance, tables.row_cdf, tables.column_cdf)
+    light = (tables.texel, tables.row_cdf, tables.column_cdf)
     points = (position, normal, wo, albedo, roughness)
     core = native.require()
     core.relight(

@@ -63,6 +63,7 @@ class Picture:
     depth: Tensor  # [H, W] along the camera's -Z, world units, 0 where nothing is
     alpha: Tensor  # [H, W] of the object
     shadow: Tensor | None  # [H, W] what the floor loses of its light, where there is a floor
+    metallic: Tensor | None  # [H, W] on black, where the scene has metal
     opaque: bool  # whether something stands behind
 
 
@@ -120,6 +121,7 @@ def render_picture(
         depth=grid(torch.where(there[:, 0], surface.depth * (wo @ backward), 0.0)),
         alpha=grid(surface.opacity),
         shadow=None if shadow is None else grid(shadow),
+        metallic=None if surface.metallic is None else grid(surface.metallic * surface.opacity),
         opaque=quality.background != "transparent",
     )
 
@@ -127,8 +129,9 @@ def render_picture(
 def channels(picture: Picture) -> dict[str, Tensor]:
     """The channels of a saved EXR file, [H, W] each: rgb.R, normal.X, depth and so on."""
     out = {"depth": picture.depth, "alpha": picture.alpha}
-    if picture.shadow is not None:
-        out["shadow"] = picture.shadow
+    for name in ("shadow", "metallic"):
+        if (layer := getattr(picture, name)) is not None:
+            out[name] = layer
     for name, value, letters in (
         ("rgb", picture.rgb, "RGB"),
         ("albedo", picture.albedo, "RGB"),

@@ -37,7 +37,7 @@ def surface_at(scene: Scene, rays: Rays, jitter: Tensor | None = None) -> Surfac
     opacity = total[:, -1]
     mean = total[:, :-1] / opacity.clamp_min(1e-4)[:, None]
     features, gradient, t = mean.split([scene.field.channels, 3, 1], 1)
-    albedo, roughness = scene.material(features)
+    albedo, roughness, *metallic = scene.material(features)
     return Surface(
         position=rays.origin + t * rays.direction,
         normal=torch.nn.functional.normalize(gradient, dim=1, eps=1e-6),
@@ -46,12 +46,13 @@ def surface_at(scene: Scene, rays: Rays, jitter: Tensor | None = None) -> Surfac
         roughness=roughness,
         opacity=opacity,
         depth=t[:, 0],
+        metallic=metallic[0] if metallic else None,
     )
 
 
 def at_rays(surface: Surface, index: Tensor) -> Surface:
-    """The surface at some of its rays."""
-    return Surface(**{name: value[index] for name, value in vars(surface).items()})
+    """The surface at some of its rays: numbers, or a mask."""
+    return Surface(**{name: None if x is None else x[index] for name, x in vars(surface).items()})
 
 
 def shade(
@@ -93,8 +94,9 @@ def surface_of_view(scene: Scene, cameras: Cameras, view: int) -> tuple[Surface,
             rays.origin.split(RAYS_AT_ONCE), rays.direction.split(RAYS_AT_ONCE), strict=True
         )
     ]
-    whole = Surface(**{name: torch.cat([vars(p)[name] for p in parts]) for name in vars(parts[0])})
-    return whole, -rays.direction
+    columns = {name: [vars(part)[name] for part in parts] for name in vars(parts[0])}
+    whole = {name: None if x[0] is None else torch.cat(x) for name, x in columns.items()}
+    return Surface(**whole), -rays.direction
 
 
 @torch.no_grad()
@@ -110,5 +112,4 @@ def extract_mesh(scene: Scene) -> Mesh:
         sample = scene.field.sample(points)
         normal = torch.nn.functional.normalize(sample.gradient, dim=1, eps=1e-6)
         parts.append((normal, *scene.material(sample.features)))
-    normals, albedo, roughness = (torch.cat(p) for p in zip(*parts, strict=True))
-    return Mesh(vertices, faces, normals, albedo, roughness)
+    return Mesh(vertices, faces, *(torch.cat(p) for p in zip(*parts, strict=True)))

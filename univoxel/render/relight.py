@@ -10,6 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from univoxel.brdf import split
 from univoxel.color import luminance
 from univoxel.ops import EnvTables, Lamp, Sun, VisibilityScene, relight
 from univoxel.records import Mesh, Rays, Surface
@@ -75,15 +76,20 @@ def relight_surface(
     """
     there = surface.opacity > 0
     rgb = surface.position.new_zeros(len(there), 3)
+    metallic = None if surface.metallic is None else surface.metallic[there]
+    diffuse, f0 = split(surface.albedo[there], metallic)
+    mesh, mesh_f0 = _layers(stage.mesh)
     rgb[there] = relight(
         stage.visibility,
-        stage.mesh,
+        mesh,
         lighting.tables,
         surface.position[there],
         surface.normal[there],
         wo[there],
-        surface.albedo[there],
+        diffuse,
         surface.roughness[there],
+        f0=f0,
+        mesh_f0=mesh_f0,
         offset=stage.offset,
         samples=samples,
         bounces=bounces,
@@ -194,6 +200,14 @@ def ground_shadow(
     return shadow
 
 
+def _layers(mesh: Mesh) -> tuple[Mesh, Tensor | None]:
+    """The mesh with the albedo of its diffuse base, and its F0 where there is metal."""
+    if mesh.albedo is None or mesh.metallic is None:
+        return mesh, None
+    diffuse, f0 = split(mesh.albedo, mesh.metallic)
+    return replace(mesh, albedo=diffuse), f0
+
+
 def _floor(
     points: Tensor,
     *,
@@ -207,10 +221,11 @@ def _floor(
     """Luminance [N] that points of a white floor send up, without the object and with it."""
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(points)
     nothing = VisibilityScene(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int32))
+    mesh, mesh_f0 = _layers(stage.mesh)
     alone, lit = (
         relight(
             visibility,
-            stage.mesh,
+            mesh,
             lighting.tables,
             points,
             up,
@@ -222,6 +237,7 @@ def _floor(
             suns=lighting.suns,
             lamps=lighting.lamps,
             f0=torch.zeros_like(points),
+            mesh_f0=mesh_f0,
             first=first,
             samples=samples,
             seed=seed,

@@ -12,12 +12,11 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from univoxel import metrics
 from univoxel.color import linear_to_srgb, luminance
-from univoxel.data import DataError
-from univoxel.data.images import read_image, write_exr, write_png
+from univoxel.data.images import write_exr, write_png
 from univoxel.envmap import EnvMap, lookup
 from univoxel.scene import load_scene
 from univoxel.sphere import fibonacci_sphere, latlong_directions, texel_solid_angles
-from univoxel.tasks.frames import trained_on
+from univoxel.tasks.frames import read_map, trained_on
 
 GREY = 0.5  # albedo of the ball
 TEXELS = 64  # rows of the map that light is summed over
@@ -104,20 +103,6 @@ def brightest(map: Tensor) -> Tensor:
     return place[(near @ luminance(light)).argmax()]
 
 
-def true_map(data: Path) -> Tensor | None:
-    """The light of the photographs, where the data set has it."""
-    for suffix in (".hdr", ".exr"):
-        path = data / "envmaps" / f"train{suffix}"
-        if path.is_file():
-            try:
-                return EnvMap(read_image(path)).radiance
-            except DataError:
-                raise
-            except ValueError as error:
-                raise DataError(f"{path}: {error}") from None
-    return None
-
-
 def _light(map: Tensor) -> tuple[Tensor, Tensor]:
     """Directions [M, 3] and radiance times solid angle [M, 3] of a map, pooled to few texels."""
     height, width, _ = map.shape
@@ -145,3 +130,12 @@ def _tiles(map: Tensor, height: int) -> list[Tensor]:
     grey = grey_ball(map, normal.flatten(0, 1)).view(height, height, 3)
     balls = [torch.where(inside[..., None], b, 0.0) for b in (grey, lookup(light, mirrored))]
     return [lookup(light, latlong_directions(height)), *balls]
+
+
+def true_map(data: Path) -> Tensor | None:
+    """The light of the photographs, where the data set has it."""
+    for suffix in (".hdr", ".exr"):
+        path = data / "envmaps" / f"train{suffix}"
+        if path.is_file():
+            return read_map(path).radiance
+    return None

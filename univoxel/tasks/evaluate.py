@@ -26,14 +26,14 @@ from univoxel.data import (
     relight_maps,
 )
 from univoxel.data.base import decode
-from univoxel.data.images import read_image, replacing, write_exr, write_png
-from univoxel.envmap import EnvMap, tables
+from univoxel.data.images import replacing, write_exr, write_png
+from univoxel.envmap import tables
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, stage
 from univoxel.scene import FILE, Scene, load_checkpoint
 from univoxel.tasks.contact_sheet import Panel, contact_sheet, shrink
-from univoxel.tasks.frames import trained_on
+from univoxel.tasks.frames import read_map, trained_on
 from univoxel.tasks.layers import Layers, Relighting, exr_channels, render_layers
 
 # key: what the table says of it
@@ -125,7 +125,7 @@ def evaluate(
     photos = load_photos(folder, "test")
     relit = _relit_photos(photos)
     points = load_points(folder)
-    maps = {name: _read_map(path) for name, path in relight_maps(folder).items()}
+    maps = {name: read_map(path) for name, path in relight_maps(folder).items()}
     scene, report = load_checkpoint(run)
     for place in (save, json and json.parent):
         if place:
@@ -209,15 +209,6 @@ def _relit_photos(photos: Photos) -> dict[str, tuple[Tensor, Tensor]]:
         _check_size(photos, alpha[0], f"pictures in relight/{name}")
         relit[name] = color, alpha
     return relit
-
-
-def _read_map(path: Path) -> EnvMap:
-    try:
-        return EnvMap(read_image(path))
-    except DataError:
-        raise
-    except ValueError as error:
-        raise DataError(f"{path}: {error}") from None
 
 
 def _truth(photos: Photos, view: int) -> Truth:

@@ -12,6 +12,8 @@ import torch
 
 from univoxel.camera import Cameras
 from univoxel.data import DataError, load_cameras, load_photos
+from univoxel.data.images import read_image
+from univoxel.envmap import EnvMap
 from univoxel.records import Mesh
 
 ORBIT_FRAMES = 60
@@ -104,6 +106,22 @@ def resize(cameras: Cameras, width: int) -> Cameras:
     return Cameras(
         cameras.camera_to_world, cameras.focal * scale, cameras.centre * scale, width, height
     )
+
+
+def read_map(path: Path) -> EnvMap:
+    """A file as an environment map.
+
+    Raises:
+        DataError: it cannot be used as one; the message names it.
+        OSError: it cannot be read.
+    """
+    radiance = read_image(path)
+    if radiance.dim() == 3 and radiance.shape[2] == 4:
+        radiance = radiance[..., :3]  # some writers add an alpha that says nothing
+    try:
+        return EnvMap(radiance.contiguous())
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from None
 
 
 def trained_on(run: Path) -> Path:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from univoxel.camera import Cameras
 from univoxel.records import Surface
-from univoxel.render.pipeline import shade, surface_of_view
+from univoxel.render.pipeline import at_rays, shade, surface_of_view
 from univoxel.render.relight import Lighting, Stage, relight_surface
 from univoxel.scene import Scene
 
@@ -44,8 +44,7 @@ def render_layers(
     """Render one view. Nothing is shaded where the opacity is 0."""
     whole, wo = surface_of_view(scene, cameras, view)
     there = whole.opacity > 0
-    surface = Surface(**{name: value[there] for name, value in vars(whole).items()})
-    wo = wo[there]
+    surface, wo = at_rays(whole, there), wo[there]
 
     def picture(values: Tensor) -> Tensor:
         out = values.new_zeros(len(there), *values.shape[1:])

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from univoxel import envmap as env
 from univoxel.camera import Cameras
-from univoxel.data import DataError
-from univoxel.data.images import read_image, write_exr, write_png
+from univoxel.data.images import write_exr, write_png
 from univoxel.ops import Lamp, Sun
 from univoxel.records import Surface
 from univoxel.render.frame import (
@@ -31,7 +30,7 @@ from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, Stage, stage, turned
 from univoxel.scene import Scene, load_scene
 from univoxel.tasks.animation import require, write_animation
-from univoxel.tasks.frames import ELEVATION, Frame, frames_of, views_of
+from univoxel.tasks.frames import ELEVATION, Frame, frames_of, read_map, views_of
 
 NO_MAP = "lights"  # name of light without a map
 Ground = float | Literal["lowest"] | None
@@ -188,7 +187,7 @@ def lighting(
     if envmap is None:
         envmap = env.EnvMap(torch.zeros(1, 2, 3))
     elif not isinstance(envmap, env.EnvMap):
-        envmap = _read_map(Path(envmap))
+        envmap = read_map(Path(envmap))
     times = lambda power: tuple(exposure * x for x in power)  # noqa: E731
     lights = Lighting(
         env.tables(replace(envmap, exposure=exposure * envmap.exposure)),
@@ -257,13 +256,3 @@ def _pictures(
 def _pair(stem: Path) -> tuple[Path, Path]:
     """The PNG and the EXR file of a frame; names may hold dots."""
     return stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}.exr")
-
-
-def _read_map(path: Path) -> env.EnvMap:
-    radiance = read_image(path)
-    if radiance.dim() == 3 and radiance.shape[2] == 4:
-        radiance = radiance[..., :3]  # some writers add an alpha that says nothing
-    try:
-        return env.EnvMap(radiance.contiguous())
-    except ValueError as error:
-        raise DataError(f"{path}: {error}") from None
