@@ -107,15 +107,18 @@ def draw(path: Path) -> None:
     import matplotlib.pyplot as plt
 
     rows = json.loads(path.read_text())["shade_sg"]
-    figure, axis = plt.subplots(figsize=(6, 4))
+    figure, axis = plt.subplots(figsize=(7, 5))
     for dtype, mark in (("float32", "o-"), ("float64", "s--")):
         own = [r for r in rows if r["dtype"] == dtype]
         ms = [r["ms"] for r in own]
-        axis.loglog(ms, [r["error"] for r in own], mark, label=f"{dtype}, radiance")
-        worst = [max(r["grad_error"].values()) for r in own]
-        axis.loglog(ms, worst, mark, alpha=0.5, label=f"{dtype}, worst gradient")
-        axis.loglog(ms, [r["rounding"] for r in own], ":", label=f"{dtype}, rounding alone")
-        for r in own if dtype == "float32" else []:
+        axis.loglog(ms, [r["error"] for r in own], mark, color="black", label=f"radiance, {dtype}")
+        if dtype == "float64":
+            continue
+        for name in NAMES:
+            errors = [r["grad_error"][name] for r in own]
+            axis.loglog(ms, errors, ".-", alpha=0.6, label=f"gradient to {name}")
+        axis.loglog(ms, [r["rounding"] for r in own], "k:", label="rounding alone, worst")
+        for r in own:
             axis.annotate(str(r["directions"]), (r["ms"], r["error"]), fontsize=8)
     axis.set_xlabel(f"ms, forward + backward, {POINTS} points x {LOBES} lobes")
     axis.set_ylabel(f"relative L2 error; truth: {TRUTH} directions in float64")

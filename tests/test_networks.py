@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from univoxel.networks import MLP
+from univoxel.networks import FEWEST_ROWS, MLP
 from univoxel.ops import use_backend
 
 
@@ -20,9 +20,10 @@ def test_one_layer_is_linear():
     torch.testing.assert_close(net(x), net.linear[0](x))
 
 
+@pytest.mark.parametrize("rows", [0, 50, FEWEST_ROWS])
 @pytest.mark.parametrize("backend", ["auto", "reference"])
-def test_equals_its_layers_one_by_one(backend):
-    net, x = MLP([6, 9, 9, 4]), torch.randn(50, 6)
+def test_equals_its_layers_one_by_one(backend, rows):
+    net, x = MLP([6, 9, 9, 4]), torch.randn(rows, 6)
     wanted = x
     for layer in net:
         wanted = layer(wanted)

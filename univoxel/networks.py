@@ -10,9 +10,11 @@ from torch import Tensor, nn
 
 from univoxel import ops
 
+FEWEST_ROWS = 2048  # for the fused op: with fewer, torch's layers one by one are done sooner
+
 
 class MLP(nn.Sequential):
-    """Linear layers with ReLU between them; evaluated as one op.
+    """Linear layers with ReLU between them; many rows are evaluated as one op.
 
     Args:
         sizes: numbers of inputs, of each hidden layer's units, of outputs; each at least 1.
@@ -38,5 +40,7 @@ class MLP(nn.Sequential):
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, sizes[0]] -> [N, sizes[-1]]."""
+        if len(x) < FEWEST_ROWS:
+            return super().forward(x)
         linear = self.linear
         return ops.mlp(x, [layer.weight for layer in linear], [layer.bias for layer in linear])
