@@ -24,7 +24,7 @@ LAYERS = [
     {"cli"},
 ]
 HELPERS = {
-    "ops": {"checks", "native", "visibility"},
+    "ops": {"checks", "native", "reflectance", "visibility"},
     "fields": {"base", "hull"},
     "lights": {"base", "quadrature"},
     "data": {"base", "images", "radiance"},
