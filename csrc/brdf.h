@@ -4,6 +4,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <glm/vec2.hpp>
+
+#include "common.h"
 
 namespace univoxel {
 
@@ -45,11 +48,17 @@ inline T smith_v(T n_dot_v, T n_dot_l, T a2) {
     return T(0.5) / (n_dot_l * smith_root(n_dot_v, a2) + n_dot_v * smith_root(n_dot_l, a2));
 }
 
+/// (1 - v.h)^5, the share of 1 in Schlick's mean of 1 and F0.
+template <class T>
+inline T schlick_weight(T v_dot_h) {
+    const T m = 1 - v_dot_h, m2 = m * m;
+    return m2 * m2 * m;
+}
+
 /// Fresnel reflectance (Schlick 1994, eq. 15).
 template <class T>
 inline T schlick_f(T v_dot_h, T f0) {
-    const T m = 1 - v_dot_h, m2 = m * m;
-    return f0 + (1 - f0) * (m2 * m2 * m);
+    return f0 + (1 - f0) * schlick_weight(v_dot_h);
 }
 
 /// E, the albedo of the specular layer alone, and its derivatives.
@@ -75,9 +84,9 @@ constexpr double kAlbedoWhite[35] = {
     23.344,   -6.60739, 9.15137,  -7.20615,   7.20929,   -7.59783,  -0.86621, 0.162265,
 };
 
-/// Within 0.005 of quadrature for n.v in [0.02, 1], roughness in [0.05, 1] and any F0.
-template <class T>
-inline SpecularAlbedo<T> specular_albedo(T n_dot_v, T roughness, T f0) {
+/// A polynomial with such exponents, of numbers or of pairs of them, and its derivatives.
+template <class V, class T, class Coefficient>
+inline SpecularAlbedo<V> albedo_polynomial(T n_dot_v, T roughness, Coefficient&& coefficient) {
     const T v = std::max(n_dot_v, T(kCosMin)), alpha = ggx_alpha(roughness);
     const T inv = 1 / (v + alpha), u = v * inv;
     T pv[5] = {1}, pr[5] = {1}, pu[5] = {1};
@@ -86,12 +95,11 @@ inline SpecularAlbedo<T> specular_albedo(T n_dot_v, T roughness, T f0) {
         pr[i] = pr[i - 1] * roughness;
         pu[i] = pu[i - 1] * u;
     }
-    T value = 0, dv = 0, dr = 0, du = 0;
+    V value(0), dv(0), dr(0), du(0);
     for (int i = 0, term = 0; i < 5; ++i) {
         for (int j = 0; i + j < 5; ++j) {
             for (int k = 0; i + j + k < 5; ++k, ++term) {
-                const T c =
-                    T(kAlbedoBlack[term]) + f0 * (T(kAlbedoWhite[term]) - T(kAlbedoBlack[term]));
+                const V c = coefficient(term);
                 value += c * pv[i] * pr[j] * pu[k];
                 if (i > 0) dv += c * T(i) * pv[i - 1] * pr[j] * pu[k];
                 if (j > 0) dr += c * T(j) * pv[i] * pr[j - 1] * pu[k];
@@ -99,13 +107,46 @@ inline SpecularAlbedo<T> specular_albedo(T n_dot_v, T roughness, T f0) {
             }
         }
     }
-    if (value < 0 || value > 1) return {std::min(std::max(value, T(0)), T(1)), 0, 0};
     if (n_dot_v >= T(kCosMin))
         dv += du * alpha * inv * inv;
     else
-        dv = 0;
-    if (roughness * roughness >= T(kAlphaMin)) dr -= du * v * inv * inv * 2 * roughness;
+        dv = V(0);
+    if (roughness * roughness >= T(kAlphaMin)) dr -= du * v * inv * inv * T(2) * roughness;
     return {value, dv, dr};
+}
+
+/// Within 0.005 of quadrature for n.v in [0.02, 1], roughness in [0.05, 1] and any F0.
+template <class T>
+inline SpecularAlbedo<T> specular_albedo(T n_dot_v, T roughness, T f0) {
+    const auto e = albedo_polynomial<T>(n_dot_v, roughness, [f0](int term) {
+        return T(kAlbedoBlack[term]) + f0 * (T(kAlbedoWhite[term]) - T(kAlbedoBlack[term]));
+    });
+    if (e.value < 0 || e.value > 1) return {std::min(std::max(e.value, T(0)), T(1)), 0, 0};
+    return e;
+}
+
+/// E of an F0 per channel, and its derivatives.
+template <class T>
+struct ColouredAlbedo {
+    vec3<T> value, d_cosine, d_roughness;
+    vec3<T> d_f0;  // dE_c / d F0_c
+};
+
+template <class T>
+inline ColouredAlbedo<T> specular_albedo(T n_dot_v, T roughness, const vec3<T>& f0) {
+    using Pair = glm::vec<2, T, glm::defaultp>;
+    const auto e = albedo_polynomial<Pair>(n_dot_v, roughness, [](int term) {
+        return Pair(T(kAlbedoBlack[term]), T(kAlbedoWhite[term]) - T(kAlbedoBlack[term]));
+    });
+    const vec3<T> value = e.value.x + f0 * e.value.y;
+    ColouredAlbedo<T> out{value, e.d_cosine.x + f0 * e.d_cosine.y,
+                          e.d_roughness.x + f0 * e.d_roughness.y, vec3<T>(e.value.y)};
+    for (int c = 0; c < 3; ++c) {
+        if (!(value[c] < 0 || value[c] > 1)) continue;
+        out.value[c] = std::min(std::max(value[c], T(0)), T(1));
+        out.d_cosine[c] = out.d_roughness[c] = out.d_f0[c] = 0;
+    }
+    return out;
 }
 
 }  // namespace univoxel

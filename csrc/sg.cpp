@@ -90,17 +90,17 @@ Directions<T> canonical(const ShadeSG<T>& in) {
 
 /// One point in the frame of the directions: the frame of its normal, turned by -rotation. There
 /// the directions are constants and the normal is +Z.
-template <class T>
+template <class T, class F0>
 struct Point {
     Frame<T> frame;
     T cos_r, sin_r;
-    LocalBrdf<T> brdf;
+    LocalBrdf<T, F0> brdf;
 
-    Point(const ShadeSG<T>& in, int64_t i)
+    Point(const ShadeSG<T>& in, int64_t i, const F0& f0)
         : frame(load3(in.normal, i)),
           cos_r(std::cos(in.rotation[i])),
           sin_r(std::sin(in.rotation[i])),
-          brdf(local(load3(in.wo, i)), load3(in.albedo, i), in.roughness[i], in.f0) {}
+          brdf(local(load3(in.wo, i)), load3(in.albedo, i), in.roughness[i], f0) {}
 
     vec3<T> local(const vec3<T>& w) const {
         const T t = glm::dot(frame.tangent, w), b = glm::dot(frame.bitangent, w);
@@ -117,10 +117,10 @@ struct Point {
     }
 };
 
-/// Integrals of one lobe of unit amplitude over the directions.
+/// Integrals of one lobe of unit amplitude over the directions, or gradients to them.
 template <class T>
 struct LobeSums {
-    T diffuse, layer;  // against max(n.w, 0) and the specular layer
+    T cosine, layer, gain;  // against max(n.w, 0) and the specular layer; gain is 0 unless coloured
 };
 
 /// A lobe's exponent over log2 e as a plane: x . w + offset.
@@ -135,45 +135,57 @@ struct Exponent {
     T operator()(T wx, T wy, T wz) const { return z * wz + (y * wy + (x * wx + offset)); }
 };
 
-template <class T>
+template <bool kGain, class T>
 LobeSums<T> lobe_forward(const Directions<T>& dir, const Exponent<T>& exponent, Clamp<T> clamp) {
     const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *layer = dir.layer;
+    [[maybe_unused]] const T* gain = dir.gain;
     const int64_t count = dir.count;
-    T diffuse = 0, specular = 0;
-#pragma omp simd reduction(+ : diffuse, specular)
+    T diffuse = 0, specular = 0, more = 0;
+#pragma omp simd reduction(+ : diffuse, specular, more)
     for (int64_t d = 0; d < count; ++d) {
         const T g = simd_exp2(exponent(x[d], y[d], z[d]), clamp);
         diffuse += g * cosine[d];
         specular += g * layer[d];
+        if constexpr (kGain) more += g * gain[d];
     }
-    return {diffuse, specular};
+    return {diffuse, specular, more};
 }
 
-/// The same; adds grad_layer_scale * lobe to the layer's gradient, and returns in `moment` the sum
-/// of grad_lobe * lobe * w with grad_lobe = grad_cosine_scale * cosine + grad_layer_scale * layer.
-/// Two loops, `lobe` between them: iterations of one would be too long to overlap.
-template <class T>
+/// The same; adds to the gradients of layer and gain theirs from the sums, and returns in `moment`
+/// the sum of grad_lobe * lobe * w. Two loops, `lobe` between them: iterations of one would be too
+/// long to overlap.
+template <bool kGain, class T>
 LobeSums<T> lobe_backward(Directions<T>& dir, const Exponent<T>& exponent, Clamp<T> clamp,
-                          T grad_cosine_scale, T grad_layer_scale, vec3<T>& moment) {
+                          const LobeSums<T>& grad, vec3<T>& moment) {
     const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *layer = dir.layer;
     T *grad_layer = dir.grad_layer, *lobe = dir.lobe;
+    [[maybe_unused]] const T* gain = dir.gain;
+    [[maybe_unused]] T* grad_gain = dir.grad_gain;
+    const T to_cosine = grad.cosine, to_layer = grad.layer;
+    [[maybe_unused]] const T to_gain = grad.gain;
     const int64_t count = dir.count;
 #pragma omp simd
     for (int64_t d = 0; d < count; ++d) lobe[d] = simd_exp2(exponent(x[d], y[d], z[d]), clamp);
-    T diffuse = 0, specular = 0, mx = 0, my = 0, mz = 0;
-#pragma omp simd reduction(+ : diffuse, specular, mx, my, mz)
+    T diffuse = 0, specular = 0, more = 0, mx = 0, my = 0, mz = 0;
+#pragma omp simd reduction(+ : diffuse, specular, more, mx, my, mz)
     for (int64_t d = 0; d < count; ++d) {
         const T g = lobe[d];
-        const T w = g * (grad_cosine_scale * cosine[d] + grad_layer_scale * layer[d]);
+        T w = to_cosine * cosine[d] + to_layer * layer[d];
+        if constexpr (kGain) w += to_gain * gain[d];
+        w *= g;
         diffuse += g * cosine[d];
         specular += g * layer[d];
         mx += w * x[d];
         my += w * y[d];
         mz += w * z[d];
-        grad_layer[d] += grad_layer_scale * g;
+        grad_layer[d] += to_layer * g;
+        if constexpr (kGain) {
+            more += g * gain[d];
+            grad_gain[d] += to_gain * g;
+        }
     }
     moment = {mx, my, mz};
-    return {diffuse, specular};
+    return {diffuse, specular, more};
 }
 
 }  // namespace
@@ -183,21 +195,77 @@ void shade_sg_forward(const ShadeSG<T>& in, T* rgb, int threads) {
     const int64_t K = in.n_lobes;
     const T weight = T(2 * kPi) / T(in.n_directions);
     const Clamp<T> clamp = clamp_of<T>();
-    parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Directions<T> dir = canonical(in);
-        for (int64_t i = begin; i < end; ++i) {
-            const Point<T> p(in, i);
-            specular_layer(p.brdf, in.f0, dir);
-            vec3<T> sum(0);
-            for (int64_t k = i * K; k < (i + 1) * K; ++k) {
-                const Exponent<T> exponent(p.local(load3(in.axis, k)), in.sharpness[k]);
-                const auto s = lobe_forward(dir, exponent, clamp);
-                sum += load3(in.amplitude, k) * (p.brdf.diffuse * s.diffuse + s.layer);
+    with_f0(in.f0, in.coloured, [&](auto f0_of) {
+        constexpr bool kGain = kColoured<decltype(f0_of(0))>;
+        parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
+            Directions<T> dir = canonical(in);
+            for (int64_t i = begin; i < end; ++i) {
+                const Point p(in, i, f0_of(i));
+                specular_layer(p.brdf, dir);
+                vec3<T> sum(0);
+                for (int64_t k = i * K; k < (i + 1) * K; ++k) {
+                    const Exponent<T> exponent(p.local(load3(in.axis, k)), in.sharpness[k]);
+                    const auto s = lobe_forward<kGain>(dir, exponent, clamp);
+                    const vec3<T> layer = p.brdf.colour_of(s.layer, s.gain);
+                    sum += load3(in.amplitude, k) * (p.brdf.diffuse * s.cosine + layer);
+                }
+                store3(rgb, i, weight * sum);
             }
-            store3(rgb, i, weight * sum);
-        }
+        });
     });
 }
+
+namespace {
+
+/// Write the gradients of point i.
+template <class T, class F0>
+void point_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGrad<T>& grad, int64_t i,
+                    const F0& f0, Clamp<T> clamp, Directions<T>& dir) {
+    constexpr bool kGain = kColoured<F0>;
+    const int64_t K = in.n_lobes;
+    const T weight = T(2 * kPi) / T(in.n_directions);
+    const Point p(in, i, f0);
+    const vec3<T> g = weight * load3(grad_rgb, i);
+    specular_layer(p.brdf, dir);
+    std::fill(dir.grad_layer, dir.grad_layer + dir.count, T(0));
+    if (kGain) std::fill(dir.grad_gain, dir.grad_gain + dir.count, T(0));
+    vec3<T> grad_diffuse(0), grad_f0(0), grad_t(0), grad_b(0), grad_n(0);
+    // Rows of the frame meet each local vector's gradient by an outer product.
+    const auto from_local = [&](const vec3<T>& grad_local, const vec3<T>& world) {
+        const vec3<T> u = p.unturn(grad_local);
+        grad_t += u.x * world;
+        grad_b += u.y * world;
+        grad_n += u.z * world;
+        return p.world(u);
+    };
+    for (int64_t k = i * K; k < (i + 1) * K; ++k) {
+        const vec3<T> world = load3(in.axis, k), axis = p.local(world);
+        const T sharpness = in.sharpness[k];
+        const vec3<T> ga = g * load3(in.amplitude, k);
+        LobeSums<T> to{glm::dot(ga, p.brdf.diffuse), sum_of(ga), 0};
+        if constexpr (kGain) to.gain = glm::dot(ga, f0);
+        vec3<T> moment;
+        const auto s = lobe_backward<kGain>(dir, Exponent<T>(axis, sharpness), clamp, to, moment);
+        const vec3<T> layer = p.brdf.colour_of(s.layer, s.gain);
+        store3(grad.amplitude, k, g * (p.brdf.diffuse * s.cosine + layer));
+        grad_diffuse += ga * s.cosine;
+        grad_f0 += ga * s.gain;
+        grad.sharpness[k] =
+            glm::dot(moment, axis) - (to.cosine * s.cosine + to.layer * s.layer + to.gain * s.gain);
+        store3(grad.axis, k, from_local(sharpness * moment, world));
+    }
+    auto from_layer = specular_layer_backward<true, false>(p.brdf, dir);
+    const auto from_brdf =
+        p.brdf.backward(grad_diffuse, from_layer.a2, load3(in.albedo, i), in.roughness[i]);
+    store3(grad.albedo, i, from_brdf.albedo);
+    grad.roughness[i] = from_brdf.roughness;
+    if constexpr (kGain) store3(grad.f0, i, grad_f0 + from_brdf.e * p.brdf.layer.d_f0);
+    from_layer.wo.z += from_brdf.cosine;
+    store3(grad.wo, i, from_local(from_layer.wo, load3(in.wo, i)));
+    store3(grad.normal, i, p.frame.backward(grad_t, grad_b, grad_n));
+}
+
+}  // namespace
 
 // With P_k, S_k the integrals of lobe k against cosine and layer, rgb = sum_k amplitude_k (diffuse
 // P_k + S_k). In the point's own frame directions are constants, so all that a lobe's exponential
@@ -205,48 +273,13 @@ void shade_sg_forward(const ShadeSG<T>& in, T* rgb, int threads) {
 template <class T>
 void shade_sg_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGrad<T>& grad,
                        int threads) {
-    const int64_t K = in.n_lobes;
-    const T weight = T(2 * kPi) / T(in.n_directions);
     const Clamp<T> clamp = clamp_of<T>();
-    parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Directions<T> dir = canonical(in);
-        for (int64_t i = begin; i < end; ++i) {
-            const Point<T> p(in, i);
-            const vec3<T> g = weight * load3(grad_rgb, i);
-            specular_layer(p.brdf, in.f0, dir);
-            std::fill(dir.grad_layer, dir.grad_layer + dir.count, T(0));
-            vec3<T> grad_diffuse(0), grad_t(0), grad_b(0), grad_n(0);
-            // Rows of the frame meet each local vector's gradient by an outer product.
-            const auto from_local = [&](const vec3<T>& grad_local, const vec3<T>& world) {
-                const vec3<T> u = p.unturn(grad_local);
-                grad_t += u.x * world;
-                grad_b += u.y * world;
-                grad_n += u.z * world;
-                return p.world(u);
-            };
-            for (int64_t k = i * K; k < (i + 1) * K; ++k) {
-                const vec3<T> world = load3(in.axis, k), axis = p.local(world);
-                const T sharpness = in.sharpness[k];
-                const vec3<T> amplitude = load3(in.amplitude, k), ga = g * amplitude;
-                const T to_cosine = glm::dot(ga, p.brdf.diffuse), to_layer = ga.x + ga.y + ga.z;
-                vec3<T> moment;
-                const auto s = lobe_backward(dir, Exponent<T>(axis, sharpness), clamp, to_cosine,
-                                             to_layer, moment);
-                store3(grad.amplitude, k, g * (p.brdf.diffuse * s.diffuse + s.layer));
-                grad_diffuse += ga * s.diffuse;
-                grad.sharpness[k] =
-                    glm::dot(moment, axis) - (to_cosine * s.diffuse + to_layer * s.layer);
-                store3(grad.axis, k, from_local(sharpness * moment, world));
-            }
-            auto [grad_a2, grad_wo] = specular_layer_backward<true>(p.brdf, in.f0, dir);
-            const auto grad_brdf =
-                p.brdf.backward(grad_diffuse, grad_a2, load3(in.albedo, i), in.roughness[i]);
-            store3(grad.albedo, i, grad_brdf.albedo);
-            grad.roughness[i] = grad_brdf.roughness;
-            grad_wo.z += grad_brdf.e * p.brdf.layer.d_cosine;
-            store3(grad.wo, i, from_local(grad_wo, load3(in.wo, i)));
-            store3(grad.normal, i, p.frame.backward(grad_t, grad_b, grad_n));
-        }
+    with_f0(in.f0, in.coloured, [&](auto f0_of) {
+        parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
+            Directions<T> dir = canonical(in);
+            for (int64_t i = begin; i < end; ++i)
+                point_backward(in, grad_rgb, grad, i, f0_of(i), clamp, dir);
+        });
     });
 }
 

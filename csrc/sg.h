@@ -17,14 +17,15 @@ struct ShadeSG {
     const T* roughness;   // [N]       in [0, 1]
     const T* directions;  // [D, 3]    unit, around +Z
     const T* rotation;    // [N]       radians about +Z
+    const T* f0;          // [N, 3]    reflectance at normal incidence, if coloured; else [1]
     int64_t n_points, n_lobes, n_directions;
-    T f0;  // reflectance at normal incidence
+    bool coloured;
 };
 
-/// Where the gradients go: the shapes of ShadeSG.
+/// Where the gradients go: the shapes of ShadeSG; that to f0 is written if it is coloured.
 template <class T>
 struct ShadeSGGrad {
-    T *axis, *sharpness, *amplitude, *normal, *wo, *albedo, *roughness;
+    T *axis, *sharpness, *amplitude, *normal, *wo, *albedo, *roughness, *f0;
 };
 
 /// rgb [N, 3] = (2 pi / D) sum_d L(w_d) f(w_d, wo) max(n.w_d, 0).

@@ -75,11 +75,30 @@ Rows3<T> world_directions(const Shade<T>& in) {
     return world;
 }
 
-/// Take the directions into the frame of a sample's normal, and fill the specular layer. Below the
-/// horizon the cosine is 0, which masks all that follows: cheaper than packing the rest.
-template <class T>
-LocalBrdf<T> look(const Shade<T>& in, const Rows3<T>& world, int64_t i, Directions<T>& dir) {
-    const Frame<T> frame(load3(in.normal, i));
+/// A sample: the frame of its normal, and what it reflects there.
+template <class T, class F0>
+struct Sample {
+    Frame<T> frame;
+    LocalBrdf<T, F0> brdf;
+
+    Sample(const Shade<T>& in, int64_t i, const F0& f0)
+        : frame(load3(in.normal, i)),
+          brdf(local(load3(in.wo, i)), load3(in.albedo, i), in.roughness[i], f0) {}
+
+    vec3<T> local(const vec3<T>& w) const {
+        return {glm::dot(frame.tangent, w), glm::dot(frame.bitangent, w),
+                glm::dot(frame.normal, w)};
+    }
+    vec3<T> world(const vec3<T>& u) const {
+        return u.x * frame.tangent + u.y * frame.bitangent + u.z * frame.normal;
+    }
+};
+
+/// Take the directions into the frame of a sample, and fill the specular layer. Below the horizon
+/// the cosine is 0, which masks all that follows: cheaper than packing the rest.
+template <class T, class F0>
+void look(const Sample<T, F0>& sample, const Rows3<T>& world, Directions<T>& dir) {
+    const Frame<T>& frame = sample.frame;
     const vec3<T> t = frame.tangent, b = frame.bitangent, n = frame.normal;
     const T *wx = world[0], *wy = world[1], *wz = world[2];
     T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *held = dir.held;
@@ -95,50 +114,108 @@ LocalBrdf<T> look(const Shade<T>& in, const Rows3<T>& world, int64_t i, Directio
         cosine[d] = std::max(c, zero);
         held[d] = std::max(c, lowest);
     }
-    const vec3<T> wo = load3(in.wo, i);
-    const LocalBrdf<T> brdf({glm::dot(t, wo), glm::dot(b, wo), glm::dot(n, wo)},
-                            load3(in.albedo, i), in.roughness[i], in.f0);
-    specular_layer(brdf, in.f0, dir);
-    return brdf;
+    specular_layer(sample.brdf, dir);
 }
 
+/// What a direction of unit radiance adds to each channel: its cosine and BRDF.
+template <class T, class F0>
+struct Response {
+    const T *cosine, *layer, *gain;
+    vec3<T> diffuse, f0;
+
+    Response(const LocalBrdf<T, F0>& brdf, const Directions<T>& dir)
+        : cosine(dir.cosine),
+          layer(dir.layer),
+          gain(dir.gain),
+          diffuse(brdf.diffuse),
+          f0(brdf.f0) {}
+
+    T r(int64_t d) const { return of(d, diffuse.x, f0.x); }
+    T g(int64_t d) const { return of(d, diffuse.y, f0.y); }
+    T b(int64_t d) const { return of(d, diffuse.z, f0.z); }
+
+  private:
+    T of(int64_t d, T diffuse_c, [[maybe_unused]] T f0_c) const {
+        const T value = diffuse_c * cosine[d] + layer[d];
+        if constexpr (kColoured<F0>)
+            return value + f0_c * gain[d];
+        else
+            return value;
+    }
+};
+
 /// rgb / solid_angle of one sample.
-template <class T>
-vec3<T> reflect(const LocalBrdf<T>& brdf, const Directions<T>& dir, const Rows3<T>& radiance) {
+template <class T, class F0>
+vec3<T> reflect(const LocalBrdf<T, F0>& brdf, const Directions<T>& dir, const Rows3<T>& radiance) {
     const T *r = radiance[0], *g = radiance[1], *b = radiance[2];
-    const T *cosine = dir.cosine, *layer = dir.layer;
-    const vec3<T> diffuse = brdf.diffuse;
+    const Response<T, F0> response(brdf, dir);
     const int64_t count = dir.count;
     T sr = 0, sg = 0, sb = 0;
 #pragma omp simd reduction(+ : sr, sg, sb)
     for (int64_t d = 0; d < count; ++d) {
-        sr += r[d] * (diffuse.x * cosine[d] + layer[d]);
-        sg += g[d] * (diffuse.y * cosine[d] + layer[d]);
-        sb += b[d] * (diffuse.z * cosine[d] + layer[d]);
+        sr += r[d] * response.r(d);
+        sg += g[d] * response.g(d);
+        sb += b[d] * response.b(d);
     }
     return {sr, sg, sb};
 }
 
-/// Write albedo and roughness gradients of one sample; g is solid_angle times that to rgb.
+/// Sum over the directions above the horizon of (c . radiance) w, local: the gradient to the normal
+/// from the cosine that weighs the radiance.
 template <class T>
-void materials_backward(const Shade<T>& in, const LocalBrdf<T>& brdf, const Rows3<T>& radiance,
-                        const vec3<T>& g, int64_t i, Directions<T>& dir, const ShadeGrad<T>& grad) {
+vec3<T> cosine_moment(const vec3<T>& c, const Rows3<T>& radiance, const Directions<T>& dir) {
+    const T *r = radiance[0], *g = radiance[1], *b = radiance[2];
+    const T *x = dir.x, *y = dir.y, *z = dir.z;
+    const int64_t count = dir.count;
+    T mx = 0, my = 0, mz = 0;
+#pragma omp simd reduction(+ : mx, my, mz)
+    for (int64_t d = 0; d < count; ++d) {
+        const T all = c.x * r[d] + c.y * g[d] + c.z * b[d], seen = z[d] > 0 ? all : T(0);
+        mx += seen * x[d];
+        my += seen * y[d];
+        mz += seen * z[d];
+    }
+    return {mx, my, mz};
+}
+
+/// Write the gradients of one sample but that to the light; g is solid_angle times that to rgb.
+template <class T, class F0>
+void sample_backward(const Shade<T>& in, const Sample<T, F0>& sample, const Rows3<T>& radiance,
+                     const vec3<T>& g, int64_t i, Directions<T>& dir, const ShadeGrad<T>& grad) {
+    constexpr bool kGain = kColoured<F0>;
+    const auto& brdf = sample.brdf;
     const T *r = radiance[0], *gr = radiance[1], *b = radiance[2], *cosine = dir.cosine;
     T* grad_layer = dir.grad_layer;
+    [[maybe_unused]] const T* gain = dir.gain;
+    [[maybe_unused]] T* grad_gain = dir.grad_gain;
+    [[maybe_unused]] const vec3<T> gf = g * brdf.f0;
     const int64_t count = dir.count;
-    T sr = 0, sg = 0, sb = 0;
-#pragma omp simd reduction(+ : sr, sg, sb)
+    T sr = 0, sg = 0, sb = 0, fr = 0, fg = 0, fb = 0;
+#pragma omp simd reduction(+ : sr, sg, sb, fr, fg, fb)
     for (int64_t d = 0; d < count; ++d) {
         sr += r[d] * cosine[d];
         sg += gr[d] * cosine[d];
         sb += b[d] * cosine[d];
         grad_layer[d] = g.x * r[d] + g.y * gr[d] + g.z * b[d];
+        if constexpr (kGain) {
+            fr += r[d] * gain[d];
+            fg += gr[d] * gain[d];
+            fb += b[d] * gain[d];
+            grad_gain[d] = gf.x * r[d] + gf.y * gr[d] + gf.z * b[d];
+        }
     }
-    const T grad_a2 = specular_layer_backward<false>(brdf, in.f0, dir).a2;
-    const auto out =
-        brdf.backward(g * vec3<T>(sr, sg, sb), grad_a2, load3(in.albedo, i), in.roughness[i]);
-    store3(grad.albedo, i, out.albedo);
-    grad.roughness[i] = out.roughness;
+    const auto from_layer = grad.normal ? specular_layer_backward<false, true>(brdf, dir)
+                                        : specular_layer_backward<false, false>(brdf, dir);
+    const auto from_brdf =
+        brdf.backward(g * vec3<T>(sr, sg, sb), from_layer.a2, load3(in.albedo, i), in.roughness[i]);
+    store3(grad.albedo, i, from_brdf.albedo);
+    grad.roughness[i] = from_brdf.roughness;
+    if constexpr (kGain)
+        store3(grad.f0, i, g * vec3<T>(fr, fg, fb) + from_brdf.e * brdf.layer.d_f0);
+    if (!grad.normal) return;
+    const vec3<T> normal = from_layer.normal + from_brdf.cosine * brdf.wo +
+                           cosine_moment(g * brdf.diffuse, radiance, dir);
+    store3(grad.normal, i, sample.world(normal));
 }
 
 /// Fetches the radiance that one sample sees.
@@ -192,42 +269,48 @@ template <class T>
 void shade_radiance_forward(const Shade<T>& in, const T* radiance, T* rgb, int threads) {
     const Rows3<T> world = world_directions(in);
     const int64_t D = in.n_directions;
-    parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Directions<T> dir(D);
-        Rows3<T> light(D);
-        for (int64_t i = begin; i < end; ++i) {
-            const auto brdf = look(in, world, i, dir);
-            light.split(radiance + 3 * i * D);
-            store3(rgb, i, in.solid_angle * reflect(brdf, dir, light));
-        }
+    with_f0(in.f0, in.coloured, [&](auto f0_of) {
+        parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
+            Directions<T> dir(D);
+            Rows3<T> light(D);
+            for (int64_t i = begin; i < end; ++i) {
+                const Sample sample(in, i, f0_of(i));
+                look(sample, world, dir);
+                light.split(radiance + 3 * i * D);
+                store3(rgb, i, in.solid_angle * reflect(sample.brdf, dir, light));
+            }
+        });
     });
 }
 
-// grad radiance_dc = g_c (diffuse_c max(n.w, 0) + layer_d) with g = solid_angle grad_rgb, and the
+// grad radiance_dc = g_c (diffuse_c max(n.w, 0) + layer_dc) with g = solid_angle grad_rgb, and the
 // layer receives sum_c g_c radiance_dc. See docs/derivations/shade.md.
 template <class T>
 void shade_radiance_backward(const Shade<T>& in, const T* radiance, const T* grad_rgb,
                              const ShadeGrad<T>& grad, int threads) {
     const Rows3<T> world = world_directions(in);
     const int64_t D = in.n_directions;
-    parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Directions<T> dir(D);
-        Rows3<T> light(D);
-        for (int64_t i = begin; i < end; ++i) {
-            const auto brdf = look(in, world, i, dir);
-            const vec3<T> g = in.solid_angle * load3(grad_rgb, i), gd = g * brdf.diffuse;
-            light.split(radiance + 3 * i * D);
-            materials_backward(in, brdf, light, g, i, dir, grad);
-            if (!grad.light) continue;
-            T* to = grad.light + 3 * i * D;
-            const T *cosine = dir.cosine, *layer = dir.layer;
+    with_f0(in.f0, in.coloured, [&](auto f0_of) {
+        parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
+            Directions<T> dir(D);
+            Rows3<T> light(D);
+            for (int64_t i = begin; i < end; ++i) {
+                const Sample sample(in, i, f0_of(i));
+                look(sample, world, dir);
+                const vec3<T> g = in.solid_angle * load3(grad_rgb, i);
+                light.split(radiance + 3 * i * D);
+                sample_backward(in, sample, light, g, i, dir, grad);
+                if (!grad.light) continue;
+                T* to = grad.light + 3 * i * D;
+                const Response response(sample.brdf, dir);
 #pragma omp simd
-            for (int64_t d = 0; d < D; ++d) {
-                to[3 * d] = gd.x * cosine[d] + g.x * layer[d];
-                to[3 * d + 1] = gd.y * cosine[d] + g.y * layer[d];
-                to[3 * d + 2] = gd.z * cosine[d] + g.z * layer[d];
+                for (int64_t d = 0; d < D; ++d) {
+                    to[3 * d] = g.x * response.r(d);
+                    to[3 * d + 1] = g.y * response.g(d);
+                    to[3 * d + 2] = g.z * response.b(d);
+                }
             }
-        }
+        });
     });
 }
 
@@ -235,14 +318,17 @@ template <class T>
 void shade_map_forward(const Shade<T>& in, const MapLight<T>& light, T* rgb, int threads) {
     const Rows3<T> world = world_directions(in);
     const int64_t D = in.n_directions;
-    parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Directions<T> dir(D);
-        MapReader<T> reader(light, D);
-        for (int64_t i = begin; i < end; ++i) {
-            const auto brdf = look(in, world, i, dir);
-            reader.load(i);
-            store3(rgb, i, in.solid_angle * reflect(brdf, dir, reader.radiance));
-        }
+    with_f0(in.f0, in.coloured, [&](auto f0_of) {
+        parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
+            Directions<T> dir(D);
+            MapReader<T> reader(light, D);
+            for (int64_t i = begin; i < end; ++i) {
+                const Sample sample(in, i, f0_of(i));
+                look(sample, world, dir);
+                reader.load(i);
+                store3(rgb, i, in.solid_angle * reflect(sample.brdf, dir, reader.radiance));
+            }
+        });
     });
 }
 
@@ -256,25 +342,29 @@ void shade_map_backward(const Shade<T>& in, const MapLight<T>& light, const T* g
     const int64_t grain = std::max(kSamplesPerChunk, (in.n_samples + kMapChunks - 1) / kMapChunks);
     const int64_t chunks = (in.n_samples + grain - 1) / grain;
     std::vector<Rows3<T>> sums(grad.light ? chunks : 0, Rows3<T>(D));
-    parallel_for(in.n_samples, grain, threads, [&](int64_t begin, int64_t end) {
-        Directions<T> dir(D);
-        MapReader<T> reader(light, D);
-        for (int64_t i = begin; i < end; ++i) {
-            const auto brdf = look(in, world, i, dir);
-            const vec3<T> g = in.solid_angle * load3(grad_rgb, i), gd = g * brdf.diffuse;
-            reader.load(i);
-            materials_backward(in, brdf, reader.radiance, g, i, dir, grad);
-            if (!grad.light) continue;
-            Rows3<T>& sum = sums[begin / grain];
-            T *x = sum[0], *y = sum[1], *z = sum[2];
-            const T *cosine = dir.cosine, *layer = dir.layer, *open = reader.visibility.data();
+    with_f0(in.f0, in.coloured, [&](auto f0_of) {
+        parallel_for(in.n_samples, grain, threads, [&](int64_t begin, int64_t end) {
+            Directions<T> dir(D);
+            MapReader<T> reader(light, D);
+            for (int64_t i = begin; i < end; ++i) {
+                const Sample sample(in, i, f0_of(i));
+                look(sample, world, dir);
+                const vec3<T> g = in.solid_angle * load3(grad_rgb, i);
+                reader.load(i);
+                sample_backward(in, sample, reader.radiance, g, i, dir, grad);
+                if (!grad.light) continue;
+                Rows3<T>& sum = sums[begin / grain];
+                T *x = sum[0], *y = sum[1], *z = sum[2];
+                const T* open = reader.visibility.data();
+                const Response response(sample.brdf, dir);
 #pragma omp simd
-            for (int64_t d = 0; d < D; ++d) {
-                x[d] += open[d] * (gd.x * cosine[d] + g.x * layer[d]);
-                y[d] += open[d] * (gd.y * cosine[d] + g.y * layer[d]);
-                z[d] += open[d] * (gd.z * cosine[d] + g.z * layer[d]);
+                for (int64_t d = 0; d < D; ++d) {
+                    x[d] += open[d] * (g.x * response.r(d));
+                    y[d] += open[d] * (g.y * response.g(d));
+                    z[d] += open[d] * (g.z * response.b(d));
+                }
             }
-        }
+        });
     });
     if (!grad.light) return;
     std::fill(grad.light, grad.light + 3 * D, T(0));

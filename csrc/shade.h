@@ -14,9 +14,10 @@ struct Shade {
     const T* albedo;      // [N, 3] linear
     const T* roughness;   // [N]    in [0, 1]
     const T* directions;  // [D, 3] unit, world
+    const T* f0;          // [N, 3] reflectance at normal incidence, if coloured; else [1]
     int64_t n_samples, n_directions;
     T solid_angle;  // of each direction, steradians
-    T f0;           // reflectance at normal incidence
+    bool coloured;
 };
 
 /// One map of radiance seen by P points: radiance_nd = visibility map_d + indirect, row index_n.
@@ -28,10 +29,11 @@ struct MapLight {
     const int64_t* index;                               // [N] in [0, P)
 };
 
-/// Where the gradients go; light [N, D, 3] or [D, 3], or null where nobody asks.
+/// Where the gradients go. Light ([N, D, 3] or [D, 3]) and normal may be null: nobody asks. That to
+/// f0 is written if it is coloured.
 template <class T>
 struct ShadeGrad {
-    T *light, *albedo, *roughness;
+    T *light, *normal, *albedo, *roughness, *f0;
 };
 
 /// rgb [N, 3] = solid_angle sum_d radiance_nd f(w_d, wo_n) max(n.w_d, 0); radiance [N, D, 3].

@@ -146,6 +146,55 @@ def test_gradcheck():
     assert torch.autograd.gradcheck(brdf.evaluate, (*inputs, r))
 
 
+def test_f0_per_channel_is_each_channel_alone():
+    """Values and gradients, also where the eye is behind the surface and E leaves the fit."""
+    g = torch.Generator().manual_seed(2)
+    inputs = [random_unit(g, 40), random_unit(g, 40)[:, None], random_unit(g, 6)]
+    inputs[0] = inputs[0][:, None]
+    inputs += [torch.rand(40, 1, 3, generator=g).double(), torch.rand(40, 1, generator=g).double()]
+    leaves = [t.requires_grad_() for t in inputs]
+    f0 = torch.rand(40, 1, 3, generator=g).double()
+    f0[0], f0[1], f0[2] = 0, 1, torch.tensor([0.0, 0.5, 1.0])
+    weight = torch.rand(40, 6, 3, generator=g).double()
+    got = brdf.evaluate(*leaves, f0)
+    grads = torch.autograd.grad((got * weight).sum(), leaves)
+    wanted = torch.empty_like(got)
+    summed = [torch.zeros_like(t) for t in leaves]
+    for i in range(40):
+        for c in range(3):
+            mine = [leaf if leaf.shape[0] == 6 else leaf[i] for leaf in leaves]
+            f = brdf.evaluate(*mine, float(f0[i, 0, c]))[..., c]
+            wanted[i, :, c] = f.detach()
+            for to, by in zip(
+                summed, torch.autograd.grad((f * weight[i, :, c]).sum(), leaves), strict=True
+            ):
+                to += by
+    torch.testing.assert_close(got.detach(), wanted)
+    torch.testing.assert_close(list(grads), summed)
+
+
+def test_gradcheck_of_f0():
+    g = torch.Generator().manual_seed(3)
+    n, wo, wi = (random_unit(g, 6) for _ in range(3))
+    albedo, f0 = torch.rand(2, 6, 3, generator=g).double()
+    r = 0.2 + 0.7 * torch.rand(6, generator=g).double()
+    inputs = [t.requires_grad_() for t in (n, wo, wi, albedo, r, f0)]
+    assert torch.autograd.gradcheck(brdf.evaluate, inputs)
+
+
+def test_white_metal_sends_what_its_layer_reflects():
+    """Without a base, white light comes back as E(F0 = 1): as far as the fit is good."""
+    wi, weight = half_sphere(400, 200)
+    for roughness in (0.45, 1.0):
+        for cosine in (0.2, 1.0):
+            wo, r = view(cosine), torch.tensor(roughness, dtype=torch.float64)
+            f = brdf.evaluate(Z, wo, wi, torch.zeros(3).double(), r, torch.ones(3).double())
+            total = (f * (wi[:, 2] * weight)[:, None]).sum(0)
+            wanted = visible_normals_albedo(cosine, roughness, 1.0)
+            # 1e-3: the mid-point rule over a highlight
+            torch.testing.assert_close(total, torch.full((3,), wanted).double(), atol=1e-3, rtol=0)
+
+
 def test_specular_albedo_is_a_share_outside_the_fitted_range_too():
     """Outside the fitted range E stays a share."""
     v = torch.linspace(-1, 1, 101)[:, None]

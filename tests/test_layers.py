@@ -24,7 +24,7 @@ LAYERS = [
     {"cli"},
 ]
 HELPERS = {
-    "ops": {"checks", "native", "visibility"},
+    "ops": {"checks", "native", "reflectance", "visibility"},
     "fields": {"base", "hull"},
     "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
     "data": {"base", "images", "radiance"},

@@ -1,10 +1,11 @@
 """The BRDF of docs/conventions.md: a GGX layer over a Lambertian base.
 
 Directions are unit vectors [..., 3] that broadcast against each other; cosines and materials are
-[...]. ``wo`` points to the eye, ``wi`` to the light. Everything is differentiable and finite, in
-value and gradient, for any normal (zero too), any pair of directions and roughness in [0, 1]:
-cosines to the eye and the light are held above 1e-4, so an eye behind the surface shades as at
-grazing view, and light from behind the surface adds nothing.
+[...]; F0 is a number, or [..., 3] per channel, and then what depends on it has channels too. ``wo``
+points to the eye, ``wi`` to the light. Everything is differentiable and finite, in value and
+gradient, for any normal (zero too), any pair of directions and roughness in [0, 1]: cosines to the
+eye and the light are held above 1e-4, so an eye behind the surface shades as at grazing view, and
+light from behind the surface adds nothing.
 """
 
 from __future__ import annotations
@@ -94,9 +95,9 @@ def specular(
     wo: Tensor,  # [..., 3]
     wi: Tensor,  # [..., 3]
     roughness: Tensor,  # [...] in [0, 1]
-    f0: Tensor | float = F0,
+    f0: Tensor | float = F0,  # a tensor is [..., 3]
 ) -> Tensor:
-    """The specular layer D F V, without the cosine: [...], >= 0; 0 for n.wi <= 0.
+    """The specular layer D F V, without the cosine: [...] or, as F0, [..., 3]; 0 for n.wi <= 0.
 
     For unit directions wo.h = |wi + wo| / 2, which needs no division.
     """
@@ -107,21 +108,19 @@ def specular(
     n_cross_h_squared = torch.linalg.cross(*torch.broadcast_tensors(normal, half))
     n_cross_h_squared = (n_cross_h_squared**2).sum(-1) / squared
     n_dot_l = (normal * wi).sum(-1)
-    value = (
-        ggx_d(n_dot_h_squared, n_cross_h_squared, alpha)
-        * smith_v((normal * wo).sum(-1), n_dot_l, alpha)
-        * schlick_f(0.5 * squared.sqrt(), f0)
-    )
-    return torch.where(n_dot_l > 0, value, 0.0)
+    value = ggx_d(n_dot_h_squared, n_cross_h_squared, alpha)
+    value = value * smith_v((normal * wo).sum(-1), n_dot_l, alpha)
+    value, v_dot_h, lit = _per_channel(f0, value, 0.5 * squared.sqrt(), n_dot_l > 0)
+    return torch.where(lit, value * schlick_f(v_dot_h, f0), 0.0)
 
 
 def specular_albedo(n_dot_v: Tensor, roughness: Tensor, f0: Tensor | float = F0) -> Tensor:
-    """E, the share of light that the specular layer alone reflects, in [0, 1]: [...].
+    """E, the share of light that the specular layer alone reflects, in [0, 1].
 
         E = integral over the half-sphere of D F V (n.wi) dwi
 
-    Linear in F0 (Schlick). A polynomial fit, within 0.005 of quadrature for n.v in [0.02, 1],
-    roughness in [0.05, 1] and any F0.
+    [...] or, as F0, [..., 3]. Linear in F0 (Schlick). A polynomial fit, within 0.005 of quadrature
+    for n.v in [0.02, 1], roughness in [0.05, 1] and any F0.
     """
     v, alpha = n_dot_v.clamp_min(COS_MIN), ggx_alpha(roughness)
     powers = torch.arange(5, device=v.device)
@@ -134,7 +133,13 @@ def specular_albedo(n_dot_v: Tensor, roughness: Tensor, f0: Tensor | float = F0)
     black, white = (
         (monomials * monomials.new_tensor(c)).sum(-1) for c in (_ALBEDO_BLACK, _ALBEDO_WHITE)
     )
+    black, white = _per_channel(f0, black, white)
     return (black + f0 * (white - black)).clamp(0.0, 1.0)
+
+
+def _per_channel(f0: Tensor | float, *numbers: Tensor) -> tuple[Tensor, ...]:
+    """Numbers [...] as [..., 1] where F0 has channels."""
+    return tuple(n[..., None] for n in numbers) if isinstance(f0, Tensor) else numbers
 
 
 def evaluate(
@@ -143,7 +148,7 @@ def evaluate(
     wi: Tensor,  # [..., 3]
     albedo: Tensor,  # [..., 3]
     roughness: Tensor,  # [...] in [0, 1]
-    f0: Tensor | float = F0,
+    f0: Tensor | float = F0,  # a tensor is [..., 3]
 ) -> Tensor:
     """The whole BRDF, without the cosine: [..., 3]; 0 for n.wi <= 0.
 
@@ -153,9 +158,11 @@ def evaluate(
         normal, wo, wi: unit directions in one frame.
         albedo: linear, in [0, 1].
         roughness: perceptual; GGX alpha is its square.
-        f0: reflectance at normal incidence, in [0, 1].
+        f0: reflectance at normal incidence, in [0, 1]; a tensor is [..., 3], per channel.
     """
     diffuse = (1 - specular_albedo((normal * wo).sum(-1), roughness, f0)) / math.pi
+    layer = specular(normal, wo, wi, roughness, f0)
+    if not isinstance(f0, Tensor):
+        diffuse, layer = diffuse[..., None], layer[..., None]
     lit = (normal * wi).sum(-1, keepdim=True) > 0
-    value = diffuse[..., None] * albedo + specular(normal, wo, wi, roughness, f0)[..., None]
-    return torch.where(lit, value, 0.0)
+    return torch.where(lit, diffuse * albedo + layer, 0.0)

@@ -13,21 +13,22 @@ namespace {
 template <class T>
 Shade<T> shade_of(const char* op, const array<T>& normal, const array<T>& wo,
                   const array<T>& albedo, const array<T>& roughness, const array<T>& directions,
-                  double solid_angle, double f0) {
+                  const array<T>& f0, double solid_angle) {
     const int64_t n = roughness.size();
     require(normal.size() == 3 * n && wo.size() == 3 * n && albedo.size() == 3 * n &&
-                directions.size() % 3 == 0,
+                directions.size() % 3 == 0 && (f0.size() == 1 || f0.size() == 3 * n),
             std::string(op) + ": sizes do not fit");
-    return {normal.data(),         wo.data(),         albedo.data(),
-            roughness.data(),      directions.data(), n,
-            directions.size() / 3, T(solid_angle),    T(f0)};
+    return {normal.data(), wo.data(), albedo.data(),         roughness.data(), directions.data(),
+            f0.data(),     n,         directions.size() / 3, T(solid_angle),   f0.size() != 1};
 }
 
-/// An empty array of the light's gradient means that nobody asks for it.
+/// An empty array of the gradient to the light or the normal means that nobody asks for it.
 template <class T>
-ShadeGrad<T> shade_grad_of(array<T>& light, array<T>& albedo, array<T>& roughness) {
-    return {light.size() ? light.mutable_data() : nullptr, albedo.mutable_data(),
-            roughness.mutable_data()};
+ShadeGrad<T> shade_grad_of(array<T>& light, array<T>& normal, array<T>& albedo, array<T>& roughness,
+                           array<T>& f0) {
+    return {light.size() ? light.mutable_data() : nullptr,
+            normal.size() ? normal.mutable_data() : nullptr, albedo.mutable_data(),
+            roughness.mutable_data(), f0.mutable_data()};
 }
 
 template <class T>
@@ -36,9 +37,9 @@ void bind_shade_radiance(py::module_& m) {
         "shade_radiance_forward",
         [](const array<T>& radiance, const array<T>& normal, const array<T>& wo,
            const array<T>& albedo, const array<T>& roughness, const array<T>& directions,
-           array<T>& rgb, double solid_angle, double f0, int threads) {
+           const array<T>& f0, array<T>& rgb, double solid_angle, int threads) {
             const auto in = shade_of("shade_radiance", normal, wo, albedo, roughness, directions,
-                                     solid_angle, f0);
+                                     f0, solid_angle);
             require(radiance.size() == 3 * in.n_samples * in.n_directions,
                     "shade_radiance: radiance of another size");
             const T* light = radiance.data();
@@ -48,29 +49,32 @@ void bind_shade_radiance(py::module_& m) {
         },
         py::arg("radiance").noconvert(), py::arg("normal").noconvert(), py::arg("wo").noconvert(),
         py::arg("albedo").noconvert(), py::arg("roughness").noconvert(),
-        py::arg("directions").noconvert(), py::arg("rgb").noconvert(), py::arg("solid_angle"),
-        py::arg("f0"), py::arg("threads"));
+        py::arg("directions").noconvert(), py::arg("f0").noconvert(), py::arg("rgb").noconvert(),
+        py::arg("solid_angle"), py::arg("threads"));
     m.def(
         "shade_radiance_backward",
         [](const array<T>& radiance, const array<T>& normal, const array<T>& wo,
            const array<T>& albedo, const array<T>& roughness, const array<T>& directions,
-           const array<T>& grad_rgb, array<T>& grad_radiance, array<T>& grad_albedo,
-           array<T>& grad_roughness, double solid_angle, double f0, int threads) {
+           const array<T>& f0, const array<T>& grad_rgb, array<T>& grad_radiance,
+           array<T>& grad_normal, array<T>& grad_albedo, array<T>& grad_roughness,
+           array<T>& grad_f0, double solid_angle, int threads) {
             const auto in = shade_of("shade_radiance", normal, wo, albedo, roughness, directions,
-                                     solid_angle, f0);
+                                     f0, solid_angle);
             require(radiance.size() == 3 * in.n_samples * in.n_directions,
                     "shade_radiance: radiance of another size");
-            const auto grad = shade_grad_of(grad_radiance, grad_albedo, grad_roughness);
+            const auto grad =
+                shade_grad_of(grad_radiance, grad_normal, grad_albedo, grad_roughness, grad_f0);
             const T *light = radiance.data(), *from = grad_rgb.data();
             py::gil_scoped_release nogil;
             shade_radiance_backward(in, light, from, grad, threads);
         },
         py::arg("radiance").noconvert(), py::arg("normal").noconvert(), py::arg("wo").noconvert(),
         py::arg("albedo").noconvert(), py::arg("roughness").noconvert(),
-        py::arg("directions").noconvert(), py::arg("grad_rgb").noconvert(),
-        py::arg("grad_radiance").noconvert(), py::arg("grad_albedo").noconvert(),
-        py::arg("grad_roughness").noconvert(), py::arg("solid_angle"), py::arg("f0"),
-        py::arg("threads"));
+        py::arg("directions").noconvert(), py::arg("f0").noconvert(),
+        py::arg("grad_rgb").noconvert(), py::arg("grad_radiance").noconvert(),
+        py::arg("grad_normal").noconvert(), py::arg("grad_albedo").noconvert(),
+        py::arg("grad_roughness").noconvert(), py::arg("grad_f0").noconvert(),
+        py::arg("solid_angle"), py::arg("threads"));
 }
 
 template <class T>
@@ -105,9 +109,9 @@ void bind_shade_map(py::module_& m) {
         [](const array<T>& map, const Fractions<T>& visibility, const Halves<T>& indirect,
            const array<int64_t>& index, const array<T>& normal, const array<T>& wo,
            const array<T>& albedo, const array<T>& roughness, const array<T>& directions,
-           array<T>& rgb, double solid_angle, double f0, int threads) {
+           const array<T>& f0, array<T>& rgb, double solid_angle, int threads) {
             const auto in =
-                shade_of("shade_map", normal, wo, albedo, roughness, directions, solid_angle, f0);
+                shade_of("shade_map", normal, wo, albedo, roughness, directions, f0, solid_angle);
             const auto light = map_light_of(in, map, visibility, indirect, index);
             T* out = rgb.mutable_data();
             py::gil_scoped_release nogil;
@@ -117,18 +121,21 @@ void bind_shade_map(py::module_& m) {
         py::arg("indirect").noconvert(), py::arg("index").noconvert(),
         py::arg("normal").noconvert(), py::arg("wo").noconvert(), py::arg("albedo").noconvert(),
         py::arg("roughness").noconvert(), py::arg("directions").noconvert(),
-        py::arg("rgb").noconvert(), py::arg("solid_angle"), py::arg("f0"), py::arg("threads"));
+        py::arg("f0").noconvert(), py::arg("rgb").noconvert(), py::arg("solid_angle"),
+        py::arg("threads"));
     m.def(
         "shade_map_backward",
         [](const array<T>& map, const Fractions<T>& visibility, const Halves<T>& indirect,
            const array<int64_t>& index, const array<T>& normal, const array<T>& wo,
            const array<T>& albedo, const array<T>& roughness, const array<T>& directions,
-           const array<T>& grad_rgb, array<T>& grad_map, array<T>& grad_albedo,
-           array<T>& grad_roughness, double solid_angle, double f0, int threads) {
+           const array<T>& f0, const array<T>& grad_rgb, array<T>& grad_map, array<T>& grad_normal,
+           array<T>& grad_albedo, array<T>& grad_roughness, array<T>& grad_f0, double solid_angle,
+           int threads) {
             const auto in =
-                shade_of("shade_map", normal, wo, albedo, roughness, directions, solid_angle, f0);
+                shade_of("shade_map", normal, wo, albedo, roughness, directions, f0, solid_angle);
             const auto light = map_light_of(in, map, visibility, indirect, index);
-            const auto grad = shade_grad_of(grad_map, grad_albedo, grad_roughness);
+            const auto grad =
+                shade_grad_of(grad_map, grad_normal, grad_albedo, grad_roughness, grad_f0);
             const T* from = grad_rgb.data();
             py::gil_scoped_release nogil;
             shade_map_backward(in, light, from, grad, threads);
@@ -137,9 +144,10 @@ void bind_shade_map(py::module_& m) {
         py::arg("indirect").noconvert(), py::arg("index").noconvert(),
         py::arg("normal").noconvert(), py::arg("wo").noconvert(), py::arg("albedo").noconvert(),
         py::arg("roughness").noconvert(), py::arg("directions").noconvert(),
-        py::arg("grad_rgb").noconvert(), py::arg("grad_map").noconvert(),
-        py::arg("grad_albedo").noconvert(), py::arg("grad_roughness").noconvert(),
-        py::arg("solid_angle"), py::arg("f0"), py::arg("threads"));
+        py::arg("f0").noconvert(), py::arg("grad_rgb").noconvert(), py::arg("grad_map").noconvert(),
+        py::arg("grad_normal").noconvert(), py::arg("grad_albedo").noconvert(),
+        py::arg("grad_roughness").noconvert(), py::arg("grad_f0").noconvert(),
+        py::arg("solid_angle"), py::arg("threads"));
 }
 
 }  // namespace

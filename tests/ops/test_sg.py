@@ -6,7 +6,7 @@ import pytest
 import torch
 from check_op import check_op
 
-from univoxel import sphere
+from univoxel import brdf, sphere
 from univoxel.ops import shade_sg, shade_sg_reference
 from univoxel.ops.sg import _shade_sg
 
@@ -51,6 +51,34 @@ def test_native_equals_reference():
     check_op(shade_sg, shade_sg_reference, cases, rtol=RTOL)
 
 
+def metals(case, seed=1):
+    """The same points with an F0 per channel, black and white among them."""
+    f0 = torch.rand(
+        len(case[3]), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+    )
+    f0[:1, 0], f0[:1, 1] = 0, 1
+    return *case[:9], f0.requires_grad_()
+
+
+def test_metals_native_equals_reference():
+    cases = [
+        metals(points(3, 4, 37)),
+        metals(points(2, 0, 16)),
+        metals(points(0, 3, 16)),
+        metals(points(4, 2, 64, roughness=(0.05, 0.2))),
+    ]
+    behind = list(metals(points(3, 2, 20)))
+    behind[4] = (-behind[4].detach()).requires_grad_()
+    behind[7] = sphere.fibonacci_sphere(20, torch.float64)
+    check_op(shade_sg, shade_sg_reference, [*cases, tuple(behind)], rtol=RTOL)
+
+
+def test_f0_of_equal_channels_is_a_number():
+    case = points(3, 4, 37, f0=0.3)
+    f0 = torch.full((3, 3), 0.3, dtype=torch.float64)
+    torch.testing.assert_close(shade_sg(*case[:9], f0), shade_sg(*case), rtol=1e-12, atol=0)
+
+
 def test_eye_behind_the_surface_and_light_below():
     case = list(points(3, 2, 20))
     case[4] = -case[4].detach()
@@ -60,7 +88,9 @@ def test_eye_behind_the_surface_and_light_below():
 
 
 def test_opcheck():
-    torch.library.opcheck(_shade_sg, points(3, 2, 16))
+    *tensors, f0 = points(3, 2, 16)
+    torch.library.opcheck(_shade_sg, (*tensors, torch.tensor(f0, dtype=torch.float64)))
+    torch.library.opcheck(_shade_sg, metals(points(3, 2, 16)))
 
 
 def test_many_points_cross_the_chunks():
@@ -97,6 +127,17 @@ def test_white_furnace():
     torch.testing.assert_close(
         shade_sg(*case), torch.full((5, 3), 0.7).double(), rtol=0.006, atol=0
     )
+
+
+def test_white_metal_furnace():
+    """A white metal under the same light from everywhere shows E of F0 = 1, and no base."""
+    case = list(points(5, 1, 4096, roughness=(0.5, 1.0)))
+    case[1], case[2] = torch.zeros(5, 1).double(), torch.ones(5, 1, 3).double()
+    case[4] = case[3]  # seen from above, where 4096 directions resolve the highlight
+    case[5], case[9] = torch.zeros(5, 3).double(), torch.ones(5, 3).double()
+    wanted = brdf.specular_albedo(torch.ones(5).double(), case[6], 1.0)[:, None].expand(5, 3)
+    # 0.006: the fit of the layer's albedo is good to 0.005
+    torch.testing.assert_close(shade_sg(*case), wanted, rtol=0, atol=0.006)
 
 
 def test_diffuse_under_a_wide_lobe():
@@ -159,6 +200,10 @@ def test_extremes_are_finite(dtype):
         (7, torch.rand(0, 3), ValueError, "at least one direction"),
         (8, torch.rand(3).double(), ValueError, "rotation must be .* float32"),
         (9, 1.5, ValueError, r"f0 must be in \[0, 1\], got 1.5"),
+        (9, math.nan, ValueError, r"f0 must be in \[0, 1\], got nan"),
+        (9, [0.04], TypeError, "f0 must be a number or a tensor, got list"),
+        (9, torch.rand(3), ValueError, r"f0 must be \[N, 3\]"),
+        (9, torch.rand(3, 3).double(), ValueError, "f0 must be .* float32"),
     ],
 )
 def test_bad_arguments(index, value, error, message):

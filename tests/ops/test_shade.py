@@ -6,7 +6,7 @@ import pytest
 import torch
 from check_op import check_op
 
-from univoxel import sphere
+from univoxel import brdf, sphere
 from univoxel.ops import (
     shade_map,
     shade_map_reference,
@@ -14,7 +14,7 @@ from univoxel.ops import (
     shade_radiance_reference,
     use_backend,
 )
-from univoxel.ops.shade import _shade_map, _shade_radiance
+from univoxel.ops.shade import _shade_map, _shade_radiance, _shade_radiance_backward
 
 # Above check_op's common bound: sums of a few hundred directions, and D's denominator at low
 # roughness.
@@ -56,6 +56,24 @@ def mapped(n, count, points=5, seed=0, roughness=(0.2, 1.0), f0=0.04):
     return (map, visibility, indirect, index, *surface(g, n, count, roughness), f0)
 
 
+def metals(case, seed=1):
+    """The same with an F0 per channel, black and white among them, and normals to learn."""
+    n = len(case[-7])
+    f0 = uniform(torch.Generator().manual_seed(seed), 0, 1, n, 3)
+    f0[:1, 0], f0[:1, 1] = 0, 1
+    return *case[:-7], case[-7].clone().requires_grad_(), *case[-6:-1], f0.requires_grad_()
+
+
+def for_unit_normals(op, at):
+    """gradcheck moves normals off the sphere, where op and reference need not agree."""
+
+    def normalised(*case):
+        unit = torch.nn.functional.normalize(case[at], dim=-1)
+        return op(*case[:at], unit, *case[at + 1 :])
+
+    return normalised
+
+
 def detached(case, dtype=torch.float32):
     return [
         a.detach().to(dtype) if isinstance(a, torch.Tensor) and a.is_floating_point() else a
@@ -74,7 +92,7 @@ def test_radiance_native_equals_reference():
         lit(0, 16),
         lit(4, 64, roughness=(0.05, 0.2), f0=0.0),
     ]
-    check_op(shade_radiance, shade_radiance_reference, cases, RTOL, _shade_radiance)
+    check_op(shade_radiance, shade_radiance_reference, cases, RTOL)
 
 
 def test_map_native_equals_reference():
@@ -84,10 +102,52 @@ def test_map_native_equals_reference():
         mapped(0, 16, points=0),
         mapped(4, 64, roughness=(0.05, 0.2), f0=0.0),
     ]
-    check_op(shade_map, shade_map_reference, cases, RTOL, _shade_map)
+    check_op(shade_map, shade_map_reference, cases, RTOL)
     check_op(in_halves(shade_map), in_halves(shade_map_reference), cases[:1], RTOL)
     map, visibility, *rest = mapped(6, 37)
     check_op(shade_map, shade_map_reference, [(map, visibility.double() / 255, *rest)], RTOL)
+
+
+@pytest.mark.parametrize("f0", ["number", "per channel"])
+def test_normals_and_metals_native_equals_reference(f0):
+    for op, reference, at, case in (
+        (shade_radiance, shade_radiance_reference, 1, lit),
+        (shade_map, shade_map_reference, 4, mapped),
+    ):
+        cases = [case(3, 37), case(0, 16), case(4, 64, roughness=(0.05, 0.2))]
+        behind = list(case(3, 20))
+        behind[-6] = -behind[-6]  # the eye
+        cases = [metals(c) for c in (*cases, tuple(behind))]
+        if f0 == "number":
+            cases = [(*c[:-1], 0.3) for c in cases]
+        check_op(for_unit_normals(op, at), for_unit_normals(reference, at), cases, RTOL)
+
+
+def test_gradient_to_the_normal_takes_it_as_any_vector():
+    """Its part along the normal, which the normalisation above drops, is the reference's too."""
+    for op, reference, case in (
+        (shade_radiance, shade_radiance_reference, lit(40, 64)),
+        (shade_map, shade_map_reference, mapped(40, 64)),
+    ):
+        for full in (metals(case), (*metals(case)[:-1], 0.04)):
+            normal = full[-7]
+            (got,) = torch.autograd.grad(op(*full).square().sum(), normal)
+            (wanted,) = torch.autograd.grad(reference(*full).square().sum(), normal)
+            assert bool(((got * normal).sum(-1).abs() > 1e-3).any())
+            torch.testing.assert_close(got, wanted, rtol=1e-9, atol=1e-12)
+
+
+def test_opcheck():
+    for custom_op, case in ((_shade_radiance, lit(3, 16)), (_shade_map, mapped(3, 16))):
+        for *tensors, omega, f0 in (case, metals(case)):
+            stored = torch.as_tensor(f0, dtype=torch.float64)
+            torch.library.opcheck(custom_op, (*tensors, stored, omega))
+
+
+def test_f0_of_equal_channels_is_a_number():
+    for op, case in ((shade_radiance, lit(5, 40, f0=0.3)), (shade_map, mapped(5, 40, f0=0.3))):
+        f0 = torch.full((5, 3), 0.3, dtype=torch.float64)
+        torch.testing.assert_close(op(*case[:-1], f0), op(*case), rtol=1e-12, atol=0)
 
 
 def test_eye_behind_the_surface():
@@ -143,13 +203,20 @@ def test_every_half_is_read_right():
 
 
 def test_fixed_light_gets_no_gradient():
-    """Materials alone: the same gradients, and nothing computed for the light."""
+    """Materials alone: the same gradients, and nothing computed for light and normal."""
     for op, case in ((shade_radiance, lit(3, 16)), (shade_map, mapped(3, 16))):
         materials = case[-5], case[-4]
+        learned = torch.autograd.grad(op(*metals(case)[:-1], 0.04).sum(), materials)
         wanted = torch.autograd.grad(op(*case).sum(), materials)
         fixed = (case[0].detach(), *case[1:])
         got = torch.autograd.grad(op(*fixed).sum(), materials)
         assert all(torch.equal(a, b) for a, b in zip(got, wanted, strict=True))
+        torch.testing.assert_close(got, learned, rtol=1e-12, atol=0)
+    *tensors, omega, f0 = detached(lit(3, 16))
+    grads = _shade_radiance_backward(
+        *tensors, torch.tensor(f0), torch.ones(3, 3), omega, False, False
+    )
+    assert [g.numel() for g in grads] == [0, 0, 9, 3, 0]
 
 
 def test_whole_graph_compiles():
@@ -191,6 +258,16 @@ def test_white_furnace():
     torch.testing.assert_close(shade_radiance(*case), wanted, rtol=0.006, atol=0)
 
 
+def test_white_metal_furnace():
+    """A white metal under the same light from everywhere shows E of F0 = 1, and no base."""
+    case = detached(lit(5, 8192, roughness=(0.5, 1.0)), torch.float64)
+    case[0], case[2] = torch.ones_like(case[0]), case[1]
+    case[3], case[-1] = torch.zeros(5, 3).double(), torch.ones(5, 3).double()
+    wanted = brdf.specular_albedo(torch.ones(5).double(), case[4], 1.0)[:, None].expand(5, 3)
+    # 0.006: the fit of the layer's albedo is good to 0.005
+    torch.testing.assert_close(shade_radiance(*case), wanted, rtol=0, atol=0.006)
+
+
 def test_the_two_forms_agree():
     map, visibility, indirect, index, *rest = mapped(6, 40)
     radiance = visibility[index][..., None] / 255 * map + indirect[index]
@@ -224,12 +301,17 @@ def test_extremes_are_finite(dtype):
         normal[2], wo[3] = 0, -normal[3]  # no normal; eye opposite the normal
         wo[4] = -directions[0]  # light opposite the eye, behind the surface
         normal[4], albedo[5] = directions[0], 0
-        leaves = [t.requires_grad_() for t in (case[0], albedo, roughness)]
+        f0 = torch.rand(6, 3, generator=torch.Generator().manual_seed(0)).to(dtype)
+        f0[0], f0[1] = 0, 1
+        leaves = [t.requires_grad_() for t in (case[0], normal, albedo, roughness)]
         for function in (op, reference):
-            rgb = function(*case)
-            for t in (rgb, *torch.autograd.grad(rgb.sum(), leaves)):
-                assert bool(t.isfinite().all())
-            assert bool((rgb[2] == 0).all())
+            for last in (case[-1], f0.requires_grad_()):
+                rgb = function(*case[:-1], last)
+                for t in (rgb, *torch.autograd.grad(rgb.sum(), leaves, retain_graph=True)):
+                    assert bool(t.isfinite().all())
+                assert bool((rgb[2] == 0).all())
+            (grad,) = torch.autograd.grad(rgb.sum(), f0)
+            assert bool(grad.isfinite().all())
 
 
 SURFACE_ERRORS = [
@@ -240,7 +322,9 @@ SURFACE_ERRORS = [
     (4, torch.rand(7, 3), ValueError, r"directions must be \[D, 3\] .* D=8"),
     (5, 0.0, ValueError, "solid_angle must be above 0 and finite, got 0.0"),
     (6, 1.5, ValueError, r"f0 must be in \[0, 1\], got 1.5"),
-    (0, torch.rand(3, 3, requires_grad=True), NotImplementedError, "no gradient to normal"),
+    (6, [0.04], TypeError, "f0 must be a number or a tensor, got list"),
+    (6, torch.rand(3, 1), ValueError, r"f0 must be \[N, 3\]"),
+    (6, torch.rand(3, 3).double(), ValueError, "f0 must be .* float32"),
     (1, torch.rand(3, 3, requires_grad=True), NotImplementedError, "no gradient to wo"),
 ]
 RADIANCE_ERRORS = [

@@ -28,17 +28,19 @@ def composite():
 def shade_sg():
     leaves = [unit(N, 4), normal(N, 4).abs().detach().requires_grad_(), normal(N, 4, 3), unit(N),
               unit(N, seed=1), normal(N, 3), torch.full((N,), 0.4).requires_grad_()]  # fmt: skip
-    return ops.shade_sg(*leaves, sphere.fibonacci_hemisphere(16), torch.zeros(N)), leaves
+    f0 = normal(N, 3, seed=1)
+    rgb = ops.shade_sg(*leaves, sphere.fibonacci_hemisphere(16), torch.zeros(N), f0)
+    return rgb, [*leaves, f0]
 
 
 def shade_radiance():
-    radiance, albedo = normal(N, 16, 3), normal(N, 3)
+    radiance, albedo, f0 = normal(N, 16, 3), normal(N, 3), normal(N, 3, seed=1)
     roughness = torch.full((N,), 0.4).requires_grad_()
-    frame = (unit(N, grad=False), unit(N, seed=1, grad=False))
+    n, wo = unit(N), unit(N, seed=1, grad=False)
     rgb = ops.shade_radiance(
-        radiance, *frame, albedo, roughness, sphere.fibonacci_sphere(16), 4 * torch.pi / 16
+        radiance, n, wo, albedo, roughness, sphere.fibonacci_sphere(16), 4 * torch.pi / 16, f0
     )
-    return rgb, [radiance, albedo, roughness]
+    return rgb, [radiance, n, albedo, roughness, f0]
 
 
 def march():

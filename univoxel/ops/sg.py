@@ -10,6 +10,7 @@ from torch import Tensor
 from univoxel import brdf, sphere
 from univoxel.ops import native
 from univoxel.ops.checks import check
+from univoxel.ops.reflectance import room_for_grad, sizes_of_f0, stored_f0
 
 
 def shade_sg(
@@ -22,7 +23,7 @@ def shade_sg(
     roughness: Tensor,  # [N]
     directions: Tensor,  # [D, 3]
     rotation: Tensor,  # [N]
-    f0: float = 0.04,
+    f0: Tensor | float = 0.04,
 ) -> Tensor:
     """Radiance towards the eye of points lit by K spherical Gaussians each.
 
@@ -42,17 +43,17 @@ def shade_sg(
         directions: [D, 3] unit, around +Z, of equal solid angle, such as
             sphere.fibonacci_hemisphere; any number above 0.
         rotation: [N] radians; random turns trade the pattern of a fixed set for noise.
-        f0: reflectance at normal incidence, in [0, 1].
+        f0: reflectance at normal incidence, in [0, 1]: a number, or [N, 3] per channel.
 
     Returns:
         rgb [N, 3] linear radiance.
 
     Raises:
         TypeError, ValueError: an argument is no tensor, or of another size or dtype than above;
-            no directions; f0 outside [0, 1].
+            no directions; f0 a number outside [0, 1].
 
     Differentiable in: axis, sharpness, amplitude, normal (the directions turn with it), wo, albedo,
-    roughness. Second order raises.
+    roughness, f0 where it is a tensor. Second order raises.
     """
     sizes = check(
         "shade_sg",
@@ -65,15 +66,15 @@ def shade_sg(
         roughness=(roughness, "N"),
         directions=(directions, "D 3"),
         rotation=(rotation, "N"),
+        **sizes_of_f0(f0),
     )
     if sizes["D"] == 0:
         raise ValueError("shade_sg: directions must hold at least one direction, got none")
-    if not 0.0 <= f0 <= 1.0:
-        raise ValueError(f"shade_sg: f0 must be in [0, 1], got {f0}")
+    reflectance = stored_f0("shade_sg", f0, like=axis)
     lobes = (axis, sharpness, amplitude)
     arguments = (*lobes, normal, wo, albedo, roughness, directions.detach(), rotation.detach())
     if native.serves(axis):
-        return _shade_sg(*(a.contiguous() for a in arguments), float(f0))
+        return _shade_sg(*(a.contiguous() for a in (*arguments, reflectance)))
     return shade_sg_reference(*arguments, f0)
 
 
@@ -87,7 +88,7 @@ def shade_sg_reference(
     roughness: Tensor,
     directions: Tensor,
     rotation: Tensor,
-    f0: float = 0.04,
+    f0: Tensor | float = 0.04,
 ) -> Tensor:
     """The same in eager torch, in the frame of each normal, where the normal is +Z."""
     to_local = torch.stack([*sphere.frame(normal), normal], 1)
@@ -97,9 +98,9 @@ def shade_sg_reference(
     lobe = (sharpness[..., None] * (torch.einsum("nki,ndi->nkd", axis, wi) - 1)).exp()
     radiance = torch.einsum("nkd,nkc->ndc", lobe, amplitude)
     up = wi.new_tensor([0.0, 0.0, 1.0])
-    diffuse = (1 - brdf.specular_albedo(wo[..., 2], roughness[:, None], f0)) / math.pi
-    layer = brdf.specular(up, wo, wi, roughness[:, None], f0)
-    f = diffuse[..., None] * albedo[:, None] + layer[..., None]
+    if isinstance(f0, Tensor):
+        f0 = f0[:, None]
+    f = brdf.evaluate(up, wo, wi, albedo[:, None], roughness[:, None], f0)
     cosine = wi[..., 2:].clamp_min(0)
     return (2 * math.pi / len(directions)) * (radiance * f * cosine).sum(1)
 
@@ -115,11 +116,11 @@ def _shade_sg(
     roughness: Tensor,
     directions: Tensor,
     rotation: Tensor,
-    f0: float,
+    f0: Tensor,
 ) -> Tensor:
-    inputs = (axis, sharpness, amplitude, normal, wo, albedo, roughness, directions, rotation)
+    inputs = (axis, sharpness, amplitude, normal, wo, albedo, roughness, directions, rotation, f0)
     rgb = torch.empty_like(normal)
-    native.require().shade_sg_forward(*native.arrays(*inputs, rgb), f0, native.threads())
+    native.require().shade_sg_forward(*native.arrays(*inputs, rgb), native.threads())
     return rgb
 
 
@@ -134,15 +135,18 @@ def _shade_sg_backward(
     roughness: Tensor,
     directions: Tensor,
     rotation: Tensor,
+    f0: Tensor,
     grad_rgb: Tensor,
-    f0: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    inputs = (axis, sharpness, amplitude, normal, wo, albedo, roughness, directions, rotation)
-    grads = tuple(torch.empty_like(t) for t in inputs[:7])
-    native.require().shade_sg_backward(
-        *native.arrays(*inputs, grad_rgb, *grads), f0, native.threads()
-    )
-    return grads  # pyright: ignore[reportReturnType]  there are seven
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    inputs = (axis, sharpness, amplitude, normal, wo, albedo, roughness, directions, rotation, f0)
+    grads = _empty_grads(*inputs)
+    native.require().shade_sg_backward(*native.arrays(*inputs, grad_rgb, *grads), native.threads())
+    return grads  # pyright: ignore[reportReturnType]  there are eight
+
+
+def _empty_grads(*inputs: Tensor) -> tuple[Tensor, ...]:
+    """Room for the gradients: of all inputs but the directions and their rotation."""
+    return *(torch.empty_like(t) for t in inputs[:7]), room_for_grad(inputs[9])
 
 
 @_shade_sg.register_fake
@@ -152,17 +156,16 @@ def _(axis, sharpness, amplitude, normal, *others):
 
 @_shade_sg_backward.register_fake
 def _(*inputs):
-    return tuple(torch.empty_like(t) for t in inputs[:7])
+    return _empty_grads(*inputs)
 
 
 def _save(ctx, inputs, output):
-    *tensors, ctx.f0 = inputs
-    ctx.save_for_backward(*tensors)
+    ctx.save_for_backward(*inputs)
 
 
 def _backward(ctx, grad_rgb):
-    grads = _shade_sg_backward(*ctx.saved_tensors, grad_rgb.contiguous(), ctx.f0)
-    return *grads, None, None, None
+    *grads, grad_f0 = _shade_sg_backward(*ctx.saved_tensors, grad_rgb.contiguous())
+    return *grads, None, None, grad_f0 if ctx.needs_input_grad[9] else None
 
 
 _shade_sg.register_autograd(_backward, setup_context=_save)

@@ -10,6 +10,7 @@ from torch import Tensor
 from univoxel import brdf
 from univoxel.ops import native
 from univoxel.ops.checks import check
+from univoxel.ops.reflectance import room_for_grad, sizes_of_f0, stored_f0
 
 
 def shade_radiance(
@@ -20,7 +21,7 @@ def shade_radiance(
     roughness: Tensor,  # [N]
     directions: Tensor,  # [D, 3]
     solid_angle: float,
-    f0: float = 0.04,
+    f0: Tensor | float = 0.04,
 ) -> Tensor:
     """Radiance towards the eye of points that each receive their own light.
 
@@ -37,17 +38,18 @@ def shade_radiance(
         directions: [D, 3] unit, world, over the whole sphere, such as sphere.fibonacci_sphere;
             any number above 0.
         solid_angle: of each direction, steradians; 4 pi / D over the whole sphere.
-        f0: reflectance at normal incidence, in [0, 1].
+        f0: reflectance at normal incidence, in [0, 1]: a number, or [N, 3] per channel.
 
     Returns:
         rgb [N, 3] linear radiance.
 
     Raises:
         TypeError, ValueError: an argument is no tensor, or of another size or dtype than above;
-            no directions; solid_angle not above 0; f0 outside [0, 1].
-        NotImplementedError: normal or wo requires grad.
+            no directions; solid_angle not above 0; f0 a number outside [0, 1].
+        NotImplementedError: wo requires grad.
 
-    Differentiable in: radiance, albedo, roughness. Second order raises.
+    Differentiable in: radiance, normal (as any vector: a change of its length counts too), albedo,
+    roughness, f0 where it is a tensor. Second order raises.
     """
     check(
         "shade_radiance",
@@ -57,12 +59,14 @@ def shade_radiance(
         albedo=(albedo, "N 3"),
         roughness=(roughness, "N"),
         directions=(directions, "D 3"),
+        **sizes_of_f0(f0),
     )
-    _check_rest("shade_radiance", normal, wo, directions, solid_angle, f0)
+    _check_rest("shade_radiance", directions, solid_angle, wo=wo)
+    reflectance = stored_f0("shade_radiance", f0, like=radiance)
     arguments = (radiance, normal, wo, albedo, roughness, directions.detach())
     if native.serves(radiance):
-        contiguous = (a.contiguous() for a in arguments)
-        return _shade_radiance(*contiguous, float(solid_angle), float(f0))
+        contiguous = (a.contiguous() for a in (*arguments, reflectance))
+        return _shade_radiance(*contiguous, float(solid_angle))
     return shade_radiance_reference(*arguments, solid_angle, f0)
 
 
@@ -77,7 +81,7 @@ def shade_map(
     roughness: Tensor,  # [N]
     directions: Tensor,  # [D, 3]
     solid_angle: float,
-    f0: float = 0.04,
+    f0: Tensor | float = 0.04,
 ) -> Tensor:
     """Radiance towards the eye of points under one distant map, partly hidden from each.
 
@@ -100,9 +104,10 @@ def shade_map(
 
     Raises:
         TypeError, ValueError: as in shade_radiance; an index outside [0, P).
-        NotImplementedError: visibility, indirect, normal or wo requires grad.
+        NotImplementedError: visibility, indirect or wo requires grad.
 
-    Differentiable in: map, albedo, roughness. Second order raises.
+    Differentiable in: map, and normal, albedo, roughness and f0 as in shade_radiance. Second order
+    raises.
     """
     as_bytes, as_half = _is(visibility, torch.uint8), _is(indirect, torch.float16)
     check(
@@ -116,13 +121,16 @@ def shade_map(
         albedo=(albedo, "N 3"),
         roughness=(roughness, "N"),
         directions=(directions, "D 3"),
+        **sizes_of_f0(f0),
     )
-    _check_rest("shade_map", normal, wo, directions, solid_angle, f0, visibility, indirect)
+    constants = {"visibility": visibility, "indirect": indirect, "wo": wo}
+    _check_rest("shade_map", directions, solid_angle, **constants)
+    reflectance = stored_f0("shade_map", f0, like=map)
     arguments = (map, visibility, indirect, index, normal, wo, albedo, roughness)
     arguments = (*arguments, directions.detach())
     if native.serves(map):
-        contiguous = (a.contiguous() for a in arguments)
-        return _shade_map(*contiguous, float(solid_angle), float(f0))
+        contiguous = (a.contiguous() for a in (*arguments, reflectance))
+        return _shade_map(*contiguous, float(solid_angle))
     return shade_map_reference(*arguments, solid_angle, f0)
 
 
@@ -130,26 +138,14 @@ def _is(argument: object, dtype: torch.dtype) -> bool:
     return isinstance(argument, Tensor) and argument.dtype == dtype
 
 
-def _check_rest(
-    op: str,
-    normal: Tensor,
-    wo: Tensor,
-    directions: Tensor,
-    solid_angle: float,
-    f0: float,
-    visibility: Tensor | None = None,
-    indirect: Tensor | None = None,
-) -> None:
+def _check_rest(op: str, directions: Tensor, solid_angle: float, **constants: Tensor) -> None:
     """What sizes and dtypes do not show."""
     if len(directions) == 0:
         raise ValueError(f"{op}: directions must hold at least one direction, got none")
     if not 0.0 < solid_angle < math.inf:
         raise ValueError(f"{op}: solid_angle must be above 0 and finite, got {solid_angle}")
-    if not 0.0 <= f0 <= 1.0:
-        raise ValueError(f"{op}: f0 must be in [0, 1], got {f0}")
-    constants = {"normal": normal, "wo": wo, "visibility": visibility, "indirect": indirect}
     for name, tensor in constants.items():
-        if tensor is not None and tensor.requires_grad and torch.is_grad_enabled():
+        if tensor.requires_grad and torch.is_grad_enabled():
             raise NotImplementedError(f"{op}: no gradient to {name}; detach it")
 
 
@@ -161,9 +157,11 @@ def shade_radiance_reference(
     roughness: Tensor,
     directions: Tensor,
     solid_angle: float,
-    f0: float = 0.04,
+    f0: Tensor | float = 0.04,
 ) -> Tensor:
     """The same in eager torch."""
+    if isinstance(f0, Tensor):
+        f0 = f0[:, None]
     surface = (albedo[:, None], roughness[:, None])
     f = brdf.evaluate(normal[:, None], wo[:, None], directions, *surface, f0)
     cosine = (normal[:, None] * directions).sum(-1, keepdim=True).clamp_min(0)
@@ -181,7 +179,7 @@ def shade_map_reference(
     roughness: Tensor,
     directions: Tensor,
     solid_angle: float,
-    f0: float = 0.04,
+    f0: Tensor | float = 0.04,
 ) -> Tensor:
     """The same in eager torch; its memory grows with N D."""
     fraction = visibility[index].to(map.dtype)
@@ -201,13 +199,13 @@ def _shade_radiance(
     albedo: Tensor,
     roughness: Tensor,
     directions: Tensor,
+    f0: Tensor,
     solid_angle: float,
-    f0: float,
 ) -> Tensor:
-    inputs = (radiance, normal, wo, albedo, roughness, directions)
+    inputs = (radiance, normal, wo, albedo, roughness, directions, f0)
     rgb = torch.empty_like(normal)
     native.require().shade_radiance_forward(
-        *native.arrays(*inputs, rgb), solid_angle, f0, native.threads()
+        *native.arrays(*inputs, rgb), solid_angle, native.threads()
     )
     return rgb
 
@@ -220,15 +218,16 @@ def _shade_radiance_backward(
     albedo: Tensor,
     roughness: Tensor,
     directions: Tensor,
+    f0: Tensor,
     grad_rgb: Tensor,
     solid_angle: float,
-    f0: float,
     to_radiance: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    inputs = (radiance, normal, wo, albedo, roughness, directions)
-    grads = _empty_grads(radiance, albedo, roughness, to_radiance)
+    to_normal: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    inputs = (radiance, normal, wo, albedo, roughness, directions, f0)
+    grads = _empty_grads(radiance, normal, albedo, roughness, f0, to_radiance, to_normal)
     native.require().shade_radiance_backward(
-        *native.arrays(*inputs, grad_rgb, *grads), solid_angle, f0, native.threads()
+        *native.arrays(*inputs, grad_rgb, *grads), solid_angle, native.threads()
     )
     return grads
 
@@ -244,15 +243,14 @@ def _shade_map(
     albedo: Tensor,
     roughness: Tensor,
     directions: Tensor,
+    f0: Tensor,
     solid_angle: float,
-    f0: float,
 ) -> Tensor:
-    surface = (normal, wo, albedo, roughness, directions)
+    surface = (normal, wo, albedo, roughness, directions, f0)
     rgb = torch.empty_like(normal)
     native.require().shade_map_forward(
         *native.arrays(map, visibility, _bits(indirect), index, *surface, rgb),
         solid_angle,
-        f0,
         native.threads(),
     )
     return rgb
@@ -269,17 +267,17 @@ def _shade_map_backward(
     albedo: Tensor,
     roughness: Tensor,
     directions: Tensor,
+    f0: Tensor,
     grad_rgb: Tensor,
     solid_angle: float,
-    f0: float,
     to_map: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    surface = (normal, wo, albedo, roughness, directions)
-    grads = _empty_grads(map, albedo, roughness, to_map)
+    to_normal: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    surface = (normal, wo, albedo, roughness, directions, f0)
+    grads = _empty_grads(map, normal, albedo, roughness, f0, to_map, to_normal)
     native.require().shade_map_backward(
         *native.arrays(map, visibility, _bits(indirect), index, *surface, grad_rgb, *grads),
         solid_angle,
-        f0,
         native.threads(),
     )
     return grads
@@ -290,10 +288,20 @@ def _bits(indirect: Tensor) -> Tensor:
     return indirect.view(torch.uint16) if indirect.dtype == torch.float16 else indirect
 
 
-def _empty_grads(light: Tensor, albedo: Tensor, roughness: Tensor, to_light: bool):
-    """Room for the gradients; none for that of the light, the largest, unless it is asked for."""
+def _empty_grads(
+    light: Tensor,
+    normal: Tensor,
+    albedo: Tensor,
+    roughness: Tensor,
+    f0: Tensor,
+    to_light: bool,
+    to_normal: bool,
+):
+    """Room for the gradients; for those of light and normal, the dear ones, where asked for."""
     grad_light = torch.empty_like(light) if to_light else light.new_empty(0)
-    return grad_light, torch.empty_like(albedo), torch.empty_like(roughness)
+    grad_normal = torch.empty_like(normal) if to_normal else normal.new_empty(0)
+    materials = torch.empty_like(albedo), torch.empty_like(roughness), room_for_grad(f0)
+    return grad_light, grad_normal, *materials
 
 
 @_shade_radiance.register_fake
@@ -302,8 +310,8 @@ def _(radiance, normal, *others):
 
 
 @_shade_radiance_backward.register_fake
-def _(radiance, normal, wo, albedo, roughness, *others):
-    return _empty_grads(radiance, albedo, roughness, others[-1])
+def _(radiance, normal, wo, albedo, roughness, directions, f0, grad_rgb, solid_angle, *asked):
+    return _empty_grads(radiance, normal, albedo, roughness, f0, *asked)
 
 
 @_shade_map.register_fake
@@ -312,32 +320,37 @@ def _(map, visibility, indirect, index, normal, *others):
 
 
 @_shade_map_backward.register_fake
-def _(map, visibility, indirect, index, normal, wo, albedo, roughness, *others):
-    return _empty_grads(map, albedo, roughness, others[-1])
+def _(map, visibility, indirect, index, normal, wo, albedo, roughness, directions, f0, *others):
+    return _empty_grads(map, normal, albedo, roughness, f0, *others[-2:])
 
 
 def _save(ctx, inputs, output):
-    *tensors, ctx.solid_angle, ctx.f0 = inputs
+    *tensors, ctx.solid_angle = inputs
     ctx.save_for_backward(*tensors)
 
 
+def _keep(asked: tuple[bool, ...], grads: tuple[Tensor, ...]) -> list[Tensor | None]:
+    return [grad if ask else None for ask, grad in zip(asked, grads, strict=True)]
+
+
 def _radiance_backward(ctx, grad_rgb):
-    to_radiance = ctx.needs_input_grad[0]
-    grad_radiance, grad_albedo, grad_roughness = _shade_radiance_backward(
-        *ctx.saved_tensors, grad_rgb.contiguous(), ctx.solid_angle, ctx.f0, to_radiance
+    radiance, normal, _, albedo, roughness, _, f0, _ = ctx.needs_input_grad
+    grads = _shade_radiance_backward(
+        *ctx.saved_tensors, grad_rgb.contiguous(), ctx.solid_angle, radiance, normal
     )
-    light = grad_radiance if to_radiance else None
-    return light, None, None, grad_albedo, grad_roughness, None, None, None
+    asked = (radiance, normal, albedo, roughness, f0)
+    radiance, normal, albedo, roughness, f0 = _keep(asked, grads)
+    return radiance, normal, None, albedo, roughness, None, f0, None
 
 
 def _map_backward(ctx, grad_rgb):
-    to_map = ctx.needs_input_grad[0]
-    grad_map, grad_albedo, grad_roughness = _shade_map_backward(
-        *ctx.saved_tensors, grad_rgb.contiguous(), ctx.solid_angle, ctx.f0, to_map
+    map, _, _, _, normal, _, albedo, roughness, _, f0, _ = ctx.needs_input_grad
+    grads = _shade_map_backward(
+        *ctx.saved_tensors, grad_rgb.contiguous(), ctx.solid_angle, map, normal
     )
-    light = grad_map if to_map else None
-    nothing = (None,) * 5
-    return light, *nothing, grad_albedo, grad_roughness, None, None, None
+    asked = (map, normal, albedo, roughness, f0)
+    map, normal, albedo, roughness, f0 = _keep(asked, grads)
+    return map, None, None, None, normal, None, albedo, roughness, None, f0, None
 
 
 _shade_radiance.register_autograd(_radiance_backward, setup_context=_save)
