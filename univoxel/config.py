@@ -36,7 +36,8 @@ class StageConfig:
     lr_sdf: tuple[float, float] = (0.2, 0.02)  # at begin and end, voxels per step; all rates > 0
     lr_features: tuple[float, float] = (0.1, 0.01)
     lr_networks: tuple[float, float] = (3e-3, 3e-4)
-    plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.5]
+    plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.125]
+    spread: int = 4  # passes that smooth the sdf's gradient before the optimiser, >= 0
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 1]
     physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
     refit: bool = False  # geometry and materials stay; light and radiance follow them
@@ -51,7 +52,8 @@ class StageConfig:
             lambda x: len(x) == 2 and all(0 < v < math.inf for v in x),
             *("sharpness", "lr_sdf", "lr_features", "lr_networks"),
         )
-        _check(self, "in [0, 0.5]", lambda x: 0 <= x <= 0.5, "plate")
+        _check(self, "at least 0", lambda x: x >= 0, "spread")
+        _check(self, "in [0, 0.125]", lambda x: 0 <= x <= 0.125, "plate")
         _check(self, "in [0, 1]", lambda x: 0 <= x <= 1, "diffusion", "physical_from")
 
 
@@ -194,7 +196,11 @@ def preset(name: str, data: Path, out: Path, light: LightName = "hybrid") -> Tra
         case _:
             raise ValueError(f"preset must be draft, fast or full, got {name!r}")
     coarse = StageConfig(
-        voxels=0.9, iterations=steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35)
+        voxels=0.9,
+        iterations=steps // 2,
+        share=0.15,
+        rays=rays // 2,
+        sharpness=(0.7, 0.35),
     )
     fine = StageConfig(
         voxels=voxels,

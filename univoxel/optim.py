@@ -80,11 +80,11 @@ class RowAdam(torch.optim.Optimizer):
         state["step"] += 1
         assert param.grad is not None
         grad = param.grad
-        rows = _rows_of(grad)
+        rows = rows_of(grad)
         # Autograd forgets that a gradient is coalesced when it stores it; sorting again is dear.
         if not (rows[1:] > rows[:-1]).all():
             grad = grad.coalesce()
-            rows = _rows_of(grad)
+            rows = rows_of(grad)
         values = grad._values()
         dims = grad.sparse_dim()
         table = (param.shape[:dims].numel(), param.shape[dims:].numel())  # no -1: it may be empty
@@ -131,7 +131,7 @@ class RowAdam(torch.optim.Optimizer):
         return state
 
 
-def _rows_of(grad: Tensor) -> Tensor:
+def rows_of(grad: Tensor) -> Tensor:
     """Number of each index of a sparse tensor among all, the sparse dimensions flattened."""
     indices = grad._indices()
     rows = indices[0]

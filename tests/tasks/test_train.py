@@ -5,7 +5,7 @@ import json
 
 import pytest
 import torch
-from analytic import RADIUS, write_scene
+from analytic import RADIUS, sphere_scene, write_scene
 
 from univoxel.config import StageConfig, TrainConfig, preset
 from univoxel.data import load_photos
@@ -85,6 +85,25 @@ def test_every_light_learns_the_photographs(data, tmp_path, light):
     pixels = torch.cartesian_prod(torch.arange(2), torch.arange(32), torch.arange(32))
     psnr = task.held_out_psnr(scene, photos, pixels, physical=True)
     assert psnr > 18  # black gives 9 dB, the right sphere in one mean colour 16
+
+
+def test_a_gradient_spreads_over_the_nodes_that_it_touches():
+    field = sphere_scene(0, voxel_size=0.1).field
+    x, y, z = torch.cartesian_prod(*[torch.arange(2, 7)] * 3).unbind(1)
+    rows = torch.stack([x, y, z])
+    values = torch.zeros(rows.shape[1])
+    middle = (rows == 4).all(0)
+    values[middle] = 1.0
+    grad = torch.sparse_coo_tensor(rows, values, field.sdf.shape, check_invariants=True)
+    field.sdf.grad = grad.coalesce()
+    scratch = torch.zeros_like(field.sdf.data)
+    task.spread_gradient(field, 2, scratch)
+    spread = field.sdf.grad.to_dense()
+    beside = [spread[3, 4, 4], spread[5, 4, 4], spread[4, 3, 4], spread[4, 4, 5]]
+    assert spread[4, 4, 4] > beside[0] > spread[2, 4, 4] > 0
+    torch.testing.assert_close(torch.stack(beside), beside[0].expand(4))
+    torch.testing.assert_close(spread.sum(), torch.tensor(1.0))  # two passes stay in the block
+    assert not scratch.any()
 
 
 def test_time_ends_a_run_with_a_usable_result(data, tmp_path):

@@ -24,7 +24,7 @@ from univoxel.data import DataError, Photos, load_photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
 from univoxel.ops import smooth_rows_
-from univoxel.optim import RowAdam
+from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays, Surface
 from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at
@@ -35,6 +35,7 @@ from univoxel.tasks.progress import Progress
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
 SMOOTH_EVERY = 4  # steps between smoothings of what the step has touched
+SPREAD = 0.8  # share of the neighbours' mean that a node's gradient takes on in a pass
 REFRESH = 16  # steps between looks at which bricks are empty
 RETRACE = 100  # steps after which light is traced through the surface as it has become
 MOMENTS = (0.9, 0.99)
@@ -136,6 +137,7 @@ def run_stage(
         ],
         betas=MOMENTS,
     )
+    scratch = torch.zeros_like(field.sdf.data)
     for done in progress.steps():
         physical = done >= stage.physical_from
         rates = (
@@ -162,6 +164,8 @@ def run_stage(
         if stage.refit:
             assert field.features.grad is not None
             field.features.grad._values()[:, : scene.material.channels] = 0
+        if stage.spread and not stage.refit:
+            spread_gradient(field, stage.spread, scratch)
         optimizer.step()
         if progress.step % SMOOTH_EVERY == 0 and not stage.refit:
             smooth(field, stage)
@@ -209,17 +213,34 @@ def objective(
     return terms | {name: getattr(weight, name) * value for name, value in prior.items()}
 
 
+def spread_gradient(field: DenseField, passes: int, scratch: Tensor) -> None:
+    """Diffuse the sdf's gradient over the nodes that it touches, before Adam sees it.
+
+    Adam steps of neighbours then agree: the surface moves in large pieces, far and without the
+    bumps that steps of single nodes leave (a Sobolev gradient, as in Nicolet et al. 2021, Large
+    Steps in Inverse Rendering of Geometry).
+
+    Args:
+        scratch: [X, Y, Z] of zeros, which is left so.
+    """
+    grad = field.sdf.grad
+    assert grad is not None
+    rows = rows_of(grad)
+    scratch.view(-1)[rows] = grad._values()
+    for _ in range(passes):
+        smooth_rows_(scratch[..., None], rows, SPREAD, order=1)
+    grad._values().copy_(scratch.view(-1)[rows])
+    scratch.view(-1)[rows] = 0
+
+
 def smooth(field: DenseField, stage: StageConfig) -> None:
     """Regularise the nodes that the step has touched, beside the optimiser and not inside it."""
-    for grid, order, amount in (
-        (field.sdf.data[..., None], 2, stage.plate * SMOOTH_EVERY),
-        (field.features.data, 1, stage.diffusion * SMOOTH_EVERY),
-    ):
-        grad = field.sdf.grad if order == 2 else field.features.grad
-        assert grad is not None
-        x, y, z = grad._indices()  # coalesced by the op; autograd only forgets the flag
-        rows = (x * grid.shape[1] + y) * grid.shape[2] + z
-        smooth_rows_(grid, rows, amount, order)
+    sdf, features = field.sdf, field.features
+    assert sdf.grad is not None
+    assert features.grad is not None
+    plate, diffusion = stage.plate * SMOOTH_EVERY, stage.diffusion * SMOOTH_EVERY
+    smooth_rows_(sdf.data[..., None], rows_of(sdf.grad), plate, order=2)
+    smooth_rows_(features.data, rows_of(features.grad), diffusion, order=1)
 
 
 def split_pixels(distance: Tensor) -> tuple[Tensor, Tensor]:
