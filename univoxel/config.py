@@ -73,6 +73,7 @@ class JointConfig:
     lr_map: float = 0.05  # of the log map
     albedo_smoothness: float = 0.005  # weights >= 0
     roughness_smoothness: float = 0.02
+    metallic: float = 0.01
     newton_steps: int = 4  # between rounds, >= 0
     newton_points: int = 6000  # of the points, >= 1
     newton_views: int = 8  # sightings of each, >= 2
@@ -85,7 +86,7 @@ class JointConfig:
         _check(self, "at least views", lambda x: x >= self.views, "rays")
         rates = ("lr_features", "lr_networks", "lr_map", "newton_smooth")
         _check(self, "above 0", lambda x: 0 < x < math.inf, *rates)
-        weights = ("albedo_smoothness", "roughness_smoothness", "newton_steps")
+        weights = ("albedo_smoothness", "roughness_smoothness", "metallic", "newton_steps")
         _check(self, "at least 0", lambda x: 0 <= x < math.inf, *weights)
         _check(self, "at least 2", lambda x: x >= 2, "newton_views")
 
@@ -98,6 +99,7 @@ class LossConfig:
     silhouette: float = 0.1
     albedo_smoothness: float = 0.005
     roughness_smoothness: float = 0.02
+    metallic: float = 0.01  # what the mean metallic costs: metal is for where nothing else serves
     light_smoothness: float = 0.1
     white_light: float = 0.01
     map_smoothness: float = 1e-3  # total variation of the log map

@@ -18,18 +18,21 @@ def directions(n):
 
 @pytest.mark.parametrize("size", [1.0, 1e4])  # of the features: sigmoids saturate, ranges hold
 def test_materials_stay_in_their_ranges(size):
-    albedo, roughness = MaterialHead(4, 8)(size * torch.randn(200, 6))
+    albedo, roughness, metallic = MaterialHead(4, 8)(size * torch.randn(200, 6))
     assert albedo.shape == (200, 3)
     assert roughness.shape == (200,)
     assert ((albedo >= 0) & (albedo <= 1)).all()
     assert ((roughness >= MaterialHead.min_roughness) & (roughness <= 1)).all()
+    assert metallic.shape == (200,)
+    assert ((metallic >= 0) & (metallic <= 1)).all()
 
 
-def test_materials_start_mid_grey_and_rather_rough():
-    albedo, roughness = MaterialHead(8, 64)(torch.zeros(1, 8))
+def test_materials_start_mid_grey_rather_rough_and_no_metal():
+    albedo, roughness, metallic = MaterialHead(8, 64)(torch.zeros(1, 8))
     # The last layer's weights start at a tenth: what its hidden units give is small.
     torch.testing.assert_close(albedo, torch.full((1, 3), 0.5), atol=0.05, rtol=0)
     assert 0.55 < roughness < 0.75
+    assert metallic < 0.1
 
 
 def test_materials_see_their_channels_only():

@@ -41,7 +41,8 @@ def problem_on_a_sphere(points: int, views: int, nodes: int) -> joint.Problem:
     open_share = torch.full((points, nodes), 255, dtype=torch.uint8)
     indirect = torch.zeros(points, nodes, 3, dtype=torch.float16)
     transport = Transport(fibonacci_sphere(nodes), open_share, indirect)
-    return joint.Problem(seen, transport, black, 0.05)
+    no_metal = torch.zeros(points, dtype=torch.bool)
+    return joint.Problem(seen, transport, black, no_metal, 0.05)
 
 
 def photographed(problem: joint.Problem, map, albedo, roughness) -> joint.Problem:
@@ -231,10 +232,10 @@ def scene_of(albedo, roughness: float, nodes: int):
     scene = sphere_scene(nodes)
     last = scene.material.net[-1]
     low = scene.material.min_roughness
-    wanted = torch.tensor([*albedo, (roughness - low) / (1 - low)])
+    wanted = torch.tensor([*albedo, (roughness - low) / (1 - low), 0.0])
     with torch.no_grad():
         last.weight.zero_()
-        last.bias.copy_(torch.logit(wanted))
+        last.bias.copy_(torch.logit(wanted, eps=1e-6))
     return scene
 
 
@@ -263,6 +264,13 @@ def test_newton_without_rich_points_leaves_the_map():
     problem = problem_on_a_sphere(20, 3, 32)  # of at least 4 sightings is asked
     assert joint.newton_round(scene, problem, CFG) == []
     assert (scene.sky.log_radiance == 0).all()
+
+
+def test_metals_have_no_say_in_the_map():
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
+    problem = problem_on_a_sphere(20, 8, 32)
+    problem = dataclasses.replace(problem, metal=torch.ones(20, dtype=torch.bool))
+    assert joint.newton_round(scene, problem, CFG) == []
 
 
 class Steps:

@@ -9,23 +9,26 @@ from univoxel.networks import MLP
 
 
 class MaterialHead(nn.Module):
-    """The first `channels` features of [N, C] -> albedo [N, 3] and roughness [N]."""
+    """The first `channels` features of [N, C] -> albedo [N, 3], roughness [N] and metallic [N].
+
+    Albedo is the base colour of glTF: of a metal, what it reflects at normal incidence.
+    """
 
     min_roughness = 0.05  # below, a highlight is narrower than the light's own detail
 
     def __init__(self, channels: int, hidden: int):
         super().__init__()
         self.channels = channels
-        self.net = MLP([channels, hidden, hidden, 4])
+        self.net = MLP([channels, hidden, hidden, 5])
         last = self.net.linear[-1]
-        with torch.no_grad():  # start mid-grey and rather rough, whatever the features
+        with torch.no_grad():  # start mid-grey, rather rough and no metal, whatever the features
             last.weight.mul_(0.1)
-            last.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.5]))
+            last.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.5, -4.0]))
 
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         out = torch.sigmoid(self.net(features[:, : self.channels]))
         low = self.min_roughness
-        return out[:, :3], low + (1 - low) * out[:, 3]
+        return out[:, :3], low + (1 - low) * out[:, 3], out[:, 4]
 
 
 class RadianceHead(nn.Module):

@@ -78,11 +78,14 @@ def reflected(
     radiance = light.incident(surface, wi)
     if occlusion is not None:
         radiance = occlusion.visibility[..., None] * radiance + occlusion.indirect
+    diffuse, f0 = brdf.split(surface.albedo, surface.metallic)
+    f0 = brdf.F0 if f0 is None else f0
     normal, solid_angle = surface.normal, 2 * math.pi / directions
     if torch.is_grad_enabled() and (normal.requires_grad or wo.requires_grad):
         normal = normal[:, None]
-        material = surface.albedo[:, None], surface.roughness[:, None]
-        f = brdf.evaluate(normal, wo[:, None], wi, *material)
+        material = diffuse[:, None], surface.roughness[:, None]
+        f0 = f0[:, None] if isinstance(f0, Tensor) else f0
+        f = brdf.evaluate(normal, wo[:, None], wi, *material, f0)
         cosine = (normal * wi).sum(-1, keepdim=True).clamp_min(0)
         return solid_angle * (radiance * f * cosine).sum(1)
     # Around its own normal, and turned back, every point has the same directions
@@ -92,10 +95,11 @@ def reflected(
         radiance,
         up,
         sphere.rotate_z(sphere.to_local(wo, normal), -rotation),
-        surface.albedo,
+        diffuse,
         surface.roughness,
         sphere.fibonacci_hemisphere(directions, wo.dtype).to(wo.device),
         solid_angle,
+        f0,
     )
 
 
@@ -120,12 +124,14 @@ def reflected_shared(
         count = occlusion.visibility.shape[1]
         return reflected(light, surface, wo, count, occlusion, generator)
     directions = whole_sphere(light.directions, generator).to(wo)
+    diffuse, f0 = brdf.split(surface.albedo, surface.metallic)
     return ops.shade_radiance(
         light.incident(surface, directions),
         surface.normal,
         wo,
-        surface.albedo,
+        diffuse,
         surface.roughness,
         directions,
         4 * math.pi / len(directions),
+        brdf.F0 if f0 is None else f0,
     )

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from univoxel import ops, sphere
+from univoxel import brdf, ops, sphere
 from univoxel.lights import head, lobes, priors, quadrature
 from univoxel.lights.base import AbstractLight
 from univoxel.records import Occlusion, Surface
@@ -95,14 +95,16 @@ class LocalSG(AbstractLight):
         if occlusion is not None:
             return quadrature.reflected(self, surface, wo, self.directions, occlusion, generator)
         directions = sphere.fibonacci_hemisphere(self.directions, wo.dtype).to(wo.device)
+        diffuse, f0 = brdf.split(surface.albedo, surface.metallic)
         return ops.shade_sg(
             *self.lobes(surface),
             surface.normal,
             wo,
-            surface.albedo,
+            diffuse,
             surface.roughness,
             directions,
             quadrature.rotations(surface, generator),
+            brdf.F0 if f0 is None else f0,
         )
 
     def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:

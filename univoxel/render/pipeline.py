@@ -37,7 +37,7 @@ def surface_at(scene: Scene, rays: Rays, jitter: Tensor | None = None) -> Surfac
     opacity = total[:, -1]
     mean = total[:, :-1] / opacity.clamp_min(1e-4)[:, None]
     features, gradient, t = mean.split([scene.field.channels, 3, 1], 1)
-    albedo, roughness, *metallic = scene.material(features)
+    albedo, roughness, metallic = scene.material(features)
     return Surface(
         position=rays.origin + t * rays.direction,
         normal=torch.nn.functional.normalize(gradient, dim=1, eps=1e-6),
@@ -46,13 +46,13 @@ def surface_at(scene: Scene, rays: Rays, jitter: Tensor | None = None) -> Surfac
         roughness=roughness,
         opacity=opacity,
         depth=t[:, 0],
-        metallic=metallic[0] if metallic else None,
+        metallic=metallic,
     )
 
 
 def at_rays(surface: Surface, index: Tensor) -> Surface:
     """The surface at some of its rays: numbers, or a mask."""
-    return Surface(**{name: None if x is None else x[index] for name, x in vars(surface).items()})
+    return Surface(**{name: x[index] for name, x in vars(surface).items() if x is not None})
 
 
 def shade(
@@ -94,8 +94,8 @@ def surface_of_view(scene: Scene, cameras: Cameras, view: int) -> tuple[Surface,
             rays.origin.split(RAYS_AT_ONCE), rays.direction.split(RAYS_AT_ONCE), strict=True
         )
     ]
-    columns = {name: [vars(part)[name] for part in parts] for name in vars(parts[0])}
-    whole = {name: None if x[0] is None else torch.cat(x) for name, x in columns.items()}
+    names = [name for name, x in vars(parts[0]).items() if x is not None]
+    whole = {name: torch.cat([vars(part)[name] for part in parts]) for name in names}
     return Surface(**whole), -rays.direction
 
 

@@ -33,6 +33,7 @@ from univoxel.tasks.progress import Progress
 
 CLIPPED = 0.97  # sRGB; brighter pixels are lower bounds
 NEWTON_CHUNK = 256  # points whose equations are built at once
+METAL = 0.2  # metallic from which on a point is taken for metal
 CAUCHY = 0.05  # sRGB; residuals beyond are taken for what the model cannot explain
 
 
@@ -43,6 +44,7 @@ class Problem:
     seen: Observations
     transport: Transport
     target: Tensor  # [S, 3] sRGB-encoded sightings
+    metal: Tensor  # [P] bool, what the stages before took for metal; no other point can become it
     voxel_size: float
 
     @property
@@ -64,7 +66,8 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     seen = observe(position, normal, photos, tracer, offset)
     direction = scene.sky.direction
     transport = trace(seen, tracer, mesh, bright, direction, cfg.tracing, offset, generator)
-    return Problem(seen, transport, losses.encode(seen.color), offset)
+    metal = scene.material(scene.field.sample(position).features)[2] > METAL
+    return Problem(seen, transport, losses.encode(seen.color), metal, offset)
 
 
 def draw(problem: Problem, points: int, views: int) -> tuple[Tensor, Tensor]:
@@ -114,7 +117,10 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
     assert scene.sky is not None
     index, sighting = draw(problem, cfg.rays // cfg.views, cfg.views)
     points = index[:: cfg.views]
-    albedo, roughness = scene.material(scene.field.sample(seen.position[points]).features)
+    material = scene.material(scene.field.sample(seen.position[points]).features)
+    albedo, roughness, metallic = material
+    diffuse, f0 = brdf.split(albedo, metallic * problem.metal[points])
+    assert f0 is not None
     repeat = torch.arange(len(points)).repeat_interleave(cfg.views)
     rgb = shade_map(
         scene.sky.radiance,
@@ -123,19 +129,21 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
         index,
         seen.normal[index],
         seen.wo[sighting],
-        albedo[repeat],
+        diffuse[repeat],
         widened(roughness, len(transport.direction))[repeat],
         transport.direction,
         problem.solid_angle,
+        f0[repeat],
     )
     beside = seen.position[points]
     beside = beside + 2 * problem.voxel_size * torch.randn_like(beside)
-    albedo_near, roughness_near = scene.material(scene.field.sample(beside).features)
+    albedo_near, roughness_near, _ = scene.material(scene.field.sample(beside).features)
     encoded, target = losses.encode(rgb), problem.target[sighting]
     return {
         "joint": losses.photometric(encoded, target, clipped=CLIPPED),
         "albedo": cfg.albedo_smoothness * losses.smoothness(albedo, albedo_near),
         "roughness": cfg.roughness_smoothness * losses.smoothness(roughness, roughness_near),
+        "metallic": cfg.metallic * metallic.mean(),
     }
 
 
@@ -177,11 +185,12 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
     seen, sky = problem.seen, scene.sky
     assert sky is not None
     counts = seen.offsets.diff()
-    rich = (counts >= cfg.newton_views // 2).nonzero()[:, 0]
+    # A metal has no albedo to eliminate
+    rich = ((counts >= cfg.newton_views // 2) & ~problem.metal).nonzero()[:, 0]
     chosen = rich[torch.randperm(len(rich))[: cfg.newton_points]]
     if not len(chosen):
         return []
-    albedo, roughness = scene.material(scene.field.sample(seen.position[chosen]).features)
+    albedo, roughness, _ = scene.material(scene.field.sample(seen.position[chosen]).features)
     log_albedo = albedo.clamp_min(1e-3).log()
     which = (torch.rand(len(chosen), cfg.newton_views) * counts[chosen][:, None]).long()
     sighting = seen.offsets[chosen][:, None] + which

@@ -203,12 +203,14 @@ def objective(
     encoded = losses.encode(shaded * opacity + behind * (1 - opacity))
     beside = met.position.detach() + scene.field.voxel_size * torch.randn_like(met.position)
     near = scene.field.sample(beside).features
-    albedo, roughness = scene.material(near)
+    albedo, roughness, _ = scene.material(near)
+    assert met.metallic is not None
     prior = scene.light.regularisation(met, replace(met, features=near, position=beside))
     terms |= {
         "physical": losses.photometric(encoded, target),
         "albedo": weight.albedo_smoothness * losses.smoothness(met.albedo, albedo),
         "roughness": weight.roughness_smoothness * losses.smoothness(met.roughness, roughness),
+        "metallic": weight.metallic * met.metallic.mean(),
     }
     return terms | {name: getattr(weight, name) * value for name, value in prior.items()}
 
