@@ -235,7 +235,7 @@ def preset(name: str, data: Path, out: Path, light: LightName = "hybrid") -> Tra
             )
             return TrainConfig(data, out, (coarse, fine, joint, refit), minutes)
         case _ if light in alone:
-            scene = SceneConfig(sky_nodes=0, light=alone[light])
+            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light])
             return TrainConfig(data, out, (coarse, fine), minutes, scene=scene)
         case _:
             names = ", ".join(("hybrid", *alone))

@@ -15,8 +15,18 @@ from torch import nn
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.fields.hull import GridShape
-from univoxel.lights import EnvmapLight, EnvmapSGLight, LightConfig, SGConfig, build, read_config
+from univoxel.lights import (
+    EnvmapLight,
+    EnvmapSGLight,
+    LightConfig,
+    MLPLightConfig,
+    SGConfig,
+    SHConfig,
+    build,
+    read_config,
+)
 from univoxel.lights.distant import DistantLight
+from univoxel.lights.mirrored import MirroredLight
 from univoxel.ops import VisibilityScene
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
@@ -31,6 +41,7 @@ class SceneConfig:
     material_channels: int = 8  # of them, that albedo and roughness are decoded from, >= 1
     hidden: int = 64  # width of the material and radiance heads, >= 1
     sky_nodes: int = 512  # directions of the environment map, >= 0; 0: the scene has none
+    mirrored: bool = True  # whether a local light gets a network for what is mirrored sharply
     light: LightConfig = field(default_factory=SGConfig)
 
     def __post_init__(self):
@@ -58,6 +69,9 @@ class Scene(nn.Module):
         self.radiance = RadianceHead(cfg.channels, cfg.hidden)
         self.light = build(cfg.channels, cfg.light)
         self.sky = DistantLight(cfg.sky_nodes) if cfg.sky_nodes else None
+        self.mirrored = None
+        if cfg.mirrored and isinstance(cfg.light, SGConfig | SHConfig | MLPLightConfig):
+            self.mirrored = MirroredLight(cfg.channels, cfg.hidden, cfg.light.scale)
         self._occluder: VisibilityScene | None = None
 
     def occluder(self) -> VisibilityScene:

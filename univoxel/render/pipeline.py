@@ -65,7 +65,10 @@ def shade(
     """
     light = scene.light
     if not light.traced:
-        return light.reflected(surface, wo, generator=generator)
+        rgb = light.reflected(surface, wo, generator=generator)
+        if scene.mirrored is None:
+            return rgb
+        return (rgb + scene.mirrored(surface, wo)).clamp_min(0)
     parts = []
     for index in torch.arange(len(wo)).split(max(1, TRACED_AT_ONCE // light.directions)):
         part = at_rays(surface, index)

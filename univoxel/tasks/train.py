@@ -129,6 +129,9 @@ def run_stage(
     field.sdf.requires_grad_(not stage.refit)
     scene.material.requires_grad_(not stage.refit)
     networks = [scene.material, scene.radiance, scene.light]
+    if scene.mirrored:  # only with fixed materials: before, it would take their gloss upon itself
+        scene.mirrored.requires_grad_(stage.refit)
+        networks.append(scene.mirrored)
     optimizer = RowAdam(
         [
             {"params": [field.sdf], "eps": EPS_SDF},

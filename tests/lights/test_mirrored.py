@@ -1,0 +1,63 @@
+"""The network of what is mirrored sharply."""
+
+import torch
+from torch.nn.functional import normalize
+
+from univoxel import brdf
+from univoxel.lights.mirrored import MirroredLight
+from univoxel.records import Surface
+
+
+def mirror_ball(n: int, metallic: float) -> tuple[Surface, torch.Tensor]:
+    """Points of a ball of radius 1, and unit directions to the eye on their side."""
+    normal = normalize(torch.randn(n, 3), dim=1)
+    wo = normalize(normal + 0.7 * normalize(torch.randn(n, 3), dim=1), dim=1)
+    ones = torch.ones(n)
+    surface = Surface(
+        position=normal,
+        normal=normal,
+        features=torch.zeros(n, 2),
+        albedo=torch.ones(n, 3),
+        roughness=0.1 * ones,
+        opacity=ones,
+        depth=ones,
+        metallic=metallic * ones,
+    )
+    return surface, wo
+
+
+def test_adds_nothing_at_first():
+    surface, wo = mirror_ball(50, 1.0)
+    assert not MirroredLight(2, 8, 1.0)(surface, wo).any()
+
+
+def test_learns_an_edge_that_no_lobe_has():
+    torch.manual_seed(0)
+    head = MirroredLight(2, 32, 1.0)
+    optimizer = torch.optim.Adam(head.parameters(), lr=1e-2)
+
+    def error() -> torch.Tensor:
+        surface, wo = mirror_ball(512, 1.0)
+        mirrored = 2 * (surface.normal * wo).sum(1, keepdim=True) * surface.normal - wo
+        sky = (mirrored[:, 2:] > 0).float()  # white above the horizon, black below
+        share = brdf.specular_albedo((surface.normal * wo).sum(1), surface.roughness, 1.0)
+        return (head(surface, wo) - share[:, None] * sky).square().mean()
+
+    before = error().item()
+    for _ in range(150):
+        optimizer.zero_grad()
+        error().backward()
+        optimizer.step()
+    assert error() < 0.1 * before  # one radiance for all leaves half of it
+
+
+def test_a_dielectric_mirrors_as_much_less_as_its_layer_reflects():
+    torch.manual_seed(0)
+    head = MirroredLight(2, 8, 1.0)
+    torch.nn.init.normal_(head.net.linear[-1].weight)
+    surface, wo = mirror_ball(50, 1.0)
+    cosine = (surface.normal * wo).sum(1)
+    metal = head(surface, wo) / brdf.specular_albedo(cosine, surface.roughness, 1.0)[:, None]
+    surface = Surface(**{**vars(surface), "metallic": None})
+    share = brdf.specular_albedo(cosine, surface.roughness, brdf.F0)[:, None]
+    torch.testing.assert_close(head(surface, wo), share * metal)

@@ -1,0 +1,55 @@
+"""Light that is finer than the lobes of a local light, as a surface mirrors it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from univoxel import brdf
+from univoxel.lights import head
+from univoxel.networks import MLP
+from univoxel.records import Surface
+
+_OCTAVES = 4  # of the mirrored direction: sines of 1, 2, 4, 8 radians
+
+
+class MirroredLight(nn.Module):
+    """What the mirrored direction holds beyond a local light's lobes: E(n.wo, roughness) times a
+    network of place, roughness and mirrored direction.
+
+    Lobes and quadratures blur what a smooth surface mirrors sharply. The split sum (Karis 2013,
+    Real Shading in Unreal Engine 4) asks for one blurred radiance a point instead, which a network
+    can hold (Liu et al. 2023, NeRO). Signed, for it corrects the lobes; at first it is 0.
+    """
+
+    def __init__(self, features: int, hidden: int, scale: float):
+        """
+        Args:
+            features: C of Surface.features.
+            hidden: width of the network.
+            scale: world units: half the extent of what is lit.
+        """
+        super().__init__()
+        self.scale = scale
+        inputs = features + 3 + 6 * head.FREQUENCIES + 6 * _OCTAVES + 2
+        self.net = MLP([inputs, hidden, hidden, 3])
+        last = self.net.linear[-1]
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    def forward(self, surface: Surface, wo: Tensor) -> Tensor:
+        """Radiance [N, 3] towards unit directions wo [N, 3], to be added."""
+        cosine = (surface.normal * wo).sum(1, keepdim=True)
+        mirrored = 2 * cosine * surface.normal - wo
+        waves = [w for i in range(_OCTAVES) for w in _waves(mirrored * 2**i)]
+        roughness = surface.roughness[:, None]
+        place = head.encode(surface, self.scale)
+        light = self.net(torch.cat([place, *waves, roughness, cosine], 1))
+        _, f0 = brdf.split(surface.albedo, surface.metallic)
+        if f0 is None:
+            f0 = torch.full_like(surface.albedo, brdf.F0)
+        return brdf.specular_albedo(cosine[:, 0], surface.roughness, f0) * light
+
+
+def _waves(angle: Tensor) -> tuple[Tensor, Tensor]:
+    return angle.sin(), angle.cos()
