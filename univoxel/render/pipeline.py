@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -49,7 +52,7 @@ def surface_at(scene: Scene, rays: Rays, jitter: Tensor | None = None) -> Surfac
 
 def at_rays(surface: Surface, index: Tensor) -> Surface:
     """The surface at some of its rays: numbers, or a mask."""
-    return Surface(**{name: None if x is None else x[index] for name, x in vars(surface).items()})
+    return _mapped(lambda x: x[index], surface)
 
 
 def shade(scene: Scene, surface: Surface, wo: Tensor) -> Tensor:
@@ -77,9 +80,7 @@ def surface_of_view(scene: Scene, cameras: Cameras, view: int) -> tuple[Surface,
             rays.origin.split(RAYS_AT_ONCE), rays.direction.split(RAYS_AT_ONCE), strict=True
         )
     ]
-    columns = {name: [vars(part)[name] for part in parts] for name in vars(parts[0])}
-    whole = {name: None if x[0] is None else torch.cat(x) for name, x in columns.items()}
-    return Surface(**whole), -rays.direction
+    return _mapped(lambda *x: torch.cat(x), *parts), -rays.direction
 
 
 @torch.no_grad()
@@ -96,3 +97,13 @@ def extract_mesh(scene: Scene) -> Mesh:
         normal = torch.nn.functional.normalize(sample.gradient, dim=1, eps=1e-6)
         parts.append((normal, *scene.material(sample.features)))
     return Mesh(vertices, faces, *(torch.cat(p) for p in zip(*parts, strict=True)))
+
+
+def _mapped(f: Callable[..., Tensor], *surfaces: Surface) -> Surface:
+    """f of each tensor of some surfaces; what they do not have stays None."""
+
+    def one(*values: Any) -> Any:
+        return None if values[0] is None else f(*values)
+
+    names = vars(surfaces[0])
+    return Surface(**{name: one(*(vars(s)[name] for s in surfaces)) for name in names})
