@@ -35,7 +35,7 @@ from univoxel.ops import VisibilityScene, relight
 from univoxel.records import Mesh
 
 SPP = [1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024]
-TRUTH_SPP = 16384
+TRUTH_SPP = 8192
 THEIR_SPP = [16, 64, 256]
 COMMON = {"offset": 1e-3, "bounces": 2}
 
@@ -303,7 +303,8 @@ def main() -> None:
     if data and "pictures" in wanted:
         result["pictures"] = against_pictures(data, arguments.samples, arguments.every)
     arguments.out.write_text(json.dumps(result, indent=1) + "\n")
-    draw(arguments.out)
+    if "strategies" in result:
+        draw(arguments.out)
 
 
 if __name__ == "__main__":
