@@ -82,8 +82,9 @@ void bind_integrator(py::module_& m) {
             for (const array<float>* a :
                  {&position, &normal, &wo, &albedo, &f0, static_cast<const array<float>*>(&rgb)})
                 require(a->size() == 3 * n, "relight: points differ in number");
-            require(bounces == 0 || (vertex_normal && vertex_albedo && vertex_roughness && vertex_f0),
-                    "relight: bounces need materials");
+            require(
+                bounces == 0 || (vertex_normal && vertex_albedo && vertex_roughness && vertex_f0),
+                "relight: bounces need materials");
             require(sun.size() % 7 == 0 && lamp.size() % 6 == 0, "relight: lights of another size");
             const auto data = [](const optional_array& a) { return a ? a->data() : nullptr; };
             const Relight in{&scene,

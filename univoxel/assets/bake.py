@@ -43,7 +43,7 @@ def with_materials(scene: Scene, mesh: Mesh) -> Mesh:
         normal = torch.nn.functional.normalize(at.gradient, dim=1, eps=1e-6)
         parts.append((normal, *scene.material(at.features)))
     *rest, metallic = (torch.cat(p) for p in zip(*parts, strict=True))
-    return Mesh(mesh.vertices, mesh.faces, *rest, unless_none(metallic))
+    return Mesh(mesh.vertices, mesh.faces, *rest, metallic=unless_none(metallic))
 
 
 @torch.no_grad()
@@ -74,7 +74,9 @@ def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
         parts.append((in_frame(at.gradient, n, t), *scene.material(at.features)))
     place = dilated(texel, size)
     *rest, metallic = (torch.cat(p)[place] for p in zip(*parts, strict=True))
-    return TexturedMesh(vertices, faces, normals, tangents, uv, *rest, unless_none(metallic))
+    return TexturedMesh(
+        vertices, faces, normals, tangents, uv, *rest, metallic=unless_none(metallic)
+    )
 
 
 def in_frame(direction: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:

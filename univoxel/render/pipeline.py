@@ -117,4 +117,4 @@ def extract_mesh(scene: Scene) -> Mesh:
         normal = torch.nn.functional.normalize(sample.gradient, dim=1, eps=1e-6)
         parts.append((normal, *scene.material(sample.features)))
     *rest, metallic = (torch.cat(p) for p in zip(*parts, strict=True))
-    return Mesh(vertices, faces, *rest, unless_none(metallic))
+    return Mesh(vertices, faces, *rest, metallic=unless_none(metallic))
