@@ -14,7 +14,6 @@ namespace {
 
 using vec = float3;
 
-constexpr vec kF0{0.04f, 0.04f, 0.04f};
 constexpr int kFewestPoints = 16;    // in a chunk
 constexpr int kRouletteDepth = 2;    // bounces before paths may end at random
 constexpr float kHitOffset = 1e-5f;  // of the coordinates: lifts a ray off the triangle it left
@@ -47,9 +46,8 @@ Vertex vertex_at(const Relight& in, vec origin, vec direction, const Hit& hit) {
         normal = normal + w[k] * row(in.vertex_normal, face[k]);
         albedo = albedo + w[k] * row(in.vertex_albedo, face[k]);
         roughness += w[k] * in.vertex_roughness[face[k]];
-        if (in.vertex_f0) f0 = f0 + w[k] * row(in.vertex_f0, face[k]);
+        f0 = f0 + w[k] * row(in.vertex_f0, face[k]);
     }
-    if (!in.vertex_f0) f0 = kF0;
     // Surfaces have two sides: turn both normals to the side that the path came from.
     vec geometric = unit(of(hit.normal));
     if (dot(geometric, direction) >= 0) geometric = -1 * geometric;
@@ -294,7 +292,7 @@ void relight(const Relight& in, float* rgb, int threads) {
             for (int64_t i = begin; i < end; ++i) {
                 const vec normal = row(in.normal, i), wo = row(in.wo, i);
                 const vec position = row(in.position, i), albedo = row(in.albedo, i);
-                const vec f0 = in.f0 ? row(in.f0, i) : kF0;
+                const vec f0 = row(in.f0, i);
                 // A missing normal, or anything that is not a number, shades black.
                 if (!(dot(normal, normal) > 0.5f) ||
                     !std::isfinite(mean(normal + wo + position + albedo + f0) + in.roughness[i]))

@@ -21,10 +21,10 @@ struct Lights {
 /// Points to shade. N points, P vertices of the mesh; row-major, contiguous.
 struct Relight {
     const VisibilityScene* scene;
-    const float* vertex_normal;     // [P, 3] unit; these three may be null without bounces
+    const float* vertex_normal;     // [P, 3] unit; these four may be null without bounces
     const float* vertex_albedo;     // [P, 3]
     const float* vertex_roughness;  // [P]
-    const float* vertex_f0;         // [P, 3], or null: kF0 everywhere
+    const float* vertex_f0;         // [P, 3]
     EnvMapTables map;
     Lights lights;
     const float* position;   // [N, 3]
@@ -32,7 +32,7 @@ struct Relight {
     const float* wo;         // [N, 3] unit
     const float* albedo;     // [N, 3]
     const float* roughness;  // [N]
-    const float* f0;         // [N, 3], or null: kF0 everywhere
+    const float* f0;         // [N, 3]
     int64_t n_points;
     // First rays start this far along the normal and pass what is as near, world units.
     float offset;

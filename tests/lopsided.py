@@ -26,10 +26,10 @@ def roughness(points: torch.Tensor) -> torch.Tensor:
 
 
 class Identity(torch.nn.Module):
-    """The features are the materials."""
+    """The features are the materials; no metal."""
 
     def forward(self, features):
-        return features[:, :3], features[:, 3]
+        return features[:, :3], features[:, 3], torch.zeros(len(features))
 
 
 def lopsided(voxels: int = 48**3, change=None, light=None) -> Scene:

@@ -25,9 +25,7 @@ def test_clipped_pixels_cost_nothing_when_overshot():
     torch.testing.assert_close(drawn.grad, torch.tensor([[0.0, 1 / 3, -1 / 3]]))
 
 
-def test_silhouette_and_smoothness_vanish_where_equal():
+def test_silhouette_vanishes_where_equal():
     a = torch.rand(5)
     assert losses.silhouette(a, a) == 0
-    assert losses.smoothness(a, a) == 0
     assert losses.silhouette(a + 0.5, a).item() == pytest.approx(0.25)
-    assert losses.smoothness(a + 0.5, a).item() == pytest.approx(0.5)

@@ -41,22 +41,30 @@ _ALBEDO_WHITE = [
 # fmt: on
 
 
-def split(base: Tensor, metallic: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Diffuse albedo [..., 3] and F0 [..., 3] of a base colour, as glTF defines them.
+def split(base: Tensor, metallic: Tensor | None) -> tuple[Tensor, Tensor | float]:
+    """Diffuse albedo [..., 3] and F0 of a base colour, as glTF defines them.
 
         diffuse = base (1 - metallic),  F0 = 0.04 (1 - metallic) + base metallic
 
     Args:
         base: [..., 3] linear, in [0, 1].
-        metallic: [...] in [0, 1]; None is 0 everywhere, and gives the base and None, for 0.04.
+        metallic: [...] in [0, 1]; None is 0 everywhere.
+
+    Returns:
+        The diffuse albedo, and F0 as [..., 3], or the number 0.04 where metallic is None.
 
     Differentiable in: base, metallic.
     Source: Khronos Group, glTF 2.0 Specification, appendix B.
     """
     if metallic is None:
-        return base, None
+        return base, F0
     m = metallic[..., None]
     return base * (1 - m), F0 * (1 - m) + base * m
+
+
+def unless_none(metallic: Tensor) -> Tensor | None:
+    """Metallic [...], or None where no value of it would show in 8 bits: a dielectric scene."""
+    return metallic if (metallic > 0.5 / 255).any() else None
 
 
 def ggx_alpha(roughness: Tensor) -> Tensor:

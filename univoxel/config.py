@@ -38,7 +38,7 @@ class StageConfig:
     lr_networks: tuple[float, float] = (3e-3, 3e-4)
     plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.125]
     spread: int = 4  # passes that smooth the sdf's gradient before the optimiser, >= 0
-    diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 1]
+    diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 0.25]
     physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
     refit: bool = False  # geometry and materials stay; light and radiance follow them
 
@@ -54,7 +54,8 @@ class StageConfig:
         )
         _check(self, "at least 0", lambda x: x >= 0, "spread")
         _check(self, "in [0, 0.125]", lambda x: 0 <= x <= 0.125, "plate")
-        _check(self, "in [0, 1]", lambda x: 0 <= x <= 1, "diffusion", "physical_from")
+        _check(self, "in [0, 0.25]", lambda x: 0 <= x <= 0.25, "diffusion")
+        _check(self, "in [0, 1]", lambda x: 0 <= x <= 1, "physical_from")
 
 
 @dataclass(frozen=True)
@@ -197,13 +198,7 @@ def preset(name: str, data: Path, out: Path, light: LightName = "hybrid") -> Tra
             minutes, voxels, steps, rays = 12.0, 4.0, 2500, 2048
         case _:
             raise ValueError(f"preset must be draft, fast or full, got {name!r}")
-    coarse = StageConfig(
-        voxels=0.9,
-        iterations=steps // 2,
-        share=0.15,
-        rays=rays // 2,
-        sharpness=(0.7, 0.35),
-    )
+    coarse = StageConfig(0.9, steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35))
     fine = StageConfig(
         voxels=voxels,
         iterations=steps,

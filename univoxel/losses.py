@@ -30,8 +30,3 @@ def photometric(
 def silhouette(opacity: Tensor, alpha: Tensor) -> Tensor:
     """Squared difference of opacity and the photograph's alpha, [N]."""
     return (opacity - alpha).square().mean()
-
-
-def smoothness(value: Tensor, near: Tensor) -> Tensor:
-    """L1 between what is decoded at surface points and right beside them, [N, ...]."""
-    return (value - near).abs().mean()

@@ -44,3 +44,11 @@ class MLP(nn.Sequential):
             return super().forward(x)
         linear = self.linear
         return ops.mlp(x, [layer.weight for layer in linear], [layer.bias for layer in linear])
+
+
+def waves(x: Tensor, octaves: int) -> list[Tensor]:
+    """Sines and cosines of x, 2 x, 4 x and so on: 2 * octaves tensors as x.
+
+    Networks of low dimension learn detail from them. Source: Mildenhall et al. 2020, eq. 4.
+    """
+    return [wave for i in range(octaves) for wave in ((x * 2**i).sin(), (x * 2**i).cos())]

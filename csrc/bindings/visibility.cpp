@@ -73,19 +73,19 @@ void bind_integrator(py::module_& m) {
            const array<float>& column_cdf, float rotation, const array<float>& sun,
            const array<float>& lamp, const array<float>& position, const array<float>& normal,
            const array<float>& wo, const array<float>& albedo, const array<float>& roughness,
-           const optional_array& f0, array<float>& rgb, float offset, uint32_t first, int samples,
+           const array<float>& f0, array<float>& rgb, float offset, uint32_t first, int samples,
            int bounces, uint32_t seed, Strategy strategy, int threads) {
             const int64_t n = roughness.size(), h = texel.shape(0), w = texel.shape(1);
             require(texel.size() == 4 * h * w && row_cdf.size() == h + 1 &&
                         column_cdf.size() == h * (w + 1),
                     "relight: the tables do not belong to this map");
             for (const array<float>* a :
-                 {&position, &normal, &wo, &albedo, static_cast<const array<float>*>(&rgb)})
+                 {&position, &normal, &wo, &albedo, &f0, static_cast<const array<float>*>(&rgb)})
                 require(a->size() == 3 * n, "relight: points differ in number");
-            require(bounces == 0 || (vertex_normal && vertex_albedo && vertex_roughness),
-                    "relight: bounces need materials");
-            require(sun.size() % 7 == 0 && lamp.size() % 6 == 0 && (!f0 || f0->size() == 3 * n),
-                    "relight: lights or f0 of another size");
+            require(
+                bounces == 0 || (vertex_normal && vertex_albedo && vertex_roughness && vertex_f0),
+                "relight: bounces need materials");
+            require(sun.size() % 7 == 0 && lamp.size() % 6 == 0, "relight: lights of another size");
             const auto data = [](const optional_array& a) { return a ? a->data() : nullptr; };
             const Relight in{&scene,
                              data(vertex_normal),
@@ -99,7 +99,7 @@ void bind_integrator(py::module_& m) {
                              wo.data(),
                              albedo.data(),
                              roughness.data(),
-                             data(f0),
+                             f0.data(),
                              n,
                              offset,
                              first,

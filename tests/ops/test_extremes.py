@@ -8,61 +8,14 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from extremes import WILD, channels, check_finite, few, pick, run, same, seeds, shading
+from hypothesis import given
 from hypothesis import strategies as st
 
-from univoxel import ops, sphere
+from univoxel import ops
 from univoxel.ops import native
 
 pytestmark = pytest.mark.skipif(native.core is None, reason="without the extension")
-few = settings(max_examples=40, deadline=None, derandomize=True)
-
-REACH = 1e36  # of a float32 result: sums of some tens of these stay below 3.4e38
-WILD = (0.0, -0.0, 1e-45, -1e-40, 1.2e-38, 1e-7, 0.5, 1.0, -1.0, 1e4, 1e30, -1e30)
-seeds = st.integers(0, 2**31)
-channels = st.sampled_from([0, 1, 3, 12, 17])
-
-
-def pick(generator, values, *size):
-    """Numbers drawn from a list, and as many from a normal distribution."""
-    values = torch.tensor(values, dtype=torch.float64)
-    drawn = values[torch.randint(len(values), size, generator=generator)]
-    usual = torch.randn(size, generator=generator, dtype=torch.float64)
-    return torch.where(torch.rand(size, generator=generator) < 0.5, drawn, usual).float()
-
-
-def run(op, arguments, dtype=torch.float32):
-    """Outputs, then gradients of their sum to every floating tensor that asks for one."""
-    arguments = [
-        a.detach().to(dtype).requires_grad_(a.requires_grad)
-        if isinstance(a, torch.Tensor) and a.is_floating_point()
-        else a
-        for a in arguments
-    ]
-    out = op(*arguments)
-    out = [out] if isinstance(out, torch.Tensor) else list(out)
-    leaves = [a for a in arguments if isinstance(a, torch.Tensor) and a.requires_grad]
-    through = [o for o in out if o.requires_grad]
-    grads = torch.autograd.grad(through, leaves, [torch.ones_like(o) for o in through])
-    return [*(o.detach() for o in out), *(g.to_dense() if g.is_sparse else g for g in grads)]
-
-
-def check_finite(op, reference, arguments):
-    for got, want in zip(
-        run(op, arguments),
-        run(reference, arguments, torch.float64),
-        strict=True,
-    ):
-        assert got.shape == want.shape
-        lost = want.isfinite() & (want.abs() < REACH) & ~got.isfinite()
-        assert not lost.any(), f"{got[lost][:4]}, in float64 {want[lost][:4]}"
-
-
-def same(a, b):
-    """Equal numbers, NaN equal to NaN."""
-    return torch.equal(torch.nan_to_num(a, 12345.0), torch.nan_to_num(b, 12345.0)) and torch.equal(
-        a.isnan(), b.isnan()
-    )
 
 
 # --- composite
@@ -162,101 +115,6 @@ def test_sample_dense_keeps_a_nan_gradient_near_its_point(seed, sparse):
     for leaf in (sdf, features):
         grad = leaf.grad.to_dense() if sparse else leaf.grad
         assert grad.flatten(0, 2)[far].isfinite().all()
-
-
-# --- shade_sg
-
-
-def shading(seed, n, k):
-    g = torch.Generator().manual_seed(seed)
-
-    def unit(*size):
-        v = torch.nn.functional.normalize(torch.randn(*size, 3, generator=g), dim=-1)
-        poles = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, -0.0, -0.0], [1, 0, 0], [1e-20, 0, 1]])
-        chosen = poles[torch.randint(len(poles), size, generator=g)]
-        return torch.where(torch.rand(*size, 1, generator=g) < 0.4, chosen, v)
-
-    normal = unit(n)
-    towards = torch.tensor([1.0, -1.0])[torch.randint(2, (n, 1), generator=g)]
-    wo = torch.where(torch.rand(n, 1, generator=g) < 0.3, normal * towards, unit(n))
-    sharpness = pick(g, (0.0, 1e-45, 1e-3, 30.0, 1e6, 1e30), n, k).abs()
-    amplitude = pick(g, (0.0, 1e-45, 1.0, 1e6), n, k, 3).abs()
-    albedo = pick(g, (0.0, 1.0, 1e-45), n, 3).clamp(0, 1)
-    roughness = pick(g, (0.0, 1.0, 1e-45, 0.03), n).clamp(0, 1)
-    parameters = (unit(n, k), sharpness, amplitude, normal, wo, albedo, roughness)
-    directions = sphere.fibonacci_hemisphere(32)
-    rotation = pick(g, (0.0, 6.2831853, -1e4), n)
-    return [p.requires_grad_() for p in parameters] + [directions, rotation]
-
-
-def reflectance(seed, n, kind):
-    """A number, or an F0 per channel."""
-    g = torch.Generator().manual_seed(seed + 1)
-    return pick(g, (0.0, 1.0, 1e-45), n, 3).clamp(0, 1).requires_grad_() if kind is None else kind
-
-
-f0s = st.sampled_from([0.0, 0.04, 1.0, None])
-
-
-@few
-@given(seeds, st.integers(0, 5), st.integers(0, 3), f0s)
-def test_shade_sg_is_finite(seed, n, k, f0):
-    f0 = reflectance(seed, n, f0)
-    check_finite(ops.shade_sg, ops.shade_sg_reference, (*shading(seed, n, k), f0))
-
-
-@few
-@given(seeds, st.integers(0, 3), st.sampled_from([0, 1, 2, 3, 4, 5, 6, 8, 9]))
-def test_shade_sg_keeps_nan_at_its_point(seed, point, argument):
-    arguments = [*shading(seed, 4, 2), reflectance(seed, 4, None)]
-    before = run(ops.shade_sg, arguments)
-    with torch.no_grad():
-        arguments[argument][point] = math.nan
-    after = run(ops.shade_sg, arguments)
-    others = torch.arange(4) != point
-    for a, b in zip(before, after, strict=True):
-        assert same(a[others], b[others])
-
-
-# --- shade_radiance, shade_map
-
-
-def under_light(seed, n, count=16):
-    """Light, then what shade_radiance and shade_map share; normals and eyes of `shading`."""
-    g = torch.Generator().manual_seed(seed)
-    _, _, _, normal, wo, albedo, roughness, *_ = shading(seed, n, 1)
-    light = pick(g, (0.0, 1e-45, 1.0, 1e6), n, count, 3).abs().requires_grad_()
-    directions = sphere.fibonacci_sphere(count)
-    rest = (normal, wo.detach(), albedo, roughness, directions, 4 * math.pi / count)
-    return light, rest
-
-
-@few
-@given(seeds, st.integers(0, 5), f0s)
-def test_shade_under_given_light_is_finite(seed, n, f0):
-    light, rest = under_light(seed, n)
-    f0 = reflectance(seed, n, f0)
-    check_finite(ops.shade_radiance, ops.shade_radiance_reference, (light, *rest, f0))
-    g = torch.Generator().manual_seed(seed)
-    visibility = torch.rand(4, 16, generator=g).round(decimals=1)
-    indirect = pick(g, (0.0, 1e-45, 1.0, 1e6), 4, 16, 3).abs()
-    map = pick(g, (0.0, 1e-45, 1.0, 1e6), 16, 3).abs().requires_grad_()
-    mapped = (map, visibility, indirect, torch.arange(n) % 4, *rest, f0)
-    check_finite(ops.shade_map, ops.shade_map_reference, mapped)
-
-
-@few
-@given(seeds, st.integers(0, 3), st.sampled_from(["light", 0, 1, 2, 3, 6]))
-def test_shade_under_given_light_keeps_nan_at_its_point(seed, point, argument):
-    light, rest = under_light(seed, 4)
-    rest = (*rest, reflectance(seed, 4, None))
-    before = run(ops.shade_radiance, (light, *rest))
-    with torch.no_grad():
-        (light if argument == "light" else rest[argument])[point] = math.nan
-    after = run(ops.shade_radiance, (light, *rest))
-    others = torch.arange(4) != point
-    for a, b in zip(before, after, strict=True):
-        assert same(a[others], b[others])
 
 
 # --- march

@@ -10,12 +10,13 @@ import torch
 from analytic import RADIUS, cameras_around, sphere_normals, sphere_scene, write_scene
 from torch.nn.functional import normalize
 
-from univoxel import losses
+from univoxel import brdf, losses
 from univoxel.color import linear_to_srgb
 from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.data import Photos
 from univoxel.lights.sg import SGConfig
 from univoxel.ops import shade_map
+from univoxel.optim import RowAdam
 from univoxel.render.pipeline import extract_mesh
 from univoxel.render.transport import Observations, Transport
 from univoxel.scene import SceneConfig
@@ -45,13 +46,13 @@ def problem_on_a_sphere(points: int, views: int, nodes: int) -> joint.Problem:
     return joint.Problem(seen, transport, black, no_metal, 0.05)
 
 
-def photographed(problem: joint.Problem, map, albedo, roughness) -> joint.Problem:
+def photographed(problem: joint.Problem, map, albedo, roughness, f0=None) -> joint.Problem:
     """The same with the sightings that a map [D, 3] and materials [P, 3], [P] make."""
     point = torch.repeat_interleave(problem.seen.offsets.diff())
     t, seen = problem.transport, problem.seen
     color = shade_map(
         map, t.open, t.indirect, point, seen.normal[point], seen.wo, albedo[point],
-        roughness[point], t.direction, problem.solid_angle,
+        roughness[point], t.direction, problem.solid_angle, brdf.F0 if f0 is None else f0[point],
     )  # fmt: skip
     seen = replace(seen, color=color)
     return replace(problem, seen=seen, target=losses.encode(color))
@@ -271,6 +272,51 @@ def test_metals_have_no_say_in_the_map():
     problem = problem_on_a_sphere(20, 8, 32)
     problem = dataclasses.replace(problem, metal=torch.ones(20, dtype=torch.bool))
     assert joint.newton_round(scene, problem, CFG) == []
+
+
+@pytest.mark.parametrize("metal", [False, True])
+def test_only_what_was_metal_before_can_be_metal(metal):
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
+    problem = problem_on_a_sphere(20, 8, 32)
+    problem = replace(problem, metal=torch.full((20,), metal))
+    with torch.no_grad():
+        scene.material.net[-1].bias[4] = 0.0
+    joint.objective(scene, problem, CFG)["joint"].backward()
+    slope = scene.material.net[-1].bias.grad
+    assert slope[:4].abs().min() > 0
+    assert (slope[4] != 0) == metal
+
+
+def test_metal_is_learned_where_it_is():
+    """Under a known map with lamps: copper on one side of the sphere, a dielectric on the other."""
+    torch.manual_seed(3)
+    nodes, count = 64, 600
+    problem = problem_on_a_sphere(count, 12, nodes)
+    map = 0.3 + 4 * (torch.rand(nodes, 3) < 0.1)
+    copper = problem.seen.normal[:, 0] > 0
+    base = torch.where(
+        copper[:, None], torch.tensor([0.95, 0.6, 0.4]), torch.tensor([0.4, 0.5, 0.6])
+    )
+    shown = joint.widened(torch.full((count,), 0.3), nodes)
+    albedo, f0 = brdf.split(base, copper.float())
+    problem = replace(photographed(problem, map, albedo, shown, f0), metal=torch.ones_like(copper))
+    scene = sphere_scene(nodes)
+    with torch.no_grad():
+        scene.sky.log_radiance.copy_(map.log())
+    optimizer = RowAdam(
+        [{"params": [scene.field.features], "lr": 0.03}, {"params": scene.material.parameters()}],
+        lr=3e-3,
+    )
+    for _ in range(400):
+        optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(joint.objective(scene, problem, CFG).values())).sum().backward()
+        optimizer.step()
+    features = scene.field.sample(problem.seen.position).features
+    found, _, metallic = (m.detach() for m in scene.material(features))
+    inside = problem.seen.normal[:, 0].abs() > 0.2
+    assert metallic[inside & copper].mean() > 0.9
+    assert metallic[inside & ~copper].mean() < 0.05
+    assert (found - base)[inside].abs().mean() < 0.05
 
 
 class Steps:

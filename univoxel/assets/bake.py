@@ -7,6 +7,7 @@ from torch import Tensor
 
 from univoxel.assets.atlas import dilated, rasterise, unwrap, vertex_normals, vertex_tangents
 from univoxel.assets.base import TexturedMesh
+from univoxel.brdf import unless_none
 from univoxel.fields.base import AbstractField
 from univoxel.records import FieldSample, Mesh
 from univoxel.scene import Scene
@@ -41,7 +42,8 @@ def with_materials(scene: Scene, mesh: Mesh) -> Mesh:
         _, at = nearest_surface(scene.field, points)
         normal = torch.nn.functional.normalize(at.gradient, dim=1, eps=1e-6)
         parts.append((normal, *scene.material(at.features)))
-    return Mesh(mesh.vertices, mesh.faces, *(torch.cat(p) for p in zip(*parts, strict=True)))
+    *rest, metallic = (torch.cat(p) for p in zip(*parts, strict=True))
+    return Mesh(mesh.vertices, mesh.faces, *rest, metallic=unless_none(metallic))
 
 
 @torch.no_grad()
@@ -71,8 +73,10 @@ def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
         _, at = nearest_surface(scene.field, point)
         parts.append((in_frame(at.gradient, n, t), *scene.material(at.features)))
     place = dilated(texel, size)
-    textures = (torch.cat(p)[place] for p in zip(*parts, strict=True))
-    return TexturedMesh(vertices, faces, normals, tangents, uv, *textures)
+    *rest, metallic = (torch.cat(p)[place] for p in zip(*parts, strict=True))
+    return TexturedMesh(
+        vertices, faces, normals, tangents, uv, *rest, metallic=unless_none(metallic)
+    )
 
 
 def in_frame(direction: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:

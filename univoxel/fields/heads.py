@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from univoxel.networks import MLP
+from univoxel.networks import MLP, waves
 
 
 class MaterialHead(nn.Module):
@@ -45,5 +45,5 @@ class RadianceHead(nn.Module):
     def forward(self, features: Tensor, normal: Tensor, wo: Tensor) -> Tensor:
         cosine = (normal * wo).sum(1, keepdim=True)
         mirrored = 2 * cosine * normal - wo
-        waves = torch.cat([mirrored, (2 * mirrored).sin(), (2 * mirrored).cos()], 1)
-        return torch.sigmoid(self.net(torch.cat([features, normal, waves, cosine], 1)))
+        fine = waves(2 * mirrored, 1)
+        return torch.sigmoid(self.net(torch.cat([features, normal, mirrored, *fine, cosine], 1)))

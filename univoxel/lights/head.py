@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from univoxel.networks import MLP
+from univoxel.networks import MLP, waves
 from univoxel.records import Surface
 
 FREQUENCIES = 3  # of the position: sines of 1, 2, 4 half-turns over the scale
@@ -51,6 +51,5 @@ def encode(surface: Surface, scale: float) -> Tensor:
     Args:
         scale: world units: half the extent of what is lit.
     """
-    angle = surface.position * (math.pi / scale)
-    waves = [w for i in range(FREQUENCIES) for w in ((angle * 2**i).sin(), (angle * 2**i).cos())]
-    return torch.cat([surface.features, surface.position / scale, *waves], -1)
+    fine = waves(surface.position * (math.pi / scale), FREQUENCIES)
+    return torch.cat([surface.features, surface.position / scale, *fine], -1)

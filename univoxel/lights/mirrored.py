@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from univoxel import brdf
 from univoxel.lights import head
-from univoxel.networks import MLP
+from univoxel.networks import MLP, waves
 from univoxel.records import Surface
 
 _OCTAVES = 4  # of the mirrored direction: sines of 1, 2, 4, 8 radians
@@ -41,15 +41,9 @@ class MirroredLight(nn.Module):
         """Radiance [N, 3] towards unit directions wo [N, 3], to be added."""
         cosine = (surface.normal * wo).sum(1, keepdim=True)
         mirrored = 2 * cosine * surface.normal - wo
-        waves = [w for i in range(_OCTAVES) for w in _waves(mirrored * 2**i)]
         roughness = surface.roughness[:, None]
         place = head.encode(surface, self.scale)
-        light = self.net(torch.cat([place, *waves, roughness, cosine], 1))
+        light = self.net(torch.cat([place, *waves(mirrored, _OCTAVES), roughness, cosine], 1))
         _, f0 = brdf.split(surface.albedo, surface.metallic)
-        if f0 is None:
-            f0 = torch.full_like(surface.albedo, brdf.F0)
-        return brdf.specular_albedo(cosine[:, 0], surface.roughness, f0) * light
-
-
-def _waves(angle: Tensor) -> tuple[Tensor, Tensor]:
-    return angle.sin(), angle.cos()
+        share = brdf.specular_albedo(cosine[:, 0], surface.roughness, f0)
+        return (share if share.dim() == 2 else share[:, None]) * light

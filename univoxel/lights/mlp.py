@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from univoxel import sphere
 from univoxel.lights import head, priors, quadrature
 from univoxel.lights.base import AbstractLight
-from univoxel.networks import MLP
+from univoxel.networks import MLP, waves
 from univoxel.records import Occlusion, Surface
 
 _MEAN_OVER = 32  # directions that stand for the whole sphere where light is averaged
@@ -87,12 +87,7 @@ class LocalMLP(AbstractLight):
 
     def basis(self, wi: Tensor) -> Tensor:
         """[..., rank + 1] of unit directions [..., 3]; the first is 1."""
-        waves = [
-            w
-            for i in range(self.config.frequencies)
-            for w in ((wi * 2**i).sin(), (wi * 2**i).cos())
-        ]
-        encoded = torch.cat([wi, *waves], -1)
+        encoded = torch.cat([wi, *waves(wi, self.config.frequencies)], -1)
         values = self.basis_net(encoded.flatten(0, -2)).unflatten(0, wi.shape[:-1])
         return torch.cat([torch.ones_like(values[..., :1]), values], -1)
 

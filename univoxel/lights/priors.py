@@ -1,4 +1,5 @@
-"""What is likely of light: it changes little from point to point, and is white on the whole."""
+"""What is likely: light and material change little from point to point, light is white on the
+whole."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from torch import Tensor
 
 
 def smoothness(value: Tensor, near: Tensor) -> Tensor:
-    """L1 between what lights surface points and what lights places right beside them, [N, ...]."""
+    """L1 between what holds at surface points and at places right beside them, [N, ...]."""
     return (value - near).abs().mean()
 
 

@@ -79,7 +79,6 @@ def reflected(
     if occlusion is not None:
         radiance = occlusion.visibility[..., None] * radiance + occlusion.indirect
     diffuse, f0 = brdf.split(surface.albedo, surface.metallic)
-    f0 = brdf.F0 if f0 is None else f0
     normal, solid_angle = surface.normal, 2 * math.pi / directions
     if torch.is_grad_enabled() and (normal.requires_grad or wo.requires_grad):
         normal = normal[:, None]
@@ -133,5 +132,5 @@ def reflected_shared(
         surface.roughness,
         directions,
         4 * math.pi / len(directions),
-        brdf.F0 if f0 is None else f0,
+        f0,
     )

@@ -104,7 +104,7 @@ class LocalSG(AbstractLight):
             surface.roughness,
             directions,
             quadrature.rotations(surface, generator),
-            brdf.F0 if f0 is None else f0,
+            f0,
         )
 
     def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:

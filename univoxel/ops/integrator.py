@@ -10,8 +10,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from univoxel.brdf import F0
 from univoxel.ops import native
 from univoxel.ops.checks import check
+from univoxel.ops.reflectance import stored_f0
 from univoxel.ops.visibility import VisibilityScene
 from univoxel.records import Mesh
 
@@ -89,8 +91,8 @@ def relight(
     bounces: int = 0,
     suns: Sequence[Sun] = (),
     lamps: Sequence[Lamp] = (),
-    f0: Tensor | None = None,
-    mesh_f0: Tensor | None = None,
+    f0: Tensor | float = F0,
+    mesh_f0: Tensor | float = F0,
     first: int = 0,
     seed: int = 0,
     strategy: Strategy = "mis",
@@ -123,8 +125,8 @@ def relight(
         samples: paths per point, >= 1; powers of 2 are best.
         bounces: reflections after the first point, >= 0; 0 is direct light only.
         suns, lamps: lights besides the map.
-        f0: [N, 3] float32 in [0, 1], reflectance at normal incidence; 0.04 when left out. A metal
-            has its colour here and albedo 0.
+        f0: [N, 3] float32 or a number, in [0, 1]: reflectance at normal incidence. A metal has its
+            colour here and albedo 0.
         mesh_f0: [P, 3] likewise at the mesh's vertices, for bounces.
         first: number of the first sample in the sequence, >= 0: the mean of samples 0 .. 63 is that
             of 0 .. 31 and 32 .. 63.
@@ -168,7 +170,7 @@ def relight(
     ):
         if not ok:
             raise ValueError(f"relight: {name}, got {value!r}")
-    if f0 is not None:
+    if isinstance(f0, Tensor):
         check("relight", position=(position, "N 3", torch.float32), f0=(f0, "N 3", torch.float32))
     materials = _materials(scene, mesh, mesh_f0) if bounces else (None,) * 4
     traced = scene.native()
@@ -176,7 +178,7 @@ def relight(
         raise RuntimeError("relight: runs on the native backend only, got use_backend('reference')")
     rgb = torch.empty_like(position, memory_format=torch.contiguous_format)
     light = (tables.texel, tables.row_cdf, tables.column_cdf)
-    points = (position, normal, wo, albedo, roughness)
+    points = (position, normal, wo, albedo, roughness, _rows_of_f0(f0, position))
     core = native.require()
     core.relight(
         traced,
@@ -185,7 +187,6 @@ def relight(
         tables.rotation,
         *map(_array, (_pack_suns(suns), _pack_lamps(lamps))),
         *map(_array, points),
-        _array(f0),
         *native.arrays(rgb),
         offset,
         first,
@@ -198,8 +199,8 @@ def relight(
     return rgb
 
 
-def _materials(scene: VisibilityScene, mesh: Mesh, f0: Tensor | None) -> tuple[Tensor | None, ...]:
-    """Normals, albedo, roughness and F0, if any, at the vertices of the scene's mesh."""
+def _materials(scene: VisibilityScene, mesh: Mesh, f0: Tensor | float) -> tuple[Tensor, ...]:
+    """Normals, albedo, roughness and F0 at the vertices of the scene's mesh."""
     if mesh.normals is None or mesh.albedo is None or mesh.roughness is None:
         raise ValueError("relight: bounces need a mesh with normals, albedo and roughness")
     check(
@@ -208,9 +209,14 @@ def _materials(scene: VisibilityScene, mesh: Mesh, f0: Tensor | None) -> tuple[T
         mesh_normals=(mesh.normals, "P 3", torch.float32),
         mesh_albedo=(mesh.albedo, "P 3", torch.float32),
         mesh_roughness=(mesh.roughness, "P", torch.float32),
-        **({} if f0 is None else {"mesh_f0": (f0, "P 3", torch.float32)}),
+        **({"mesh_f0": (f0, "P 3", torch.float32)} if isinstance(f0, Tensor) else {}),
     )
-    return mesh.normals, mesh.albedo, mesh.roughness, f0
+    return mesh.normals, mesh.albedo, mesh.roughness, _rows_of_f0(f0, mesh.normals)
+
+
+def _rows_of_f0(f0: Tensor | float, like: Tensor) -> Tensor:
+    """F0 as [N, 3], as like is."""
+    return stored_f0("relight", f0, like).expand_as(like)
 
 
 def _array(tensor: Tensor | None):

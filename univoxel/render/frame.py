@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from univoxel import envmap as env
+from univoxel.brdf import unless_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.records import Surface
@@ -109,6 +110,7 @@ def render_picture(
         clear = clear * (1 - shadow[:, None])
     if quality.background == "map":
         rgb = rgb + clear * env.background(lighting.tables, rays.direction)
+    metallic = None if surface.metallic is None else unless_none(surface.metallic)
     backward = cameras.camera_to_world[view, :, 2]
 
     def grid(values: Tensor) -> Tensor:
@@ -121,7 +123,7 @@ def render_picture(
         depth=grid(torch.where(there[:, 0], surface.depth * (wo @ backward), 0.0)),
         alpha=grid(surface.opacity),
         shadow=None if shadow is None else grid(shadow),
-        metallic=None if surface.metallic is None else grid(surface.metallic * surface.opacity),
+        metallic=None if metallic is None else grid(metallic * surface.opacity),
         opaque=quality.background != "transparent",
     )
 

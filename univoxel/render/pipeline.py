@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from univoxel.brdf import unless_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.lights.quadrature import rotations
 from univoxel.ops import composite
@@ -115,4 +116,5 @@ def extract_mesh(scene: Scene) -> Mesh:
         sample = scene.field.sample(points)
         normal = torch.nn.functional.normalize(sample.gradient, dim=1, eps=1e-6)
         parts.append((normal, *scene.material(sample.features)))
-    return Mesh(vertices, faces, *(torch.cat(p) for p in zip(*parts, strict=True)))
+    *rest, metallic = (torch.cat(p) for p in zip(*parts, strict=True))
+    return Mesh(vertices, faces, *rest, metallic=unless_none(metallic))

@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from univoxel.brdf import split
+from univoxel.brdf import F0, split
 from univoxel.color import luminance
 from univoxel.ops import EnvTables, Lamp, Sun, VisibilityScene, relight
 from univoxel.records import Mesh, Rays, Surface
@@ -200,10 +200,10 @@ def ground_shadow(
     return shadow
 
 
-def _layers(mesh: Mesh) -> tuple[Mesh, Tensor | None]:
-    """The mesh with the albedo of its diffuse base, and its F0 where there is metal."""
-    if mesh.albedo is None or mesh.metallic is None:
-        return mesh, None
+def _layers(mesh: Mesh) -> tuple[Mesh, Tensor | float]:
+    """The mesh with the albedo of its diffuse base, and its F0."""
+    if mesh.albedo is None:
+        return mesh, F0
     diffuse, f0 = split(mesh.albedo, mesh.metallic)
     return replace(mesh, albedo=diffuse), f0
 
@@ -236,7 +236,7 @@ def _floor(
             bounces=reflections,
             suns=lighting.suns,
             lamps=lighting.lamps,
-            f0=torch.zeros_like(points),
+            f0=0.0,
             mesh_f0=mesh_f0,
             first=first,
             samples=samples,

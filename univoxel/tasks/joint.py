@@ -17,6 +17,7 @@ from torch import Tensor
 from univoxel import brdf, losses
 from univoxel.config import JointConfig
 from univoxel.data import Photos
+from univoxel.lights import priors
 from univoxel.ops import VisibilityScene, shade_map
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import extract_mesh
@@ -120,7 +121,7 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
     material = scene.material(scene.field.sample(seen.position[points]).features)
     albedo, roughness, metallic = material
     diffuse, f0 = brdf.split(albedo, metallic * problem.metal[points])
-    assert f0 is not None
+    assert isinstance(f0, Tensor)
     repeat = torch.arange(len(points)).repeat_interleave(cfg.views)
     rgb = shade_map(
         scene.sky.radiance,
@@ -141,8 +142,8 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
     encoded, target = losses.encode(rgb), problem.target[sighting]
     return {
         "joint": losses.photometric(encoded, target, clipped=CLIPPED),
-        "albedo": cfg.albedo_smoothness * losses.smoothness(albedo, albedo_near),
-        "roughness": cfg.roughness_smoothness * losses.smoothness(roughness, roughness_near),
+        "albedo": cfg.albedo_smoothness * priors.smoothness(albedo, albedo_near),
+        "roughness": cfg.roughness_smoothness * priors.smoothness(roughness, roughness_near),
         "metallic": cfg.metallic * metallic.mean(),
     }
 

@@ -23,6 +23,7 @@ from univoxel.config import (
 from univoxel.data import DataError, Photos, load_photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
+from univoxel.lights import priors
 from univoxel.ops import smooth_rows_
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays, Surface
@@ -211,8 +212,8 @@ def objective(
     prior = scene.light.regularisation(met, replace(met, features=near, position=beside))
     terms |= {
         "physical": losses.photometric(encoded, target),
-        "albedo": weight.albedo_smoothness * losses.smoothness(met.albedo, albedo),
-        "roughness": weight.roughness_smoothness * losses.smoothness(met.roughness, roughness),
+        "albedo": weight.albedo_smoothness * priors.smoothness(met.albedo, albedo),
+        "roughness": weight.roughness_smoothness * priors.smoothness(met.roughness, roughness),
         "metallic": weight.metallic * met.metallic.mean(),
     }
     return terms | {name: getattr(weight, name) * value for name, value in prior.items()}
