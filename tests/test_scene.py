@@ -59,6 +59,27 @@ def test_a_checkpoint_gives_the_same_scene(tmp_path, light):
         assert torch.equal(a, b), name
 
 
+def test_a_slim_file_holds_what_is_seen(tmp_path):
+    """Half the precision, and nothing of features where no ray stops."""
+    scene = small_scene()
+    distance = scene.field.sdf.detach().abs() / scene.field.voxel_size
+    with torch.no_grad():
+        scene.field.features.copy_(torch.randn(*scene.field.grid.size, 4))
+    stored = load_file(save_scene(scene, tmp_path, {}, slim=True))
+    assert stored["field.sdf"].dtype == stored["field.feature_values"].dtype == torch.float16
+    assert len(stored["field.feature_rows"]) < scene.field.grid.nodes_count
+    again = load_scene(tmp_path)
+    kept, wanted = again.field.features, scene.field.features.detach()
+    assert kept.dtype == again.field.sdf.dtype == torch.float32
+    torch.testing.assert_close(kept[distance < 3.9], wanted[distance < 3.9], rtol=2**-11, atol=0)
+    assert distance.max() > 4.1
+    assert not kept[distance > 4.1].any()
+    # Half precision has 11 bits
+    near = distance < 4
+    error = (again.field.sdf - scene.field.sdf)[near].abs().max() / scene.field.voxel_size
+    assert error < 4 * 2**-11
+
+
 def test_lights_of_older_files_are_lobes():
     assert read_config({"lobes": 4}) == SGConfig(lobes=4)
 

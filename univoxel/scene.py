@@ -31,6 +31,8 @@ from univoxel.ops import VisibilityScene
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
 FILE = "scene.safetensors"
+SHELL = 4.0  # voxels around the surface, beyond which a finished scene needs no features
+HALF_MAX = 65504.0
 
 
 @dataclass(frozen=True)
@@ -95,8 +97,12 @@ class Scene(nn.Module):
         return self.sky
 
 
-def save_scene(scene: Scene, run: Path, state: dict) -> Path:
+def save_scene(scene: Scene, run: Path, state: dict, slim: bool = False) -> Path:
     """Write run/scene.safetensors whole or not at all; `state` (JSON) travels in its metadata.
+
+    Args:
+        slim: for a scene that is done: the grids in half precision, and features only where rays
+            meet the surface; otherwise what is loaded equals what was saved, bit by bit.
 
     Raises:
         OSError: names the file when it cannot be written; the one before stays.
@@ -104,8 +110,15 @@ def save_scene(scene: Scene, run: Path, state: dict) -> Path:
     tensors = {k: v.contiguous() for k, v in scene.state_dict().items() if k != "field.features"}
     # Features that no sample has touched are 0: only the others are stored.
     features = scene.field.features.detach().flatten(0, 2)
-    rows = features.any(1).nonzero()[:, 0]
+    touched = features.any(1)
+    if slim:
+        touched &= scene.field.sdf.detach().flatten().abs() < SHELL * scene.field.voxel_size
+    rows = touched.nonzero()[:, 0]
     tensors["field.feature_rows"], tensors["field.feature_values"] = rows.int(), features[rows]
+    if slim:
+        # sdf next to the surface is a small number: half precision keeps it to 1e-3 voxels
+        for name in ("field.sdf", "field.feature_values"):
+            tensors[name] = tensors[name].clamp(-HALF_MAX, HALF_MAX).half()
     meta = {
         "format": FORMAT,
         "scene": asdict(scene.cfg),
@@ -156,7 +169,7 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
         scene = Scene(cfg, DenseField(grid, cfg.channels), meta["inv_s"])
         rows, values = tensors.pop("field.feature_rows"), tensors.pop("field.feature_values")
         features = torch.zeros(grid.nodes_count, cfg.channels)
-        features[rows.long()] = values
+        features[rows.long()] = values.float()
         tensors["field.features"] = features.view(*grid.size, cfg.channels)
         scene.load_state_dict(tensors)
         return scene.eval(), meta["state"]

@@ -109,7 +109,8 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
                 if scene.field.grid != grid:
                     scene.field = scene.field.resized(grid)
                 run_stage(scene, cfg, stage, photos, pixels, held_out, progress)
-            save_scene(scene, cfg.out, progress.state())
+            done = index + 1 == len(cfg.stages)
+            save_scene(scene, cfg.out, progress.state(), slim=done)
             preview(scene, photos, cfg.out / "preview.png")
     return cfg.out
 
