@@ -69,7 +69,7 @@ def calls(monkeypatch):
     replace("export", None)
     replace("envmap", None)
     replace("demo", Path("demo/index.html"))
-    return types.SimpleNamespace(noted=noted, replace=replace)
+    return types.SimpleNamespace(noted=noted, replace=replace, stand_in=stand_in, task=task)
 
 
 def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
@@ -154,6 +154,29 @@ def test_inspect(calls, tmp_path, capsys):
     assert capsys.readouterr().out == f"{out}\n"
 
 
+def test_experiments(calls, tmp_path, capsys):
+    calls.stand_in("univoxel.experiments.compare", compare=calls.task("compare", "table"))
+    calls.stand_in("univoxel.experiments.chart", chart=calls.task("chart", "picture"))
+    options = ["--preset", "draft", "--samples", "4", "--set", "seed=1"]
+    more = ["--light", "sg", "sg:lobes=12", "--minutes", "2"]
+    assert main(["compare", "cup", "shoe", "--out", "out", *options, *more]) == 0
+    assert main(["chart", "cup", "--out", "out", *options, "--light", "sg", "--quick"]) == 0
+    assert main(["chart", "cup", "--out", "out", "--only", "draft", "fast"]) == 0
+    lights = ("sg", "sg:lobes=12")
+    scenes = (Path("cup"), Path("shoe"))
+    assert [given for _, given, _ in calls.noted] == [
+        (scenes, Path("out"), "draft", lights, 2.0, ("seed=1",), 4),
+        ((Path("cup"),), Path("out"), "draft", "sg", True, (), ("seed=1",), 4),
+        ((Path("cup"),), Path("out"), "fast", "hybrid", False, ("draft", "fast"), (), 64),
+    ]
+    assert capsys.readouterr().out.split() == ["table", "picture", "picture"]
+    assert main(["compare", "cup", "--out", "out", "--minutes", "-1"]) == 2
+    assert "--minutes must be above 0, got -1" in capsys.readouterr().err
+    calls.stand_in("univoxel.experiments.chart", chart=calls.task("chart", KeyboardInterrupt()))
+    assert main(["chart", "cup", "--out", "out"]) == 130
+    assert "out keeps the trainings that are done" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "error",
     [
@@ -206,7 +229,10 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         ),
         (["train", "x", "--out", "y", "--minutes", "a"], "Error parsing --minutes: "),
         (["sing"], "Unrecognized options: sing"),
-        ([], "Expected one of {train, eval, relight, export, envmap, inspect, demo}"),
+        (
+            [],
+            "Expected one of {train, eval, relight, export, envmap, inspect, compare, chart, demo}",
+        ),
     ],
 )
 def test_wrong_usage_is_one_line(calls, capsys, arguments, message):

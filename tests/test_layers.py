@@ -18,9 +18,13 @@ LAYERS = [
     {"data", "fields", "lights", "optim"},
     {"scene"},
     {"assets", "distributed", "losses", "metrics", "render"},
-    {"config"},
+    {"config", "overrides"},
     {"tasks"},
     {"tasks.demo"},
+    {"experiments.plots", "experiments.record"},
+    {"experiments.worker"},
+    {"experiments.runner"},
+    {"experiments"},
     {"cli"},
 ]
 HELPERS = {

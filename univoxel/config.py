@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 from univoxel.data.images import replacing
 from univoxel.lights import (
@@ -22,6 +22,7 @@ from univoxel.lights import (
 from univoxel.scene import SceneConfig
 
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
+LIGHTS: tuple[LightName, ...] = get_args(LightName)
 
 
 @dataclass(frozen=True)
