@@ -16,6 +16,7 @@ from univoxel.experiments.record import Outcome, Setting
 
 PRESETS = ("draft", "fast", "full")
 SHOWN = (plots.NVS, plots.ALBEDO, plots.ROUGHNESS, plots.RELIT, plots.NORMAL)
+ACROSS = 3  # panels in a row
 QUICK = ("voxels-x0.5", "rays-x0.5", "light-sg")  # beside draft and the preset
 
 
@@ -130,36 +131,57 @@ def fronts(outcomes: Sequence[Outcome]) -> dict[str, dict[str, list[str]]]:
 
 
 def draw(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
-    """A row for each scene; in it a panel for each measure that it has, and one of the held-out
-    rays while training went on."""
+    """For each scene a panel for each measure that there is, and one of the held-out rays while
+    training went on."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogFormatter
 
     scenes = list(dict.fromkeys(o.scene for o in outcomes))
     shown = [m for m in SHOWN if any(_points(outcomes, s, m) for s in scenes)]
-    across = len(shown) + 1
-    figure = Figure(figsize=(4.4 * across, 3.8 * len(scenes)), layout="constrained")
-    axes = figure.subplots(len(scenes), across, squeeze=False)
+    rows = -(-(len(shown) + 1) // ACROSS)  # of a scene
+    figure = Figure(figsize=(4.6 * ACROSS, 3.6 * rows * len(scenes)), layout="constrained")
+    axes = figure.subplots(rows * len(scenes), ACROSS, squeeze=False).reshape(len(scenes), -1)
+    marks = _marks(outcomes)
     for row, scene in zip(axes, scenes, strict=True):
         for axis, measure in zip(row, shown, strict=False):
-            _draw_measure(axis, measure, _points(outcomes, scene, measure))
+            _draw_measure(axis, measure, _points(outcomes, scene, measure), marks)
             axis.set_title(f"{scene}: {measure.title}", size=10)
-        _draw_logs(row[-1], [o for o in outcomes if o.scene == scene and not o.error])
-        row[-1].set_title(f"{scene}: held-out rays of training views, dB", size=10)
-    for axis in axes.flat:
-        axis.set_xscale("log")
-        axis.set_xlabel("training, seconds")
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
+        log, *unused = row[len(shown) :]
+        _draw_logs(log, [o for o in outcomes if o.scene == scene and not o.error])
+        log.set_title(f"{scene}: held-out rays of training views, dB", size=10)
+        for axis in (*row[: len(shown)], log):
+            axis.set_xscale("log")
+            axis.xaxis.set_major_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
+            axis.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
+            axis.set_xlabel("training, seconds")
+            axis.grid(alpha=0.25)
+            axis.spines[["top", "right"]].set_visible(False)
+        for axis in unused:
+            axis.set_axis_off()
     made = plots.machine()
+    legend = ", ".join(f"{mark} {name}" for name, mark in marks.items() if name != mark)
     figure.suptitle(
         f"{made['threads']} threads of {made['processor']}. Line: Pareto front. Grey: published, "
-        "on other data and on GPUs.",
+        f"on other data and on GPUs.\n{legend}",
         size=9,
+        wrap=True,
     )
     return plots.save_figure(figure, stem)
 
 
-def _draw_measure(axis: Any, measure: Measure, points: list[tuple[str, tuple[float, float]]]):
+def _marks(outcomes: Sequence[Outcome]) -> dict[str, str]:
+    """What stands beside a setting's dots: a preset's name, a number for others."""
+    names = list(dict.fromkeys(o.setting for o in outcomes))
+    others = [name for name in names if name not in PRESETS]
+    return {name: name if name in PRESETS else str(others.index(name) + 1) for name in names}
+
+
+def _draw_measure(
+    axis: Any,
+    measure: Measure,
+    points: list[tuple[str, tuple[float, float]]],
+    marks: dict[str, str],
+) -> None:
     place = [point for _, point in points]
     if not measure.more:
         axis.invert_yaxis()  # better is up in every panel
@@ -167,8 +189,8 @@ def _draw_measure(axis: Any, measure: Measure, points: list[tuple[str, tuple[flo
     axis.plot(*_columns(front), color=plots.color(0), linewidth=1, drawstyle="steps-post")
     for name, point in points:
         kind = 0 if name in PRESETS else 2 if name.startswith("light-") else 1
-        axis.plot(*point, "os^"[kind], color=plots.color(kind), markersize=8 - 2 * (kind > 0))
-        _label(axis, name, point, "black")
+        axis.plot(*point, "os^"[kind], color=plots.color(kind), markersize=8 - 3 * (kind > 0))
+        _label(axis, marks[name], point, "black", 8)
     for p in PUBLISHED:
         if (value := p.measures.get(measure.key)) is None:
             continue
@@ -177,7 +199,7 @@ def _draw_measure(axis: Any, measure: Measure, points: list[tuple[str, tuple[flo
             axis.annotate(p.name, (0.01, value), xycoords=("axes fraction", "data"), size=6)
         else:
             axis.plot(60 * p.minutes, value, "x", color="grey")
-            _label(axis, p.name, (60 * p.minutes, value), "grey")
+            _label(axis, p.name, (60 * p.minutes, value), "grey", 6)
 
 
 def _draw_logs(axis: Any, outcomes: Iterable[Outcome]):
@@ -192,8 +214,8 @@ def _draw_logs(axis: Any, outcomes: Iterable[Outcome]):
         axis.legend(fontsize=7)
 
 
-def _label(axis: Any, text: str, point: tuple[float, float], color: str) -> None:
-    axis.annotate(text, point, (4, 3), textcoords="offset points", size=6, color=color)
+def _label(axis: Any, text: str, point: tuple[float, float], color: str, size: int) -> None:
+    axis.annotate(text, point, (4, 3), textcoords="offset points", size=size, color=color)
 
 
 def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
