@@ -2,12 +2,21 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from analytic import RADIUS, cameras_around, sphere_normals, sphere_scene, write_scene
+from analytic import (
+    RADIUS,
+    cameras_around,
+    photos_of,
+    sphere_normals,
+    sphere_scene,
+    write_scene,
+)
 from torch.nn.functional import normalize
 
 from univoxel import brdf, losses
@@ -322,11 +331,19 @@ def test_metal_is_learned_where_it_is():
 class Steps:
     """A clock that lets a stage run through."""
 
-    def __init__(self, count: int):
-        self.count = count
+    def __init__(self, count: int, rooms: Sequence[int] = ()):
+        self.count, self.rooms, self.asked = count, list(rooms), []
 
-    def steps(self):
+    def steps(self, apart):
+        assert 0 < apart < 1
         yield from (i / self.count for i in range(self.count))
+
+    def apart(self):
+        return nullcontext()
+
+    def room_for(self, blocks):
+        self.asked.append(blocks)
+        return self.rooms.pop(0) if self.rooms else blocks
 
     def due(self) -> bool:
         return False
@@ -390,6 +407,39 @@ def test_solve_recovers_albedo_and_map():
     assert error.mean().abs() < 0.1
     assert error.std() < 0.3  # of a map whose logarithm varies by 0.7
     assert true.log().std() > 0.6
+
+
+@pytest.mark.parametrize(
+    ("rooms", "newton", "asked"),
+    [((), [0.25, 0.5, 0.75], [2, 1, 0]), ((1, 0), [0.25, 0.625], [2, 0]), ((0,), [0.25], [2])],
+)
+def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, asked):
+    """With less room than rounds there are fewer rounds, each of them longer."""
+    steps, when, rates, made = Steps(400, rooms), [], [], []
+
+    class Optimizer(RowAdam):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            rates.append([])
+
+        def step(self):
+            rates[-1].append(self.param_groups[0]["lr"])
+            made.append(None)
+
+    def objective(scene, *_):
+        return {"joint": scene.sky.log_radiance.square().sum()}
+
+    monkeypatch.setattr(joint, "pose", lambda *_: None)
+    monkeypatch.setattr(joint, "objective", objective)
+    monkeypatch.setattr(joint, "RowAdam", Optimizer)
+    monkeypatch.setattr(joint, "newton_round", lambda *_: when.append(len(made) / steps.count))
+    cfg = JointConfig(rounds=4)
+    joint.solve(sphere_scene(8), photos_of(1, 8), cfg, 0, steps)
+    assert when == newton
+    assert steps.asked == asked
+    for rate in rates:  # every round runs through the whole of its schedule
+        assert rate[0] == cfg.lr_features
+        assert rate[-1] == pytest.approx(0.1 * cfg.lr_features, rel=0.03)  # of 100 steps, the last
 
 
 def test_a_refit_leaves_geometry_and_materials_bit_for_bit(tmp_path, monkeypatch):

@@ -35,6 +35,7 @@ from univoxel.tasks.progress import Progress
 CLIPPED = 0.97  # sRGB; brighter pixels are lower bounds
 NEWTON_CHUNK = 256  # points whose equations are built at once
 METAL = 0.2  # metallic from which on a point is taken for metal
+NEWTON_SHARE = 0.25  # of the stage's time, before there is a measurement
 CAUCHY = 0.05  # sRGB; residuals beyond are taken for what the model cannot explain
 
 
@@ -85,11 +86,13 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     """Fit scene.sky and the materials to the photographs; geometry and other heads stay."""
     assert scene.sky is not None
     problem = pose(scene, photos, cfg, seed)
-    turn = 0  # rounds begun
-    for done in progress.steps():
-        if done >= turn / cfg.rounds:
-            if turn:
-                newton_round(scene, problem, cfg)
+    first, turn, more = 0.0, -1.0, cfg.rounds  # begin and end of a round, rounds to come
+    for done in progress.steps(NEWTON_SHARE):
+        if done >= turn:
+            if more < cfg.rounds:
+                with progress.apart():
+                    newton_round(scene, problem, cfg)
+                more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
             optimizer = RowAdam(
                 [
                     {"params": [scene.field.features], "eps": 1e-8},
@@ -98,10 +101,11 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
                 ],
                 betas=(0.9, 0.99),
             )
-            turn += 1
-        fade = 0.1 ** (done * cfg.rounds - (turn - 1))
+            first, turn, more = done, done + (1 - done) / more, more - 1
+        fade = 0.1 ** ((done - first) / (turn - first))
         # After a Newton round the map is better than what Adam would make of it: it moves slowly
-        rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * (1.0 if turn == 1 else 0.1))
+        slow = 1.0 if more == cfg.rounds - 1 else 0.1
+        rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * slow)
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate * fade
         terms = objective(scene, problem, cfg)
