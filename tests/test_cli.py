@@ -60,9 +60,10 @@ def calls(monkeypatch):
     def replace(name, result, **others):
         stand_in(f"univoxel.tasks.{name}", **{name: task(name, result)}, **others)
 
-    stand_in(
-        "univoxel.config", preset=lambda name, data, out, light: Config(data, out, name, light)
-    )
+    def chosen(preset, minutes, data, out, light):
+        return Config(data, out, preset, light, minutes or 4.0)
+
+    stand_in("univoxel.config", chosen=chosen)
     replace("train", Path("run"))
     replace("evaluate", {"psnr": 31.25, "views": 5})
     replace("relight", None)
@@ -225,7 +226,7 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["train"], "Missing from univoxel train: DATA "),
         (
             ["train", "x", "--out", "y", "--preset", "z"],
-            "invalid choice 'z' for argument '--preset'. Expected one of ('draft', 'fast', 'full')",
+            "invalid choice 'z' for argument '--preset'. Expected one of ('auto', 'draft', ",
         ),
         (["train", "x", "--out", "y", "--minutes", "a"], "Error parsing --minutes: "),
         (["sing"], "Unrecognized options: sing"),
@@ -263,7 +264,7 @@ def test_help_does_not_wait_for_torch():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-    assert "--preset {draft,fast,full}" in run.stdout
+    assert "--preset {auto,draft,fast,full}" in run.stdout
 
 
 def test_version(capsys):

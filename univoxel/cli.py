@@ -6,7 +6,6 @@ Tasks are imported by the command that runs them: `univoxel --help` does not wai
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import io
 import sys
@@ -31,7 +30,7 @@ def train(
     data: Annotated[Positional[Path], arg(metavar="DATA")],
     /,
     out: Annotated[Path, arg(metavar="RUN")],
-    preset: Literal["draft", "fast", "full"] = "fast",
+    preset: Literal["auto", "draft", "fast", "full"] = "auto",
     light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
@@ -44,7 +43,8 @@ def train(
     Args:
         data: folder of the photographs and their cameras
         out: folder that the run is written to
-        preset: how much work goes in: draft is a look, fast the usual, full the best
+        preset: how much work goes in: draft is a look, 1 minute on two cores, fast the usual, 4,
+            full the best, 12; auto is what fits into --minutes, or else fast
         light: sg, local lobes as published; hybrid, then one environment map with traced
             visibility, which cleans shadows from the albedo; others to compare with: sh and mlp,
             local too, envmap-sg and envmap, one map from the beginning
@@ -53,16 +53,14 @@ def train(
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
             stages.1.voxels=3; config.json in a run's folder holds them all
     """
-    from univoxel.config import preset as preset_config
+    from univoxel.config import chosen
     from univoxel.overrides import changed
     from univoxel.tasks import train as task
 
     _check_minutes(minutes)
     if not resume and (out / "scene.safetensors").exists():
         raise FileExistsError(f"{out} holds a run already: add --resume, or choose another --out")
-    config = preset_config(preset, data=data, out=out, light=light)
-    if minutes is not None:
-        config = dataclasses.replace(config, minutes=minutes)
+    config = chosen(preset, minutes, data=data, out=out, light=light)
     print(task.train(changed(config, set), resume=resume))
 
 
@@ -260,7 +258,7 @@ def compare(
     scenes: Scenes,
     /,
     out: Annotated[Path, arg(metavar="DIR")],
-    preset: Literal["draft", "fast", "full"] = "fast",
+    preset: Literal["auto", "draft", "fast", "full"] = "auto",
     light: Annotated[tuple[str, ...], arg(metavar="LIGHT [LIGHT ...]")] = (
         *("hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"),
     ),
@@ -280,7 +278,7 @@ def compare(
     Args:
         scenes: folders of photographs
         out: folder for the results
-        preset: how much work goes into each training
+        preset: how much work goes into each training, as of train
         light: models of light, as of train --light; sg:lobes=12 changes a field of the light's
             configuration, sg:lobes=12,hidden=32 two
         minutes: wall-clock limit of each training, above 0

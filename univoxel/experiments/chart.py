@@ -14,6 +14,7 @@ from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
 from univoxel.experiments.record import Outcome, Setting
 
+BETWEEN = (2, 8)  # minutes, where the curve is looked at between the presets
 PRESETS = ("draft", "fast", "full")
 SHOWN = (plots.NVS, plots.ALBEDO, plots.ROUGHNESS, plots.RELIT, plots.NORMAL)
 ACROSS = 3  # panels in a row
@@ -112,6 +113,7 @@ def settings(preset: str, light: LightName, changes: tuple[str, ...] = ()) -> di
     base = Setting(preset, preset, light, None, changes)
     config = base.config(Path(), Path())
     found = [Setting(name, name, light, None, changes) for name in PRESETS]
+    found += [Setting(f"minutes-{m}", "auto", light, m, changes) for m in BETWEEN]
     for name, own in _knobs(config).items():
         found.append(replace(base, name=name, changes=(*changes, *own)))
     found += [replace(base, name=f"light-{x}", light=x) for x in LIGHTS if x != light]
@@ -188,7 +190,13 @@ def _draw_measure(
     front = [place[i] for i in plots.pareto(place, measure.more)]
     axis.plot(*_columns(front), color=plots.color(0), linewidth=1, drawstyle="steps-post")
     for name, point in points:
-        kind = 0 if name in PRESETS else 2 if name.startswith("light-") else 1
+        kind = (
+            0
+            if name in PRESETS or name.startswith("minutes-")
+            else 2
+            if name.startswith("light-")
+            else 1
+        )
         axis.plot(*point, "os^"[kind], color=plots.color(kind), markersize=8 - 3 * (kind > 0))
         _label(axis, marks[name], point, "black", 8)
     for p in PUBLISHED:

@@ -32,7 +32,7 @@ MEAN = "mean"  # title of the table over all scenes
 def compare(
     scenes: Sequence[Path],
     out: Path,
-    preset: str = "fast",
+    preset: str = "auto",
     light: Sequence[str] = LIGHTS,
     minutes: float | None = None,
     changes: Sequence[str] = (),
@@ -44,7 +44,7 @@ def compare(
         scenes: folders of data sets, of different names.
         out: every training is kept in out/SCENE/LIGHT, and not done again by a later call.
         light: names as of --light; `NAME:FIELD=VALUE[,FIELD=VALUE]` changes fields of the light.
-        minutes: limit of the wall time of each, the preset's when left out.
+        preset, minutes: how much work goes into each, as of config.chosen.
         changes: FIELD=VALUE of the configuration, for all.
         samples: of the light per pixel of relit pictures in evaluation.
 

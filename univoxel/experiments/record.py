@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from univoxel.config import LightName, TrainConfig, preset
+from univoxel.config import LightName, TrainConfig, chosen
 from univoxel.data.images import replacing
 from univoxel.overrides import changed
 
@@ -20,9 +20,9 @@ class Setting:
     """How to train, whatever the scene."""
 
     name: str  # of its folder and in tables; unique among the settings of an experiment
-    preset: str = "fast"
+    preset: str = "auto"
     light: LightName = "hybrid"
-    minutes: float | None = None  # limit of the wall time, the preset's when left out
+    minutes: float | None = None  # as of config.chosen
     changes: tuple[str, ...] = ()  # FIELD=VALUE of the configuration
 
     def config(self, data: Path, out: Path) -> TrainConfig:
@@ -31,9 +31,7 @@ class Setting:
         Raises:
             ValueError: there is no such preset, light or field, or a value is out of range.
         """
-        config = preset(self.preset, data, out, self.light)
-        if self.minutes is not None:
-            config = dataclasses.replace(config, minutes=self.minutes)
+        config = chosen(self.preset, self.minutes, data, out, self.light)
         return changed(config, self.changes)
 
 
