@@ -27,6 +27,8 @@ from univoxel.data import load_photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
+from univoxel.lights import priors
+from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.sg import LocalSG
 from univoxel.optim import RowAdam
 from univoxel.render import pipeline
@@ -40,11 +42,17 @@ STAGES = {
     "march": [(DenseField, "march")],
     "sample": [(DenseField, "sample")],
     "composite": [(pipeline, "composite")],
-    "heads": [(MaterialHead, "forward"), (RadianceHead, "forward"), (LocalSG, "raw")],
+    "heads": [
+        *((head, "forward") for head in (MaterialHead, RadianceHead, MirroredLight)),
+        (LocalSG, "raw"),
+    ],
     "light": [(LocalSG, "reflected"), (LocalSG, "lobes_from_raw")],
-    "losses": [(losses, n) for n in ("photometric", "silhouette", "smoothness", "white_light")],
+    "losses": [
+        *((losses, name) for name in ("photometric", "silhouette")),
+        *((priors, name) for name in ("smoothness", "chroma", "total_variation")),
+    ],
     "optimiser": [(RowAdam, "step")],
-    "smoothing": [(train, "smooth")],
+    "smoothing": [(train, "smooth"), (train, "spread_gradient")],
     "refresh": [(DenseField, "refresh")],
 }
 BACKWARD = "backward"

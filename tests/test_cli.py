@@ -89,7 +89,7 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0)
     expected = Config(Path("photos"), out, "draft", "sg", 2.0, 7, LossConfig(2.0), stages)
     assert capsys.readouterr().out == "run\n"
-    assert calls.noted == [("train", (expected,), {"resume": False})]
+    assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
 
 
 def test_train_keeps_the_minutes_of_the_preset(calls, tmp_path):
@@ -102,7 +102,10 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
     assert main(["train", "photos", "--out", str(tmp_path)]) == 2
     assert "holds a run already: add --resume" in capsys.readouterr().err
     assert main(["train", "photos", "--out", str(tmp_path), "--resume"]) == 0
-    assert calls.noted[0][2] == {"resume": True}
+    assert calls.noted[0][2] == {"resume": True, "timelapse": None}
+    film = ["--timelapse", "frames/"]
+    assert main(["train", "photos", "--out", str(tmp_path), "--resume", *film]) == 0
+    assert calls.noted[1][2] == {"resume": True, "timelapse": "frames/"}
 
 
 def test_eval(calls):

@@ -34,7 +34,10 @@ HELPERS = {
     "data": {"base", "images", "radiance"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
-    "tasks": {"animation", "contact_sheet", "envmap", "frames", "joint", "layers", "progress"},
+    "tasks": {
+        *("animation", "contact_sheet", "envmap", "frames", "joint", "layers", "progress"),
+        "timelapse",
+    },
 }
 # Extras: imported inside the function that needs one
 OPTIONAL = {"imageio_ffmpeg", "matplotlib", "trimesh", "viser"}

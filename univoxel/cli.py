@@ -36,6 +36,9 @@ def train(
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
     resume: bool = False,
+    timelapse: Annotated[
+        str | None, arg(metavar="FILE.gif|FILE.mp4|DIR/", help_behavior_hint="(default: none)")
+    ] = None,
     set: Changes = (),
 ) -> None:
     """Recover geometry, materials and light from posed photographs.
@@ -50,6 +53,8 @@ def train(
             local too, envmap-sg and envmap, one map from the beginning
         minutes: wall-clock limit, above 0; training ends in time with what it has
         resume: go on with the run in --out
+        timelapse: picture of a test view over training time, or a folder of its frames; making
+            them does not count as training
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
             stages.1.voxels=3; config.json in a run's folder holds them all
     """
@@ -61,7 +66,7 @@ def train(
     if not resume and (out / "scene.safetensors").exists():
         raise FileExistsError(f"{out} holds a run already: add --resume, or choose another --out")
     config = chosen(preset, minutes, data=data, out=out, light=light)
-    print(task.train(changed(config, set), resume=resume))
+    print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
 
 
 def evaluate(

@@ -331,6 +331,8 @@ def test_metal_is_learned_where_it_is():
 class Steps:
     """A clock that lets a stage run through."""
 
+    over = False
+
     def __init__(self, count: int, rooms: Sequence[int] = ()):
         self.count, self.rooms, self.asked = count, list(rooms), []
 
@@ -407,6 +409,13 @@ def test_solve_recovers_albedo_and_map():
     assert error.mean().abs() < 0.1
     assert error.std() < 0.3  # of a map whose logarithm varies by 0.7
     assert true.log().std() > 0.6
+
+
+def test_no_time_is_no_tracing():
+    steps = Steps(10)
+    steps.over, steps.skip = True, lambda: steps.asked.append("skip")
+    joint.solve(sphere_scene(8), photos_of(1, 8), JointConfig(), 0, steps)
+    assert steps.asked == ["skip"]
 
 
 @pytest.mark.parametrize(

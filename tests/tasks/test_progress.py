@@ -130,7 +130,8 @@ def test_a_watcher_is_called_between_steps_off_the_clock(tmp_path, clock):
         seen.append(progress.step)
         clock.now += 1000
 
-    progress = Progress(config(tmp_path, 1.0), clock.now, START, watch)
+    progress = Progress(config(tmp_path, 1.0), clock.now, START)
+    progress.watch = watch
     steps(progress, clock, 0.01)
     assert seen == list(range(1, 11))
     assert progress.seconds == pytest.approx(0.1)

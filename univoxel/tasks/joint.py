@@ -85,6 +85,9 @@ def draw(problem: Problem, points: int, views: int) -> tuple[Tensor, Tensor]:
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
     """Fit scene.sky and the materials to the photographs; geometry and other heads stay."""
     assert scene.sky is not None
+    if progress.over:
+        progress.skip()
+        return
     problem = pose(scene, photos, cfg, seed)
     first, turn, more = 0.0, -1.0, cfg.rounds  # begin and end of a round, rounds to come
     for done in progress.steps(NEWTON_SHARE):

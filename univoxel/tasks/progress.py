@@ -33,14 +33,11 @@ class Progress:
     that is short of time is short in all its stages.
     """
 
-    def __init__(
-        self, cfg: TrainConfig, begin: float, state: dict, watch: Callable[[], None] | None = None
-    ):
+    def __init__(self, cfg: TrainConfig, begin: float, state: dict):
         """
         Args:
             begin: of training, on time.monotonic's clock.
             state: as `state` gave it.
-            watch: called between steps, off the clock.
         """
         self.cfg, self.begin = cfg, begin
         self.stage, self.done, self.step = state["stage"], state["progress"], state["step"]
@@ -49,7 +46,7 @@ class Progress:
         self._stage_begin = self.seconds  # of the stage in this sitting
         self._stage_end = 0.0  # when its time is over
         self._apart, self._last_apart, self._reserved = 0.0, 0.0, 0.0  # seconds, see `apart`
-        self._watch = watch
+        self.watch: Callable[[], None] | None = None  # called between steps, off the clock
         self._log = cfg.out / "log.jsonl"
         self._told, self._told_step = time.monotonic(), self.step
         self._saved = time.monotonic()
@@ -119,10 +116,19 @@ class Progress:
             self.done += (1 - self.done) / max(steps_left, 1)
             if self.done > 1 - 1e-9:
                 self.done = 1.0
-            if self._watch:
+            if self.watch:
                 with self.paused():
-                    self._watch()
-        self.made.append(self._stage_steps / stage.iterations)
+                    self.watch()
+        self.skip()
+
+    @property
+    def over(self) -> bool:
+        """Whether the time is up."""
+        return self.seconds >= 60 * self.cfg.minutes - RESERVE_SECONDS
+
+    def skip(self) -> None:
+        """Leave the present stage as it is for the next."""
+        self.made.append(self._stage_steps / self.cfg.stages[self.stage].iterations)
         self.stage, self.done, self._stage_steps = self.stage + 1, 0.0, 0
         self._stage_begin = self.seconds
 

@@ -32,6 +32,7 @@ from univoxel.render.pipeline import at_rays, shade, surface_at
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
 from univoxel.tasks import joint
 from univoxel.tasks.progress import Progress
+from univoxel.tasks.timelapse import Timelapse
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
@@ -59,8 +60,12 @@ class Batch:
         return -self.rays.direction
 
 
-def train(cfg: TrainConfig, resume: bool = False) -> Path:
+def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None = None) -> Path:
     """Train a scene; leave model, log, preview and configuration in cfg.out and return it.
+
+    Args:
+        timelapse: .gif, .mp4 or folder for pictures of a view over training time, which making
+            them does not count in.
 
     Raises:
         DataError: input that cannot be used.
@@ -70,6 +75,7 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
         FileNotFoundError, ValueError: with resume, there is no checkpoint that can be read, or it
             belongs to another configuration.
     """
+    film = None if timelapse is None else Timelapse(timelapse, cfg)
     begin = time.monotonic()
     torch.manual_seed(cfg.seed)
     photos = load_photos(cfg.data, "train")
@@ -100,6 +106,8 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
     save_config(cfg)
     with Progress(cfg, begin, state) as progress:
+        if film:
+            progress.watch = lambda: film.look(scene, progress)
         for index in range(state["stage"], len(cfg.stages)):
             stage, grid = cfg.stages[index], grids[index]
             if isinstance(stage, JointConfig):
@@ -112,6 +120,8 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
             done = index + 1 == len(cfg.stages)
             save_scene(scene, cfg.out, progress.state(), slim=done)
             preview(scene, photos, cfg.out / "preview.png")
+        if film:
+            film.finish(scene, progress)
     return cfg.out
 
 
