@@ -15,6 +15,7 @@ import os
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -43,14 +44,14 @@ PARTS = STAGES | {
 class RunClock(Clock):
     """A clock for a whole training: it starts anew with every stage."""
 
-    def __init__(self, cfg: TrainConfig) -> None:
-        super().__init__()
-        self.cfg, self.columns, self.begin = cfg, {}, time.perf_counter()
+    def __init__(self, cfg: TrainConfig, now: Callable[[], float]) -> None:
+        super().__init__(now)
+        self.cfg, self.columns, self.begin = cfg, {}, now()
         self.steps, self.spent = 0, 0.0  # backward passes and their seconds
 
     def enter(self, title: str) -> None:
         """Book what was measured to a column and start anew."""
-        whole = time.perf_counter() - self.begin
+        whole = self.now() - self.begin
         rows = defaultdict(float, self.forward)
         divided = sum(self.backward.values())
         for name, seconds in self.backward.items():
@@ -63,7 +64,7 @@ class RunClock(Clock):
             old["rows"][name] = old["rows"].get(name, 0.0) + seconds
         self.forward.clear()
         self.backward.clear()
-        self.begin, self.steps, self.spent = time.perf_counter(), 0, 0.0
+        self.begin, self.steps, self.spent = self.now(), 0, 0.0
 
     def stage(self, function):
         """A stage's function as a column of its own."""
@@ -86,13 +87,13 @@ class RunClock(Clock):
     def backward_pass(self, function):
         def call(*arguments, **options):
             divide = self.steps % EVERY == 0
-            begin = time.perf_counter()
+            begin = self.now()
             with torch.autograd.profiler.profile(enabled=divide) as events:
                 function(*arguments, **options)
             if divide:
                 self.add_backward(events.function_events)
             self._ranges.clear()
-            seconds = time.perf_counter() - begin
+            seconds = self.now() - begin
             self._inner[-1] += seconds
             if divide and self.steps:  # what the profiler itself took is no part of the training
                 usual = self.spent / self.steps
@@ -104,9 +105,9 @@ class RunClock(Clock):
         return call
 
 
-def profile(cfg: TrainConfig) -> dict:
+def profile(cfg: TrainConfig, now: Callable[[], float] = time.perf_counter) -> dict:
     """Seconds by stage and part of one training."""
-    clock, originals = RunClock(cfg), []
+    clock, originals = RunClock(cfg, now), []
 
     def patch(owner, attribute, wrap):
         original = getattr(owner, attribute)
@@ -119,14 +120,14 @@ def profile(cfg: TrainConfig) -> dict:
     patch(torch.Tensor, "backward", clock.backward_pass)
     patch(train, "run_stage", clock.stage)
     patch(joint, "solve", clock.stage)
-    begin = time.perf_counter()
+    begin = now()
     try:
         train.train(cfg)
         clock.enter(START)
     finally:
         for owner, attribute, original in originals:
             setattr(owner, attribute, original)
-    return {"seconds": time.perf_counter() - begin, "stages": clock.columns}
+    return {"seconds": now() - begin, "stages": clock.columns}
 
 
 def table(result: dict) -> str:
@@ -161,14 +162,18 @@ def main() -> None:
     parser.add_argument("scene", type=Path, help="folder of photographs")
     parser.add_argument("--preset", default="fast", help="draft, fast or full (default: fast)")
     parser.add_argument("--minutes", type=float, help="limit (default: the preset's)")
+    parser.add_argument(
+        "--cpu", action="store_true", help="processor time: for one thread on a busy machine"
+    )
     parser.add_argument("--out", type=Path, default=HERE / "results" / "profile.json")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         cfg = chosen(options.preset, options.minutes, options.scene, Path(folder) / "run")
-        result = profile(cfg)
+        result = profile(cfg, time.process_time if options.cpu else time.perf_counter)
     result |= {
         "scene": options.scene.name,
         "preset": options.preset,
+        "clock": "processor" if options.cpu else "wall",
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
         "load_average": os.getloadavg()[0],

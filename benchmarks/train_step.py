@@ -15,6 +15,7 @@ import json
 import os
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -63,7 +64,8 @@ COUNT = {"native": 32, "reference": 4}  # steps: of 16, one refreshes and four s
 class Clock:
     """Seconds by stage, forward and backward, of every call between `start` and `stop`."""
 
-    def __init__(self) -> None:
+    def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:
+        self.now = now
         self.forward: dict[str, float] = defaultdict(float)
         self.backward: dict[str, float] = defaultdict(float)
         self._inner = [0.0]  # seconds in stages called from the present one
@@ -72,12 +74,12 @@ class Clock:
     def timed(self, name: str, function):
         def call(*arguments, **options):
             number = torch._C._autograd._get_sequence_nr
-            first, begin = number(), time.perf_counter()
+            first, begin = number(), self.now()
             self._inner.append(0.0)
             try:
                 return function(*arguments, **options)
             finally:
-                seconds = time.perf_counter() - begin
+                seconds = self.now() - begin
                 self.forward[name] += seconds - self._inner.pop()
                 self._inner[-1] += seconds
                 self._ranges.append((first, number(), name))

@@ -36,7 +36,7 @@ HELPERS = {
     "assets": {"atlas", "base"},
     "tasks": {
         *("animation", "contact_sheet", "envmap", "frames", "joint", "layers", "progress"),
-        "timelapse",
+        *("plateau", "timelapse"),
     },
 }
 # Extras: imported inside the function that needs one

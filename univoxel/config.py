@@ -118,6 +118,8 @@ class TrainConfig:
     stages: tuple[StageConfig | JointConfig, ...]
     minutes: float  # > 0; training ends in time, with what it has
     seed: int = 0
+    # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
+    patience: float = 0.0
     scene: SceneConfig = field(default_factory=SceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
 
@@ -134,6 +136,7 @@ class TrainConfig:
                 "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
             )
         _check(self, "above 0", lambda x: x > 0, "minutes")
+        _check(self, "at least 0", lambda x: 0 <= x < math.inf, "patience")
 
 
 def _check(config: object, wanted: str, holds: Callable[[Any], bool], *names: str) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.tasks import progress as module
-from univoxel.tasks.progress import RESERVE_SECONDS, Progress, append_line
+from univoxel.tasks.progress import RESERVE_SECONDS, REST, Progress, append_line
 
 START = {"stage": 0, "progress": 0.0, "step": 0}
 
@@ -158,6 +158,21 @@ def test_a_stage_in_two_sittings_is_counted_whole(tmp_path, clock):
     later = Progress(cfg, clock.now, progress.state())
     steps(later, clock, 0.01)
     assert later.made == [1.0]
+
+
+def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, capsys):
+    with Progress(config(tmp_path, 1.0, iterations=1000), clock.now, START) as progress:
+        done = []
+        for x in progress.steps():
+            done.append(x)
+            clock.now += 0.001
+            if len(done) == 500:
+                progress.shorten()
+    assert len(done) == pytest.approx(500 + REST * 500, abs=1)
+    assert done[499] == pytest.approx(0.499)
+    assert done[-1] > 0.99
+    assert (progress.early, progress.state()["early"]) == ([0], [0])
+    assert "time ended" not in capsys.readouterr().out
 
 
 def test_no_time_is_no_step(tmp_path, clock):

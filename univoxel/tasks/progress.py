@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import resource
 import time
@@ -22,6 +23,7 @@ CHECKPOINT_SECONDS = 60.0
 RESERVE_SECONDS = 4.0  # of the budget, kept for the last checkpoint and the preview
 PACE = 0.1  # weight of the newest step in the mean time of a step
 UNSURE = 4  # first steps of a stage, whose time is no measure for the others
+REST = 0.3  # of the steps that are left to a stage that is shortened: for its rates to fall
 ALL = 0.995  # share of the planned steps from which on a stage was not cut
 
 
@@ -42,7 +44,11 @@ class Progress:
         self.cfg, self.begin = cfg, begin
         self.stage, self.done, self.step = state["stage"], state["progress"], state["step"]
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
+        self.early: list[int] = list(
+            state.get("early", ())
+        )  # numbers of stages that were shortened
         self._stage_steps = state.get("stage_steps", 0)  # made in the present stage
+        self._planned, self._count = 0, 0  # steps of the stage in this sitting
         self._stage_begin = self.seconds  # of the stage in this sitting
         self._stage_end = 0.0  # when its time is over
         self._apart, self._last_apart, self._reserved = 0.0, 0.0, 0.0  # seconds, see `apart`
@@ -79,6 +85,7 @@ class Progress:
             "progress": self.done,
             "step": self.step,
             "made": self.made,
+            "early": self.early,
             "stage_steps": self._stage_steps,
             "seconds": self.seconds,
             "threads": torch.get_num_threads(),
@@ -94,24 +101,25 @@ class Progress:
         Args:
             apart: share of the stage's time, a guess, that passes under `apart`.
         """
-        stage, count, pace = self.cfg.stages[self.stage], 0, 0.0
+        stage, pace = self.cfg.stages[self.stage], 0.0
         shares = [
             (1 - self.done) * stage.share,
             *(s.share for s in self.cfg.stages[self.stage + 1 :]),
         ]
         left = max(60 * self.cfg.minutes - RESERVE_SECONDS - self._stage_begin, 0.0)
         allowed = left * shares[0] / sum(shares)
-        planned = max(1, round((1 - self.done) * stage.iterations))
+        self._planned, self._count = max(1, round((1 - self.done) * stage.iterations)), 0
         self._stage_end, self._reserved = self._stage_begin + allowed, apart * allowed
         while self.done < 1 and (begin := self.seconds) < self._stage_end:
             passed = self._apart
             yield self.done
             spent = self.seconds - begin - (self._apart - passed)
-            pace = spent if count == 0 else (1 - PACE) * pace + PACE * spent
-            self.step, self._stage_steps, count = self.step + 1, self._stage_steps + 1, count + 1
+            pace = spent if self._count == 0 else (1 - PACE) * pace + PACE * spent
+            self.step, self._stage_steps = self.step + 1, self._stage_steps + 1
+            self._count += 1
             room = self._stage_end - self.seconds - self._reserved
-            steps_left = planned - count + 1  # with the one that was made
-            if count > UNSURE and room < pace * (steps_left - 1):
+            steps_left = self._planned - self._count + 1  # with the one that was made
+            if self._count > UNSURE and room < pace * (steps_left - 1):
                 steps_left = 1 + room / pace if room > 0 else 1
             self.done += (1 - self.done) / max(steps_left, 1)
             if self.done > 1 - 1e-9:
@@ -131,6 +139,11 @@ class Progress:
         self.made.append(self._stage_steps / self.cfg.stages[self.stage].iterations)
         self.stage, self.done, self._stage_steps = self.stage + 1, 0.0, 0
         self._stage_begin = self.seconds
+
+    def shorten(self) -> None:
+        """Run through the rest of the stage's schedule in fewer steps."""
+        self._planned = self._count + math.ceil(REST * (self._planned - self._count))
+        self.early.append(self.stage)
 
     @contextmanager
     def apart(self) -> Iterator[None]:
@@ -161,7 +174,9 @@ class Progress:
 
     def cut(self) -> str:
         """A line about the stages that time ended before their steps; empty if none was."""
-        short = [(i + 1, made) for i, made in enumerate(self.made) if made < ALL]
+        short = [
+            (i + 1, made) for i, made in enumerate(self.made) if made < ALL and i not in self.early
+        ]
         if not short:
             return ""
         stages = ", ".join(f"{made:.0%} in stage {i}" for i, made in short)

@@ -31,6 +31,7 @@ from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
 from univoxel.tasks import joint
+from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress
 from univoxel.tasks.timelapse import Timelapse
 
@@ -153,6 +154,7 @@ def run_stage(
         betas=MOMENTS,
     )
     scratch = torch.zeros_like(field.sdf.data)
+    plateau = Plateau(cfg.patience)
     for done in progress.steps():
         physical = done >= stage.physical_from
         rates = (
@@ -184,6 +186,10 @@ def run_stage(
         optimizer.step()
         if progress.step % SMOOTH_EVERY == 0 and not stage.refit:
             smooth(field, stage)
+        if plateau.due(done):
+            quality = held_out_psnr(scene, photos, held_out, physical)
+            if plateau.flat(done, quality, physical):
+                progress.shorten()
         if progress.due():
             quality = held_out_psnr(scene, photos, held_out, physical)
             progress.report({k: v.item() for k, v in terms.items()}, quality)
