@@ -55,6 +55,7 @@ def test_a_training_is_recorded_with_every_measure(out):
     assert set(MEASURES) | {"map_ball_psnr", "map_brightest_degrees"} <= set(outcome.measures)
     assert outcome.measures["nvs_psnr"] > 5
     assert outcome.measures["peak_rss_mb"] > 50
+    assert outcome.measures["steps_made"] == 1
     assert outcome.measures["map_ball_psnr"] is None  # local light has no map
     assert outcome.load_average is not None
     assert (out / "ball" / "small" / "run" / FILE).is_file()

@@ -23,6 +23,7 @@ COLUMNS = (
     plots.NORMAL,
     plots.MAP,
     plots.SECONDS,
+    plots.STEPS,
     plots.MEMORY,
     plots.PARAMETERS,
 )

@@ -39,6 +39,7 @@ RELIT = Measure("relit_psnr", "relit, dB", True)
 NORMAL = Measure("normal_mae_deg", "normals, degrees", False)
 MAP = Measure("map_ball_psnr", "grey ball under the map, dB", True)
 SECONDS = Measure("train_seconds", "training, s", False, ".0f")
+STEPS = Measure("steps_made", "steps made", True, ".0%")
 MEMORY = Measure("peak_rss_mb", "peak memory, MB", False, ".0f")
 PARAMETERS = Measure("parameters", "parameters", False, ",.0f")
 

@@ -45,7 +45,11 @@ def work(folder: Path) -> None:
             shutil.rmtree(config.out, ignore_errors=True)
             train(config)
         samples = job["samples"]
-        measures = evaluate(config.out, samples=samples) | light_error(config.out, folder / MAP)
+        measures = {
+            **evaluate(config.out, samples=samples),
+            "steps_made": steps_made(config),
+            **light_error(config.out, folder / MAP),
+        }
         Outcome(
             folder.parent.name,
             setting.name,
@@ -63,6 +67,13 @@ def finished(config: TrainConfig) -> bool:
         return load_checkpoint(config.out)[1]["stage"] == len(config.stages)
     except (ValueError, FileNotFoundError):
         return False
+
+
+def steps_made(config: TrainConfig) -> float:
+    """Share of the planned steps that the run made; less than 1 where time ended it."""
+    made = load_checkpoint(config.out)[1]["made"]
+    planned = [stage.iterations for stage in config.stages]
+    return sum(m * p for m, p in zip(made, planned, strict=True)) / sum(planned)
 
 
 def light_error(run: Path, file: Path) -> dict[str, float | None]:

@@ -90,7 +90,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         return
     problem = pose(scene, photos, cfg, seed)
     first, turn, more = 0.0, -1.0, cfg.rounds  # begin and end of a round, rounds to come
-    for done in progress.steps(NEWTON_SHARE):
+    for done in progress.steps(NEWTON_SHARE if cfg.rounds > 1 else 0.0):
         if done >= turn:
             if more < cfg.rounds:
                 with progress.apart():
