@@ -269,6 +269,35 @@ def test_newton_recovers_a_known_map():
     assert error.abs().mean() < 0.25 * true.log().abs().mean()
 
 
+def test_newton_in_no_time_takes_few_points(monkeypatch):
+    scene, counts = scene_of((0.5, 0.4, 0.3), 0.4, 32), []
+    problem = problem_on_a_sphere(100, 12, 32)
+    equations = joint.normal_equations
+
+    def counted(rows, *arguments):
+        counts.append(len(rows.diffuse))
+        return equations(rows, *arguments)
+
+    monkeypatch.setattr(joint, "normal_equations", counted)
+    monkeypatch.setattr(joint, "NEWTON_CHUNK", 20)
+    cfg = replace(CFG, newton_steps=2)
+    joint.newton_round(scene, problem, cfg, seconds=0.0)
+    assert counts == [20] * (1 + cfg.newton_steps * joint.LEAST_CHUNKS)  # one to measure
+    counts.clear()
+    joint.newton_round(scene, problem, cfg, seconds=1e3)
+    assert counts == [20] * (1 + cfg.newton_steps * 5)
+
+
+def test_a_run_that_was_cut_traces_fewer_points(monkeypatch):
+    asked = []
+    monkeypatch.setattr(joint, "pose", lambda scene, photos, cfg, seed: asked.append(cfg.points))
+    for pace in (1.0, 0.5, 0.0):
+        steps = Steps(0)
+        steps.pace = pace
+        joint.solve(sphere_scene(8), photos_of(1, 8), JointConfig(points=10000), 0, steps)
+    assert asked == [10000, 5000, joint.LEAST_POINTS]
+
+
 def test_newton_without_rich_points_leaves_the_map():
     scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
     problem = problem_on_a_sphere(20, 3, 32)  # of at least 4 sightings is asked
@@ -331,7 +360,7 @@ def test_metal_is_learned_where_it_is():
 class Steps:
     """A clock that lets a stage run through."""
 
-    over = False
+    over, pace, reserved = False, 1.0, math.inf
 
     def __init__(self, count: int, rooms: Sequence[int] = ()):
         self.count, self.rooms, self.asked = count, list(rooms), []

@@ -144,6 +144,7 @@ def test_what_was_cut_is_told(tmp_path, clock, capsys):
         steps(progress, clock, 1.1)  # 50 of 100 in 55 s
     assert progress.made == pytest.approx([1.0, 0.5], abs=0.01)
     assert progress.state()["made"] == progress.made
+    assert progress.pace == progress.made[1]
     told = capsys.readouterr().out
     assert "time ended this training early: of the planned steps it made 50% in stage 2;" in told
 
@@ -172,6 +173,7 @@ def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, ca
     assert done[499] == pytest.approx(0.499)
     assert done[-1] > 0.99
     assert (progress.early, progress.state()["early"]) == ([0], [0])
+    assert progress.pace == 1.0
     assert "time ended" not in capsys.readouterr().out
 
 

@@ -51,7 +51,8 @@ class Progress:
         self._planned, self._count = 0, 0  # steps of the stage in this sitting
         self._stage_begin = self.seconds  # of the stage in this sitting
         self._stage_end = 0.0  # when its time is over
-        self._apart, self._last_apart, self._reserved = 0.0, 0.0, 0.0  # seconds, see `apart`
+        self._apart, self._last_apart = 0.0, 0.0  # seconds, see `apart`
+        self.reserved = 0.0  # seconds that are kept for blocks under `apart` in this stage
         self.watch: Callable[[], None] | None = None  # called between steps, off the clock
         self._log = cfg.out / "log.jsonl"
         self._told, self._told_step = time.monotonic(), self.step
@@ -109,7 +110,7 @@ class Progress:
         left = max(60 * self.cfg.minutes - RESERVE_SECONDS - self._stage_begin, 0.0)
         allowed = left * shares[0] / sum(shares)
         self._planned, self._count = max(1, round((1 - self.done) * stage.iterations)), 0
-        self._stage_end, self._reserved = self._stage_begin + allowed, apart * allowed
+        self._stage_end, self.reserved = self._stage_begin + allowed, apart * allowed
         while self.done < 1 and (begin := self.seconds) < self._stage_end:
             passed = self._apart
             yield self.done
@@ -117,7 +118,7 @@ class Progress:
             pace = spent if self._count == 0 else (1 - PACE) * pace + PACE * spent
             self.step, self._stage_steps = self.step + 1, self._stage_steps + 1
             self._count += 1
-            room = self._stage_end - self.seconds - self._reserved
+            room = self._stage_end - self.seconds - self.reserved
             steps_left = self._planned - self._count + 1  # with the one that was made
             if self._count > UNSURE and room < pace * (steps_left - 1):
                 steps_left = 1 + room / pace if room > 0 else 1
@@ -133,6 +134,12 @@ class Progress:
     def over(self) -> bool:
         """Whether the time is up."""
         return self.seconds >= 60 * self.cfg.minutes - RESERVE_SECONDS
+
+    @property
+    def pace(self) -> float:
+        """Share of its steps that the stage before made, if time cut it short; else 1."""
+        last = self.stage - 1
+        return self.made[last] if 0 <= last < len(self.made) and last not in self.early else 1.0
 
     def skip(self) -> None:
         """Leave the present stage as it is for the next."""
@@ -159,7 +166,7 @@ class Progress:
         left = max(self._stage_end - self.seconds, 0.0) / 2
         if self._last_apart:
             blocks = min(blocks, int(left / self._last_apart))
-        self._reserved = blocks * self._last_apart
+        self.reserved = blocks * self._last_apart
         return blocks
 
     @contextmanager
