@@ -2,12 +2,21 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from analytic import RADIUS, cameras_around, sphere_normals, sphere_scene, write_scene
+from analytic import (
+    RADIUS,
+    cameras_around,
+    photos_of,
+    sphere_normals,
+    sphere_scene,
+    write_scene,
+)
 from torch.nn.functional import normalize
 
 from univoxel import brdf, losses
@@ -260,6 +269,35 @@ def test_newton_recovers_a_known_map():
     assert error.abs().mean() < 0.25 * true.log().abs().mean()
 
 
+def test_newton_in_no_time_takes_few_points(monkeypatch):
+    scene, counts = scene_of((0.5, 0.4, 0.3), 0.4, 32), []
+    problem = problem_on_a_sphere(100, 12, 32)
+    equations = joint.normal_equations
+
+    def counted(rows, *arguments):
+        counts.append(len(rows.diffuse))
+        return equations(rows, *arguments)
+
+    monkeypatch.setattr(joint, "normal_equations", counted)
+    monkeypatch.setattr(joint, "NEWTON_CHUNK", 20)
+    cfg = replace(CFG, newton_steps=2)
+    joint.newton_round(scene, problem, cfg, seconds=0.0)
+    assert counts == [20] * (1 + cfg.newton_steps * joint.LEAST_CHUNKS)  # one to measure
+    counts.clear()
+    joint.newton_round(scene, problem, cfg, seconds=1e3)
+    assert counts == [20] * (1 + cfg.newton_steps * 5)
+
+
+def test_a_run_that_was_cut_traces_fewer_points(monkeypatch):
+    asked = []
+    monkeypatch.setattr(joint, "pose", lambda scene, photos, cfg, seed: asked.append(cfg.points))
+    for pace in (1.0, 0.5, 0.0):
+        steps = Steps(0)
+        steps.pace = pace
+        joint.solve(sphere_scene(8), photos_of(1, 8), JointConfig(points=10000), 0, steps)
+    assert asked == [10000, 5000, joint.LEAST_POINTS]
+
+
 def test_newton_without_rich_points_leaves_the_map():
     scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
     problem = problem_on_a_sphere(20, 3, 32)  # of at least 4 sightings is asked
@@ -322,11 +360,21 @@ def test_metal_is_learned_where_it_is():
 class Steps:
     """A clock that lets a stage run through."""
 
-    def __init__(self, count: int):
-        self.count = count
+    over, pace, reserved = False, 1.0, math.inf
 
-    def steps(self):
+    def __init__(self, count: int, rooms: Sequence[int] = ()):
+        self.count, self.rooms, self.asked = count, list(rooms), []
+
+    def steps(self, apart):
+        assert 0 < apart < 1
         yield from (i / self.count for i in range(self.count))
+
+    def apart(self):
+        return nullcontext()
+
+    def room_for(self, blocks):
+        self.asked.append(blocks)
+        return self.rooms.pop(0) if self.rooms else blocks
 
     def due(self) -> bool:
         return False
@@ -390,6 +438,46 @@ def test_solve_recovers_albedo_and_map():
     assert error.mean().abs() < 0.1
     assert error.std() < 0.3  # of a map whose logarithm varies by 0.7
     assert true.log().std() > 0.6
+
+
+def test_no_time_is_no_tracing():
+    steps = Steps(10)
+    steps.over, steps.skip = True, lambda: steps.asked.append("skip")
+    joint.solve(sphere_scene(8), photos_of(1, 8), JointConfig(), 0, steps)
+    assert steps.asked == ["skip"]
+
+
+@pytest.mark.parametrize(
+    ("rooms", "newton", "asked"),
+    [((), [0.25, 0.5, 0.75], [2, 1, 0]), ((1, 0), [0.25, 0.625], [2, 0]), ((0,), [0.25], [2])],
+)
+def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, asked):
+    """With less room than rounds there are fewer rounds, each of them longer."""
+    steps, when, rates, made = Steps(400, rooms), [], [], []
+
+    class Optimizer(RowAdam):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            rates.append([])
+
+        def step(self):
+            rates[-1].append(self.param_groups[0]["lr"])
+            made.append(None)
+
+    def objective(scene, *_):
+        return {"joint": scene.sky.log_radiance.square().sum()}
+
+    monkeypatch.setattr(joint, "pose", lambda *_: None)
+    monkeypatch.setattr(joint, "objective", objective)
+    monkeypatch.setattr(joint, "RowAdam", Optimizer)
+    monkeypatch.setattr(joint, "newton_round", lambda *_: when.append(len(made) / steps.count))
+    cfg = JointConfig(rounds=4)
+    joint.solve(sphere_scene(8), photos_of(1, 8), cfg, 0, steps)
+    assert when == newton
+    assert steps.asked == asked
+    for rate in rates:  # every round runs through the whole of its schedule
+        assert rate[0] == cfg.lr_features
+        assert rate[-1] == pytest.approx(0.1 * cfg.lr_features, rel=0.03)  # of 100 steps, the last
 
 
 def test_a_refit_leaves_geometry_and_materials_bit_for_bit(tmp_path, monkeypatch):

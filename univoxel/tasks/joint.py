@@ -9,7 +9,8 @@ map and materials alternate with Gauss-Newton steps on the map.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -35,6 +36,8 @@ from univoxel.tasks.progress import Progress
 CLIPPED = 0.97  # sRGB; brighter pixels are lower bounds
 NEWTON_CHUNK = 256  # points whose equations are built at once
 METAL = 0.2  # metallic from which on a point is taken for metal
+NEWTON_COST = 2.7  # of a sighting in a Newton step, over one in a step of Adam; measured
+LEAST_CHUNKS, LEAST_POINTS = 2, 2000  # on a machine however slow
 CAUCHY = 0.05  # sRGB; residuals beyond are taken for what the model cannot explain
 
 
@@ -84,12 +87,19 @@ def draw(problem: Problem, points: int, views: int) -> tuple[Tensor, Tensor]:
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
     """Fit scene.sky and the materials to the photographs; geometry and other heads stay."""
     assert scene.sky is not None
-    problem = pose(scene, photos, cfg, seed)
-    turn = 0  # rounds begun
-    for done in progress.steps():
-        if done >= turn / cfg.rounds:
-            if turn:
-                newton_round(scene, problem, cfg)
+    if progress.over:
+        progress.skip()
+        return
+    # What does not fit is cut alike: points here, steps of Adam by `steps`, points of Newton below
+    points = min(cfg.points, max(LEAST_POINTS, round(progress.pace * cfg.points)))
+    problem = pose(scene, photos, replace(cfg, points=points), seed)
+    first, turn, more = 0.0, -1.0, cfg.rounds  # begin and end of a round, rounds to come
+    for done in progress.steps(newton_share(cfg)):
+        if done >= turn:
+            if more < cfg.rounds:
+                with progress.apart():
+                    newton_round(scene, problem, cfg, progress.reserved / more)
+                more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
             optimizer = RowAdam(
                 [
                     {"params": [scene.field.features], "eps": 1e-8},
@@ -98,10 +108,11 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
                 ],
                 betas=(0.9, 0.99),
             )
-            turn += 1
-        fade = 0.1 ** (done * cfg.rounds - (turn - 1))
+            first, turn, more = done, done + (1 - done) / more, more - 1
+        fade = 0.1 ** ((done - first) / (turn - first))
         # After a Newton round the map is better than what Adam would make of it: it moves slowly
-        rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * (1.0 if turn == 1 else 0.1))
+        slow = 1.0 if more == cfg.rounds - 1 else 0.1
+        rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * slow)
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate * fade
         terms = objective(scene, problem, cfg)
@@ -110,6 +121,13 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         optimizer.step()
         if progress.due():
             progress.report({k: v.item() for k, v in terms.items()}, None)
+
+
+def newton_share(cfg: JointConfig) -> float:
+    """Share of the stage's time that Newton rounds take if nothing is cut."""
+    sightings = cfg.newton_points * cfg.newton_views * cfg.newton_steps * (cfg.rounds - 1)
+    newton = NEWTON_COST * sightings
+    return newton / (newton + cfg.iterations * cfg.rays)
 
 
 def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Tensor]:
@@ -173,7 +191,9 @@ class Block:
 
 
 @torch.no_grad()
-def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float]:
+def newton_round(
+    scene: Scene, problem: Problem, cfg: JointConfig, seconds: float = math.inf
+) -> list[float]:
     """Gauss-Newton steps on the log map, with the albedo of every point eliminated.
 
     The normal equations for log map and log albedo of the points are block diagonal in the albedo;
@@ -182,7 +202,11 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
     highlights of known reflectance. Residuals are in sRGB-encoded colour with Cauchy weights; a
     graph Laplacian keeps the log map smooth. Returns the mean weighted squared residual before each
     step.
+
+    Args:
+        seconds: wall time that it may take, about: fewer points serve where all would take more.
     """
+    begin = time.monotonic()
     seen, sky = problem.seen, scene.sky
     assert sky is not None
     counts = seen.offsets.diff()
@@ -197,7 +221,19 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
     sighting = seen.offsets[chosen][:, None] + which
     parts = torch.arange(len(chosen)).split(NEWTON_CHUNK)
     roughness = widened(roughness, len(sky.direction))
-    rows = [light_rows(problem, chosen[k], sighting[k], roughness[k]) for k in parts]
+    rows, spent = [], 0.0  # on the equations of one part
+    for k in parts:
+        rows.append(light_rows(problem, chosen[k], sighting[k], roughness[k]))
+        if len(rows) == 1 and seconds < math.inf:
+            before = time.monotonic()
+            normal_equations(rows[0], sky.radiance, log_albedo[k])
+            spent = time.monotonic() - before
+        so_far = time.monotonic() - begin
+        if len(rows) >= LEAST_CHUNKS and so_far + cfg.newton_steps * len(rows) * spent > seconds:
+            break
+    parts = parts[: len(rows)]
+    count = sum(map(len, parts))
+    sighting, log_albedo = sighting[:count], log_albedo[:count]
     smooth = cfg.newton_smooth * graph_laplacian(sky.direction)
     costs = []
     for _ in range(cfg.newton_steps):

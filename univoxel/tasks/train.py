@@ -31,7 +31,9 @@ from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
 from univoxel.tasks import joint
+from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress
+from univoxel.tasks.timelapse import Timelapse
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
@@ -59,8 +61,12 @@ class Batch:
         return -self.rays.direction
 
 
-def train(cfg: TrainConfig, resume: bool = False) -> Path:
+def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None = None) -> Path:
     """Train a scene; leave model, log, preview and configuration in cfg.out and return it.
+
+    Args:
+        timelapse: .gif, .mp4 or folder for pictures of a view over training time, which making
+            them does not count in.
 
     Raises:
         DataError: input that cannot be used.
@@ -70,6 +76,7 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
         FileNotFoundError, ValueError: with resume, there is no checkpoint that can be read, or it
             belongs to another configuration.
     """
+    film = None if timelapse is None else Timelapse(timelapse, cfg)
     begin = time.monotonic()
     torch.manual_seed(cfg.seed)
     photos = load_photos(cfg.data, "train")
@@ -100,6 +107,8 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
     save_config(cfg)
     with Progress(cfg, begin, state) as progress:
+        if film:
+            progress.watch = lambda: film.look(scene, progress)
         for index in range(state["stage"], len(cfg.stages)):
             stage, grid = cfg.stages[index], grids[index]
             if isinstance(stage, JointConfig):
@@ -112,6 +121,8 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
             done = index + 1 == len(cfg.stages)
             save_scene(scene, cfg.out, progress.state(), slim=done)
             preview(scene, photos, cfg.out / "preview.png")
+        if film:
+            film.finish(scene, progress)
     return cfg.out
 
 
@@ -143,6 +154,7 @@ def run_stage(
         betas=MOMENTS,
     )
     scratch = torch.zeros_like(field.sdf.data)
+    plateau = Plateau(cfg.patience)
     for done in progress.steps():
         physical = done >= stage.physical_from
         rates = (
@@ -174,6 +186,10 @@ def run_stage(
         optimizer.step()
         if progress.step % SMOOTH_EVERY == 0 and not stage.refit:
             smooth(field, stage)
+        if plateau.due(done):
+            quality = held_out_psnr(scene, photos, held_out, physical)
+            if plateau.flat(done, quality, physical):
+                progress.shorten()
         if progress.due():
             quality = held_out_psnr(scene, photos, held_out, physical)
             progress.report({k: v.item() for k, v in terms.items()}, quality)
