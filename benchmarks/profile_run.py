@@ -1,6 +1,6 @@
 """Where the seconds of a whole training go, by its stages and by what is done in them.
 
-    python benchmarks/profile_run.py SCENE [--preset fast] [--out benchmarks/results/profile.json]
+    python benchmarks/profile_run.py SCENE [--preset fast] [--part 6] [--cpu]
 
 `univoxel.tasks.train` itself runs; what it calls is timed where it is called. Of every 16th
 backward pass the profiler says which part of the forward pass its nodes belong to; the time of all
@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -26,6 +27,7 @@ from univoxel.ops import VisibilityScene
 from univoxel.tasks import joint, train
 
 HERE = Path(__file__).parent
+FIXED = ("joint: pose and trace", "joint: Newton", "previews", "checkpoints", "held-out rays")
 EVERY = 16  # backward passes of which one is divided
 START = "before"  # loading, hull; also what lies between the stages
 PARTS = STAGES | {
@@ -130,9 +132,25 @@ def profile(cfg: TrainConfig, now: Callable[[], float] = time.perf_counter) -> d
     return {"seconds": now() - begin, "stages": clock.columns}
 
 
+def extrapolated(columns: dict, part: int) -> dict:
+    """Columns of a run with an n-th of its steps as if it had made all of them."""
+    found = {}
+    for title, column in columns.items():
+        rows = {
+            name: seconds * (1 if title == START or name in FIXED else part)
+            for name, seconds in column["rows"].items()
+        }
+        found[title] = {
+            "seconds": sum(rows.values()),
+            "steps": part * column["steps"],
+            "rows": rows,
+        }
+    return found
+
+
 def table(result: dict) -> str:
     """Markdown, seconds; what is below half a per cent of the whole goes into other."""
-    stages = result["stages"]
+    stages = extrapolated(result["stages"], result["part"])
     names = dict.fromkeys(name for s in stages.values() for name in s["rows"])
     whole = sum(s["seconds"] for s in stages.values())
     sums = {n: sum(s["rows"].get(n, 0.0) for s in stages.values()) for n in names}
@@ -165,14 +183,20 @@ def main() -> None:
     parser.add_argument(
         "--cpu", action="store_true", help="processor time: for one thread on a busy machine"
     )
+    parser.add_argument(
+        "--part", type=int, default=1, help="make an n-th of the steps and multiply (default: 1)"
+    )
     parser.add_argument("--out", type=Path, default=HERE / "results" / "profile.json")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         cfg = chosen(options.preset, options.minutes, options.scene, Path(folder) / "run")
+        stages = (replace(s, iterations=s.iterations // options.part) for s in cfg.stages)
+        cfg = replace(cfg, stages=tuple(stages))
         result = profile(cfg, time.process_time if options.cpu else time.perf_counter)
     result |= {
         "scene": options.scene.name,
         "preset": options.preset,
+        "part": options.part,
         "clock": "processor" if options.cpu else "wall",
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
