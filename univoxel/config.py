@@ -19,7 +19,7 @@ from univoxel.lights import (
     SGConfig,
     SHConfig,
 )
-from univoxel.scene import SceneConfig
+from univoxel.scene import SceneConfig, Varying
 
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
 
@@ -177,7 +177,9 @@ def check_same(cfg: TrainConfig) -> None:
             )
 
 
-def preset(name: str, data: Path, out: Path, light: LightName = "hybrid") -> TrainConfig:
+def preset(
+    name: str, data: Path, out: Path, light: LightName = "hybrid", varying: Varying = "none"
+) -> TrainConfig:
     """The configuration of a preset: draft (1 minute), fast (4) or full (12) on two cores.
 
     Args:
@@ -185,9 +187,11 @@ def preset(name: str, data: Path, out: Path, light: LightName = "hybrid") -> Tra
             environment map with traced visibility for the materials, then lobes that follow them;
             "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
             traced visibility from the beginning. docs/lights.md tells them apart.
+        varying: what differs from photograph to photograph: "none"; "exposure", a gain per channel;
+            "light", the light itself too.
 
     Raises:
-        ValueError: an unknown name.
+        ValueError: an unknown name; varying light with a map from the beginning.
     """
     match name:
         case "draft":
@@ -228,9 +232,10 @@ def preset(name: str, data: Path, out: Path, light: LightName = "hybrid") -> Tra
                 physical_from=0.0,
                 refit=True,
             )
-            return TrainConfig(data, out, (coarse, fine, joint, refit), minutes)
+            scene = SceneConfig(varying=varying)
+            return TrainConfig(data, out, (coarse, fine, joint, refit), minutes, scene=scene)
         case _ if light in alone:
-            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light])
+            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=varying)
             return TrainConfig(data, out, (coarse, fine), minutes, scene=scene)
         case _:
             names = ", ".join(("hybrid", *alone))

@@ -38,7 +38,8 @@ def problem_on_a_sphere(points: int, views: int, nodes: int) -> joint.Problem:
     wo = facing(normal.repeat_interleave(views, 0), 0.3)
     offsets = torch.arange(points + 1) * views
     black = torch.zeros(points * views, 3)
-    seen = Observations(RADIUS * normal, normal, offsets, wo, black)
+    view = torch.arange(points * views) % views
+    seen = Observations(RADIUS * normal, normal, offsets, wo, black, view)
     open_share = torch.full((points, nodes), 255, dtype=torch.uint8)
     indirect = torch.zeros(points, nodes, 3, dtype=torch.float16)
     transport = Transport(fibonacci_sphere(nodes), open_share, indirect)
@@ -79,7 +80,8 @@ def rows_and_map():
     problem = replace(problem, target=target)
     sighting = torch.arange(20).view(5, 4)
     rows = joint.light_rows(problem, torch.arange(5), sighting, torch.full((5,), 0.3))
-    rows = joint.Rows(**{f.name: getattr(rows, f.name).double() for f in dataclasses.fields(rows)})
+    values = {f.name: getattr(rows, f.name) for f in dataclasses.fields(rows)}
+    rows = joint.Rows(**{k: v.double() if k != "view" else v for k, v in values.items()})
     map = map * torch.linspace(1.6, 0.9, 12)[:, None]
     return rows, map.double(), albedo.log().double()
 

@@ -9,7 +9,7 @@ map and materials alternate with Gauss-Newton steps on the map.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -62,13 +62,20 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     assert scene.sky is not None
     tracer = VisibilityScene(mesh.vertices, mesh.faces)
     offset = scene.field.voxel_size
-    bright = mean_colors(observe(mesh.vertices, mesh.normals, photos, tracer, offset))
+    bright = mean_colors(
+        unexposed(scene, observe(mesh.vertices, mesh.normals, photos, tracer, offset))
+    )
     position, normal = surface_points(mesh, cfg.points, generator)
     seen = observe(position, normal, photos, tracer, offset)
     direction = scene.sky.direction
     transport = trace(seen, tracer, mesh, bright, direction, cfg.tracing, offset, generator)
     metal = scene.material(scene.field.sample(position).features)[2] > METAL
     return Problem(seen, transport, losses.encode(seen.color), metal, offset)
+
+
+def unexposed(scene: Scene, seen: Observations) -> Observations:
+    """The same as one exposure would have it, as far as the scene knows the photographs'."""
+    return replace(seen, color=seen.color / scene.exposed(torch.ones_like(seen.color), seen.view))
 
 
 def draw(problem: Problem, points: int, views: int) -> tuple[Tensor, Tensor]:
@@ -90,14 +97,16 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         if done >= turn / cfg.rounds:
             if turn:
                 newton_round(scene, problem, cfg)
-            optimizer = RowAdam(
-                [
-                    {"params": [scene.field.features], "eps": 1e-8},
-                    {"params": list(scene.material.parameters())},
-                    {"params": [scene.sky.log_radiance]},
-                ],
-                betas=(0.9, 0.99),
-            )
+            groups = [
+                {"params": [scene.field.features], "eps": 1e-8},
+                {"params": list(scene.material.parameters())},
+                {"params": [scene.sky.log_radiance]},
+            ]
+            if scene.views:
+                groups[1]["params"].append(scene.views.gain_steps)
+                if scene.views.sky_weights is not None:
+                    groups[2]["params"] += [scene.views.sky_weights, scene.views.sky_basis]
+            optimizer = RowAdam(groups, betas=(0.9, 0.99))
             turn += 1
         fade = 0.1 ** (done * cfg.rounds - (turn - 1))
         # After a Newton round the map is better than what Adam would make of it: it moves slowly
@@ -115,7 +124,6 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
 def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Tensor]:
     """The weighted losses of a random batch of sightings."""
     seen, transport = problem.seen, problem.transport
-    assert scene.sky is not None
     index, sighting = draw(problem, cfg.rays // cfg.views, cfg.views)
     points = index[:: cfg.views]
     material = scene.material(scene.field.sample(seen.position[points]).features)
@@ -123,19 +131,9 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
     diffuse, f0 = brdf.split(albedo, metallic * problem.metal[points])
     assert isinstance(f0, Tensor)
     repeat = torch.arange(len(points)).repeat_interleave(cfg.views)
-    rgb = shade_map(
-        scene.sky.radiance,
-        transport.open,
-        transport.indirect,
-        index,
-        seen.normal[index],
-        seen.wo[sighting],
-        diffuse[repeat],
-        widened(roughness, len(transport.direction))[repeat],
-        transport.direction,
-        problem.solid_angle,
-        f0[repeat],
-    )
+    roughness_shown = widened(roughness, len(transport.direction))
+    shown = diffuse[repeat], roughness_shown[repeat], f0[repeat]
+    rgb = draw_sightings(scene, problem, index, sighting, *shown)
     beside = seen.position[points]
     beside = beside + 2 * problem.voxel_size * torch.randn_like(beside)
     albedo_near, roughness_near, _ = scene.material(scene.field.sample(beside).features)
@@ -148,6 +146,69 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
     }
 
 
+def draw_sightings(
+    scene: Scene,
+    problem: Problem,
+    point: Tensor,
+    sighting: Tensor,
+    diffuse: Tensor,
+    roughness: Tensor,
+    f0: Tensor,
+) -> Tensor:
+    """What the map makes of sightings [N] of points [N], each in its photograph's light: [N, 3].
+
+    Args:
+        diffuse, roughness, f0: of the points, [N, 3], [N] and [N, 3].
+    """
+    seen, transport, sky = problem.seen, problem.transport, scene.sky
+    assert sky is not None
+    view = seen.view[sighting]
+    change = scene.views.sky_change() if scene.views else None
+    if change is None:
+        order, parts, maps = None, (slice(None),), [sky.radiance]
+    else:  # a map for each view
+        order = torch.argsort(view)
+        parts = order.split(torch.bincount(view, minlength=len(change)).tolist())
+        maps = (sky.log_radiance + change).exp().unbind()
+    rgb = torch.cat(
+        [
+            shade_map(
+                map,
+                transport.open,
+                transport.indirect,
+                point[part],
+                seen.normal[point[part]],
+                seen.wo[sighting[part]],
+                diffuse[part],
+                roughness[part],
+                transport.direction,
+                problem.solid_angle,
+                f0[part],
+            )
+            for part, map in zip(parts, maps, strict=True)
+        ]
+    )
+    if order is not None:
+        rgb = rgb[torch.argsort(order)]
+    return scene.exposed(rgb, view)
+
+
+@dataclass(frozen=True)
+class Differs:
+    """What differs from view to view; constant in a round."""
+
+    gain: Tensor  # [views, 3]
+    change: Tensor | None  # [views, D, 3] factor on the map
+
+
+def view_differences(scene: Scene) -> Differs | None:
+    """Those of the scene's photographs; None where they all have one light."""
+    if scene.views is None:
+        return None
+    change = scene.views.sky_change()
+    return Differs(scene.views.log_gain.exp(), None if change is None else change.exp())
+
+
 @dataclass(frozen=True)
 class Rows:
     """What light does at V sightings of P points, linear in the map; constant in a round."""
@@ -158,6 +219,7 @@ class Rows:
     diffuse_blocked: Tensor  # [P, V, 3] radiance from the blocked share, for albedo 1
     shine_blocked: Tensor  # [P, V, 3]
     target: Tensor  # [P, V, 3] sRGB-encoded
+    view: Tensor  # [P, V] int64: which photograph
 
 
 @dataclass(frozen=True)
@@ -199,10 +261,10 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
     roughness = widened(roughness, len(sky.direction))
     rows = [light_rows(problem, chosen[k], sighting[k], roughness[k]) for k in parts]
     smooth = cfg.newton_smooth * graph_laplacian(sky.direction)
-    costs = []
+    differs, costs = view_differences(scene), []
     for _ in range(cfg.newton_steps):
         blocks = [
-            normal_equations(r, sky.radiance, log_albedo[k])
+            normal_equations(r, sky.radiance, log_albedo[k], differs)
             for r, k in zip(rows, parts, strict=True)
         ]
         x = sky.log_radiance.T  # [3, D]
@@ -237,17 +299,29 @@ def light_rows(problem: Problem, point: Tensor, sighting: Tensor, roughness: Ten
         through[..., None] * (cosine @ blocked),
         shine @ blocked,
         problem.target[sighting],
+        seen.view[sighting],
     )
 
 
-def normal_equations(rows: Rows, light: Tensor, log_albedo: Tensor) -> Block:
-    """The block of some points for map `light` [D, 3] and `log_albedo` [P, 3]."""
+def normal_equations(
+    rows: Rows, light: Tensor, log_albedo: Tensor, differs: Differs | None = None
+) -> Block:
+    """The block of some points for map `light` [D, 3] and `log_albedo` [P, 3].
+
+    What differs from view to view stays as it is.
+    """
     hessian, gradient, cross, own, norm, cost = [], [], [], [], [], 0.0
     for c in range(3):
         albedo = log_albedo[:, c, None].exp()
-        sky = rows.through * (rows.diffuse @ light[:, c])[:, None]
-        diffuse = albedo * (sky + rows.diffuse_blocked[..., c])
-        drawn = diffuse + rows.shine @ light[:, c] + rows.shine_blocked[..., c]
+        by_diffuse, by_shine, gain = rows.diffuse[:, None], rows.shine, 1.0
+        if differs is not None:
+            gain = differs.gain[rows.view, c]
+            if differs.change is not None:
+                change = differs.change[rows.view, :, c]
+                by_diffuse, by_shine = by_diffuse * change, by_shine * change
+        sky = rows.through * (by_diffuse @ light[:, c])
+        diffuse = gain * albedo * (sky + rows.diffuse_blocked[..., c])
+        drawn = diffuse + gain * (by_shine @ light[:, c] + rows.shine_blocked[..., c])
         target = rows.target[..., c]
         residual = target - losses.encode(drawn)
         weight = 1 / (1 + (residual / CAUCHY).square())
@@ -255,8 +329,8 @@ def normal_equations(rows: Rows, light: Tensor, log_albedo: Tensor) -> Block:
         root = weight.sqrt()
         slope = root * encoded_slope(drawn)
         r = root * residual
-        jacobian = (albedo * rows.through)[..., None] * rows.diffuse[:, None] + rows.shine
-        jacobian = jacobian * slope[..., None] * light[:, c]
+        jacobian = (albedo * rows.through)[..., None] * by_diffuse + by_shine
+        jacobian = jacobian * (slope * gain)[..., None] * light[:, c]
         self_ = slope * diffuse
         n = self_.square().sum(1) + 1e-6  # a point that shows no diffuse light keeps its albedo
         tie = torch.einsum("pvd,pv->pd", jacobian, self_)
