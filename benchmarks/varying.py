@@ -2,11 +2,13 @@
 
     python benchmarks/varying.py DATA [--preset draft] [--lights sg hybrid] [--kinds ...]
 
-Makes four data sets of one, in --work:
-- exposure: a gain per view within +-1 stop; color: gains per view and channel within +-1/2 stop;
+Makes data sets of one, in --work:
+- exposure: a random gain per view within +-1 stop; metered: as a camera's automatic would set it,
+  towards the same mean brightness in every view, within +-1 stop;
+- color: random gains per view and channel within +-1/2 stop;
 - relit: the photographs rendered anew by univoxel's own path tracer, under the training map, from
   the data set's mesh with the albedo and roughness of the nearest pixels of its test views;
-- turned: the same, with the map turned to another side in each view.
+- turned: the same, with the map turning with the camera about +Z, as on a turntable.
 Test views and all ground truth stay as they are. Then trains each kind without and with --varying
 and evaluates; what is done already is not done again. The result names the command.
 """
@@ -27,7 +29,7 @@ from scipy import ndimage, spatial
 from torch.nn.functional import normalize
 
 from univoxel.camera import image_rays
-from univoxel.color import linear_to_srgb
+from univoxel.color import linear_to_srgb, luminance
 from univoxel.config import preset
 from univoxel.data import Photos, load_photos, load_truth
 from univoxel.data.images import replacing, write_png
@@ -43,7 +45,8 @@ from univoxel.tasks.train import train
 # kind: what it is compared with, and the models that are trained on it
 KINDS = {
     "fixed": ("fixed", ["none", "light"]),
-    "exposure": ("fixed", ["none", "exposure", "light"]),
+    "exposure": ("fixed", ["none", "exposure"]),
+    "metered": ("fixed", ["none", "exposure"]),
     "color": ("fixed", ["none", "exposure"]),
     "relit": ("relit", ["none"]),
     "turned": ("relit", ["none", "light"]),
@@ -52,12 +55,20 @@ NEAREST = 4  # pixels of test views that a material is the mean of
 SAMPLES = 128  # of the light in a rendered photograph
 
 
-def gains(kind: str, views: int, seed: int = 0) -> torch.Tensor:
-    """Factors [V, 3] on linear colour, of geometric mean 1."""
-    generator = torch.Generator().manual_seed(seed)
+def gains(kind: str, folder: Path, seed: int = 0) -> torch.Tensor:
+    """Factors [V, 3] on the linear colour of the training photographs, of geometric mean 1."""
+    generator, photos = torch.Generator().manual_seed(seed), load_photos(folder, "train")
+    views = len(photos)
     stops = torch.zeros(views, 3)
     if kind == "exposure":
         stops = (2 * torch.rand(views, 1, generator=generator) - 1).expand(-1, 3)
+    elif kind == "metered":
+        means = []
+        for v in range(views):
+            color, alpha = photos.picture(v)
+            means.append(luminance(color[alpha > 0.5]).mean())
+        stops = -torch.stack(means).log2()
+        stops = (stops - stops.mean()).clamp(-1, 1)[:, None].expand(-1, 3)
     elif kind == "color":
         stops = torch.rand(views, 3, generator=generator) - 0.5
     return 2 ** (stops - stops.mean(0))
@@ -153,10 +164,10 @@ def make(folder: Path, kind: str, out: Path) -> Path:
         return out
     photos = load_photos(folder, "train")
     if kind in ("relit", "turned"):
-        degrees = 360 * torch.rand(len(photos), generator=torch.Generator().manual_seed(0))
-        color = rendered(folder, photos, degrees * (kind == "turned"))
+        x, y = photos.cameras.camera_to_world[:, :2, 3].unbind(1)
+        color = rendered(folder, photos, torch.atan2(y, x).rad2deg() * (kind == "turned"))
     else:
-        color = exposed(photos, gains(kind, len(photos)))
+        color = exposed(photos, gains(kind, folder))
     shutil.copytree(folder, out, ignore=shutil.ignore_patterns("train"), dirs_exist_ok=True)
     frames = json.loads((folder / "transforms_train.json").read_text())
     (out / "transforms_train.json").unlink()
@@ -169,12 +180,12 @@ def make(folder: Path, kind: str, out: Path) -> Path:
     return out
 
 
-def gain_error(run: Path, kind: str) -> float | None:
+def gain_error(run: Path, folder: Path, kind: str) -> float | None:
     """Root mean square error of the recovered gains, in stops; None where the run has none."""
     views = load_scene(run).views
-    if views is None or kind not in ("fixed", "exposure", "color"):
+    if views is None or KINDS[kind][0] != "fixed":
         return None
-    true = gains(kind, len(views)).log2()
+    true = gains(kind, folder).log2()
     return float((views.log_gain.detach() / math.log(2) - true).square().mean().sqrt())
 
 
@@ -184,6 +195,8 @@ def main() -> None:
     parser.add_argument("--preset", default="draft")
     parser.add_argument("--lights", nargs="+", default=["sg", "hybrid"])
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
+    models = ["none", "exposure", "light"]
+    parser.add_argument("--varying", nargs="+", default=models, choices=models)
     parser.add_argument("--minutes", type=float, default=60.0, help="so many that steps decide")
     parser.add_argument("--work", type=Path, default=Path("build/varying"))
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results/varying.json")
@@ -193,7 +206,7 @@ def main() -> None:
     for light in arguments.lights:
         for kind in arguments.kinds:
             data = make(arguments.data, kind, arguments.work / f"{arguments.data.name}_{kind}")
-            for varying in KINDS[kind][1]:
+            for varying in (m for m in KINDS[kind][1] if m in arguments.varying):
                 name = f"{arguments.data.name} {arguments.preset} {light} {kind} {varying}"
                 if name in result["runs"]:
                     continue
@@ -201,7 +214,9 @@ def main() -> None:
                 cfg = preset(arguments.preset, data, run, light, varying)
                 if not (run / FILE).is_file():
                     train(replace(cfg, minutes=arguments.minutes))
-                own = evaluate(run, samples=32) | {"gain_stops": gain_error(run, kind)}
+                own = evaluate(run, samples=32) | {
+                    "gain_stops": gain_error(run, arguments.data, kind)
+                }
                 result["runs"][name] = own
                 with replacing(arguments.out) as temporary:
                     temporary.write_text(json.dumps(result, indent=1) + "\n")

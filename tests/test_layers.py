@@ -30,7 +30,16 @@ HELPERS = {
     "data": {"base", "images", "radiance"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
-    "tasks": {"animation", "contact_sheet", "envmap", "frames", "joint", "layers", "progress"},
+    "tasks": {
+        "animation",
+        "contact_sheet",
+        "envmap",
+        "equations",
+        "frames",
+        "joint",
+        "layers",
+        "progress",
+    },
 }
 # Extras: imported inside the function that needs one
 OPTIONAL = {"imageio_ffmpeg", "matplotlib", "trimesh", "viser"}

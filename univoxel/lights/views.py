@@ -17,10 +17,9 @@ class ViewLights(nn.Module):
     - A gain per channel: exposure, and the colour of all light. Their geometric mean over the views
       is 1, so that they cannot trade with albedo or light.
     - A code of Z numbers, which networks of light read beside the features. Materials never do.
-    - What is added to the logarithm of the scene's map at D directions: a low-rank
-      sum_r weight_vr basis_r. The basis starts as spherical harmonics of degree 1 to 3, the weights
-      at 0. Their mean over the views is 0, and that of the codes too: the mean light is the light
-      of no view in particular.
+    - What is added to the logarithm of the scene's map at D directions: sum_r weight_vrc basis_rd.
+      The R functions start as spherical harmonics of degree 1 to 3, the weights at 0.
+    Weights and codes have mean 0 over the views: the mean light is that of no view in particular.
 
     Source: Martin-Brualla et al. 2021 (NeRF in the Wild) for a learned code per photograph.
     """
@@ -49,8 +48,8 @@ class ViewLights(nn.Module):
         self.sky_weights = self.sky_basis = None
         if directions is not None:
             basis = real_harmonics(DEGREE, directions)[:, 1:].T  # the first is constant: the gain
-            self.sky_weights = nn.Parameter(torch.zeros(len(names), len(basis)))
-            self.sky_basis = nn.Parameter(basis[..., None].repeat(1, 1, 3))  # [R, D, 3]
+            self.sky_weights = nn.Parameter(torch.zeros(len(names), len(basis), 3))
+            self.sky_basis = nn.Parameter(basis.contiguous())  # [R, D]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -70,6 +69,10 @@ class ViewLights(nn.Module):
                 f"--light-of: expected a number below {len(self)} or one of {self.names[0]} to "
                 f"{self.names[-1]}, got {view!r}"
             )
+
+    def add_to_gains(self, step: Tensor) -> None:
+        """Add [V, 3] to the log gains, but for its mean."""
+        self.gain_steps.data += step / RATE
 
     @property
     def log_gain(self) -> Tensor:
@@ -93,7 +96,7 @@ class ViewLights(nn.Module):
         """What each view adds to the log map: [V, D, 3]; None where all have one map."""
         if self.sky_weights is None or self.sky_basis is None:
             return None
-        return torch.einsum("vr,rdc->vdc", _centred(self.sky_weights), self.sky_basis)
+        return torch.einsum("vrc,rd->vdc", _centred(self.sky_weights), self.sky_basis)
 
 
 def _centred(values: Tensor) -> Tensor:

@@ -30,12 +30,18 @@ from univoxel.render.transport import (
     trace,
 )
 from univoxel.scene import Scene
+from univoxel.tasks.equations import (
+    CLIPPED,
+    Rows,
+    graph_laplacian,
+    normal_equations,
+    view_differences,
+    weights_step,
+)
 from univoxel.tasks.progress import Progress
 
-CLIPPED = 0.97  # sRGB; brighter pixels are lower bounds
 NEWTON_CHUNK = 256  # points whose equations are built at once
 METAL = 0.2  # metallic from which on a point is taken for metal
-CAUCHY = 0.05  # sRGB; residuals beyond are taken for what the model cannot explain
 
 
 @dataclass(frozen=True)
@@ -103,15 +109,17 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
                 {"params": [scene.sky.log_radiance]},
             ]
             if scene.views:
-                groups[1]["params"].append(scene.views.gain_steps)
+                groups.append({"params": [scene.views.gain_steps]})
                 if scene.views.sky_weights is not None:
                     groups[2]["params"] += [scene.views.sky_weights, scene.views.sky_basis]
             optimizer = RowAdam(groups, betas=(0.9, 0.99))
             turn += 1
         fade = 0.1 ** (done * cfg.rounds - (turn - 1))
-        # After a Newton round the map is better than what Adam would make of it: it moves slowly
-        rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * (1.0 if turn == 1 else 0.1))
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+        # After a Newton round light is better than what Adam would make of it while the albedo
+        # follows: the map moves slowly, gains do not
+        of_map, of_gains = (1.0, 1.0) if turn == 1 else (0.1, 0.0)
+        rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * of_map, cfg.lr_networks * of_gains)
+        for group, rate in zip(optimizer.param_groups, rates, strict=False):
             group["lr"] = rate * fade
         terms = objective(scene, problem, cfg)
         optimizer.zero_grad(set_to_none=True)
@@ -193,47 +201,6 @@ def draw_sightings(
     return scene.exposed(rgb, view)
 
 
-@dataclass(frozen=True)
-class Differs:
-    """What differs from view to view; constant in a round."""
-
-    gain: Tensor  # [views, 3]
-    change: Tensor | None  # [views, D, 3] factor on the map
-
-
-def view_differences(scene: Scene) -> Differs | None:
-    """Those of the scene's photographs; None where they all have one light."""
-    if scene.views is None:
-        return None
-    change = scene.views.sky_change()
-    return Differs(scene.views.log_gain.exp(), None if change is None else change.exp())
-
-
-@dataclass(frozen=True)
-class Rows:
-    """What light does at V sightings of P points, linear in the map; constant in a round."""
-
-    diffuse: Tensor  # [P, D] sky into irradiance: cosine, open share and solid angle
-    through: Tensor  # [P, V] irradiance into radiance, for albedo 1
-    shine: Tensor  # [P, V, D] sky into specular radiance
-    diffuse_blocked: Tensor  # [P, V, 3] radiance from the blocked share, for albedo 1
-    shine_blocked: Tensor  # [P, V, 3]
-    target: Tensor  # [P, V, 3] sRGB-encoded
-    view: Tensor  # [P, V] int64: which photograph
-
-
-@dataclass(frozen=True)
-class Block:
-    """Normal equations of some points: the map's part, and what ties it to their albedo."""
-
-    hessian: Tensor  # [3, D, D]
-    gradient: Tensor  # [3, D]
-    cross: Tensor  # [3, P, D] map against log albedo
-    own: Tensor  # [3, P] gradient of log albedo
-    norm: Tensor  # [3, P] curvature of log albedo
-    cost: float
-
-
 @torch.no_grad()
 def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float]:
     """Gauss-Newton steps on the log map, with the albedo of every point eliminated.
@@ -242,8 +209,9 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
     its Schur complement is D x D. What then speaks for the map is only what no albedo can explain:
     how a point's brightness changes from view to view, and with it the absolute scale, from
     highlights of known reflectance. Residuals are in sRGB-encoded colour with Cauchy weights; a
-    graph Laplacian keeps the log map smooth. Returns the mean weighted squared residual before each
-    step.
+    graph Laplacian keeps the log map smooth. Where light varies, log gains of the views are solved
+    for together with the map, and the changes of each view's map beside it. Returns the mean
+    weighted squared residual before each step.
     """
     seen, sky = problem.seen, scene.sky
     assert sky is not None
@@ -261,19 +229,30 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
     roughness = widened(roughness, len(sky.direction))
     rows = [light_rows(problem, chosen[k], sighting[k], roughness[k]) for k in parts]
     smooth = cfg.newton_smooth * graph_laplacian(sky.direction)
-    differs, costs = view_differences(scene), []
+    unknowns = len(smooth) + (len(scene.views) if scene.views else 0)
+    smooth = torch.nn.functional.pad(smooth, 2 * (0, unknowns - len(smooth)))
+    costs = []
     for _ in range(cfg.newton_steps):
+        differs = view_differences(scene)
         blocks = [
             normal_equations(r, sky.radiance, log_albedo[k], differs)
             for r, k in zip(rows, parts, strict=True)
         ]
         x = sky.log_radiance.T  # [3, D]
+        x = torch.nn.functional.pad(
+            x, (0, unknowns - x.shape[1])
+        )  # no gain is likelier than another
         system = torch.stack([b.hessian for b in blocks]).sum(0) / sighting.numel() + smooth
         system.diagonal(dim1=1, dim2=2).add_(cfg.newton_smooth)
         right = torch.stack([b.gradient for b in blocks]).sum(0) / sighting.numel() - x @ smooth
         factor = torch.linalg.cholesky(system.double())
         step = torch.cholesky_solve(right.double()[..., None], factor)[..., 0].float().clamp(-1, 1)
-        sky.log_radiance.add_(step.T)
+        to_map, to_gain = step.split([len(sky.direction), unknowns - len(sky.direction)], 1)
+        sky.log_radiance.add_(to_map.T)
+        if scene.views is not None:
+            scene.views.add_to_gains(to_gain.T)
+            sky.log_radiance.add_(to_gain.mean(1))  # what all gains share is light
+            weights_step(scene.views, blocks, sighting.numel(), cfg.newton_smooth)
         change = [(b.own - torch.einsum("cpd,cd->cp", b.cross, step)) / b.norm for b in blocks]
         log_albedo = (log_albedo + torch.cat(change, 1).T.clamp(-0.5, 0.5)).clamp(-7.0, 0.0)
         costs.append(sum(b.cost for b in blocks) / sighting.numel())
@@ -303,55 +282,6 @@ def light_rows(problem: Problem, point: Tensor, sighting: Tensor, roughness: Ten
     )
 
 
-def normal_equations(
-    rows: Rows, light: Tensor, log_albedo: Tensor, differs: Differs | None = None
-) -> Block:
-    """The block of some points for map `light` [D, 3] and `log_albedo` [P, 3].
-
-    What differs from view to view stays as it is.
-    """
-    hessian, gradient, cross, own, norm, cost = [], [], [], [], [], 0.0
-    for c in range(3):
-        albedo = log_albedo[:, c, None].exp()
-        by_diffuse, by_shine, gain = rows.diffuse[:, None], rows.shine, 1.0
-        if differs is not None:
-            gain = differs.gain[rows.view, c]
-            if differs.change is not None:
-                change = differs.change[rows.view, :, c]
-                by_diffuse, by_shine = by_diffuse * change, by_shine * change
-        sky = rows.through * (by_diffuse @ light[:, c])
-        diffuse = gain * albedo * (sky + rows.diffuse_blocked[..., c])
-        drawn = diffuse + gain * (by_shine @ light[:, c] + rows.shine_blocked[..., c])
-        target = rows.target[..., c]
-        residual = target - losses.encode(drawn)
-        weight = 1 / (1 + (residual / CAUCHY).square())
-        weight = weight.masked_fill((target > CLIPPED) & (residual < 0), 0.0)
-        root = weight.sqrt()
-        slope = root * encoded_slope(drawn)
-        r = root * residual
-        jacobian = (albedo * rows.through)[..., None] * by_diffuse + by_shine
-        jacobian = jacobian * (slope * gain)[..., None] * light[:, c]
-        self_ = slope * diffuse
-        n = self_.square().sum(1) + 1e-6  # a point that shows no diffuse light keeps its albedo
-        tie = torch.einsum("pvd,pv->pd", jacobian, self_)
-        g = (self_ * r).sum(1)
-        flat, low = jacobian.flatten(0, 1), tie / n.sqrt()[:, None]
-        hessian.append(flat.T @ flat - low.T @ low)
-        gradient.append(r.flatten() @ flat - (g / n) @ tie)
-        cross.append(tie)
-        own.append(g)
-        norm.append(n)
-        cost += r.square().sum().item()
-    return Block(
-        torch.stack(hessian),
-        torch.stack(gradient),
-        torch.stack(cross),
-        torch.stack(own),
-        torch.stack(norm),
-        cost,
-    )
-
-
 def widened(roughness: Tensor, nodes: int) -> Tensor:
     """Roughness whose lobe covers the gap between the map's nodes.
 
@@ -360,17 +290,3 @@ def widened(roughness: Tensor, nodes: int) -> Tensor:
     alpha^2, and variances add (Kaplanyan and Hill 2016 filter normals so).
     """
     return (roughness**4 + 1 / nodes) ** 0.25
-
-
-def encoded_slope(linear: Tensor) -> Tensor:
-    """Derivative of the sRGB curve."""
-    power = 1.055 / 2.4 * linear.clamp_min(0.0031308) ** (1 / 2.4 - 1)
-    return torch.where(linear <= 0.0031308, 12.92, power)
-
-
-def graph_laplacian(direction: Tensor, neighbours: int = 6) -> Tensor:
-    """Laplacian [D, D] of the graph of nearest neighbours on the sphere, symmetric."""
-    near = (direction @ direction.T).topk(neighbours + 1, 1).indices[:, 1:]
-    adjacent = torch.zeros(len(direction), len(direction)).scatter_(1, near, 1.0)
-    adjacent = torch.maximum(adjacent, adjacent.T)
-    return torch.diag(adjacent.sum(1)) - adjacent

@@ -137,6 +137,7 @@ def run_stage(
         scene.mirrored.requires_grad_(stage.refit)
         networks.append(scene.mirrored)
     if scene.views:
+        scene.views.gain_steps.requires_grad_(not stage.refit)
         networks.append(scene.views)
     optimizer = RowAdam(
         [
