@@ -77,6 +77,16 @@ class Steps:
 RED, BLUE = torch.tensor([0.6, 0.2, 0.15]), torch.tensor([0.15, 0.25, 0.6])
 
 
+def lamps(nodes: int) -> torch.Tensor:
+    """A grey map [D, 3] with three lamps that make highlights."""
+    direction = fibonacci_sphere(nodes)
+    map = torch.full((nodes, 3), 0.35)
+    for axis in ([1.0, -1.0, 1.0], [-1.0, 0.2, 0.5], [0.0, 1.0, 0.3]):
+        lobe = (12 * (direction @ normalize(torch.tensor(axis), dim=0) - 1)).exp()
+        map += lobe[:, None] * torch.tensor([3.3, 3.0, 2.7])
+    return map
+
+
 def photographs_under(
     maps: torch.Tensor, roughness: float, views: int = 16, size: int = 48
 ) -> Photos:

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from analytic import sphere_scene, write_scene
+from analytic import scene_of, sphere_scene, write_scene
 from sightings import (
     BLUE,
     RED,
     Steps,
     facing,
+    lamps,
     photographed,
     photographs_under,
     problem_on_a_sphere,
@@ -192,18 +193,6 @@ def test_draw_takes_points_that_are_seen_and_their_own_sightings():
     assert set(sighting.tolist()) == set(range(9))  # each is drawn at times
 
 
-def scene_of(albedo, roughness: float, nodes: int):
-    """The sphere with one material everywhere, under a grey map."""
-    scene = sphere_scene(nodes)
-    last = scene.material.net[-1]
-    low = scene.material.min_roughness
-    wanted = torch.tensor([*albedo, (roughness - low) / (1 - low), 0.0])
-    with torch.no_grad():
-        last.weight.zero_()
-        last.bias.copy_(torch.logit(wanted, eps=1e-6))
-    return scene
-
-
 CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
 
 
@@ -285,11 +274,7 @@ def test_metal_is_learned_where_it_is():
 
 def test_solve_recovers_albedo_and_map():
     nodes, roughness = 128, 0.29
-    direction = fibonacci_sphere(nodes)
-    true = torch.full((nodes, 3), 0.35)
-    for axis in ([1.0, -1.0, 1.0], [-1.0, 0.2, 0.5], [0.0, 1.0, 0.3]):  # lamps make highlights
-        lobe = (12 * (direction @ normalize(torch.tensor(axis), dim=0) - 1)).exp()
-        true += lobe[:, None] * torch.tensor([3.3, 3.0, 2.7])
+    true = lamps(nodes)
     photos = photographs_under(true, roughness)
     scene = sphere_scene(nodes)
     before = {k: v.clone() for k, v in scene.state_dict().items()}

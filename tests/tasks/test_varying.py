@@ -1,19 +1,30 @@
 """Photographs in varying light: what differs is found, and materials stay as under one light."""
 
 import dataclasses
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from analytic import sphere_scene
-from sightings import BLUE, RED, Steps, photographed, photographs_under, random_problem
+from analytic import scene_of, sphere_scene, write_scene
+from sightings import (
+    BLUE,
+    RED,
+    Steps,
+    lamps,
+    photographed,
+    photographs_under,
+    problem_on_a_sphere,
+    random_problem,
+)
 
 from univoxel import losses
-from univoxel.config import JointConfig
+from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.lights import SGConfig
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import Scene
-from univoxel.sphere import fibonacci_sphere
+from univoxel.scene import Scene, SceneConfig, load_scene
 from univoxel.tasks import equations, joint
+from univoxel.tasks.train import train
 
 NODES = 12
 
@@ -23,6 +34,7 @@ def varying(scene: Scene, views: int, kind: str = "light") -> Scene:
     torch.manual_seed(4)
     names = tuple(f"r_{v}" for v in range(views))
     other = Scene(replace(scene.cfg, varying=kind, views=names), scene.field)
+    other.material = scene.material
     with torch.no_grad():
         other.views.gain_steps.normal_(0, 0.03)
         if kind == "light":
@@ -82,36 +94,93 @@ def test_equations_know_what_differs():
     torch.testing.assert_close(full[:, :NODES], -by_map.T / 2, **exact)
     torch.testing.assert_close(full[:, NODES:], -by_gain.T / 2, **exact)
     torch.testing.assert_close(block.own, -by_albedo.T / 2, **exact)
-    torch.testing.assert_close(block.weights[1], -by_weights.permute(2, 0, 1) / 2, **exact)
+    differs = equations.Differs(gain, change, basis)
+    _, slopes = equations.view_equations(rows, map.double(), a.detach(), differs)
+    torch.testing.assert_close(slopes[..., -1], -by_gain.T / 2, **exact)
+    torch.testing.assert_close(slopes[..., :-1], -by_weights.permute(2, 0, 1) / 2, **exact)
 
 
-def lamps(nodes: int) -> torch.Tensor:
-    """A map [D, 3] with highlights to make."""
-    direction = fibonacci_sphere(nodes)
-    map = torch.full((nodes, 3), 0.35)
-    for axis in ([1.0, -1.0, 1.0], [-1.0, 0.2, 0.5], [0.0, 1.0, 0.3]):
-        lobe = (
-            12 * (direction @ torch.nn.functional.normalize(torch.tensor(axis), dim=0) - 1)
-        ).exp()
-        map += lobe[:, None] * torch.tensor([3.3, 3.0, 2.7])
-    return map
+def stops(views: int, most: float) -> torch.Tensor:
+    """Random gains [V, 3] in stops, of mean 0."""
+    torch.manual_seed(0)
+    random = most * (2 * torch.rand(views, 3) - 1)
+    return random - random.mean(0)
+
+
+def test_newton_finds_gains_and_what_each_map_has_of_its_own():
+    nodes, views = 64, 12
+    scene = varying(scene_of((0.5, 0.4, 0.3), 0.3, nodes), views)
+    problem = problem_on_a_sphere(400, views, nodes)
+    map = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
+    wanted = stops(views, 1.0)
+    change = scene.views.sky_change().detach()
+    colors = [
+        photographed(
+            problem,
+            map * change[v].exp() * 2 ** wanted[v],
+            torch.tensor([0.5, 0.4, 0.3]).expand(400, 3),
+            joint.widened(torch.full((400,), 0.3), nodes),
+        ).seen.color[v::views]
+        for v in range(views)
+    ]
+    color = torch.stack(colors, 1).flatten(0, 1)
+    problem = replace(problem, target=losses.encode(color))
+    with torch.no_grad():
+        scene.views.gain_steps.zero_()
+        scene.views.sky_weights.zero_()
+    cfg = JointConfig(newton_points=400, newton_views=12, newton_steps=8)
+    costs = joint.newton_round(scene, problem, cfg)
+    costs += joint.newton_round(scene, problem, cfg)
+    found = scene.views
+    print(costs, (found.log_gain / math.log(2) - wanted).abs().max())
+    print((found.sky_change() - change).square().mean().sqrt(), change.square().mean().sqrt())
+    raise AssertionError
 
 
 def test_solve_finds_gains_and_the_albedo_under_them():
-    torch.manual_seed(0)
     nodes, views = 128, 16
-    stops = 2 * torch.rand(views, 3) - 1
-    gain = 2 ** (stops - stops.mean(0))
-    photos = photographs_under(gain[:, None] * lamps(nodes), 0.29)
+    wanted = stops(views, 1.0)
+    photos = photographs_under(2 ** wanted[:, None] * lamps(nodes), 0.29)
     scene = varying(sphere_scene(nodes), views, "exposure")
     with torch.no_grad():
         scene.views.gain_steps.zero_()
-    cfg = JointConfig(points=1500, newton_points=1000, rays=1024, tracing=1, rounds=3)
+    cfg = JointConfig(points=1000, newton_points=1000, rays=1024, tracing=1, rounds=3)
     joint.solve(scene, photos, cfg, 0, Steps(300))
-    error = (scene.views.gain(torch.arange(views)).detach() / gain).log2()
-    print(error.abs().max(), error.std())
+    error = scene.views.log_gain.detach() / math.log(2) - wanted
     mesh = extract_mesh(scene)
     x = mesh.vertices[:, 0]
     ratio = torch.stack([mesh.albedo[x > 0.1].mean(0) / RED, mesh.albedo[x < -0.1].mean(0) / BLUE])
-    print(ratio, ratio / ratio.mean(), mesh.albedo[x > 0.1].std(0))
+    print(
+        error.abs().max(),
+        error.square().mean().sqrt(),
+        ratio,
+        ratio[0] / ratio[1],
+        mesh.albedo[x > 0.1].std(0),
+    )
+    assert False
+
+
+@pytest.mark.parametrize("kind", ["none", "exposure"])
+def test_training_finds_exposures(tmp_path, kind):
+    wanted = stops(12, 0.7)
+    data = write_scene(tmp_path / "data", gain=2**wanted)
+    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
+    stages = (
+        StageConfig(voxels=0.01, iterations=60, share=0.5, rays=256),
+        StageConfig(voxels=0.03, iterations=80, share=0.5, rays=256, physical_from=0.0),
+    )
+    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, light=light, varying=kind)
+    cfg = TrainConfig(data, tmp_path / "run", stages, minutes=2.0, scene=sizes)
+    scene = load_scene(train(cfg))
+    mesh = extract_mesh(scene)
+    x = mesh.vertices[:, 0]
+    print(
+        kind,
+        mesh.albedo[x > 0.1].mean(0),
+        mesh.albedo[x < -0.1].mean(0),
+        mesh.albedo[x > 0.1].std(0),
+    )
+    if scene.views:
+        error = scene.views.log_gain / math.log(2) - wanted
+        print(error.abs().max(), error.square().mean().sqrt())
     assert False

@@ -70,9 +70,18 @@ class ViewLights(nn.Module):
                 f"{self.names[-1]}, got {view!r}"
             )
 
-    def add_to_gains(self, step: Tensor) -> None:
-        """Add [V, 3] to the log gains, but for its mean."""
-        self.gain_steps.data += step / RATE
+    def add(self, to_gains: Tensor, to_weights: Tensor | None = None) -> Tensor:
+        """Add to log gains [V, 3] and weights [V, R, 3], but for what all views have of it.
+
+        Returns:
+            That, for the log map that they share to take up: [1, 3], or [D, 3] with weights.
+        """
+        self.gain_steps.data += to_gains / RATE
+        shared = to_gains.mean(0, keepdim=True)
+        if to_weights is None or self.sky_weights is None or self.sky_basis is None:
+            return shared
+        self.sky_weights.data += to_weights
+        return shared + torch.einsum("rc,rd->dc", to_weights.mean(0), self.sky_basis.detach())
 
     @property
     def log_gain(self) -> Tensor:

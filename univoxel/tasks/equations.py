@@ -8,12 +8,10 @@ import torch
 from torch import Tensor
 
 from univoxel import losses
-from univoxel.lights.views import ViewLights
 from univoxel.scene import Scene
 
 CLIPPED = 0.97  # sRGB; brighter pixels are lower bounds
 CAUCHY = 0.05  # sRGB; residuals beyond are taken for what the model cannot explain
-WEIGHTS_PRIOR = 10.0  # on the changes of a view's map, in units of the Laplacian's weight
 
 
 @dataclass(frozen=True)
@@ -60,8 +58,33 @@ class Block:
     cross: Tensor  # [3, P, D + B] light against log albedo
     own: Tensor  # [3, P] gradient of log albedo
     norm: Tensor  # [3, P] curvature of log albedo
-    weights: tuple[Tensor, Tensor] | None  # [3, B, R, R], [3, B, R] of each view's change alone
     cost: float
+
+
+def linearised(
+    rows: Rows, light: Tensor, log_albedo: Tensor, c: int, differs: Differs | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """One channel's weighted residuals [P, V], and their slopes, weighted and encoded: by the log
+    map [P, V, D], by log albedo [P, V], and by a factor on everything [P, V]."""
+    albedo = log_albedo[:, c, None].exp()
+    by_diffuse, by_shine, gain = rows.diffuse[:, None], rows.shine, 1.0
+    if differs is not None:
+        gain = differs.gain[rows.view, c]
+        if differs.change is not None:
+            change = differs.change[rows.view, :, c]
+            by_diffuse, by_shine = by_diffuse * change, by_shine * change
+    sky = rows.through * (by_diffuse @ light[:, c])
+    diffuse = gain * albedo * (sky + rows.diffuse_blocked[..., c])
+    drawn = diffuse + gain * (by_shine @ light[:, c] + rows.shine_blocked[..., c])
+    target = rows.target[..., c]
+    residual = target - losses.encode(drawn)
+    weight = 1 / (1 + (residual / CAUCHY).square())
+    weight = weight.masked_fill((target > CLIPPED) & (residual < 0), 0.0)
+    root = weight.sqrt()
+    slope = root * encoded_slope(drawn)
+    jacobian = (albedo * rows.through)[..., None] * by_diffuse + by_shine
+    jacobian = jacobian * (slope * gain)[..., None] * light[:, c]
+    return root * residual, jacobian, slope * diffuse, slope * drawn
 
 
 def normal_equations(
@@ -69,35 +92,14 @@ def normal_equations(
 ) -> Block:
     """The block of some points for map `light` [D, 3] and `log_albedo` [P, 3].
 
-    What differs from view to view stays as it is.
+    Changes of a view's map stay as they are.
     """
-    hessian, gradient, cross, own, norm, weights, cost = [], [], [], [], [], [], 0.0
+    hessian, gradient, cross, own, norm, cost = [], [], [], [], [], 0.0
     for c in range(3):
-        albedo = log_albedo[:, c, None].exp()
-        by_diffuse, by_shine, gain = rows.diffuse[:, None], rows.shine, 1.0
+        r, jacobian, self_, whole = linearised(rows, light, log_albedo, c, differs)
         if differs is not None:
-            gain = differs.gain[rows.view, c]
-            if differs.change is not None:
-                change = differs.change[rows.view, :, c]
-                by_diffuse, by_shine = by_diffuse * change, by_shine * change
-        sky = rows.through * (by_diffuse @ light[:, c])
-        diffuse = gain * albedo * (sky + rows.diffuse_blocked[..., c])
-        drawn = diffuse + gain * (by_shine @ light[:, c] + rows.shine_blocked[..., c])
-        target = rows.target[..., c]
-        residual = target - losses.encode(drawn)
-        weight = 1 / (1 + (residual / CAUCHY).square())
-        weight = weight.masked_fill((target > CLIPPED) & (residual < 0), 0.0)
-        root = weight.sqrt()
-        slope = root * encoded_slope(drawn)
-        r = root * residual
-        jacobian = (albedo * rows.through)[..., None] * by_diffuse + by_shine
-        jacobian = jacobian * (slope * gain)[..., None] * light[:, c]
-        if differs is not None:
-            if differs.basis is not None:
-                weights.append(by_view(jacobian @ differs.basis.T, r, rows.view, len(differs.gain)))
             of_view = torch.nn.functional.one_hot(rows.view, len(differs.gain))
-            jacobian = torch.cat([jacobian, (slope * drawn)[..., None] * of_view], 2)
-        self_ = slope * diffuse
+            jacobian = torch.cat([jacobian, whole[..., None] * of_view], 2)
         n = self_.square().sum(1) + 1e-6  # a point that shows no diffuse light keeps its albedo
         tie = torch.einsum("pvd,pv->pd", jacobian, self_)
         g = (self_ * r).sum(1)
@@ -114,37 +116,26 @@ def normal_equations(
         torch.stack(cross),
         torch.stack(own),
         torch.stack(norm),
-        (torch.stack([w[0] for w in weights]), torch.stack([w[1] for w in weights]))
-        if weights
-        else None,
         cost,
     )
 
 
-def by_view(jacobian: Tensor, residual: Tensor, view: Tensor, views: int) -> tuple[Tensor, Tensor]:
-    """Normal equations [B, R, R], [B, R] of each view's own R unknowns.
-
-    Args:
-        jacobian, residual, view: [P, V, R], [P, V] and [P, V] of sightings.
-    """
-    j, r, view = jacobian.flatten(0, 1), residual.flatten(), view.flatten()
-    hessian = j.new_zeros(views, j.shape[1], j.shape[1])
-    gradient = j.new_zeros(views, j.shape[1])
-    hessian.index_add_(0, view, j[:, :, None] * j[:, None])
-    return hessian, gradient.index_add_(0, view, r[:, None] * j)
-
-
-def weights_step(views: ViewLights, blocks: list[Block], sightings: int, smooth: float) -> None:
-    """A Gauss-Newton step of each view's change of the map, all else as it is."""
-    parts = [b.weights for b in blocks if b.weights is not None]
-    if not parts or views.sky_weights is None:
-        return
-    hessian, gradient = (torch.stack(p).sum(0) / sightings for p in zip(*parts, strict=True))
-    now = views.sky_weights - views.sky_weights.mean(0)  # [B, R, 3]
-    hessian.diagonal(dim1=2, dim2=3).add_(WEIGHTS_PRIOR * smooth)
-    right = gradient - WEIGHTS_PRIOR * smooth * now.permute(2, 0, 1)
-    step = torch.linalg.solve(hessian, right[..., None])[..., 0].clamp(-1, 1)
-    views.sky_weights.add_(step.permute(1, 2, 0))
+def view_equations(
+    rows: Rows, light: Tensor, log_albedo: Tensor, differs: Differs
+) -> tuple[Tensor, Tensor]:
+    """Normal equations [3, B, R + 1, R + 1], [3, B, R + 1] of what each view has of its own: R
+    weights of its map's change and its log gain. Map and albedo stay as they are."""
+    assert differs.basis is not None
+    views, count = len(differs.gain), len(differs.basis) + 1
+    hessian = light.new_zeros(3, views, count, count)
+    gradient = light.new_zeros(3, views, count)
+    of_view = rows.view.flatten()
+    for c in range(3):
+        r, jacobian, _, whole = linearised(rows, light, log_albedo, c, differs)
+        own = torch.cat([jacobian @ differs.basis.T, whole[..., None]], 2).flatten(0, 1)
+        hessian[c].index_add_(0, of_view, own[:, :, None] * own[:, None])
+        gradient[c].index_add_(0, of_view, r.flatten()[:, None] * own)
+    return hessian, gradient
 
 
 def encoded_slope(linear: Tensor) -> Tensor:

@@ -36,11 +36,12 @@ from univoxel.tasks.equations import (
     graph_laplacian,
     normal_equations,
     view_differences,
-    weights_step,
+    view_equations,
 )
 from univoxel.tasks.progress import Progress
 
 NEWTON_CHUNK = 256  # points whose equations are built at once
+WEIGHTS_PRIOR = 10.0  # on changes of a view's map, in units of the Laplacian's weight
 METAL = 0.2  # metallic from which on a point is taken for metal
 
 
@@ -209,9 +210,9 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
     its Schur complement is D x D. What then speaks for the map is only what no albedo can explain:
     how a point's brightness changes from view to view, and with it the absolute scale, from
     highlights of known reflectance. Residuals are in sRGB-encoded colour with Cauchy weights; a
-    graph Laplacian keeps the log map smooth. Where light varies, log gains of the views are solved
-    for together with the map, and the changes of each view's map beside it. Returns the mean
-    weighted squared residual before each step.
+    graph Laplacian keeps the log map smooth. Where light varies, the views' log gains are solved
+    for together with the map, and before that, with the map as it is, what each view's map has of
+    its own. Returns the mean weighted squared residual before each step.
     """
     seen, sky = problem.seen, scene.sky
     assert sky is not None
@@ -234,14 +235,20 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
     costs = []
     for _ in range(cfg.newton_steps):
         differs = view_differences(scene)
+        if differs is not None and differs.basis is not None:
+            found = [
+                view_equations(r, sky.radiance, log_albedo[k], differs)
+                for r, k in zip(rows, parts, strict=True)
+            ]
+            sums = (torch.stack(f).sum(0) / sighting.numel() for f in zip(*found, strict=True))
+            views_step(scene, *sums, cfg.newton_smooth)
+            differs = view_differences(scene)
         blocks = [
             normal_equations(r, sky.radiance, log_albedo[k], differs)
             for r, k in zip(rows, parts, strict=True)
         ]
         x = sky.log_radiance.T  # [3, D]
-        x = torch.nn.functional.pad(
-            x, (0, unknowns - x.shape[1])
-        )  # no gain is likelier than another
+        x = torch.nn.functional.pad(x, (0, unknowns - x.shape[1]))  # no gain is likelier than 1
         system = torch.stack([b.hessian for b in blocks]).sum(0) / sighting.numel() + smooth
         system.diagonal(dim1=1, dim2=2).add_(cfg.newton_smooth)
         right = torch.stack([b.gradient for b in blocks]).sum(0) / sighting.numel() - x @ smooth
@@ -250,13 +257,31 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
         to_map, to_gain = step.split([len(sky.direction), unknowns - len(sky.direction)], 1)
         sky.log_radiance.add_(to_map.T)
         if scene.views is not None:
-            scene.views.add_to_gains(to_gain.T)
-            sky.log_radiance.add_(to_gain.mean(1))  # what all gains share is light
-            weights_step(scene.views, blocks, sighting.numel(), cfg.newton_smooth)
+            sky.log_radiance.add_(scene.views.add(to_gain.T))
         change = [(b.own - torch.einsum("cpd,cd->cp", b.cross, step)) / b.norm for b in blocks]
         log_albedo = (log_albedo + torch.cat(change, 1).T.clamp(-0.5, 0.5)).clamp(-7.0, 0.0)
         costs.append(sum(b.cost for b in blocks) / sighting.numel())
     return costs
+
+
+def views_step(scene: Scene, hessian: Tensor, gradient: Tensor, smooth: float) -> None:
+    """Gauss-Newton step of each view's gain and change of the map.
+
+    Args:
+        hessian, gradient: [3, B, R + 1, R + 1] and [3, B, R + 1] from `view_equations`, over the
+            number of sightings.
+    """
+    views, sky = scene.views, scene.sky
+    assert views is not None
+    assert sky is not None
+    assert views.sky_weights is not None
+    now = views.sky_weights - views.sky_weights.mean(0)  # [B, R, 3]
+    now = torch.nn.functional.pad(now.permute(2, 0, 1), (0, 1))
+    prior = WEIGHTS_PRIOR * smooth
+    hessian.diagonal(dim1=2, dim2=3).add_(prior)
+    step = torch.linalg.solve(hessian, (gradient - prior * now)[..., None])[..., 0].clamp(-1, 1)
+    step = step.permute(1, 2, 0)
+    sky.log_radiance.add_(views.add(step[:, -1], step[:, :-1]))
 
 
 def light_rows(problem: Problem, point: Tensor, sighting: Tensor, roughness: Tensor) -> Rows:
