@@ -19,12 +19,15 @@ from sightings import (
 )
 
 from univoxel import losses
+from univoxel.cli import main
 from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.data import load_photos
+from univoxel.data.images import read_image
 from univoxel.lights import SGConfig
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import Scene, SceneConfig, load_scene
+from univoxel.scene import Scene, SceneConfig, load_checkpoint, load_scene, save_scene
 from univoxel.tasks import equations, joint
-from univoxel.tasks.train import train
+from univoxel.tasks.train import held_out_psnr, train
 
 NODES = 12
 
@@ -131,10 +134,12 @@ def test_newton_finds_gains_and_what_each_map_has_of_its_own():
     cfg = JointConfig(newton_points=400, newton_views=12, newton_steps=8)
     costs = joint.newton_round(scene, problem, cfg)
     costs += joint.newton_round(scene, problem, cfg)
-    found = scene.views
-    print(costs, (found.log_gain / math.log(2) - wanted).abs().max())
-    print((found.sky_change() - change).square().mean().sqrt(), change.square().mean().sqrt())
-    raise AssertionError
+    assert costs[-1] < 0.03 * costs[0]
+    # A view sees half a sphere of normals, on which a change of degree 2 or 3 is nearly a gain and
+    # one of degree 1: between them part stays open, though what they draw together does not
+    off = scene.views.sky_change() - change
+    assert off.square().mean().sqrt() < 0.4 * change.square().mean().sqrt()
+    assert (scene.views.log_gain / math.log(2) - wanted).abs().max() < 0.5
 
 
 def test_solve_finds_gains_and_the_albedo_under_them():
@@ -150,37 +155,65 @@ def test_solve_finds_gains_and_the_albedo_under_them():
     mesh = extract_mesh(scene)
     x = mesh.vertices[:, 0]
     ratio = torch.stack([mesh.albedo[x > 0.1].mean(0) / RED, mesh.albedo[x < -0.1].mean(0) / BLUE])
-    print(
-        error.abs().max(),
-        error.square().mean().sqrt(),
-        ratio,
-        ratio[0] / ratio[1],
-        mesh.albedo[x > 0.1].std(0),
-    )
-    assert False
+    print("SOLVE", error.abs().max(), error.square().mean().sqrt(), (ratio[0] / ratio[1]).tolist())
+    assert error.square().mean().sqrt() < 0.1  # of gains that differ by 0.6
+    assert error.abs().max() < 0.3
+    # A factor per channel is the light's too; between the sides it is none
+    assert (ratio[0] / ratio[1] - 1).abs().max() < 0.15
 
 
-@pytest.mark.parametrize("kind", ["none", "exposure"])
-def test_training_finds_exposures(tmp_path, kind):
-    wanted = stops(12, 0.7)
-    data = write_scene(tmp_path / "data", gain=2**wanted)
+def test_training_explains_exposures(tmp_path):
+    data = write_scene(tmp_path / "data", gain=2 ** stops(12, 0.7))
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
         StageConfig(voxels=0.01, iterations=60, share=0.5, rays=256),
         StageConfig(voxels=0.03, iterations=80, share=0.5, rays=256, physical_from=0.0),
     )
-    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, light=light, varying=kind)
-    cfg = TrainConfig(data, tmp_path / "run", stages, minutes=2.0, scene=sizes)
-    scene = load_scene(train(cfg))
-    mesh = extract_mesh(scene)
-    x = mesh.vertices[:, 0]
-    print(
-        kind,
-        mesh.albedo[x > 0.1].mean(0),
-        mesh.albedo[x < -0.1].mean(0),
-        mesh.albedo[x > 0.1].std(0),
-    )
-    if scene.views:
-        error = scene.views.log_gain / math.log(2) - wanted
-        print(error.abs().max(), error.square().mean().sqrt())
-    assert False
+    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
+    photos = load_photos(data, "train")
+    pixels = torch.cartesian_prod(torch.arange(12), torch.arange(32), torch.arange(32))
+    found = {}
+    for varying in ("none", "exposure", "light"):
+        scene = replace(sizes, varying=varying)
+        cfg = TrainConfig(data, tmp_path / varying, stages, minutes=2.0, scene=scene)
+        learned = load_scene(train(cfg))
+        assert learned.cfg.views == (() if varying == "none" else tuple(photos.names))
+        found[varying] = held_out_psnr(learned, photos, pixels, physical=True)
+    print("TRAIN", found)
+    assert min(found["exposure"], found["light"]) > found["none"] + 2
+
+
+def test_the_light_of_a_view_from_the_command_line(tmp_path, capsys):
+    data = write_scene(tmp_path / "data", views=6, size=16)
+    small = [
+        *(f"--set=stages.{i}.{name}" for i in (0, 1, 3) for name in ("voxels=0.004", "rays=64")),
+        *(f"--set=stages.{i}.iterations=2" for i in (0, 2, 3)),
+        *("--set=stages.1.iterations=20", "--set=stages.1.physical_from=0.0"),
+        *("--set=stages.2.rays=64", "--set=stages.2.points=64", "--set=stages.2.newton_points=8"),
+        *("--set=scene.sky_nodes=32", "--set=scene.light.directions=8"),
+    ]
+    run = tmp_path / "run"
+    assert main(["train", str(data), "--out", str(run), "--varying", "light", *small]) == 0
+    with torch.no_grad():  # 20 steps make no difference to see
+        scene, state = load_checkpoint(run)
+        scene.views.sky_weights.normal_()
+        scene.views.gain_steps.normal_(0, 0.1)
+        save_scene(scene, run, state)
+    maps = {}
+    for view in (None, "r_2", "2", "3"):
+        out = tmp_path / f"{view}.exr"
+        options = [] if view is None else ["--light-of", view]
+        assert main(["envmap", str(run), "--out", str(out), "--height", "8", *options]) == 0
+        maps[view] = read_image(out)
+    assert torch.equal(maps["r_2"], maps["2"])
+    assert not torch.allclose(maps["2"], maps["3"], rtol=0.1)
+    assert not torch.allclose(maps["2"], maps[None], rtol=0.1)
+    place = ["--view", "0", "--pixel", "8,8"]
+    for command in (["eval"], ["inspect", *place]):
+        assert main([command[0], str(run), *command[1:], "--light-of", "r_2"]) == 0
+    for command in (["eval"], ["inspect", *place], ["envmap", "--out", str(tmp_path / "a.exr")]):
+        capsys.readouterr()
+        assert main([command[0], str(run), *command[1:], "--light-of", "r_9"]) == 2
+        assert "--light-of: expected a number below 6 or one of r_0 to r_5, got 'r_9'" in (
+            capsys.readouterr().err
+        )
