@@ -240,8 +240,9 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
                 view_equations(r, sky.radiance, log_albedo[k], differs)
                 for r, k in zip(rows, parts, strict=True)
             ]
-            sums = (torch.stack(f).sum(0) / sighting.numel() for f in zip(*found, strict=True))
-            views_step(scene, *sums, cfg.newton_smooth)
+            hessian = torch.stack([h for h, _ in found]).sum(0) / sighting.numel()
+            slope = torch.stack([g for _, g in found]).sum(0) / sighting.numel()
+            views_step(scene, hessian, slope, cfg.newton_smooth)
             differs = view_differences(scene)
         blocks = [
             normal_equations(r, sky.radiance, log_albedo[k], differs)
