@@ -29,6 +29,7 @@ class Config:
     out: Path
     preset: str
     light: str
+    varying: str
     minutes: float = 4.0
     seed: int = 0
     loss: LossConfig = LossConfig()
@@ -60,8 +61,8 @@ def calls(monkeypatch):
     def replace(name, result, **others):
         stand_in(f"univoxel.tasks.{name}", **{name: task(name, result)}, **others)
 
-    def chosen(preset, minutes, data, out, light):
-        return Config(data, out, preset, light, minutes or 4.0)
+    def chosen(preset, minutes, data, out, light, varying):
+        return Config(data, out, preset, light, varying, minutes or 4.0)
 
     stand_in("univoxel.config", chosen=chosen)
     replace("train", Path("run"))
@@ -81,13 +82,17 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
         "draft",
         "--light",
         "sg",
+        "--varying",
+        "exposure",
         "--minutes",
         "2",
         *(f"--set={change}" for change in changes),
     ]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
     stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0)
-    expected = Config(Path("photos"), out, "draft", "sg", 2.0, 7, LossConfig(2.0), stages)
+    expected = Config(
+        Path("photos"), out, "draft", "sg", "exposure", 2.0, 7, LossConfig(2.0), stages
+    )
     assert capsys.readouterr().out == "run\n"
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
 
@@ -109,14 +114,15 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
 
 
 def test_eval(calls):
-    options = ["--samples", "8", "--bounces", "0"]
+    options = ["--samples", "8", "--bounces", "0", "--light-of", "r_7"]
     paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
     named = [str(part) for name, path in paths.items() for part in (f"--{name}", path)]
     assert main(["eval", "run", *named, *options]) == 0
     assert main(["eval", "run"]) == 0
     default = {"data": None, "save": None, "json": None, "samples": 64, "bounces": 2}
+    default["light_of"] = None
     assert calls.noted == [
-        ("evaluate", (Path("run"),), {**paths, "samples": 8, "bounces": 0}),
+        ("evaluate", (Path("run"),), {**paths, "samples": 8, "bounces": 0, "light_of": "r_7"}),
         ("evaluate", (Path("run"),), default),
     ]
 
@@ -139,12 +145,14 @@ def test_relight_export_and_demo(calls, capsys):
 
 def test_envmap(calls, capsys):
     assert main(["envmap", "run", "--out", "map.exr"]) == 0
-    assert calls.noted == [("envmap", (Path("run"), Path("map.exr")), {"height": 128})]
+    assert calls.noted == [
+        ("envmap", (Path("run"), Path("map.exr")), {"height": 128, "light_of": None})
+    ]
     assert capsys.readouterr().out == "map.exr\n"
     found = types.SimpleNamespace(ball_psnr=31.24, brightest_degrees=4.0)
     calls.replace("envmap", found)
-    assert main(["envmap", "run", "--out", "map.exr", "--height", "32"]) == 0
-    assert calls.noted[-1][2] == {"height": 32}
+    assert main(["envmap", "run", "--out", "map.exr", "--height", "32", "--light-of", "2"]) == 0
+    assert calls.noted[-1][2] == {"height": 32, "light_of": "2"}
     _, ball, brightest = capsys.readouterr().out.splitlines()
     assert "31.2 dB" in ball
     assert "4.0 degrees" in brightest
@@ -154,7 +162,7 @@ def test_inspect(calls, tmp_path, capsys):
     out = tmp_path / "light.png"
     calls.replace("inspect", out, parse_pixel=lambda text: text.split(","))
     assert main(["inspect", "run", "--view", "r_1", "--pixel", "3,4", "--out", str(out)]) == 0
-    assert calls.noted == [("inspect", (Path("run"), "r_1", ["3", "4"], out), {})]
+    assert calls.noted == [("inspect", (Path("run"), "r_1", ["3", "4"], out), {"light_of": None})]
     assert capsys.readouterr().out == f"{out}\n"
 
 

@@ -24,6 +24,9 @@ Changes: TypeAlias = Annotated[
     UseAppendAction[tuple[str, ...]],
     arg(metavar="FIELD=VALUE", help_behavior_hint="(repeatable)"),
 ]
+LightOf: TypeAlias = Annotated[
+    str | None, arg(metavar="VIEW", help_behavior_hint="(default: the mean of all)")
+]
 
 
 def train(
@@ -32,6 +35,7 @@ def train(
     out: Annotated[Path, arg(metavar="RUN")],
     preset: Literal["auto", "draft", "fast", "full"] = "auto",
     light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
+    varying: Literal["none", "exposure", "light"] = "none",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
@@ -51,6 +55,8 @@ def train(
         light: sg, local lobes as published; hybrid, then one environment map with traced
             visibility, which cleans shadows from the albedo; others to compare with: sh and mlp,
             local too, envmap-sg and envmap, one map from the beginning
+        varying: what differs from photograph to photograph: exposure, with the colour balance, or
+            the light itself too
         minutes: wall-clock limit, above 0; training ends in time with what it has
         resume: go on with the run in --out
         timelapse: picture of a test view over training time, or a folder of its frames; making
@@ -65,7 +71,7 @@ def train(
     _check_minutes(minutes)
     if not resume and (out / "scene.safetensors").exists():
         raise FileExistsError(f"{out} holds a run already: add --resume, or choose another --out")
-    config = chosen(preset, minutes, data=data, out=out, light=light)
+    config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
     print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
 
 
@@ -83,6 +89,7 @@ def evaluate(
     ] = None,
     samples: int = 64,
     bounces: int = 2,
+    light_of: LightOf = None,
 ) -> None:
     """Measure a run on the test views and print the table.
 
@@ -93,10 +100,13 @@ def evaluate(
         json: file for the measures
         samples: of the light, per pixel of relit pictures
         bounces: reflections between parts of the object in relit pictures, 0 for none
+        light_of: training view, by name or number, in whose light novel views are rendered, where
+            the run was trained with --varying
     """
     from univoxel.tasks import evaluate as task
 
-    task.evaluate(run, data=data, save=save, json=json, samples=samples, bounces=bounces)
+    options = {"samples": samples, "bounces": bounces, "light_of": light_of}
+    task.evaluate(run, data=data, save=save, json=json, **options)
 
 
 def relight(
@@ -218,6 +228,7 @@ def envmap(
     /,
     out: Annotated[Path, arg(metavar="FILE.exr")],
     height: Annotated[int, arg(metavar="ROWS")] = 128,
+    light_of: LightOf = None,
 ) -> None:
     """Write the light that the photographs were taken in, as an environment map.
 
@@ -226,10 +237,12 @@ def envmap(
         out: the map, linear radiance; a picture of it goes beside, with the true map if the data
             set has it
         height: rows of the map; it is twice as wide
+        light_of: training view, by name or number, whose map it is, where the run was trained with
+            --varying
     """
     from univoxel.tasks import envmap as task
 
-    found = task.envmap(run, out, height=height)
+    found = task.envmap(run, out, height=height, light_of=light_of)
     print(out)
     if found:
         print(f"grey ball under it: PSNR {found.ball_psnr:.1f} dB, a scale per channel")
@@ -245,6 +258,7 @@ def inspect(
         Path | None,
         arg(metavar="FILE.png", help_behavior_hint="(default: in RUN/inspect)"),
     ] = None,
+    light_of: LightOf = None,
 ) -> None:
     """Draw the light that falls on one point of the surface, beside the truth where it is known.
 
@@ -253,10 +267,12 @@ def inspect(
         view: name or number of a test view
         pixel: whose surface point; 0,0 is the top left
         out: the picture; an .exr file with the layers goes beside
+        light_of: training view, by name or number, whose light it is, where the run was trained
+            with --varying
     """
     from univoxel.tasks import inspect as task
 
-    print(task.inspect(run, view, task.parse_pixel(pixel), out))
+    print(task.inspect(run, view, task.parse_pixel(pixel), out, light_of=light_of))
 
 
 def compare(

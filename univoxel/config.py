@@ -19,7 +19,7 @@ from univoxel.lights import (
     SGConfig,
     SHConfig,
 )
-from univoxel.scene import SceneConfig
+from univoxel.scene import SceneConfig, Varying
 
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
@@ -198,21 +198,25 @@ PRESETS = {
 }
 
 
-def preset(name: str, data: Path, out: Path, light: LightName = "hybrid") -> TrainConfig:
+def preset(
+    name: str, data: Path, out: Path, light: LightName = "hybrid", varying: Varying = "none"
+) -> TrainConfig:
     """The configuration of a preset: draft (1 minute), fast (4) or full (12) on two cores.
 
     Args:
-        light: see `budget`.
+        light, varying: see `budget`.
 
     Raises:
-        ValueError: an unknown name.
+        ValueError: an unknown name, or varying light with a map from the beginning.
     """
     if name not in PRESETS:
         raise ValueError(f"preset must be draft, fast or full, got {name!r}")
-    return _configuration(PRESETS[name], data, out, light)
+    return _configuration(PRESETS[name], data, out, light, varying)
 
 
-def budget(minutes: float, data: Path, out: Path, light: LightName = "hybrid") -> TrainConfig:
+def budget(
+    minutes: float, data: Path, out: Path, light: LightName = "hybrid", varying: Varying = "none"
+) -> TrainConfig:
     """The configuration for any time, in minutes on two cores: the presets and what lies between.
 
     Args:
@@ -221,25 +225,33 @@ def budget(minutes: float, data: Path, out: Path, light: LightName = "hybrid") -
             environment map with traced visibility for the materials, then lobes that follow them;
             "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
             traced visibility from the beginning. docs/lights.md tells them apart.
+        varying: what differs from photograph to photograph: "none"; "exposure", a gain per channel;
+            "light", the light itself too.
 
     Raises:
-        ValueError: minutes out of range, or no such light.
+        ValueError: minutes out of range, no such light, or varying light with a map from the
+            beginning.
     """
     if not 0 < minutes < math.inf:
         raise ValueError(f"minutes must be above 0, got {minutes:g}")
-    return _configuration(work_in(minutes), data, out, light)
+    return _configuration(work_in(minutes), data, out, light, varying)
 
 
 def chosen(
-    name: str, minutes: float | None, data: Path, out: Path, light: LightName = "hybrid"
+    name: str,
+    minutes: float | None,
+    data: Path,
+    out: Path,
+    light: LightName = "hybrid",
+    varying: Varying = "none",
 ) -> TrainConfig:
     """A preset within a limit of minutes; or for the name auto, the work that fits into them.
 
     Without minutes: the preset as it is, fast for auto.
     """
     if name == "auto" and minutes is not None:
-        return budget(minutes, data, out, light)
-    config = preset("fast" if name == "auto" else name, data, out, light)
+        return budget(minutes, data, out, light, varying)
+    config = preset("fast" if name == "auto" else name, data, out, light, varying)
     return config if minutes is None else replace(config, minutes=minutes)
 
 
@@ -260,7 +272,9 @@ def work_in(minutes: float) -> Work:
     return Work(minutes, min(voxels, known[-1].voxels), steps, min(rays, known[-1].rays))
 
 
-def _configuration(work: Work, data: Path, out: Path, light: LightName) -> TrainConfig:
+def _configuration(
+    work: Work, data: Path, out: Path, light: LightName, varying: Varying
+) -> TrainConfig:
     minutes, voxels = work.minutes, round(work.voxels, 3)
     steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
     coarse = StageConfig(0.9, steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35))
@@ -293,9 +307,10 @@ def _configuration(work: Work, data: Path, out: Path, light: LightName) -> Train
                 physical_from=0.0,
                 refit=True,
             )
-            return TrainConfig(data, out, (coarse, fine, joint, refit), minutes)
+            scene = SceneConfig(varying=varying)
+            return TrainConfig(data, out, (coarse, fine, joint, refit), minutes, scene=scene)
         case _ if light in alone:
-            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light])
+            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=varying)
             return TrainConfig(data, out, (coarse, fine), minutes, scene=scene)
         case _:
             names = ", ".join(("hybrid", *alone))
