@@ -1,8 +1,8 @@
 """What the priors on light do to albedo and relit pictures, charted.
 
-    python benchmarks/priors.py SCENE [SCENE ...] [--hybrid]
+    python benchmarks/priors.py SCENE [SCENE ...] [--lights sg hybrid]
 
-smooth: the weight of the smoothness of the local lobes, --light sg, on every scene. white: the
+smooth: the weight of the smoothness of the local lobes, on every scene. white: the
 weight of the prior for white light, on the first scene as it is and under light of another colour
 (its photographs times COLOR; the true albedo stays). Scenes are brought to about --pixels wide.
 What differs in a weight alone shares the first stage, which no light takes part in. What is done
@@ -109,8 +109,7 @@ def trained(cfg: TrainConfig, start: Path) -> None:
     """Train from the first stage that is kept in `start`, and made there if it is not."""
     if (cfg.out / FILE).is_file():
         return
-    if not (start / FILE).is_file():
-        train(replace(cfg, out=start, stages=cfg.stages[:1]))
+    train(replace(cfg, out=start, stages=cfg.stages[:1]), resume=(start / FILE).is_file())
     partial = cfg.out.with_suffix(".partial")
     shutil.rmtree(partial, ignore_errors=True)
     shutil.copytree(start, partial)
@@ -156,7 +155,9 @@ def main() -> None:
     parser.add_argument("scenes", type=Path, nargs="*")
     parser.add_argument("--preset", default="draft")
     parser.add_argument("--priors", nargs="+", default=["smooth", "white"])
-    parser.add_argument("--hybrid", action="store_true", help="the white prior with hybrid too")
+    parser.add_argument("--lights", nargs="+", default=["sg"], help="which, such as sg hybrid")
+    parser.add_argument("--smooth", nargs="+", type=float, default=SMOOTH)
+    parser.add_argument("--white", nargs="+", type=float, default=WHITE)
     parser.add_argument("--pixels", type=int, default=100)
     parser.add_argument("--minutes", type=float, default=60.0, help="so many that steps decide")
     parser.add_argument("--work", type=Path, default=Path("build/priors"))
@@ -171,12 +172,14 @@ def main() -> None:
         wide = load_photos(scene, "test").cameras.width
         small = shrunk(scene, max(1, wide // arguments.pixels), arguments.work / scene.name)
         if "smooth" in arguments.priors:
-            losses = [replace(default, light_smoothness=weight) for weight in SMOOTH]
-            jobs += [(scene.name, small, "sg", loss) for loss in losses]
+            losses = [replace(default, light_smoothness=weight) for weight in arguments.smooth]
+            jobs += [
+                (scene.name, small, light, loss) for light in arguments.lights for loss in losses
+            ]
         if "white" in arguments.priors and scene == arguments.scenes[0]:
             other = tinted(small, arguments.work / f"{scene.name}_tinted")
-            losses = [replace(default, white_light=weight) for weight in WHITE]
-            for light in ["sg", "hybrid"] if arguments.hybrid else ["sg"]:
+            losses = [replace(default, white_light=weight) for weight in arguments.white]
+            for light in arguments.lights:
                 for name, folder in ((scene.name, small), (f"{scene.name} tinted", other)):
                     jobs += [(name, folder, light, loss) for loss in losses]
     for scene, folder, light, loss in jobs:
