@@ -120,29 +120,28 @@ def trained(cfg: TrainConfig, start: Path) -> None:
 
 def chart(result: dict, path: Path) -> None:
     """A column for each prior, a row for each measure; a line for each scene and light."""
-    weights = {"smooth": "light_smoothness", "white": "white_light"}
     default = asdict(LossConfig())
-    figure, axes = plt.subplots(len(MEASURES), 2, figsize=(10, 8), sharex="col")
-    for (measure, title), pair in zip(MEASURES.items(), axes, strict=True):
-        for axis, prior in zip(pair, ("smooth", "white"), strict=True):
-            lines: dict[str, list[tuple[float, float]]] = {}
-            (other,) = {*weights.values()} - {weights[prior]}
-            for row in result["runs"].values():
-                if row["loss"][other] == default[other]:
-                    name = f"{row['scene']}, {row['light']}"
-                    point = row["loss"][weights[prior]], row[measure]
-                    lines.setdefault(name, []).append(point)
-            lines = {name: points for name, points in lines.items() if len(points) > 1}
-            for name, points in sorted(lines.items()):
-                weight, value = zip(*sorted(points), strict=True)
-                axis.plot(weight, value, marker="o", label=name)
-            axis.set_xscale("symlog", linthresh=0.01 if prior == "smooth" else 0.003)
+    columns: dict[str, dict[str, list[dict]]] = {}  # rows by weight and line
+    for name, other in (("light_smoothness", "white_light"), ("white_light", "light_smoothness")):
+        lines: dict[str, list[dict]] = {}
+        for row in result["runs"].values():
+            if row["loss"][other] == default[other]:
+                lines.setdefault(f"{row['scene']}, {row['light']}", []).append(row)
+        if lines := {line: rows for line, rows in lines.items() if len(rows) > 1}:
+            columns[name] = lines
+    size = {"figsize": (5 * len(columns), 8), "sharex": "col", "squeeze": False}
+    figure, axes = plt.subplots(len(MEASURES), len(columns), **size)
+    for axis_row, (measure, title) in zip(axes, MEASURES.items(), strict=True):
+        for axis, (name, lines) in zip(axis_row, columns.items(), strict=True):
+            for line, rows in sorted(lines.items()):
+                points = sorted((row["loss"][name], row[measure]) for row in rows)
+                axis.plot(*zip(*points, strict=True), marker="o", label=line)
+            axis.set_xscale("symlog", linthresh=0.01)
+            axis.axvline(default[name], color="#808080", linestyle=":")
+            axis.set_xlabel(f"loss.{name}; dotted: the default")
             axis.set_ylabel(f"{title}, dB")
             axis.spines[["top", "right"]].set_visible(False)
-            if lines and measure == "albedo_psnr_3ch":
-                axis.legend(fontsize=7)
-    for axis, name in zip(axes[-1], weights.values(), strict=True):
-        axis.set_xlabel(f"loss.{name} (default {default[name]:g})")
+            axis.legend(fontsize=7)
     figure.suptitle(result["command"], size=7)
     figure.tight_layout()
     for suffix in (".png", ".svg"):
