@@ -1,8 +1,8 @@
 """What the priors on light do to albedo and relit pictures, charted.
 
-    python benchmarks/priors.py SCENE [SCENE ...] [--hybrid]
+    python benchmarks/priors.py SCENE [SCENE ...] [--lights sg hybrid]
 
-smooth: the weight of the smoothness of the local lobes, --light sg, on every scene. white: the
+smooth: the weight of the smoothness of the local lobes, on every scene. white: the
 weight of the prior for white light, on the first scene as it is and under light of another colour
 (its photographs times COLOR; the true albedo stays). Scenes are brought to about --pixels wide.
 What differs in a weight alone shares the first stage, which no light takes part in. What is done
@@ -109,8 +109,7 @@ def trained(cfg: TrainConfig, start: Path) -> None:
     """Train from the first stage that is kept in `start`, and made there if it is not."""
     if (cfg.out / FILE).is_file():
         return
-    if not (start / FILE).is_file():
-        train(replace(cfg, out=start, stages=cfg.stages[:1]))
+    train(replace(cfg, out=start, stages=cfg.stages[:1]), resume=(start / FILE).is_file())
     partial = cfg.out.with_suffix(".partial")
     shutil.rmtree(partial, ignore_errors=True)
     shutil.copytree(start, partial)
@@ -121,29 +120,28 @@ def trained(cfg: TrainConfig, start: Path) -> None:
 
 def chart(result: dict, path: Path) -> None:
     """A column for each prior, a row for each measure; a line for each scene and light."""
-    weights = {"smooth": "light_smoothness", "white": "white_light"}
     default = asdict(LossConfig())
-    figure, axes = plt.subplots(len(MEASURES), 2, figsize=(10, 8), sharex="col")
-    for (measure, title), pair in zip(MEASURES.items(), axes, strict=True):
-        for axis, prior in zip(pair, ("smooth", "white"), strict=True):
-            lines: dict[str, list[tuple[float, float]]] = {}
-            (other,) = {*weights.values()} - {weights[prior]}
-            for row in result["runs"].values():
-                if row["loss"][other] == default[other]:
-                    name = f"{row['scene']}, {row['light']}"
-                    point = row["loss"][weights[prior]], row[measure]
-                    lines.setdefault(name, []).append(point)
-            lines = {name: points for name, points in lines.items() if len(points) > 1}
-            for name, points in sorted(lines.items()):
-                weight, value = zip(*sorted(points), strict=True)
-                axis.plot(weight, value, marker="o", label=name)
-            axis.set_xscale("symlog", linthresh=0.01 if prior == "smooth" else 0.003)
+    columns: dict[str, dict[str, list[dict]]] = {}  # rows by weight and line
+    for name, other in (("light_smoothness", "white_light"), ("white_light", "light_smoothness")):
+        lines: dict[str, list[dict]] = {}
+        for row in result["runs"].values():
+            if row["loss"][other] == default[other]:
+                lines.setdefault(f"{row['scene']}, {row['light']}", []).append(row)
+        if lines := {line: rows for line, rows in lines.items() if len(rows) > 1}:
+            columns[name] = lines
+    size = {"figsize": (5 * len(columns), 8), "sharex": "col", "squeeze": False}
+    figure, axes = plt.subplots(len(MEASURES), len(columns), **size)
+    for axis_row, (measure, title) in zip(axes, MEASURES.items(), strict=True):
+        for axis, (name, lines) in zip(axis_row, columns.items(), strict=True):
+            for line, rows in sorted(lines.items()):
+                points = sorted((row["loss"][name], row[measure]) for row in rows)
+                axis.plot(*zip(*points, strict=True), marker="o", label=line)
+            axis.set_xscale("symlog", linthresh=0.01)
+            axis.axvline(default[name], color="#808080", linestyle=":")
+            axis.set_xlabel(f"loss.{name}; dotted: the default")
             axis.set_ylabel(f"{title}, dB")
             axis.spines[["top", "right"]].set_visible(False)
-            if lines and measure == "albedo_psnr_3ch":
-                axis.legend(fontsize=7)
-    for axis, name in zip(axes[-1], weights.values(), strict=True):
-        axis.set_xlabel(f"loss.{name} (default {default[name]:g})")
+            axis.legend(fontsize=7)
     figure.suptitle(result["command"], size=7)
     figure.tight_layout()
     for suffix in (".png", ".svg"):
@@ -156,7 +154,9 @@ def main() -> None:
     parser.add_argument("scenes", type=Path, nargs="*")
     parser.add_argument("--preset", default="draft")
     parser.add_argument("--priors", nargs="+", default=["smooth", "white"])
-    parser.add_argument("--hybrid", action="store_true", help="the white prior with hybrid too")
+    parser.add_argument("--lights", nargs="+", default=["sg"], help="which, such as sg hybrid")
+    parser.add_argument("--smooth", nargs="+", type=float, default=SMOOTH)
+    parser.add_argument("--white", nargs="+", type=float, default=WHITE)
     parser.add_argument("--pixels", type=int, default=100)
     parser.add_argument("--minutes", type=float, default=60.0, help="so many that steps decide")
     parser.add_argument("--work", type=Path, default=Path("build/priors"))
@@ -171,12 +171,14 @@ def main() -> None:
         wide = load_photos(scene, "test").cameras.width
         small = shrunk(scene, max(1, wide // arguments.pixels), arguments.work / scene.name)
         if "smooth" in arguments.priors:
-            losses = [replace(default, light_smoothness=weight) for weight in SMOOTH]
-            jobs += [(scene.name, small, "sg", loss) for loss in losses]
+            losses = [replace(default, light_smoothness=weight) for weight in arguments.smooth]
+            jobs += [
+                (scene.name, small, light, loss) for light in arguments.lights for loss in losses
+            ]
         if "white" in arguments.priors and scene == arguments.scenes[0]:
             other = tinted(small, arguments.work / f"{scene.name}_tinted")
-            losses = [replace(default, white_light=weight) for weight in WHITE]
-            for light in ["sg", "hybrid"] if arguments.hybrid else ["sg"]:
+            losses = [replace(default, white_light=weight) for weight in arguments.white]
+            for light in arguments.lights:
                 for name, folder in ((scene.name, small), (f"{scene.name} tinted", other)):
                     jobs += [(name, folder, light, loss) for loss in losses]
     for scene, folder, light, loss in jobs:

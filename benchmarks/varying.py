@@ -212,8 +212,7 @@ def main() -> None:
                     continue
                 run = arguments.work / name.replace(" ", "_")
                 cfg = preset(arguments.preset, data, run, light, varying)
-                if not (run / FILE).is_file():
-                    train(replace(cfg, minutes=arguments.minutes))
+                train(replace(cfg, minutes=arguments.minutes), resume=(run / FILE).is_file())
                 own = evaluate(run, samples=32) | {
                     "gain_stops": gain_error(run, arguments.data, kind)
                 }
