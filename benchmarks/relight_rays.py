@@ -8,6 +8,8 @@ Bare Embree traces the very same rays in the same order, from an array, and does
 after the other by rtcOccluded1, and by packets of 8, the fastest of its calls on such rays. That
 they are the same is checked: shaded here, with the answers of bare Embree, they give the
 integrator's picture.
+
+All on one thread, by its processor time: other programs then slow what is compared alike.
 """
 
 from __future__ import annotations
@@ -27,8 +29,10 @@ from univoxel.ops import relight
 OFFSET = 1e-3
 
 
-def ray_rates(scene: Scene, samples: int = 32, repeat: int = 7) -> dict:
-    """Rays a second, in all and as a share of what bare Embree does."""
+def ray_rates(scene: Scene, samples: int = 64, repeat: int = 9) -> dict:
+    """Rays a second of one thread, in all and as a share of what bare Embree does."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     visibility, _, light, position, normal, wo, albedo, roughness = scene.ours
     direction = env.sample(light, _sobol(len(position), samples))[0].view(-1, samples, 3)
     radiance = env.background(light, direction.reshape(-1, 3)).view_as(direction)
@@ -65,9 +69,10 @@ def ray_rates(scene: Scene, samples: int = 32, repeat: int = 7) -> dict:
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeat):  # in turns: the machine's speed drifts
         for name, work in works.items():
-            begin = time.perf_counter()
+            begin = time.process_time()
             work()
-            times[name].append(time.perf_counter() - begin)
+            times[name].append(time.process_time() - begin)
+    torch.set_num_threads(threads)
     rates = {name: len(rays[0]) / sorted(t)[repeat // 2] for name, t in times.items()}
     return {
         "rays": len(rays[0]),
