@@ -311,7 +311,9 @@ def _configuration(
             return TrainConfig(data, out, (coarse, fine, joint, refit), minutes, scene=scene)
         case _ if light in alone:
             scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=varying)
-            return TrainConfig(data, out, (coarse, fine), minutes, scene=scene)
+            # Lobes that light the materials to the end: what leaves least shading in the albedo
+            loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
+            return TrainConfig(data, out, (coarse, fine), minutes, scene=scene, loss=loss)
         case _:
             names = ", ".join(("hybrid", *alone))
             raise ValueError(f"light must be one of {names}, got {light!r}")
