@@ -1,4 +1,6 @@
-// What Embree does at best: shadow rays in a bare loop, for benchmarks/peers.py (C ABI, ctypes).
+// What Embree does at best: shadow rays in a bare loop, for benchmarks/peers.py and relight_rays.py
+// (C ABI, ctypes).
+#include <algorithm>
 #include <cstdint>
 #include <limits>
 #if UNIVOXEL_EMBREE >= 4
@@ -50,6 +52,36 @@ __attribute__((visibility("default"))) void bare_occluded(void* scene, const flo
         rtcOccluded1(static_cast<RTCScene>(scene), &context, &ray);
 #endif
         out[i] = ray.tfar < 0;
+    }
+}
+
+/// The same by packets of 8 neighbours.
+__attribute__((visibility("default"))) void bare_occluded_8(void* scene, const float* origin,
+                                                            const float* direction, int64_t n,
+                                                            bool* out, int threads) {
+#pragma omp parallel for schedule(dynamic, 128) num_threads(threads)
+    for (int64_t first = 0; first < n; first += 8) {
+        alignas(32) int valid[8];
+        RTCRay8 ray;
+        for (int64_t k = 0; k < 8; ++k) {
+            const int64_t i = std::min(first + k, n - 1);
+            valid[k] = first + k < n ? -1 : 0;
+            ray.org_x[k] = origin[3 * i], ray.org_y[k] = origin[3 * i + 1];
+            ray.org_z[k] = origin[3 * i + 2];
+            ray.dir_x[k] = direction[3 * i], ray.dir_y[k] = direction[3 * i + 1];
+            ray.dir_z[k] = direction[3 * i + 2];
+            ray.tnear[k] = 0, ray.tfar[k] = std::numeric_limits<float>::infinity();
+            ray.time[k] = 0, ray.mask[k] = ~0u, ray.id[k] = 0, ray.flags[k] = 0;
+        }
+#if UNIVOXEL_EMBREE >= 4
+        rtcOccluded8(valid, static_cast<RTCScene>(scene), &ray);
+#else
+        RTCIntersectContext context;
+        rtcInitIntersectContext(&context);
+        rtcOccluded8(valid, static_cast<RTCScene>(scene), &context, &ray);
+#endif
+        for (int64_t k = 0; k < std::min<int64_t>(8, n - first); ++k)
+            out[first + k] = ray.tfar[k] < 0;
     }
 }
 }

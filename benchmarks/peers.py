@@ -37,12 +37,20 @@ def occluded(vertices: Tensor, faces: Tensor, origin: Tensor, direction: Tensor)
         return {}
     rays = (vertices, faces, origin, direction)
     return {
-        "bare rtcOccluded1": lambda: _bare_embree(*rays, robust=True),
-        "bare rtcOccluded1, not robust": lambda: _bare_embree(*rays, robust=False),
+        "bare rtcOccluded1": lambda: bare_embree(*rays, robust=True),
+        "bare rtcOccluded1, not robust": lambda: bare_embree(*rays, robust=False),
     }
 
 
-def _bare_embree(vertices: Tensor, faces: Tensor, origin: Tensor, direction: Tensor, robust: bool):
+def bare_embree(
+    vertices: Tensor,  # [P, 3] float32
+    faces: Tensor,  # [F, 3] int32
+    origin: Tensor,  # [N, 3] float32, contiguous
+    direction: Tensor,  # [N, 3]
+    robust: bool,
+    name: str = "bare_occluded",
+) -> Callable[[], object]:
+    """Work that asks which rays meet something, by a function of bare_embree.cpp."""
     library = ctypes.CDLL(str(BARE_EMBREE))
     library.bare_scene.restype = ctypes.c_void_p
     out = torch.empty(len(origin), dtype=torch.bool)
@@ -62,7 +70,7 @@ def _bare_embree(vertices: Tensor, faces: Tensor, origin: Tensor, direction: Ten
     rays = (pointer(origin), pointer(direction), ctypes.c_int64(len(origin)), pointer(out))
     threads = ctypes.c_int(torch.get_num_threads())
     kept = (origin, direction, out)  # pointers keep nothing alive
-    return lambda: (library.bare_occluded(scene, *rays, threads), kept)
+    return lambda: (getattr(library, name)(scene, *rays, threads), kept)
 
 
 def composite(alpha: Tensor, value: Tensor, n_rays: int) -> Peers:

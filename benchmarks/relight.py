@@ -22,10 +22,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from relight_rays import ray_rates
 from relight_scenes import TESTS, Scene, mesh_scene, sphere_scene, true_mesh
 from torch import Tensor
 
-from univoxel import envmap as env
 from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data import load_photos
@@ -52,33 +52,6 @@ def timed(work, repeat: int = 3) -> tuple[Tensor, float]:
         result = work()
         times.append(time.perf_counter() - start)
     return result, sorted(times)[repeat // 2]
-
-
-def ray_rates(scene: Scene, samples: int = 32) -> dict:
-    """Shadow rays a second within the integrator, and of bare Embree on rays like them.
-
-    With the map's samples alone and no bounces every ray of the integrator is a shadow ray from a
-    sample above the horizon: as many, from the same points, in the same distribution and order, are
-    traced one by one with `VisibilityScene.occluded`, which does nothing else.
-    """
-    visibility, _, light, position, normal = scene.ours[:5]
-    uniform = torch.rand(len(position) * samples, 2, generator=torch.Generator().manual_seed(0))
-    direction = env.sample(light, uniform)[0].view(len(position), samples, 3)
-    above = (direction * normal[:, None]).sum(-1) > 0
-    origin = (position + COMMON["offset"] * normal)[:, None].expand_as(direction)[above]
-    rays = origin.contiguous(), direction[above].contiguous()
-    options = {"offset": COMMON["offset"], "samples": samples, "bounces": 0, "strategy": "map"}
-    bare, whole = [], []
-    for _ in range(5):  # in turns: the machine's speed drifts
-        bare.append(timed(lambda: visibility.occluded(*rays, COMMON["offset"]), 1)[1])
-        whole.append(timed(lambda: relight(*scene.ours, **options), 1)[1])
-    bare_rate, whole_rate = (len(rays[0]) / sorted(t)[2] for t in (bare, whole))
-    return {
-        "rays": len(rays[0]),
-        "bare": bare_rate,
-        "integrator": whole_rate,
-        "ratio": whole_rate / bare_rate,
-    }
 
 
 def strategies(scene: Scene) -> list[dict]:

@@ -16,11 +16,13 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
 import torch
 from relight_scenes import true_mesh
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 from torch import Tensor
+from trimesh.triangles import closest_point
 
 from univoxel import lights
 from univoxel.assets.bake import with_materials
@@ -46,6 +48,7 @@ from univoxel.tasks.frames import read_map
 from univoxel.tasks.train import train
 
 TERMS = ("none", "geometry", "light", "both")
+NEIGHBOURS = 4  # samples of the surface whose triangles a node is measured to
 STILL = 1e-9  # a learning rate that moves nothing
 SHOWN = (
     "nvs_psnr", "albedo_psnr_3ch", "roughness_mse", "relit_psnr", "normal_mae_deg"
@@ -54,7 +57,7 @@ PIXELS = ("albedo", "roughness", "normal", "mesh")
 
 
 def true_sdf(folder: Path, grid: GridShape) -> Tensor:
-    """Signed distance [X, Y, Z] of a data set's mesh: exact near it, about right elsewhere."""
+    """Signed distance [X, Y, Z] of a data set's mesh, cut off at six voxels."""
     vertices, faces, _ = true_mesh(folder)
     corner = vertices[faces.long()]
     area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).norm(dim=1)
@@ -70,7 +73,14 @@ def true_sdf(folder: Path, grid: GridShape) -> Tensor:
     near[tuple(index.clamp_min(0).minimum(limit).T)] = True
     band = torch.from_numpy(binary_dilation(near.numpy(), iterations=6))
     sdf = torch.full(grid.size, 6 * grid.voxel_size)
-    sdf[band] = torch.from_numpy(cKDTree(points.numpy()).query(nodes[band].numpy())[0]).float()
+    near_to, tree = nodes[band].numpy(), cKDTree(points.numpy())
+    _, nearest = tree.query(near_to, NEIGHBOURS)
+    best = np.full(len(near_to), np.inf)
+    for k in range(NEIGHBOURS):  # exact to the triangles of the nearest samples
+        triangles = corner[face[nearest[:, k]]].numpy()
+        foot = closest_point(triangles, near_to)
+        best = np.minimum(best, np.linalg.norm(foot - near_to, axis=1))
+    sdf[band] = torch.from_numpy(best).float()
     return torch.where(inside(vertices, faces, nodes.reshape(-1, 3)).view(grid.size), -sdf, sdf)
 
 

@@ -15,6 +15,7 @@ import json
 import os
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,6 +28,8 @@ from univoxel.data import load_photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
+from univoxel.lights import priors
+from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.sg import LocalSG
 from univoxel.optim import RowAdam
 from univoxel.render import pipeline
@@ -40,11 +43,17 @@ STAGES = {
     "march": [(DenseField, "march")],
     "sample": [(DenseField, "sample")],
     "composite": [(pipeline, "composite")],
-    "heads": [(MaterialHead, "forward"), (RadianceHead, "forward"), (LocalSG, "raw")],
+    "heads": [
+        *((head, "forward") for head in (MaterialHead, RadianceHead, MirroredLight)),
+        (LocalSG, "raw"),
+    ],
     "light": [(LocalSG, "reflected"), (LocalSG, "lobes_from_raw")],
-    "losses": [(losses, n) for n in ("photometric", "silhouette", "smoothness", "white_light")],
+    "losses": [
+        *((losses, name) for name in ("photometric", "silhouette")),
+        *((priors, name) for name in ("smoothness", "chroma", "total_variation")),
+    ],
     "optimiser": [(RowAdam, "step")],
-    "smoothing": [(train, "smooth")],
+    "smoothing": [(train, "smooth"), (train, "spread_gradient")],
     "refresh": [(DenseField, "refresh")],
 }
 BACKWARD = "backward"
@@ -55,7 +64,8 @@ COUNT = {"native": 32, "reference": 4}  # steps: of 16, one refreshes and four s
 class Clock:
     """Seconds by stage, forward and backward, of every call between `start` and `stop`."""
 
-    def __init__(self) -> None:
+    def __init__(self, now: Callable[[], float] = time.perf_counter) -> None:
+        self.now = now
         self.forward: dict[str, float] = defaultdict(float)
         self.backward: dict[str, float] = defaultdict(float)
         self._inner = [0.0]  # seconds in stages called from the present one
@@ -64,12 +74,12 @@ class Clock:
     def timed(self, name: str, function):
         def call(*arguments, **options):
             number = torch._C._autograd._get_sequence_nr
-            first, begin = number(), time.perf_counter()
+            first, begin = number(), self.now()
             self._inner.append(0.0)
             try:
                 return function(*arguments, **options)
             finally:
-                seconds = time.perf_counter() - begin
+                seconds = self.now() - begin
                 self.forward[name] += seconds - self._inner.pop()
                 self._inner[-1] += seconds
                 self._ranges.append((first, number(), name))

@@ -26,6 +26,7 @@ struct MapDraws {
     float *u, *v;           // in: two numbers in [0, 1)
     int32_t *row, *column;  // out: the texel
     float *x, *z;           // out: across the map in texels, the height of the direction
+    float* pdf;             // out: its density per steradian
     int n;
 };
 
@@ -42,15 +43,23 @@ class EnvMap {
           width_(static_cast<int32_t>(tables.width)),
           height_(static_cast<int32_t>(tables.height)),
           turn_(static_cast<float>(tables.rotation / (2 * kPi64))),
-          edge_(tables.height + 1) {
-        for (int64_t r = 0; r <= t_.height; ++r)
-            edge_[r] = static_cast<float>(std::cos(kPi64 * r / t_.height));
+          edge_(tables.height + 1),
+          per_solid_(tables.height) {
+        const auto edge = [&](int64_t r) { return std::cos(kPi64 * r / t_.height); };
+        for (int64_t r = 0; r <= t_.height; ++r) edge_[r] = static_cast<float>(edge(r));
+        for (int64_t r = 0; r < t_.height; ++r)
+            per_solid_[r] = static_cast<float>(t_.width / (2 * kPi64 * (edge(r) - edge(r + 1))));
         guide_.resize(kGuide);
         for (int32_t k = 0, row = 0; k < kGuide; ++k) {
             const float v = static_cast<float>(k) / kGuide;
             while (row + 1 < height_ && t_.row_cdf[row + 1] <= v) ++row;
             guide_[k] = row;
         }
+        while (blocks_ * kBlock < width_) blocks_ *= 2;
+        block_.resize(t_.height * blocks_, 2.f);
+        for (int32_t r = 0; r < height_; ++r)
+            for (int32_t c = 0; c < width_; c += kBlock)
+                block_[r * blocks_ + c / kBlock] = t_.column_cdf[r * (t_.width + 1) + c];
         // A black map has the density of its solid angle, or 0, but never light.
         const int64_t n = t_.height * t_.width;
         for (int64_t i = 0; i < n && black_; ++i)
@@ -62,14 +71,18 @@ class EnvMap {
     /// Draw places: the texel by inverting both tables, then uniform in solid angle within it.
     void draw(const MapDraws& d) const {
         find_rows(d);
+        find_columns(d);
         const int32_t pitch = width_ + 1;
-        const auto column = [&](int i, int32_t j) { return t_.column_cdf[d.row[i] * pitch + j]; };
-        find(width_, column, d.u, d.column, d.n);
 #pragma GCC ivdep
         for (int i = 0; i < d.n; ++i) {
-            d.x[i] = d.column[i] + d.u[i];
-            const float top = edge_[d.row[i]], bottom = edge_[d.row[i] + 1];
-            d.z[i] = top + d.v[i] * (bottom - top);
+            const int32_t row = d.row[i], column = d.column[i];
+            const float* at = t_.column_cdf + row * pitch + column;
+            const float share = at[1] - at[0];
+            const float low = t_.row_cdf[row], share_of_row = t_.row_cdf[row + 1] - low;
+            const float top = edge_[row], bottom = edge_[row + 1];
+            d.x[i] = column + place_in(d.u[i], at[0], share);
+            d.z[i] = top + place_in(d.v[i], low, share_of_row) * (bottom - top);
+            d.pdf[i] = share * share_of_row * per_solid_[row];
         }
     }
 
@@ -90,13 +103,19 @@ class EnvMap {
                 std::min(std::max(0.f, y), float(height_))};
     }
 
-    float pdf(int32_t row, int32_t column) const {
+    float pdf(const MapPlace& at) const {
+        const int32_t row = static_cast<int32_t>(std::min(at.y, height_ - 1.f));
+        const int32_t column = static_cast<int32_t>(std::min(at.x, width_ - 1.f));
         return t_.texel[4 * (row * width_ + column) + 3];
     }
 
-    float pdf(const MapPlace& at) const {
-        return pdf(static_cast<int32_t>(std::min(at.y, height_ - 1.f)),
-                   static_cast<int32_t>(std::min(at.x, width_ - 1.f)));
+    /// Call for the texels about a place, which `radiance` will read.
+    void prefetch(const MapPlace& at) const {
+        const int32_t row = static_cast<int32_t>(std::max(at.y - 0.5f, 0.f));
+        const int32_t column = static_cast<int32_t>(std::max(at.x - 0.5f, 0.f));
+        const float* texel = t_.texel + 4 * (row * width_ + column);
+        __builtin_prefetch(texel);
+        __builtin_prefetch(texel + (row + 1 < height_ ? 4 * width_ : 0));
     }
 
     /// Radiance, bilinear between pixel centres, around the border in x, clamped at the poles.
@@ -118,7 +137,7 @@ class EnvMap {
 
   private:
     static constexpr double kPi64 = 3.14159265358979323846;
-    static constexpr int kGuide = 4096;
+    static constexpr int kGuide = 4096, kBlock = 16;
     using float4 = float __attribute__((vector_size(16)));
 
     /// Texel i of the radiance and its density.
@@ -128,6 +147,11 @@ class EnvMap {
         return out;
     }
 
+    /// Where u lies in the interval from `low` that it was found in, in [0, 1).
+    static float place_in(float u, float low, float width) {
+        return std::min((u - low) / std::max(width, 1e-30f), 1 - 0x1p-24f);
+    }
+
     /// Rows are found from where `guide_` says; few have a step or more to go.
     void find_rows(const MapDraws& d) const {
         const float* cdf = t_.row_cdf;
@@ -135,38 +159,39 @@ class EnvMap {
         for (int i = 0; i < d.n; ++i) d.row[i] = guide_[static_cast<int32_t>(d.v[i] * kGuide)];
         for (int i = 0; i < d.n; ++i)
             while (cdf[d.row[i] + 1] <= d.v[i]) ++d.row[i];
-#pragma GCC ivdep
-        for (int i = 0; i < d.n; ++i) {
-            const float low = cdf[d.row[i]], width = cdf[d.row[i] + 1] - low;
-            d.v[i] = std::min((d.v[i] - low) / std::max(width, 1e-30f), 1 - 0x1p-24f);
-        }
     }
 
-    /// The intervals of tables `at` that hold u, of n; leaves in u the place within them, in [0,
-    /// 1). An empty interval is never found. All search in step: there is no branch to mispredict.
+    /// The columns that hold u, by blocks first: their table stays in cache. An empty column is
+    /// never found.
+    void find_columns(const MapDraws& d) const {
+        std::fill_n(d.column, d.n, 0);
+        find(blocks_, d, [this](int32_t r, int32_t c) { return block_[r * blocks_ + c]; });
+        for (int i = 0; i < d.n; ++i) d.column[i] *= kBlock;
+        find(kBlock, d, [this](int32_t r, int32_t c) {
+            return t_.column_cdf[r * (width_ + 1) + (c < width_ ? c : width_)];
+        });
+    }
+
+    /// Move columns on by less than `reach`, a power of 2, as far as `table` is at most u. All
+    /// search in step: there is no branch to mispredict.
     template <class F>
-    static void find(int32_t n, F&& at, float* u, int32_t* found, int count) {
-        std::fill(found, found + count, 0);
-        int32_t step = 1;
-        while (2 * step < n) step *= 2;
-        for (; step > 0; step /= 2) {
+    static void find(int32_t reach, const MapDraws& d, F&& table) {
+        for (int32_t step = reach / 2; step > 0; step /= 2) {
 #pragma GCC ivdep
-            for (int i = 0; i < count; ++i) {
-                const int32_t next = found[i] + step, j = next < n ? next : n - 1;
-                found[i] = at(i, j) <= u[i] ? j : found[i];
+            for (int i = 0; i < d.n; ++i) {
+                const int32_t next = d.column[i] + step;
+                d.column[i] = table(d.row[i], next) <= d.u[i] ? next : d.column[i];
             }
-        }
-#pragma GCC ivdep
-        for (int i = 0; i < count; ++i) {
-            const float low = at(i, found[i]), width = at(i, found[i] + 1) - low;
-            u[i] = std::min((u[i] - low) / std::max(width, 1e-30f), 1 - 0x1p-24f);
         }
     }
 
     EnvMapTables t_;
     int32_t width_, height_;
-    float turn_;                  // rotation in turns
-    std::vector<float> edge_;     // [H + 1] z of the rows' borders, from 1 to -1
+    float turn_;                    // rotation in turns
+    std::vector<float> edge_;       // [H + 1] z of the rows' borders, from 1 to -1
+    std::vector<float> per_solid_;  // [H] one over the solid angle of a texel
+    int32_t blocks_ = 1;            // in a row, a power of 2
+    std::vector<float> block_;    // [H, blocks_] where they begin in the row's table; 2: beyond it
     std::vector<int32_t> guide_;  // [kGuide] the rows that hold 0, 1 / kGuide, 2 / kGuide, ...
     bool black_ = true;
 };

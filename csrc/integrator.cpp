@@ -56,77 +56,41 @@ Vertex vertex_at(const Relight& in, vec origin, vec direction, const Hit& hit) {
     if (dot(normal, geometric) < 0) normal = -1 * normal;
     const vec at = origin + hit.t * direction;
     const float size = std::max(largest({std::abs(at.x), std::abs(at.y), std::abs(at.z)}), hit.t);
-    return {at + kHitOffset * size * geometric, geometric, normal,
-            PathBrdf::of(PathFrame(normal).to_local(-1 * direction), albedo, roughness, f0)};
+    return {at + kHitOffset * size * geometric,
+            geometric,
+            normal,
+            -1 * direction,
+            albedo,
+            f0,
+            roughness};
 }
 
-/// Number rays so that neighbours point the same way: by the square of a 16 x 16 grid over the
-/// octahedron that their direction meets, the squares along Morton's curve.
-template <int N>
-void order_by_direction(const Ways<N>& ways, uint8_t* key, int32_t* order) {
-    const int n = ways.n;
-#pragma GCC ivdep
-    for (int i = 0; i < n; ++i) {
-        const vec d = ways.direction[i];
-        const float ax = std::abs(d.x), ay = std::abs(d.y);
-        const float scale = 1 / (ax + ay + std::abs(d.z) + 1e-30f);
-        const float fx = std::copysign(1 - ay * scale, d.x),
-                    fy = std::copysign(1 - ax * scale, d.y);
-        const float x = d.z < 0 ? fx : d.x * scale, y = d.z < 0 ? fy : d.y * scale;
-        uint32_t a = static_cast<int32_t>(std::min(std::max(0.f, 8 + 8 * x), 15.f));
-        uint32_t b = static_cast<int32_t>(std::min(std::max(0.f, 8 + 8 * y), 15.f));
-        a = (a | (a << 2)) & 0x33, b = (b | (b << 2)) & 0x33;
-        a = (a | (a << 1)) & 0x55, b = (b | (b << 1)) & 0x55;
-        key[i] = static_cast<uint8_t>(a | (b << 1));
-    }
-    int32_t start[257] = {};
-    for (int i = 0; i < n; ++i) ++start[key[i] + 1];
-    for (int k = 0; k < 256; ++k) start[k + 1] += start[k];
-    for (int i = 0; i < n; ++i) order[start[key[i]]++] = i;
-}
-
-/// Put the rays of some ways side by side in a good order.
-template <int N>
-RayStream stream_of(Wave& w, const Ways<N>& ways, float t_min) {
-    order_by_direction(ways, w.key, w.order);
-    for (int j = 0; j < ways.n; ++j) {
-        const int i = w.order[j];
-        w.origin.set(j, w.paths->origin[ways.lane[i]]);
-        w.direction.set(j, ways.direction[i]);
-        w.distance[j] = ways.distance[i];
-    }
-    return {w.origin.x,    w.origin.y,    w.origin.z, w.direction.x,
-            w.direction.y, w.direction.z, t_min,      ways.n};
-}
-
-/// Look along the shadow rays and add the light that arrives.
-void trace_shadows(const Relight& in, Wave& w, float t_min) {
-    in.scene->occluded(stream_of(w, w.shadows, t_min), w.distance, w.blocked);
-    for (int j = 0; j < w.shadows.n; ++j) {
-        if (w.blocked[j]) continue;
-        const int i = w.order[j], path = w.paths->path[w.shadows.lane[i]];
-        w.light.set(path, w.light[path] + w.shadows.light[i]);
-    }
-    w.shadows.n = 0;
-}
-
-/// Take those of the ways drawn that carry light among the shadow rays; times the map's light where
-/// one is given.
-void queue_drawn(const Relight& in, Wave& w, float t_min, const EnvMap* map = nullptr) {
-    Ways<2 * kLanes>& to = w.shadows;
-    if (to.n + w.paths->n > 2 * kLanes) trace_shadows(in, w, t_min);
-    const int first = to.n;
+/// Look along those of the ways drawn that carry light, and add it where nothing is in between. The
+/// light of the map, where one is given, is theirs times what is drawn.
+void look(const Relight& in, Wave& w, float t_min, const EnvMap* map = nullptr) {
+    Rays& rays = w.rays;
+    int n = 0;
     for (int i = 0; i < w.paths->n; ++i) {
-        const vec light = w.drawn.light[i];
-        to.direction.set(to.n, w.drawn.direction[i]);
-        to.light.set(to.n, light);
-        to.distance[to.n] = w.drawn.distance[i];
-        to.lane[to.n] = i;
-        to.n += largest(light) > 0;
+        rays.lane[n] = i;
+        n += largest(w.drawn.light[i]) > 0;
     }
-    if (!map) return;
-    for (int k = first; k < to.n; ++k)
-        to.light.set(k, to.light[k] * map->radiance({w.x[to.lane[k]], w.y[to.lane[k]]}));
+    if (map)
+        for (int k = 0; k < n; ++k) map->prefetch({w.x[rays.lane[k]], w.y[rays.lane[k]]});
+    rays.n = 0;
+    for (int k = 0; k < n; ++k) {
+        const int i = rays.lane[k];
+        const vec light = w.drawn.light[i];
+        const vec seen = map ? light * map->radiance({w.x[i], w.y[i]}) : light;
+        rays.light.set(rays.n, seen);
+        rays.set(rays.n, i, w.paths->origin[i], w.drawn.direction[i], w.drawn.distance[i]);
+        rays.n += largest(seen) > 0;
+    }
+    in.scene->occluded(rays.stream(t_min), rays.distance, rays.blocked);
+    for (int k = 0; k < rays.n; ++k) {
+        if (rays.blocked[k]) continue;
+        const int path = w.paths->path[rays.lane[k]];
+        w.light.set(path, w.light[path] + rays.light[k]);
+    }
 }
 
 /// Light of the suns and lamps that arrives at the vertices and leaves them along the paths.
@@ -151,7 +115,7 @@ void draw_suns_and_lamps(const Relight& in, Wave& w, uint32_t depth, float t_min
             const float radius = std::sqrt(down * (2 - down));
             add(i, disc.to_world(on_circle(u.y, radius, 1 - down)), irradiance, kFar);
         }
-        queue_drawn(in, w, t_min);
+        look(in, w, t_min);
     }
     for (int64_t k = 0; k < in.lights.n_lamps; ++k) {
         const vec position = row(in.lights.lamp + 6 * k);
@@ -162,7 +126,7 @@ void draw_suns_and_lamps(const Relight& in, Wave& w, uint32_t depth, float t_min
             const float distance = std::sqrt(squared);
             add(i, (1 / distance) * way, (1 / squared) * intensity, distance);
         }
-        queue_drawn(in, w, t_min);
+        look(in, w, t_min);
     }
 }
 
@@ -175,14 +139,14 @@ void draw_map(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth) {
         const Point2 u = sobol2(p.index[i], hash(hash(p.seed[i], depth), 0));
         w.u[i] = u.x, w.v[i] = u.y;
     }
-    map.draw({w.u, w.v, w.row, w.column, w.x, w.z, n});
+    map.draw({w.u, w.v, w.row, w.column, w.x, w.z, w.pdf, n});
     const float both = in.strategy == Strategy::mis ? 1 : 0;
 #pragma GCC ivdep
     for (int i = 0; i < n; ++i) {
         const vec direction = map.direction(w.x[i], w.z[i]);
         const PathFrame frame(p.normal[i]);
         const PathBrdf::Value value = p.brdf(i).evaluate(frame.to_local(direction));
-        const float pdf = map.pdf(w.row[i], w.column[i]);
+        const float pdf = w.pdf[i];
         const bool ok = (pdf > 0) & above(p, i, direction);
         const float weight = ok ? mis_weight(pdf, value.pdf, both) / pdf : 0.f;
         w.y[i] = map.down(w.z[i]);
@@ -223,18 +187,17 @@ void draw_brdf(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth) {
 
 /// Follow the directions drawn: to the map, whose light is added, or to the next vertices.
 void advance(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth, float t_min) {
-    Ways<2 * kLanes>& ways = w.shadows;  // empty now
+    Rays& rays = w.rays;
+    rays.n = 0;
     for (int i = 0; i < w.paths->n; ++i) {
-        ways.direction.set(ways.n, w.drawn.direction[i]);
-        ways.distance[ways.n] = kFar;
-        ways.lane[ways.n] = i;
-        ways.n += w.pdf[i] > 0;
+        rays.set(rays.n, i, w.paths->origin[i], w.drawn.direction[i], kFar);
+        rays.n += w.pdf[i] > 0;
     }
-    in.scene->closest_hit(stream_of(w, ways, t_min), w.hit);
+    in.scene->closest_hit(rays.stream(t_min), w.hit);
     w.next->n = 0;
-    for (int j = 0; j < ways.n; ++j) {
-        const int i = ways.lane[w.order[j]], path = w.paths->path[i];
-        const Hit& hit = w.hit[j];
+    for (int k = 0; k < rays.n; ++k) {
+        const int i = rays.lane[k], path = w.paths->path[i];
+        const Hit& hit = w.hit[k];
         if (hit.face < 0) {
             const vec light = w.drawn.light[i] * map.radiance({w.x[i], w.y[i]});
             w.light.set(path, w.light[path] + light);
@@ -249,9 +212,9 @@ void advance(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth, floa
             throughput = (1 / survival) * throughput;
         }
         w.next->push(vertex_at(in, w.paths->origin[i], w.drawn.direction[i], hit), throughput, seed,
-                     index, path, 1);
+                     index, path);
     }
-    ways.n = 0;
+    w.next->settle();
     std::swap(w.paths, w.next);
 }
 
@@ -263,13 +226,12 @@ void trace(const Relight& in, const EnvMap& map, Wave& w) {
         draw_suns_and_lamps(in, w, depth, t_min);
         if (in.strategy != Strategy::brdf && !map.black()) {
             draw_map(in, map, w, depth);
-            queue_drawn(in, w, t_min, &map);
+            look(in, w, t_min, &map);
         }
         if (!last || (in.strategy != Strategy::map && !map.black())) {
             draw_brdf(in, map, w, depth);
-            if (last) queue_drawn(in, w, t_min, &map);
+            if (last) look(in, w, t_min, &map);
         }
-        trace_shadows(in, w, t_min);
         if (last) return;
         advance(in, map, w, depth, t_min);
     }
@@ -283,32 +245,38 @@ void relight(const Relight& in, float* rgb, int threads) {
     parallel_for(in.n_points, grain, threads, [&](int64_t begin, int64_t end) {
         thread_local const auto wave = std::make_unique<Wave>();
         Wave& w = *wave;
-        vec3<double> sum[kLanes] = {};  // in float, equal addends of many samples drift
+        vec3<double> sum[kLanes];  // in float, equal addends of many samples drift
         const int points = static_cast<int>(end - begin), together = kLanes / points;
+        std::fill_n(sum, points, vec3<double>(0));
+        w.first.n = 0;
+        for (int64_t i = begin; i < end; ++i) {
+            const Vertex first{row(in.position, i) + in.offset * row(in.normal, i),
+                               {},
+                               row(in.normal, i),
+                               row(in.wo, i),
+                               row(in.albedo, i),
+                               row(in.f0, i),
+                               in.roughness[i]};
+            // A missing normal, or anything that is not a number, shades black.
+            if (dot(first.normal, first.normal) > 0.5f &&
+                std::isfinite(
+                    mean(first.origin + first.normal + first.wo + first.albedo + first.f0) +
+                    first.roughness))
+                w.first.push(first, {1, 1, 1}, hash(static_cast<uint32_t>(i), in.seed), 0,
+                             static_cast<int>(i - begin));
+        }
+        w.first.settle();
         for (int done = 0; done < in.samples; done += together) {
             const int samples = std::min(together, in.samples - done);
-            w.paths->n = w.shadows.n = 0;
+            w.paths->n = 0;
             for (int k = 0; k < points * samples; ++k) w.light.set(k, {});
-            for (int64_t i = begin; i < end; ++i) {
-                const vec normal = row(in.normal, i), wo = row(in.wo, i);
-                const vec position = row(in.position, i), albedo = row(in.albedo, i);
-                const vec f0 = row(in.f0, i);
-                // A missing normal, or anything that is not a number, shades black.
-                if (!(dot(normal, normal) > 0.5f) ||
-                    !std::isfinite(mean(normal + wo + position + albedo + f0) + in.roughness[i]))
-                    continue;
-                const Vertex first{
-                    position + in.offset * normal,
-                    {},
-                    normal,
-                    PathBrdf::of(PathFrame(normal).to_local(wo), albedo, in.roughness[i], f0)};
-                const uint32_t seed = hash(static_cast<uint32_t>(i), in.seed);
-                w.paths->push(first, {1, 1, 1}, seed, in.first + static_cast<uint32_t>(done),
-                              static_cast<int>(i - begin) * samples, samples);
-            }
+            for (int k = 0; k < w.first.n; ++k)
+                w.paths->repeat(w.first, k, in.first + static_cast<uint32_t>(done),
+                                w.first.path[k] * samples, samples);
             trace(in, map, w);
-            for (int k = 0; k < points * samples; ++k)
-                sum[k / samples] += vec3<double>(w.light.x[k], w.light.y[k], w.light.z[k]);
+            for (int k = 0, i = 0; k < points; ++k)
+                for (int j = 0; j < samples; ++j, ++i)
+                    sum[k] += vec3<double>(w.light.x[i], w.light.y[i], w.light.z[i]);
         }
         for (int k = 0; k < points; ++k)
             store3(rgb, begin + k, vec3<float>(sum[k] / static_cast<double>(in.samples)));

@@ -11,6 +11,32 @@
 
 namespace univoxel {
 
+/// The polynomials of specular_albedo, unrolled for loops over points: terms from First on in the
+/// last, the last two and all three of their variables, up to a total degree of N - 1.
+template <int First, int N>
+inline float albedo_terms(const double (&c)[35], float u) {
+    if constexpr (N == 1)
+        return static_cast<float>(c[First]);
+    else
+        return static_cast<float>(c[First]) + u * albedo_terms<First + 1, N - 1>(c, u);
+}
+template <int First, int N>
+inline float albedo_terms(const double (&c)[35], float roughness, float u) {
+    const float here = albedo_terms<First, N>(c, u);
+    if constexpr (N == 1)
+        return here;
+    else
+        return here + roughness * albedo_terms<First + N, N - 1>(c, roughness, u);
+}
+template <int First, int N>
+inline float albedo_terms(const double (&c)[35], float cosine, float roughness, float u) {
+    const float here = albedo_terms<First, N>(c, roughness, u);
+    if constexpr (N == 1)
+        return here;
+    else
+        return here + cosine * albedo_terms<First + N*(N + 1) / 2, N - 1>(c, cosine, roughness, u);
+}
+
 /// At one point towards one eye, in the frame of the normal.
 struct PathBrdf {
     float3 wo, diffuse, f0;       // diffuse: (1 - E) albedo / pi
@@ -18,17 +44,18 @@ struct PathBrdf {
 
     static PathBrdf of(float3 wo, const float3& albedo, float roughness, const float3& f0) {
         // An eye behind the shading normal looks on at grazing angle.
-        wo.z = std::max(wo.z, static_cast<float>(kCosMin));
+        wo.z = std::max(wo.z, float(kCosMin));
         wo = unit(wo);
-        // E for each channel of F0, most often one value.
-        const float first = specular_albedo(wo.z, roughness, f0.x).value;
-        float3 layer{first, first, first};
-        if (f0.y != f0.x) layer.y = specular_albedo(wo.z, roughness, f0.y).value;
-        if (f0.z != f0.x) layer.z = specular_albedo(wo.z, roughness, f0.z).value;
+        const float alpha = ggx_alpha(roughness), u = wo.z / (wo.z + alpha);
+        const float black = albedo_terms<0, 5>(kAlbedoBlack, wo.z, roughness, u);
+        const float white = albedo_terms<0, 5>(kAlbedoWhite, wo.z, roughness, u);
+        const auto layer_of = [=](float f) {
+            return std::min(std::max(0.f, black + f * (white - black)), 1.f);
+        };
+        const float3 layer{layer_of(f0.x), layer_of(f0.y), layer_of(f0.z)};
         const float3 diffuse = (float3{1, 1, 1} - layer) * albedo;
         const float base = mean(diffuse), top = mean(layer);
-        return {wo, (1 / float(kPi)) * diffuse, f0, ggx_alpha(roughness),
-                top / std::max(top + base, 1e-6f)};
+        return {wo, (1 / float(kPi)) * diffuse, f0, alpha, top / std::max(top + base, 1e-6f)};
     }
 
     struct Value {

@@ -51,61 +51,33 @@ bool usable(const vec3<float>& o, const vec3<float>& d) {
     return size < 1e18f;
 }
 
-// Embree's calls for packets, one name for all widths and versions.
+// Packets of 8 are the fastest for rays that start close by in all directions, also where Embree
+// has wider ones.
+constexpr int kPacket = 8;
+
 #if UNIVOXEL_EMBREE >= 4
 void trace(const int* valid, RTCScene scene, RTCRay8& rays) {
     rtcOccluded8(valid, scene, &rays);
 }
-void trace(const int* valid, RTCScene scene, RTCRay16& rays) {
-    rtcOccluded16(valid, scene, &rays);
-}
 void trace(const int* valid, RTCScene scene, RTCRayHit8& rays) {
     rtcIntersect8(valid, scene, &rays);
 }
-void trace(const int* valid, RTCScene scene, RTCRayHit16& rays) {
-    rtcIntersect16(valid, scene, &rays);
-}
 #else
-RTCIntersectContext make_context() {
+void trace(const int* valid, RTCScene scene, RTCRay8& rays) {
     RTCIntersectContext context;
     rtcInitIntersectContext(&context);
-    return context;
-}
-void trace(const int* valid, RTCScene scene, RTCRay8& rays) {
-    RTCIntersectContext context = make_context();
     rtcOccluded8(valid, scene, &context, &rays);
 }
-void trace(const int* valid, RTCScene scene, RTCRay16& rays) {
-    RTCIntersectContext context = make_context();
-    rtcOccluded16(valid, scene, &context, &rays);
-}
 void trace(const int* valid, RTCScene scene, RTCRayHit8& rays) {
-    RTCIntersectContext context = make_context();
+    RTCIntersectContext context;
+    rtcInitIntersectContext(&context);
     rtcIntersect8(valid, scene, &context, &rays);
-}
-void trace(const int* valid, RTCScene scene, RTCRayHit16& rays) {
-    RTCIntersectContext context = make_context();
-    rtcIntersect16(valid, scene, &context, &rays);
 }
 #endif
 
-template <int W>
-struct PacketOf;
-template <>
-struct PacketOf<8> {
-    using Ray = RTCRay8;
-    using RayHit = RTCRayHit8;
-};
-template <>
-struct PacketOf<16> {
-    using Ray = RTCRay16;
-    using RayHit = RTCRayHit16;
-};
-
-/// Copy rays first .. first + W of a stream; the last ones again beyond its end, marked invalid.
-template <int W, class Ray>
-void load(const RayStream& rays, int first, Ray& packet, int* valid) {
-    for (int k = 0; k < W; ++k) {
+/// Copy rays from `first` on; the last one again beyond the end of the stream, marked invalid.
+void load(const RayStream& rays, int first, RTCRay8& packet, int* valid) {
+    for (int k = 0; k < kPacket; ++k) {
         const int i = std::min(first + k, rays.n - 1);
         const vec3<float> o(rays.ox[i], rays.oy[i], rays.oz[i]);
         const vec3<float> d(rays.dx[i], rays.dy[i], rays.dz[i]);
@@ -118,43 +90,6 @@ void load(const RayStream& rays, int first, Ray& packet, int* valid) {
     }
 }
 
-template <int W>
-void occluded_in_packets(RTCScene scene, const RayStream& rays, const float* distance,
-                         uint8_t* out) {
-    alignas(64) int valid[W];
-    typename PacketOf<W>::Ray packet;
-    for (int first = 0; first < rays.n; first += W) {
-        load<W>(rays, first, packet, valid);
-        for (int k = 0; k < std::min(W, rays.n - first); ++k) packet.tfar[k] = distance[first + k];
-        trace(valid, scene, packet);
-        for (int k = 0; k < std::min(W, rays.n - first); ++k)
-            out[first + k] = valid[k] && packet.tfar[k] < 0;
-    }
-}
-
-template <int W>
-void closest_hit_in_packets(RTCScene scene, const RayStream& rays, Hit* out) {
-    alignas(64) int valid[W];
-    typename PacketOf<W>::RayHit packet;
-    for (int first = 0; first < rays.n; first += W) {
-        load<W>(rays, first, packet.ray, valid);
-        for (int k = 0; k < W; ++k) {
-            packet.hit.geomID[k] = RTC_INVALID_GEOMETRY_ID;
-            packet.hit.instID[0][k] = RTC_INVALID_GEOMETRY_ID;
-        }
-        trace(valid, scene, packet);
-        for (int k = 0; k < std::min(W, rays.n - first); ++k) {
-            const bool met = valid[k] && packet.hit.geomID[k] != RTC_INVALID_GEOMETRY_ID;
-            out[first + k] = met ? Hit{packet.ray.tfar[k],
-                                       packet.hit.u[k],
-                                       packet.hit.v[k],
-                                       static_cast<int64_t>(packet.hit.primID[k]),
-                                       {packet.hit.Ng_x[k], packet.hit.Ng_y[k], packet.hit.Ng_z[k]}}
-                                 : kNothing;
-        }
-    }
-}
-
 }  // namespace
 
 struct VisibilityScene::Impl {
@@ -162,7 +97,7 @@ struct VisibilityScene::Impl {
     std::vector<int32_t> faces;
     RTCDevice device = nullptr;
     RTCScene scene = nullptr;
-    int width = 1;  // rays that this processor traces in step
+    bool packets = false;  // whether this processor traces several rays in step
 
     ~Impl() {
         if (scene) rtcReleaseScene(scene);
@@ -189,10 +124,8 @@ VisibilityScene::VisibilityScene(const float* vertices, int64_t n_vertices, cons
     impl_->faces.resize(3 * n_faces + 4);
     impl_->device = rtcNewDevice(("threads=" + std::to_string(threads)).c_str());
     if (!impl_->device) fail(nullptr);
-    if (rtcGetDeviceProperty(impl_->device, RTC_DEVICE_PROPERTY_NATIVE_RAY8_SUPPORTED))
-        impl_->width = 8;
-    if (rtcGetDeviceProperty(impl_->device, RTC_DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED))
-        impl_->width = 16;
+    impl_->packets =
+        rtcGetDeviceProperty(impl_->device, RTC_DEVICE_PROPERTY_NATIVE_RAY8_SUPPORTED) != 0;
     impl_->scene = rtcNewScene(impl_->device);
     // Without it, 2 % of rays aimed at an edge slip through between its triangles.
     rtcSetSceneFlags(impl_->scene, RTC_SCENE_FLAG_ROBUST);
@@ -248,19 +181,47 @@ const int32_t* VisibilityScene::faces() const {
 }
 
 void VisibilityScene::occluded(const RayStream& rays, const float* distance, uint8_t* out) const {
-    if (impl_->width == 16) return occluded_in_packets<16>(impl_->scene, rays, distance, out);
-    if (impl_->width == 8) return occluded_in_packets<8>(impl_->scene, rays, distance, out);
-    for (int i = 0; i < rays.n; ++i)
-        out[i] = occluded({rays.ox[i], rays.oy[i], rays.oz[i]},
-                          {rays.dx[i], rays.dy[i], rays.dz[i]}, rays.t_min, distance[i]);
+    if (!impl_->packets) {
+        for (int i = 0; i < rays.n; ++i)
+            out[i] = occluded({rays.ox[i], rays.oy[i], rays.oz[i]},
+                              {rays.dx[i], rays.dy[i], rays.dz[i]}, rays.t_min, distance[i]);
+        return;
+    }
+    alignas(32) int valid[kPacket];
+    RTCRay8 packet;
+    for (int first = 0; first < rays.n; first += kPacket) {
+        const int n = std::min(kPacket, rays.n - first);
+        load(rays, first, packet, valid);
+        std::copy_n(distance + first, n, packet.tfar);
+        trace(valid, impl_->scene, packet);
+        for (int k = 0; k < n; ++k) out[first + k] = valid[k] && packet.tfar[k] < 0;
+    }
 }
 
 void VisibilityScene::closest_hit(const RayStream& rays, Hit* out) const {
-    if (impl_->width == 16) return closest_hit_in_packets<16>(impl_->scene, rays, out);
-    if (impl_->width == 8) return closest_hit_in_packets<8>(impl_->scene, rays, out);
-    for (int i = 0; i < rays.n; ++i)
-        out[i] = closest_hit({rays.ox[i], rays.oy[i], rays.oz[i]},
-                             {rays.dx[i], rays.dy[i], rays.dz[i]}, rays.t_min);
+    if (!impl_->packets) {
+        for (int i = 0; i < rays.n; ++i)
+            out[i] = closest_hit({rays.ox[i], rays.oy[i], rays.oz[i]},
+                                 {rays.dx[i], rays.dy[i], rays.dz[i]}, rays.t_min);
+        return;
+    }
+    alignas(32) int valid[kPacket];
+    RTCRayHit8 packet;
+    for (int first = 0; first < rays.n; first += kPacket) {
+        load(rays, first, packet.ray, valid);
+        std::fill_n(packet.hit.geomID, kPacket, RTC_INVALID_GEOMETRY_ID);
+        std::fill_n(packet.hit.instID[0], kPacket, RTC_INVALID_GEOMETRY_ID);
+        trace(valid, impl_->scene, packet);
+        for (int k = 0; k < std::min(kPacket, rays.n - first); ++k) {
+            const bool met = valid[k] && packet.hit.geomID[k] != RTC_INVALID_GEOMETRY_ID;
+            out[first + k] = met ? Hit{packet.ray.tfar[k],
+                                       packet.hit.u[k],
+                                       packet.hit.v[k],
+                                       static_cast<int64_t>(packet.hit.primID[k]),
+                                       {packet.hit.Ng_x[k], packet.hit.Ng_y[k], packet.hit.Ng_z[k]}}
+                                 : kNothing;
+        }
+    }
 }
 
 #else  // without Embree every query is unreachable: there is no scene to ask

@@ -61,14 +61,22 @@ def photograph(cameras: Cameras, view: int) -> tuple[torch.Tensor, torch.Tensor]
     return albedo * (0.6 + 0.4 * normal[..., 2:]) * hit[..., None], hit.float()
 
 
-def write_scene(folder: Path, views: int = 12, size: int = 32) -> Path:
-    """The photographs as a data set in the NeRF/Blender layout, train and test."""
+def write_scene(
+    folder: Path, views: int = 12, size: int = 32, gain: torch.Tensor | None = None
+) -> Path:
+    """The photographs as a data set in the NeRF/Blender layout, train and test.
+
+    Args:
+        gain: [views, 3] on the radiance of those to train on.
+    """
     for split, count in (("train", views), ("test", 2)):
         cameras = cameras_around(count, size)
         (folder / split).mkdir(parents=True)
         frames = []
         for v in range(count):
             color, alpha = photograph(cameras, v)
+            if gain is not None and split == "train":
+                color = color * gain[v]
             rgba = torch.cat([linear_to_srgb(color), alpha[..., None]], -1)
             picture = (255 * rgba).round().to(torch.uint8).numpy()
             Image.fromarray(picture).save(folder / split / f"r_{v}.png")
@@ -100,3 +108,15 @@ def photos_of(views: int, size: int) -> Photos:
     color, alpha = zip(*(photograph(cameras, v) for v in range(views)), strict=True)
     names = [f"r_{v}" for v in range(views)]
     return Photos(Path("sphere"), names, torch.stack(color), torch.stack(alpha), cameras)
+
+
+def scene_of(albedo, roughness: float, nodes: int):
+    """The sphere with one material everywhere, under a grey map."""
+    scene = sphere_scene(nodes)
+    last = scene.material.net[-1]
+    low = scene.material.min_roughness
+    wanted = torch.tensor([*albedo, (roughness - low) / (1 - low), 0.0])
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.copy_(torch.logit(wanted, eps=1e-6))
+    return scene

@@ -173,6 +173,11 @@ def test_data_that_cannot_be_used(data, tmp_path, refused, change, message):
         (["--set=scene.channels=0"], "SceneConfig: channels must be at least 1, got 0"),
         (["--set=scene.light.lobes=0"], "SGConfig: lobes must be >= 1, got 0"),
         (["--set=loss.radiance=-1"], "LossConfig: radiance must be at least 0, got -1.0"),
+        (
+            ["--varying", "light", "--light", "envmap"],
+            "varying light needs hybrid or a local light",
+        ),
+        (["--varying", "weather"], "'weather' for argument '--varying'"),
         (["--preset", "best"], "'best' for argument '--preset'"),
         (["--minuts", "3"], "Unrecognized options: --minuts, 3"),
     ],

@@ -29,6 +29,7 @@ class Config:
     out: Path
     preset: str
     light: str
+    varying: str
     minutes: float = 4.0
     seed: int = 0
     loss: LossConfig = LossConfig()
@@ -60,16 +61,17 @@ def calls(monkeypatch):
     def replace(name, result, **others):
         stand_in(f"univoxel.tasks.{name}", **{name: task(name, result)}, **others)
 
-    stand_in(
-        "univoxel.config", preset=lambda name, data, out, light: Config(data, out, name, light)
-    )
+    def chosen(preset, minutes, data, out, light, varying):
+        return Config(data, out, preset, light, varying, minutes or 4.0)
+
+    stand_in("univoxel.config", chosen=chosen)
     replace("train", Path("run"))
     replace("evaluate", {"psnr": 31.25, "views": 5})
     replace("relight", None)
     replace("export", None)
     replace("envmap", None)
     replace("demo", Path("demo/index.html"))
-    return types.SimpleNamespace(noted=noted, replace=replace)
+    return types.SimpleNamespace(noted=noted, replace=replace, stand_in=stand_in, task=task)
 
 
 def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
@@ -80,15 +82,19 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
         "draft",
         "--light",
         "sg",
+        "--varying",
+        "exposure",
         "--minutes",
         "2",
         *(f"--set={change}" for change in changes),
     ]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
     stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0)
-    expected = Config(Path("photos"), out, "draft", "sg", 2.0, 7, LossConfig(2.0), stages)
+    expected = Config(
+        Path("photos"), out, "draft", "sg", "exposure", 2.0, 7, LossConfig(2.0), stages
+    )
     assert capsys.readouterr().out == "run\n"
-    assert calls.noted == [("train", (expected,), {"resume": False})]
+    assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
 
 
 def test_train_keeps_the_minutes_of_the_preset(calls, tmp_path):
@@ -101,18 +107,22 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
     assert main(["train", "photos", "--out", str(tmp_path)]) == 2
     assert "holds a run already: add --resume" in capsys.readouterr().err
     assert main(["train", "photos", "--out", str(tmp_path), "--resume"]) == 0
-    assert calls.noted[0][2] == {"resume": True}
+    assert calls.noted[0][2] == {"resume": True, "timelapse": None}
+    film = ["--timelapse", "frames/"]
+    assert main(["train", "photos", "--out", str(tmp_path), "--resume", *film]) == 0
+    assert calls.noted[1][2] == {"resume": True, "timelapse": "frames/"}
 
 
 def test_eval(calls):
-    options = ["--samples", "8", "--bounces", "0"]
+    options = ["--samples", "8", "--bounces", "0", "--light-of", "r_7"]
     paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
     named = [str(part) for name, path in paths.items() for part in (f"--{name}", path)]
     assert main(["eval", "run", *named, *options]) == 0
     assert main(["eval", "run"]) == 0
     default = {"data": None, "save": None, "json": None, "samples": 64, "bounces": 2}
+    default["light_of"] = None
     assert calls.noted == [
-        ("evaluate", (Path("run"),), {**paths, "samples": 8, "bounces": 0}),
+        ("evaluate", (Path("run"),), {**paths, "samples": 8, "bounces": 0, "light_of": "r_7"}),
         ("evaluate", (Path("run"),), default),
     ]
 
@@ -135,12 +145,14 @@ def test_relight_export_and_demo(calls, capsys):
 
 def test_envmap(calls, capsys):
     assert main(["envmap", "run", "--out", "map.exr"]) == 0
-    assert calls.noted == [("envmap", (Path("run"), Path("map.exr")), {"height": 128})]
+    assert calls.noted == [
+        ("envmap", (Path("run"), Path("map.exr")), {"height": 128, "light_of": None})
+    ]
     assert capsys.readouterr().out == "map.exr\n"
     found = types.SimpleNamespace(ball_psnr=31.24, brightest_degrees=4.0)
     calls.replace("envmap", found)
-    assert main(["envmap", "run", "--out", "map.exr", "--height", "32"]) == 0
-    assert calls.noted[-1][2] == {"height": 32}
+    assert main(["envmap", "run", "--out", "map.exr", "--height", "32", "--light-of", "2"]) == 0
+    assert calls.noted[-1][2] == {"height": 32, "light_of": "2"}
     _, ball, brightest = capsys.readouterr().out.splitlines()
     assert "31.2 dB" in ball
     assert "4.0 degrees" in brightest
@@ -150,8 +162,31 @@ def test_inspect(calls, tmp_path, capsys):
     out = tmp_path / "light.png"
     calls.replace("inspect", out, parse_pixel=lambda text: text.split(","))
     assert main(["inspect", "run", "--view", "r_1", "--pixel", "3,4", "--out", str(out)]) == 0
-    assert calls.noted == [("inspect", (Path("run"), "r_1", ["3", "4"], out), {})]
+    assert calls.noted == [("inspect", (Path("run"), "r_1", ["3", "4"], out), {"light_of": None})]
     assert capsys.readouterr().out == f"{out}\n"
+
+
+def test_experiments(calls, tmp_path, capsys):
+    calls.stand_in("univoxel.experiments.compare", compare=calls.task("compare", "table"))
+    calls.stand_in("univoxel.experiments.chart", chart=calls.task("chart", "picture"))
+    options = ["--preset", "draft", "--samples", "4", "--set", "seed=1"]
+    more = ["--light", "sg", "sg:lobes=12", "--minutes", "2"]
+    assert main(["compare", "cup", "shoe", "--out", "out", *options, *more]) == 0
+    assert main(["chart", "cup", "--out", "out", *options, "--light", "sg", "--quick"]) == 0
+    assert main(["chart", "cup", "--out", "out", "--only", "draft", "fast"]) == 0
+    lights = ("sg", "sg:lobes=12")
+    scenes = (Path("cup"), Path("shoe"))
+    assert [given for _, given, _ in calls.noted] == [
+        (scenes, Path("out"), "draft", lights, 2.0, ("seed=1",), 4),
+        ((Path("cup"),), Path("out"), "draft", "sg", True, (), ("seed=1",), 4),
+        ((Path("cup"),), Path("out"), "fast", "hybrid", False, ("draft", "fast"), (), 64),
+    ]
+    assert capsys.readouterr().out.split() == ["table", "picture", "picture"]
+    assert main(["compare", "cup", "--out", "out", "--minutes", "-1"]) == 2
+    assert "--minutes must be above 0, got -1" in capsys.readouterr().err
+    calls.stand_in("univoxel.experiments.chart", chart=calls.task("chart", KeyboardInterrupt()))
+    assert main(["chart", "cup", "--out", "out"]) == 130
+    assert "out keeps the trainings that are done" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -202,11 +237,14 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["train"], "Missing from univoxel train: DATA "),
         (
             ["train", "x", "--out", "y", "--preset", "z"],
-            "invalid choice 'z' for argument '--preset'. Expected one of ('draft', 'fast', 'full')",
+            "invalid choice 'z' for argument '--preset'. Expected one of ('auto', 'draft', ",
         ),
         (["train", "x", "--out", "y", "--minutes", "a"], "Error parsing --minutes: "),
         (["sing"], "Unrecognized options: sing"),
-        ([], "Expected one of {train, eval, relight, export, envmap, inspect, demo}"),
+        (
+            [],
+            "Expected one of {train, eval, relight, export, envmap, inspect, compare, chart, demo}",
+        ),
     ],
 )
 def test_wrong_usage_is_one_line(calls, capsys, arguments, message):
@@ -237,7 +275,7 @@ def test_help_does_not_wait_for_torch():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-    assert "--preset {draft,fast,full}" in run.stdout
+    assert "--preset {auto,draft,fast,full}" in run.stdout
 
 
 def test_version(capsys):

@@ -6,7 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from univoxel.config import JointConfig, LossConfig, StageConfig, TrainConfig, preset, save_config
+from univoxel.config import (
+    JointConfig,
+    LossConfig,
+    StageConfig,
+    TrainConfig,
+    budget,
+    chosen,
+    preset,
+    save_config,
+    work_in,
+)
 from univoxel.lights.sg import LocalSG, SGConfig
 from univoxel.scene import SceneConfig
 
@@ -23,6 +33,42 @@ def test_presets(name):
     voxels = [stage.voxels for stage in grids]
     assert voxels == sorted(voxels)
     assert grids[-1].physical_from < 1  # or materials would never be learned
+
+
+@pytest.mark.parametrize("light", ["hybrid", "sg", "envmap"])
+@pytest.mark.parametrize("name", ["draft", "fast", "full"])
+def test_a_preset_is_a_point_of_the_curve(name, light):
+    config = preset(name, Path("photos"), Path("run"), light)
+    assert budget(config.minutes, Path("photos"), Path("run"), light) == config
+
+
+def test_more_minutes_are_more_work():
+    minutes = [0.05, 0.5, 1.0, 1.7, 3.9, 4.0, 4.1, 8.0, 12.0, 13.0, 60.0]
+    configs = [budget(m, Path("photos"), Path("run")) for m in minutes]
+    assert [c.minutes for c in configs] == minutes
+    fine = [c.stages[1] for c in configs]
+    for name in ("voxels", "iterations", "rays"):
+        values = [getattr(s, name) for s in fine]
+        assert values == sorted(values)
+    assert len({s.iterations for s in fine}) == len(fine)
+    between, low, high = (work_in(m) for m in (2.0, 1.0, 4.0))
+    assert between.steps == pytest.approx((low.steps * high.steps) ** 0.5)
+    assert (fine[-1].voxels, fine[-1].rays) == (fine[-3].voxels, fine[-3].rays)  # memory stays
+
+
+def test_what_preset_and_minutes_choose():
+    photos, run = Path("photos"), Path("run")
+    draft = preset("draft", photos, run, "sg")
+    assert chosen("draft", None, photos, run, "sg") == draft
+    assert chosen("draft", 7.0, photos, run, "sg") == replace(draft, minutes=7.0)  # a limit
+    assert chosen("auto", 7.0, photos, run, "sg") == budget(7.0, photos, run, "sg")
+    assert chosen("auto", None, photos, run) == preset("fast", photos, run)
+
+
+@pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan"), float("inf")])
+def test_no_time_to_work_in(minutes):
+    with pytest.raises(ValueError, match=f"minutes must be above 0, got {minutes:g}"):
+        budget(minutes, Path("photos"), Path("run"))
 
 
 @pytest.mark.parametrize("light", ["sg", "sh", "mlp", "envmap-sg", "envmap"])
@@ -89,6 +135,7 @@ def test_the_file_holds_every_field(tmp_path):
         (JointConfig(), {"lr_map": 0.0}, "lr_map must be above 0, got 0.0"),
         (JointConfig(), {"newton_steps": -1}, "newton_steps must be at least 0, got -1"),
         (JointConfig(), {"newton_views": 1}, "newton_views must be at least 2, got 1"),
+        (CONFIG, {"patience": -0.1}, "patience must be at least 0, got -0.1"),
         (CONFIG, {"minutes": 0.0}, "minutes must be above 0, got 0.0"),
         (SceneConfig(), {"channels": 0}, "channels must be at least 1, got 0"),
         (SceneConfig(), {"hidden": 0}, "hidden must be at least 1, got 0"),

@@ -18,9 +18,13 @@ LAYERS = [
     {"data", "fields", "lights", "optim"},
     {"scene"},
     {"assets", "distributed", "losses", "metrics", "render"},
-    {"config"},
+    {"config", "overrides"},
     {"tasks"},
     {"tasks.demo"},
+    {"experiments.plots", "experiments.record"},
+    {"experiments.worker"},
+    {"experiments.runner"},
+    {"experiments"},
     {"cli"},
 ]
 HELPERS = {
@@ -30,7 +34,10 @@ HELPERS = {
     "data": {"base", "images", "radiance"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
-    "tasks": {"animation", "contact_sheet", "envmap", "frames", "joint", "layers", "progress"},
+    "tasks": {
+        *("animation", "contact_sheet", "envmap", "equations", "frames", "joint", "layers"),
+        *("plateau", "progress", "timelapse"),
+    },
 }
 # Extras: imported inside the function that needs one
 OPTIONAL = {"imageio_ffmpeg", "matplotlib", "trimesh", "viser"}

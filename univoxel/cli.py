@@ -5,15 +5,13 @@ Tasks are imported by the command that runs them: `univoxel --help` does not wai
 
 from __future__ import annotations
 
-import ast
 import contextlib
-import dataclasses
 import functools
 import io
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
@@ -21,48 +19,60 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from univoxel import __version__
 
 Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
+Scenes: TypeAlias = Annotated[Positional[tuple[Path, ...]], arg(metavar="SCENE [SCENE ...]")]
+Changes: TypeAlias = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    arg(metavar="FIELD=VALUE", help_behavior_hint="(repeatable)"),
+]
+LightOf: TypeAlias = Annotated[
+    str | None, arg(metavar="VIEW", help_behavior_hint="(default: the mean of all)")
+]
 
 
 def train(
     data: Annotated[Positional[Path], arg(metavar="DATA")],
     /,
     out: Annotated[Path, arg(metavar="RUN")],
-    preset: Literal["draft", "fast", "full"] = "fast",
+    preset: Literal["auto", "draft", "fast", "full"] = "auto",
     light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
+    varying: Literal["none", "exposure", "light"] = "none",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
     resume: bool = False,
-    set: Annotated[
-        UseAppendAction[tuple[str, ...]],
-        arg(metavar="FIELD=VALUE", help_behavior_hint="(repeatable)"),
-    ] = (),
+    timelapse: Annotated[
+        str | None, arg(metavar="FILE.gif|FILE.mp4|DIR/", help_behavior_hint="(default: none)")
+    ] = None,
+    set: Changes = (),
 ) -> None:
     """Recover geometry, materials and light from posed photographs.
 
     Args:
         data: folder of the photographs and their cameras
         out: folder that the run is written to
-        preset: how much work goes in: draft is a look, fast the usual, full the best
+        preset: how much work goes in: draft is a look, 1 minute on two cores, fast the usual, 4,
+            full the best, 12; auto is what fits into --minutes, or else fast
         light: sg, local lobes as published; hybrid, then one environment map with traced
             visibility, which cleans shadows from the albedo; others to compare with: sh and mlp,
             local too, envmap-sg and envmap, one map from the beginning
+        varying: what differs from photograph to photograph: exposure, with the colour balance, or
+            the light itself too
         minutes: wall-clock limit, above 0; training ends in time with what it has
         resume: go on with the run in --out
+        timelapse: picture of a test view over training time, or a folder of its frames; making
+            them does not count as training
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
             stages.1.voxels=3; config.json in a run's folder holds them all
     """
-    from univoxel.config import preset as preset_config
+    from univoxel.config import chosen
+    from univoxel.overrides import changed
     from univoxel.tasks import train as task
 
-    if minutes is not None and not minutes > 0:
-        raise ValueError(f"--minutes must be above 0, got {minutes:g}")
+    _check_minutes(minutes)
     if not resume and (out / "scene.safetensors").exists():
         raise FileExistsError(f"{out} holds a run already: add --resume, or choose another --out")
-    config = preset_config(preset, data=data, out=out, light=light)
-    if minutes is not None:
-        config = dataclasses.replace(config, minutes=minutes)
-    print(task.train(_changed(config, set), resume=resume))
+    config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
+    print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
 
 
 def evaluate(
@@ -79,6 +89,7 @@ def evaluate(
     ] = None,
     samples: int = 64,
     bounces: int = 2,
+    light_of: LightOf = None,
 ) -> None:
     """Measure a run on the test views and print the table.
 
@@ -89,10 +100,13 @@ def evaluate(
         json: file for the measures
         samples: of the light, per pixel of relit pictures
         bounces: reflections between parts of the object in relit pictures, 0 for none
+        light_of: training view, by name or number, in whose light novel views are rendered, where
+            the run was trained with --varying
     """
     from univoxel.tasks import evaluate as task
 
-    task.evaluate(run, data=data, save=save, json=json, samples=samples, bounces=bounces)
+    options = {"samples": samples, "bounces": bounces, "light_of": light_of}
+    task.evaluate(run, data=data, save=save, json=json, **options)
 
 
 def relight(
@@ -214,6 +228,7 @@ def envmap(
     /,
     out: Annotated[Path, arg(metavar="FILE.exr")],
     height: Annotated[int, arg(metavar="ROWS")] = 128,
+    light_of: LightOf = None,
 ) -> None:
     """Write the light that the photographs were taken in, as an environment map.
 
@@ -222,10 +237,12 @@ def envmap(
         out: the map, linear radiance; a picture of it goes beside, with the true map if the data
             set has it
         height: rows of the map; it is twice as wide
+        light_of: training view, by name or number, whose map it is, where the run was trained with
+            --varying
     """
     from univoxel.tasks import envmap as task
 
-    found = task.envmap(run, out, height=height)
+    found = task.envmap(run, out, height=height, light_of=light_of)
     print(out)
     if found:
         print(f"grey ball under it: PSNR {found.ball_psnr:.1f} dB, a scale per channel")
@@ -241,6 +258,7 @@ def inspect(
         Path | None,
         arg(metavar="FILE.png", help_behavior_hint="(default: in RUN/inspect)"),
     ] = None,
+    light_of: LightOf = None,
 ) -> None:
     """Draw the light that falls on one point of the surface, beside the truth where it is known.
 
@@ -249,10 +267,86 @@ def inspect(
         view: name or number of a test view
         pixel: whose surface point; 0,0 is the top left
         out: the picture; an .exr file with the layers goes beside
+        light_of: training view, by name or number, whose light it is, where the run was trained
+            with --varying
     """
     from univoxel.tasks import inspect as task
 
-    print(task.inspect(run, view, task.parse_pixel(pixel), out))
+    print(task.inspect(run, view, task.parse_pixel(pixel), out, light_of=light_of))
+
+
+def compare(
+    scenes: Scenes,
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    preset: Literal["auto", "draft", "fast", "full"] = "auto",
+    light: Annotated[tuple[str, ...], arg(metavar="LIGHT [LIGHT ...]")] = (
+        *("hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"),
+    ),
+    minutes: Annotated[
+        float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
+    ] = None,
+    samples: int = 64,
+    set: Changes = (),
+) -> None:
+    """Train scenes with every model of light and put their measures side by side.
+
+    Writes DIR/compare.md, compare.json, compare.png and compare.svg. Every training is kept in
+    DIR/SCENE/LIGHT with all its measures (result.json); the same command again goes on after an
+    interruption and tries again what failed. Trainings run one after another, each in a process of
+    its own: leave the machine to them, or their times say little.
+
+    Args:
+        scenes: folders of photographs
+        out: folder for the results
+        preset: how much work goes into each training, as of train
+        light: models of light, as of train --light; sg:lobes=12 changes a field of the light's
+            configuration, sg:lobes=12,hidden=32 two
+        minutes: wall-clock limit of each training, above 0
+        samples: of the light, per pixel of relit pictures
+        set: one field of the configuration of all trainings, as of train
+    """
+    from univoxel.experiments import compare as experiment
+
+    _check_minutes(minutes)
+    print(experiment.compare(scenes, out, preset, light, minutes, set, samples))
+
+
+def chart(
+    scenes: Scenes,
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    preset: Literal["draft", "fast", "full"] = "fast",
+    light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
+    quick: bool = False,
+    only: Annotated[
+        tuple[str, ...], arg(metavar="SETTING [SETTING ...]", help_behavior_hint="(default: all)")
+    ] = (),
+    samples: int = 64,
+    set: Changes = (),
+) -> None:
+    """Draw quality against training time: presets, and single knobs around one of them.
+
+    Trains draft, fast, full, and --preset with one knob turned: voxels-x0.5 (half the voxels of the
+    finest grid), voxels-x2, rays-x0.5 (half the rays of a step), rays-x2, steps-, directions- and
+    lobes- alike, light-sg and so on. Writes DIR/chart.png, chart.svg and chart.json with every
+    measure, the log of each training, and the Pareto front of each measure: settings that no other
+    beats in both time and quality. Published figures, of other data and of GPUs, are marked.
+    Trainings are kept, and gone on with, as of compare.
+
+    Args:
+        scenes: folders of photographs
+        out: folder for the results
+        preset: what the knobs are turned around
+        light: of the presets and the knobs
+        quick: five settings instead of all
+        only: names of settings
+        samples: of the light, per pixel of relit pictures
+        set: one field of the configuration of all trainings, as of train
+    """
+    from univoxel.experiments import chart as experiment
+
+    print(experiment.chart(scenes, out, preset, light, quick, only, set, samples))
 
 
 def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> None:
@@ -273,6 +367,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "export": export,
     "envmap": envmap,
     "inspect": inspect,
+    "compare": compare,
+    "chart": chart,
     "demo": demo,
 }
 
@@ -332,6 +428,11 @@ def _deferred(command: Callable[..., None]) -> Callable[..., functools.partial[N
     return prepare
 
 
+def _check_minutes(minutes: float | None) -> None:
+    if minutes is not None and not minutes > 0:
+        raise ValueError(f"--minutes must be above 0, got {minutes:g}")
+
+
 def _gist(box: str) -> str:
     """The message alone, on one line, of the box that tyro draws around an error.
 
@@ -347,61 +448,13 @@ def _gist(box: str) -> str:
 def _kept(call: functools.partial[None]) -> str:
     """What an interrupted command left behind."""
     out = call.keywords.get("out")
+    if call.func in (compare, chart):
+        return f"; {out} keeps the trainings that are done: the same command goes on"
     if call.func is not train or not isinstance(out, Path):
         return ""
     if (out / "scene.safetensors").exists():
         return f"; {out} keeps the last saved state: go on with --resume"
     return f"; nothing was saved in {out} yet"
-
-
-def _changed(config: Any, changes: Iterable[str]) -> Any:
-    """A frozen config with fields replaced: changes are "field.field=value".
-
-    Raises:
-        ValueError: no such field, or a value of another type than the field has.
-    """
-    for change in changes:
-        path, equals, text = change.partition("=")
-        if not equals:
-            raise ValueError(f"--set {change}: expected FIELD=VALUE")
-        try:
-            config = _replaced(config, path.split("."), text)
-        except ValueError as error:
-            raise ValueError(f"--set {change}: {error}") from None
-    return config
-
-
-def _replaced(node: Any, path: list[str], text: str) -> Any:
-    """A config, or a tuple of configs, in which the value at the path is what the text says."""
-    if not path:
-        return _value(node, text)
-    name, *rest = path
-    known = [str(i) for i in range(len(node))] if isinstance(node, tuple) else _fields(node)
-    if name not in known:
-        raise ValueError(f"no field {name!r}, there are: {', '.join(known) or 'none'}")
-    if isinstance(node, tuple):
-        i = int(name)
-        return (*node[:i], _replaced(node[i], rest, text), *node[i + 1 :])
-    return dataclasses.replace(node, **{name: _replaced(getattr(node, name), rest, text)})
-
-
-def _fields(node) -> list[str]:
-    return [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
-
-
-def _value(old, text: str):
-    """The text as a value of the same type as the old one."""
-    if isinstance(old, Path):
-        return Path(text)
-    try:
-        new = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        new = text
-    if isinstance(old, float) and type(new) is int:
-        new = float(new)
-    if type(new) is not type(old):
-        raise ValueError(f"expected a {type(old).__name__} such as {old!r}, got {text!r}")
-    return new
 
 
 if __name__ == "__main__":

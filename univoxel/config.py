@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 from univoxel.data.images import replacing
 from univoxel.lights import (
@@ -19,9 +19,10 @@ from univoxel.lights import (
     SGConfig,
     SHConfig,
 )
-from univoxel.scene import SceneConfig
+from univoxel.scene import SceneConfig, Varying
 
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
+LIGHTS: tuple[LightName, ...] = get_args(LightName)
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,8 @@ class TrainConfig:
     stages: tuple[StageConfig | JointConfig, ...]
     minutes: float  # > 0; training ends in time, with what it has
     seed: int = 0
+    # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
+    patience: float = 0.0
     scene: SceneConfig = field(default_factory=SceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
 
@@ -133,6 +136,7 @@ class TrainConfig:
                 "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
             )
         _check(self, "above 0", lambda x: x > 0, "minutes")
+        _check(self, "at least 0", lambda x: 0 <= x < math.inf, "patience")
 
 
 def _check(config: object, wanted: str, holds: Callable[[Any], bool], *names: str) -> None:
@@ -172,32 +176,107 @@ def check_same(cfg: TrainConfig) -> None:
     for name in ("stages", "scene"):
         if not isinstance(before, dict) or before.get(name) != now[name]:
             raise ValueError(
-                f"{path}: the run began with other {name}: resume with the same --preset, --light "
-                "and --set as then"
+                f"{path}: the run began with other {name}: resume with the same --preset, "
+                "--minutes, --light and --set as then"
             )
 
 
-def preset(name: str, data: Path, out: Path, light: LightName = "hybrid") -> TrainConfig:
+@dataclass(frozen=True)
+class Work:
+    """What a budget of time on two cores goes into."""
+
+    minutes: float
+    voxels: float  # millions, of the finest grid
+    steps: float  # of the fine stage; the others follow
+    rays: float  # per step
+
+
+PRESETS = {
+    "draft": Work(1.0, voxels=1.0, steps=400, rays=1024),
+    "fast": Work(4.0, voxels=2.0, steps=1200, rays=2048),
+    "full": Work(12.0, voxels=4.0, steps=2500, rays=2048),
+}
+
+
+def preset(
+    name: str, data: Path, out: Path, light: LightName = "hybrid", varying: Varying = "none"
+) -> TrainConfig:
     """The configuration of a preset: draft (1 minute), fast (4) or full (12) on two cores.
 
     Args:
+        light, varying: see `budget`.
+
+    Raises:
+        ValueError: an unknown name, or varying light with a map from the beginning.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"preset must be draft, fast or full, got {name!r}")
+    return _configuration(PRESETS[name], data, out, light, varying)
+
+
+def budget(
+    minutes: float, data: Path, out: Path, light: LightName = "hybrid", varying: Varying = "none"
+) -> TrainConfig:
+    """The configuration for any time, in minutes on two cores: the presets and what lies between.
+
+    Args:
+        minutes: above 0.
         light: "sg", local lobes as published; "hybrid", local lobes while geometry forms, then one
             environment map with traced visibility for the materials, then lobes that follow them;
             "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
             traced visibility from the beginning. docs/lights.md tells them apart.
+        varying: what differs from photograph to photograph: "none"; "exposure", a gain per channel;
+            "light", the light itself too.
 
     Raises:
-        ValueError: an unknown name.
+        ValueError: minutes out of range, no such light, or varying light with a map from the
+            beginning.
     """
-    match name:
-        case "draft":
-            minutes, voxels, steps, rays = 1.0, 1.0, 400, 1024
-        case "fast":
-            minutes, voxels, steps, rays = 4.0, 2.0, 1200, 2048
-        case "full":
-            minutes, voxels, steps, rays = 12.0, 4.0, 2500, 2048
-        case _:
-            raise ValueError(f"preset must be draft, fast or full, got {name!r}")
+    if not 0 < minutes < math.inf:
+        raise ValueError(f"minutes must be above 0, got {minutes:g}")
+    return _configuration(work_in(minutes), data, out, light, varying)
+
+
+def chosen(
+    name: str,
+    minutes: float | None,
+    data: Path,
+    out: Path,
+    light: LightName = "hybrid",
+    varying: Varying = "none",
+) -> TrainConfig:
+    """A preset within a limit of minutes; or for the name auto, the work that fits into them.
+
+    Without minutes: the preset as it is, fast for auto.
+    """
+    if name == "auto" and minutes is not None:
+        return budget(minutes, data, out, light, varying)
+    config = preset("fast" if name == "auto" else name, data, out, light, varying)
+    return config if minutes is None else replace(config, minutes=minutes)
+
+
+def work_in(minutes: float) -> Work:
+    """Work on the geometric line between the presets on either side of a time.
+
+    Before draft and beyond full the nearest two lead on, except that the grid stays as fine and the
+    batch as large as in full: more would want more memory.
+    """
+    known = list(PRESETS.values())
+    k = max(i for i, w in enumerate(known[:-1]) if i == 0 or w.minutes <= minutes)
+    low, high = known[k], known[k + 1]
+    x = math.log(minutes / low.minutes) / math.log(high.minutes / low.minutes)
+    voxels, steps, rays = (
+        getattr(low, name) * (getattr(high, name) / getattr(low, name)) ** x
+        for name in ("voxels", "steps", "rays")
+    )
+    return Work(minutes, min(voxels, known[-1].voxels), steps, min(rays, known[-1].rays))
+
+
+def _configuration(
+    work: Work, data: Path, out: Path, light: LightName, varying: Varying
+) -> TrainConfig:
+    minutes, voxels = work.minutes, round(work.voxels, 3)
+    steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
     coarse = StageConfig(0.9, steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35))
     fine = StageConfig(
         voxels=voxels,
@@ -228,10 +307,13 @@ def preset(name: str, data: Path, out: Path, light: LightName = "hybrid") -> Tra
                 physical_from=0.0,
                 refit=True,
             )
-            return TrainConfig(data, out, (coarse, fine, joint, refit), minutes)
+            scene = SceneConfig(varying=varying)
+            return TrainConfig(data, out, (coarse, fine, joint, refit), minutes, scene=scene)
         case _ if light in alone:
-            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light])
-            return TrainConfig(data, out, (coarse, fine), minutes, scene=scene)
+            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=varying)
+            # Lobes that light the materials to the end: what leaves least shading in the albedo
+            loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
+            return TrainConfig(data, out, (coarse, fine), minutes, scene=scene, loss=loss)
         case _:
             names = ", ".join(("hybrid", *alone))
             raise ValueError(f"light must be one of {names}, got {light!r}")

@@ -6,11 +6,12 @@ import json
 import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import nn
+from torch import Tensor, nn
 
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
@@ -19,6 +20,9 @@ from univoxel.lights import (
     EnvmapLight,
     EnvmapSGLight,
     LightConfig,
+    LocalMLP,
+    LocalSG,
+    LocalSH,
     MLPLightConfig,
     SGConfig,
     SHConfig,
@@ -27,12 +31,15 @@ from univoxel.lights import (
 )
 from univoxel.lights.distant import DistantLight
 from univoxel.lights.mirrored import MirroredLight
+from univoxel.lights.views import ViewLights
 from univoxel.ops import VisibilityScene
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
 FILE = "scene.safetensors"
 SHELL = 4.0  # voxels around the surface, beyond which a finished scene needs no features
 HALF_MAX = 65504.0
+
+Varying: TypeAlias = Literal["none", "exposure", "light"]
 
 
 @dataclass(frozen=True)
@@ -45,9 +52,12 @@ class SceneConfig:
     sky_nodes: int = 512  # directions of the environment map, >= 0; 0: the scene has none
     mirrored: bool = True  # whether a local light gets a network for what is mirrored sharply
     light: LightConfig = field(default_factory=SGConfig)
+    varying: Varying = "none"  # what differs from photograph to photograph, see ViewLights
+    codes: int = 8  # numbers that tell the light of a view, where that varies, >= 1
+    views: tuple[str, ...] = ()  # names of the photographs, which training fills in where it varies
 
     def __post_init__(self):
-        for name in ("channels", "material_channels", "hidden"):
+        for name in ("channels", "material_channels", "hidden", "codes"):
             if getattr(self, name) < 1:
                 raise ValueError(
                     f"SceneConfig: {name} must be at least 1, got {getattr(self, name)}"
@@ -56,6 +66,17 @@ class SceneConfig:
             raise ValueError(
                 f"SceneConfig: material_channels must be at most channels ({self.channels}), "
                 f"got {self.material_channels}"
+            )
+        if self.varying not in ("none", "exposure", "light"):
+            raise ValueError(
+                f"SceneConfig: varying must be none, exposure or light, got {self.varying!r}"
+            )
+        if self.varying == "light" and not isinstance(
+            self.light, SGConfig | SHConfig | MLPLightConfig
+        ):
+            raise ValueError(
+                "SceneConfig: varying light needs hybrid or a local light, sg, sh or mlp, got "
+                f"{self.light.kind}; varying exposure goes with every light"
             )
 
 
@@ -68,13 +89,54 @@ class Scene(nn.Module):
         self.inv_s = inv_s  # sharpness of the NeuS density, 1 / world units
         self.field = field
         self.material = MaterialHead(cfg.material_channels, cfg.hidden)
-        self.radiance = RadianceHead(cfg.channels, cfg.hidden)
-        self.light = build(cfg.channels, cfg.light)
+        codes = cfg.codes if cfg.varying == "light" else 0
+        inputs = cfg.channels + codes  # of what draws photographs: features and the view's code
+        self.radiance = RadianceHead(inputs, cfg.hidden)
+        self.light = build(inputs, cfg.light)
         self.sky = DistantLight(cfg.sky_nodes) if cfg.sky_nodes else None
         self.mirrored = None
         if cfg.mirrored and isinstance(cfg.light, SGConfig | SHConfig | MLPLightConfig):
-            self.mirrored = MirroredLight(cfg.channels, cfg.hidden, cfg.light.scale)
+            self.mirrored = MirroredLight(inputs, cfg.hidden, cfg.light.scale)
+        self.views = None
+        if cfg.varying != "none":
+            directions = self.sky.direction if codes and self.sky else None
+            self.views = ViewLights(cfg.views, codes, directions)
+        if codes:  # at first they change nothing
+            assert isinstance(self.light, LocalSG | LocalSH | LocalMLP)
+            nets = [self.radiance.net, self.light.head]
+            nets += [self.mirrored.net] if self.mirrored else []
+            for net in nets:
+                net.linear[0].weight.data[:, cfg.channels : inputs] = 0
         self._occluder: VisibilityScene | None = None
+
+    def coded(self, features: Tensor, view: Tensor | int | None = None) -> Tensor:
+        """Features [N, C] as the networks of light read them: [N, C + Z], with the view's code.
+
+        Args:
+            view: [N] int64 number of a photograph, or one for all; None: the light that is shown.
+        """
+        code = None if self.views is None else self.views.code(view)
+        if code is None:
+            return features
+        return torch.cat([features, code.expand(len(features), -1)], 1)
+
+    def exposed(self, radiance: Tensor, view: Tensor | int | None = None) -> Tensor:
+        """Linear radiance [N, 3] with the gain of photographs; view as in `coded`."""
+        return radiance if self.views is None else radiance * self.views.gain(view)
+
+    def show_light_of(self, view: str | None) -> None:
+        """Choose the photograph, by name or number, whose light is shown; None: the mean of all.
+
+        Raises:
+            ValueError: no such photograph, or the scene has one light for all.
+        """
+        if self.views is not None:
+            self.views.choose(view)
+        elif view is not None:
+            raise ValueError(
+                f"--light-of: all views of this run have one light, got {view!r}; it was trained "
+                "without --varying"
+            )
 
     def occluder(self) -> VisibilityScene:
         """The surface, ready for rays: as it was when first asked for since `surface_moved`.
@@ -91,10 +153,13 @@ class Scene(nn.Module):
         self._occluder = None
 
     def environment(self) -> DistantLight | EnvmapLight | EnvmapSGLight | None:
-        """The one distant map that the scene stood in, where it has one."""
+        """The one distant map that the scene stood in, where it has one; without gains."""
         if isinstance(self.light, EnvmapLight | EnvmapSGLight):
             return self.light
-        return self.sky
+        change = self.views.sky_change() if self.views else None
+        if self.sky is None or self.views is None or self.views.chosen is None or change is None:
+            return self.sky
+        return self.sky.changed(change[self.views.chosen])
 
 
 def save_scene(scene: Scene, run: Path, state: dict, slim: bool = False) -> Path:
@@ -162,7 +227,8 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
         )
     try:
         light = read_config(meta["scene"].pop("light"))
-        cfg = SceneConfig(**meta["scene"], light=light)
+        views = tuple(meta["scene"].pop("views", ()))
+        cfg = SceneConfig(**meta["scene"], light=light, views=views)
         grid = GridShape(
             tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
         )

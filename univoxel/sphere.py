@@ -1,4 +1,4 @@
-"""Directions: point sets on the sphere, frames around a normal, the lat-long mapping."""
+"""Directions: point sets on the sphere, frames around a normal, the lat-long mapping, harmonics."""
 
 from __future__ import annotations
 
@@ -126,3 +126,35 @@ def texel_solid_angles(height: int, width: int) -> Tensor:
     """[H, W] steradians of the texels of a lat-long map, exact; they sum to 4 pi."""
     edge = torch.sin(math.pi * (0.5 - torch.arange(height + 1, dtype=torch.float64) / height))
     return (-(edge.diff()) * (2 * math.pi / width)).float()[:, None].expand(height, width)
+
+
+def real_harmonics(order: int, direction: Tensor) -> Tensor:
+    """Orthonormal real spherical harmonics Y_lm of degrees l up to `order`.
+
+        Y_lm = N_lm Q_lm(z) Re (x + i y)^m,   m > 0;    Im (x + i y)^|m|, m < 0
+        Q_l^m(z) = P_l^m(z) / (1 - z^2)^(m / 2), a polynomial; no Condon-Shortley phase
+
+    Polynomials in x, y and z throughout: smooth at the poles too.
+
+    Args:
+        direction: [..., 3] unit.
+
+    Returns:
+        [..., (order + 1)^2], Y_lm at l^2 + l + m.
+    """
+    x, y, z = direction.unbind(-1)
+    real, imaginary = torch.ones_like(x), torch.zeros_like(x)  # of (x + i y)^m
+    diagonal = 1.0  # Q_mm = (2 m - 1)!!
+    found: dict[tuple[int, int], Tensor] = {}
+    for m in range(order + 1):
+        before, now = torch.zeros_like(z), torch.full_like(z, diagonal)  # Q_{l-1}^m and Q_l^m
+        for degree in range(m, order + 1):
+            square = (2 * degree + 1) / (4 * math.pi)
+            square *= math.factorial(degree - m) / math.factorial(degree + m)
+            value = math.sqrt(square * (2 if m else 1)) * now
+            found[degree, m], found[degree, -m] = value * real, value * (imaginary if m else real)
+            above = (2 * degree + 1) * z * now - (degree + m) * before
+            before, now = now, above / (degree + 1 - m)
+        diagonal *= 2 * m + 1
+        real, imaginary = x * real - y * imaginary, x * imaginary + y * real
+    return torch.stack([found[k] for k in sorted(found)], -1)

@@ -150,7 +150,8 @@ def test_what_lies_behind_the_camera_hides_nothing(sphere, photos):
 def test_mean_colors():
     color = torch.tensor([[0.2, 0.4, 0.6], [0.4, 0.4, 0.0], [1.0, 2.0, 3.0]])
     nothing = torch.zeros(3, 3)
-    seen = Observations(nothing, nothing, torch.tensor([0, 2, 2, 3]), nothing, color)
+    view = torch.zeros(3, dtype=torch.int64)
+    seen = Observations(nothing, nothing, torch.tensor([0, 2, 2, 3]), nothing, color, view)
     expected = torch.tensor([[0.3, 0.4, 0.3], [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
     assert torch.allclose(mean_colors(seen), expected)
 
@@ -219,7 +220,7 @@ SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 def points(position: torch.Tensor, normal: torch.Tensor) -> Observations:
     nothing = torch.zeros(0, 3)
     offsets = torch.zeros(len(position) + 1, dtype=torch.int64)
-    return Observations(position, normal, offsets, nothing, nothing)
+    return Observations(position, normal, offsets, nothing, nothing, offsets[:0])
 
 
 def views_of(seen: Observations, cameras) -> tuple[torch.Tensor, torch.Tensor]:

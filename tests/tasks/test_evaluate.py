@@ -78,6 +78,7 @@ def folders(tmp_path):
 def relit_calls(monkeypatch):
     """Stand-ins for the renderer. Light is 1 from everywhere, so radiance is the true albedo."""
     scene = nn.Linear(3, 2)
+    scene.show_light_of = lambda view: None
     scene.field = nn.Identity()
     scene.field.voxel_size = 0.125
     calls = []

@@ -3,69 +3,33 @@
 import dataclasses
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-from analytic import RADIUS, cameras_around, sphere_normals, sphere_scene, write_scene
+from analytic import photos_of, scene_of, sphere_scene, write_scene
+from sightings import (
+    BLUE,
+    RED,
+    Steps,
+    facing,
+    lamps,
+    photographed,
+    photographs_under,
+    problem_on_a_sphere,
+    random_problem,
+)
 from torch.nn.functional import normalize
 
 from univoxel import brdf, losses
-from univoxel.color import linear_to_srgb
 from univoxel.config import JointConfig, StageConfig, TrainConfig
-from univoxel.data import Photos
 from univoxel.lights.sg import SGConfig
 from univoxel.ops import shade_map
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import extract_mesh
-from univoxel.render.transport import Observations, Transport
 from univoxel.scene import SceneConfig
 from univoxel.sphere import fibonacci_sphere
-from univoxel.tasks import joint
+from univoxel.tasks import equations, joint
 from univoxel.tasks import train as train_task
-
-
-def facing(normal: torch.Tensor, least: float) -> torch.Tensor:
-    """Random unit directions [N, 3] at a cosine of at least about `least` to the normals."""
-    wo = normalize(torch.randn_like(normal), dim=1)
-    wo = wo * (wo * normal).sum(1, keepdim=True).sign()
-    return normalize(wo + least * normal, dim=1)
-
-
-def problem_on_a_sphere(points: int, views: int, nodes: int) -> joint.Problem:
-    """Points that see everything above their horizon, and black photographs of them."""
-    normal = normalize(torch.randn(points, 3), dim=1)
-    wo = facing(normal.repeat_interleave(views, 0), 0.3)
-    offsets = torch.arange(points + 1) * views
-    black = torch.zeros(points * views, 3)
-    seen = Observations(RADIUS * normal, normal, offsets, wo, black)
-    open_share = torch.full((points, nodes), 255, dtype=torch.uint8)
-    indirect = torch.zeros(points, nodes, 3, dtype=torch.float16)
-    transport = Transport(fibonacci_sphere(nodes), open_share, indirect)
-    no_metal = torch.zeros(points, dtype=torch.bool)
-    return joint.Problem(seen, transport, black, no_metal, 0.05)
-
-
-def photographed(problem: joint.Problem, map, albedo, roughness, f0=None) -> joint.Problem:
-    """The same with the sightings that a map [D, 3] and materials [P, 3], [P] make."""
-    point = torch.repeat_interleave(problem.seen.offsets.diff())
-    t, seen = problem.transport, problem.seen
-    color = shade_map(
-        map, t.open, t.indirect, point, seen.normal[point], seen.wo, albedo[point],
-        roughness[point], t.direction, problem.solid_angle, brdf.F0 if f0 is None else f0[point],
-    )  # fmt: skip
-    seen = replace(seen, color=color)
-    return replace(problem, seen=seen, target=losses.encode(color))
-
-
-def random_problem(points: int = 5, views: int = 4, nodes: int = 12) -> joint.Problem:
-    """With half-open directions and light from what blocks them."""
-    torch.manual_seed(1)
-    problem = problem_on_a_sphere(points, views, nodes)
-    open_share = torch.randint(0, 256, (points, nodes), dtype=torch.uint8)
-    indirect = torch.rand(points, nodes, 3).half()
-    transport = Transport(problem.transport.direction, open_share, indirect)
-    return replace(problem, transport=transport)
 
 
 @pytest.fixture
@@ -79,7 +43,8 @@ def rows_and_map():
     problem = replace(problem, target=target)
     sighting = torch.arange(20).view(5, 4)
     rows = joint.light_rows(problem, torch.arange(5), sighting, torch.full((5,), 0.3))
-    rows = joint.Rows(**{f.name: getattr(rows, f.name).double() for f in dataclasses.fields(rows)})
+    values = {f.name: getattr(rows, f.name) for f in dataclasses.fields(rows)}
+    rows = equations.Rows(**{k: v.double() if k != "view" else v for k, v in values.items()})
     map = map * torch.linspace(1.6, 0.9, 12)[:, None]
     return rows, map.double(), albedo.log().double()
 
@@ -95,22 +60,22 @@ def test_rows_draw_what_the_shading_draws():
     assert torch.equal(rows.target, problem.target[which])
 
 
-def drawn_by(rows: joint.Rows, map: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
+def drawn_by(rows: equations.Rows, map: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
     sky = rows.through[..., None] * (rows.diffuse @ map)[:, None]
     return albedo[:, None] * (sky + rows.diffuse_blocked) + rows.shine @ map + rows.shine_blocked
 
 
-def weights(rows: joint.Rows, map: torch.Tensor, log_albedo: torch.Tensor) -> torch.Tensor:
+def weights(rows: equations.Rows, map: torch.Tensor, log_albedo: torch.Tensor) -> torch.Tensor:
     residual = rows.target - losses.encode(drawn_by(rows, map, log_albedo.exp()))
-    weight = 1 / (1 + (residual / joint.CAUCHY) ** 2)
-    return torch.where((rows.target > joint.CLIPPED) & (residual < 0), 0.0, weight)
+    weight = 1 / (1 + (residual / equations.CAUCHY) ** 2)
+    return torch.where((rows.target > equations.CLIPPED) & (residual < 0), 0.0, weight)
 
 
 def test_equations_are_the_schur_complement_of_the_dense_system(rows_and_map):
     rows, map, log_albedo = rows_and_map
     weight = weights(rows, map, log_albedo)
     assert 0 < int((weight == 0).sum()) < weight.numel() / 2  # clipped sightings are among them
-    block = joint.normal_equations(rows, map, log_albedo)
+    block = equations.normal_equations(rows, map, log_albedo)
     cost = 0.0
     for c in range(3):
 
@@ -160,7 +125,7 @@ def test_the_gradient_is_that_of_the_cost_at_fixed_weights(rows_and_map):
         return (weight * residual**2).sum()
 
     x, a = map.log(), log_albedo
-    block = joint.normal_equations(rows, map, log_albedo)
+    block = equations.normal_equations(rows, map, log_albedo)
     h = 1e-5
     for node, c in ((0, 0), (5, 1), (11, 2)):
         step = torch.zeros_like(x)
@@ -179,8 +144,8 @@ def test_slope_is_the_derivative_of_the_curve():
     x = torch.tensor([0.0, 0.001, 0.00313, 0.0032, 0.1, 0.9, 3.0], dtype=torch.float64)
     x.requires_grad_()
     (slope,) = torch.autograd.grad(losses.encode(x[1:]).sum(), x)
-    assert torch.allclose(joint.encoded_slope(x.detach())[1:], slope[1:], rtol=1e-6)
-    assert joint.encoded_slope(x.detach())[0] == 12.92
+    assert torch.allclose(equations.encoded_slope(x.detach())[1:], slope[1:], rtol=1e-6)
+    assert equations.encoded_slope(x.detach())[0] == 12.92
 
 
 def test_widened_lobes_cover_the_gap_between_nodes():
@@ -200,7 +165,7 @@ def test_widened_lobes_cover_the_gap_between_nodes():
 
 def test_laplacian():
     direction = fibonacci_sphere(200)
-    matrix = joint.graph_laplacian(direction)
+    matrix = equations.graph_laplacian(direction)
     assert (matrix.sum(1) == 0).all()
     assert torch.equal(matrix, matrix.T)
     assert (matrix.diagonal() >= 6).all()
@@ -228,18 +193,6 @@ def test_draw_takes_points_that_are_seen_and_their_own_sightings():
     assert set(sighting.tolist()) == set(range(9))  # each is drawn at times
 
 
-def scene_of(albedo, roughness: float, nodes: int):
-    """The sphere with one material everywhere, under a grey map."""
-    scene = sphere_scene(nodes)
-    last = scene.material.net[-1]
-    low = scene.material.min_roughness
-    wanted = torch.tensor([*albedo, (roughness - low) / (1 - low), 0.0])
-    with torch.no_grad():
-        last.weight.zero_()
-        last.bias.copy_(torch.logit(wanted, eps=1e-6))
-    return scene
-
-
 CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
 
 
@@ -258,6 +211,35 @@ def test_newton_recovers_a_known_map():
     assert costs[-1] < 1e-3 * costs[0]
     # What is left is the smoothness, which this uneven map has none of
     assert error.abs().mean() < 0.25 * true.log().abs().mean()
+
+
+def test_newton_in_no_time_takes_few_points(monkeypatch):
+    scene, counts = scene_of((0.5, 0.4, 0.3), 0.4, 32), []
+    problem = problem_on_a_sphere(100, 12, 32)
+    equations = joint.normal_equations
+
+    def counted(rows, *arguments):
+        counts.append(len(rows.diffuse))
+        return equations(rows, *arguments)
+
+    monkeypatch.setattr(joint, "normal_equations", counted)
+    monkeypatch.setattr(joint, "NEWTON_CHUNK", 20)
+    cfg = replace(CFG, newton_steps=2)
+    joint.newton_round(scene, problem, cfg, seconds=0.0)
+    assert counts == [20] * (1 + cfg.newton_steps * joint.LEAST_CHUNKS)  # one to measure
+    counts.clear()
+    joint.newton_round(scene, problem, cfg, seconds=1e3)
+    assert counts == [20] * (1 + cfg.newton_steps * 5)
+
+
+def test_a_run_that_was_cut_traces_fewer_points(monkeypatch):
+    asked = []
+    monkeypatch.setattr(joint, "pose", lambda scene, photos, cfg, seed: asked.append(cfg.points))
+    for pace in (1.0, 0.5, 0.0):
+        steps = Steps(0)
+        steps.pace = pace
+        joint.solve(sphere_scene(8), photos_of(1, 8), JointConfig(points=10000), 0, steps)
+    assert asked == [10000, 5000, joint.LEAST_POINTS]
 
 
 def test_newton_without_rich_points_leaves_the_map():
@@ -319,54 +301,9 @@ def test_metal_is_learned_where_it_is():
     assert (found - base)[inside].abs().mean() < 0.05
 
 
-class Steps:
-    """A clock that lets a stage run through."""
-
-    def __init__(self, count: int):
-        self.count = count
-
-    def steps(self):
-        yield from (i / self.count for i in range(self.count))
-
-    def due(self) -> bool:
-        return False
-
-
-RED, BLUE = torch.tensor([0.6, 0.2, 0.15]), torch.tensor([0.15, 0.25, 0.6])
-
-
-def photographs_under(map, roughness: float, views: int = 16, size: int = 48) -> Photos:
-    """The sphere, red on +X and blue on -X, under a map [D, 3]."""
-    cameras = cameras_around(views, size)
-    direction = fibonacci_sphere(len(map))
-    color, alpha = [], []
-    for v in range(views):
-        normal, hit = sphere_normals(cameras, v)
-        n = normal[hit]
-        wo = normalize(cameras.camera_to_world[v, :, 3] - RADIUS * n, dim=1)
-        count = len(n)
-        albedo = torch.where(n[:, :1] > 0, RED, BLUE)
-        shown = joint.widened(torch.full((count,), roughness), len(map))
-        rgb = shade_map(
-            map, torch.full((count, len(map)), 255, dtype=torch.uint8),
-            torch.zeros(count, len(map), 3).half(), torch.arange(count), n, wo, albedo,
-            shown, direction, 4 * math.pi / len(map),
-        )  # fmt: skip
-        picture = torch.zeros(size, size, 3)
-        picture[hit] = rgb
-        color.append((255 * linear_to_srgb(picture)).round().to(torch.uint8))
-        alpha.append(hit.float())
-    names = [f"r_{v}" for v in range(views)]
-    return Photos(Path("sphere"), names, torch.stack(color), torch.stack(alpha), cameras)
-
-
 def test_solve_recovers_albedo_and_map():
     nodes, roughness = 128, 0.29
-    direction = fibonacci_sphere(nodes)
-    true = torch.full((nodes, 3), 0.35)
-    for axis in ([1.0, -1.0, 1.0], [-1.0, 0.2, 0.5], [0.0, 1.0, 0.3]):  # lamps make highlights
-        lobe = (12 * (direction @ normalize(torch.tensor(axis), dim=0) - 1)).exp()
-        true += lobe[:, None] * torch.tensor([3.3, 3.0, 2.7])
+    true = lamps(nodes)
     photos = photographs_under(true, roughness)
     scene = sphere_scene(nodes)
     before = {k: v.clone() for k, v in scene.state_dict().items()}
@@ -390,6 +327,46 @@ def test_solve_recovers_albedo_and_map():
     assert error.mean().abs() < 0.1
     assert error.std() < 0.3  # of a map whose logarithm varies by 0.7
     assert true.log().std() > 0.6
+
+
+def test_no_time_is_no_tracing():
+    steps = Steps(10)
+    steps.over, steps.skip = True, lambda: steps.asked.append("skip")
+    joint.solve(sphere_scene(8), photos_of(1, 8), JointConfig(), 0, steps)
+    assert steps.asked == ["skip"]
+
+
+@pytest.mark.parametrize(
+    ("rooms", "newton", "asked"),
+    [((), [0.25, 0.5, 0.75], [2, 1, 0]), ((1, 0), [0.25, 0.625], [2, 0]), ((0,), [0.25], [2])],
+)
+def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, asked):
+    """With less room than rounds there are fewer rounds, each of them longer."""
+    steps, when, rates, made = Steps(400, rooms), [], [], []
+
+    class Optimizer(RowAdam):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            rates.append([])
+
+        def step(self):
+            rates[-1].append(self.param_groups[0]["lr"])
+            made.append(None)
+
+    def objective(scene, *_):
+        return {"joint": scene.sky.log_radiance.square().sum()}
+
+    monkeypatch.setattr(joint, "pose", lambda *_: None)
+    monkeypatch.setattr(joint, "objective", objective)
+    monkeypatch.setattr(joint, "RowAdam", Optimizer)
+    monkeypatch.setattr(joint, "newton_round", lambda *_: when.append(len(made) / steps.count))
+    cfg = JointConfig(rounds=4)
+    joint.solve(sphere_scene(8), photos_of(1, 8), cfg, 0, steps)
+    assert when == newton
+    assert steps.asked == asked
+    for rate in rates:  # every round runs through the whole of its schedule
+        assert rate[0] == cfg.lr_features
+        assert rate[-1] == pytest.approx(0.1 * cfg.lr_features, rel=0.03)  # of 100 steps, the last
 
 
 def test_a_refit_leaves_geometry_and_materials_bit_for_bit(tmp_path, monkeypatch):

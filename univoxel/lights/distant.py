@@ -26,6 +26,12 @@ class DistantLight(nn.Module):
         """[D, 3] linear."""
         return self.log_radiance.exp()
 
+    def changed(self, log_change: Tensor) -> DistantLight:
+        """Another light, whose logarithm is this one's plus [D, 3]; without gradients."""
+        light = DistantLight(len(self.direction)).to(self.direction)
+        light.log_radiance.data.copy_(self.log_radiance.detach() + log_change.detach())
+        return light
+
     def incident(self, wi: Tensor) -> Tensor:
         """Radiance [M, 3] from unit directions wi [M, 3], interpolated between the nodes.
 

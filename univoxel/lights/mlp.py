@@ -43,7 +43,7 @@ class LocalMLP(AbstractLight):
     directions cost N + D runs of a network and one matrix product, where a single network of both,
     as in NeILF, costs N D runs. What is lost is what a code of `rank` numbers a channel cannot say.
     It holds direct light, indirect light and visibility together, and starts at radiance 1/2 from
-    everywhere. No gradient goes to normals.
+    everywhere.
 
     Source: Yao et al. 2022 (NeILF) for light as a network of place and direction.
     """
@@ -102,7 +102,7 @@ class LocalMLP(AbstractLight):
         occlusion: Occlusion | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Radiance [N, 3] towards wo, summed over the whole sphere; no gradient to normals."""
+        """Radiance [N, 3] towards wo, summed over the whole sphere."""
         return quadrature.reflected_shared(self, surface, wo, occlusion, generator)
 
     def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -113,12 +112,12 @@ def reflected_shared(
 
     All points share the D = light.directions directions, over the whole sphere, and
     `light.incident` takes them as [D, 3]: what a light does per direction it does D times, not N D
-    times. Without gradient to normals. An occlusion goes by the directions around each normal.
+    times. An occlusion goes by the directions around each normal. Differentiable in what the light
+    is, and in the surface's normals and materials.
 
     Args:
         generator: turns the directions at random, as a whole.
     """
-    surface = replace(surface, normal=surface.normal.detach())
     if occlusion is not None:
         count = occlusion.visibility.shape[1]
         return reflected(light, surface, wo, count, occlusion, generator)

@@ -42,7 +42,7 @@ class LocalSH(AbstractLight):
     at radiance 1/2 from everywhere.
 
     Light is taken on directions that all points share, so the harmonics are evaluated once per
-    direction and a matrix product does the rest. No gradient goes to normals.
+    direction and a matrix product does the rest.
     """
 
     traced = False
@@ -82,7 +82,7 @@ class LocalSH(AbstractLight):
 
     def incident(self, surface: Surface, wi: Tensor) -> Tensor:
         """Radiance [N, D, 3] from unit directions wi [N, D, 3]; or [D, 3], the same for all."""
-        harmonics = real_harmonics(self.config.order, wi)
+        harmonics = sphere.real_harmonics(self.config.order, wi)
         return nn.functional.softplus(harmonics @ self.coefficients(surface))
 
     def reflected(
@@ -92,46 +92,14 @@ class LocalSH(AbstractLight):
         occlusion: Occlusion | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Radiance [N, 3] towards wo, summed over the whole sphere; no gradient to normals."""
+        """Radiance [N, 3] towards wo, summed over the whole sphere."""
         return quadrature.reflected_shared(self, surface, wo, occlusion, generator)
 
     def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
         here, beside = self.coefficients(surface), self.coefficients(near)
         wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)
-        light = nn.functional.softplus(real_harmonics(self.config.order, wi) @ here)
+        light = nn.functional.softplus(sphere.real_harmonics(self.config.order, wi) @ here)
         return {
             "light_smoothness": priors.smoothness(here, beside),
             "white_light": priors.chroma(light.mean(1)),
         }
-
-
-def real_harmonics(order: int, direction: Tensor) -> Tensor:
-    """Orthonormal real spherical harmonics Y_lm of degrees l up to `order`.
-
-        Y_lm = N_lm Q_lm(z) Re (x + i y)^m,   m > 0;    Im (x + i y)^|m|, m < 0
-        Q_l^m(z) = P_l^m(z) / (1 - z^2)^(m / 2), a polynomial; no Condon-Shortley phase
-
-    Polynomials in x, y and z throughout: smooth at the poles too.
-
-    Args:
-        direction: [..., 3] unit.
-
-    Returns:
-        [..., (order + 1)^2], Y_lm at l^2 + l + m.
-    """
-    x, y, z = direction.unbind(-1)
-    real, imaginary = torch.ones_like(x), torch.zeros_like(x)  # of (x + i y)^m
-    diagonal = 1.0  # Q_mm = (2 m - 1)!!
-    found: dict[tuple[int, int], Tensor] = {}
-    for m in range(order + 1):
-        before, now = torch.zeros_like(z), torch.full_like(z, diagonal)  # Q_{l-1}^m and Q_l^m
-        for degree in range(m, order + 1):
-            square = (2 * degree + 1) / (4 * math.pi)
-            square *= math.factorial(degree - m) / math.factorial(degree + m)
-            value = math.sqrt(square * (2 if m else 1)) * now
-            found[degree, m], found[degree, -m] = value * real, value * (imaginary if m else real)
-            above = (2 * degree + 1) * z * now - (degree + m) * before
-            before, now = now, above / (degree + 1 - m)
-        diagonal *= 2 * m + 1
-        real, imaginary = x * real - y * imaginary, x * imaginary + y * real
-    return torch.stack([found[k] for k in sorted(found)], -1)

@@ -62,4 +62,4 @@ def outgoing(scene: Scene, points: Tensor, wo: Tensor) -> Tensor:
     """Linear radiance [N, 3] that places [N, 3] on the surface send along wo [N, 3], as seen."""
     sample = scene.field.sample(points)
     normal = normalize(sample.gradient, dim=1, eps=1e-6)
-    return srgb_to_linear(scene.radiance(sample.features, normal, wo))
+    return srgb_to_linear(scene.radiance(scene.coded(sample.features), normal, wo))

@@ -21,7 +21,7 @@ def preview(scene: Scene, photos: Photos, path: Path, view: int = 0) -> None:
     opacity = surface.opacity[:, None]
     tiles = [
         linear_to_srgb(color * alpha[..., None]),
-        linear_to_srgb(shade_hits(scene, surface, wo)),
+        linear_to_srgb(shade_hits(scene, surface, wo, view)),
         linear_to_srgb(surface.albedo * opacity),
         surface.roughness[:, None].expand(-1, 3) * opacity,
         (0.5 + 0.5 * surface.normal) * opacity,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -57,34 +59,41 @@ def at_rays(surface: Surface, index: Tensor) -> Surface:
 
 
 def shade(
-    scene: Scene, surface: Surface, wo: Tensor, generator: torch.Generator | None = None
+    scene: Scene,
+    surface: Surface,
+    wo: Tensor,
+    generator: torch.Generator | None = None,
+    view: Tensor | int | None = None,
 ) -> Tensor:
     """Physically based radiance [N, 3] that the surface sends along wo, linear.
 
     Args:
         generator: turns the directions that light is taken from at random.
+        view: [N] photographs in whose light and exposure it stands, or one for all, where they
+            differ; None: those that the scene shows.
     """
     light = scene.light
     if not light.traced:
+        surface = replace(surface, features=scene.coded(surface.features, view))
         rgb = light.reflected(surface, wo, generator=generator)
-        if scene.mirrored is None:
-            return rgb
-        return (rgb + scene.mirrored(surface, wo)).clamp_min(0)
+        if scene.mirrored is not None:
+            rgb = (rgb + scene.mirrored(surface, wo)).clamp_min(0)
+        return scene.exposed(rgb, view)
     parts = []
     for index in torch.arange(len(wo)).split(max(1, TRACED_AT_ONCE // light.directions)):
         part = at_rays(surface, index)
         seen = occlusion(scene, part, light.directions, rotations(part, generator))
         parts.append(light.reflected(part, wo[index], seen))
-    return torch.cat(parts) if parts else torch.zeros_like(wo)
+    return scene.exposed(torch.cat(parts) if parts else torch.zeros_like(wo), view)
 
 
 @torch.no_grad()
-def shade_hits(scene: Scene, surface: Surface, wo: Tensor) -> Tensor:
+def shade_hits(scene: Scene, surface: Surface, wo: Tensor, view: int | None = None) -> Tensor:
     """`shade` where there is a surface, times its opacity: linear radiance on black [N, 3]."""
     rgb = torch.zeros_like(surface.position)
     for index in (surface.opacity > 1e-3).nonzero()[:, 0].split(RAYS_AT_ONCE):
         met = at_rays(surface, index)
-        rgb[index] = shade(scene, met, wo[index]) * met.opacity[:, None]
+        rgb[index] = shade(scene, met, wo[index], view=view) * met.opacity[:, None]
     return rgb
 
 

@@ -28,6 +28,7 @@ class Observations:
     offsets: Tensor  # [P + 1] int64: point p has sightings offsets[p] .. offsets[p + 1]
     wo: Tensor  # [S, 3] unit, to the camera
     color: Tensor  # [S, 3] linear
+    view: Tensor  # [S] int64: which photograph
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def observe(
     Args:
         offset: world units that rays start above the surface.
     """
-    point, wo, color = [], [], []
+    point, wo, color, view = [], [], [], []
     coverage = photos.coverage()
     for v in range(len(photos)):
         eye = photos.cameras.camera_to_world[v, :, 3]
@@ -88,11 +89,13 @@ def observe(
         point.append(near[kept])
         wo.append(towards[near][kept])
         color.append(seen[kept])
+        view.append(torch.full((int(kept.sum()),), v))
     index = torch.cat(point)
     order = torch.argsort(index, stable=True)
     counts = torch.bincount(index, minlength=len(position))
     offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-    return Observations(position, normal, offsets, torch.cat(wo)[order], torch.cat(color)[order])
+    sorted_ = (torch.cat(parts)[order] for parts in (wo, color, view))
+    return Observations(position, normal, offsets, *sorted_)
 
 
 def mean_colors(seen: Observations) -> Tensor:

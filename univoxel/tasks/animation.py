@@ -27,8 +27,8 @@ def require(kind: str) -> None:
         _ffmpeg()
 
 
-def write_animation(path: Path, pictures: Sequence[Path]) -> None:
-    """Write pictures of one size, on white where they are transparent, 25 a second.
+def write_animation(path: Path, pictures: Sequence[Path], rate: int = FRAMES_PER_SECOND) -> None:
+    """Write pictures of one size, on white where they are transparent, `rate` a second.
 
     Whole or not at all; a GIF runs in a loop; an MP4 is H.264, cut to even sizes.
 
@@ -45,7 +45,7 @@ def write_animation(path: Path, pictures: Sequence[Path]) -> None:
                 format="GIF",
                 save_all=True,
                 append_images=rest,
-                duration=1000 // FRAMES_PER_SECOND,
+                duration=1000 // rate,
                 loop=0,
             )
             return
@@ -54,7 +54,7 @@ def write_animation(path: Path, pictures: Sequence[Path]) -> None:
         writer = _ffmpeg().write_frames(
             str(temporary),
             (width, height),
-            fps=FRAMES_PER_SECOND,
+            fps=rate,
             codec="libx264",
             macro_block_size=2,
             output_params=["-f", "mp4", "-movflags", "+faststart"],
@@ -77,6 +77,6 @@ def _ffmpeg():
         import imageio_ffmpeg  # pyright: ignore[reportMissingImports]  the extra `video`
     except ImportError:
         raise ImportError(
-            "relight: an MP4 needs imageio-ffmpeg: pip install 'univoxel[video]', or choose gif"
+            "an MP4 needs imageio-ffmpeg: pip install 'univoxel[video]', or choose gif"
         ) from None
     return imageio_ffmpeg

@@ -33,7 +33,9 @@ class Comparison:
 
 
 @torch.no_grad()
-def envmap(run: Path, out: Path, height: int = 128) -> Comparison | None:
+def envmap(
+    run: Path, out: Path, height: int = 128, light_of: str | None = None
+) -> Comparison | None:
     """Write the recovered map of a run, and a picture of it beside; compare it with the true one.
 
     Light and albedo share a factor per channel that photographs hardly fix; the comparison takes it
@@ -45,13 +47,16 @@ def envmap(run: Path, out: Path, height: int = 128) -> Comparison | None:
             with .png: a row for the recovered map and one for the true map, each with a grey and a
             mirror ball seen from +X, +Z up.
         height: rows of the map, >= 1.
+        light_of: training view, by name or number, whose light it is, where light varies; their
+            mean when left out.
 
     Returns:
         None where the data set has no true map.
 
     Raises:
         DataError: run or true map cannot be read.
-        ValueError: the run has no map; an argument out of range.
+        ValueError: the run has no map; an argument out of range; light_of is no training view, or
+            light does not vary.
         OSError: a file cannot be written.
     """
     if height < 1:
@@ -59,13 +64,14 @@ def envmap(run: Path, out: Path, height: int = 128) -> Comparison | None:
     if out.suffix.lower() != ".exr":
         raise ValueError(f"--out: expected a name that ends in .exr, got {out}")
     scene = load_scene(run)
+    scene.show_light_of(light_of)
     sky = scene.environment()
     if sky is None:
         raise ValueError(
             f"{run}: this run has no environment map: it was trained with local light, "
             f"{scene.cfg.light.kind}, alone"
         )
-    recovered, true = sky.latlong(height), true_map(trained_on(run))
+    recovered, true = scene.exposed(sky.latlong(height)), true_map(trained_on(run))
     out.parent.mkdir(parents=True, exist_ok=True)
     write_exr(out, dict(zip("RGB", recovered.unbind(2), strict=True)), half=False)
     rows, result = [recovered], None

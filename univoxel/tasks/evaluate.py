@@ -86,6 +86,7 @@ def evaluate(
     json: Path | None = None,
     samples: int = 64,
     bounces: int = 2,
+    light_of: str | None = None,
 ) -> dict[str, float | int | None]:
     """Measure a trained scene on its test views, print the table and return it.
 
@@ -110,10 +111,13 @@ def evaluate(
         json: file for the measures.
         samples: light samples per pixel of relit pictures.
         bounces: reflections between parts of the object in relit pictures, 0 for none.
+        light_of: training view, by name or number, whose light novel views are rendered in, where
+            light varies; their mean when left out.
 
     Raises:
         DataError: the run or the data cannot be read.
-        ValueError: samples or bounces out of range.
+        ValueError: samples or bounces out of range; light_of is no training view, or light does not
+            vary.
         OSError: a result cannot be written.
     """
     if samples < 1 or bounces < 0:
@@ -127,6 +131,7 @@ def evaluate(
     points = load_points(folder)
     maps = {name: read_map(path) for name, path in relight_maps(folder).items()}
     scene, report = load_checkpoint(run)
+    scene.show_light_of(light_of)
     for place in (save, json and json.parent):
         if place:
             place.mkdir(parents=True, exist_ok=True)

@@ -41,7 +41,12 @@ class Incident:
 
 @torch.no_grad()
 def inspect(
-    run: Path, view: str, pixel: tuple[int, int], out: Path | None = None, height: int = 128
+    run: Path,
+    view: str,
+    pixel: tuple[int, int],
+    out: Path | None = None,
+    height: int = 128,
+    light_of: str | None = None,
 ) -> Path:
     """Draw the light that a scene says falls on the surface under a pixel; returns the picture.
 
@@ -59,10 +64,13 @@ def inspect(
         pixel: column and row.
         out: .png; in the run's folder when left out.
         height: rows of the lat-long pictures, >= 1.
+        light_of: training view, by name or number, whose light it is, where light varies; their
+            mean when left out.
 
     Raises:
         DataError: the run or its data cannot be read.
-        ValueError: no such view or pixel, or no surface under it; an argument out of range.
+        ValueError: no such view or pixel, or no surface under it; an argument out of range;
+            light_of is no training view, or light does not vary.
         OSError: a file cannot be written.
     """
     if height < 1:
@@ -70,6 +78,7 @@ def inspect(
     if out is not None and out.suffix.lower() != ".png":
         raise ValueError(f"--out: expected a name that ends in .png, got {out}")
     scene = load_scene(run)
+    scene.show_light_of(light_of)
     data = trained_on(run)
     photos = load_photos(data, "test")
     index = _view(photos, view)
@@ -98,12 +107,14 @@ def arriving(scene: Scene, surface: Surface, height: int) -> list[Incident]:
     shape = (height, 2 * height)
     layers = []
     if not scene.light.traced:
-        radiance = scene.light.incident(surface, wi)
+        coded = replace(surface, features=scene.coded(surface.features))
+        radiance = scene.exposed(scene.light.incident(coded, wi)[0])
         layers.append(Incident(f"local {scene.cfg.light.kind}", radiance.view(*shape, 3)))
     sky = scene.environment()
     if sky is not None:
         clear, indirect = look(scene, *starts(scene, surface, wi))
         radiance = torch.where(clear[:, None], sky.latlong(height).flatten(0, 1), indirect)
+        radiance = scene.exposed(radiance)
         layers.append(Incident("map", radiance.view(*shape, 3), clear.view(shape)))
     return layers
 

@@ -9,7 +9,8 @@ map and materials alternate with Gauss-Newton steps on the map.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -30,12 +31,21 @@ from univoxel.render.transport import (
     trace,
 )
 from univoxel.scene import Scene
+from univoxel.tasks.equations import (
+    CLIPPED,
+    Rows,
+    graph_laplacian,
+    normal_equations,
+    view_differences,
+    view_equations,
+)
 from univoxel.tasks.progress import Progress
 
-CLIPPED = 0.97  # sRGB; brighter pixels are lower bounds
 NEWTON_CHUNK = 256  # points whose equations are built at once
+WEIGHTS_PRIOR = 10.0  # on changes of a view's map, in units of the Laplacian's weight
 METAL = 0.2  # metallic from which on a point is taken for metal
-CAUCHY = 0.05  # sRGB; residuals beyond are taken for what the model cannot explain
+NEWTON_COST = 2.7  # of a sighting in a Newton step, over one in a step of Adam; measured
+LEAST_CHUNKS, LEAST_POINTS = 2, 2000  # on a machine however slow
 
 
 @dataclass(frozen=True)
@@ -62,13 +72,20 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     assert scene.sky is not None
     tracer = VisibilityScene(mesh.vertices, mesh.faces)
     offset = scene.field.voxel_size
-    bright = mean_colors(observe(mesh.vertices, mesh.normals, photos, tracer, offset))
+    bright = mean_colors(
+        unexposed(scene, observe(mesh.vertices, mesh.normals, photos, tracer, offset))
+    )
     position, normal = surface_points(mesh, cfg.points, generator)
     seen = observe(position, normal, photos, tracer, offset)
     direction = scene.sky.direction
     transport = trace(seen, tracer, mesh, bright, direction, cfg.tracing, offset, generator)
     metal = scene.material(scene.field.sample(position).features)[2] > METAL
     return Problem(seen, transport, losses.encode(seen.color), metal, offset)
+
+
+def unexposed(scene: Scene, seen: Observations) -> Observations:
+    """The same as one exposure would have it, as far as the scene knows the photographs'."""
+    return replace(seen, color=seen.color / scene.exposed(torch.ones_like(seen.color), seen.view))
 
 
 def draw(problem: Problem, points: int, views: int) -> tuple[Tensor, Tensor]:
@@ -84,25 +101,36 @@ def draw(problem: Problem, points: int, views: int) -> tuple[Tensor, Tensor]:
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
     """Fit scene.sky and the materials to the photographs; geometry and other heads stay."""
     assert scene.sky is not None
-    problem = pose(scene, photos, cfg, seed)
-    turn = 0  # rounds begun
-    for done in progress.steps():
-        if done >= turn / cfg.rounds:
-            if turn:
-                newton_round(scene, problem, cfg)
-            optimizer = RowAdam(
-                [
-                    {"params": [scene.field.features], "eps": 1e-8},
-                    {"params": list(scene.material.parameters())},
-                    {"params": [scene.sky.log_radiance]},
-                ],
-                betas=(0.9, 0.99),
-            )
-            turn += 1
-        fade = 0.1 ** (done * cfg.rounds - (turn - 1))
-        # After a Newton round the map is better than what Adam would make of it: it moves slowly
-        rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * (1.0 if turn == 1 else 0.1))
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+    if progress.over:
+        progress.skip()
+        return
+    # What does not fit is cut alike: points here, steps of Adam by `steps`, points of Newton below
+    points = min(cfg.points, max(LEAST_POINTS, round(progress.pace * cfg.points)))
+    problem = pose(scene, photos, replace(cfg, points=points), seed)
+    first, turn, more = 0.0, -1.0, cfg.rounds  # begin and end of a round, rounds to come
+    for done in progress.steps(newton_share(cfg)):
+        if done >= turn:
+            if more < cfg.rounds:
+                with progress.apart():
+                    newton_round(scene, problem, cfg, progress.reserved / more)
+                more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
+            groups = [
+                {"params": [scene.field.features], "eps": 1e-8},
+                {"params": list(scene.material.parameters())},
+                {"params": [scene.sky.log_radiance]},
+            ]
+            if scene.views:
+                groups.append({"params": [scene.views.gain_steps]})
+                if scene.views.sky_weights is not None:
+                    groups[2]["params"] += [scene.views.sky_weights, scene.views.sky_basis]
+            optimizer = RowAdam(groups, betas=(0.9, 0.99))
+            first, turn, more = done, done + (1 - done) / more, more - 1
+        fade = 0.1 ** ((done - first) / (turn - first))
+        # After a Newton round light is better than what Adam would make of it while the albedo
+        # follows: the map moves slowly, gains do not
+        of_map, of_gains = (1.0, 1.0) if more == cfg.rounds - 1 else (0.1, 0.0)
+        rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * of_map, cfg.lr_networks * of_gains)
+        for group, rate in zip(optimizer.param_groups, rates, strict=False):
             group["lr"] = rate * fade
         terms = objective(scene, problem, cfg)
         optimizer.zero_grad(set_to_none=True)
@@ -112,10 +140,16 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             progress.report({k: v.item() for k, v in terms.items()}, None)
 
 
+def newton_share(cfg: JointConfig) -> float:
+    """Share of the stage's time that Newton rounds take if nothing is cut."""
+    sightings = cfg.newton_points * cfg.newton_views * cfg.newton_steps * (cfg.rounds - 1)
+    newton = NEWTON_COST * sightings
+    return newton / (newton + cfg.iterations * cfg.rays)
+
+
 def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Tensor]:
     """The weighted losses of a random batch of sightings."""
     seen, transport = problem.seen, problem.transport
-    assert scene.sky is not None
     index, sighting = draw(problem, cfg.rays // cfg.views, cfg.views)
     points = index[:: cfg.views]
     material = scene.material(scene.field.sample(seen.position[points]).features)
@@ -123,19 +157,9 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
     diffuse, f0 = brdf.split(albedo, metallic * problem.metal[points])
     assert isinstance(f0, Tensor)
     repeat = torch.arange(len(points)).repeat_interleave(cfg.views)
-    rgb = shade_map(
-        scene.sky.radiance,
-        transport.open,
-        transport.indirect,
-        index,
-        seen.normal[index],
-        seen.wo[sighting],
-        diffuse[repeat],
-        widened(roughness, len(transport.direction))[repeat],
-        transport.direction,
-        problem.solid_angle,
-        f0[repeat],
-    )
+    roughness_shown = widened(roughness, len(transport.direction))
+    shown = diffuse[repeat], roughness_shown[repeat], f0[repeat]
+    rgb = draw_sightings(scene, problem, index, sighting, *shown)
     beside = seen.position[points]
     beside = beside + 2 * problem.voxel_size * torch.randn_like(beside)
     albedo_near, roughness_near, _ = scene.material(scene.field.sample(beside).features)
@@ -148,41 +172,71 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
     }
 
 
-@dataclass(frozen=True)
-class Rows:
-    """What light does at V sightings of P points, linear in the map; constant in a round."""
+def draw_sightings(
+    scene: Scene,
+    problem: Problem,
+    point: Tensor,
+    sighting: Tensor,
+    diffuse: Tensor,
+    roughness: Tensor,
+    f0: Tensor,
+) -> Tensor:
+    """What the map makes of sightings [N] of points [N], each in its photograph's light: [N, 3].
 
-    diffuse: Tensor  # [P, D] sky into irradiance: cosine, open share and solid angle
-    through: Tensor  # [P, V] irradiance into radiance, for albedo 1
-    shine: Tensor  # [P, V, D] sky into specular radiance
-    diffuse_blocked: Tensor  # [P, V, 3] radiance from the blocked share, for albedo 1
-    shine_blocked: Tensor  # [P, V, 3]
-    target: Tensor  # [P, V, 3] sRGB-encoded
-
-
-@dataclass(frozen=True)
-class Block:
-    """Normal equations of some points: the map's part, and what ties it to their albedo."""
-
-    hessian: Tensor  # [3, D, D]
-    gradient: Tensor  # [3, D]
-    cross: Tensor  # [3, P, D] map against log albedo
-    own: Tensor  # [3, P] gradient of log albedo
-    norm: Tensor  # [3, P] curvature of log albedo
-    cost: float
+    Args:
+        diffuse, roughness, f0: of the points, [N, 3], [N] and [N, 3].
+    """
+    seen, transport, sky = problem.seen, problem.transport, scene.sky
+    assert sky is not None
+    view = seen.view[sighting]
+    change = scene.views.sky_change() if scene.views else None
+    if change is None:
+        order, parts, maps = None, (slice(None),), [sky.radiance]
+    else:  # a map for each view
+        order = torch.argsort(view)
+        parts = order.split(torch.bincount(view, minlength=len(change)).tolist())
+        maps = (sky.log_radiance + change).exp().unbind()
+    rgb = torch.cat(
+        [
+            shade_map(
+                map,
+                transport.open,
+                transport.indirect,
+                point[part],
+                seen.normal[point[part]],
+                seen.wo[sighting[part]],
+                diffuse[part],
+                roughness[part],
+                transport.direction,
+                problem.solid_angle,
+                f0[part],
+            )
+            for part, map in zip(parts, maps, strict=True)
+        ]
+    )
+    if order is not None:
+        rgb = rgb[torch.argsort(order)]
+    return scene.exposed(rgb, view)
 
 
 @torch.no_grad()
-def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float]:
+def newton_round(
+    scene: Scene, problem: Problem, cfg: JointConfig, seconds: float = math.inf
+) -> list[float]:
     """Gauss-Newton steps on the log map, with the albedo of every point eliminated.
 
     The normal equations for log map and log albedo of the points are block diagonal in the albedo;
     its Schur complement is D x D. What then speaks for the map is only what no albedo can explain:
     how a point's brightness changes from view to view, and with it the absolute scale, from
     highlights of known reflectance. Residuals are in sRGB-encoded colour with Cauchy weights; a
-    graph Laplacian keeps the log map smooth. Returns the mean weighted squared residual before each
-    step.
+    graph Laplacian keeps the log map smooth. Where light varies, the views' log gains are solved
+    for together with the map, and before that, with the map as it is, what each view's map has of
+    its own. Returns the mean weighted squared residual before each step.
+
+    Args:
+        seconds: wall time that it may take, about: fewer points serve where all would take more.
     """
+    begin = time.monotonic()
     seen, sky = problem.seen, scene.sky
     assert sky is not None
     counts = seen.offsets.diff()
@@ -197,25 +251,73 @@ def newton_round(scene: Scene, problem: Problem, cfg: JointConfig) -> list[float
     sighting = seen.offsets[chosen][:, None] + which
     parts = torch.arange(len(chosen)).split(NEWTON_CHUNK)
     roughness = widened(roughness, len(sky.direction))
-    rows = [light_rows(problem, chosen[k], sighting[k], roughness[k]) for k in parts]
+    rows, spent = [], 0.0  # on the equations of one part
+    for k in parts:
+        rows.append(light_rows(problem, chosen[k], sighting[k], roughness[k]))
+        if len(rows) == 1 and seconds < math.inf:
+            before = time.monotonic()
+            normal_equations(rows[0], sky.radiance, log_albedo[k])
+            spent = time.monotonic() - before
+        so_far = time.monotonic() - begin
+        if len(rows) >= LEAST_CHUNKS and so_far + cfg.newton_steps * len(rows) * spent > seconds:
+            break
+    parts = parts[: len(rows)]
+    count = sum(map(len, parts))
+    sighting, log_albedo = sighting[:count], log_albedo[:count]
     smooth = cfg.newton_smooth * graph_laplacian(sky.direction)
+    unknowns = len(smooth) + (len(scene.views) if scene.views else 0)
+    smooth = torch.nn.functional.pad(smooth, 2 * (0, unknowns - len(smooth)))
     costs = []
     for _ in range(cfg.newton_steps):
+        differs = view_differences(scene)
+        if differs is not None and differs.basis is not None:
+            found = [
+                view_equations(r, sky.radiance, log_albedo[k], differs)
+                for r, k in zip(rows, parts, strict=True)
+            ]
+            hessian = torch.stack([h for h, _ in found]).sum(0) / sighting.numel()
+            slope = torch.stack([g for _, g in found]).sum(0) / sighting.numel()
+            views_step(scene, hessian, slope, cfg.newton_smooth)
+            differs = view_differences(scene)
         blocks = [
-            normal_equations(r, sky.radiance, log_albedo[k])
+            normal_equations(r, sky.radiance, log_albedo[k], differs)
             for r, k in zip(rows, parts, strict=True)
         ]
         x = sky.log_radiance.T  # [3, D]
+        x = torch.nn.functional.pad(x, (0, unknowns - x.shape[1]))  # no gain is likelier than 1
         system = torch.stack([b.hessian for b in blocks]).sum(0) / sighting.numel() + smooth
         system.diagonal(dim1=1, dim2=2).add_(cfg.newton_smooth)
         right = torch.stack([b.gradient for b in blocks]).sum(0) / sighting.numel() - x @ smooth
         factor = torch.linalg.cholesky(system.double())
         step = torch.cholesky_solve(right.double()[..., None], factor)[..., 0].float().clamp(-1, 1)
-        sky.log_radiance.add_(step.T)
+        to_map, to_gain = step.split([len(sky.direction), unknowns - len(sky.direction)], 1)
+        sky.log_radiance.add_(to_map.T)
+        if scene.views is not None:
+            sky.log_radiance.add_(scene.views.add(to_gain.T))
         change = [(b.own - torch.einsum("cpd,cd->cp", b.cross, step)) / b.norm for b in blocks]
         log_albedo = (log_albedo + torch.cat(change, 1).T.clamp(-0.5, 0.5)).clamp(-7.0, 0.0)
         costs.append(sum(b.cost for b in blocks) / sighting.numel())
     return costs
+
+
+def views_step(scene: Scene, hessian: Tensor, gradient: Tensor, smooth: float) -> None:
+    """Gauss-Newton step of each view's gain and change of the map.
+
+    Args:
+        hessian, gradient: [3, B, R + 1, R + 1] and [3, B, R + 1] from `view_equations`, over the
+            number of sightings.
+    """
+    views, sky = scene.views, scene.sky
+    assert views is not None
+    assert sky is not None
+    assert views.sky_weights is not None
+    now = views.sky_weights - views.sky_weights.mean(0)  # [B, R, 3]
+    now = torch.nn.functional.pad(now.permute(2, 0, 1), (0, 1))
+    prior = WEIGHTS_PRIOR * smooth
+    hessian.diagonal(dim1=2, dim2=3).add_(prior)
+    step = torch.linalg.solve(hessian, (gradient - prior * now)[..., None])[..., 0].clamp(-1, 1)
+    step = step.permute(1, 2, 0)
+    sky.log_radiance.add_(views.add(step[:, -1], step[:, :-1]))
 
 
 def light_rows(problem: Problem, point: Tensor, sighting: Tensor, roughness: Tensor) -> Rows:
@@ -237,44 +339,7 @@ def light_rows(problem: Problem, point: Tensor, sighting: Tensor, roughness: Ten
         through[..., None] * (cosine @ blocked),
         shine @ blocked,
         problem.target[sighting],
-    )
-
-
-def normal_equations(rows: Rows, light: Tensor, log_albedo: Tensor) -> Block:
-    """The block of some points for map `light` [D, 3] and `log_albedo` [P, 3]."""
-    hessian, gradient, cross, own, norm, cost = [], [], [], [], [], 0.0
-    for c in range(3):
-        albedo = log_albedo[:, c, None].exp()
-        sky = rows.through * (rows.diffuse @ light[:, c])[:, None]
-        diffuse = albedo * (sky + rows.diffuse_blocked[..., c])
-        drawn = diffuse + rows.shine @ light[:, c] + rows.shine_blocked[..., c]
-        target = rows.target[..., c]
-        residual = target - losses.encode(drawn)
-        weight = 1 / (1 + (residual / CAUCHY).square())
-        weight = weight.masked_fill((target > CLIPPED) & (residual < 0), 0.0)
-        root = weight.sqrt()
-        slope = root * encoded_slope(drawn)
-        r = root * residual
-        jacobian = (albedo * rows.through)[..., None] * rows.diffuse[:, None] + rows.shine
-        jacobian = jacobian * slope[..., None] * light[:, c]
-        self_ = slope * diffuse
-        n = self_.square().sum(1) + 1e-6  # a point that shows no diffuse light keeps its albedo
-        tie = torch.einsum("pvd,pv->pd", jacobian, self_)
-        g = (self_ * r).sum(1)
-        flat, low = jacobian.flatten(0, 1), tie / n.sqrt()[:, None]
-        hessian.append(flat.T @ flat - low.T @ low)
-        gradient.append(r.flatten() @ flat - (g / n) @ tie)
-        cross.append(tie)
-        own.append(g)
-        norm.append(n)
-        cost += r.square().sum().item()
-    return Block(
-        torch.stack(hessian),
-        torch.stack(gradient),
-        torch.stack(cross),
-        torch.stack(own),
-        torch.stack(norm),
-        cost,
+        seen.view[sighting],
     )
 
 
@@ -286,17 +351,3 @@ def widened(roughness: Tensor, nodes: int) -> Tensor:
     alpha^2, and variances add (Kaplanyan and Hill 2016 filter normals so).
     """
     return (roughness**4 + 1 / nodes) ** 0.25
-
-
-def encoded_slope(linear: Tensor) -> Tensor:
-    """Derivative of the sRGB curve."""
-    power = 1.055 / 2.4 * linear.clamp_min(0.0031308) ** (1 / 2.4 - 1)
-    return torch.where(linear <= 0.0031308, 12.92, power)
-
-
-def graph_laplacian(direction: Tensor, neighbours: int = 6) -> Tensor:
-    """Laplacian [D, D] of the graph of nearest neighbours on the sphere, symmetric."""
-    near = (direction @ direction.T).topk(neighbours + 1, 1).indices[:, 1:]
-    adjacent = torch.zeros(len(direction), len(direction)).scatter_(1, near, 1.0)
-    adjacent = torch.maximum(adjacent, adjacent.T)
-    return torch.diag(adjacent.sum(1)) - adjacent

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -19,18 +21,39 @@ from univoxel.config import TrainConfig
 REPORT_SECONDS = 5.0
 CHECKPOINT_SECONDS = 60.0
 RESERVE_SECONDS = 4.0  # of the budget, kept for the last checkpoint and the preview
+PACE = 0.1  # weight of the newest step in the mean time of a step
+UNSURE = 4  # first steps of a stage, whose time is no measure for the others
+REST = 0.3  # of the steps that are left to a stage that is shortened: for its rates to fall
+ALL = 0.995  # share of the planned steps from which on a stage was not cut
 
 
 class Progress:
     """Counts a run against its steps and its time, whichever is further along, and tells of it.
 
     A schedule follows `steps()`: on a slow machine a stage makes fewer steps and still runs through
-    the whole of its schedule.
+    the whole of its schedule. Every stage gets its share of what is left of the time, so that a run
+    that is short of time is short in all its stages.
     """
 
     def __init__(self, cfg: TrainConfig, begin: float, state: dict):
+        """
+        Args:
+            begin: of training, on time.monotonic's clock.
+            state: as `state` gave it.
+        """
         self.cfg, self.begin = cfg, begin
         self.stage, self.done, self.step = state["stage"], state["progress"], state["step"]
+        self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
+        self.early: list[int] = list(
+            state.get("early", ())
+        )  # numbers of stages that were shortened
+        self._stage_steps = state.get("stage_steps", 0)  # made in the present stage
+        self._planned, self._count = 0, 0  # steps of the stage in this sitting
+        self._stage_begin = self.seconds  # of the stage in this sitting
+        self._stage_end = 0.0  # when its time is over
+        self._apart, self._last_apart = 0.0, 0.0  # seconds, see `apart`
+        self.reserved = 0.0  # seconds that are kept for blocks under `apart` in this stage
+        self.watch: Callable[[], None] | None = None  # called between steps, off the clock
         self._log = cfg.out / "log.jsonl"
         self._told, self._told_step = time.monotonic(), self.step
         self._saved = time.monotonic()
@@ -46,8 +69,10 @@ class Progress:
         self._bar.start()
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, kind: type | None, *_) -> None:
         self._bar.stop()
+        if kind is None and (told := self.cut()):
+            self._bar.console.print(told, markup=False, highlight=False)
 
     @property
     def seconds(self) -> float:
@@ -60,27 +85,112 @@ class Progress:
             "stage": self.stage,
             "progress": self.done,
             "step": self.step,
+            "made": self.made,
+            "early": self.early,
+            "stage_steps": self._stage_steps,
             "seconds": self.seconds,
             "threads": torch.get_num_threads(),
             "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
 
-    def steps(self) -> Iterator[float]:
-        """Progress through the present stage in [0, 1), once a step; then the next stage is on."""
-        stage, first, count = self.cfg.stages[self.stage], self.done, 0
-        begin = time.monotonic()
-        left = max(60 * self.cfg.minutes - RESERVE_SECONDS - self.seconds, 0.0)
-        shares = [(1 - first) * stage.share, *(s.share for s in self.cfg.stages[self.stage + 1 :])]
+    def steps(self, apart: float = 0.0) -> Iterator[float]:
+        """Progress through the present stage in [0, 1), once a step; then the next stage is on.
+
+        What is left of the schedule is spread over the steps that are left: those that were
+        planned, or as many as fit into the stage's time as steps went lately.
+
+        Args:
+            apart: share of the stage's time, a guess, that passes under `apart`.
+        """
+        stage, pace = self.cfg.stages[self.stage], 0.0
+        shares = [
+            (1 - self.done) * stage.share,
+            *(s.share for s in self.cfg.stages[self.stage + 1 :]),
+        ]
+        left = max(60 * self.cfg.minutes - RESERVE_SECONDS - self._stage_begin, 0.0)
         allowed = left * shares[0] / sum(shares)
-        while True:
-            spent = (time.monotonic() - begin) / allowed if allowed else 1.0
-            self.done = first + max(count / stage.iterations, (1 - first) * spent)
-            if self.done >= 1.0:
-                self.stage, self.done = self.stage + 1, 0.0
-                return
+        self._planned, self._count = max(1, round((1 - self.done) * stage.iterations)), 0
+        self._stage_end, self.reserved = self._stage_begin + allowed, apart * allowed
+        while self.done < 1 and (begin := self.seconds) < self._stage_end:
+            passed = self._apart
             yield self.done
-            count += 1
-            self.step += 1
+            spent = self.seconds - begin - (self._apart - passed)
+            pace = spent if self._count == 0 else (1 - PACE) * pace + PACE * spent
+            self.step, self._stage_steps = self.step + 1, self._stage_steps + 1
+            self._count += 1
+            room = self._stage_end - self.seconds - self.reserved
+            steps_left = self._planned - self._count + 1  # with the one that was made
+            if self._count > UNSURE and room < pace * (steps_left - 1):
+                steps_left = 1 + room / pace if room > 0 else 1
+            self.done += (1 - self.done) / max(steps_left, 1)
+            if self.done > 1 - 1e-9:
+                self.done = 1.0
+            if self.watch:
+                with self.paused():
+                    self.watch()
+        self.skip()
+
+    @property
+    def over(self) -> bool:
+        """Whether the time is up."""
+        return self.seconds >= 60 * self.cfg.minutes - RESERVE_SECONDS
+
+    @property
+    def pace(self) -> float:
+        """Share of its steps that the stage before made, if time cut it short; else 1."""
+        last = self.stage - 1
+        return self.made[last] if 0 <= last < len(self.made) and last not in self.early else 1.0
+
+    def skip(self) -> None:
+        """Leave the present stage as it is for the next."""
+        self.made.append(self._stage_steps / self.cfg.stages[self.stage].iterations)
+        self.stage, self.done, self._stage_steps = self.stage + 1, 0.0, 0
+        self._stage_begin = self.seconds
+
+    def shorten(self) -> None:
+        """Run through the rest of the stage's schedule in fewer steps."""
+        self._planned = self._count + math.ceil(REST * (self._planned - self._count))
+        self.early.append(self.stage)
+
+    @contextmanager
+    def apart(self) -> Iterator[None]:
+        """A block between steps whose time says nothing of how long steps take."""
+        begin = self.seconds
+        yield
+        self._last_apart = self.seconds - begin
+        self._apart += self._last_apart
+
+    def room_for(self, blocks: int) -> int:
+        """How many blocks as long as the last `apart` fit into half of what is left of the stage,
+        at most `blocks`; their time is kept for them."""
+        left = max(self._stage_end - self.seconds, 0.0) / 2
+        if self._last_apart:
+            blocks = min(blocks, int(left / self._last_apart))
+        self.reserved = blocks * self._last_apart
+        return blocks
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """A block whose time does not count at all."""
+        begin = time.monotonic()
+        yield
+        spent = time.monotonic() - begin
+        self.begin, self._told, self._saved = (
+            x + spent for x in (self.begin, self._told, self._saved)
+        )
+
+    def cut(self) -> str:
+        """A line about the stages that time ended before their steps; empty if none was."""
+        short = [
+            (i + 1, made) for i, made in enumerate(self.made) if made < ALL and i not in self.early
+        ]
+        if not short:
+            return ""
+        stages = ", ".join(f"{made:.0%} in stage {i}" for i, made in short)
+        return (
+            f"time ended this training early: of the planned steps it made {stages}; "
+            "more minutes give more quality"
+        )
 
     def due(self) -> bool:
         """Whether it is time to report."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from univoxel import lights, losses
 from univoxel.camera import pixel_rays
-from univoxel.color import linear_to_srgb
+from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.config import (
     JointConfig,
     LossConfig,
@@ -31,7 +31,9 @@ from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
 from univoxel.tasks import joint
+from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress
+from univoxel.tasks.timelapse import Timelapse
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
@@ -50,6 +52,7 @@ MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silh
 class Batch:
     """Rays, and what the photographs show there."""
 
+    view: Tensor  # [N] int64
     rays: Rays
     color: Tensor  # [N, 3] linear, straight
     alpha: Tensor  # [N]
@@ -59,8 +62,12 @@ class Batch:
         return -self.rays.direction
 
 
-def train(cfg: TrainConfig, resume: bool = False) -> Path:
+def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None = None) -> Path:
     """Train a scene; leave model, log, preview and configuration in cfg.out and return it.
+
+    Args:
+        timelapse: .gif, .mp4 or folder for pictures of a view over training time, which making
+            them does not count in.
 
     Raises:
         DataError: input that cannot be used.
@@ -70,6 +77,7 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
         FileNotFoundError, ValueError: with resume, there is no checkpoint that can be read, or it
             belongs to another configuration.
     """
+    film = None if timelapse is None else Timelapse(timelapse, cfg)
     begin = time.monotonic()
     torch.manual_seed(cfg.seed)
     photos = load_photos(cfg.data, "train")
@@ -94,12 +102,15 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
         hull = visual_hull(distance, photos.cameras, first)
         field = DenseField(first, cfg.scene.channels, hull)
         light = lights.scaled(cfg.scene.light, float((upper - lower).max()) / 2)
-        scene = Scene(replace(cfg.scene, light=light), field)
+        views = tuple(photos.names) if cfg.scene.varying != "none" else ()
+        scene = Scene(replace(cfg.scene, light=light, views=views), field)
         state = {"stage": 0, "progress": 0.0, "step": 0}
 
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
     save_config(cfg)
     with Progress(cfg, begin, state) as progress:
+        if film:
+            progress.watch = lambda: film.look(scene, progress)
         for index in range(state["stage"], len(cfg.stages)):
             stage, grid = cfg.stages[index], grids[index]
             if isinstance(stage, JointConfig):
@@ -112,6 +123,8 @@ def train(cfg: TrainConfig, resume: bool = False) -> Path:
             done = index + 1 == len(cfg.stages)
             save_scene(scene, cfg.out, progress.state(), slim=done)
             preview(scene, photos, cfg.out / "preview.png")
+        if film:
+            film.finish(scene, progress)
     return cfg.out
 
 
@@ -134,6 +147,9 @@ def run_stage(
     if scene.mirrored:  # only with fixed materials: before, it would take their gloss upon itself
         scene.mirrored.requires_grad_(stage.refit)
         networks.append(scene.mirrored)
+    if scene.views:
+        scene.views.gain_steps.requires_grad_(not stage.refit)
+        networks.append(scene.views)
     optimizer = RowAdam(
         [
             {"params": [field.sdf], "eps": EPS_SDF},
@@ -143,6 +159,7 @@ def run_stage(
         betas=MOMENTS,
     )
     scratch = torch.zeros_like(field.sdf.data)
+    plateau = Plateau(cfg.patience)
     for done in progress.steps():
         physical = done >= stage.physical_from
         rates = (
@@ -174,6 +191,10 @@ def run_stage(
         optimizer.step()
         if progress.step % SMOOTH_EVERY == 0 and not stage.refit:
             smooth(field, stage)
+        if plateau.due(done):
+            quality = held_out_psnr(scene, photos, held_out, physical)
+            if plateau.flat(done, quality, physical):
+                progress.shorten()
         if progress.due():
             quality = held_out_psnr(scene, photos, held_out, physical)
             progress.report({k: v.item() for k, v in terms.items()}, quality)
@@ -192,7 +213,7 @@ def objective(
     # A random background: otherwise a surface of the background's colour explains empty space.
     behind = torch.rand_like(batch.color)
     target = linear_to_srgb(batch.color * alpha + behind * (1 - alpha))
-    radiance = scene.radiance(surface.features, surface.normal, batch.wo)
+    radiance = encoded_radiance(scene, surface, batch)
     drawn = radiance * opacity + linear_to_srgb(behind) * (1 - opacity)
     terms = {
         "radiance": weight.radiance * losses.photometric(drawn, target),
@@ -202,15 +223,17 @@ def objective(
     if not physical or not len(hit):
         return terms
 
-    met = at_rays(surface, hit)
+    met, view = at_rays(surface, hit), batch.view[hit]
     opacity, behind, target = opacity[hit], behind[hit], target[hit]
-    shaded = shade(scene, met, batch.wo[hit], torch.default_generator)
+    shaded = shade(scene, met, batch.wo[hit], torch.default_generator, view)
     encoded = losses.encode(shaded * opacity + behind * (1 - opacity))
     beside = met.position.detach() + scene.field.voxel_size * torch.randn_like(met.position)
     near = scene.field.sample(beside).features
     albedo, roughness, _ = scene.material(near)
     assert met.metallic is not None
-    prior = scene.light.regularisation(met, replace(met, features=near, position=beside))
+    here = replace(met, features=scene.coded(met.features, view))
+    near = replace(met, features=scene.coded(near, view), position=beside)
+    prior = scene.light.regularisation(here, near)
     terms |= {
         "physical": losses.photometric(encoded, target),
         "albedo": weight.albedo_smoothness * priors.smoothness(met.albedo, albedo),
@@ -218,6 +241,15 @@ def objective(
         "metallic": weight.metallic * met.metallic.mean(),
     }
     return terms | {name: getattr(weight, name) * value for name, value in prior.items()}
+
+
+def encoded_radiance(scene: Scene, surface: Surface, batch: Batch) -> Tensor:
+    """What the radiance head says of the photographs' rays: [N, 3], sRGB-encoded."""
+    features = scene.coded(surface.features, batch.view)
+    encoded = scene.radiance(features, surface.normal, batch.wo)
+    if scene.views is None:
+        return encoded
+    return losses.encode(scene.exposed(srgb_to_linear(encoded), batch.view))
 
 
 def spread_gradient(field: DenseField, passes: int, scratch: Tensor) -> None:
@@ -267,7 +299,7 @@ def batch_at(photos: Photos, pixels: Tensor) -> Batch:
     view, row, column = pixels.unbind(1)
     color, alpha = photos.pixels(view, row, column)
     centre = torch.stack([column, row], 1) + 0.5
-    return Batch(pixel_rays(photos.cameras, view, centre), color, alpha)
+    return Batch(view, pixel_rays(photos.cameras, view, centre), color, alpha)
 
 
 @torch.no_grad()
@@ -277,10 +309,10 @@ def held_out_psnr(scene: Scene, photos: Photos, pixels: Tensor, physical: bool) 
     batch = batch_at(photos, pixels)
     surface = surface_at(scene, batch.rays)
     if physical:
-        shaded = linear_to_srgb(shade(scene, surface, batch.wo) * surface.opacity[:, None])
+        shaded = shade(scene, surface, batch.wo, view=batch.view)
+        shaded = linear_to_srgb(shaded * surface.opacity[:, None])
     else:
-        shaded = scene.radiance(surface.features, surface.normal, batch.wo)
-        shaded = shaded * surface.opacity[:, None]
+        shaded = encoded_radiance(scene, surface, batch) * surface.opacity[:, None]
     target = linear_to_srgb(batch.color * batch.alpha[:, None])
     return -10 * torch.log10((shaded - target).square().mean()).item()
 

@@ -1,0 +1,109 @@
+"""The chart of quality against time, from made-up outcomes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from univoxel.experiments import chart as module
+from univoxel.experiments.plots import pareto
+from univoxel.experiments.record import Outcome
+
+
+def test_the_front_is_what_no_other_beats():
+    points = [(60, 30.0), (240, 36.0), (300, 35.0), (720, 36.0), (900, 38.0), (60, 29.0)]
+    assert pareto(points, more=True) == [0, 1, 4]
+    assert pareto([(t, -v) for t, v in points], more=False) == [0, 1, 4]
+    assert pareto([], more=True) == []
+
+
+@pytest.mark.parametrize("light", ["hybrid", "sg", "mlp"])
+def test_every_setting_is_a_configuration_of_its_own(light):
+    found = module.settings("fast", light)
+    assert list(found)[:3] == ["draft", "fast", "full"]
+    configs = [repr(s.config(Path(), Path())) for s in found.values()]
+    assert len(set(configs)) == len(configs)
+    assert ("lobes-x0.5" in found) == (light != "mlp")
+    assert f"light-{light}" not in found
+    assert set(module.QUICK) - {f"light-{light}"} <= set(found)
+
+
+def test_a_knob_turns_what_it_says():
+    base, double = (
+        module.settings("fast", "hybrid")[name].config(Path(), Path())
+        for name in ("fast", "voxels-x2")
+    )
+    finest = max(getattr(s, "voxels", 0) for s in base.stages)
+    for before, after in zip(base.stages, double.stages, strict=True):
+        if getattr(before, "voxels", None) == finest:
+            assert after.voxels == 2 * finest
+        else:
+            assert after == before
+    half = module.settings("fast", "hybrid", ("seed=4",))["rays-x0.5"].config(Path(), Path())
+    assert half.seed == 4
+    assert [s.rays for s in half.stages] == [s.rays // 2 for s in base.stages]
+    assert [s.iterations for s in half.stages] == [s.iterations for s in base.stages]
+
+
+def outcome(scene, name, seconds, psnr, mse=None):
+    measures = {"nvs_psnr": psnr, "roughness_mse": mse, "train_seconds": seconds}
+    log = [
+        {"seconds": t * seconds, "stage": 0, "held_out_psnr": q}
+        for t, q in ((0.2, 20.0), (0.5, None), (0.9, 28.0))
+    ]
+    return Outcome(scene, name, {}, measures, log)
+
+
+ROWS = [
+    outcome("cup", "draft", 60, 30.0, 0.02),
+    outcome("cup", "fast", 240, 29.0, 0.01),
+    outcome("cup", "voxels-x2", 300, 31.0, 0.01),
+    outcome("shoe", "draft", 60, 30.0),
+    Outcome("shoe", "fast", {}, error="ValueError: no"),
+]
+
+
+def test_fronts_by_scene_and_measure():
+    found = module.fronts(ROWS)
+    assert found["cup"]["nvs_psnr"] == ["draft", "voxels-x2"]
+    assert found["cup"]["roughness_mse"] == ["draft", "fast"]
+    assert found["shoe"] == {m.key: [] for m in module.SHOWN} | {"nvs_psnr": ["draft"]}
+
+
+def test_the_picture_is_drawn(tmp_path):
+    png, svg = module.draw(ROWS, tmp_path / "chart")
+    assert png.read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in svg.read_text()
+
+
+@pytest.fixture
+def passed(monkeypatch):
+    """What reaches the runner, in place of the trainings."""
+    noted = []
+
+    def run(scenes, settings, out, samples):
+        noted.append([s.name for s in settings])
+        out.mkdir(exist_ok=True)
+        return [outcome("cup", s.name, 60, 30.0) for s in settings]
+
+    monkeypatch.setattr(module.runner, "run", run)
+    return noted
+
+
+def test_which_settings_are_trained(passed, tmp_path):
+    out = tmp_path / "out"
+    assert module.chart([tmp_path], out, quick=True) == out / "chart.png"
+    module.chart([tmp_path], out, "draft", quick=True)
+    module.chart([tmp_path], out, only=["fast", "lobes-x2"])
+    assert passed == [
+        ["draft", "fast", *module.QUICK],
+        ["draft", *module.QUICK],
+        ["fast", "lobes-x2"],
+    ]
+    assert {p.name for p in out.iterdir()} == {"chart.json", "chart.png", "chart.svg"}
+    record = json.loads((out / "chart.json").read_text())
+    assert [p["setting"] for p in record["points"]] == ["fast", "lobes-x2"]
+    assert record["fronts"]["cup"]["nvs_psnr"] == ["fast"]
+    assert {p["minutes"] for p in record["published"]} >= {18, 14, None}
+    with pytest.raises(ValueError, match=r"--only must be of draft, fast, full, .*, got speed"):
+        module.chart([tmp_path], out, only=["fast", "speed"])

@@ -1,0 +1,158 @@
+"""Many trainings: each on an analytic scene with settings that take a moment."""
+
+import dataclasses
+import json
+import shutil
+
+import pytest
+from analytic import write_scene
+
+from univoxel.data import DataError
+from univoxel.experiments import runner, worker
+from univoxel.experiments.record import Setting, load_outcome
+from univoxel.scene import FILE
+from univoxel.tasks.evaluate import MEASURES
+
+TINY = (
+    *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),
+    *("stages.0.iterations=2", "stages.1.iterations=8", "stages.1.physical_from=0.0"),
+    *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
+    *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
+)
+SMALL = Setting("small", "draft", "sg", changes=TINY)
+DIES = dataclasses.replace(SMALL, name="dies", changes=(*TINY, "loss.radiance=1e39"))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("many") / "ball", views=6, size=16)
+
+
+@pytest.fixture(scope="module")
+def out(data, tmp_path_factory):
+    """A folder in which one setting came through and one failed."""
+    out = tmp_path_factory.mktemp("out")
+    assert [bool(o.error) for o in runner.run([data], [DIES, SMALL], out, samples=1)] == [1, 0]
+    return out
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """The names of the settings whose process was started, in place of the process."""
+    names = []
+
+    def note(job, bar):
+        names.append(job.setting.name)
+        return runner.Outcome(job.scene, job.setting.name, job.identity)
+
+    monkeypatch.setattr(runner, "_train", note)
+    return names
+
+
+def test_a_training_is_recorded_with_every_measure(out):
+    outcome = load_outcome(out / "ball" / "small")
+    assert (outcome.scene, outcome.setting, outcome.error) == ("ball", "small", None)
+    assert set(MEASURES) | {"map_ball_psnr", "map_brightest_degrees"} <= set(outcome.measures)
+    assert outcome.measures["nvs_psnr"] > 5
+    assert outcome.measures["peak_rss_mb"] > 50
+    assert outcome.measures["steps_made"] == 1
+    assert outcome.measures["map_ball_psnr"] is None  # local light has no map
+    assert outcome.load_average is not None
+    assert (out / "ball" / "small" / "run" / FILE).is_file()
+
+
+def test_a_failure_is_recorded_and_the_rest_goes_on(out):
+    outcome = load_outcome(out / "ball" / "dies")
+    assert outcome.error.startswith("FloatingPointError: the loss is inf at step 0")
+    assert not outcome.measures
+    failed = runner.failures([outcome, load_outcome(out / "ball" / "small")])
+    assert failed.startswith("1 of 2 trainings failed, ")
+    assert "ball/dies: FloatingPointError" in failed
+
+
+def test_what_is_done_is_not_done_again(data, out, trained):
+    again = runner.run([data], [DIES, SMALL], out, samples=1)
+    assert trained == ["dies"]
+    assert again[1] == load_outcome(out / "ball" / "small")
+
+
+def test_results_of_other_settings_are_not_taken(data, out, trained):
+    other = dataclasses.replace(SMALL, changes=(*TINY, "seed=5"))
+    for settings, samples in (([other], 1), ([SMALL], 2)):
+        with pytest.raises(ValueError, match=r"small/result\.json: is of another configuration"):
+            runner.run([data], settings, out, samples=samples)
+    assert not trained
+
+
+def test_a_killed_evaluation_goes_on_from_the_trained_scene(out, tmp_path, monkeypatch):
+    folder = tmp_path / "ball" / "small"
+    shutil.copytree(out / "ball" / "small", folder)
+    (folder / "result.json").unlink()
+    monkeypatch.setattr(worker, "train", lambda config: pytest.fail("it was trained already"))
+    worker.work(folder)
+    assert load_outcome(folder).measures["nvs_psnr"] > 5
+
+
+def test_a_killed_training_starts_anew(out, tmp_path, monkeypatch):
+    folder = tmp_path / "ball" / "small"
+    shutil.copytree(out / "ball" / "small", folder)
+    (folder / "run" / FILE).write_bytes(b"cut short")
+    begun = []
+
+    def train(config):
+        begun.append(config)
+        assert not config.out.exists()
+        shutil.copytree(out / "ball" / "small" / "run", config.out)
+
+    monkeypatch.setattr(worker, "train", train)
+    worker.work(folder)
+    assert len(begun) == 1
+
+
+def test_two_processes_do_not_share_a_folder(out, tmp_path):
+    folder = tmp_path / "small"
+    shutil.copytree(out / "ball" / "small", folder)
+    with (folder / "job.json").open() as file:
+        worker.fcntl.flock(file, worker.fcntl.LOCK_EX)
+        with pytest.raises(RuntimeError, match="small: another process is at work there"):
+            worker.work(folder)
+
+
+def test_a_signal_is_named(tmp_path):
+    assert runner._reason(-9, tmp_path / "none") == "ended by SIGKILL"
+    (tmp_path / "said").write_text("")
+    assert runner._reason(3, tmp_path / "said") == "ended with exit code 3"
+
+
+def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):
+    other = tmp_path / "b" / "ball"
+    shutil.copytree(data, other)
+    (other / "transforms_test.json").unlink()
+    out = tmp_path / "out"
+
+    def refused(error, match, scenes=(data,), settings=(SMALL,), samples=1):
+        with pytest.raises(error, match=match):
+            runner.run(scenes, settings, out, samples)
+
+    refused(ValueError, "expected scenes in folders of different names", [data, other])
+    refused(ValueError, "expected scenes in folders of different names", [])
+    refused(DataError, "transforms_test", [other])
+    refused(
+        ValueError, r"settings of different names, got \['small', 'small'\]", [data], [SMALL] * 2
+    )
+    escaping = dataclasses.replace(SMALL, name="../up")
+    refused(ValueError, r"settings of different names, got \['../up'\]", settings=[escaping])
+    refused(ValueError, "--samples must be at least 1, got 0", samples=0)
+    unknown = dataclasses.replace(SMALL, changes=("seed=x",))
+    refused(ValueError, "--set seed=x: expected a int", settings=[unknown])
+    assert not trained
+    assert not out.exists()
+
+
+def test_the_log_is_kept_for_charts(tmp_path):
+    assert worker.read_log(tmp_path / "log.jsonl") == []
+    line = {"seconds": 5.0, "stage": 1, "held_out_psnr": None, "losses": {}}
+    (tmp_path / "log.jsonl").write_text(json.dumps(line) + "\n")
+    assert worker.read_log(tmp_path / "log.jsonl") == [
+        {"seconds": 5.0, "stage": 1, "held_out_psnr": None}
+    ]

@@ -1,0 +1,268 @@
+"""Quality against training time: presets, and single knobs around one of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from univoxel.config import LIGHTS, LightName, StageConfig, TrainConfig
+from univoxel.data.images import replacing
+from univoxel.experiments import plots, runner
+from univoxel.experiments.plots import Measure
+from univoxel.experiments.record import Outcome, Setting
+
+BETWEEN = (2, 8)  # minutes, where the curve is looked at between the presets
+PRESETS = ("draft", "fast", "full")
+SHOWN = (plots.NVS, plots.ALBEDO, plots.ROUGHNESS, plots.RELIT, plots.NORMAL)
+ACROSS = 3  # panels in a row
+QUICK = ("voxels-x0.5", "rays-x0.5", "light-sg")  # beside draft and the preset
+
+
+@dataclass(frozen=True)
+class Published:
+    """A figure from a paper: another data set, a GPU. Drawn to compare orders, not digits."""
+
+    name: str
+    where: str  # data and machine
+    minutes: float | None  # of training; None where none is published
+    measures: dict[str, float]
+
+
+def _published(name: str, where: str, minutes: float | None, *values: float) -> Published:
+    keys = (plots.NVS.key, plots.ALBEDO.key, plots.ROUGHNESS.key, plots.RELIT.key)
+    return Published(name, where, minutes, dict(zip(keys, values, strict=True)))
+
+
+# Wu et al. 2024 (UniVoxel), their comparison of lights, and what others report
+_MII = "MII synthetic, RTX 3090"
+PUBLISHED = (
+    _published("UniVoxel, 16 SG", _MII, 18, 36.232, 29.933, 0.007, 29.445),
+    _published("UniVoxel, 128 SG map", _MII, 58, 34.185, 27.368, 0.012, 27.446),
+    _published("UniVoxel, 256x512 map", _MII, 120, 35.042, 29.369, 0.010, 29.592),
+    _published("best of the field", "Synthetic4Relight, GPU", 14, 37.1, 30.8, 0.004, 35.9),
+    Published("UniVoxel", "Shiny Blender, RTX 3090", None, {plots.NORMAL.key: 9.3}),
+    Published("best of the field", "Shiny Blender, GPU", None, {plots.NORMAL.key: 2.0}),
+)
+
+
+def chart(
+    scenes: Sequence[Path],
+    out: Path,
+    preset: str = "fast",
+    light: LightName = "hybrid",
+    quick: bool = False,
+    only: Sequence[str] = (),
+    changes: Sequence[str] = (),
+    samples: int = 64,
+) -> Path:
+    """Train every scene with presets and knobs; write out/chart.json, .png and .svg.
+
+    Args:
+        scenes: folders of data sets, of different names.
+        out: every training is kept in out/SCENE/SETTING, and not done again by a later call.
+        preset: what the knobs are turned around.
+        light: of the presets and the knobs.
+        quick: draft, the preset and three knobs.
+        only: names of settings; all when empty.
+        changes: FIELD=VALUE of the configuration, for all.
+        samples: of the light per pixel of relit pictures in evaluation.
+
+    Returns:
+        out/chart.png.
+
+    Raises:
+        DataError, ValueError: a scene or an argument cannot be used; nothing was trained.
+        ImportError: matplotlib is missing.
+        RuntimeError: trainings failed; what came through is in the files.
+        OSError: a file cannot be written.
+    """
+    plots.require()
+    chosen = settings(preset, light, tuple(changes))
+    wanted = only or ((*dict.fromkeys(("draft", preset)), *QUICK) if quick else tuple(chosen))
+    if unknown := [name for name in wanted if name not in chosen]:
+        raise ValueError(f"--only must be of {', '.join(chosen)}, got {', '.join(unknown)}")
+    outcomes = runner.run(scenes, [chosen[name] for name in wanted], out, samples)
+    record = {
+        "preset": preset,
+        "light": light,
+        "changes": list(changes),
+        "samples": samples,
+        "machine": plots.machine(),
+        "points": [asdict(outcome) for outcome in outcomes],
+        "fronts": fronts(outcomes),
+        "published": [asdict(point) for point in PUBLISHED],
+    }
+    with replacing(out / "chart.json") as temporary:
+        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    if any(not outcome.error for outcome in outcomes):
+        draw(outcomes, out / "chart")
+    if failed := runner.failures(outcomes):
+        raise RuntimeError(failed)
+    return out / "chart.png"
+
+
+def settings(preset: str, light: LightName, changes: tuple[str, ...] = ()) -> dict[str, Setting]:
+    """The presets, and the preset with one knob turned, by name.
+
+    Raises:
+        ValueError: no such preset or light, or changes that it does not take.
+    """
+    base = Setting(preset, preset, light, None, changes)
+    config = base.config(Path(), Path())
+    found = [Setting(name, name, light, None, changes) for name in PRESETS]
+    found += [Setting(f"minutes-{m}", "auto", light, m, changes) for m in BETWEEN]
+    for name, own in _knobs(config).items():
+        found.append(replace(base, name=name, changes=(*changes, *own)))
+    found += [replace(base, name=f"light-{x}", light=x) for x in LIGHTS if x != light]
+    return {setting.name: setting for setting in found}
+
+
+def fronts(outcomes: Sequence[Outcome]) -> dict[str, dict[str, list[str]]]:
+    """By scene and measure, the settings that no other beats in both time and quality."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for scene in dict.fromkeys(o.scene for o in outcomes):
+        found[scene] = {}
+        for measure in SHOWN:
+            there = _points(outcomes, scene, measure)
+            front = plots.pareto([point for _, point in there], measure.more)
+            found[scene][measure.key] = [there[i][0] for i in front]
+    return found
+
+
+def draw(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
+    """For each scene a panel for each measure that there is, and one of the held-out rays while
+    training went on."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogFormatter
+
+    scenes = list(dict.fromkeys(o.scene for o in outcomes))
+    shown = [m for m in SHOWN if any(_points(outcomes, s, m) for s in scenes)]
+    rows = -(-(len(shown) + 1) // ACROSS)  # of a scene
+    figure = Figure(figsize=(4.6 * ACROSS, 3.6 * rows * len(scenes)), layout="constrained")
+    axes = figure.subplots(rows * len(scenes), ACROSS, squeeze=False).reshape(len(scenes), -1)
+    marks = _marks(outcomes)
+    for row, scene in zip(axes, scenes, strict=True):
+        for axis, measure in zip(row, shown, strict=False):
+            _draw_measure(axis, measure, _points(outcomes, scene, measure), marks)
+            axis.set_title(f"{scene}: {measure.title}", size=10)
+        log, *unused = row[len(shown) :]
+        _draw_logs(log, [o for o in outcomes if o.scene == scene and not o.error])
+        log.set_title(f"{scene}: held-out rays of training views, dB", size=10)
+        for axis in (*row[: len(shown)], log):
+            axis.set_xscale("log")
+            axis.xaxis.set_major_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
+            axis.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
+            axis.set_xlabel("training, seconds")
+            axis.grid(alpha=0.25)
+            axis.spines[["top", "right"]].set_visible(False)
+        for axis in unused:
+            axis.set_axis_off()
+    made = plots.machine()
+    legend = ", ".join(f"{mark} {name}" for name, mark in marks.items() if name != mark)
+    figure.suptitle(
+        f"{made['threads']} threads of {made['processor']}. Line: Pareto front. Grey: published, "
+        f"on other data and on GPUs.\n{legend}",
+        size=9,
+        wrap=True,
+    )
+    return plots.save_figure(figure, stem)
+
+
+def _marks(outcomes: Sequence[Outcome]) -> dict[str, str]:
+    """What stands beside a setting's dots: a preset's name, a number for others."""
+    names = list(dict.fromkeys(o.setting for o in outcomes))
+    others = [name for name in names if name not in PRESETS]
+    return {name: name if name in PRESETS else str(others.index(name) + 1) for name in names}
+
+
+def _draw_measure(
+    axis: Any,
+    measure: Measure,
+    points: list[tuple[str, tuple[float, float]]],
+    marks: dict[str, str],
+) -> None:
+    place = [point for _, point in points]
+    if not measure.more:
+        axis.invert_yaxis()  # better is up in every panel
+    front = [place[i] for i in plots.pareto(place, measure.more)]
+    axis.plot(*_columns(front), color=plots.color(0), linewidth=1, drawstyle="steps-post")
+    for name, point in points:
+        kind = (
+            0
+            if name in PRESETS or name.startswith("minutes-")
+            else 2
+            if name.startswith("light-")
+            else 1
+        )
+        axis.plot(*point, "os^"[kind], color=plots.color(kind), markersize=8 - 3 * (kind > 0))
+        _label(axis, marks[name], point, "black", 8)
+    for p in PUBLISHED:
+        if (value := p.measures.get(measure.key)) is None:
+            continue
+        if p.minutes is None:
+            axis.axhline(value, color="grey", linestyle=":", linewidth=1)
+            axis.annotate(p.name, (0.01, value), xycoords=("axes fraction", "data"), size=6)
+        else:
+            axis.plot(60 * p.minutes, value, "x", color="grey")
+            _label(axis, p.name, (60 * p.minutes, value), "grey", 6)
+
+
+def _draw_logs(axis: Any, outcomes: Iterable[Outcome]):
+    for outcome in outcomes:
+        front = outcome.setting in PRESETS
+        seen = [e for e in outcome.log if e["held_out_psnr"] is not None and e["seconds"] > 0]
+        curve = [(entry["seconds"], entry["held_out_psnr"]) for entry in seen]
+        color = plots.color(PRESETS.index(outcome.setting)) if front else "grey"
+        label = outcome.setting if front else None
+        axis.plot(*_columns(curve), color=color, linewidth=1.5 if front else 0.6, label=label)
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(fontsize=7)
+
+
+def _label(axis: Any, text: str, point: tuple[float, float], color: str, size: int) -> None:
+    axis.annotate(text, point, (4, 3), textcoords="offset points", size=size, color=color)
+
+
+def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    return [x for x, _ in points], [y for _, y in points]
+
+
+def _points(
+    outcomes: Sequence[Outcome], scene: str, measure: Measure
+) -> list[tuple[str, tuple[float, float]]]:
+    """Setting, seconds and value of a scene's trainings that came through."""
+    found = []
+    for o in outcomes:
+        seconds, value = o.measures.get(plots.SECONDS.key), o.measures.get(measure.key)
+        if o.scene == scene and seconds is not None and value is not None:
+            found.append((o.setting, (seconds, value)))
+    return found
+
+
+def _knobs(config: TrainConfig) -> dict[str, tuple[str, ...]]:
+    """FIELD=VALUE that turn one knob of a configuration, by name."""
+    stages = list(enumerate(config.stages))
+    finest = max(s.voxels for _, s in stages if isinstance(s, StageConfig))
+    found: dict[str, tuple[str, ...]] = {}
+
+    def turn(name: str, wanted: Callable[[Any], bool], field: str, factor: float) -> None:
+        own = []
+        for i, stage in stages:
+            if wanted(stage):
+                value = getattr(stage, field) * factor
+                own.append(f"stages.{i}.{field}={value if field == 'voxels' else round(value)}")
+        found[f"{name}-x{factor:g}"] = tuple(own)
+
+    for factor in (0.5, 2.0):
+        turn("voxels", lambda s: getattr(s, "voxels", None) == finest, "voxels", factor)
+        turn("rays", lambda s: True, "rays", factor)
+        turn("steps", lambda s: True, "iterations", factor)
+        for field in ("lobes", "directions"):
+            value = getattr(config.scene.light, field, None)
+            if value:
+                changed = f"scene.light.{field}={round(factor * value)}"
+                found[f"{field}-x{factor:g}"] = (changed,)
+    return found

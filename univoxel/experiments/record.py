@@ -1,0 +1,82 @@
+"""What one training of many is, and what came out of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from univoxel.config import LightName, TrainConfig, chosen
+from univoxel.data.images import replacing
+from univoxel.overrides import changed
+
+RESULT = "result.json"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How to train, whatever the scene."""
+
+    name: str  # of its folder and in tables; unique among the settings of an experiment
+    preset: str = "auto"
+    light: LightName = "hybrid"
+    minutes: float | None = None  # as of config.chosen
+    changes: tuple[str, ...] = ()  # FIELD=VALUE of the configuration
+
+    def config(self, data: Path, out: Path) -> TrainConfig:
+        """The whole configuration.
+
+        Raises:
+            ValueError: there is no such preset, light or field, or a value is out of range.
+        """
+        config = chosen(self.preset, self.minutes, data, out, self.light)
+        return changed(config, self.changes)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One training on one scene."""
+
+    scene: str
+    setting: str
+    identity: dict  # what a later call must agree with to take this for its own; JSON
+    # By the keys of tasks.evaluate.MEASURES, steps_made (share of the planned ones), and map_*, the
+    # fields of tasks.envmap.Comparison
+    measures: Mapping[str, float | int | None] = dataclasses.field(default_factory=dict)
+    log: list[dict] = dataclasses.field(default_factory=list)  # seconds, stage, held_out_psnr
+    load_average: float | None = None  # of the machine when it began
+    error: str | None = None  # why it failed
+
+    def save(self, folder: Path) -> None:
+        """Write folder/result.json, whole or not at all.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        with replacing(folder / RESULT) as temporary:
+            text = json.dumps(dataclasses.asdict(self), indent=1)
+            temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def load_outcome(folder: Path) -> Outcome | None:
+    """What folder/result.json holds; None where there is none.
+
+    Raises:
+        ValueError: it is no such file.
+    """
+    path = folder / RESULT
+    if not path.exists():
+        return None
+    try:
+        return Outcome(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"{path}: expected the record of a training: {error}") from None
+
+
+def identity(config: TrainConfig, samples: int) -> dict:
+    """Everything that decides what comes out, as JSON has it; not where it lies."""
+    fields = dataclasses.asdict(config) | {"data": str(config.data.resolve())}
+    del fields["out"]
+    return json.loads(json.dumps({"samples": samples, "config": fields}, default=str))

@@ -1,0 +1,97 @@
+"""The process of one training: `python -m univoxel.experiments.worker FOLDER`.
+
+FOLDER holds job.json; result.json is written into it, whole or not at all. A process of its own
+gives each training a fresh peak of memory, and takes nothing down with it when it dies.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+
+from univoxel.config import TrainConfig, check_same
+from univoxel.experiments.record import Outcome, Setting, identity
+from univoxel.scene import load_checkpoint
+from univoxel.tasks.envmap import Comparison, envmap
+from univoxel.tasks.evaluate import evaluate
+from univoxel.tasks.train import train
+
+JOB = "job.json"
+RUN = "run"  # the training's own folder
+MAP = "envmap.exr"  # the recovered light, where the run has one
+
+
+def work(folder: Path) -> None:
+    """Train, evaluate and record what folder/job.json says.
+
+    A training that was broken off starts anew: one in several sittings is not what a reader of its
+    figures expects. One that was finished is only evaluated.
+    """
+    with (folder / JOB).open(encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise RuntimeError(f"{folder}: another process is at work there") from None
+        job = json.load(file)
+        setting = Setting(**job["setting"] | {"changes": tuple(job["setting"]["changes"])})
+        config = setting.config(Path(job["data"]), folder / RUN)
+        load = os.getloadavg()[0]
+        if not finished(config):
+            shutil.rmtree(config.out, ignore_errors=True)
+            train(config)
+        samples = job["samples"]
+        measures = {
+            **evaluate(config.out, samples=samples),
+            "steps_made": steps_made(config),
+            **light_error(config.out, folder / MAP),
+        }
+        Outcome(
+            folder.parent.name,
+            setting.name,
+            identity(config, samples),
+            measures,
+            read_log(config.out / "log.jsonl"),
+            load,
+        ).save(folder)
+
+
+def finished(config: TrainConfig) -> bool:
+    """Whether the run's folder holds the whole of this training."""
+    try:
+        check_same(config)
+        return load_checkpoint(config.out)[1]["stage"] == len(config.stages)
+    except (ValueError, FileNotFoundError):
+        return False
+
+
+def steps_made(config: TrainConfig) -> float:
+    """Share of the planned steps that the run made; less than 1 where time ended it."""
+    made = load_checkpoint(config.out)[1]["made"]
+    planned = [stage.iterations for stage in config.stages]
+    return sum(m * p for m, p in zip(made, planned, strict=True)) / sum(planned)
+
+
+def light_error(run: Path, file: Path) -> dict[str, float | None]:
+    """How far the recovered map, which is written to a file, is from the true one, as map_*."""
+    found = None
+    if load_checkpoint(run)[0].environment() is not None:
+        found = envmap(run, file)
+    names = [f.name for f in dataclasses.fields(Comparison)]
+    return {f"map_{name}": None if found is None else getattr(found, name) for name in names}
+
+
+def read_log(path: Path) -> list[dict]:
+    """What a chart needs of a training's log."""
+    if not path.exists():  # over before the first report
+        return []
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return [{key: line[key] for key in ("seconds", "stage", "held_out_psnr")} for line in lines]
+
+
+if __name__ == "__main__":
+    work(Path(sys.argv[1]))

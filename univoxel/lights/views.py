@@ -1,0 +1,112 @@
+"""What the light of each photograph has of its own."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from univoxel.sphere import real_harmonics
+
+DEGREE = 3  # of the harmonics that a view's map may differ by at first: halves, quarters of the sky
+RATE = 10.0  # the learning rate of networks moves log gains that much faster: a stop is soon taken
+
+
+class ViewLights(nn.Module):
+    """Gains, codes and changes of the map for V views; as many views as there are photographs.
+
+    - A gain per channel: exposure, and the colour of all light. Their geometric mean over the views
+      is 1, so that they cannot trade with albedo or light.
+    - A code of Z numbers, which networks of light read beside the features. Materials never do.
+    - What is added to the logarithm of the scene's map at D directions: sum_r weight_vrc basis_rd.
+      The R functions start as spherical harmonics of degree 1 to 3, the weights at 0.
+    Weights and codes have mean 0 over the views: the mean light is that of no view in particular.
+
+    Source: Martin-Brualla et al. 2021 (NeRF in the Wild) for a learned code per photograph.
+    """
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        codes: int = 0,
+        directions: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """
+        Args:
+            names: of the V views, in the order of their numbers.
+            codes: Z, >= 0; 0: the views differ by gains alone.
+            directions: [D, 3] unit, of the scene's map, where it may differ from view to view.
+            generator: draws the first codes.
+        """
+        super().__init__()
+        self.names = names
+        self.chosen: int | None = None  # whose light is shown where no view is named; None: mean
+        self.gain_steps = nn.Parameter(torch.zeros(len(names), 3))
+        self.raw_codes = None
+        if codes:
+            self.raw_codes = nn.Parameter(torch.randn(len(names), codes, generator=generator))
+        self.sky_weights = self.sky_basis = None
+        if directions is not None:
+            basis = real_harmonics(DEGREE, directions)[:, 1:].T  # the first is constant: the gain
+            self.sky_weights = nn.Parameter(torch.zeros(len(names), len(basis), 3))
+            self.sky_basis = nn.Parameter(basis.contiguous())  # [R, D]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def choose(self, view: str | None) -> None:
+        """Show the light of a view, by name or number, where none is named; None: the mean light.
+
+        Raises:
+            ValueError: no such view.
+        """
+        if view is None or view in self.names:
+            self.chosen = None if view is None else self.names.index(view)
+        elif view.isdigit() and int(view) < len(self):
+            self.chosen = int(view)
+        else:
+            raise ValueError(
+                f"--light-of: expected a number below {len(self)} or one of {self.names[0]} to "
+                f"{self.names[-1]}, got {view!r}"
+            )
+
+    def add(self, to_gains: Tensor, to_weights: Tensor | None = None) -> Tensor:
+        """Add to log gains [V, 3] and weights [V, R, 3], but for what all views have of it.
+
+        Returns:
+            That, for the log map that they share to take up: [1, 3], or [D, 3] with weights.
+        """
+        self.gain_steps.data += to_gains / RATE
+        shared = to_gains.mean(0, keepdim=True)
+        if to_weights is None or self.sky_weights is None or self.sky_basis is None:
+            return shared
+        self.sky_weights.data += to_weights
+        return shared + torch.einsum("rc,rd->dc", to_weights.mean(0), self.sky_basis.detach())
+
+    @property
+    def log_gain(self) -> Tensor:
+        """[V, 3], of mean 0 over the views."""
+        return RATE * _centred(self.gain_steps)
+
+    def gain(self, view: Tensor | int | None = None) -> Tensor:
+        """Factor [N, 3] on radiance in the photographs of views [N]; [3] for one view, or none."""
+        view = self.chosen if view is None else view
+        return self.gain_steps.new_ones(3) if view is None else self.log_gain[view].exp()
+
+    def code(self, view: Tensor | int | None = None) -> Tensor | None:
+        """[N, Z] of views [N]; [Z] for one view, or none. None where only gains differ."""
+        if self.raw_codes is None:
+            return None
+        view = self.chosen if view is None else view
+        codes = _centred(self.raw_codes)
+        return torch.zeros_like(codes[0]) if view is None else codes[view]
+
+    def sky_change(self) -> Tensor | None:
+        """What each view adds to the log map: [V, D, 3]; None where all have one map."""
+        if self.sky_weights is None or self.sky_basis is None:
+            return None
+        return torch.einsum("vrc,rd->vdc", _centred(self.sky_weights), self.sky_basis)
+
+
+def _centred(values: Tensor) -> Tensor:
+    return values - values.mean(0)

@@ -1,0 +1,152 @@
+"""Gauss-Newton on the light of photographs: the normal equations that joint.py solves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from univoxel import losses
+from univoxel.scene import Scene
+
+CLIPPED = 0.97  # sRGB; brighter pixels are lower bounds
+CAUCHY = 0.05  # sRGB; residuals beyond are taken for what the model cannot explain
+
+
+@dataclass(frozen=True)
+class Differs:
+    """What differs between the photographs' lights, of which there are B."""
+
+    gain: Tensor  # [B, 3]
+    change: Tensor | None  # [B, D, 3] factor on the map
+    basis: Tensor | None  # [R, D] that log change is a sum of
+
+
+def view_differences(scene: Scene) -> Differs | None:
+    """Those of the scene's photographs; None where they all have one light."""
+    views = scene.views
+    if views is None:
+        return None
+    change = views.sky_change()
+    change = None if change is None else change.exp()
+    return Differs(views.log_gain.exp(), change, views.sky_basis)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What light does at V sightings of P points, linear in the map; constant in a round."""
+
+    diffuse: Tensor  # [P, D] sky into irradiance: cosine, open share and solid angle
+    through: Tensor  # [P, V] irradiance into radiance, for albedo 1
+    shine: Tensor  # [P, V, D] sky into specular radiance
+    diffuse_blocked: Tensor  # [P, V, 3] radiance from the blocked share, for albedo 1
+    shine_blocked: Tensor  # [P, V, 3]
+    target: Tensor  # [P, V, 3] sRGB-encoded
+    view: Tensor  # [P, V] int64: which photograph
+
+
+@dataclass(frozen=True)
+class Block:
+    """Normal equations of some points: the light's part, and what ties it to their albedo.
+
+    The light is the log map of D directions and, where views differ, their B log gains after it.
+    """
+
+    hessian: Tensor  # [3, D + B, D + B]
+    gradient: Tensor  # [3, D + B]
+    cross: Tensor  # [3, P, D + B] light against log albedo
+    own: Tensor  # [3, P] gradient of log albedo
+    norm: Tensor  # [3, P] curvature of log albedo
+    cost: float
+
+
+def linearised(
+    rows: Rows, light: Tensor, log_albedo: Tensor, c: int, differs: Differs | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """One channel's weighted residuals [P, V], and their slopes, weighted and encoded: by the log
+    map [P, V, D], by log albedo [P, V], and by a factor on everything [P, V]."""
+    albedo = log_albedo[:, c, None].exp()
+    by_diffuse, by_shine, gain = rows.diffuse[:, None], rows.shine, 1.0
+    if differs is not None:
+        gain = differs.gain[rows.view, c]
+        if differs.change is not None:
+            change = differs.change[rows.view, :, c]
+            by_diffuse, by_shine = by_diffuse * change, by_shine * change
+    sky = rows.through * (by_diffuse @ light[:, c])
+    diffuse = gain * albedo * (sky + rows.diffuse_blocked[..., c])
+    drawn = diffuse + gain * (by_shine @ light[:, c] + rows.shine_blocked[..., c])
+    target = rows.target[..., c]
+    residual = target - losses.encode(drawn)
+    weight = 1 / (1 + (residual / CAUCHY).square())
+    weight = weight.masked_fill((target > CLIPPED) & (residual < 0), 0.0)
+    root = weight.sqrt()
+    slope = root * encoded_slope(drawn)
+    jacobian = (albedo * rows.through)[..., None] * by_diffuse + by_shine
+    jacobian = jacobian * (slope * gain)[..., None] * light[:, c]
+    return root * residual, jacobian, slope * diffuse, slope * drawn
+
+
+def normal_equations(
+    rows: Rows, light: Tensor, log_albedo: Tensor, differs: Differs | None = None
+) -> Block:
+    """The block of some points for map `light` [D, 3] and `log_albedo` [P, 3].
+
+    Changes of a view's map stay as they are.
+    """
+    hessian, gradient, cross, own, norm, cost = [], [], [], [], [], 0.0
+    for c in range(3):
+        r, jacobian, self_, whole = linearised(rows, light, log_albedo, c, differs)
+        if differs is not None:
+            of_view = torch.nn.functional.one_hot(rows.view, len(differs.gain))
+            jacobian = torch.cat([jacobian, whole[..., None] * of_view], 2)
+        n = self_.square().sum(1) + 1e-6  # a point that shows no diffuse light keeps its albedo
+        tie = torch.einsum("pvd,pv->pd", jacobian, self_)
+        g = (self_ * r).sum(1)
+        flat, low = jacobian.flatten(0, 1), tie / n.sqrt()[:, None]
+        hessian.append(flat.T @ flat - low.T @ low)
+        gradient.append(r.flatten() @ flat - (g / n) @ tie)
+        cross.append(tie)
+        own.append(g)
+        norm.append(n)
+        cost += r.square().sum().item()
+    return Block(
+        torch.stack(hessian),
+        torch.stack(gradient),
+        torch.stack(cross),
+        torch.stack(own),
+        torch.stack(norm),
+        cost,
+    )
+
+
+def view_equations(
+    rows: Rows, light: Tensor, log_albedo: Tensor, differs: Differs
+) -> tuple[Tensor, Tensor]:
+    """Normal equations [3, B, R + 1, R + 1], [3, B, R + 1] of what each view has of its own: R
+    weights of its map's change and its log gain. Map and albedo stay as they are."""
+    assert differs.basis is not None
+    views, count = len(differs.gain), len(differs.basis) + 1
+    hessian = light.new_zeros(3, views, count, count)
+    gradient = light.new_zeros(3, views, count)
+    of_view = rows.view.flatten()
+    for c in range(3):
+        r, jacobian, _, whole = linearised(rows, light, log_albedo, c, differs)
+        own = torch.cat([jacobian @ differs.basis.T, whole[..., None]], 2).flatten(0, 1)
+        hessian[c].index_add_(0, of_view, own[:, :, None] * own[:, None])
+        gradient[c].index_add_(0, of_view, r.flatten()[:, None] * own)
+    return hessian, gradient
+
+
+def encoded_slope(linear: Tensor) -> Tensor:
+    """Derivative of the sRGB curve."""
+    power = 1.055 / 2.4 * linear.clamp_min(0.0031308) ** (1 / 2.4 - 1)
+    return torch.where(linear <= 0.0031308, 12.92, power)
+
+
+def graph_laplacian(direction: Tensor, neighbours: int = 6) -> Tensor:
+    """Laplacian [D, D] of the graph of nearest neighbours on the sphere, symmetric."""
+    near = (direction @ direction.T).topk(neighbours + 1, 1).indices[:, 1:]
+    adjacent = torch.zeros(len(direction), len(direction)).scatter_(1, near, 1.0)
+    adjacent = torch.maximum(adjacent, adjacent.T)
+    return torch.diag(adjacent.sum(1)) - adjacent
