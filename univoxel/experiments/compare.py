@@ -120,6 +120,7 @@ def draw(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
                     text, (value, place), (6, 0), textcoords="offset points", va="center", size=7
                 )
         axis.margins(x=0.2)
+        axis.locator_params(axis="x", nbins=4)  # long numbers would run into each other
         axis.grid(axis="y", alpha=0.3)
         axis.set_title(f"{column.title} ({'more' if column.more else 'less'} is better)", size=9)
         axis.spines[["top", "right"]].set_visible(False)
