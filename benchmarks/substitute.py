@@ -57,7 +57,10 @@ PIXELS = ("albedo", "roughness", "normal", "mesh")
 
 
 def true_sdf(folder: Path, grid: GridShape) -> Tensor:
-    """Signed distance [X, Y, Z] of a data set's mesh, cut off at six voxels."""
+    """Signed distance [X, Y, Z] of a data set's mesh, cut off at six voxels.
+
+    Walls thinner than two voxels are lost between the nodes, as in any field on this grid.
+    """
     vertices, faces, _ = true_mesh(folder)
     corner = vertices[faces.long()]
     area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).norm(dim=1)

@@ -72,6 +72,13 @@ def test_a_base_colour_is_split_as_gltf_says():
     assert number == 0.04
 
 
+def test_what_no_picture_would_show_is_no_metal():
+    assert brdf.metal_or_none(torch.tensor([0.0, 0.49 / 255])) is None
+    metallic = torch.tensor([0.0, 0.51 / 255])
+    assert brdf.metal_or_none(metallic) is metallic
+    assert brdf.metal_or_none(torch.empty(0)) is None
+
+
 @pytest.mark.parametrize("metallic", [1.0, 0.4])
 @pytest.mark.parametrize("roughness", [0.25, 0.7])
 def test_a_metal_sphere_equals_quadrature(metallic, roughness):

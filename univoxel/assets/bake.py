@@ -7,7 +7,7 @@ from torch import Tensor
 
 from univoxel.assets.atlas import dilated, rasterise, unwrap, vertex_normals, vertex_tangents
 from univoxel.assets.base import TexturedMesh
-from univoxel.brdf import unless_none
+from univoxel.brdf import metal_or_none
 from univoxel.fields.base import AbstractField
 from univoxel.records import FieldSample, Mesh
 from univoxel.scene import Scene
@@ -43,7 +43,7 @@ def with_materials(scene: Scene, mesh: Mesh) -> Mesh:
         normal = torch.nn.functional.normalize(at.gradient, dim=1, eps=1e-6)
         parts.append((normal, *scene.material(at.features)))
     *rest, metallic = (torch.cat(p) for p in zip(*parts, strict=True))
-    return Mesh(mesh.vertices, mesh.faces, *rest, metallic=unless_none(metallic))
+    return Mesh(mesh.vertices, mesh.faces, *rest, metallic=metal_or_none(metallic))
 
 
 @torch.no_grad()
@@ -75,7 +75,7 @@ def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
     place = dilated(texel, size)
     *rest, metallic = (torch.cat(p)[place] for p in zip(*parts, strict=True))
     return TexturedMesh(
-        vertices, faces, normals, tangents, uv, *rest, metallic=unless_none(metallic)
+        vertices, faces, normals, tangents, uv, *rest, metallic=metal_or_none(metallic)
     )
 
 

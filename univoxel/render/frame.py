@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from univoxel import envmap as env
-from univoxel.brdf import unless_none
+from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.records import Surface
@@ -110,7 +110,7 @@ def render_picture(
         clear = clear * (1 - shadow[:, None])
     if quality.background == "map":
         rgb = rgb + clear * env.background(lighting.tables, rays.direction)
-    metallic = None if surface.metallic is None else unless_none(surface.metallic)
+    metallic = None if surface.metallic is None else metal_or_none(surface.metallic)
     backward = cameras.camera_to_world[view, :, 2]
 
     def grid(values: Tensor) -> Tensor:

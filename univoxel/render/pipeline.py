@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from univoxel.brdf import unless_none
+from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.lights.quadrature import rotations
 from univoxel.ops import composite
@@ -126,4 +126,4 @@ def extract_mesh(scene: Scene) -> Mesh:
         normal = torch.nn.functional.normalize(sample.gradient, dim=1, eps=1e-6)
         parts.append((normal, *scene.material(sample.features)))
     *rest, metallic = (torch.cat(p) for p in zip(*parts, strict=True))
-    return Mesh(vertices, faces, *rest, metallic=unless_none(metallic))
+    return Mesh(vertices, faces, *rest, metallic=metal_or_none(metallic))
