@@ -31,6 +31,7 @@ class Config:
     light: str
     varying: str
     minutes: float = 4.0
+    downscale: int = 0
     seed: int = 0
     loss: LossConfig = LossConfig()
     stages: tuple[StageConfig, ...] = (StageConfig(), StageConfig())
@@ -86,12 +87,14 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
         "exposure",
         "--minutes",
         "2",
+        "--downscale",
+        "4",
         *(f"--set={change}" for change in changes),
     ]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
     stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0)
     expected = Config(
-        Path("photos"), out, "draft", "sg", "exposure", 2.0, 7, LossConfig(2.0), stages
+        Path("photos"), out, "draft", "sg", "exposure", 2.0, 4, 7, LossConfig(2.0), stages
     )
     assert capsys.readouterr().out == "run\n"
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
