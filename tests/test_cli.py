@@ -100,6 +100,13 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
 
 
+@pytest.mark.parametrize("factor", ["0", "-2"])
+def test_downscale_out_of_range(calls, tmp_path, capsys, factor):
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), "--downscale", factor]) == 2
+    assert f"--downscale must be at least 1, got {factor}" in capsys.readouterr().err
+    assert not calls.noted
+
+
 def test_train_keeps_the_minutes_of_the_preset(calls, tmp_path):
     assert main(["train", "photos", "--out", str(tmp_path / "run")]) == 0
     assert calls.noted[0][1][0].minutes == 4.0

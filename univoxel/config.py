@@ -176,11 +176,11 @@ def check_same(cfg: TrainConfig) -> None:
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: cannot be read, so the run cannot go on: {error}") from None
     now = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
-    for name in ("stages", "scene"):
-        if not isinstance(before, dict) or before.get(name) != now[name]:
+    for name in ("stages", "scene", "downscale"):
+        if not isinstance(before, dict) or before.get(name, 0) != now[name]:
             raise ValueError(
                 f"{path}: the run began with other {name}: resume with the same --preset, "
-                "--minutes, --light and --set as then"
+                "--minutes, --light, --downscale and --set as then"
             )
 
 
