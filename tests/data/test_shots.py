@@ -101,6 +101,15 @@ def test_a_mask_beside_the_photograph(tmp_path):
         write_png(tmp_path / "test" / "p_000_alpha.png", np.full((HEIGHT, WIDTH), 7, np.uint8))
 
 
+def test_masks_in_a_folder_beside_that_of_the_photographs(tmp_path):
+    written = scene(2)
+    write_nerf(tmp_path, written)
+    (tmp_path / "test_mask").mkdir()
+    write_png(tmp_path / "test_mask" / "p_000.png", np.full((HEIGHT, WIDTH), 9, np.uint8))
+    assert load_photos(tmp_path, "test").alpha.unique().tolist() == [9]
+    assert np.array_equal(load_photos(tmp_path).alpha[0], written.pictures[1, ..., 3])
+
+
 def test_focal_lengths_are_divided(tmp_path):
     cameras = load_photos(write_nerf(tmp_path, scene()), downscale=4).cameras
     torch.testing.assert_close(cameras.focal, torch.full((8, 2), FOCAL / 4))

@@ -1,13 +1,15 @@
-"""The layout of NeRF-synthetic scenes, of Shiny Blender and of Synthetic4Relight.
+"""The layout of NeRF-synthetic scenes, of Shiny Blender, Synthetic4Relight and Stanford-ORB.
 
 transforms_<split>.json     see univoxel.data.transforms
 <file_path>[.png]           RGBA photograph, straight alpha, sRGB; or with <file_path>_alpha.png
 <file_path>_rgba.png        the same
 <file_path>_rgb.exr         linear photograph, with <file_path>_mask.png
+train/0001.exr              linear photograph, with train_mask/0001.png
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from univoxel.data.base import DataError, Photos
@@ -29,4 +31,11 @@ def load_blender(folder: Path, split: str = "train", downscale: int = 0) -> Phot
     if not path.is_file():
         raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
     _, shots = read_frames(path)
+    shots = [replace(shot, mask=shot.mask or _mask(shot.image)) for shot in shots]
     return read_shots(folder, "NeRF layout", split, shots, downscale)
+
+
+def _mask(image: Path) -> Path | None:
+    """What Stanford-ORB has in a folder of its own beside that of the photographs."""
+    path = image.parent.with_name(f"{image.parent.name}_mask") / f"{image.stem}.png"
+    return path if path.is_file() else None

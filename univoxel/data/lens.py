@@ -73,10 +73,13 @@ def straightened(lens: Lens) -> Lens:
 
 def sources(lens: Lens, pinhole: Lens) -> Tensor:
     """Where the pixels of a pinhole's picture lie in the lens's: [H, W, 2], for `straighten`."""
-    column, row = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    # float32 is worth a few 1e-4 pixels here, and half the memory of large pictures
+    column, row = np.meshgrid(
+        np.arange(pinhole.width, dtype=np.float32) + 0.5,
+        np.arange(pinhole.height, dtype=np.float32) + 0.5,
+    )
     x, y = lens.seen(*_directions(pinhole, column, row))
-    where = np.stack([2 * x / lens.width - 1, 2 * y / lens.height - 1], -1)
-    return torch.from_numpy(where.astype(np.float32))
+    return torch.from_numpy(np.stack([2 * x / lens.width - 1, 2 * y / lens.height - 1], -1))
 
 
 def straighten(picture: Tensor, sources: Tensor) -> Tensor:
