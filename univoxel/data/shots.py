@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from univoxel.camera import Cameras
-from univoxel.color import linear_to_srgb
+from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data.base import DataError, Photos, decode
 from univoxel.data.images import read_image
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
@@ -21,6 +21,7 @@ LARGE = 200_000_000  # pixels in all photographs, from where on their size must 
 TRAINING_BYTES = 25  # of memory that training takes for each of them, about
 SUGGESTED = 1000  # pixels along the longer side
 TEST_EVERY = 8
+LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
 # How far +Z may be from the cameras' common up direction in a world that is taken as upright:
 # cameras are held askew and lean over, but worlds that are not upright are turned by much more.
 LEAN = math.radians(30)
@@ -154,6 +155,9 @@ def resampled(
     color: Tensor, alpha: Tensor, factor: int, grid: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Stored colour and alpha, straightened and then shrunk in linear light; stored as before."""
+    encoded = color.dtype == torch.uint8
+    if encoded:  # a table is many times as fast as the curve
+        color = torch.from_numpy(LINEAR[color.numpy()])
     linear, coverage = decode(color, alpha)
     picture = torch.cat([linear * coverage[..., None], coverage[..., None]], -1)
     if grid is not None:
@@ -161,7 +165,7 @@ def resampled(
     picture = shrink(picture, factor)
     linear, coverage = picture[..., :3], picture[..., 3]
     linear = torch.where(coverage[..., None] > 0, linear / coverage[..., None], 0.0)
-    if color.dtype == torch.uint8:
+    if encoded:
         linear = (255 * linear_to_srgb(linear)).round().to(torch.uint8)
     if alpha.dtype == torch.uint8:
         coverage = (255 * coverage).round().to(torch.uint8)
