@@ -52,7 +52,7 @@ def scores(run: Path, every: int, samples: int = 64) -> list[dict]:
     here = stage(_scaled(extract_mesh(scene), scale), scene.field.voxel_size)
     maps = relight_maps(folder)
     lights = {name: Lighting(tables(read_map(path))) for name, path in maps.items()}
-    wanted = {name: load_relit(folder, name, photos.names) for name in lights}
+    wanted = {name: load_relit(photos, name) for name in lights}
     found: dict[tuple[int, float], list[float]] = {}
     for view in range(0, len(photos), every):
         surface, wo = surface_of_view(scene, photos.cameras, view)

@@ -158,12 +158,12 @@ def relit_with_true_pixels(run: Path, folder: Path, samples: int = 64) -> dict[s
     other = replace(other, normals=normals, albedo=(other.albedo * scale).clamp_max(1))
     stages = {m: stage(mesh, scene.field.voxel_size) for m, mesh in ((0, own), (1, other))}
     maps = {name: Lighting(tables(read_map(path))) for name, path in relight_maps(folder).items()}
-    wanted = {name: load_relit(folder, name, photos.names) for name in maps}
+    wanted = {name: load_relit(photos, name) for name in maps}
     found: dict[str, list[float]] = {}
-    for view, name in enumerate(photos.names):
+    for view in range(len(photos)):
         surface, wo = surface_of_view(scene, photos.cameras, view)
         surface = replace(surface, albedo=(surface.albedo * scale).clamp_max(1))
-        true = of_truth(surface, load_truth(folder, name), photos.cameras, view)
+        true = of_truth(surface, load_truth(photos, view), photos.cameras, view)
         for key in ("nothing", *PIXELS, "all"):
             terms = set(PIXELS) if key == "all" else {key}
             here = replace(surface, **{k: v for k, v in true.items() if k in terms})

@@ -90,8 +90,8 @@ def materials(folder: Path):
     """Function from world points [P, 3] to albedo [P, 3] and roughness [P] of the truth there."""
     test = load_photos(folder, "test")
     points, values = [], []
-    for v, name in enumerate(test.names):
-        truth, rays = load_truth(folder, name), image_rays(test.cameras, v)
+    for v in range(len(test)):
+        truth, rays = load_truth(test, v), image_rays(test.cameras, v)
         inside = truth.mask.flatten() & (truth.depth.flatten() > 0)
         forward = -test.cameras.camera_to_world[v, :, 2]
         t = truth.depth.flatten() / (rays.direction @ forward)

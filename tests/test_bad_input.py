@@ -121,7 +121,10 @@ def frame_two_away(pose):
     ("change", "message"),
     [
         (shutil.rmtree, r"data: expected a folder with a scene, got nothing there"),
-        (empty, r"data: expected transforms_train\.json, got an empty folder"),
+        (
+            empty,
+            r"data: expected photographs with their cameras, got an empty folder \(looked for ",
+        ),
         (
             lambda d: (d / "transforms_train.json").write_text('{"frames": [}'),
             r"transforms_train\.json: broken JSON in line 1, column 13",
@@ -140,7 +143,7 @@ def frame_two_away(pose):
             lambda d: (d / "train" / "r_1.png").write_bytes(b"no picture"),
             r"r_1\.png: expected a PNG or JPEG",
         ),
-        (transparent, r"transforms_train\.json: all 6 pictures are fully transparent"),
+        (transparent, r"data: all 6 pictures are fully transparent"),
         (exr_with(np.nan), r"r_0\.exr: NaN or infinity at row 3, column 4"),
         (exr_with(np.inf), r"r_0\.exr: NaN or infinity at row 3, column 4"),
         (matrix(lambda m: m.fill(0)), r"frame 1: expected the last row 0 0 0 1"),

@@ -31,6 +31,7 @@ class Config:
     light: str
     varying: str
     minutes: float = 4.0
+    downscale: int = 0
     seed: int = 0
     loss: LossConfig = LossConfig()
     stages: tuple[StageConfig, ...] = (StageConfig(), StageConfig())
@@ -86,15 +87,24 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
         "exposure",
         "--minutes",
         "2",
+        "--downscale",
+        "4",
         *(f"--set={change}" for change in changes),
     ]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
     stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0)
     expected = Config(
-        Path("photos"), out, "draft", "sg", "exposure", 2.0, 7, LossConfig(2.0), stages
+        Path("photos"), out, "draft", "sg", "exposure", 2.0, 4, 7, LossConfig(2.0), stages
     )
     assert capsys.readouterr().out == "run\n"
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
+
+
+@pytest.mark.parametrize("factor", ["0", "-2"])
+def test_downscale_out_of_range(calls, tmp_path, capsys, factor):
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), "--downscale", factor]) == 2
+    assert f"--downscale must be at least 1, got {factor}" in capsys.readouterr().err
+    assert not calls.noted
 
 
 def test_train_keeps_the_minutes_of_the_preset(calls, tmp_path):

@@ -137,6 +137,7 @@ def test_the_file_holds_every_field(tmp_path):
         (JointConfig(), {"newton_steps": -1}, "newton_steps must be at least 0, got -1"),
         (JointConfig(), {"newton_views": 1}, "newton_views must be at least 2, got 1"),
         (CONFIG, {"patience": -0.1}, "patience must be at least 0, got -0.1"),
+        (CONFIG, {"downscale": -1}, "downscale must be at least 0, got -1"),
         (CONFIG, {"minutes": 0.0}, "minutes must be above 0, got 0.0"),
         (SceneConfig(), {"channels": 0}, "channels must be at least 1, got 0"),
         (SceneConfig(), {"hidden": 0}, "hidden must be at least 1, got 0"),

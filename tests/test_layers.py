@@ -31,7 +31,7 @@ HELPERS = {
     "ops": {"checks", "native", "reflectance", "visibility"},
     "fields": {"base", "hull"},
     "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
-    "data": {"base", "images", "radiance"},
+    "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "tasks": {

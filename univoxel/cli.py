@@ -6,6 +6,7 @@ Tasks are imported by the command that runs them: `univoxel --help` does not wai
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import io
 import sys
@@ -36,6 +37,9 @@ def train(
     preset: Literal["auto", "draft", "fast", "full"] = "auto",
     light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
     varying: Literal["none", "exposure", "light"] = "none",
+    downscale: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
+    ] = None,
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
@@ -57,6 +61,7 @@ def train(
             local too, envmap-sg and envmap, one map from the beginning
         varying: what differs from photograph to photograph: exposure, with the colour balance, or
             the light itself too
+        downscale: train on photographs of 1/N of their width and height
         minutes: wall-clock limit, above 0; training ends in time with what it has
         resume: go on with the run in --out
         timelapse: picture of a test view over training time, or a folder of its frames; making
@@ -71,7 +76,10 @@ def train(
     _check_minutes(minutes)
     if not resume and (out / "scene.safetensors").exists():
         raise FileExistsError(f"{out} holds a run already: add --resume, or choose another --out")
+    if downscale is not None and downscale < 1:
+        raise ValueError(f"--downscale must be at least 1, got {downscale}")
     config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
+    config = dataclasses.replace(config, downscale=downscale or 0)
     print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
 
 

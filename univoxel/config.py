@@ -117,6 +117,9 @@ class TrainConfig:
     out: Path  # folder of the run
     stages: tuple[StageConfig | JointConfig, ...]
     minutes: float  # > 0; training ends in time, with what it has
+    # pixels of the photographs along a side of one that is trained on, >= 1; 0: 1, but large
+    # photographs are refused
+    downscale: int = 0
     seed: int = 0
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
@@ -136,7 +139,7 @@ class TrainConfig:
                 "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
             )
         _check(self, "above 0", lambda x: x > 0, "minutes")
-        _check(self, "at least 0", lambda x: 0 <= x < math.inf, "patience")
+        _check(self, "at least 0", lambda x: 0 <= x < math.inf, "patience", "downscale")
 
 
 def _check(config: object, wanted: str, holds: Callable[[Any], bool], *names: str) -> None:
@@ -173,11 +176,11 @@ def check_same(cfg: TrainConfig) -> None:
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: cannot be read, so the run cannot go on: {error}") from None
     now = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
-    for name in ("stages", "scene"):
-        if not isinstance(before, dict) or before.get(name) != now[name]:
+    for name in ("stages", "scene", "downscale"):
+        if not isinstance(before, dict) or before.get(name, 0) != now[name]:
             raise ValueError(
                 f"{path}: the run began with other {name}: resume with the same --preset, "
-                "--minutes, --light and --set as then"
+                "--minutes, --light, --downscale and --set as then"
             )
 
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from univoxel.data import DataError, load_photos
-from univoxel.data.blender import RIGID_TOLERANCE, find_image
 from univoxel.data.images import write_exr, write_png
+from univoxel.data.transforms import RIGID_TOLERANCE, find_image
 
 WIDTH, HEIGHT, ANGLE = 6, 4, 0.8
 
@@ -218,6 +218,11 @@ def opaque(folder):
     write_png(folder / "train" / "r_1.png", rgba()[..., :3])
 
 
+def all_opaque(folder):
+    for view in range(2):
+        write_png(folder / "train" / f"r_{view}.png", np.full((HEIGHT, WIDTH, 4), 255, np.uint8))
+
+
 def gray(folder):
     write_png(folder / "train" / "r_1.png", rgba()[..., 0])
 
@@ -230,7 +235,7 @@ def small_mask(folder):
 BROKEN = {
     "no transforms": (
         lambda f: without(f, "transforms_train.json"),
-        "expected transforms_train.json, got train$",
+        r"expected photographs .*, got train \(looked for transforms_train\.json, ",
     ),
     "broken JSON": (text(b'{\n"frames": [,]\n}'), "broken JSON in line 2, column 12"),
     "cut JSON": (text(b'{"frames": ['), "broken JSON in line 1"),
@@ -238,7 +243,7 @@ BROKEN = {
     "a list": (text(b"[1, 2]"), r"expected a JSON object, got \[1, 2\]"),
     "no frames": (root(frames=[]), r"expected a list of frames, got \[\]"),
     "frames of another kind": (root(frames={"a": 1}), "expected a list of frames, got {'a': 1}"),
-    "a frame of another kind": (root(frames=["r_0"]), "frame 0: expected an object .* got 'r_0'"),
+    "a frame of another kind": (root(frames=["r_0"]), "frame 0: expected an object, got 'r_0'"),
     "a frame without a path": (
         frame(file_path=None),
         "frame 1: expected an object with a file_path",
@@ -249,14 +254,22 @@ BROKEN = {
     ),
     "empty path": (frame(file_path=""), "frame 1: no picture"),
     "double name": (frame(file_path="./train/r_0.png"), "frame 1: the name r_0 .* came before"),
-    "distortion": (root(k1=0.1, p2=-0.01), r"frame 0: lens distortion \(k1, p2\) is not supported"),
-    "distortion of a frame": (frame(k2=0.1), r"frame 1: lens distortion \(k2\) is not supported"),
+    "distortion by k4": (frame(k4=0.1), "frame 1: expected distortion by k1 k2 k3 p1 p2, got k4"),
+    "distortion in words": (frame(k2="0"), "frame 1: expected k2 between -inf and inf, got '0'"),
+    "too much distortion": (root(k1=20.0), "frame 0: its distortion leaves less than 1/2"),
+    "folding distortion": (
+        root(k1=-10.0, k2=30.0),
+        "frame 0: its distortion folds the picture over",
+    ),
+    "a fisheye": (root(is_fisheye=True), "frame 0: expected one of the camera models .* a fisheye"),
+    "another camera": (frame(camera_model="EQUIRECTANGULAR"), "models .* got 'EQUIRECTANGULAR'"),
     "another size": (
         lambda f: write_png(f / "train" / "r_1.png", rgba(width=5)),
         r"r_1\.png: expected 6x4 pixels like r_0, got 5x4",
     ),
     "size unlike the file's": (root(w=60, h=40), r"pictures of 60x40 pixels \(w and h\), got 6x4"),
     "transparent": (transparent, "all 2 pictures are fully transparent"),
+    "opaque": (all_opaque, "all 2 pictures are fully opaque: cut the object out"),
     "no alpha": (opaque, r"r_1\.png: expected an alpha channel or a mask r_1_mask\.png"),
     "grey": (gray, r"r_1\.png: expected a picture with 3 or 4 channels, got 1"),
     "mask of another size": (small_mask, r"r_1_mask\.png: expected 6x4 pixels, got 2x2"),
@@ -323,7 +336,7 @@ def test_broken_scenes(scene, case):
 def test_missing_and_empty_folders(tmp_path):
     with pytest.raises(DataError, match="none: expected a folder with a scene, got nothing there"):
         load_photos(tmp_path / "none")
-    with pytest.raises(DataError, match=r"expected transforms_test\.json, got an empty folder"):
+    with pytest.raises(DataError, match=r"got an empty folder \(looked for transforms_test"):
         load_photos(tmp_path, "test")
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="file: expected a folder with a scene, got a file"):
@@ -333,7 +346,7 @@ def test_missing_and_empty_folders(tmp_path):
 def test_full_folders_are_not_listed_whole(tmp_path):
     for k in range(9):
         (tmp_path / f"{k}.txt").write_text("")
-    with pytest.raises(DataError, match=r"got 0\.txt, .*4\.txt, \.\.\.$"):
+    with pytest.raises(DataError, match=r"got 0\.txt, .*4\.txt, \.\.\. \("):
         load_photos(tmp_path)
 
 

@@ -319,3 +319,21 @@ def test_a_failed_replacement_cleans_up(tmp_path, monkeypatch):
         write(tmp_path / "a.png", 1)
     assert caught.value.errno == errno.EROFS
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.exr"])
+def test_size_without_reading(tmp_path, name):
+    path = tmp_path / name
+    if name == "a.exr":
+        images.write_exr(path, dict.fromkeys("RGB", np.zeros((3, 5), np.float32)))
+    else:
+        Image.fromarray(np.zeros((3, 5, 3), np.uint8)).save(path)
+    assert images.image_size(path) == (5, 3)
+    path.write_bytes(path.read_bytes()[:20])
+    with pytest.raises(DataError, match=rf"{name}: expected .* could not read it"):
+        images.image_size(path)
+    path.write_bytes(b"")
+    with pytest.raises(DataError, match=rf"{name}: the file is empty"):
+        images.image_size(path)
+    with pytest.raises(DataError, match="none: expected a file, got nothing there"):
+        images.image_size(tmp_path / "none")

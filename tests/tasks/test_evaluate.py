@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.data import DataError
+from univoxel.data import DataError, load_photos
 from univoxel.data.images import read_exr, read_image, write_png
 from univoxel.records import Mesh, Surface
 from univoxel.tasks import evaluate as task
@@ -160,7 +160,7 @@ def test_raw_albedo_against_a_formula(folders, relit_calls):
 
 def test_foreground_psnr_leaves_the_background_out(folders, relit_calls):
     """A quarter of the picture is inside: the same error there weighs four times as much."""
-    truth = task.load_photos(folders.data, "test")
+    truth = load_photos(folders.data, "test")
     layers = layers_module.render_layers(nn.Identity(), truth.cameras, 0)
     expected = task._expected(truth, {}, 0)
     numbers = dict(task.score(layers, expected, task.Scales(torch.ones(3), torch.ones(3))))

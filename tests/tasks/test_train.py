@@ -5,14 +5,18 @@ import json
 
 import pytest
 import torch
-from analytic import RADIUS, sphere_scene, write_scene
+from analytic import RADIUS, photos_of, sphere_scene, write_scene
+from layouts import Scene, write_colmap
+from scipy.spatial.transform import Rotation
 
+from univoxel.color import linear_to_srgb
 from univoxel.config import StageConfig, TrainConfig, preset
 from univoxel.data import load_photos
 from univoxel.lights import EnvmapConfig, EnvmapSGConfig, MLPLightConfig, SGConfig, SHConfig
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import FILE, SceneConfig, load_scene
 from univoxel.tasks import train as task
+from univoxel.tasks.frames import photos_of as photos_of_run
 from univoxel.tasks.train import batch_at, split_pixels, train
 
 
@@ -106,6 +110,32 @@ def test_a_gradient_spreads_over_the_nodes_that_it_touches():
     assert not scratch.any()
 
 
+def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, capsys):
+    """The sphere, 40 times as large, far away and upside down, from half of the pixels."""
+    scale, centre = 40.0, torch.tensor([100.0, -50.0, 30.0])
+    photos = photos_of(16, 64)
+    poses = torch.eye(4).repeat(16, 1, 1)
+    poses[:, :3] = photos.cameras.camera_to_world
+    poses[:, :3, 3] = scale * poses[:, :3, 3] + centre
+    color = torch.cat([linear_to_srgb(photos.color), photos.alpha[..., None]], -1)
+    pictures = (255 * color).round().to(torch.uint8)
+    turn = Rotation.from_rotvec([2.0, -0.5, 0.7])
+    written = Scene(poses.numpy(), pictures.numpy()).turned(turn)
+    focal = float(photos.cameras.focal[0, 0])
+    data = write_colmap(tmp_path / "data", written, parameters=(focal, 32.0, 32.0))
+    stages = (StageConfig(voxels=0.01, iterations=40, share=1.0, rays=256),)
+    out = train(config(data, tmp_path / "run", stages=stages, downscale=2))
+    said = "COLMAP model, 14 photographs of 32x32 pixels in train, shrunk to 1/2, world turned to"
+    assert said in capsys.readouterr().out
+    mesh = extract_mesh(load_scene(out))
+    middle = (mesh.vertices.amin(0) + mesh.vertices.amax(0)) / 2
+    away = (mesh.vertices - middle).norm(dim=1) / scale - RADIUS
+    assert away.abs().mean() < 0.03  # as above
+    assert abs(float(middle.norm() - centre.norm())) < 0.03 * scale
+    views = photos_of_run(out)
+    assert (views.downscale, views.cameras.width) == (2, 32)
+
+
 def test_time_ends_a_run_with_a_usable_result(data, tmp_path):
     out = train(config(data, tmp_path / "run", minutes=1e-3))
     assert extract_mesh(load_scene(out)).faces.numel() > 0
@@ -133,6 +163,8 @@ def test_resume_goes_on_where_it_stopped(data, tmp_path, monkeypatch):
 
 def test_resume_refuses_another_configuration(run, data):
     cfg = config(data, run)
+    with pytest.raises(ValueError, match=r"the run began with other downscale: .* --downscale"):
+        train(dataclasses.replace(cfg, downscale=2), resume=True)
     with pytest.raises(ValueError, match="the run began with other stages: resume with the same"):
         train(dataclasses.replace(cfg, stages=cfg.stages[:1]), resume=True)
     train(dataclasses.replace(cfg, minutes=5.0), resume=True)  # more time is no other run

@@ -3,14 +3,12 @@
 from pathlib import Path
 
 from univoxel.data.base import DataError, Photos, Truth
-from univoxel.data.blender import (
-    load_blender,
-    load_cameras,
-    load_points,
-    load_relit,
-    load_truth,
-    relight_maps,
-)
+from univoxel.data.blender import is_blender, load_blender
+from univoxel.data.colmap import is_colmap, load_colmap
+from univoxel.data.nerfstudio import is_nerfstudio, load_nerfstudio
+from univoxel.data.tensoir import is_tensoir, load_tensoir
+from univoxel.data.transforms import load_cameras
+from univoxel.data.truth import load_points, load_relit, load_truth, relight_maps
 
 __all__ = [
     "DataError",
@@ -24,11 +22,38 @@ __all__ = [
     "relight_maps",
 ]
 
+# In this order: data sets with splits of their own come first
+_LAYOUTS = (
+    (is_blender, load_blender),
+    (is_nerfstudio, load_nerfstudio),
+    (is_colmap, load_colmap),
+    (is_tensoir, load_tensoir),
+)
 
-def load_photos(folder: str | Path, split: str = "train") -> Photos:
+
+def load_photos(folder: str | Path, split: str = "train", downscale: int = 0) -> Photos:
     """Read the photographs of one split in whatever layout the folder has.
+
+    Lens distortion is taken out. docs/data.md shows the layouts.
+
+    Args:
+        downscale: side of the squares of pixels that become one, >= 1; 0 for 1, refused where the
+            photographs are so large that training them would take gigabytes of memory.
 
     Raises:
         DataError: one line that names the file, what was expected and what came.
     """
-    return load_blender(folder, split)
+    folder = Path(folder)
+    if not folder.is_dir():
+        what = "a file" if folder.exists() else "nothing there"
+        raise DataError(f"{folder}: expected a folder with a scene, got {what}")
+    for fits, load in _LAYOUTS:
+        if fits(folder, split):
+            return load(folder, split, downscale)
+    files = sorted(path.name for path in folder.iterdir())
+    came = ", ".join(files[:5]) + (", ..." if len(files) > 5 else "") or "an empty folder"
+    raise DataError(
+        f"{folder}: expected photographs with their cameras, got {came} (looked for "
+        f"transforms_{split}.json, transforms.json, cameras and images (.bin or .txt) of COLMAP in "
+        f"sparse/0, sparse, colmap/sparse/0 and here, {split}_000/metadata.json)"
+    )

@@ -27,6 +27,8 @@ class Photos:
     )
     alpha: Tensor  # [V, H, W] uint8 (0 to 255) or float32 (0 to 1) coverage
     cameras: Cameras
+    about: str = ""  # what was read and how, for people
+    downscale: int = 1  # pixels of the files along a side of one of these
 
     def __len__(self) -> int:
         return len(self.names)

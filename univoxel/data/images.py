@@ -53,6 +53,28 @@ def read_image(path: str | Path) -> Tensor:
     return torch.from_numpy(_read_pillow(path))
 
 
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Width and height of a PNG, JPEG or EXR, from its beginning alone.
+
+    Raises:
+        DataError: the file is missing, empty, or not what its name says.
+    """
+    path = Path(path)
+    _require_file(path)
+    try:
+        if path.suffix.lower() == ".exr":
+            with OpenEXR.File(str(path), header_only=True) as file:
+                low, high = file.header()["dataWindow"]
+            return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path, formats=["PNG", "JPEG"]) as image:
+                return image.size
+    except (OSError, SyntaxError, ValueError, RuntimeError, Image.DecompressionBombError) as error:
+        kind = "an OpenEXR file" if path.suffix.lower() == ".exr" else "a PNG or JPEG"
+        raise DataError(f"{path}: expected {kind}, could not read it: {error}") from None
+
+
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     """All channels of the first part of an OpenEXR file, [H, W] float32 each.
 

@@ -60,7 +60,7 @@ def run(
     jobs = [_job(data, s, out, samples) for data in _named(scenes) for s in _distinct(settings)]
     for data in scenes:
         for split in ("train", "test"):
-            load_photos(data, split)
+            load_photos(data, split, settings[0].config(data, out).downscale)
     before = {job.folder: load_outcome(job.folder) for job in jobs}
     for job in jobs:
         found = before[job.folder]

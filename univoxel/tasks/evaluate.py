@@ -19,7 +19,6 @@ from univoxel.data import (
     DataError,
     Photos,
     Truth,
-    load_photos,
     load_points,
     load_relit,
     load_truth,
@@ -33,7 +32,7 @@ from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, stage
 from univoxel.scene import FILE, Scene, load_checkpoint
 from univoxel.tasks.contact_sheet import Panel, contact_sheet, shrink
-from univoxel.tasks.frames import read_map, trained_on
+from univoxel.tasks.frames import photos_of, read_map
 from univoxel.tasks.layers import Layers, Relighting, exr_channels, render_layers
 
 # key: what the table says of it
@@ -125,11 +124,10 @@ def evaluate(
             f"evaluate: expected samples >= 1 and bounces >= 0, got {samples} and {bounces}"
         )
     run = Path(run)
-    folder = data or trained_on(run)
-    photos = load_photos(folder, "test")
+    photos = photos_of(run, data)
     relit = _relit_photos(photos)
-    points = load_points(folder)
-    maps = {name: read_map(path) for name, path in relight_maps(folder).items()}
+    points = load_points(photos.folder)
+    maps = {name: read_map(path) for name, path in relight_maps(photos.folder).items()}
     scene, report = load_checkpoint(run)
     scene.show_light_of(light_of)
     for place in (save, json and json.parent):
@@ -210,14 +208,14 @@ def _relit_photos(photos: Photos) -> dict[str, tuple[Tensor, Tensor]]:
     """Stored colour and alpha of the test views, by map."""
     relit = {}
     for name in relight_maps(photos.folder):
-        color, alpha = load_relit(photos.folder, name, photos.names)
+        color, alpha = load_relit(photos, name)
         _check_size(photos, alpha[0], f"pictures in relight/{name}")
         relit[name] = color, alpha
     return relit
 
 
 def _truth(photos: Photos, view: int) -> Truth:
-    truth = load_truth(photos.folder, photos.names[view])
+    truth = load_truth(photos, view)
     if truth.mask is not None:
         _check_size(photos, truth.mask, f"truth of {photos.names[view]}")
     return truth

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from json import JSONDecodeError, loads
+from json import loads
 from pathlib import Path
 
 import torch
 
 from univoxel.camera import Cameras
-from univoxel.data import DataError, load_cameras, load_photos
+from univoxel.data import DataError, Photos, load_cameras, load_photos
 from univoxel.data.images import read_image
 from univoxel.envmap import EnvMap
 from univoxel.records import Mesh
@@ -92,7 +92,7 @@ def views_of(
         names = [f"orbit_{i:04d}" for i in range(frames)]
         return names, orbit(mesh, frames, resolution or ORBIT_SIZE, elevation)
     if word == "test":
-        photos = load_photos(trained_on(run), "test")
+        photos = photos_of(run)
         names, views = photos.names, photos.cameras
     else:
         names, views = load_cameras(cameras, ORBIT_SIZE)
@@ -126,10 +126,28 @@ def read_map(path: Path) -> EnvMap:
 
 def trained_on(run: Path) -> Path:
     """The data set that a run's config.json names."""
+    return _data_of(run)[0]
+
+
+def photos_of(run: Path, data: Path | None = None) -> Photos:
+    """The test views at the size that a run was trained at; of another data set, if one is given.
+
+    Raises:
+        DataError: the run or the photographs cannot be read.
+    """
+    if data is not None and not (run / "config.json").is_file():
+        return load_photos(data, "test")
+    folder, downscale = _data_of(run)
+    return load_photos(data or folder, "test", downscale)
+
+
+def _data_of(run: Path) -> tuple[Path, int]:
+    """The data set that a run's config.json names, and how far its photographs were shrunk."""
     path = run / "config.json"
     try:
-        return Path(loads(path.read_text(encoding="utf-8"))["data"])
+        config = loads(path.read_text(encoding="utf-8"))
+        return Path(config["data"]), int(config.get("downscale", 0))
     except FileNotFoundError:
         raise DataError(f"{run}: expected the folder of a run, got no {path.name}") from None
-    except (KeyError, TypeError, JSONDecodeError, UnicodeDecodeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise DataError(f"{path}: expected JSON with the key data: {error!r}") from None

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from univoxel.camera import pixel_rays
 from univoxel.color import linear_to_srgb, luminance
-from univoxel.data import Photos, load_photos
+from univoxel.data import Photos
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.mesh import read_ply
 from univoxel.envmap import EnvMap, lookup
@@ -23,7 +23,7 @@ from univoxel.render.pipeline import surface_at
 from univoxel.scene import Scene, load_scene
 from univoxel.sphere import latlong_directions, texel_solid_angles
 from univoxel.tasks.envmap import true_map
-from univoxel.tasks.frames import trained_on
+from univoxel.tasks.frames import photos_of
 
 MIN_OPACITY = 0.5  # of a pixel that has a surface
 LABEL = 18  # pixels of height
@@ -79,15 +79,14 @@ def inspect(
         raise ValueError(f"--out: expected a name that ends in .png, got {out}")
     scene = load_scene(run)
     scene.show_light_of(light_of)
-    data = trained_on(run)
-    photos = load_photos(data, "test")
+    photos = photos_of(run)
     index = _view(photos, view)
     rays = _ray(photos, index, pixel)
     surface = surface_at(scene, rays)
     if not surface.opacity[0] > MIN_OPACITY:
         raise ValueError(f"--pixel: there is no surface under pixel {pixel[0]},{pixel[1]}")
     layers = arriving(scene, surface, height)
-    truth = true_light(scene, data, rays, height)
+    truth = true_light(scene, photos.folder, rays, height)
     out = out or run / "inspect" / f"{photos.names[index]}_{pixel[0]}_{pixel[1]}.png"
     out.parent.mkdir(parents=True, exist_ok=True)
     channels = {}

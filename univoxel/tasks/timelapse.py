@@ -54,9 +54,9 @@ class Timelapse:
         self.file = None if folder else Path(path)
         self.folder = Path(path) if folder else cfg.out / "timelapse"
         try:
-            cameras = load_photos(cfg.data, "test").cameras
+            cameras = load_photos(cfg.data, "test", cfg.downscale).cameras
         except DataError:
-            cameras = load_photos(cfg.data, "train").cameras
+            cameras = load_photos(cfg.data, "train", cfg.downscale).cameras
         self.cameras = resize(cameras, min(cameras.width, SIZE))
         self.every = 60 * cfg.minutes / FRAMES  # seconds
         self._next = 0.0

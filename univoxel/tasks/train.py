@@ -80,9 +80,10 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     film = None if timelapse is None else Timelapse(timelapse, cfg)
     begin = time.monotonic()
     torch.manual_seed(cfg.seed)
-    photos = load_photos(cfg.data, "train")
+    photos = load_photos(cfg.data, "train", cfg.downscale)
     if not resume and (cfg.out / FILE).exists():
         raise FileExistsError(f"{cfg.out} holds a run already: pass --resume or another --out")
+    print(photos.about)
 
     distance = mask_distances(photos.coverage())
     pixels, held_out = split_pixels(distance)

@@ -1,0 +1,122 @@
+"""COLMAP's models: where they lie, and errors."""
+
+import struct
+
+import numpy as np
+import pytest
+from layouts import HEIGHT, WIDTH, scene, write_colmap
+
+from univoxel.data import DataError, load_photos
+from univoxel.data.images import write_png
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_places(tmp_path, place, text):
+    photos = load_photos(write_colmap(tmp_path, scene(), place, text), "test")
+    assert photos.names == ["p_000", "p_008"]
+
+
+def test_binary_files_come_first(tmp_path):
+    write_colmap(tmp_path, scene())
+    write_colmap(tmp_path, scene(3), text=True)
+    assert len(load_photos(tmp_path)) == 8
+
+
+def test_photographs_in_folders_and_names_with_spaces(tmp_path):
+    write_colmap(tmp_path, scene(2), text=True)
+    for part, ending in (("images", ".png"), ("masks", ".png.png")):
+        (tmp_path / part / "a b").mkdir()
+        for v in range(2):
+            path = tmp_path / part / f"p_00{v}{ending}"
+            path.rename(tmp_path / part / "a b" / f"p {v}{ending}")
+    path = tmp_path / "sparse" / "0" / "images.txt"
+    path.write_text(path.read_text().replace("p_00", "a b/p "))
+    assert load_photos(tmp_path, "test").names == ["a b_p 0"]
+
+
+def edited(name, change):
+    def apply(folder):
+        path = folder / "sparse" / "0" / name
+        path.write_text(change(path.read_text()))
+
+    return apply
+
+
+def cut(name, keep):
+    def apply(folder):
+        path = folder / "sparse" / "0" / name
+        path.write_bytes(path.read_bytes()[:keep])
+
+    return apply
+
+
+def other_size(folder):
+    write_png(folder / "images" / "p_004.png", np.ones((HEIGHT, WIDTH + 1, 3), np.uint8))
+
+
+TEXT = {
+    "fisheye": (
+        edited("cameras.txt", lambda t: t.replace("SIMPLE_PINHOLE", "OPENCV_FISHEYE")),
+        r"cameras\.txt: expected cameras of SIMPLE_PINHOLE, .*, camera 3 is OPENCV_FISHEYE: run",
+    ),
+    "parameters": (
+        edited("cameras.txt", lambda t: t.replace("SIMPLE_PINHOLE", "PINHOLE")),
+        r"cameras\.txt: expected a file of a COLMAP model, .*: camera 3 has 3 parameters",
+    ),
+    "words": (
+        edited("cameras.txt", lambda t: t.replace("11.0", "wide")),
+        r"cameras\.txt: expected a file of a COLMAP model, .* 'wide'",
+    ),
+    "focal length": (
+        edited("cameras.txt", lambda t: t.replace("11.0", "-11.0")),
+        r"cameras\.txt: .* camera 3 has size 12x8 and parameters \[-11",
+    ),
+    "camera": (
+        edited("images.txt", lambda t: t.replace(" 3 p_004", " 9 p_004")),
+        r"images\.txt: p_004\.png has camera 9, got no such",
+    ),
+    "line": (
+        edited("images.txt", lambda t: t.replace(" 3 p_004.png", "")),
+        r"images\.txt: expected a file of a COLMAP model",
+    ),
+    "nothing": (edited("images.txt", lambda t: "# none\n"), r"images\.txt: expected photographs w"),
+    "quaternion": (
+        edited("images.txt", lambda t: "1 0 0 0 0 1 2 3 3 p_000.png\n"),
+        r"images\.txt: .* the pose of p_000\.png is",
+    ),
+    "no picture": (
+        lambda f: (f / "images" / "p_004.png").unlink(),
+        r"images\.txt: no picture .*images/p_004\.png",
+    ),
+    "no pictures": (
+        lambda f: (f / "images").rename(f / "photos"),
+        r"images\.txt: no picture p_009\.png in .*images or ",
+    ),
+    "size": (other_size, r"p_004\.png: expected 12x8 pixels as its camera .*, got 13x8"),
+}
+BINARY = {
+    "cut cameras": (cut("cameras.bin", 30), r"cameras\.bin: expected a file of a COLMAP model"),
+    "empty": (cut("cameras.bin", 0), r"cameras\.bin: expected a file of a COLMAP model"),
+    "cut name": (cut("images.bin", 76), r"images\.bin: expected a file of a COLMAP model"),
+    "cut points": (cut("images.bin", -3), r"images\.bin: expected a file of a COLMAP model"),
+}
+
+
+@pytest.mark.parametrize("case", [*TEXT, *BINARY])
+def test_broken_models(tmp_path, case):
+    change, message = (TEXT | BINARY)[case]
+    write_colmap(tmp_path, scene(), text=case in TEXT)
+    change(tmp_path)
+    with pytest.raises(DataError, match=message) as caught:
+        load_photos(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("number", "name"), [(7, "FOV"), (99, "model 99")])
+def test_models_that_are_not_supported(tmp_path, number, name):
+    write_colmap(tmp_path, scene())
+    data = struct.pack("<Q", 1) + struct.pack("<iiQQ", 3, number, WIDTH, HEIGHT) + bytes(80)
+    (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(data)
+    with pytest.raises(DataError, match=f"camera 3 is {name}: run colmap image_undistorter"):
+        load_photos(tmp_path)

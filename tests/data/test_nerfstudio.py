@@ -1,0 +1,103 @@
+"""transforms.json of nerfstudio and instant-ngp: what it may say, and errors."""
+
+import json
+
+import numpy as np
+import pytest
+from layouts import FOCAL, HEIGHT, WIDTH, angle, scene, write_nerfstudio
+
+from univoxel.data import DataError, load_photos
+from univoxel.data.images import write_png
+
+
+def edit(folder, change):
+    path = folder / "transforms.json"
+    root = json.loads(path.read_text())
+    change(root)
+    path.write_text(json.dumps(root))
+
+
+@pytest.fixture
+def data(tmp_path):
+    return write_nerfstudio(tmp_path, scene())
+
+
+def test_instant_ngps_angle_and_paths(data):
+    def change(root):
+        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model"):
+            del root[key]
+        root.update(camera_angle_x=angle(), camera_angle_y=0.6, scale=0.33, offset=[0.5] * 3)
+        for frame in root["frames"]:
+            frame.update(file_path=f"./{frame['file_path']}", sharpness=30.0)
+
+    edit(data, change)
+    cameras = load_photos(data).cameras
+    assert cameras.focal.flatten().tolist() == pytest.approx([FOCAL] * 16)
+    assert cameras.centre[0].tolist() == [WIDTH / 2, HEIGHT / 2]
+
+
+def test_intrinsics_of_a_frame(data):
+    edit(
+        data, lambda root: root["frames"][0].update(fl_x=20.0, cx=5.0)
+    )  # p_009: written last first
+    cameras = load_photos(data).cameras
+    assert cameras.focal[:, 0].tolist() == [FOCAL] * 7 + [20.0]
+    assert cameras.centre[7].tolist() == [5.0, HEIGHT / 2]
+
+
+def test_splits_of_the_file(data):
+    names = {"train_filenames": ["images/p_003.png", "images/p_001.png"]}
+    edit(data, lambda root: root.update(names, test_filenames=["images/p_000.png"]))
+    assert load_photos(data).names == ["p_003", "p_001"]
+    assert load_photos(data, "test").names == ["p_000"]
+
+
+def test_masks_without_mask_path(data):
+    edit(data, lambda root: [frame.pop("mask_path") for frame in root["frames"]])
+    written = scene()
+    assert np.array_equal(load_photos(data, "test").alpha[0], written.pictures[0, ..., 3])
+
+
+def root(**values):
+    return lambda folder: edit(folder, lambda r: r.update(values))
+
+
+def frame(**values):
+    return lambda folder: edit(folder, lambda r: r["frames"][1].update(values))
+
+
+def other_size(folder):
+    edit(folder, lambda r: [r.pop("w"), r.pop("h")])
+    write_png(folder / "images" / "p_008.png", np.ones((HEIGHT, 9, 3), np.uint8))
+
+
+def other_mask(folder):
+    write_png(folder / "masks" / "p_001.png", np.ones((WIDTH, HEIGHT), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (root(camera_model="OPENCV_FISHEYE"), "frame 0: .*models .* got 'OPENCV_FISHEYE'"),
+        (root(w=24, h=16), r"frame 0: expected pictures of 24x16 pixels \(w and h\), got 12x8"),
+        (root(k1="x"), "frame 0: expected k1 between -inf and inf, got 'x'"),
+        (frame(mask_path="masks/none.png"), r"frame 1: no mask .*masks/none\.png \(mask_path\)"),
+        (frame(mask_path=7), "frame 1: no mask .*/7"),
+        (root(test_filenames="p_000"), "expected test_filenames as a list of file_paths"),
+        (root(test_filenames=[]), "frames of the file in test_filenames, got an empty list"),
+        (root(test_filenames=["x/y.png"]), "frames of the file in test_filenames, got y"),
+        (other_size, r"p_008\.png: expected 12x8 pixels like p_000, got 9x8"),
+    ],
+)
+def test_broken_files(data, change, message):
+    load_photos(data, "test")
+    change(data)
+    with pytest.raises(DataError, match=message) as caught:
+        load_photos(data, "test")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mask_of_another_size(data):
+    other_mask(data)
+    with pytest.raises(DataError, match=r"masks/p_001\.png: expected 12x8 pixels, got 8x12"):
+        load_photos(data)

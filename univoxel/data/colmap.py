@@ -1,0 +1,215 @@
+"""COLMAP's sparse models.
+
+sparse/0/cameras.bin, images.bin    or .txt; in sparse/0, sparse, colmap/sparse/0 or the folder
+images/<name>                       photographs, or in the folder itself
+masks/<name>.png                    masks, or alpha in the photographs
+
+Source: COLMAP's documentation, "Output Format" and "Camera Models".
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from univoxel.data.base import DataError, Photos
+from univoxel.data.images import image_size
+from univoxel.data.lens import Lens
+from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+# By number in binary files; of those that are supported, how many parameters they have.
+MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
+    *("FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
+)
+SUPPORTED = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+TO_OPENGL = np.diag([1.0, -1.0, -1.0])  # of camera axes: x right, y down, z forward in COLMAP
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A photograph that the model has a pose for."""
+
+    camera: int
+    name: str  # path within the folder of photographs
+    pose: np.ndarray  # [3, 4] camera-to-world, axes as of `Cameras`
+
+
+def is_colmap(folder: Path, split: str) -> bool:
+    return _model(folder) is not None
+
+
+def load_colmap(folder: Path, split: str = "train", downscale: int = 0) -> Photos:
+    """Photographs and cameras of one split: every eighth is for tests.
+
+    The world keeps its scale and origin, and is turned so that +Z is up.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    found = _model(folder)
+    if found is None:
+        raise DataError(f"{folder}: expected a COLMAP model in {', '.join(PLACES)}, got none")
+    model, ending = found
+    cameras_file, images_file = model / f"cameras{ending}", model / f"images{ending}"
+    try:
+        cameras = read_cameras(cameras_file)
+    except (struct.error, IndexError, ValueError) as error:
+        raise _broken(cameras_file, error) from None
+    try:
+        images = read_images(images_file)
+    except (struct.error, IndexError, ValueError) as error:
+        raise _broken(images_file, error) from None
+    if not images:
+        raise DataError(f"{images_file}: expected photographs with poses, got none")
+
+    photos = next((p for p in (folder / "images", folder) if (p / images[0].name).is_file()), None)
+    if photos is None:
+        raise DataError(
+            f"{images_file}: no picture {images[0].name} in {folder / 'images'} or {folder}"
+        )
+    shots = []
+    for image in images:
+        path = photos / image.name
+        if image.camera not in cameras:
+            raise DataError(f"{images_file}: {image.name} has camera {image.camera}, got no such")
+        lens = cameras[image.camera]
+        if not path.is_file():
+            raise DataError(f"{images_file}: no picture {path}")
+        width, height = image_size(path)
+        if (width, height) != (lens.width, lens.height):
+            raise DataError(
+                f"{path}: expected {lens.width}x{lens.height} pixels as its camera has in "
+                f"{cameras_file.name}, got {width}x{height}"
+            )
+        name = Path(image.name).with_suffix("").as_posix().replace("/", "_")
+        mask = find_mask(folder, image.name)
+        shots.append(Shot(name, str(images_file), path, mask, image.pose, lens))
+    shots, remarks = upright(shots)
+    shots = every_eighth(folder, shots, split)
+    return read_shots(folder, "COLMAP model", split, shots, downscale, remarks)
+
+
+def read_cameras(path: Path) -> dict[int, Lens]:
+    """cameras.bin or cameras.txt, by camera id.
+
+    Raises:
+        DataError: a camera model that is not supported.
+        ValueError, IndexError, struct.error: a broken file.
+    """
+    rows = _cameras_text(path) if path.suffix == ".txt" else _cameras_binary(path)
+    lenses = {}
+    for number, model, width, height, p in rows:
+        match model:
+            case "SIMPLE_PINHOLE":
+                lens = Lens(width, height, (p[0], p[0]), (p[1], p[2]))
+            case "PINHOLE":
+                lens = Lens(width, height, (p[0], p[1]), (p[2], p[3]))
+            case "SIMPLE_RADIAL":
+                lens = Lens(width, height, (p[0], p[0]), (p[1], p[2]), (p[3], 0.0, 0.0))
+            case "RADIAL":
+                lens = Lens(width, height, (p[0], p[0]), (p[1], p[2]), (p[3], p[4], 0.0))
+            case _:
+                radial, tangential = (p[4], p[5], 0.0), (p[6], p[7])
+                lens = Lens(width, height, (p[0], p[1]), (p[2], p[3]), radial, tangential)
+        if min(width, height, *lens.focal) <= 0 or not np.isfinite(p).all():
+            raise ValueError(f"camera {number} has size {width}x{height} and parameters {p}")
+        lenses[number] = lens
+    return lenses
+
+
+def read_images(path: Path) -> list[Registered]:
+    """images.bin or images.txt.
+
+    Raises:
+        ValueError, IndexError, struct.error: a broken file.
+    """
+    rows = _images_text(path) if path.suffix == ".txt" else _images_binary(path)
+    images = []
+    for quaternion, translation, camera, name in rows:
+        length = np.linalg.norm(quaternion)
+        if not 0.5 < length < 2 or not np.isfinite(translation).all():
+            raise ValueError(f"the pose of {name} is {quaternion}, {translation}")
+        w, x, y, z = np.asarray(quaternion) / length
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        to_camera = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+        position = -to_camera.T @ np.asarray(translation)
+        pose = np.concatenate([to_camera.T @ TO_OPENGL, position[:, None]], 1)
+        images.append(Registered(camera, name, pose))
+    return images
+
+
+def _model(folder: Path) -> tuple[Path, str] | None:
+    """The folder of the model and the ending of its files; binary ones first, as COLMAP does."""
+    for place in PLACES:
+        for ending in (".bin", ".txt"):
+            if all((folder / place / f"{n}{ending}").is_file() for n in ("cameras", "images")):
+                return folder / place, ending
+    return None
+
+
+def _broken(path: Path, error: Exception) -> DataError:
+    return DataError(f"{path}: expected a file of a COLMAP model, could not read it: {error}")
+
+
+def _parameters(path: Path, number: int, model: str) -> int:
+    if model not in SUPPORTED:
+        raise DataError(
+            f"{path}: expected cameras of {', '.join(SUPPORTED)}, camera {number} is {model}: "
+            "run colmap image_undistorter, or map with --ImageReader.camera_model OPENCV"
+        )
+    return SUPPORTED[model]
+
+
+def _cameras_text(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if not line.strip() or line.startswith("#"):
+            continue
+        number, model, width, height, *rest = line.split()
+        if len(rest) != _parameters(path, int(number), model):
+            raise ValueError(f"camera {number} has {len(rest)} parameters")
+        yield int(number), model, int(width), int(height), [float(value) for value in rest]
+
+
+def _cameras_binary(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
+    data = path.read_bytes()
+    (count,), at = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        number, kind, width, height = struct.unpack_from("<iiQQ", data, at)
+        model = MODELS[kind] if 0 <= kind < len(MODELS) else f"model {kind}"
+        form = f"<{_parameters(path, number, model)}d"
+        at += 24
+        yield number, model, width, height, list(struct.unpack_from(form, data, at))
+        at += struct.calcsize(form)
+
+
+def _images_text(path: Path) -> Iterator[tuple[list[float], list[float], int, str]]:
+    lines = iter(path.read_text(encoding="utf-8").splitlines())
+    for line in lines:
+        if not line.strip() or line.startswith("#"):
+            continue
+        _, *pose, camera, name = line.split(maxsplit=9)
+        values = [float(value) for value in pose]
+        if len(values) != 7:
+            raise ValueError(f"expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line!r}")
+        yield values[:4], values[4:], int(camera), name.strip()
+        next(lines, None)  # its points, a line that may be empty
+
+
+def _images_binary(path: Path) -> Iterator[tuple[list[float], list[float], int, str]]:
+    data = path.read_bytes()
+    (count,), at = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        _, *pose, camera = struct.unpack_from("<i7di", data, at)
+        end = data.index(b"\0", at + 64)
+        name = data[at + 64 : end].decode("utf-8")
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9 + 24 * points
+        if at > len(data):
+            raise ValueError("the file is cut off")
+        yield pose[:4], pose[4:], camera, name

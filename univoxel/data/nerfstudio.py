@@ -1,0 +1,51 @@
+"""The layout of nerfstudio and instant-ngp.
+
+transforms.json             see univoxel.data.transforms; aabb_scale, scale and offset say nothing
+images/frame_00001.jpg      photographs, where file_path says
+masks/frame_00001.png       masks, where mask_path says, or as COLMAP names them
+
+train_filenames and test_filenames in the file are its splits, as far as they are there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from univoxel.data.base import DataError, Photos
+from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.data.transforms import read_frames, short, view_name
+
+
+def is_nerfstudio(folder: Path, split: str) -> bool:
+    return (folder / "transforms.json").is_file()
+
+
+def load_nerfstudio(folder: Path, split: str = "train", downscale: int = 0) -> Photos:
+    """Photographs and cameras of one split: without one in the file, every eighth is for tests.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    path = folder / "transforms.json"
+    root, shots = read_frames(path)
+    shots = [replace(s, mask=s.mask or find_mask(folder, s.image.name)) for s in shots]
+    shots, remarks = upright(shots)
+    chosen = root.get(f"{split}_filenames")
+    if chosen is None:
+        shots = every_eighth(folder, shots, split)
+    else:
+        shots = _named(path, shots, f"{split}_filenames", chosen)
+    return read_shots(folder, "nerfstudio layout", split, shots, downscale, remarks)
+
+
+def _named(path: Path, shots: list[Shot], key: str, chosen: object) -> list[Shot]:
+    if not isinstance(chosen, list) or not all(isinstance(name, str) for name in chosen):
+        raise DataError(f"{path}: expected {key} as a list of file_paths, got {short(chosen)}")
+    by_name = {shot.name: shot for shot in shots}
+    names = [view_name(name) for name in chosen]
+    unknown = [name for name in names if name not in by_name]
+    if unknown or not names:
+        came = ", ".join(unknown[:1]) or "an empty list"
+        raise DataError(f"{path}: expected frames of the file in {key}, got {came}")
+    return [by_name[name] for name in names]

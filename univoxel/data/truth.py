@@ -1,0 +1,207 @@
+"""Ground truth beside the photographs: materials, normals, relit views, points on the surface.
+
+test/gt/<name>.npz                                  of this project's scenes
+test/<name>_albedo.png, _rough.png, _normal.png     Synthetic4Relight, Shiny Blender
+<name>/albedo.png, normal.png                       TensoIR-Synthetic
+relight/<map>/<name>.png                            test views under envmaps/<map>.hdr
+test_rli/<map>_<name>.png                           the same in Synthetic4Relight
+<name>/rgba_<map>.png                               the same in TensoIR-Synthetic
+points.npz                                          points on the true surface
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from univoxel.color import srgb_to_linear
+from univoxel.data.base import DataError, Photos, Truth
+from univoxel.data.images import read_image
+from univoxel.data.lens import shrink
+from univoxel.data.shots import read_photo, resampled, size_of
+from univoxel.data.tensoir import is_tensoir, photographed
+from univoxel.data.transforms import find_image
+
+WHOLE = 250 / 255  # coverage above which a pixel is well inside the object
+MAP_ENDINGS = (".hdr", ".exr")
+
+
+def load_truth(photos: Photos, view: int) -> Truth:
+    """Ground truth of a test view; an empty record where there is none.
+
+    The mask is where alpha > 250 of 255, so that no silhouette pixel counts: that of the npz, or of
+    the photograph.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    name = photos.names[view]
+    path = photos.folder / "test" / "gt" / f"{name}.npz"
+    if path.is_file():
+        return _arrays(path, photos.downscale)
+    return _pictures(photos, view)
+
+
+def relight_maps(folder: str | Path) -> dict[str, Path]:
+    """The environment maps under which relit test views exist, by name; empty if there are none.
+
+    relight/<map> must have its map. Data sets of others come apart from their maps: there, it is
+    the maps that are found in the folder or the one above, or in envmaps/ of either.
+    """
+    folder = Path(folder)
+    maps = {}
+    for pictures in sorted((folder / "relight").glob("*/")):
+        found = _map(folder / "envmaps", pictures.name)
+        if found is None:
+            raise DataError(
+                f"{pictures}: expected its map {folder / 'envmaps' / pictures.name}.hdr, "
+                f"got nothing there"
+            )
+        maps[pictures.name] = found
+    if maps:
+        return maps
+    names = {path.name.partition("_")[0] for path in (folder / "test_rli").glob("*_*.png")}
+    if is_tensoir(folder, "test"):
+        pictures = set(folder.glob("test_*/rgba_*.png"))
+        lights = {p.stem.partition("_")[2] for p in pictures if p.name != photographed(folder)}
+        names |= lights
+    places = [p / sub for p in (folder, folder.resolve().parent) for sub in ("envmaps", ".")]
+    for name in sorted(names):
+        found = next((path for place in places if (path := _map(place, name))), None)
+        if found is not None:
+            maps[name] = found
+    return maps
+
+
+def load_relit(photos: Photos, map: str) -> tuple[Tensor, Tensor]:
+    """Test views under another map: colour [V, H, W, 3] and alpha [V, H, W] as in `Photos`."""
+    pictures: list[tuple[Tensor, Tensor]] = []
+    for name in photos.names:
+        path = _relit(photos.folder, name, map)
+        color, alpha = read_photo(path)
+        if photos.downscale > 1:
+            color, alpha = resampled(color, alpha, photos.downscale)
+        if pictures and color.shape != pictures[0][0].shape:
+            raise DataError(
+                f"{path}: expected {size_of(pictures[0][0])} pixels, got {size_of(color)}"
+            )
+        pictures.append((color, alpha))
+    return torch.stack([c for c, _ in pictures]), torch.stack([a for _, a in pictures])
+
+
+def load_points(folder: str | Path) -> Tensor | None:
+    """Points [P, 3] float32 on the true surface, world: points.npz, or None where there is none."""
+    path = Path(folder) / "points.npz"
+    if not path.is_file():
+        return None
+    arrays = _read_npz(path)
+    points = arrays.get("points")
+    if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise DataError(f"{path}: expected an array points [P, 3], got {_shapes(arrays)}")
+    if not np.isfinite(points).all():
+        raise DataError(f"{path}: points hold NaN or infinity")
+    return torch.from_numpy(points.astype(np.float32))
+
+
+def _map(folder: Path, name: str) -> Path | None:
+    return next((p for end in MAP_ENDINGS if (p := folder / (name + end)).is_file()), None)
+
+
+def _relit(folder: Path, name: str, map: str) -> Path:
+    for path in (folder / "test_rli" / f"{map}_{name}.png", folder / name / f"rgba_{map}.png"):
+        if path.is_file():
+            return path
+    return find_image(folder / "relight" / map, name, f"{folder / 'relight' / map}")
+
+
+def _arrays(path: Path, factor: int) -> Truth:
+    arrays = _read_npz(path)
+    shape = arrays["alpha"].shape if "alpha" in arrays else None
+    if shape is None or len(shape) != 2:
+        raise DataError(f"{path}: expected an array alpha [H, W], got {_shapes(arrays)}")
+    wanted = {"albedo": (*shape, 3), "roughness": shape, "normal": (*shape, 3), "depth": shape}
+    alpha = torch.from_numpy(arrays["alpha"].astype(np.float32) / 255)
+    fields: dict[str, Tensor] = {"mask": shrink(alpha[..., None], factor)[..., 0] > WHOLE}
+    for key, size in wanted.items():
+        if key not in arrays:
+            continue
+        value = arrays[key].astype(np.float32)
+        if value.shape != size or not np.isfinite(value).all():
+            raise DataError(
+                f"{path}: expected finite {key} of shape {list(size)}, got {list(value.shape)}"
+            )
+        fields[key] = _shrunk(key, torch.from_numpy(value), alpha, factor)
+    return Truth(**fields)
+
+
+def _pictures(photos: Photos, view: int) -> Truth:
+    """Truth from pictures of the data sets in the field.
+
+    The albedo is sRGB in Synthetic4Relight and linear in TensoIR-Synthetic; normals are 1/2 + n/2
+    in the world; roughness is as it is.
+    """
+    folder, name = photos.folder, photos.names[view]
+    files = {
+        "albedo": (folder / "test" / f"{name}_albedo.png", folder / name / "albedo.png"),
+        "roughness": (folder / "test" / f"{name}_rough.png",),
+        "normal": (folder / "test" / f"{name}_normal.png", folder / name / "normal.png"),
+    }
+    _, coverage = photos.picture(view)
+    fields: dict[str, Tensor] = {}
+    for key, paths in files.items():
+        path = next((path for path in paths if path.is_file()), None)
+        if path is None:
+            continue
+        value, alpha = _channels(path)
+        if key == "roughness":
+            value = value[..., 0]
+        elif value.shape[2] != 3:
+            raise DataError(f"{path}: expected a picture with 3 or 4 channels, got 1")
+        elif key == "normal":
+            value = 2 * value - 1
+        elif path == paths[0]:
+            value = srgb_to_linear(value)
+        value = _shrunk(key, value, alpha, photos.downscale)
+        if value.shape[:2] != coverage.shape:
+            raise DataError(
+                f"{path}: expected {size_of(coverage)} pixels like the photograph's, "
+                f"got {size_of(value)}"
+            )
+        fields[key] = value * (coverage > 0).view(*coverage.shape, *[1] * (value.dim() - 2))
+    return Truth(**fields, mask=coverage > WHOLE) if fields else Truth()
+
+
+def _channels(path: Path) -> tuple[Tensor, Tensor]:
+    """A picture's colour or grey [H, W, 3 or 1] as stored, and its alpha [H, W], 1 without one."""
+    image = read_image(path)
+    image = image.float() / 255 if image.dtype == torch.uint8 else image
+    if image.shape[2] == 4:
+        return image[..., :3], image[..., 3]
+    return image, torch.ones(image.shape[:2])
+
+
+def _shrunk(key: str, value: Tensor, alpha: Tensor, factor: int) -> Tensor:
+    """Means weighted by coverage; of normals, their direction."""
+    flat = value.view(*alpha.shape, -1)
+    if factor > 1:
+        total = shrink(alpha[..., None], factor)
+        flat = shrink(flat * alpha[..., None], factor) / total.clamp_min(1e-6)
+    if key == "normal":
+        flat = torch.nn.functional.normalize(flat, dim=-1)
+    return flat if value.dim() == 3 else flat[..., 0]
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise DataError(f"{path}: expected an npz file, could not read it: {error}") from None
+
+
+def _shapes(arrays: dict[str, np.ndarray]) -> str:
+    return ", ".join(f"{key} {list(value.shape)}" for key, value in arrays.items()) or "no arrays"
