@@ -14,7 +14,7 @@ LAYERS = [
     {"records"},
     {"brdf", "camera", "color", "sphere"},
     {"ops"},
-    {"envmap", "networks"},
+    {"envmap", "networks", "packing"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
     {"assets", "distributed", "losses", "metrics", "render"},
@@ -36,7 +36,7 @@ HELPERS = {
     "assets": {"atlas", "base"},
     "tasks": {
         *("animation", "contact_sheet", "envmap", "equations", "frames", "joint", "layers"),
-        *("plateau", "progress", "timelapse"),
+        *("capacity", "footprint", "plateau", "progress", "shrink", "timelapse"),
     },
 }
 # Extras: imported inside the function that needs one
