@@ -35,8 +35,8 @@ HELPERS = {
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "tasks": {
-        *("animation", "contact_sheet", "envmap", "equations", "frames", "joint", "layers"),
-        *("capacity", "footprint", "plateau", "progress", "shrink", "timelapse"),
+        *("animation", "capacity", "contact_sheet", "envmap", "equations", "frames", "joint"),
+        *("layers", "look", "plateau", "progress", "shrink", "spare", "timelapse"),
     },
 }
 # Extras: imported inside the function that needs one

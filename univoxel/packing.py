@@ -59,7 +59,8 @@ def unpack(packed: dict[str, Tensor], size: tuple[int, int, int], far: float) ->
 def _pieces(near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Number of the connected piece of every node that is not near, from 1 in the order of their
     first nodes, 0 for near ones; and the flat number of each piece's first node."""
-    piece = np.asarray(ndimage.label(~near)[0])
+    piece = np.empty(near.shape, np.int32)
+    ndimage.label(~near, output=piece)
     numbers, first = np.unique(piece, return_index=True)
     first = first[numbers > 0]
     order = np.argsort(first)

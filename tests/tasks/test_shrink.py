@@ -21,6 +21,7 @@ LIGHTS = [
 def lit_scene(light=LIGHTS[0]):
     """A scene of random features and weights, so that everything depends on everything."""
     scene = sphere_scene(16, voxel_size=0.1, light=light).eval()
+    scene.inv_s = 60.0
     g = torch.Generator().manual_seed(1)
     with torch.no_grad():
         scene.field.features.normal_(generator=g)
@@ -45,9 +46,9 @@ def seen(scene, look):
 
 
 def assert_same(scene, look, before):
-    # Twice the same sums in another order: float32 and heads of three layers
+    # Twice the same sums in another order: float32, heads of three layers, sRGB steep in the dark
     for name, value in seen(scene, look).items():
-        torch.testing.assert_close(value, before[name], atol=2e-5, rtol=1e-4, msg=name)
+        torch.testing.assert_close(value, before[name], atol=2e-4, rtol=1e-3, msg=name)
 
 
 @pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.kind)

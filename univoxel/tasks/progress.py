@@ -151,6 +151,11 @@ class Progress:
         self.stage, self.done, self._stage_steps = self.stage + 1, 0.0, 0
         self._stage_begin = self.seconds
 
+    def credit(self, share: float) -> None:
+        """Count a share of the coming stage's steps as made."""
+        self.done = share
+        self._stage_steps = round(share * self.cfg.stages[self.stage].iterations)
+
     def shorten(self) -> None:
         """Run through the rest of the stage's schedule in fewer steps."""
         self._planned = self._count + math.ceil(REST * (self._planned - self._count))

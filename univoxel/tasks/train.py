@@ -108,6 +108,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         views = tuple(photos.names) if cfg.scene.varying != "none" else ()
         scene = Scene(replace(cfg.scene, light=light, views=views), field)
         state = {"stage": 0, "progress": 0.0, "step": 0}
+        if cfg.budget_mb is not None:
+            capacity.check_budget(scene, cfg.budget_mb)
 
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
     save_config(cfg)
@@ -131,6 +133,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
                 looks = look_at(photos, held_out), look_at(photos, lesson)
                 chosen = capacity.adapt(scene, cfg, index, box, *looks, rehearse, progress.pace)
                 progress.chosen += [choice.noted() for choice in chosen]
+                if capacity.rehearsed(chosen):
+                    progress.credit(capacity.REHEARSAL)
             done = index + 1 == len(cfg.stages)
             reach = capacity.reach(progress.chosen)
             save_scene(scene, cfg.out, progress.state(), slim=done, reach=reach)
