@@ -26,6 +26,7 @@ GRID_TOLERANCE = 0.1  # dB that a rehearsal on a coarser grid may fall short of 
 STRIDE, STEP = 1 / 9, 1 / 3  # voxels of a grid over those of the next finer that is tried
 FEWEST_VOXELS = 16**3
 REHEARSAL = 0.05  # share of a stage's steps that a grid is tried for; of the chosen one they count
+FEWEST_STEPS = 8  # of a rehearsal: fewer tell nothing
 LESSON = 1024  # rays of the training photographs that heads settle on
 REACHES = (3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5, 1.25, 1.0)  # voxels
 HEADER, NAME = 8192, 64  # bytes of a model's file that hold no numbers, and of a view's name
@@ -166,7 +167,7 @@ def adapt(
     follows = after[0] if after else None
     if isinstance(follows, StageConfig) and not follows.refit:
         most = limit = round(1e6 * follows.voxels)
-        steps = max(1, round(REHEARSAL * pace * follows.iterations))
+        steps = max(FEWEST_STEPS, round(REHEARSAL * pace * follows.iterations))
         if cfg.budget_mb:
             most = min(most, affordable(scene, 1e6 * cfg.budget_mb))
 

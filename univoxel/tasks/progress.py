@@ -45,9 +45,7 @@ class Progress:
         self.stage, self.done, self.step = state["stage"], state["progress"], state["step"]
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
         self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
-        self.chosen: list[dict] = list(
-            state.get("chosen", ())
-        )  # of capacity, see tasks/capacity.py
+        self.chosen: list[dict] = list(state.get("chosen", ()))  # of capacity
         self._stage_steps = state.get("stage_steps", 0)  # made in the present stage
         self._planned, self._count = 0, 0  # steps of the stage in this sitting
         self._stage_begin = self.seconds  # of the stage in this sitting

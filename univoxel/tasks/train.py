@@ -127,7 +127,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
                 if cfg.capacity == "adaptive":
                     stage = capacity.on_grid(stage, box, grid.voxel_size)
                 run_stage(scene, cfg, stage, photos, pixels, held_out, progress)
-            if cfg.capacity == "adaptive":
+            done = index + 1 == len(cfg.stages)
+            if cfg.capacity == "adaptive" and (done or not progress.over):
                 rehearse = partial(rehearsal, cfg, photos, pixels, held_out)
                 lesson = pixels[torch.randperm(len(pixels))[: capacity.LESSON]]
                 looks = look_at(photos, held_out), look_at(photos, lesson)
@@ -135,7 +136,6 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
                 progress.chosen += [choice.noted() for choice in chosen]
                 if capacity.rehearsed(chosen):
                     progress.credit(capacity.REHEARSAL)
-            done = index + 1 == len(cfg.stages)
             reach = capacity.reach(progress.chosen)
             save_scene(scene, cfg.out, progress.state(), slim=done, reach=reach)
             preview(scene, photos, cfg.out / "preview.png")
