@@ -58,18 +58,25 @@ def configured(base: TrainConfig, setting: str) -> TrainConfig:
 def draw(runs: dict[str, dict], stem: Path) -> None:
     """Write the chart: a panel for each measure, parameters across."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter, NullFormatter
 
     figure = Figure(figsize=(3.6 * len(PANELS), 3.6), layout="constrained")
     for axes, measure in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
-        for name, own in runs.items():
+        for k, (name, own) in enumerate(runs.items()):
             adapted = name.split()[-1].startswith(("adaptive", "budget"))
             x, y = own["stored_parameters"], own[measure.key]
             axes.scatter(x, y, color=plots.color(1 if adapted else 0), zorder=2)
             axes.annotate(
-                name.split()[-1], (x, y), xytext=(4, 4), textcoords="offset points", fontsize=7
+                name.split()[-1],
+                (x, y),
+                xytext=(4, 4 - 12 * (k % 2)),
+                textcoords="offset points",
+                fontsize=7,
             )
         axes.set(xscale="log", xlabel="parameters in the model's file", title=measure.title)
-        axes.margins(x=0.2)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.margins(x=0.25, y=0.1)
         axes.grid(alpha=0.3)
         if not measure.more:
             axes.invert_yaxis()

@@ -28,6 +28,7 @@ FEWEST_VOXELS = 16**3
 REHEARSAL = 0.05  # share of a stage's steps that a grid is tried for; of the chosen one they count
 FEWEST_STEPS = 8  # of a rehearsal: fewer tell nothing
 LESSON = 1024  # rays of the training photographs that heads settle on
+REACH_TOLERANCE = 0.05  # dB that nodes far from the surface may be worth and are not stored
 REACHES = (3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5, 1.25, 1.0)  # voxels
 HEADER, NAME = 8192, 64  # bytes of a model's file that hold no numbers, and of a view's name
 
@@ -108,7 +109,7 @@ def copy_over(source: Scene, target: Scene) -> None:
     target.surface_moved()
 
 
-def shorter_reach(scene: Scene, look: Look, limit: float = TOLERANCE) -> Choice:
+def shorter_reach(scene: Scene, look: Look, limit: float = REACH_TOLERANCE) -> Choice:
     """How far from the surface a finished scene is stored, in voxels."""
     with torch.no_grad():
         before = look.decode(scene, surface := look.meet(scene), surface.features)
