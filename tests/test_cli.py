@@ -33,6 +33,8 @@ class Config:
     minutes: float = 4.0
     downscale: int = 0
     seed: int = 0
+    capacity: str = "fixed"
+    budget_mb: float | None = None
     loss: LossConfig = LossConfig()
     stages: tuple[StageConfig, ...] = (StageConfig(), StageConfig())
 
@@ -71,6 +73,7 @@ def calls(monkeypatch):
     replace("relight", None)
     replace("export", None)
     replace("envmap", None)
+    replace("info", {})
     replace("demo", Path("demo/index.html"))
     return types.SimpleNamespace(noted=noted, replace=replace, stand_in=stand_in, task=task)
 
@@ -94,7 +97,9 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     assert main(["train", "photos", "--out", str(out), *options]) == 0
     stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0)
     expected = Config(
-        Path("photos"), out, "draft", "sg", "exposure", 2.0, 4, 7, LossConfig(2.0), stages
+        *(Path("photos"), out, "draft", "sg", "exposure", 2.0, 4, 7),
+        loss=LossConfig(2.0),
+        stages=stages,
     )
     assert capsys.readouterr().out == "run\n"
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
@@ -110,6 +115,21 @@ def test_downscale_out_of_range(calls, tmp_path, capsys, factor):
 def test_train_keeps_the_minutes_of_the_preset(calls, tmp_path):
     assert main(["train", "photos", "--out", str(tmp_path / "run")]) == 0
     assert calls.noted[0][1][0].minutes == 4.0
+
+
+@pytest.mark.parametrize(
+    ("options", "budget"), [(["--adaptive"], None), (["--budget-mb", "2.5"], 2.5)]
+)
+def test_train_fits_the_model_to_the_scene(calls, tmp_path, options, budget):
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), *options]) == 0
+    config = calls.noted[0][1][0]
+    assert (config.capacity, config.budget_mb) == ("adaptive", budget)
+
+
+def test_info(calls):
+    assert main(["info", "run", "--json", "a.json", "--picture", "b.png"]) == 0
+    expected = {"json": Path("a.json"), "picture": Path("b.png")}
+    assert calls.noted == [("info", (Path("run"),), expected)]
 
 
 def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
@@ -253,7 +273,8 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "Unrecognized options: sing"),
         (
             [],
-            "Expected one of {train, eval, relight, export, envmap, inspect, compare, chart, demo}",
+            "Expected one of {train, eval, relight, export, envmap, inspect, info, compare, "
+            "chart, demo}",
         ),
     ],
 )

@@ -14,7 +14,7 @@ LAYERS = [
     {"records"},
     {"brdf", "camera", "color", "sphere"},
     {"ops"},
-    {"envmap", "networks"},
+    {"envmap", "networks", "packing"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
     {"assets", "distributed", "losses", "metrics", "render"},
@@ -35,8 +35,8 @@ HELPERS = {
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "tasks": {
-        *("animation", "contact_sheet", "envmap", "equations", "frames", "joint", "layers"),
-        *("plateau", "progress", "timelapse"),
+        *("animation", "capacity", "contact_sheet", "envmap", "equations", "frames", "joint"),
+        *("layers", "look", "plateau", "progress", "shrink", "spare", "timelapse"),
     },
 }
 # Extras: imported inside the function that needs one

@@ -43,6 +43,10 @@ def train(
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
+    adaptive: bool = False,
+    budget_mb: Annotated[
+        float | None, arg(metavar="MB", help_behavior_hint="(default: no limit)")
+    ] = None,
     resume: bool = False,
     timelapse: Annotated[
         str | None, arg(metavar="FILE.gif|FILE.mp4|DIR/", help_behavior_hint="(default: none)")
@@ -63,6 +67,10 @@ def train(
             the light itself too
         downscale: train on photographs of 1/N of their width and height
         minutes: wall-clock limit, above 0; training ends in time with what it has
+        adaptive: no larger a model than the scene needs, as held-out pixels tell: coarser grid,
+            fewer feature channels, lobes and hidden units; `univoxel info` says what was chosen
+        budget_mb: most that the file of the model may have, in millions of bytes; implies
+            --adaptive
         resume: go on with the run in --out
         timelapse: picture of a test view over training time, or a folder of its frames; making
             them does not count as training
@@ -80,6 +88,8 @@ def train(
         raise ValueError(f"--downscale must be at least 1, got {downscale}")
     config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
     config = dataclasses.replace(config, downscale=downscale or 0)
+    if adaptive or budget_mb is not None:
+        config = dataclasses.replace(config, capacity="adaptive", budget_mb=budget_mb)
     print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
 
 
@@ -283,6 +293,28 @@ def inspect(
     print(task.inspect(run, view, task.parse_pixel(pixel), out, light_of=light_of))
 
 
+def info(
+    run: Run,
+    /,
+    json: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: only printed)")
+    ] = None,
+    picture: Annotated[
+        Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: none)")
+    ] = None,
+) -> None:
+    """Say what a model consists of: parameters and bytes by part, sizes, and what was chosen.
+
+    Args:
+        run: folder of a trained run
+        json: file for the numbers
+        picture: where the grid's nodes are that hold features, and a bar of bytes by part
+    """
+    from univoxel.tasks import info as task
+
+    task.info(run, json=json, picture=picture)
+
+
 def compare(
     scenes: Scenes,
     /,
@@ -375,6 +407,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "export": export,
     "envmap": envmap,
     "inspect": inspect,
+    "info": info,
     "compare": compare,
     "chart": chart,
     "demo": demo,

@@ -22,6 +22,7 @@ from univoxel.lights import (
 from univoxel.scene import SceneConfig, Varying
 
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
+Capacity: TypeAlias = Literal["fixed", "adaptive"]
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
 
 
@@ -123,6 +124,8 @@ class TrainConfig:
     seed: int = 0
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
+    capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see tasks/capacity.py
+    budget_mb: float | None = None  # 1e6 bytes that the model's file may have, > 0; adaptive only
     scene: SceneConfig = field(default_factory=SceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
 
@@ -140,6 +143,12 @@ class TrainConfig:
             )
         _check(self, "above 0", lambda x: x > 0, "minutes")
         _check(self, "at least 0", lambda x: 0 <= x < math.inf, "patience", "downscale")
+        _check(self, "fixed or adaptive", lambda x: x in get_args(Capacity), "capacity")
+        _check(self, "above 0 or None", lambda x: x is None or 0 < x < math.inf, "budget_mb")
+        if self.budget_mb is not None and self.capacity == "fixed":
+            raise ValueError(
+                f"TrainConfig: budget_mb {self.budget_mb:g} needs capacity adaptive, got fixed"
+            )
 
 
 def _check(config: object, wanted: str, holds: Callable[[Any], bool], *names: str) -> None:
@@ -176,11 +185,13 @@ def check_same(cfg: TrainConfig) -> None:
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: cannot be read, so the run cannot go on: {error}") from None
     now = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
-    for name in ("stages", "scene", "downscale"):
-        if not isinstance(before, dict) or before.get(name, 0) != now[name]:
+    # of configurations from before there were any
+    since = {"downscale": 0, "capacity": "fixed", "budget_mb": None}
+    for name in ("stages", "scene", *since):
+        if not isinstance(before, dict) or before.get(name, since.get(name)) != now[name]:
             raise ValueError(
                 f"{path}: the run began with other {name}: resume with the same --preset, "
-                "--minutes, --light, --downscale and --set as then"
+                "--minutes, --light, --downscale, --adaptive, --budget-mb and --set as then"
             )
 
 

@@ -33,6 +33,7 @@ from univoxel.lights.distant import DistantLight
 from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.views import ViewLights
 from univoxel.ops import VisibilityScene
+from univoxel.packing import PACKED, pack, unpack
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
 FILE = "scene.safetensors"
@@ -162,28 +163,42 @@ class Scene(nn.Module):
         return self.sky.changed(change[self.views.chosen])
 
 
-def save_scene(scene: Scene, run: Path, state: dict, slim: bool = False) -> Path:
-    """Write run/scene.safetensors whole or not at all; `state` (JSON) travels in its metadata.
-
-    Args:
-        slim: for a scene that is done: the grids in half precision, and features only where rays
-            meet the surface; otherwise what is loaded equals what was saved, bit by bit.
-
-    Raises:
-        OSError: names the file when it cannot be written; the one before stays.
-    """
+def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict[str, Tensor]:
+    """The tensors of a scene's file, see `save_scene`."""
     tensors = {k: v.contiguous() for k, v in scene.state_dict().items() if k != "field.features"}
     # Features that no sample has touched are 0: only the others are stored.
     features = scene.field.features.detach().flatten(0, 2)
     touched = features.any(1)
     if slim:
-        touched &= scene.field.sdf.detach().flatten().abs() < SHELL * scene.field.voxel_size
+        shell = (reach or SHELL) * scene.field.voxel_size
+        touched &= scene.field.sdf.detach().flatten().abs() < shell
+        if reach is not None:
+            packed = pack(tensors.pop("field.sdf"), shell)
+            tensors |= {f"field.sdf_{name}": value for name, value in packed.items()}
     rows = touched.nonzero()[:, 0]
     tensors["field.feature_rows"], tensors["field.feature_values"] = rows.int(), features[rows]
     if slim:
         # sdf next to the surface is a small number: half precision keeps it to 1e-3 voxels
-        for name in ("field.sdf", "field.feature_values"):
+        for name in {"field.sdf", "field.sdf_values", "field.feature_values"} & tensors.keys():
             tensors[name] = tensors[name].clamp(-HALF_MAX, HALF_MAX).half()
+    return tensors
+
+
+def save_scene(
+    scene: Scene, run: Path, state: dict, slim: bool = False, reach: float | None = None
+) -> Path:
+    """Write run/scene.safetensors whole or not at all; `state` (JSON) travels in its metadata.
+
+    Args:
+        slim: for a scene that is done: the grids in half precision, and features only where rays
+            meet the surface; otherwise what is loaded equals what was saved, bit by bit.
+        reach: voxels from the surface, > 0, beyond which a slim file says of a node only on which
+            side it lies; SHELL for features and no limit for distances when left out.
+
+    Raises:
+        OSError: names the file when it cannot be written; the one before stays.
+    """
+    tensors = stored(scene, slim, reach)
     meta = {
         "format": FORMAT,
         "scene": asdict(scene.cfg),
@@ -237,6 +252,9 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
         features = torch.zeros(grid.nodes_count, cfg.channels)
         features[rows.long()] = values.float()
         tensors["field.features"] = features.view(*grid.size, cfg.channels)
+        packed = {n: tensors.pop(k) for n in PACKED if (k := f"field.sdf_{n}") in tensors}
+        if packed:
+            tensors["field.sdf"] = unpack(packed, grid.size, SHELL * grid.voxel_size)
         scene.load_state_dict(tensors)
         return scene.eval(), meta["state"]
     except (RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:

@@ -45,6 +45,7 @@ class Progress:
         self.stage, self.done, self.step = state["stage"], state["progress"], state["step"]
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
         self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
+        self.chosen: list[dict] = list(state.get("chosen", ()))  # of capacity
         self._stage_steps = state.get("stage_steps", 0)  # made in the present stage
         self._planned, self._count = 0, 0  # steps of the stage in this sitting
         self._stage_begin = self.seconds  # of the stage in this sitting
@@ -69,8 +70,10 @@ class Progress:
 
     def __exit__(self, kind: type | None, *_) -> None:
         self._bar.stop()
-        if kind is None and (told := self.cut()):
-            self._bar.console.print(told, markup=False, highlight=False)
+        if kind is None:
+            for told in (*(c["said"] for c in self.chosen), self.cut()):
+                if told:
+                    self._bar.console.print(told, markup=False, highlight=False)
 
     @property
     def seconds(self) -> float:
@@ -85,6 +88,7 @@ class Progress:
             "step": self.step,
             "made": self.made,
             "early": self.early,
+            "chosen": self.chosen,
             "stage_steps": self._stage_steps,
             "seconds": self.seconds,
             "threads": torch.get_num_threads(),
@@ -144,6 +148,11 @@ class Progress:
         self.made.append(self._stage_steps / self.cfg.stages[self.stage].iterations)
         self.stage, self.done, self._stage_steps = self.stage + 1, 0.0, 0
         self._stage_begin = self.seconds
+
+    def credit(self, share: float) -> None:
+        """Count a share of the coming stage's steps as made."""
+        self.done = share
+        self._stage_steps = round(share * self.cfg.stages[self.stage].iterations)
 
     def shorten(self) -> None:
         """Run through the rest of the stage's schedule in fewer steps."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -30,7 +32,7 @@ from univoxel.records import Rays, Surface
 from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
-from univoxel.tasks import joint
+from univoxel.tasks import capacity, joint
 from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress
 from univoxel.tasks.timelapse import Timelapse
@@ -42,6 +44,7 @@ SPREAD = 0.8  # share of the neighbours' mean that a node's gradient takes on in
 REFRESH = 16  # steps between looks at which bricks are empty
 RETRACE = 100  # steps after which light is traced through the surface as it has become
 MOMENTS = (0.9, 0.99)
+RATES = ("lr_sdf", "lr_features", "lr_networks")
 # Adam's epsilon for the grids. Far above 0 on purpose: a node's gradient is then scaled by the
 # batch, not by its own history, and nodes that few rays see do not jump.
 EPS_SDF, EPS_FEATURES = 1e-4, 1e-8
@@ -91,21 +94,22 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         lower, upper = estimate_bounds(distance, photos.cameras)
     except ValueError as error:
         raise DataError(f"{cfg.data}: {error}") from None
-    voxels = [s.voxels if isinstance(s, StageConfig) else None for s in cfg.stages]
-    grids = [None if v is None else fit_grid(lower, upper, round(1e6 * v)) for v in voxels]
+    box = lower, upper
     if resume:
         scene, state = load_checkpoint(cfg.out)
         check_same(cfg)
         begin -= state["seconds"]
     else:
-        first = grids[0]
-        assert first is not None
+        assert isinstance(cfg.stages[0], StageConfig)
+        first = fit_grid(*box, capacity.voxels(cfg.stages[0], []))
         hull = visual_hull(distance, photos.cameras, first)
         field = DenseField(first, cfg.scene.channels, hull)
         light = lights.scaled(cfg.scene.light, float((upper - lower).max()) / 2)
         views = tuple(photos.names) if cfg.scene.varying != "none" else ()
         scene = Scene(replace(cfg.scene, light=light, views=views), field)
         state = {"stage": 0, "progress": 0.0, "step": 0}
+        if cfg.budget_mb is not None:
+            capacity.check_budget(scene, cfg.budget_mb)
 
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
     save_config(cfg)
@@ -113,16 +117,27 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         if film:
             progress.watch = lambda: film.look(scene, progress)
         for index in range(state["stage"], len(cfg.stages)):
-            stage, grid = cfg.stages[index], grids[index]
+            stage = cfg.stages[index]
             if isinstance(stage, JointConfig):
                 joint.solve(scene, photos, stage, cfg.seed, progress)
             else:
-                assert grid is not None
+                grid = fit_grid(*box, capacity.voxels(stage, progress.chosen))
                 if scene.field.grid != grid:
                     scene.field = scene.field.resized(grid)
+                if cfg.capacity == "adaptive":
+                    stage = capacity.on_grid(stage, box, grid.voxel_size)
                 run_stage(scene, cfg, stage, photos, pixels, held_out, progress)
             done = index + 1 == len(cfg.stages)
-            save_scene(scene, cfg.out, progress.state(), slim=done)
+            if cfg.capacity == "adaptive" and (done or not progress.over):
+                rehearse = partial(rehearsal, cfg, photos, pixels, held_out)
+                lesson = pixels[torch.randperm(len(pixels))[: capacity.LESSON]]
+                looks = look_at(photos, held_out), look_at(photos, lesson)
+                chosen = capacity.adapt(scene, cfg, index, box, *looks, rehearse, progress.pace)
+                progress.chosen += [choice.noted() for choice in chosen]
+                if capacity.rehearsed(chosen):
+                    progress.credit(capacity.REHEARSAL)
+            reach = capacity.reach(progress.chosen)
+            save_scene(scene, cfg.out, progress.state(), slim=done, reach=reach)
             preview(scene, photos, cfg.out / "preview.png")
         if film:
             film.finish(scene, progress)
@@ -136,7 +151,7 @@ def run_stage(
     photos: Photos,
     pixels: Tensor,
     held_out: Tensor,
-    progress: Progress,
+    progress: Progress | capacity.Rehearsal,
 ) -> None:
     """Optimise the scene on its present grid until the stage's steps or its time are over."""
     field = scene.field
@@ -204,6 +219,24 @@ def run_stage(
     field.refresh()
     scene.surface_moved()
     scene.eval()
+
+
+def rehearsal(
+    cfg: TrainConfig,
+    photos: Photos,
+    pixels: Tensor,
+    held_out: Tensor,
+    scene: Scene,
+    stage: StageConfig,
+    steps: int,
+) -> float:
+    """Hurry a scene through a stage, without light; PSNR of its held-out pixels."""
+    torch.manual_seed(cfg.seed)  # all rehearsals see the same rays
+    # From middling rates on: what has been learned must not be shaken
+    rates = {n: (math.sqrt(a * b), b) for n in RATES for a, b in [getattr(stage, n)]}
+    stage, cfg = replace(stage, physical_from=1.0, **rates), replace(cfg, patience=0.0)
+    run_stage(scene, cfg, stage, photos, pixels, held_out, capacity.Rehearsal(steps))
+    return held_out_psnr(scene, photos, held_out, physical=False)
 
 
 def objective(
@@ -316,6 +349,18 @@ def held_out_psnr(scene: Scene, photos: Photos, pixels: Tensor, physical: bool) 
         shaded = encoded_radiance(scene, surface, batch) * surface.opacity[:, None]
     target = linear_to_srgb(batch.color * batch.alpha[:, None])
     return -10 * torch.log10((shaded - target).square().mean()).item()
+
+
+def look_at(photos: Photos, pixels: Tensor) -> capacity.Look:
+    """Pixels as capacity looks at them."""
+    batch = batch_at(photos, pixels)
+    target = linear_to_srgb(batch.color * batch.alpha[:, None])
+    return capacity.Look(
+        batch.rays,
+        batch.view,
+        target,
+        radiance=lambda scene, surface: encoded_radiance(scene, surface, batch),
+    )
 
 
 def between(ends: tuple[float, float], done: float) -> float:

@@ -1,0 +1,184 @@
+"""What a trained model consists of: parameters and bytes by part, and what was chosen for it."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from rich import print
+from rich.table import Table
+from safetensors import safe_open
+
+from univoxel.data.images import replacing, write_png
+from univoxel.lights import LocalSG
+from univoxel.scene import FILE, Scene, load_checkpoint
+from univoxel.tasks.contact_sheet import heat
+
+# Beginning of a tensor's name in the file: the part it belongs to. The first that fits counts.
+PARTS = {
+    "field.sdf": "distances",
+    "field.feature": "features",
+    "material.": "material head",
+    "radiance.": "radiance head",
+    "light.": "light",
+    "mirrored.": "mirrored light",
+    "sky.": "map",
+    "views.": "views",
+}
+# Not learned: where the numbers of a grid belong, and directions that are computed
+INDICES = ("field.feature_rows", "field.sdf_rows", "field.sdf_side", "sky.direction")
+TILE, MARGIN, BAR = 260, 12, 26  # pixels of the picture
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999", "#f0e442")
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one part of the model takes up in its file."""
+
+    parameters: int  # learned numbers
+    bytes: int  # with those that say where they belong
+
+
+def info(run: Path, json: Path | None = None, picture: Path | None = None) -> dict:
+    """What the model of a run takes up and where; printed as tables, and returned.
+
+    Parameters are the learned numbers that the file holds: distances and features of the nodes it
+    stores, weights, light. Row numbers and directions of the map are bytes, and no parameters.
+
+    Args:
+        json: file for the numbers.
+        picture: .png of where the capacity went, see `draw`.
+
+    Returns:
+        JSON: `parameters`, `bytes`, `parts` (name: parameters and bytes), `grid` (size, voxel_size,
+        nodes, and shares of them: with distances, with features), `channels`,
+        `material_channels`, `hidden`, `lobes` (None where there are none), `chosen`: what,
+        before, after, cost in dB and why.
+
+    Raises:
+        FileNotFoundError, ValueError: no model there, or one that cannot be read.
+        OSError: a file cannot be written.
+    """
+    run = Path(run)
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise ValueError(f"--picture: expected a .png file, got {picture}")
+    scene, state = load_checkpoint(run)
+    found = facts(scene, parts(run), state)
+    found["bytes"] = (run / FILE).stat().st_size
+    for table in tables(found):
+        print(table)
+    for choice in found["chosen"]:
+        print(choice["said"])
+    for place in (json, picture):
+        if place:
+            place.parent.mkdir(parents=True, exist_ok=True)
+    if json:
+        with replacing(json) as temporary:
+            temporary.write_text(jsonlib.dumps(found, indent=2) + "\n", encoding="utf-8")
+    if picture:
+        write_png(picture, draw(scene, found))
+    return found
+
+
+def parts(run: Path) -> dict[str, Part]:
+    """What every part takes up in the file, the largest first."""
+    found: dict[str, Part] = {}
+    with safe_open(run / FILE, "pt") as file:
+        for name in file.keys():
+            tensor = file.get_tensor(name)
+            part = next((p for start, p in PARTS.items() if name.startswith(start)), "other")
+            so_far = found.get(part, Part(0, 0))
+            learned = 0 if name in INDICES else tensor.numel()
+            size = tensor.numel() * tensor.element_size()
+            found[part] = Part(so_far.parameters + learned, so_far.bytes + size)
+    return dict(sorted(found.items(), key=lambda item: -item[1].bytes))
+
+
+def facts(scene: Scene, parts: dict[str, Part], state: dict) -> dict:
+    """The numbers, see `info`."""
+    grid, cfg = scene.field.grid, scene.cfg
+    features = scene.field.features.detach().any(-1)
+    return {
+        "parameters": sum(p.parameters for p in parts.values()),
+        "bytes": sum(p.bytes for p in parts.values()),
+        "parts": {name: vars(part) for name, part in parts.items()},
+        "grid": {
+            "size": list(grid.size),
+            "voxel_size": grid.voxel_size,
+            "nodes": grid.nodes_count,
+            "share_with_distance": parts["distances"].parameters / grid.nodes_count,
+            "share_with_features": features.float().mean().item(),
+        },
+        "channels": cfg.channels,
+        "material_channels": cfg.material_channels,
+        "hidden": cfg.hidden,
+        "lobes": scene.light.config.lobes if isinstance(scene.light, LocalSG) else None,
+        "chosen": state.get("chosen", []),
+    }
+
+
+def tables(found: dict) -> Iterable[Table]:
+    """What is printed."""
+    table = Table("part", "parameters", "bytes", "share", title="Model")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    whole = sum(p["bytes"] for p in found["parts"].values())
+    for name, part in found["parts"].items():
+        share = f"{part['bytes'] / whole:.1%}"
+        table.add_row(name, f"{part['parameters']:,}", f"{part['bytes']:,}", share)
+    table.add_section()
+    table.add_row("all", f"{found['parameters']:,}", f"{found['bytes']:,}", "with the file's head")
+    yield table
+    grid = found["grid"]
+    table = Table("size", "value", title="Sizes")
+    table.columns[1].justify = "right"
+    x, y, z = grid["size"]
+    table.add_row("nodes of the grid", f"{x} x {y} x {z}")
+    table.add_row("voxel, world units", f"{grid['voxel_size']:.4g}")
+    table.add_row("nodes with a distance of their own", f"{grid['share_with_distance']:.1%}")
+    table.add_row("nodes with features", f"{grid['share_with_features']:.1%}")
+    table.add_row("feature channels", f"{found['channels']}")
+    table.add_row("of them for materials", f"{found['material_channels']}")
+    table.add_row("hidden units of a layer", f"{found['hidden']}")
+    table.add_row("lobes of light", "-" if found["lobes"] is None else f"{found['lobes']}")
+    yield table
+
+
+def draw(scene: Scene, found: dict) -> np.ndarray:
+    """Where the capacity went: [H, W, 3] in [0, 1].
+
+    Nodes with features, counted along each axis of the grid, the brightest where there are most;
+    under them a bar of the file's bytes by part.
+    """
+    used = scene.field.features.detach().any(-1)
+    counts = [used.sum(axis).float() for axis in range(3)]
+    most = max(max(float(c.max()) for c in counts), 1.0)
+    longest = max(used.shape)
+    width = 3 * TILE + 4 * MARGIN
+    lines = len(found["parts"])
+    height = TILE + BAR + 5 * MARGIN + 2 * MARGIN * lines
+    image = Image.new("RGB", (width, height), "white")
+    drawing, font = ImageDraw.Draw(image), ImageFont.load_default(13)
+    for k, (count, name) in enumerate(zip(counts, ("along x", "along y", "along z"), strict=True)):
+        tile = (255 * heat(count.T.flip(0), most)).astype(np.uint8)  # the second axis goes up
+        high, wide = (max(1, round(TILE * n / longest)) for n in tile.shape[:2])
+        left, top = MARGIN + k * (TILE + MARGIN), 2 * MARGIN + 4
+        picture = Image.fromarray(tile).resize((wide, high), Image.Resampling.NEAREST)
+        image.paste(picture, (left, top))
+        drawing.text((left, 4), f"nodes with features {name}", fill="black", font=font)
+    top, left = TILE + 3 * MARGIN, MARGIN
+    whole = sum(part["bytes"] for part in found["parts"].values())
+    for k, (name, part) in enumerate(found["parts"].items()):
+        share = part["bytes"] / whole
+        right = left + share * (width - 2 * MARGIN)
+        drawing.rectangle((left, top, right, top + BAR), fill=COLORS[k % len(COLORS)])
+        y = top + BAR + MARGIN + 2 * MARGIN * k
+        drawing.rectangle((MARGIN, y, MARGIN + 12, y + 12), fill=COLORS[k % len(COLORS)])
+        text = f"{name}: {part['parameters']:,} parameters, {part['bytes']:,} bytes, {share:.1%}"
+        drawing.text((MARGIN + 20, y - 2), text, fill="black", font=font)
+        left = right
+    return np.asarray(image, np.float32) / 255
