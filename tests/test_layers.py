@@ -35,8 +35,8 @@ HELPERS = {
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "tasks": {
-        *("animation", "contact_sheet", "envmap", "equations", "frames", "joint", "layers"),
-        *("plateau", "progress", "timelapse"),
+        *("animation", "contact_sheet", "envmap", "equations", "frames", "guard", "joint"),
+        *("layers", "plateau", "progress", "timelapse", "trust"),
     },
 }
 # Extras: imported inside the function that needs one

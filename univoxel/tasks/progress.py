@@ -45,6 +45,7 @@ class Progress:
         self.stage, self.done, self.step = state["stage"], state["progress"], state["step"]
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
         self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
+        self.troubles: list[str] = list(state.get("troubles", ()))  # what went wrong and was mended
         self._stage_steps = state.get("stage_steps", 0)  # made in the present stage
         self._planned, self._count = 0, 0  # steps of the stage in this sitting
         self._stage_begin = self.seconds  # of the stage in this sitting
@@ -70,7 +71,12 @@ class Progress:
     def __exit__(self, kind: type | None, *_) -> None:
         self._bar.stop()
         if kind is None and (told := self.cut()):
-            self._bar.console.print(told, markup=False, highlight=False)
+            self._say(told)
+        if kind is None and self.troubles:
+            self._say(
+                f"training met trouble and went on, {len(self.troubles)} times: look at the result "
+                f"before you trust it; the last was in {self.troubles[-1]}"
+            )
 
     @property
     def seconds(self) -> float:
@@ -85,6 +91,7 @@ class Progress:
             "step": self.step,
             "made": self.made,
             "early": self.early,
+            "troubles": self.troubles,
             "stage_steps": self._stage_steps,
             "seconds": self.seconds,
             "threads": torch.get_num_threads(),
@@ -150,6 +157,21 @@ class Progress:
         self._planned = self._count + math.ceil(REST * (self._planned - self._count))
         self.early.append(self.stage)
 
+    def abandon(self) -> None:
+        """Leave the present stage, between steps, with what it has."""
+        self.done = 1.0
+        self.early.append(self.stage)
+
+    def trouble(self, what: str) -> None:
+        """Tell, at once and in the log, of something that went wrong and was mended."""
+        self.troubles.append(what)
+        nothing = {"losses": {}, "held_out_psnr": None, "rays_per_second": None}
+        append_line(self._log, json.dumps(self.state() | nothing | {"trouble": what}))
+        self._say(what)
+
+    def _say(self, what: str) -> None:
+        self._bar.console.print(what, markup=False, highlight=False)
+
     @contextmanager
     def apart(self) -> Iterator[None]:
         """A block between steps whose time says nothing of how long steps take."""
@@ -213,6 +235,8 @@ class Progress:
         whole = max(by_stage / sum(shares), min(self.seconds / (60 * self.cfg.minutes), 1.0))
         remaining = self.seconds * (1 - whole) / max(whole, 1e-3)
         quality = "" if psnr is None else f"held-out {psnr:.1f} dB  "
+        if self.troubles:
+            quality += f"{len(self.troubles)} troubles  "
         self._bar.update(
             self._task,
             completed=whole,

@@ -24,6 +24,7 @@ from univoxel.data import DataError, Photos, load_photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
 from univoxel.lights import priors
+from univoxel.metrics import psnr
 from univoxel.ops import smooth_rows_
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays, Surface
@@ -31,6 +32,7 @@ from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
 from univoxel.tasks import joint
+from univoxel.tasks.guard import Guard
 from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress
 from univoxel.tasks.timelapse import Timelapse
@@ -72,7 +74,6 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     Raises:
         DataError: input that cannot be used.
         FileExistsError: cfg.out holds a run already and resume is False.
-        FloatingPointError: the loss is not a number any more.
         OSError: a file of the run cannot be written; what was there before stays.
         FileNotFoundError, ValueError: with resume, there is no checkpoint that can be read, or it
             belongs to another configuration.
@@ -161,6 +162,8 @@ def run_stage(
     )
     scratch = torch.zeros_like(field.sdf.data)
     plateau = Plateau(cfg.patience)
+    guard = Guard(progress, restored=lambda: moved(scene))
+    guard.follow(optimizer)
     for done in progress.steps():
         physical = done >= stage.physical_from
         rates = (
@@ -169,7 +172,7 @@ def run_stage(
             between(stage.lr_networks, done),
         )
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate
+            group["lr"] = rate * guard.scale
         scene.inv_s = 1 / (between(stage.sharpness, done) * field.voxel_size)
         if progress.step % REFRESH == 0:
             field.refresh()
@@ -180,10 +183,10 @@ def run_stage(
         surface = surface_at(scene, batch.rays, torch.rand(stage.rays))
         terms = objective(scene, cfg.loss, surface, batch, physical)
         loss = torch.stack(list(terms.values())).sum()
-        if not torch.isfinite(loss):
-            raise FloatingPointError(f"the loss is {loss.item()} at step {progress.step}")
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        if not guard.sound(loss):
+            continue
         if stage.refit:
             assert field.features.grad is not None
             field.features.grad._values()[:, : scene.material.channels] = 0
@@ -199,11 +202,17 @@ def run_stage(
         if progress.due():
             quality = held_out_psnr(scene, photos, held_out, physical)
             progress.report({k: v.item() for k, v in terms.items()}, quality)
+            guard.judge(quality, physical)
         if progress.checkpoint_due():
             save_scene(scene, cfg.out, progress.state())
-    field.refresh()
-    scene.surface_moved()
+    moved(scene)
     scene.eval()
+
+
+def moved(scene: Scene) -> None:
+    """Look again at what follows from the sdf."""
+    scene.field.refresh()
+    scene.surface_moved()
 
 
 def objective(
@@ -288,6 +297,8 @@ def split_pixels(distance: Tensor) -> tuple[Tensor, Tensor]:
     pixels = (distance < MARGIN).nonzero()
     order = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))
     held = min(HELD_OUT, len(pixels) // 10)
+    if not held:  # so few that none can be spared
+        return pixels, pixels
     return pixels[order[held:]], pixels[order[:held]]
 
 
@@ -315,7 +326,7 @@ def held_out_psnr(scene: Scene, photos: Photos, pixels: Tensor, physical: bool) 
     else:
         shaded = encoded_radiance(scene, surface, batch) * surface.opacity[:, None]
     target = linear_to_srgb(batch.color * batch.alpha[:, None])
-    return -10 * torch.log10((shaded - target).square().mean()).item()
+    return psnr(shaded, target)
 
 
 def between(ends: tuple[float, float], done: float) -> float:
