@@ -138,6 +138,11 @@ def strict(text: str) -> dict:
     return json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} in {text}"))
 
 
+@pytest.fixture(autouse=True)
+def a_report_after_every_step(monkeypatch):
+    monkeypatch.setattr(progress, "REPORT_SECONDS", -1.0)
+
+
 def run(data: Path, tmp_path: Path, light: str, capsys) -> dict:
     """Train and evaluate; the measures."""
     other = tuple(f"--set={x}" for x in ("stages.2", "stages.3", "scene.sky", "scene.light"))
@@ -155,8 +160,7 @@ def run(data: Path, tmp_path: Path, light: str, capsys) -> dict:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_result_with_finite_numbers(template, tmp_path, monkeypatch, capsys, case):
-    monkeypatch.setattr(progress, "REPORT_SECONDS", 0.0)
+def test_a_result_with_finite_numbers(template, tmp_path, capsys, case):
     data = Path(shutil.copytree(template, tmp_path / "data"))
     CASES[case](data)
     run(data, tmp_path, "hybrid", capsys)

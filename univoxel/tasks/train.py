@@ -6,7 +6,9 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import rich
 import torch
+from rich.text import Text
 from torch import Tensor
 
 from univoxel import lights, losses
@@ -21,6 +23,7 @@ from univoxel.config import (
     save_config,
 )
 from univoxel.data import DataError, Photos, load_photos
+from univoxel.data.images import replacing
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
 from univoxel.lights import priors
@@ -31,7 +34,7 @@ from univoxel.records import Rays, Surface
 from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
-from univoxel.tasks import joint
+from univoxel.tasks import joint, trust
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress
@@ -127,7 +130,19 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             preview(scene, photos, cfg.out / "preview.png")
         if film:
             film.finish(scene, progress)
+    say_trust(scene, photos, cfg.out, progress.troubles)
     return cfg.out
+
+
+def say_trust(scene: Scene, photos: Photos, out: Path, troubles: list[str]) -> None:
+    """Print, and write to trust.txt, what the photographs leave open."""
+    try:
+        told = trust.words(trust.numbers(trust.survey(scene, photos, trust.FEW_POINTS)), troubles)
+    except ValueError as error:
+        told = f"No trust report: {error}."
+    with replacing(out / "trust.txt") as temporary:
+        temporary.write_text(told + "\n", encoding="utf-8")
+    rich.print(Text(told))
 
 
 def run_stage(
