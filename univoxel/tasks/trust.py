@@ -34,13 +34,14 @@ POINTS, FEW_POINTS = 20000, 2000  # on the surface: for maps, and for words alon
 SIGHTINGS = 8  # of a point that are rendered again, at most
 DIRECTIONS = 64  # that openness is measured in where the scene has no map with its own
 STEP = 0.05  # of roughness, in the difference that tells what it changes
-ENOUGH = 5.0  # views straight from above that determine an albedo to a doubt of one half
-NOISE = 0.05  # sRGB; disagreement with the photographs that means a doubt of one half
+ENOUGH = 3.0  # views straight from above that determine an albedo to a doubt of one half
+NOISE = 0.02  # sRGB; disagreement with the photographs that means a doubt of one half
 BLACK = 0.02  # sRGB; darker pixels are noise
 NORMALS = 3.0  # voxels that opposite sides of a thin part lie farther apart, over 2
 NEIGHBOURS = 4  # points that a pixel takes its doubt from
 
-FEW, ONE_SIDE, SHUT = 3, 15.0, 0.5  # of what is told in words: views, degrees, share of the light
+# Of what is told in words: views, degrees, share of the light, difference in sRGB
+FEW, ONE_SIDE, SHUT, OFF = 3, 15.0, 0.5, 0.05
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,7 @@ def numbers(found: Survey) -> dict[str, float]:
         "clipped": share(found.clipped > 0.5),
         "black": share(found.black > 0.5),
         "shut": share(found.open < SHUT),
-        "disagreeing": share(found.disagreement > NOISE),
+        "disagreeing": share(found.disagreement > OFF),
         "dull": share((found.gloss / NOISE).square() / 12 < 1),
     }
 
@@ -260,7 +261,7 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         "black": "is black in most photographs: more light would help",
         "shut": "gets less than half of its light from outside: what parts of the object send to "
         "each other may be left in its albedo",
-        "disagreeing": f"differs from its photographs by more than {NOISE:g} in sRGB: its surface, "
+        "disagreeing": f"differs from its photographs by more than {OFF:g} in sRGB: its surface, "
         "material or light is wrong",
         "dull": "shows no highlight that tells its roughness",
     }
