@@ -231,7 +231,7 @@ def test_an_empty_mesh_has_no_chamfer_distance(folders, relit_calls, monkeypatch
 
 def test_doubts_are_compared_with_errors(folders, relit_calls, monkeypatch, tmp_path):
     """Doubts that grow with the error foretell it; those that shrink say the opposite."""
-    photos = task.load_photos(folders.data, "test")
+    photos = load_photos(folders.data, "test")
     ones = task.Scales(torch.ones(3), torch.ones(3))
     pairs = []
     for view in range(2):

@@ -130,7 +130,10 @@ def trained_on(run: Path) -> Path:
 
 
 def photos_of(run: Path, data: Path | None = None, split: str = "test") -> Photos:
-    """The test views, or those trained on, at the size that a run was trained at; of another data set, if one is given.
+    """Photographs at the size that a run was trained at; of another data set, if one is given.
+
+    Args:
+        split: "test", or "train" for those that were trained on.
 
     Raises:
         DataError: the run or the photographs cannot be read.
