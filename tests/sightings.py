@@ -67,13 +67,19 @@ class Steps:
     """A clock that lets a stage run through."""
 
     over, pace, reserved = False, 1.0, math.inf
+    stage = step = 0
 
     def __init__(self, count: int, rooms: Sequence[int] = ()):
         self.count, self.rooms, self.asked = count, list(rooms), []
+        self.troubles, self.abandoned = [], False
 
     def steps(self, apart):
         assert 0 < apart < 1
-        yield from (i / self.count for i in range(self.count))
+        for i in range(self.count):
+            if self.abandoned:
+                return
+            self.step = i
+            yield i / self.count
 
     def apart(self):
         return nullcontext()
@@ -84,6 +90,12 @@ class Steps:
 
     def due(self) -> bool:
         return False
+
+    def trouble(self, what: str) -> None:
+        self.troubles.append(what)
+
+    def abandon(self) -> None:
+        self.abandoned = True
 
 
 RED, BLUE = torch.tensor([0.6, 0.2, 0.15]), torch.tensor([0.15, 0.25, 0.6])

@@ -15,7 +15,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from univoxel.cli import main
-from univoxel.data.images import read_image, write_exr, write_png
+from univoxel.data.images import read_exr, read_image, write_exr, write_png
 from univoxel.scene import FILE
 from univoxel.tasks import progress
 
@@ -298,5 +298,9 @@ def test_the_template_is_sound(run, tmp_path):
     out = tmp_path / "out"
     arguments = ["--save", str(out), "--json", str(out / "a.json"), "--samples", "1"]
     assert main(["eval", str(run), *arguments]) == 0
-    assert {"a.json", "contact_sheet.png", "r_0.exr", "r_1.exr"} == {p.name for p in out.iterdir()}
+    names = {"a.json", "contact_sheet.png", "r_0.exr", "r_1.exr", "trust.txt"}
+    assert names == {p.name for p in out.iterdir()}
+    assert {"doubt.albedo", "doubt.roughness"} <= set(read_exr(out / "r_0.exr"))
+    assert 0 <= json.loads((out / "a.json").read_text())["trust"]["doubt_albedo"] <= 1
+    assert "Doubt of albedo" in (run / "trust.txt").read_text()
     assert read_image(run / "preview.png").shape == (16, 5 * 16, 3)

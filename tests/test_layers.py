@@ -35,8 +35,9 @@ HELPERS = {
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "tasks": {
-        *("animation", "capacity", "contact_sheet", "envmap", "equations", "frames", "joint"),
-        *("layers", "look", "plateau", "progress", "shrink", "spare", "timelapse"),
+        *("animation", "capacity", "contact_sheet", "envmap", "equations", "frames", "guard"),
+        *("joint", "layers", "look", "plateau", "progress", "shrink", "spare", "timelapse"),
+        "trust",
     },
 }
 # Extras: imported inside the function that needs one

@@ -141,3 +141,16 @@ def test_samples_of_no_area():
 def test_sizes_must_agree(function):
     with pytest.raises(ValueError, match=r"sizes to agree, got \[4, 4, 3\] and \[5, 5, 3\]"):
         function(gray(0, 4), gray(0, 5))
+
+
+def test_rank_correlation():
+    x = torch.tensor([0.1, 5.0, -2.0, 3.0])
+    assert metrics.spearman(x, x.exp()) == pytest.approx(1)
+    assert metrics.spearman(x, -x) == pytest.approx(-1)
+    # ranks 1 2 3 4 against 1 3.5 2 3.5: 1 - 6 sum d^2 / (n (n^2 - 1)) holds only without ties
+    with_ties = metrics.spearman(torch.arange(4.0), torch.tensor([0.0, 7.0, 3.0, 7.0]))
+    assert with_ties == pytest.approx(3 / 22.5**0.5)
+    assert metrics.spearman(x, torch.ones(4)) is None
+    assert metrics.spearman(torch.empty(0), torch.empty(0)) is None
+    with pytest.raises(ValueError, match="spearman: expected sizes to agree"):
+        metrics.spearman(x, x[:2])

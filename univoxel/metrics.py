@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from scipy.spatial import KDTree
+from scipy.stats import rankdata
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -120,6 +121,18 @@ def chamfer(points: Tensor, truth: Tensor) -> float:
     there, _ = KDTree(b).query(a)
     back, _ = KDTree(a).query(b)
     return float(0.5 * (there.mean() + back.mean()))
+
+
+def spearman(a: Tensor, b: Tensor) -> float | None:
+    """Rank correlation of two sets of N numbers, in [-1, 1], with mean ranks for equal ones.
+
+    None where one of the sets is all equal, or empty. Source: Spearman 1904.
+    """
+    _same_size("spearman", a, b)
+    first, second = rankdata(a.numpy()), rankdata(b.numpy())
+    if not len(first) or not first.std() or not second.std():
+        return None
+    return float(np.corrcoef(first, second)[0, 1])
 
 
 def sample_mesh(mesh: Mesh, count: int, generator: torch.Generator) -> Tensor:

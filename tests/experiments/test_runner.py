@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 
 import pytest
@@ -20,7 +21,7 @@ TINY = (
     *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
 )
 SMALL = Setting("small", "draft", "sg", changes=TINY)
-DIES = dataclasses.replace(SMALL, name="dies", changes=(*TINY, "loss.radiance=1e39"))
+DIES = dataclasses.replace(SMALL, name="dies", changes=(*TINY, f"seed={10**30}"))
 
 
 @pytest.fixture(scope="module")
@@ -63,11 +64,11 @@ def test_a_training_is_recorded_with_every_measure(out):
 
 def test_a_failure_is_recorded_and_the_rest_goes_on(out):
     outcome = load_outcome(out / "ball" / "dies")
-    assert outcome.error.startswith("FloatingPointError: the loss is inf at step 0")
+    assert re.match("[A-Za-z]+Error: Overflow", outcome.error)
     assert not outcome.measures
     failed = runner.failures([outcome, load_outcome(out / "ball" / "small")])
     assert failed.startswith("1 of 2 trainings failed, ")
-    assert "ball/dies: FloatingPointError" in failed
+    assert f"ball/dies: {outcome.error}" in failed
 
 
 def test_what_is_done_is_not_done_again(data, out, trained):

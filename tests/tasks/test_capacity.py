@@ -14,6 +14,7 @@ from univoxel.tasks import capacity, spare
 from univoxel.tasks import train as task
 from univoxel.tasks.info import info
 from univoxel.tasks.look import smallest
+from univoxel.tasks.progress import Rehearsal
 from univoxel.tasks.train import look_at, train
 
 LIGHT = SGConfig(lobes=4, hidden=16, directions=16, directions_eval=16)
@@ -127,7 +128,7 @@ def test_a_grid_is_as_coarse_as_its_rehearsal_allows(quality, chosen):
 
 
 def test_a_rehearsal_is_off_the_record():
-    rehearsal = capacity.Rehearsal(4)
+    rehearsal = Rehearsal(4)
     assert list(rehearsal.steps()) == [0, 0.25, 0.5, 0.75]
     assert rehearsal.step == 4
     assert not rehearsal.due()
@@ -217,7 +218,7 @@ def test_resume_goes_on_with_what_was_chosen(data, tmp_path, monkeypatch):
     original, sizes = task.run_stage, []
 
     def killed(scene, cfg, stage, photos, pixels, held_out, progress):
-        if not isinstance(progress, capacity.Rehearsal):
+        if not isinstance(progress, Rehearsal):
             if progress.stage == 1:
                 raise KeyboardInterrupt
             original(scene, cfg, stage, photos, pixels, held_out, progress)

@@ -1,5 +1,6 @@
 """Evaluation of a made-up scene whose every measure is known."""
 
+import dataclasses
 import json
 import math
 from types import SimpleNamespace
@@ -226,6 +227,24 @@ def test_an_empty_mesh_has_no_chamfer_distance(folders, relit_calls, monkeypatch
     empty = Mesh(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int32))
     monkeypatch.setattr(task, "extract_mesh", lambda scene: empty)
     assert task.evaluate(folders.run)["chamfer"] is None
+
+
+def test_doubts_are_compared_with_errors(folders, relit_calls, monkeypatch, tmp_path):
+    """Doubts that grow with the error foretell it; those that shrink say the opposite."""
+    photos = load_photos(folders.data, "test")
+    ones = task.Scales(torch.ones(3), torch.ones(3))
+    pairs = []
+    for view in range(2):
+        layers = layers_module.render_layers(nn.Identity(), photos.cameras, view)
+        expected = task._expected(photos, {}, view)
+        error = (linear_to_srgb(layers.albedo) - expected.albedo).abs().mean(-1)
+        doubt = torch.stack([error.sqrt(), torch.zeros_like(error)], -1)
+        albedo, roughness = task._judged(dataclasses.replace(layers, doubt=doubt), expected, ones)
+        assert len(albedo[0]) == int(inside().sum())
+        pairs.append((albedo, (-albedo[0], albedo[1]), roughness))
+    found = [task._foretold(list(p)) for p in zip(*pairs, strict=True)]
+    assert found == [pytest.approx(1.0), pytest.approx(-1.0), None]  # the last are all equal
+    assert task._foretold([None]) is None
 
 
 def test_other_data_can_be_named(folders, relit_calls):

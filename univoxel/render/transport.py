@@ -17,6 +17,7 @@ from univoxel.records import Mesh
 
 MIN_COSINE = 0.15  # views at a more grazing angle blur over too much surface
 POINTS_AT_ONCE = 4096
+HALF_MAX = 65504.0
 
 
 @dataclass(frozen=True)
@@ -147,5 +148,5 @@ def trace(
             sky += hit < 0
             radiance += torch.where((hit >= 0)[:, None], vertex_color[first[hit.clamp_min(0)]], 0.0)
         open_share[part][point, node] = (255 * sky / rays).round().to(torch.uint8)
-        indirect[part][point, node] = (radiance / rays).half()
+        indirect[part][point, node] = (radiance / rays).clamp_max(HALF_MAX).half()
     return Transport(direction, open_share, indirect)

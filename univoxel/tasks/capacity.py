@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -31,31 +31,6 @@ LESSON = 1024  # rays of the training photographs that heads settle on
 REACH_TOLERANCE = 0.05  # dB that nodes far from the surface may be worth and are not stored
 REACHES = (3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5, 1.25, 1.0)  # voxels
 HEADER, NAME = 8192, 64  # bytes of a model's file that hold no numbers, and of a view's name
-
-
-class Rehearsal:
-    """A few steps through the whole schedule of a stage, off the record; in place of Progress."""
-
-    def __init__(self, steps: int):
-        self.step, self._steps = 0, steps
-
-    def steps(self) -> Iterator[float]:
-        """Progress through the stage in [0, 1), once a step."""
-        for i in range(self._steps):
-            yield i / self._steps
-            self.step += 1
-
-    def due(self) -> bool:
-        return False
-
-    checkpoint_due = due
-
-    def state(self) -> dict:
-        return {}
-
-    def report(self, losses: dict[str, float], psnr: float | None) -> None: ...
-
-    def shorten(self) -> None: ...
 
 
 def coarser_grid(

@@ -26,6 +26,7 @@ class Panel:
     error: Tensor | None  # [H, W] >= 0
     limit: float  # the error that is drawn brightest
     unit: str = ""  # of the error
+    heads: tuple[str, str] = ("truth", "error")  # of the second and third column
 
 
 def heat(error: Tensor, limit: float) -> np.ndarray:
@@ -63,7 +64,8 @@ def contact_sheet(rows: list[tuple[str, list[Panel]]]) -> np.ndarray:
     )
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
     for column, panel in enumerate(rows[0][1]):
-        texts = (panel.title, "truth", f"error, 0 to {panel.limit:g}{panel.unit}")
+        second, third = panel.heads
+        texts = (panel.title, second, f"{third}, 0 to {panel.limit:g}{panel.unit}")
         for k, text in enumerate(texts):
             draw.text((margin + (3 * column + k) * cell, 2), text, "white", font)
     for row, (name, panels) in enumerate(rows):

@@ -138,6 +138,25 @@ def view_equations(
     return hessian, gradient
 
 
+def solve_damped(system: Tensor, right: Tensor) -> Tensor | None:
+    """Solve symmetric systems [..., N, N] x = [..., N], damped as much as they need it.
+
+    Rounding, or data that say nothing of an unknown, can leave a system indefinite. Then lambda
+    times the mean of its diagonal is added there (Levenberg 1944), lambda = 1e-6, 1e-4, 1e-2, 1,
+    until there is a finite solution; None: there is none.
+    """
+    matrix, right = system.double(), right.double()[..., None]
+    size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None].clamp_min(1e-30)
+    one = torch.eye(matrix.shape[-1], dtype=torch.double)
+    for damping in (0.0, 1e-6, 1e-4, 1e-2, 1.0):
+        factor, failed = torch.linalg.cholesky_ex(matrix + damping * size * one)
+        if not failed.any():
+            x = torch.cholesky_solve(right, factor)[..., 0].to(system.dtype)
+            if x.isfinite().all():
+                return x
+    return None
+
+
 def encoded_slope(linear: Tensor) -> Tensor:
     """Derivative of the sRGB curve."""
     power = 1.055 / 2.4 * linear.clamp_min(0.0031308) ** (1 / 2.4 - 1)

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from json import dumps
 from pathlib import Path
 from statistics import fmean
+from typing import TypeAlias
 
 import torch
 from rich import print
 from rich.progress import track
 from rich.table import Table
+from rich.text import Text
 from torch import Tensor
 
 from univoxel import metrics
@@ -31,9 +33,10 @@ from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, stage
 from univoxel.scene import FILE, Scene, load_checkpoint
-from univoxel.tasks.contact_sheet import Panel, contact_sheet, shrink
+from univoxel.tasks.contact_sheet import Panel, contact_sheet, heat, shrink
 from univoxel.tasks.frames import photos_of, read_map
 from univoxel.tasks.layers import Layers, Relighting, exr_channels, render_layers
+from univoxel.tasks.trust import Doubts, Survey, numbers, survey, words
 
 # key: what the table says of it
 MEASURES = {
@@ -48,6 +51,8 @@ MEASURES = {
     "relit_psnr_raw": "relit PSNR, dB, albedo as it is",
     "normal_mae_deg": "normals, mean error in the mask, degrees",
     "chamfer": "Chamfer distance, world units",
+    "trust_spearman": "rank correlation of the albedo's doubt with its error",
+    "trust_spearman_roughness": "rank correlation of the roughness's doubt with its error",
     "train_seconds": "training, seconds",
     "threads": "threads in training",
     "peak_rss_mb": "peak memory in training, MB",
@@ -97,17 +102,21 @@ def evaluate(
     - relit_psnr: rendered with the albedo times the scale per channel, clipped to 1, on the surface
       and on what it sees of itself; relit_psnr_raw: with the albedo as it is.
     - chamfer: samples of the mesh against points of the true surface.
+    - trust_spearman: of doubt (see `univoxel.tasks.trust`) and error over the pixels of the mask in
+      all views: of the albedo, with a scale per channel, mean absolute difference in sRGB; of the
+      roughness, absolute difference.
 
     A measure that the data has no truth for is None.
 
     Args:
         run: folder of the trained scene.
         data: folder of the data set; the one it was trained on when left out.
-        save: folder for <name>.exr of each view and contact_sheet.png. The channels are half
-            floats: rgb.*, albedo.* and relit_<map>.* linear, composited on black, with the albedo
-            as it is; roughness and normal.* (world), 0 where nothing is; alpha; depth along -Z, 0
-            where nothing is.
-        json: file for the measures.
+        save: folder for <name>.exr of each view, contact_sheet.png, and trust.txt, what is weakly
+            determined. The channels are half floats: rgb.*, albedo.* and relit_<map>.* linear,
+            composited on black, with the albedo as it is; roughness, normal.* (world), doubt.albedo
+            and doubt.roughness in [0, 1], 0 where nothing is; alpha; depth along -Z, 0 where
+            nothing is.
+        json: file for the measures, and for the figures of trust.txt under the key trust.
         samples: light samples per pixel of relit pictures.
         bounces: reflections between parts of the object in relit pictures, 0 for none.
         light_of: training view, by name or number, whose light novel views are rendered in, where
@@ -134,6 +143,8 @@ def evaluate(
         if place:
             place.mkdir(parents=True, exist_ok=True)
 
+    found_trust = _survey(scene, run, data)
+    doubts = Doubts(found_trust) if found_trust else None
     mesh = extract_mesh(scene) if maps or points is not None else None
     scales = _albedo_scales(scene, photos)
     relighting = None
@@ -143,12 +154,13 @@ def evaluate(
         relighting = Relighting(lights, here, scales.three, samples, bounces)
     found: dict[str, list[float]] = {key: [] for key in MEASURES}
     every = -(-len(photos) // SHEET_ROWS)
-    rows = []
+    rows, judged = [], []
     for view in track(range(len(photos)), description="rendering test views"):
-        layers = render_layers(scene, photos.cameras, view, relighting)
+        layers = render_layers(scene, photos.cameras, view, relighting, doubts)
         expected = _expected(photos, relit, view)
         for key, value in score(layers, expected, scales):
             found[key].append(value)
+        judged.append(_judged(layers, expected, scales))
         if save:
             write_exr(save / f"{photos.names[view]}.exr", exr_channels(layers))
             if view % every == 0:
@@ -161,6 +173,8 @@ def evaluate(
     }
     result |= {
         "chamfer": _chamfer(mesh, points),
+        "trust_spearman": _foretold([j[0] for j in judged]),
+        "trust_spearman_roughness": _foretold([j[1] for j in judged]),
         "train_seconds": report.get("seconds"),
         "threads": report.get("threads"),
         "peak_rss_mb": report.get("peak_rss_mb"),
@@ -168,9 +182,18 @@ def evaluate(
         "model_bytes": (run / FILE).stat().st_size,
     }
     print(_table(result))
+    figures = {}
+    if found_trust:
+        figures = {"trust": numbers(found_trust)}
+        paragraph = words(figures["trust"], report.get("troubles", []))
+        print(Text(paragraph))
+        if save:
+            with replacing(save / "trust.txt") as temporary:
+                temporary.write_text(paragraph + "\n", encoding="utf-8")
     if json:
         with replacing(json) as temporary:
-            temporary.write_text(dumps(result, indent=2) + "\n", encoding="utf-8")
+            text = dumps(result | figures, indent=2)
+            temporary.write_text(text + "\n", encoding="utf-8")
     return result
 
 
@@ -202,6 +225,42 @@ def score(layers: Layers, expected: Expected, scales: Scales) -> list[tuple[str,
     if truth.normal is not None and mask is not None:
         found.append(("normal_mae_deg", metrics.normal_mae(layers.normal, truth.normal, mask)))
     return found
+
+
+def _survey(scene: Scene, run: Path, data: Path | None) -> Survey | None:
+    """What the photographs that were trained on fix; None, with a line, where they are missing."""
+    try:
+        return survey(scene, photos_of(run, data, "train"))
+    except ValueError as error:  # no photographs to train on, or no surface
+        print(Text(f"no trust report: {error}"))
+        return None
+
+
+Pairs: TypeAlias = tuple[Tensor, Tensor] | None  # doubts and errors, [N] each
+
+
+def _judged(layers: Layers, expected: Expected, scales: Scales) -> tuple[Pairs, Pairs]:
+    """Doubts and errors in the mask of a view, of albedo and of roughness, where there is truth."""
+    truth, doubt = expected.truth, layers.doubt
+    if doubt is None or truth.mask is None:
+        return None, None
+    there = truth.mask & (layers.alpha > 0)
+    albedo, roughness = None, None
+    if expected.albedo is not None:
+        error = (linear_to_srgb(layers.albedo * scales.three) - expected.albedo).abs().mean(-1)
+        albedo = doubt[there][:, 0], error[there]
+    if truth.roughness is not None:
+        error = (layers.roughness - truth.roughness).abs()
+        roughness = doubt[there][:, 1], error[there]
+    return albedo, roughness
+
+
+def _foretold(pairs: list[Pairs]) -> float | None:
+    known = [pair for pair in pairs if pair is not None]
+    if not known:
+        return None
+    doubt, error = (torch.cat(part) for part in zip(*known, strict=True))
+    return metrics.spearman(doubt, error)
 
 
 def _relit_photos(photos: Photos) -> dict[str, tuple[Tensor, Tensor]]:
@@ -308,6 +367,11 @@ def _panels(layers: Layers, expected: Expected, scales: Scales) -> list[Panel]:
             " degrees",
         ),
     ]
+    if layers.doubt is not None:  # beside what it should foretell
+        albedo, rough = (torch.from_numpy(heat(x, 1.0)) for x in layers.doubt.unbind(-1))
+        heads = ("roughness doubt", "albedo error")
+        error = panels[1].error
+        panels.append(Panel("albedo doubt", albedo, rough, error, COLOR_LIMIT, heads=heads))
     panels += [
         colors(f"under {name}", layers.relit_scaled[name], photo)
         for name, photo in expected.relit.items()

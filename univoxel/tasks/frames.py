@@ -129,16 +129,19 @@ def trained_on(run: Path) -> Path:
     return _data_of(run)[0]
 
 
-def photos_of(run: Path, data: Path | None = None) -> Photos:
-    """The test views at the size that a run was trained at; of another data set, if one is given.
+def photos_of(run: Path, data: Path | None = None, split: str = "test") -> Photos:
+    """Photographs at the size that a run was trained at; of another data set, if one is given.
+
+    Args:
+        split: "test", or "train" for those that were trained on.
 
     Raises:
         DataError: the run or the photographs cannot be read.
     """
     if data is not None and not (run / "config.json").is_file():
-        return load_photos(data, "test")
+        return load_photos(data, split)
     folder, downscale = _data_of(run)
-    return load_photos(data or folder, "test", downscale)
+    return load_photos(data or folder, split, downscale)
 
 
 def _data_of(run: Path) -> tuple[Path, int]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,7 +20,7 @@ from univoxel import brdf, losses
 from univoxel.config import JointConfig
 from univoxel.data import Photos
 from univoxel.lights import priors
-from univoxel.ops import VisibilityScene, shade_map
+from univoxel.ops import shade_map
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import extract_mesh
 from univoxel.render.transport import (
@@ -36,15 +37,18 @@ from univoxel.tasks.equations import (
     Rows,
     graph_laplacian,
     normal_equations,
+    solve_damped,
     view_differences,
     view_equations,
 )
+from univoxel.tasks.guard import Guard
 from univoxel.tasks.progress import Progress
 
 NEWTON_CHUNK = 256  # points whose equations are built at once
 WEIGHTS_PRIOR = 10.0  # on changes of a view's map, in units of the Laplacian's weight
 METAL = 0.2  # metallic from which on a point is taken for metal
 NEWTON_COST = 2.7  # of a sighting in a Newton step, over one in a step of Adam; measured
+UNSOLVABLE = "the equations for the map have no solution: it stays as it is in this round"
 LEAST_CHUNKS, LEAST_POINTS = 2, 2000  # on a machine however slow
 
 
@@ -70,7 +74,7 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     mesh = extract_mesh(scene)
     assert mesh.normals is not None
     assert scene.sky is not None
-    tracer = VisibilityScene(mesh.vertices, mesh.faces)
+    tracer = scene.occluder()
     offset = scene.field.voxel_size
     bright = mean_colors(
         unexposed(scene, observe(mesh.vertices, mesh.normals, photos, tracer, offset))
@@ -106,13 +110,28 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         return
     # What does not fit is cut alike: points here, steps of Adam by `steps`, points of Newton below
     points = min(cfg.points, max(LEAST_POINTS, round(progress.pace * cfg.points)))
+    try:
+        scene.occluder()
+    except ValueError as error:  # no surface
+        progress.trouble(f"stage {progress.stage + 1}: {error}: light and materials stay")
+        progress.skip()
+        return
     problem = pose(scene, photos, replace(cfg, points=points), seed)
+    if not len(problem.seen.view):
+        progress.trouble(
+            f"stage {progress.stage + 1}: no photograph sees a point of the surface: light and "
+            "materials stay"
+        )
+        progress.skip()
+        return
     first, turn, more = 0.0, -1.0, cfg.rounds  # begin and end of a round, rounds to come
+    guard = Guard(progress)
     for done in progress.steps(newton_share(cfg)):
         if done >= turn:
             if more < cfg.rounds:
                 with progress.apart():
-                    newton_round(scene, problem, cfg, progress.reserved / more)
+                    seconds = progress.reserved / more
+                    newton_round(scene, problem, cfg, seconds, progress.trouble)
                 more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
             groups = [
                 {"params": [scene.field.features], "eps": 1e-8},
@@ -124,6 +143,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
                 if scene.views.sky_weights is not None:
                     groups[2]["params"] += [scene.views.sky_weights, scene.views.sky_basis]
             optimizer = RowAdam(groups, betas=(0.9, 0.99))
+            guard.follow(optimizer)
             first, turn, more = done, done + (1 - done) / more, more - 1
         fade = 0.1 ** ((done - first) / (turn - first))
         # After a Newton round light is better than what Adam would make of it while the albedo
@@ -131,13 +151,17 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         of_map, of_gains = (1.0, 1.0) if more == cfg.rounds - 1 else (0.1, 0.0)
         rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * of_map, cfg.lr_networks * of_gains)
         for group, rate in zip(optimizer.param_groups, rates, strict=False):
-            group["lr"] = rate * fade
+            group["lr"] = rate * fade * guard.scale
         terms = objective(scene, problem, cfg)
+        loss = torch.stack(list(terms.values())).sum()
         optimizer.zero_grad(set_to_none=True)
-        torch.stack(list(terms.values())).sum().backward()
+        loss.backward()
+        if not guard.sound(loss):
+            continue
         optimizer.step()
         if progress.due():
             progress.report({k: v.item() for k, v in terms.items()}, None)
+            guard.keep()
 
 
 def newton_share(cfg: JointConfig) -> float:
@@ -221,7 +245,11 @@ def draw_sightings(
 
 @torch.no_grad()
 def newton_round(
-    scene: Scene, problem: Problem, cfg: JointConfig, seconds: float = math.inf
+    scene: Scene,
+    problem: Problem,
+    cfg: JointConfig,
+    seconds: float = math.inf,
+    tell: Callable[[str], None] = print,
 ) -> list[float]:
     """Gauss-Newton steps on the log map, with the albedo of every point eliminated.
 
@@ -235,6 +263,7 @@ def newton_round(
 
     Args:
         seconds: wall time that it may take, about: fewer points serve where all would take more.
+        tell: called with a sentence where the equations have no solution; then the round is over.
     """
     begin = time.monotonic()
     seen, sky = problem.seen, scene.sky
@@ -277,7 +306,9 @@ def newton_round(
             ]
             hessian = torch.stack([h for h, _ in found]).sum(0) / sighting.numel()
             slope = torch.stack([g for _, g in found]).sum(0) / sighting.numel()
-            views_step(scene, hessian, slope, cfg.newton_smooth)
+            if not views_step(scene, hessian, slope, cfg.newton_smooth):
+                tell(UNSOLVABLE)
+                break
             differs = view_differences(scene)
         blocks = [
             normal_equations(r, sky.radiance, log_albedo[k], differs)
@@ -288,8 +319,11 @@ def newton_round(
         system = torch.stack([b.hessian for b in blocks]).sum(0) / sighting.numel() + smooth
         system.diagonal(dim1=1, dim2=2).add_(cfg.newton_smooth)
         right = torch.stack([b.gradient for b in blocks]).sum(0) / sighting.numel() - x @ smooth
-        factor = torch.linalg.cholesky(system.double())
-        step = torch.cholesky_solve(right.double()[..., None], factor)[..., 0].float().clamp(-1, 1)
+        step = solve_damped(system, right)
+        if step is None:
+            tell(UNSOLVABLE)
+            break
+        step = step.clamp(-1, 1)
         to_map, to_gain = step.split([len(sky.direction), unknowns - len(sky.direction)], 1)
         sky.log_radiance.add_(to_map.T)
         if scene.views is not None:
@@ -300,8 +334,8 @@ def newton_round(
     return costs
 
 
-def views_step(scene: Scene, hessian: Tensor, gradient: Tensor, smooth: float) -> None:
-    """Gauss-Newton step of each view's gain and change of the map.
+def views_step(scene: Scene, hessian: Tensor, gradient: Tensor, smooth: float) -> bool:
+    """Gauss-Newton step of each view's gain and change of the map; False: there is none.
 
     Args:
         hessian, gradient: [3, B, R + 1, R + 1] and [3, B, R + 1] from `view_equations`, over the
@@ -315,9 +349,12 @@ def views_step(scene: Scene, hessian: Tensor, gradient: Tensor, smooth: float) -
     now = torch.nn.functional.pad(now.permute(2, 0, 1), (0, 1))
     prior = WEIGHTS_PRIOR * smooth
     hessian.diagonal(dim1=2, dim2=3).add_(prior)
-    step = torch.linalg.solve(hessian, (gradient - prior * now)[..., None])[..., 0].clamp(-1, 1)
-    step = step.permute(1, 2, 0)
+    step = solve_damped(hessian, gradient - prior * now)
+    if step is None:
+        return False
+    step = step.clamp(-1, 1).permute(1, 2, 0)
     sky.log_radiance.add_(views.add(step[:, -1], step[:, :-1]))
+    return True
 
 
 def light_rows(problem: Problem, point: Tensor, sighting: Tensor, roughness: Tensor) -> Rows:

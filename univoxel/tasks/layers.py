@@ -11,6 +11,9 @@ from univoxel.records import Surface
 from univoxel.render.pipeline import at_rays, shade, surface_of_view
 from univoxel.render.relight import Lighting, Stage, relight_surface
 from univoxel.scene import Scene
+from univoxel.tasks.trust import Doubts
+
+DOUBTS = ("albedo", "roughness")
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,7 @@ class Layers:
     depth: Tensor  # [H, W] along the camera's -Z, world units, 0 where nothing is
     relit: dict[str, Tensor]  # [H, W, 3] by map
     relit_scaled: dict[str, Tensor]  # the same with the scaled albedo
+    doubt: Tensor | None = None  # [H, W, 2] in [0, 1] of albedo and roughness, 0 where nothing is
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,11 @@ class Relighting:
 
 
 def render_layers(
-    scene: Scene, cameras: Cameras, view: int, relighting: Relighting | None = None
+    scene: Scene,
+    cameras: Cameras,
+    view: int,
+    relighting: Relighting | None = None,
+    doubts: Doubts | None = None,
 ) -> Layers:
     """Render one view. Nothing is shaded where the opacity is 0."""
     whole, wo = surface_of_view(scene, cameras, view)
@@ -74,12 +82,15 @@ def render_layers(
         depth=picture(surface.depth * (wo @ backward)),
         relit=relit,
         relit_scaled=relit_scaled,
+        doubt=picture(doubts.at(surface.position, surface.normal)) if doubts else None,
     )
 
 
 def exr_channels(layers: Layers) -> dict[str, Tensor]:
     """The channels of a saved EXR file, [H, W] each: rgb.R, normal.X, relit_<map>.R and so on."""
     channels = {"alpha": layers.alpha, "depth": layers.depth, "roughness": layers.roughness}
+    if layers.doubt is not None:
+        channels |= {f"doubt.{c}": layers.doubt[..., k] for k, c in enumerate(DOUBTS)}
     colors = {"rgb": layers.rgb, "albedo": layers.albedo}
     colors |= {f"relit_{name}": rgb for name, rgb in layers.relit.items()}
     for name, value in colors.items():

@@ -46,6 +46,7 @@ class Progress:
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
         self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
         self.chosen: list[dict] = list(state.get("chosen", ()))  # of capacity
+        self.troubles: list[str] = list(state.get("troubles", ()))  # what went wrong and was mended
         self._stage_steps = state.get("stage_steps", 0)  # made in the present stage
         self._planned, self._count = 0, 0  # steps of the stage in this sitting
         self._stage_begin = self.seconds  # of the stage in this sitting
@@ -70,10 +71,16 @@ class Progress:
 
     def __exit__(self, kind: type | None, *_) -> None:
         self._bar.stop()
-        if kind is None:
-            for told in (*(c["said"] for c in self.chosen), self.cut()):
-                if told:
-                    self._bar.console.print(told, markup=False, highlight=False)
+        if kind is not None:
+            return
+        for told in (*(c["said"] for c in self.chosen), self.cut()):
+            if told:
+                self._say(told)
+        if self.troubles:
+            self._say(
+                f"training met trouble and went on, {len(self.troubles)} times: look at the result "
+                f"before you trust it; the last was in {self.troubles[-1]}"
+            )
 
     @property
     def seconds(self) -> float:
@@ -89,6 +96,7 @@ class Progress:
             "made": self.made,
             "early": self.early,
             "chosen": self.chosen,
+            "troubles": self.troubles,
             "stage_steps": self._stage_steps,
             "seconds": self.seconds,
             "threads": torch.get_num_threads(),
@@ -159,6 +167,21 @@ class Progress:
         self._planned = self._count + math.ceil(REST * (self._planned - self._count))
         self.early.append(self.stage)
 
+    def abandon(self) -> None:
+        """Leave the present stage, between steps, with what it has."""
+        self.done = 1.0
+        self.early.append(self.stage)
+
+    def trouble(self, what: str) -> None:
+        """Tell, at once and in the log, of something that went wrong and was mended."""
+        self.troubles.append(what)
+        nothing = {"losses": {}, "held_out_psnr": None, "rays_per_second": None}
+        append_line(self._log, json.dumps(self.state() | nothing | {"trouble": what}))
+        self._say(what)
+
+    def _say(self, what: str) -> None:
+        self._bar.console.print(what, markup=False, highlight=False)
+
     @contextmanager
     def apart(self) -> Iterator[None]:
         """A block between steps whose time says nothing of how long steps take."""
@@ -222,6 +245,8 @@ class Progress:
         whole = max(by_stage / sum(shares), min(self.seconds / (60 * self.cfg.minutes), 1.0))
         remaining = self.seconds * (1 - whole) / max(whole, 1e-3)
         quality = "" if psnr is None else f"held-out {psnr:.1f} dB  "
+        if self.troubles:
+            quality += f"{len(self.troubles)} troubles  "
         self._bar.update(
             self._task,
             completed=whole,
@@ -247,3 +272,33 @@ def append_line(path: Path, line: str) -> None:
         if path.exists() and path.stat().st_size > before:
             os.truncate(path, before)
         raise OSError(error.errno, f"cannot write: {error.strerror}", str(path)) from error
+
+
+class Rehearsal:
+    """A few steps through the whole schedule of a stage, off the record; in place of Progress."""
+
+    def __init__(self, steps: int):
+        self.stage, self.step, self._steps = 0, 0, steps
+
+    def steps(self) -> Iterator[float]:
+        """Progress through the stage in [0, 1), once a step."""
+        while self.step < self._steps:
+            yield self.step / self._steps
+            self.step += 1
+
+    def due(self) -> bool:
+        return False
+
+    checkpoint_due = due
+
+    def state(self) -> dict:
+        return {}
+
+    def report(self, losses: dict[str, float], psnr: float | None) -> None: ...
+
+    def shorten(self) -> None: ...
+
+    def trouble(self, what: str) -> None: ...
+
+    def abandon(self) -> None:
+        self._steps = 0

@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import rich
 import torch
+from rich.text import Text
 from torch import Tensor
 
 from univoxel import lights, losses
@@ -23,18 +25,21 @@ from univoxel.config import (
     save_config,
 )
 from univoxel.data import DataError, Photos, load_photos
+from univoxel.data.images import replacing
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
 from univoxel.lights import priors
+from univoxel.metrics import psnr
 from univoxel.ops import smooth_rows_
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays, Surface
 from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
-from univoxel.tasks import capacity, joint
+from univoxel.tasks import capacity, joint, trust
+from univoxel.tasks.guard import Guard
 from univoxel.tasks.plateau import Plateau
-from univoxel.tasks.progress import Progress
+from univoxel.tasks.progress import Progress, Rehearsal
 from univoxel.tasks.timelapse import Timelapse
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
@@ -75,7 +80,6 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     Raises:
         DataError: input that cannot be used.
         FileExistsError: cfg.out holds a run already and resume is False.
-        FloatingPointError: the loss is not a number any more.
         OSError: a file of the run cannot be written; what was there before stays.
         FileNotFoundError, ValueError: with resume, there is no checkpoint that can be read, or it
             belongs to another configuration.
@@ -141,7 +145,19 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             preview(scene, photos, cfg.out / "preview.png")
         if film:
             film.finish(scene, progress)
+    say_trust(scene, photos, cfg.out, progress.troubles)
     return cfg.out
+
+
+def say_trust(scene: Scene, photos: Photos, out: Path, troubles: list[str]) -> None:
+    """Print, and write to trust.txt, what the photographs leave open."""
+    try:
+        told = trust.words(trust.numbers(trust.survey(scene, photos, trust.FEW_POINTS)), troubles)
+    except ValueError as error:
+        told = f"No trust report: {error}."
+    with replacing(out / "trust.txt") as temporary:
+        temporary.write_text(told + "\n", encoding="utf-8")
+    rich.print(Text(told))
 
 
 def run_stage(
@@ -151,7 +167,7 @@ def run_stage(
     photos: Photos,
     pixels: Tensor,
     held_out: Tensor,
-    progress: Progress | capacity.Rehearsal,
+    progress: Progress | Rehearsal,
 ) -> None:
     """Optimise the scene on its present grid until the stage's steps or its time are over."""
     field = scene.field
@@ -176,6 +192,8 @@ def run_stage(
     )
     scratch = torch.zeros_like(field.sdf.data)
     plateau = Plateau(cfg.patience)
+    guard = Guard(progress, restored=lambda: moved(scene))
+    guard.follow(optimizer)
     for done in progress.steps():
         physical = done >= stage.physical_from
         rates = (
@@ -184,7 +202,7 @@ def run_stage(
             between(stage.lr_networks, done),
         )
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate
+            group["lr"] = rate * guard.scale
         scene.inv_s = 1 / (between(stage.sharpness, done) * field.voxel_size)
         if progress.step % REFRESH == 0:
             field.refresh()
@@ -195,10 +213,10 @@ def run_stage(
         surface = surface_at(scene, batch.rays, torch.rand(stage.rays))
         terms = objective(scene, cfg.loss, surface, batch, physical)
         loss = torch.stack(list(terms.values())).sum()
-        if not torch.isfinite(loss):
-            raise FloatingPointError(f"the loss is {loss.item()} at step {progress.step}")
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        if not guard.sound(loss):
+            continue
         if stage.refit:
             assert field.features.grad is not None
             field.features.grad._values()[:, : scene.material.channels] = 0
@@ -214,11 +232,17 @@ def run_stage(
         if progress.due():
             quality = held_out_psnr(scene, photos, held_out, physical)
             progress.report({k: v.item() for k, v in terms.items()}, quality)
+            guard.judge(quality, physical)
         if progress.checkpoint_due():
             save_scene(scene, cfg.out, progress.state())
-    field.refresh()
-    scene.surface_moved()
+    moved(scene)
     scene.eval()
+
+
+def moved(scene: Scene) -> None:
+    """Look again at what follows from the sdf."""
+    scene.field.refresh()
+    scene.surface_moved()
 
 
 def rehearsal(
@@ -235,7 +259,7 @@ def rehearsal(
     # From middling rates on: what has been learned must not be shaken
     rates = {n: (math.sqrt(a * b), b) for n in RATES for a, b in [getattr(stage, n)]}
     stage, cfg = replace(stage, physical_from=1.0, **rates), replace(cfg, patience=0.0)
-    run_stage(scene, cfg, stage, photos, pixels, held_out, capacity.Rehearsal(steps))
+    run_stage(scene, cfg, stage, photos, pixels, held_out, Rehearsal(steps))
     return held_out_psnr(scene, photos, held_out, physical=False)
 
 
@@ -321,6 +345,8 @@ def split_pixels(distance: Tensor) -> tuple[Tensor, Tensor]:
     pixels = (distance < MARGIN).nonzero()
     order = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))
     held = min(HELD_OUT, len(pixels) // 10)
+    if not held:  # so few that none can be spared
+        return pixels, pixels
     return pixels[order[held:]], pixels[order[:held]]
 
 
@@ -348,7 +374,7 @@ def held_out_psnr(scene: Scene, photos: Photos, pixels: Tensor, physical: bool) 
     else:
         shaded = encoded_radiance(scene, surface, batch) * surface.opacity[:, None]
     target = linear_to_srgb(batch.color * batch.alpha[:, None])
-    return -10 * torch.log10((shaded - target).square().mean()).item()
+    return psnr(shaded, target)
 
 
 def look_at(photos: Photos, pixels: Tensor) -> capacity.Look:
