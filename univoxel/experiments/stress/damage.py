@@ -54,32 +54,25 @@ def damaged(
     if len(photos) < damage.views:
         raise ValueError(f"{scene}: expected {damage.views} photographs, got {len(photos)}")
     random = np.random.default_rng(seed)
-    color = photos.color
+    photos = _first(photos, damage.views)
     if damage.light:
         if second is None:
             raise ValueError("damaged: light above 0 needs a scene in a second light")
-        share = torch.from_numpy(damage.light * random.uniform(size=len(color))).float()
-        other = load_photos(second, "train").color
-        color = torch.lerp(color, other, share[:, None, None, None])
-    gain = exposures(len(color), damage.stops, random) * 2**damage.exposure
-    cameras = turned(photos.cameras, damage.pose, random)
+        share = torch.from_numpy(damage.light * random.uniform(size=damage.views)).float()
+        other = load_photos(second, "train").color[: damage.views]
+        photos = replace(photos, color=torch.lerp(photos.color, other, share[:, None, None, None]))
+    gain = exposures(damage.views, damage.stops, random) * 2**damage.exposure
     shutil.rmtree(out, ignore_errors=True)
     (out / "train").mkdir(parents=True)
-    for view in range(damage.views):
-        shown, alpha = color[view], photos.alpha[view]
+    write_cameras(out, "train", turned(photos.cameras, damage.pose, random), photos.names)
+    for view, name in enumerate(photos.names):
         if damage.dilation:
-            shown, alpha = masked(replace(photos, color=color), view, damage.dilation)
+            shown, alpha = masked(photos, view, damage.dilation)
+        else:
+            shown, alpha = photos.picture(view)
         picture = photographed(shown * gain[view], damage.noise, random)
         rgba = torch.cat([picture, torch.round(255 * alpha)[..., None].byte()], -1)
-        write_png(out / "train" / f"{photos.names[view]}.png", rgba.numpy())
-    few = Cameras(
-        cameras.camera_to_world[: damage.views],
-        cameras.focal[: damage.views],
-        cameras.centre[: damage.views],
-        cameras.width,
-        cameras.height,
-    )
-    write_cameras(out, "train", few, photos.names)
+        write_png(out / "train" / f"{name}.png", rgba.numpy())
     _copy_tests(scene, out, 2**damage.exposure)
     return out
 
@@ -136,6 +129,23 @@ def clipped(folder: Path) -> float:
     photos = load_photos(folder, "train")
     inside = photos.coverage() > 0.5
     return float((photos.color == 255).any(-1)[inside].float().mean())
+
+
+def _first(photos: Photos, views: int) -> Photos:
+    c = photos.cameras
+    cameras = replace(
+        c,
+        camera_to_world=c.camera_to_world[:views],
+        focal=c.focal[:views],
+        centre=c.centre[:views],
+    )
+    return replace(
+        photos,
+        names=photos.names[:views],
+        color=photos.color[:views],
+        alpha=photos.alpha[:views],
+        cameras=cameras,
+    )
 
 
 def _copy_tests(scene: Path, out: Path, gain: float) -> None:

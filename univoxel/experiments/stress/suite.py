@@ -28,12 +28,12 @@ SECONDS = 30.0  # that a training may take, a guess
 IDENTITY = "damage.json"
 SMALL = (
     *("stages.0.voxels=0.1", "stages.0.iterations=120", "stages.0.rays=512"),
-    *("stages.1.voxels=0.25", "stages.1.iterations=200", "stages.1.rays=1024"),
+    *("stages.1.voxels=0.25", "stages.1.iterations=160", "stages.1.rays=1024"),
 )
 SMALL_HYBRID = (
-    *("stages.2.iterations=150", "stages.2.rays=2048", "stages.2.points=4000"),
+    *("stages.2.iterations=100", "stages.2.rays=2048", "stages.2.points=4000"),
     *("stages.2.newton_points=1500", "stages.2.rounds=2"),
-    *("stages.3.voxels=0.25", "stages.3.iterations=60", "stages.3.rays=1024"),
+    *("stages.3.voxels=0.25", "stages.3.iterations=40", "stages.3.rays=1024"),
 )
 
 
@@ -114,7 +114,7 @@ def photographs(found: Iterable[Axis], seeds: int, out: Path) -> dict[tuple[Leve
 def setting(light: LightName, seed: int, level: Level, changes: tuple[str, ...] = ()) -> Setting:
     """A training by steps that takes less than half a minute on two cores."""
     own = (*SMALL, *(SMALL_HYBRID if light == "hybrid" else ()), f"seed={seed}")
-    varying = "".join(f"-{c.partition('.')[2]}" for c in level.changes)
+    varying = "".join(f"-{c.rpartition('=')[2]}" for c in level.changes)
     name = f"{light}{varying}-s{seed}"
     return Setting(name, "draft", light, MINUTES, (*own, *level.changes, *changes))
 
