@@ -262,7 +262,7 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "Unrecognized options: sing"),
         (
             [],
-            "Expected one of {train, eval, relight, export, envmap, inspect, compare, chart, stress, ",
+            "Expected one of {train, eval, relight, export, envmap, inspect, compare, chart, ",
         ),
     ],
 )
