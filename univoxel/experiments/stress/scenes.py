@@ -17,7 +17,8 @@ from univoxel.sphere import latlong_directions, texel_solid_angles
 
 DISTANCE = 3.0  # of the cameras from what they look at
 VIEW_DEGREES = 36.0  # across a picture: a ball of radius 0.92 about the middle is seen whole
-HEIGHTS = (-0.4, 0.95)  # z of the directions to the cameras
+HEIGHTS = {"box": (0.4, 0.95)}  # z of the directions to the cameras; a box is looked into
+OTHER_HEIGHTS = (-0.4, 0.95)
 MAP_HEIGHT = 128  # of environment maps
 RELIGHT = ("dusk", "studio")  # maps of the relit test views
 BRIGHTNESS = 1.0  # irradiance over pi from above, of every map
@@ -52,13 +53,13 @@ def train_cameras(spec: Spec) -> Cameras:
     index = np.arange(spec.views)
     share = np.array([int(f"{i:032b}"[::-1], 2) / 2**32 for i in index])  # van der Corput
     away = spec.shift * np.array([1.0, 1.0, 1.0]) / math.sqrt(3)
-    return _cameras(share, index * math.pi * (3 - math.sqrt(5)), spec.size, -away)
+    return _cameras(spec, share, index * math.pi * (3 - math.sqrt(5)), -away)
 
 
 def test_cameras(spec: Spec) -> Cameras:
     """Cameras between those to train on, that see the object in the middle."""
     index = np.arange(spec.tests)
-    return _cameras((index + 0.5) / max(spec.tests, 1), 0.7 + 2.4 * index, spec.size, np.zeros(3))
+    return _cameras(spec, (index + 0.5) / max(spec.tests, 1), 0.7 + 2.4 * index, np.zeros(3))
 
 
 def radiance(name: str, direction: np.ndarray, sun: float = 0.0) -> np.ndarray:
@@ -165,8 +166,9 @@ def _joined(parts: Sequence[Part]) -> tuple[dict[str, Tensor], Tensor]:
     return arrays | {"faces": torch.from_numpy(faces.astype(np.int32))}, roughness
 
 
-def _cameras(share: np.ndarray, phi: np.ndarray, size: int, target: np.ndarray) -> Cameras:
-    z = HEIGHTS[0] + (HEIGHTS[1] - HEIGHTS[0]) * share
+def _cameras(spec: Spec, share: np.ndarray, phi: np.ndarray, target: np.ndarray) -> Cameras:
+    low, high = HEIGHTS.get(spec.shape, OTHER_HEIGHTS)
+    z, size = low + (high - low) * share, spec.size
     r = np.sqrt(1 - z**2)
     back = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
     right = np.cross([0.0, 0.0, 1.0], back)
