@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+import math
 import re
 from pathlib import Path
 
@@ -134,6 +135,18 @@ def test_photographs_of_another_kind_are_not_taken(stood_in, tmp_path, monkeypat
     monkeypatch.setitem(AXES, "views", changed)
     with pytest.raises(ValueError, match=r"views-6/damage\.json: is of other photographs"):
         suite.stress(tmp_path, ["views"], quick=True)
+
+
+def test_numbers_that_are_none_are_kept_as_text(stood_in, tmp_path, monkeypatch):
+    def trained(pairs, *_):
+        return [Outcome(d.name, s.name, {}, {"relit_psnr": math.nan}) for d, s in pairs]
+
+    monkeypatch.setattr(suite.runner, "run_pairs", trained)
+    suite.stress(tmp_path, ["masks"], quick=True)
+    record = json.loads((tmp_path / "stress.json").read_text(), parse_constant=pytest.fail)
+    assert {row["fault"] for row in record["rows"]} == {"not finite"}
+    assert record["rows"][0]["outcomes"][0]["relit_psnr"] == "nan"
+    assert record["axes"]["masks"]["levels"] == ["0", "3", "none"]
 
 
 def test_quick_is_hybrid_and_one_seed(stood_in, tmp_path):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -76,7 +76,7 @@ def stress(
     cells = _train(found, lights, seeds, prepared, out / "runs", tuple(changes))
     clipping = {path.name: clipped(path) for path in dict.fromkeys(prepared.values())}
     with replacing(out / "stress.json") as temporary:
-        text = json.dumps(_record(cells, clipping, changes), indent=1)
+        text = json.dumps(_record(cells, clipping, changes), indent=1, allow_nan=False)
         temporary.write_text(text + "\n", encoding="utf-8")
     with replacing(out / "stress.md") as temporary:
         temporary.write_text(report.markdown(cells), encoding="utf-8")
@@ -184,6 +184,11 @@ def _damaged(
     return place
 
 
+def _plain(measures: Mapping[str, float | int | None]) -> dict[str, float | int | str | None]:
+    """JSON knows no NaN: it becomes text."""
+    return {k: v if v is None or math.isfinite(v) else str(v) for k, v in measures.items()}
+
+
 def _record(cells: Sequence[Cell], clipping: dict[str, float], changes: Sequence[str]) -> dict:
     """All of it as JSON."""
     rows = []
@@ -200,7 +205,7 @@ def _record(cells: Sequence[Cell], clipping: dict[str, float], changes: Sequence
                 "mean": {key: cell.mean(key) for key in keys},
                 "spread": {key: cell.spread(key) for key in keys},
                 "outcomes": [
-                    {"scene": o.scene, "setting": o.setting, "error": o.error, **o.measures}
+                    {"scene": o.scene, "setting": o.setting, "error": o.error, **_plain(o.measures)}
                     for o in cell.outcomes
                 ],
             }
@@ -219,6 +224,13 @@ def _record(cells: Sequence[Cell], clipping: dict[str, float], changes: Sequence
         "changes": list(changes),
         "counts": report.counts(cells),
         "breaking_points": points,
-        "axes": {c.axis.name: dataclasses.asdict(c.axis) for c in cells},
+        "axes": {
+            c.axis.name: {
+                "title": c.axis.title,
+                "levels": [level.label for level in c.axis.levels],
+                "reference": c.axis.levels[c.axis.reference].label,
+            }
+            for c in cells
+        },
         "rows": rows,
     }
