@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb
-from univoxel.data import load_photos
+from univoxel.data import load_photos, load_truth
 from univoxel.data.images import read_image, write_exr
 from univoxel.experiments.stress import damage as module
 from univoxel.experiments.stress import render, scenes
@@ -125,7 +125,9 @@ def test_a_damaged_scene(scene, tmp_path):
     for name in ("points.npz", "test/gt/r_000.npz", "envmaps/dusk.exr", "relight/dusk/r_001.exr"):
         assert (out / name).read_bytes() == (scene / name).read_bytes()
     assert module.clipped(out) == pytest.approx(1)  # blue is 1.1 and more
-    assert not (out / "scene.json").exists()
+    truth = load_truth(load_photos(out, "test"), 1)
+    assert truth.mask.any()
+    assert truth.albedo.max() > 0.3
 
 
 def test_exposure_reaches_the_test_views_but_not_the_relit_ones(scene, tmp_path):

@@ -17,7 +17,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos, load_photos
 from univoxel.data.images import read_image, write_exr, write_png
 from univoxel.envmap import EnvMap, lookup
-from univoxel.experiments.stress.render import write_cameras
+from univoxel.experiments.stress.render import SPEC, write_cameras
 
 NO_MASK = math.inf  # as a dilation
 
@@ -151,7 +151,7 @@ def _first(photos: Photos, views: int) -> Photos:
 def _copy_tests(scene: Path, out: Path, gain: float) -> None:
     """Copy all that a run is measured with; test views get the exposure of the photographs."""
     for path in sorted(scene.iterdir()):
-        if path.name in ("train", "transforms_train.json"):
+        if path.name in ("train", "transforms_train.json", SPEC):
             continue
         if path.is_dir():
             shutil.copytree(path, out / path.name)
