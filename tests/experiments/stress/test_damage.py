@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb
-from univoxel.data import load_photos, load_truth
+from univoxel.data import DataError, load_photos, load_truth
 from univoxel.data.images import read_image, write_exr
 from univoxel.experiments.stress import damage as module
 from univoxel.experiments.stress import render, scenes
@@ -108,6 +108,13 @@ def test_a_mask_grows_and_shows_what_is_behind(scene):
     np.testing.assert_allclose(shown.numpy()[beyond], behind[beyond], rtol=0.15, atol=0.15)
     torch.testing.assert_close(shown[alpha == 1], color[alpha == 1])
     assert (module.masked(photos, 0, NO_MASK)[1] == 1).all()
+
+
+def test_without_masks_the_loader_may_refuse_but_the_suite_goes_on(scene, tmp_path):
+    out = damaged(scene, tmp_path / "out", Damage(views=2, dilation=NO_MASK))
+    with pytest.raises(DataError, match="fully opaque"):
+        load_photos(out, "train")
+    assert 0 < module.clipped(out) < 1
 
 
 def test_a_damaged_scene(scene, tmp_path):

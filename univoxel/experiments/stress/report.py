@@ -251,7 +251,8 @@ def _text(
         return "reference failed"
     if broken is not None:
         return str(broken)
-    lost = min(c.mean(key) or top for c in row[axis.reference :]) - top
+    harder = [v for c in row[axis.reference + 1 :] if (v := c.mean(key)) is not None]
+    lost = min(harder, default=top) - top
     return f"holds ({lost:+.1f} dB)"
 
 
