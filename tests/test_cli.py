@@ -212,6 +212,15 @@ def test_experiments(calls, tmp_path, capsys):
         ((Path("cup"),), Path("out"), "fast", "hybrid", False, ("draft", "fast"), (), 64),
     ]
     assert capsys.readouterr().out.split() == ["table", "picture", "picture"]
+    calls.stand_in("univoxel.experiments.stress.suite", stress=calls.task("stress", "breaks"))
+    options = ["--quick", "--only", "sun", "dark", "--light", "sg", "sh", "--seeds", "2"]
+    assert main(["stress", "--out", "out", *options, "--set", "loss.radiance=2"]) == 0
+    assert calls.noted[-1][1] == (
+        *(Path("out"), ("sun", "dark"), ("sg", "sh"), 2, True, ("loss.radiance=2",)),
+    )
+    assert main(["stress", "--out", "out"]) == 0
+    assert calls.noted[-1][1] == (Path("out"), (), (), None, False, ())
+    capsys.readouterr()
     assert main(["compare", "cup", "--out", "out", "--minutes", "-1"]) == 2
     assert "--minutes must be above 0, got -1" in capsys.readouterr().err
     calls.stand_in("univoxel.experiments.chart", chart=calls.task("chart", KeyboardInterrupt()))
@@ -274,7 +283,7 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (
             [],
             "Expected one of {train, eval, relight, export, envmap, inspect, info, compare, "
-            "chart, demo}",
+            "chart, stress, demo}",
         ),
     ],
 )

@@ -34,6 +34,7 @@ HELPERS = {
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
+    "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
     "tasks": {
         *("animation", "capacity", "contact_sheet", "envmap", "equations", "frames", "guard"),
         *("joint", "layers", "look", "plateau", "progress", "shrink", "spare", "timelapse"),
@@ -41,7 +42,7 @@ HELPERS = {
     },
 }
 # Extras: imported inside the function that needs one
-OPTIONAL = {"imageio_ffmpeg", "matplotlib", "trimesh", "viser"}
+OPTIONAL = {"drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh", "viser"}
 # The one file or folder of csrc/ that includes it; no header of ours passes it on to others.
 INCLUDES = {r"embree\d?/": "visibility.cpp", r"pybind11/": "bindings"}
 

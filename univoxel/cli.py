@@ -389,6 +389,45 @@ def chart(
     print(experiment.chart(scenes, out, preset, light, quick, only, set, samples))
 
 
+def stress(
+    out: Annotated[Path, arg(metavar="DIR")],
+    quick: bool = False,
+    only: Annotated[
+        tuple[str, ...], arg(metavar="AXIS [AXIS ...]", help_behavior_hint="(default: all)")
+    ] = (),
+    light: Annotated[
+        tuple[str, ...],
+        arg(
+            metavar="LIGHT [LIGHT ...]",
+            help_behavior_hint="(default: sg sh envmap hybrid; with --quick: hybrid)",
+        ),
+    ] = (),
+    seeds: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: 3; with --quick: 1)")
+    ] = None,
+    set: Changes = (),
+) -> None:
+    """Find out where the method breaks: scenes of known truth, made harder along one axis each.
+
+    Renders small scenes with Mitsuba 3, spoils their photographs, trains and measures. Writes
+    DIR/stress.md with the breaking point of each axis, stress.json, stress.png and stress.svg.
+    Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, thin, noise,
+    placement, dark, bright; exposure-varying and light-varying are trained with --varying. A
+    training that fails is a result. What is done is kept: the same command goes on.
+
+    Args:
+        out: folder for scenes, photographs, trainings and results
+        quick: fewer severities of each axis
+        only: names of axes
+        light: models of light, as of train
+        seeds: trainings of each level, with other random numbers
+        set: one field of the configuration of all trainings, as of train
+    """
+    from univoxel.experiments.stress import suite
+
+    print(suite.stress(out, only, light, seeds, quick, set))
+
+
 def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> None:
     """Train, evaluate and relight the small scene that comes with the package, in minutes.
 
@@ -410,6 +449,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "info": info,
     "compare": compare,
     "chart": chart,
+    "stress": stress,
     "demo": demo,
 }
 
@@ -489,7 +529,7 @@ def _gist(box: str) -> str:
 def _kept(call: functools.partial[None]) -> str:
     """What an interrupted command left behind."""
     out = call.keywords.get("out")
-    if call.func in (compare, chart):
+    if call.func in (compare, chart, stress):
         return f"; {out} keeps the trainings that are done: the same command goes on"
     if call.func is not train or not isinstance(out, Path):
         return ""

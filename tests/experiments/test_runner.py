@@ -150,6 +150,18 @@ def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):
     assert not out.exists()
 
 
+def test_scenes_with_settings_of_their_own(data, tmp_path, trained):
+    other = tmp_path / "other"
+    other.mkdir()  # cannot be read: its process says so, the rest goes on
+    twice = dataclasses.replace(SMALL, name="twice")
+    pairs = [(data, SMALL), (other, twice), (data, twice)]
+    found = runner.run_pairs(pairs, tmp_path / "out", samples=1, seconds=5.0)
+    assert [(o.scene, o.setting) for o in found] == [(d.name, s.name) for d, s in pairs]
+    assert trained == ["small", "twice", "twice"]
+    with pytest.raises(ValueError, match="settings of different names, got"):
+        runner.run_pairs([(data, SMALL), (data, SMALL)], tmp_path / "out", samples=1)
+
+
 def test_the_log_is_kept_for_charts(tmp_path):
     assert worker.read_log(tmp_path / "log.jsonl") == []
     line = {"seconds": 5.0, "stage": 1, "held_out_psnr": None, "losses": {}}

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,25 +42,51 @@ class Job:
 def run(
     scenes: Sequence[Path], settings: Sequence[Setting], out: Path, samples: int = 64
 ) -> list[Outcome]:
-    """Train every scene with every setting, one after another; by scene, then by setting.
-
-    out/SCENE/SETTING/ holds the run, what it said (output.txt) and result.json, an `Outcome`. A
-    training whose result.json is there already is not done again; one that failed is. A failure is
-    an outcome like others: the rest goes on.
-
-    Args:
-        samples: of the light per pixel of relit pictures in evaluation, >= 1.
+    """Train every scene with every setting; by scene, then by setting. See `run_pairs`.
 
     Raises:
         DataError: a scene cannot be read.
-        ValueError: two scenes or settings of one name, a setting that no configuration follows
-            from, or results of other settings in `out`.
+        ValueError: two scenes or settings of one name; as of `run_pairs`.
         OSError: `out` cannot be written.
     """
-    jobs = [_job(data, s, out, samples) for data in _named(scenes) for s in _distinct(settings)]
+    settings = _distinct(settings)
+    pairs = [(data, setting) for data in _named(scenes) for setting in settings]
+    jobs = [_job(data, setting, out, samples, None) for data, setting in pairs]
     for data in scenes:
         for split in ("train", "test"):
             load_photos(data, split, settings[0].config(data, out).downscale)
+    return _run(jobs)
+
+
+def run_pairs(
+    pairs: Sequence[tuple[Path, Setting]],
+    out: Path,
+    samples: int = 64,
+    seconds: float | None = None,
+) -> list[Outcome]:
+    """Train scenes with settings of their own, one after another.
+
+    out/SCENE/SETTING/ holds the run, what it said (output.txt) and result.json, an `Outcome`. A
+    training whose result.json is there already is not done again; one that failed is. A failure is
+    an outcome like others, that of a scene that cannot be read too: the rest goes on.
+
+    Args:
+        pairs: scenes are told apart by the names of their folders.
+        samples: of the light per pixel of relit pictures in evaluation, >= 1.
+        seconds: what one may take, a guess for the bar; the configuration's time when left out.
+
+    Raises:
+        ValueError: a setting that no configuration follows from, a pair that comes twice, or
+            results of other settings in `out`.
+        OSError: `out` cannot be written.
+    """
+    _named(dict.fromkeys(data for data, _ in pairs))
+    for scene in dict.fromkeys(data for data, _ in pairs):
+        _distinct([setting for data, setting in pairs if data == scene])
+    return _run([_job(data.resolve(), s, out, samples, seconds) for data, s in pairs])
+
+
+def _run(jobs: Sequence[Job]) -> list[Outcome]:
     before = {job.folder: load_outcome(job.folder) for job in jobs}
     for job in jobs:
         found = before[job.folder]
@@ -90,11 +116,11 @@ def failures(outcomes: Sequence[Outcome]) -> str:
     )
 
 
-def _named(scenes: Sequence[Path]) -> list[Path]:
+def _named(scenes: Iterable[Path]) -> list[Path]:
     """Scenes as absolute folders, whose names tell them apart."""
     folders = [Path(scene).resolve() for scene in scenes]
     if not folders or len({folder.name for folder in folders}) < len(folders):
-        names = [str(scene) for scene in scenes]
+        names = [str(folder) for folder in folders]
         raise ValueError(f"expected scenes in folders of different names, got {names}")
     return folders
 
@@ -107,12 +133,12 @@ def _distinct(settings: Sequence[Setting]) -> Sequence[Setting]:
     return settings
 
 
-def _job(data: Path, setting: Setting, out: Path, samples: int) -> Job:
+def _job(data: Path, setting: Setting, out: Path, samples: int, seconds: float | None) -> Job:
     if samples < 1:
         raise ValueError(f"--samples must be at least 1, got {samples}")
     folder = out / data.name / setting.name
     config = setting.config(data, folder / worker.RUN)
-    seconds = 60 * config.minutes + EVALUATION_SECONDS
+    seconds = 60 * config.minutes + EVALUATION_SECONDS if seconds is None else seconds
     return Job(folder, data.name, data, setting, samples, identity(config, samples), seconds)
 
 
