@@ -69,7 +69,11 @@ class Problem:
 
 @torch.no_grad()
 def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
-    """Sample the surface, gather its sightings and trace what light can reach it."""
+    """Sample the surface, gather its sightings and trace what light can reach it.
+
+    Raises:
+        ValueError: there is no surface, or no photograph sees it.
+    """
     generator = torch.Generator().manual_seed(seed)
     mesh = extract_mesh(scene)
     assert mesh.normals is not None
@@ -81,6 +85,8 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     )
     position, normal = surface_points(mesh, cfg.points, generator)
     seen = observe(position, normal, photos, tracer, offset)
+    if not len(seen.view):
+        raise ValueError("no photograph sees a point of the surface")
     direction = scene.sky.direction
     transport = trace(seen, tracer, mesh, bright, direction, cfg.tracing, offset, generator)
     metal = scene.material(scene.field.sample(position).features)[2] > METAL
@@ -112,16 +118,9 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     points = min(cfg.points, max(LEAST_POINTS, round(progress.pace * cfg.points)))
     try:
         scene.occluder()
-    except ValueError as error:  # no surface
+        problem = pose(scene, photos, replace(cfg, points=points), seed)
+    except ValueError as error:  # no surface, or none that is seen
         progress.trouble(f"stage {progress.stage + 1}: {error}: light and materials stay")
-        progress.skip()
-        return
-    problem = pose(scene, photos, replace(cfg, points=points), seed)
-    if not len(problem.seen.view):
-        progress.trouble(
-            f"stage {progress.stage + 1}: no photograph sees a point of the surface: light and "
-            "materials stay"
-        )
         progress.skip()
         return
     first, turn, more = 0.0, -1.0, cfg.rounds  # begin and end of a round, rounds to come

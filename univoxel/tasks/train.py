@@ -71,7 +71,7 @@ class Batch:
 
 
 def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None = None) -> Path:
-    """Train a scene; leave model, log, preview and configuration in cfg.out and return it.
+    """Train a scene; leave model, log, preview, configuration and trust.txt in cfg.out; return it.
 
     Args:
         timelapse: .gif, .mp4 or folder for pictures of a view over training time, which making
