@@ -20,7 +20,8 @@ TINY = (
     *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
     *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
 )
-SMALL = Setting("small", "draft", "sg", changes=TINY)
+# Its steps take seconds; draft's minute would cut them on a busy machine
+SMALL = Setting("small", "draft", "sg", minutes=30, changes=TINY)
 DIES = dataclasses.replace(SMALL, name="dies", changes=(*TINY, f"seed={10**30}"))
 
 
