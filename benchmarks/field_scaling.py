@@ -176,7 +176,7 @@ def main() -> None:
     if options.case:
         print(json.dumps(case(options.case[0], int(options.case[1]), options.steps)))
         return
-    rows = []
+    rows: list[dict] = []
     for size in options.sizes:
         for kind in ("dense", "sparse"):
             if kind == "dense" and size**3 * DENSE_ROW > options.most * 1e9:
