@@ -37,8 +37,7 @@ from univoxel.tasks import train
 
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "field_scaling.json"
-CHANNELS, RAYS, COARSE = 16, 2048, 48
-DENSE_ROW = 3 * 4 * (1 + CHANNELS)  # bytes of a node: value and two moments
+RAYS, COARSE = 2048, 48
 SHARPNESS = 0.5  # s of the density, voxels
 
 
@@ -46,11 +45,11 @@ def cube(n: int) -> GridShape:
     return GridShape((-1.0,) * 3, 2 / (n - 1), (n, n, n))
 
 
-def ball() -> DenseField:
+def ball(channels: int) -> DenseField:
     grid = cube(COARSE)
     x = grid.nodes()
     bumps = 0.03 * (9 * x).sin().prod(-1)
-    return DenseField(grid, CHANNELS, x.norm(dim=-1) - 0.87 + bumps)
+    return DenseField(grid, channels, x.norm(dim=-1) - 0.87 + bumps)
 
 
 def random_rays() -> Rays:
@@ -62,6 +61,7 @@ def random_rays() -> Rays:
 
 def step(field: AbstractField, optimizer: RowAdam, scratch: torch.Tensor) -> None:
     """One step towards features that are the position, at sharp opacity."""
+    channels = field.channels
     rays, inv_s = random_rays(), 1 / (SHARPNESS * field.voxel_size)
     samples = field.march(rays, torch.rand(RAYS), inv_s)
     ray = torch.repeat_interleave(samples.offsets.diff())
@@ -69,9 +69,9 @@ def step(field: AbstractField, optimizer: RowAdam, scratch: torch.Tensor) -> Non
     at = field.sample(points)
     alpha = section_alpha(at.sdf, samples.connected, inv_s)
     seen, _ = composite(alpha, torch.cat([at.features, at.gradient], 1), samples.offsets)
-    wanted, _ = composite(alpha.detach(), points.repeat(1, 6)[:, :CHANNELS], samples.offsets)
-    length = seen[:, CHANNELS:].square().sum(1)
-    loss = (seen[:, :CHANNELS] - wanted).square().mean() + 0.1 * (length - 1).square().mean()
+    wanted, _ = composite(alpha.detach(), points.repeat(1, 6)[:, :channels], samples.offsets)
+    length = seen[:, channels:].square().sum(1)
+    loss = (seen[:, :channels] - wanted).square().mean() + 0.1 * (length - 1).square().mean()
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
     train.spread_gradient(field, 4, scratch)
@@ -83,13 +83,14 @@ def resident() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def case(kind: str, size: int, steps: int) -> dict:
+def case(kind: str, size: int, channels: int, steps: int) -> dict:
     """One field at one resolution, in this process."""
     torch.manual_seed(0)
-    coarse, grid = ball(), cube(size)
+    coarse, grid = ball(channels), cube(size)
     step(coarse, RowAdam([coarse.sdf, coarse.features]), torch.zeros_like(coarse.sdf.data))
     before, begin = resident(), time.perf_counter()
     field = SparseField.around(coarse, grid) if kind == "sparse" else coarse.resized(grid)
+    field.refresh()  # the first look brings what the surface's own bricks lack beside them
     made = time.perf_counter() - begin
     optimizer = RowAdam([field.sdf, field.features], lr=0.01 * field.voxel_size, eps=1e-4)
     scratch = torch.zeros_like(field.sdf.data)
@@ -168,20 +169,25 @@ def draw(found: dict, path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 96, 128, 192, 256, 384, 512])
+    parser.add_argument("--channels", type=int, default=16)
     parser.add_argument("--steps", type=int, default=33)
     parser.add_argument("--most", type=float, default=5.0, help="GB that a dense grid may take")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--case", nargs=2, metavar=("KIND", "SIZE"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.case:
-        print(json.dumps(case(options.case[0], int(options.case[1]), options.steps)))
+        print(
+            json.dumps(case(options.case[0], int(options.case[1]), options.channels, options.steps))
+        )
         return
     rows: list[dict] = []
     for size in options.sizes:
         for kind in ("dense", "sparse"):
-            if kind == "dense" and size**3 * DENSE_ROW > options.most * 1e9:
+            row = 3 * 4 * (1 + options.channels)  # bytes of a node: value and two moments
+            if kind == "dense" and size**3 * row > options.most * 1e9:
                 continue
             command = [sys.executable, __file__, "--steps", str(options.steps)]
+            command += ["--channels", str(options.channels)]
             done = subprocess.run(
                 [*command, "--case", kind, str(size)], capture_output=True, text=True, check=True
             )
@@ -192,7 +198,7 @@ def main() -> None:
         "threads": torch.get_num_threads(),
         "cores": os.cpu_count(),
         "rays": RAYS,
-        "channels": CHANNELS,
+        "channels": options.channels,
         "steps": options.steps,
         "cases": rows,
         "exponents": {
