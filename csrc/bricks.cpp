@@ -22,22 +22,6 @@ int64_t slab_of(const Lattice& grid, const T* points, int64_t i) {
     return place(grid, 0, static_cast<double>(points[3 * i])).cell >> kShift;
 }
 
-/// Call f(x, y) for the lines of nodes that a column of cells touches: the four at its corners
-/// (inner), and if wide the eight beside these.
-template <class F>
-void for_lines(const Lattice& grid, const CellColumn& column, bool wide, F&& f) {
-    const int64_t from = wide ? -1 : 0, to = wide ? 2 : 1;
-    for (int64_t a = from; a <= to; ++a) {
-        for (int64_t b = from; b <= to; ++b) {
-            const bool inner_a = a == 0 || a == 1, inner_b = b == 0 || b == 1;
-            const int64_t x = column.x + a, y = column.y + b;
-            if (!(inner_a || inner_b) || x < 0 || y < 0) continue;
-            if (x >= grid.size[0] || y >= grid.size[1]) continue;
-            f(x, y, inner_a && inner_b);
-        }
-    }
-}
-
 }  // namespace
 
 template <class T>
@@ -182,21 +166,11 @@ TouchedRows::TouchedRows(const Lattice& grid, const std::vector<std::vector<Cell
     words_.assign(lines * words_per_line_, Word{0, 0});
     for_slabs(slabs, threads, [&](int64_t s) {
         for (const CellColumn& column : columns[s]) {
-            // Bit i stands for node z - 1 + i: a cell touches its two ends, on inner lines of a
-            // wide stencil also the two nodes beyond.
-            const uint64_t m = column.cells;
-            uint64_t ends = m << 1 | m << 2, beyond = wide ? ends | m | m << 3 : ends;
-            int64_t z = column.z - 1;
-            if (z < 0) ends >>= 1, beyond >>= 1, z = 0;
-            const int64_t room = size_z_ - z;
-            if (room < 64) {
-                ends &= (uint64_t(1) << room) - 1;
-                beyond &= (uint64_t(1) << room) - 1;
-            }
+            const NodesAlongZ along = nodes_along_z(grid, column, wide);
             for_lines(grid, column, wide, [&](int64_t x, int64_t y, bool inner) {
-                const uint64_t nodes = inner ? beyond : ends;
-                const int64_t shift = z & 63;
-                Word* w = &words_[line_[x * size_y_ + y] + (z >> 6)];
+                const uint64_t nodes = inner ? along.beyond : along.ends;
+                const int64_t shift = along.z & 63;
+                Word* w = &words_[line_[x * size_y_ + y] + (along.z >> 6)];
                 w[0].bits |= nodes << shift;
                 const uint64_t rest = shift ? nodes >> (64 - shift) : 0;
                 if (rest) w[1].bits |= rest;

@@ -50,6 +50,43 @@ struct CellColumn {
     uint32_t cells;
 };
 
+/// Call f(x, y, inner) for the lines of nodes that a column of cells touches: the four at its
+/// corners (inner), and if wide the eight beside these.
+template <class F>
+void for_lines(const Lattice& grid, const CellColumn& column, bool wide, F&& f) {
+    const int64_t from = wide ? -1 : 0, to = wide ? 2 : 1;
+    for (int64_t a = from; a <= to; ++a) {
+        for (int64_t b = from; b <= to; ++b) {
+            const bool inner_a = a == 0 || a == 1, inner_b = b == 0 || b == 1;
+            const int64_t x = column.x + a, y = column.y + b;
+            if (!(inner_a || inner_b) || x < 0 || y < 0) continue;
+            if (x >= grid.size[0] || y >= grid.size[1]) continue;
+            f(x, y, inner_a && inner_b);
+        }
+    }
+}
+
+/// Nodes along z that a column touches, from z on: bit i stands for node z + i.
+struct NodesAlongZ {
+    int64_t z;
+    uint64_t ends;    // on the lines beside the inner ones: the two ends of each cell
+    uint64_t beyond;  // on the inner lines: if wide also the two nodes beyond these
+};
+
+inline NodesAlongZ nodes_along_z(const Lattice& grid, const CellColumn& column, bool wide) {
+    // Bit i stands for node z - 1 + i.
+    const uint64_t m = column.cells;
+    uint64_t ends = m << 1 | m << 2, beyond = wide ? ends | m | m << 3 : ends;
+    int64_t z = column.z - 1;
+    if (z < 0) ends >>= 1, beyond >>= 1, z = 0;
+    const int64_t room = grid.size[2] - z;
+    if (room < 64) {
+        ends &= (uint64_t(1) << room) - 1;
+        beyond &= (uint64_t(1) << room) - 1;
+    }
+    return {z, ends, beyond};
+}
+
 /// The columns of occupied cells, slab by slab. NaN points occupy none.
 template <class T>
 std::vector<std::vector<CellColumn>> occupied_columns(const Lattice& grid, const T* points,

@@ -10,26 +10,63 @@ namespace univoxel {
 namespace {
 
 constexpr int64_t kRaysPerChunk = 128;
+constexpr int64_t kBricksPerChunk = 1024;
 // A brick whose sdf stays above this many s lets light through: sigmoid(8) = 0.99966.
 constexpr int kClearBand = 8;
 constexpr int kLongest = 1000;  // diagonals of the grid that a ray may take to cross it
 
-/// Trilinear sdf at grid coordinates inside [0, size - 1].
+/// Sdf at the corners (x, y, z) .. (x, y, z) + step of a cell, z fastest.
 template <class T>
-T sdf_at(const March<T>& in, vec3<T> g) {
-    int64_t i[3], stride[3] = {in.size[1] * in.size[2], in.size[2], 1};
-    T w[3];
+void corners(const March<T>& in, const DenseNodes& nodes, const int64_t i[3], const int64_t step[3],
+             T* f) {
+    const T* p = in.sdf + nodes.row(i[0], i[1], i[2]);
+    const int64_t x = step[0] * in.size[1] * in.size[2], y = step[1] * in.size[2];
+    for (int k = 0; k < 8; ++k) f[k] = p[(k >> 2) * x + (k >> 1 & 1) * y + (k & 1) * step[2]];
+}
+
+template <class T>
+void corners(const March<T>& in, const BrickNodes& nodes, const int64_t i[3], const int64_t step[3],
+             T* f) {
+    if ((i[0] & 3) < 3 && (i[1] & 3) < 3 && (i[2] & 3) < 3) {  // all in one brick
+        const T* p = in.sdf + nodes.row(i[0], i[1], i[2]);
+        const int64_t x = step[0] << 4, y = step[1] << 2;
+        for (int k = 0; k < 8; ++k) f[k] = p[(k >> 2) * x + (k >> 1 & 1) * y + (k & 1) * step[2]];
+        return;
+    }
+    for (int k = 0; k < 8; ++k) {
+        f[k] = in.sdf[nodes.row(i[0] + (k >> 2) * step[0], i[1] + (k >> 1 & 1) * step[1],
+                                i[2] + (k & 1) * step[2])];
+    }
+}
+
+/// Trilinear sdf at grid coordinates inside [0, size - 1].
+template <class T, class Nodes>
+T sdf_at(const March<T>& in, const Nodes& nodes, vec3<T> g) {
+    int64_t i[3], step[3];
+    T w[3], f[8];
     for (int a = 0; a < 3; ++a) {
         const T x = std::min(std::max(g[a], T(0)), T(in.size[a] - 1));
         i[a] = std::min(static_cast<int64_t>(x), std::max<int64_t>(in.size[a] - 2, 0));
         w[a] = x - T(i[a]);
-        if (in.size[a] == 1) stride[a] = 0;
+        step[a] = in.size[a] > 1;
     }
-    const T* p = in.sdf + (i[0] * in.size[1] + i[1]) * in.size[2] + i[2];
+    corners(in, nodes, i, step, f);
     const auto lerp = [](T a, T b, T t) { return a + t * (b - a); };
-    const auto along_z = [&](const T* q) { return lerp(q[0], q[stride[2]], w[2]); };
-    const auto along_y = [&](const T* q) { return lerp(along_z(q), along_z(q + stride[1]), w[1]); };
-    return lerp(along_y(p), along_y(p + stride[0]), w[0]);
+    const auto along_z = [&](int k) { return lerp(f[k], f[k + 1], w[2]); };
+    const auto along_y = [&](int k) { return lerp(along_z(k), along_z(k + 2), w[1]); };
+    return lerp(along_y(0), along_y(4), w[0]);
+}
+
+/// Least sdf in a brick.
+template <class T>
+T least(const March<T>& in, const DenseNodes&, const int64_t b[3]) {
+    const int64_t by = bricks_along(in.size[1]), bz = bricks_along(in.size[2]);
+    return in.brick_min[(b[0] * by + b[1]) * bz + b[2]];
+}
+
+template <class T>
+T least(const March<T>& in, const BrickNodes& nodes, const int64_t b[3]) {
+    return in.brick_min[nodes.brick(b[0], b[1], b[2])];
 }
 
 /// log(sigmoid(x)) without overflow.
@@ -57,8 +94,8 @@ bool clip(vec3<T> o, vec3<T> d, vec3<T> upper, T& near, T& far) {
 }
 
 /// Walk one ray; append its samples.
-template <class T>
-void march_ray(const March<T>& in, int64_t ray, Marched<T>& out) {
+template <class T, class Nodes>
+void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, Marched<T>& out) {
     // Change to grid coordinates; t stays in world units.
     const vec3<T> o = (load3(in.origin, ray) - in.grid_origin) / in.voxel_size;
     const vec3<T> d = load3(in.direction, ray) / in.voxel_size;
@@ -70,7 +107,6 @@ void march_ray(const March<T>& in, int64_t ray, Marched<T>& out) {
     const T start = near + in.jitter[ray] * in.step;
     if (!std::isfinite(start)) return;
     const T band = kClearBand / in.inv_s;
-    const int64_t by = bricks_along(in.size[1]), bz = bricks_along(in.size[2]);
     const int64_t last = static_cast<int64_t>((far - start) / in.step);
 
     T trans = 1, log_before = 0;
@@ -85,7 +121,7 @@ void march_ray(const March<T>& in, int64_t ray, Marched<T>& out) {
             b[a] = std::min(std::max<int64_t>(static_cast<int64_t>(g[a]) / kBrick, 0), n - 1);
             corner[a] = T(kBrick * (b[a] + (d[a] > 0 ? 1 : 0)));
         }
-        if (in.brick_min[(b[0] * by + b[1]) * bz + b[2]] > band) {
+        if (least(in, nodes, b) > band) {
             T exit = far;
             for (int a = 0; a < 3; ++a)
                 if (d[a] != 0) exit = std::min(exit, (corner[a] - o[a]) / d[a]);
@@ -95,9 +131,9 @@ void march_ray(const March<T>& in, int64_t ray, Marched<T>& out) {
         // The section that ends here starts at the sample before, even if that was skipped.
         if (before != k - 1) {
             const T t = start + T(std::max<int64_t>(k - 1, 0)) * in.step;
-            log_before = log_sigmoid(sdf_at(in, o + t * d) * in.inv_s);
+            log_before = log_sigmoid(sdf_at(in, nodes, o + t * d) * in.inv_s);
         }
-        const T log_here = log_sigmoid(sdf_at(in, g) * in.inv_s);
+        const T log_here = log_sigmoid(sdf_at(in, nodes, g) * in.inv_s);
         const T alpha = k > 0 ? std::max(T(0), -std::expm1(log_here - log_before)) : T(0);
         if (alpha * trans > in.min_weight) {
             if (emitted != k - 1) {
@@ -143,13 +179,47 @@ void brick_minimum(const T* sdf, const int64_t size[3], T* out, int threads) {
 }
 
 template <class T>
+void sparse_brick_minimum(const T* sdf, const int64_t size[3], const BrickNodes& nodes,
+                          const int32_t* place, int64_t n, T* out, int threads) {
+    out[0] = std::numeric_limits<T>::infinity();
+    out[1] = -out[0];
+    parallel_for(n, kBricksPerChunk, threads, [&](int64_t begin, int64_t end) {
+        for (int64_t brick = std::max<int64_t>(begin, 2); brick < end; ++brick) {
+            if (place[brick] < 0) {
+                out[brick] = out[0];
+                continue;
+            }
+            const int64_t c = place[brick] % nodes.bricks_z, ab = place[brick] / nodes.bricks_z;
+            const int64_t first[3] = {ab / nodes.bricks_y * kBrick, ab % nodes.bricks_y * kBrick,
+                                      c * kBrick};
+            int64_t last[3];
+            for (int a = 0; a < 3; ++a) last[a] = std::min(first[a] + kBrick, size[a] - 1);
+            T lowest = std::numeric_limits<T>::infinity();
+            for (int64_t x = first[0]; x <= last[0]; ++x)
+                for (int64_t y = first[1]; y <= last[1]; ++y) {
+                    const T* line = sdf + nodes.row(x, y, first[2]);
+                    const int64_t inside = std::min(last[2] - first[2], kBrick - 1);
+                    for (int64_t z = 0; z <= inside; ++z) lowest = std::min(lowest, line[z]);
+                    if (last[2] - first[2] == kBrick)
+                        lowest = std::min(lowest, sdf[nodes.row(x, y, last[2])]);
+                }
+            out[brick] = lowest;
+        }
+    });
+}
+
+template <class T>
 Marched<T> march(const March<T>& in, int threads) {
     const int64_t chunks = (in.n_rays + kRaysPerChunk - 1) / kRaysPerChunk;
     std::vector<Marched<T>> parts(chunks);
     parallel_for(in.n_rays, kRaysPerChunk, threads, [&](int64_t begin, int64_t end) {
         Marched<T>& part = parts[begin / kRaysPerChunk];
         for (int64_t ray = begin; ray < end; ++ray) {
-            march_ray(in, ray, part);
+            if (in.table) {
+                march_ray(in, in.sparse(), ray, part);
+            } else {
+                march_ray(in, in.dense(), ray, part);
+            }
             part.offsets.push_back(static_cast<int64_t>(part.t.size()));
         }
     });
@@ -166,6 +236,10 @@ Marched<T> march(const March<T>& in, int threads) {
 
 template void brick_minimum(const float*, const int64_t[3], float*, int);
 template void brick_minimum(const double*, const int64_t[3], double*, int);
+template void sparse_brick_minimum(const float*, const int64_t[3], const BrickNodes&,
+                                   const int32_t*, int64_t, float*, int);
+template void sparse_brick_minimum(const double*, const int64_t[3], const BrickNodes&,
+                                   const int32_t*, int64_t, double*, int);
 template Marched<float> march(const March<float>&, int);
 template Marched<double> march(const March<double>&, int);
 

@@ -14,7 +14,10 @@ constexpr int64_t kRowsPerChunk = 2048;
 struct Node {
     int64_t i[3];
 
-    int64_t flat(const int64_t size[3]) const { return (i[0] * size[1] + i[1]) * size[2] + i[2]; }
+    template <class Nodes>
+    int64_t row(const Nodes& nodes) const {
+        return nodes.row(i[0], i[1], i[2]);
+    }
     Node step(int axis, int64_t by, const int64_t size[3]) const {
         Node n = *this;
         n.i[axis] = std::min(std::max<int64_t>(i[axis] + by, 0), size[axis] - 1);
@@ -23,14 +26,14 @@ struct Node {
 };
 
 /// out[c] += scale (L f)[c] at a node.
-template <class T>
-void add_laplacian(const T* grid, const int64_t size[3], int64_t C, const Node& node, T scale,
-                   T* out) {
-    const T* centre = grid + node.flat(size) * C;
+template <class T, class Nodes>
+void add_laplacian(const T* grid, const int64_t size[3], const Nodes& nodes, int64_t C,
+                   const Node& node, T scale, T* out) {
+    const T* centre = grid + node.row(nodes) * C;
     for (int64_t c = 0; c < C; ++c) out[c] -= scale * centre[c];
     for (int axis = 0; axis < 3; ++axis)
         for (int64_t by : {-1, 1}) {
-            const T* near = grid + node.step(axis, by, size).flat(size) * C;
+            const T* near = grid + node.step(axis, by, size).row(nodes) * C;
             for (int64_t c = 0; c < C; ++c) out[c] += scale / 6 * near[c];
         }
 }
@@ -38,13 +41,13 @@ void add_laplacian(const T* grid, const int64_t size[3], int64_t C, const Node& 
 /// The change of a node far enough from the border, as one weighted sum: amount L f or
 /// -amount L L f. Offsets and the width of a tile count numbers, not nodes.
 template <class T>
-struct Stencil {
+struct Weights {
     static constexpr int64_t kTile = 16;
     int64_t offset[25], reach = 0;
     T weight[25];
     int count = 0;
 
-    Stencil(const int64_t size[3], int64_t C, T amount, int order) {
+    Weights(const int64_t size[3], int64_t C, T amount, int order) {
         const int64_t stride[3] = {size[1] * size[2] * C, size[2] * C, C};
         const auto put = [&](int64_t o, double w) {
             reach = std::max(reach, o);
@@ -87,16 +90,44 @@ bool away_from_border(int64_t i, int64_t size, int64_t margin) {
 }
 
 /// The change of a node near the border, where neighbours repeat.
-template <class T>
-void border_change(const T* grid, const int64_t size[3], int64_t C, const Node& node, T amount,
-                   int order, T* out) {
+template <class T, class Nodes>
+void border_change(const T* grid, const int64_t size[3], const Nodes& nodes, int64_t C,
+                   const Node& node, T amount, int order, T* out) {
     std::fill(out, out + C, T(0));
-    add_laplacian(grid, size, C, node, amount, out);
+    add_laplacian(grid, size, nodes, C, node, amount, out);
     if (order == 1) return;
     // -amount L (Lf) = amount (Lf - mean of Lf)
     for (int axis = 0; axis < 3; ++axis)
         for (int64_t by : {-1, 1})
-            add_laplacian(grid, size, C, node.step(axis, by, size), -amount / 6, out);
+            add_laplacian(grid, size, nodes, C, node.step(axis, by, size), -amount / 6, out);
+}
+
+/// Copy the nodes of a brick and `margin` around it, all inside the grid, z fastest.
+template <class T>
+void gather_brick(const T* grid, const BrickNodes& nodes, int64_t C, const Node& first,
+                  int64_t margin, T* out) {
+    const int64_t width = kBrick + 2 * margin;
+    for (int64_t x = 0; x < width; ++x)
+        for (int64_t y = 0; y < width; ++y) {
+            const int64_t at[2] = {first.i[0] - margin + x, first.i[1] - margin + y};
+            const auto copy = [&](int64_t z, int64_t count) {
+                const T* from = grid + nodes.row(at[0], at[1], z) * C;
+                out = std::copy(from, from + count * C, out);
+            };
+            copy(first.i[2] - margin, margin);
+            copy(first.i[2], kBrick);
+            copy(first.i[2] + kBrick, margin);
+        }
+}
+
+/// grid += change at the rows.
+template <class T>
+void apply_change(T* grid, int64_t C, const int64_t* rows, int64_t n, const T* change,
+                  int threads) {
+    parallel_for(n, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
+        for (int64_t k = begin; k < end; ++k)
+            for (int64_t c = 0; c < C; ++c) grid[rows[k] * C + c] += change[k * C + c];
+    });
 }
 
 }  // namespace
@@ -106,7 +137,8 @@ void smooth_rows(T* grid, const int64_t size[3], int64_t C, const int64_t* rows,
                  T amount, int order, int threads) {
     // Compute every change before any is applied: the order of rows does not matter.
     const std::unique_ptr<T[]> change(new T[n * C]);
-    const Stencil<T> stencil(size, C, amount, order);
+    const Weights<T> weights(size, C, amount, order);
+    const DenseNodes nodes{size[1], size[2]};
     const T* grid_end = grid + size[0] * size[1] * size[2] * C;
     parallel_for(n, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
         for (int64_t k = begin; k < end;) {
@@ -115,7 +147,7 @@ void smooth_rows(T* grid, const int64_t size[3], int64_t C, const int64_t* rows,
             T* out = change.get() + k * C;
             if (!away_from_border(x, size[0], order) || !away_from_border(y, size[1], order) ||
                 !away_from_border(z, size[2], order)) {
-                border_change(grid, size, C, {{x, y, z}}, amount, order, out);
+                border_change(grid, size, nodes, C, {{x, y, z}}, amount, order, out);
                 ++k;
                 continue;
             }
@@ -123,19 +155,60 @@ void smooth_rows(T* grid, const int64_t size[3], int64_t C, const int64_t* rows,
             const int64_t longest = std::min(end - k, size[2] - order - z);
             int64_t run = 1;
             while (run < longest && rows[k + run] == rows[k] + run) ++run;
-            stencil.apply(grid + rows[k] * C, run * C, grid_end, out);
+            weights.apply(grid + rows[k] * C, run * C, grid_end, out);
             k += run;
         }
     });
+    apply_change(grid, C, rows, n, change.get(), threads);
+}
+
+template <class T>
+void smooth_brick_rows(T* grid, const int64_t size[3], const BrickNodes& nodes,
+                       const int32_t* place, int64_t C, const int64_t* rows, int64_t n, T amount,
+                       int order, int threads) {
+    const std::unique_ptr<T[]> change(new T[n * C]);
+    const int64_t width = kBrick + 2 * order, numbers = width * width * width * C;
+    const int64_t padded[3] = {width, width, width};
+    const Weights<T> weights(padded, C, amount, order);
     parallel_for(n, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
-        for (int64_t k = begin; k < end; ++k)
-            for (int64_t c = 0; c < C; ++c) grid[rows[k] * C + c] += change[k * C + c];
+        const std::unique_ptr<T[]> around(new T[numbers]);
+        int64_t gathered = -1;
+        for (int64_t k = begin; k < end;) {
+            const int64_t brick = rows[k] / kBrickNodes, inside = rows[k] % kBrickNodes;
+            const int64_t c = place[brick] % nodes.bricks_z, ab = place[brick] / nodes.bricks_z;
+            const Node first{
+                {ab / nodes.bricks_y * kBrick, ab % nodes.bricks_y * kBrick, c * kBrick}};
+            bool whole = true;  // the brick and what the stencil needs of its neighbours
+            for (int a = 0; a < 3; ++a) {
+                whole = whole && first.i[a] >= order && first.i[a] + kBrick + order <= size[a];
+            }
+            const int64_t x = inside >> 4, y = inside >> 2 & 3, z = inside & 3;
+            T* out = change.get() + k * C;
+            if (!whole) {
+                const Node node{{first.i[0] + x, first.i[1] + y, first.i[2] + z}};
+                border_change(grid, size, nodes, C, node, amount, order, out);
+                ++k;
+                continue;
+            }
+            if (gathered != brick) gather_brick(grid, nodes, C, first, order, around.get());
+            gathered = brick;
+            int64_t run = 1;
+            while (k + run < end && run < kBrick - z && rows[k + run] == rows[k] + run) ++run;
+            const int64_t at = ((x + order) * width + y + order) * width + z + order;
+            weights.apply(around.get() + at * C, run * C, around.get() + numbers, out);
+            k += run;
+        }
     });
+    apply_change(grid, C, rows, n, change.get(), threads);
 }
 
 template void smooth_rows(float*, const int64_t[3], int64_t, const int64_t*, int64_t, float, int,
                           int);
 template void smooth_rows(double*, const int64_t[3], int64_t, const int64_t*, int64_t, double, int,
                           int);
+template void smooth_brick_rows(float*, const int64_t[3], const BrickNodes&, const int32_t*,
+                                int64_t, const int64_t*, int64_t, float, int, int);
+template void smooth_brick_rows(double*, const int64_t[3], const BrickNodes&, const int32_t*,
+                                int64_t, const int64_t*, int64_t, double, int, int);
 
 }  // namespace univoxel

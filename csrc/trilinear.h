@@ -61,6 +61,18 @@ inline Stencil<T> stencil(const Lattice& grid, int axis, const Place& at) {
     return s;
 }
 
+template <class T>
+struct Stencil3 {
+    Stencil<T> x, y, z;
+};
+
+template <class T>
+inline Stencil3<T> stencil3(const Lattice& grid, const T* p) {
+    return {stencil<T>(grid, 0, place(grid, 0, static_cast<double>(p[0]))),
+            stencil<T>(grid, 1, place(grid, 1, static_cast<double>(p[1]))),
+            stencil<T>(grid, 2, place(grid, 2, static_cast<double>(p[2])))};
+}
+
 /// Derivatives of a stencil's weights to the point, in world units; 0 where it is clamped.
 template <class T>
 struct StencilStep {

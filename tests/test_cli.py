@@ -5,6 +5,7 @@ import subprocess
 import sys
 import types
 from dataclasses import dataclass
+from dataclasses import replace as replace_fields
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ class LossConfig:
 class StageConfig:
     voxels: float = 1.0
     rates: tuple[float, float] = (0.1, 0.01)
+    field: str = "dense"
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,10 @@ def calls(monkeypatch):
     def chosen(preset, minutes, data, out, light, varying):
         return Config(data, out, preset, light, varying, minutes or 4.0)
 
-    stand_in("univoxel.config", chosen=chosen)
+    def with_field(config, kind):
+        return replace_fields(config, stages=(config.stages[0], StageConfig(field=kind)))
+
+    stand_in("univoxel.config", chosen=chosen, with_field=with_field)
     replace("train", Path("run"))
     replace("evaluate", {"psnr": 31.25, "views": 5})
     replace("relight", None)
@@ -130,6 +135,12 @@ def test_info(calls):
     assert main(["info", "run", "--json", "a.json", "--picture", "b.png"]) == 0
     expected = {"json": Path("a.json"), "picture": Path("b.png")}
     assert calls.noted == [("info", (Path("run"),), expected)]
+
+
+def test_train_takes_a_sparse_field_before_changes(calls, tmp_path):
+    options = ["--field", "sparse", "--set", "stages.1.voxels=30"]
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), *options]) == 0
+    assert calls.noted[0][1][0].stages == (StageConfig(), StageConfig(30.0, field="sparse"))
 
 
 def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):

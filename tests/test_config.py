@@ -15,6 +15,7 @@ from univoxel.config import (
     chosen,
     preset,
     save_config,
+    with_field,
     work_in,
 )
 from univoxel.lights.sg import LocalSG, SGConfig
@@ -33,6 +34,14 @@ def test_presets(name):
     voxels = [stage.voxels for stage in grids]
     assert voxels == sorted(voxels)
     assert grids[-1].physical_from < 1  # or materials would never be learned
+
+
+def test_fine_stages_may_be_sparse():
+    config = with_field(preset("fast", Path("photos"), Path("run")), "sparse")
+    assert [getattr(s, "field", None) for s in config.stages] == ["dense", "sparse", None, "sparse"]
+    assert with_field(config, "dense") == preset("fast", Path("photos"), Path("run"))
+    with pytest.raises(ValueError, match="no dense stage can follow a sparse one, got sparse, d"):
+        replace(CONFIG, stages=(replace(STAGE, field="sparse"), STAGE))
 
 
 @pytest.mark.parametrize("light", ["hybrid", "sg", "envmap"])
@@ -119,6 +128,7 @@ def test_the_file_holds_every_field(tmp_path):
         (STAGE, {"spread": -1}, "spread must be at least 0, got -1"),
         (STAGE, {"diffusion": -0.1}, r"diffusion must be in \[0, 0.25\], got -0.1"),
         (STAGE, {"diffusion": 0.3}, r"diffusion must be in \[0, 0.25\], got 0.3"),
+        (STAGE, {"field": "hash"}, "field must be dense or sparse, got 'hash'"),
         (STAGE, {"physical_from": 2.0}, r"physical_from must be in \[0, 1\], got 2.0"),
         (LossConfig(), {"silhouette": -1.0}, "silhouette must be at least 0, got -1.0"),
         (LossConfig(), {"map_smoothness": -1.0}, "map_smoothness must be at least 0, got -1.0"),

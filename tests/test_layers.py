@@ -28,7 +28,7 @@ LAYERS = [
     {"cli"},
 ]
 HELPERS = {
-    "ops": {"checks", "native", "reflectance", "visibility"},
+    "ops": {"checks", "dense_grid", "native", "reflectance", "visibility"},
     "fields": {"base", "hull"},
     "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},

@@ -10,6 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import fit_grid
+from univoxel.fields.sparse import SparseField
 from univoxel.lights import (
     EnvmapConfig,
     EnvmapSGConfig,
@@ -78,6 +79,41 @@ def test_a_slim_file_holds_what_is_seen(tmp_path):
     near = distance < 4
     error = (again.field.sdf - scene.field.sdf)[near].abs().max() / scene.field.voxel_size
     assert error < 4 * 2**-11
+
+
+def sparse_scene(nodes=20):
+    scene = small_scene()
+    grid = fit_grid(*scene.field.bounds(), nodes**3)
+    scene.field = SparseField.around(scene.field, grid)
+    return scene
+
+
+def test_a_checkpoint_of_a_sparse_field(tmp_path):
+    scene = sparse_scene()
+    field, rows = scene.field, 64 * scene.field.count
+    assert len(field.sdf) > rows
+    save_scene(scene, tmp_path, {})
+    again = load_scene(tmp_path).field
+    assert isinstance(again, SparseField)
+    assert again.grid == field.grid
+    assert torch.equal(again.bricks.table, field.bricks.table)
+    assert torch.equal(again.sdf, field.sdf[:rows])
+    assert torch.equal(again.features, field.features[:rows])
+    again.refresh()  # it can go on
+
+
+def test_a_slim_file_of_a_sparse_field_is_smaller(tmp_path):
+    scene = sparse_scene(48)
+    sparse = save_scene(scene, tmp_path, {}, slim=True).stat().st_size
+    kept, field = load_scene(tmp_path).field, scene.field
+    used = field.sdf[: len(kept.sdf)]
+    near = used.abs() < 3.9 * field.voxel_size
+    torch.testing.assert_close(kept.sdf, used, rtol=2**-11, atol=0)
+    torch.testing.assert_close(
+        kept.features[near], field.features[: len(used)][near], rtol=2**-11, atol=1e-7
+    )
+    scene.field = small_scene().field.resized(field.grid)
+    assert sparse < 0.75 * save_scene(scene, tmp_path, {}, slim=True).stat().st_size
 
 
 def test_lights_of_older_files_are_lobes():
@@ -178,12 +214,21 @@ def test_a_description_that_says_nothing_to_us(tmp_path, change):
         load_scene(tmp_path)
 
 
-def test_tensors_that_do_not_fit(tmp_path):
-    path = save_scene(small_scene(), tmp_path, {})
+@pytest.mark.parametrize(
+    ("scene", "name", "tensor"),
+    [
+        (small_scene, "field.sdf", torch.zeros(2, 2, 2)),
+        (sparse_scene, "field.sdf", torch.zeros(128)),
+        (sparse_scene, "field.place", torch.zeros(9).int()),
+        (sparse_scene, "field.inside", torch.zeros(1).to(torch.uint8)),
+    ],
+)
+def test_tensors_that_do_not_fit(tmp_path, scene, name, tensor):
+    path = save_scene(scene(), tmp_path, {})
     with safe_open(path, "pt") as file:
         meta = file.metadata()
     tensors = load_file(path)
-    tensors["field.sdf"] = torch.zeros(2, 2, 2)
+    tensors[name] = tensor
     save_file(tensors, path, meta)
     with pytest.raises(ValueError, match="does not fit its own description"):
         load_scene(tmp_path)

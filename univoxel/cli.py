@@ -40,6 +40,7 @@ def train(
     downscale: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
     ] = None,
+    field: Literal["dense", "sparse"] = "dense",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
@@ -66,6 +67,8 @@ def train(
         varying: what differs from photograph to photograph: exposure, with the colour balance, or
             the light itself too
         downscale: train on photographs of 1/N of their width and height
+        field: sparse stores bricks around the surface alone, for finer grids than the presets',
+            such as --set stages.1.voxels=30
         minutes: wall-clock limit, above 0; training ends in time with what it has
         adaptive: no larger a model than the scene needs, as held-out pixels tell: coarser grid,
             fewer feature channels, lobes and hidden units; `univoxel info` says what was chosen
@@ -77,7 +80,7 @@ def train(
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
             stages.1.voxels=3; config.json in a run's folder holds them all
     """
-    from univoxel.config import chosen
+    from univoxel.config import chosen, with_field
     from univoxel.overrides import changed
     from univoxel.tasks import train as task
 
@@ -90,6 +93,7 @@ def train(
     config = dataclasses.replace(config, downscale=downscale or 0)
     if adaptive or budget_mb is not None:
         config = dataclasses.replace(config, capacity="adaptive", budget_mb=budget_mb)
+    config = with_field(config, field)
     print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
 
 

@@ -21,6 +21,7 @@ from univoxel.lights import (
 )
 from univoxel.scene import SceneConfig, Varying
 
+FieldName: TypeAlias = Literal["dense", "sparse"]
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
 Capacity: TypeAlias = Literal["fixed", "adaptive"]
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
@@ -43,6 +44,7 @@ class StageConfig:
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 0.25]
     physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
     refit: bool = False  # geometry and materials stay; light and radiance follow them
+    field: FieldName = "dense"  # sparse: only bricks around the surface are stored
 
     def __post_init__(self):
         _check(self, "above 0", lambda x: 0 < x < math.inf, "voxels")
@@ -58,6 +60,7 @@ class StageConfig:
         _check(self, "in [0, 0.125]", lambda x: 0 <= x <= 0.125, "plate")
         _check(self, "in [0, 0.25]", lambda x: 0 <= x <= 0.25, "diffusion")
         _check(self, "in [0, 1]", lambda x: 0 <= x <= 1, "physical_from")
+        _check(self, "dense or sparse", lambda x: x in get_args(FieldName), "field")
 
 
 @dataclass(frozen=True)
@@ -137,6 +140,15 @@ class TrainConfig:
             lambda x: len(x) >= 1 and isinstance(x[0], StageConfig),
             "stages",
         )
+        kinds = [s.field for s in self.stages if isinstance(s, StageConfig)]
+        if kinds != sorted(kinds):
+            raise ValueError(
+                f"TrainConfig: no dense stage can follow a sparse one, got {', '.join(kinds)}"
+            )
+        if self.capacity == "adaptive" and "sparse" in kinds:
+            raise ValueError(
+                "TrainConfig: adaptive capacity fits dense grids: leave --field sparse out"
+            )
         if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
             raise ValueError(
                 "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
@@ -267,6 +279,13 @@ def chosen(
         return budget(minutes, data, out, light, varying)
     config = preset("fast" if name == "auto" else name, data, out, light, varying)
     return config if minutes is None else replace(config, minutes=minutes)
+
+
+def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
+    """The same with fine stages on such a field; the first, a coarse one, stays dense."""
+    first, *rest = cfg.stages
+    fine = [replace(s, field=kind) if isinstance(s, StageConfig) else s for s in rest]
+    return replace(cfg, stages=(first, *fine))
 
 
 def work_in(minutes: float) -> Work:

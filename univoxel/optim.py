@@ -52,6 +52,21 @@ class RowAdam(torch.optim.Optimizer):
         super().add_param_group(param_group)
 
     @torch.no_grad()
+    def follow(self, old: Tensor, new: Tensor) -> None:
+        """Go on with another tensor in place of one: the same, or with more rows at its end, which
+        begin without moments."""
+        if new is old:
+            return
+        for group in self.param_groups:
+            group["params"] = [new if p is old else p for p in group["params"]]
+        state = self.state.pop(old, None)
+        if state:
+            none = new.new_zeros(len(new) - len(old), *new.shape[1:])
+            for name in ("exp_avg", "exp_avg_sq"):
+                state[name] = torch.cat([state[name], none])
+            self.state[new] = state
+
+    @torch.no_grad()
     def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
         """Take one step on every parameter that has a gradient; return the closure's loss."""
         loss = None

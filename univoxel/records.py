@@ -6,7 +6,9 @@ Sizes: N rays, M samples, C features, V views, P points.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 
@@ -34,6 +36,66 @@ class FieldSample:
     sdf: Tensor  # [M] signed distance, world units, negative inside
     gradient: Tensor  # [M, 3] of the sdf, about unit length
     features: Tensor  # [M, C]
+
+
+@dataclass(frozen=True)
+class Bricks:
+    """Where the nodes of a sparse grid lie: in n bricks of 4^3, those of one brick together.
+
+    Node (i, j, k) is row 64 table[i // 4, j // 4, k // 4] + 16 (i % 4) + 4 (j % 4) + k % 4 of a
+    pool of 64 n rows. Bricks 0 and 1 stand for all that are missing, outside and inside the
+    surface: what they hold is what is seen there, and they get no gradient.
+
+    Raises:
+        ValueError: table, place and size do not fit each other.
+    """
+
+    table: Tensor  # [A, B, C] int32 number of a brick, in [0, n); not to be changed in place
+    place: Tensor  # [n] int32 where in the flat table a brick stands; -1: nowhere, as 0 and 1
+    size: tuple[int, int, int]  # nodes of the whole grid
+
+    SIDE: ClassVar[int] = 4
+    NODES: ClassVar[int] = 64  # in a brick
+    MISSING: ClassVar[int] = 2  # bricks that stand for missing ones
+
+    def __post_init__(self):
+        shape = tuple(-(-n // self.SIDE) for n in self.size)
+        for name, tensor, wanted in (
+            ("table", self.table, shape),
+            ("place", self.place, (max(len(self.place), self.MISSING),)),
+        ):
+            if tuple(tensor.shape) != wanted or tensor.dtype != torch.int32:
+                raise ValueError(
+                    f"Bricks: {name} must be {list(wanted)} int32 for size {list(self.size)}, got "
+                    f"{list(tensor.shape)} {str(tensor.dtype).removeprefix('torch.')}"
+                )
+        flat, n = self.table.flatten(), len(self.place)
+        stored = (flat >= self.MISSING).nonzero()[:, 0]
+        number = flat[stored].long()
+        fits = not flat.numel() or bool(flat.min() >= 0 and flat.max() < n)
+        fits = fits and int((self.place >= 0).sum()) == len(stored)
+        if not fits or not bool((self.place[number] == stored).all()):
+            raise ValueError(
+                f"Bricks: table must hold each of {n} bricks where place says, and 0 or 1 elsewhere"
+            )
+
+    def corners(self, brick: Tensor) -> Tensor:
+        """First node of bricks [K] that stand somewhere: [K, 3] int64."""
+        _, b, c = self.table.shape
+        at = self.place[brick].long()
+        return torch.stack([at // (b * c), at // c % b, at % c], -1) * self.SIDE
+
+    def rows(self, node: Tensor) -> Tensor:
+        """Rows of nodes [..., 3] int64 of the grid: [...] int64."""
+        block, inside = node // self.SIDE, node % self.SIDE
+        brick = self.table[block.unbind(-1)].long()
+        i, j, k = inside.unbind(-1)
+        return brick * self.NODES + 16 * i + 4 * j + k
+
+    def grid_rows(self) -> Tensor:
+        """Rows of all nodes of the grid: [X, Y, Z] int64."""
+        axes = [torch.arange(n, device=self.table.device) for n in self.size]
+        return self.rows(torch.stack(torch.meshgrid(*axes, indexing="ij"), -1))
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.fields.hull import GridShape
+from univoxel.fields.sparse import SparseField, pack_bricks, unpack_bricks
 from univoxel.lights import (
     EnvmapLight,
     EnvmapSGLight,
@@ -34,6 +36,7 @@ from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.views import ViewLights
 from univoxel.ops import VisibilityScene
 from univoxel.packing import PACKED, pack, unpack
+from univoxel.records import Bricks
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
 FILE = "scene.safetensors"
@@ -84,7 +87,7 @@ class SceneConfig:
 class Scene(nn.Module):
     """Everything that is learned of an object and of the light it stood in."""
 
-    def __init__(self, cfg: SceneConfig, field: DenseField, inv_s: float = 1.0):
+    def __init__(self, cfg: SceneConfig, field: AbstractField, inv_s: float = 1.0):
         super().__init__()
         self.cfg = cfg
         self.inv_s = inv_s  # sharpness of the NeuS density, 1 / world units
@@ -166,12 +169,16 @@ class Scene(nn.Module):
 def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict[str, Tensor]:
     """The tensors of a scene's file, see `save_scene`."""
     tensors = {k: v.contiguous() for k, v in scene.state_dict().items() if k != "field.features"}
+    sdf = scene.field.sdf.detach()
+    if isinstance(scene.field, SparseField):
+        tensors |= {f"field.{k}": v for k, v in pack_bricks(scene.field).items()}
+        sdf = tensors["field.sdf"] = sdf[: Bricks.NODES * scene.field.count]
     # Features that no sample has touched are 0: only the others are stored.
-    features = scene.field.features.detach().flatten(0, 2)
+    features = scene.field.features.detach().flatten(0, -2)[: sdf.numel()]
     touched = features.any(1)
     if slim:
         shell = (reach or SHELL) * scene.field.voxel_size
-        touched &= scene.field.sdf.detach().flatten().abs() < shell
+        touched &= sdf.flatten().abs() < shell
         if reach is not None:
             packed = pack(tensors.pop("field.sdf"), shell)
             tensors |= {f"field.sdf_{name}": value for name, value in packed.items()}
@@ -202,6 +209,7 @@ def save_scene(
     meta = {
         "format": FORMAT,
         "scene": asdict(scene.cfg),
+        "field": "sparse" if isinstance(scene.field, SparseField) else "dense",
         "grid": asdict(scene.field.grid),
         "inv_s": scene.inv_s,
         "state": state,
@@ -247,11 +255,16 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
         grid = GridShape(
             tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
         )
-        scene = Scene(cfg, DenseField(grid, cfg.channels), meta["inv_s"])
+        if meta.get("field", "dense") == "sparse":
+            where = tensors.pop("field.place"), tensors.pop("field.inside")
+            field = SparseField(grid, cfg.channels, unpack_bricks(*where, grid.size))
+        else:
+            field = DenseField(grid, cfg.channels)
+        scene = Scene(cfg, field, meta["inv_s"])
         rows, values = tensors.pop("field.feature_rows"), tensors.pop("field.feature_values")
-        features = torch.zeros(grid.nodes_count, cfg.channels)
+        features = field.features.data.flatten(0, -2)
         features[rows.long()] = values.float()
-        tensors["field.features"] = features.view(*grid.size, cfg.channels)
+        tensors["field.features"] = field.features.data
         packed = {n: tensors.pop(k) for n in PACKED if (k := f"field.sdf_{n}") in tensors}
         if packed:
             tensors["field.sdf"] = unpack(packed, grid.size, SHELL * grid.voxel_size)

@@ -7,18 +7,11 @@
 #include <optional>
 #include <utility>
 
-#include "bindings/common.h"
+#include "bindings/grids.h"
 #include "bricks.h"
 
 namespace univoxel {
 namespace {
-
-/// Size [X, Y, Z], origin and voxel size as Python passes them; a size of 0 holds nothing.
-Lattice lattice_of(const std::array<int64_t, 3>& size, const std::array<double, 3>& origin,
-                   double voxel_size) {
-    require(size[0] > 0 && size[1] > 0 && size[2] > 0, "sample_dense: the grid has no nodes");
-    return {{size[0], size[1], size[2]}, {origin[0], origin[1], origin[2]}, 1 / voxel_size};
-}
 
 template <class T>
 DenseGrid<T> dense_grid_of(const array<T>& sdf, const array<T>& features, const array<T>& points,
@@ -31,6 +24,8 @@ DenseGrid<T> dense_grid_of(const array<T>& sdf, const array<T>& features, const 
             points.data(),
             order.data(),
             lattice_of({sdf.shape(0), sdf.shape(1), sdf.shape(2)}, origin, voxel_size),
+            {sdf.shape(1), sdf.shape(2)},
+            sdf.size(),
             n,
             features.shape(3)};
 }
@@ -79,7 +74,7 @@ void bind_dense_grid(py::module_& m) {
         py::arg("origin"), py::arg("voxel_size"), py::arg("threads"));
     m.def(
         "touched_rows",
-        [](const array<T>& points, const array<int32_t>& order, const std::array<int64_t, 3>& size,
+        [](const array<T>& points, const array<int32_t>& order, const Size3& size,
            const Vec3& origin, double voxel_size, bool sdf, bool features, int threads) {
             const Lattice grid = lattice_of(size, origin, voxel_size);
             const T* p = points.data();

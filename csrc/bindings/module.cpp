@@ -9,5 +9,6 @@ PYBIND11_MODULE(_core, m) {
     univoxel::bind_rows_ops(m);
     univoxel::bind_sg_ops(m);
     univoxel::bind_shade_ops(m);
+    univoxel::bind_sparse_grid_ops(m);
     univoxel::bind_visibility_ops(m);
 }

@@ -1,7 +1,9 @@
+#include <pybind11/stl.h>
+
 #include <string>
 
 #include "adam.h"
-#include "bindings/common.h"
+#include "bindings/grids.h"
 #include "smooth.h"
 
 namespace univoxel {
@@ -58,6 +60,27 @@ void bind_smooth(py::module_& m) {
         },
         py::arg("grid").noconvert(), py::arg("rows").noconvert(), py::arg("amount"),
         py::arg("order"), py::arg("threads"));
+    m.def(
+        "smooth_brick_rows",
+        [](array<T>& grid, const array<int32_t>& table, const array<int32_t>& place,
+           const Size3& size, const array<int64_t>& rows, double amount, int order, int threads) {
+            const BrickNodes nodes = brick_nodes_of(table, size);
+            const int64_t* r = rows.data();
+            const int64_t n = rows.size(), end = grid.shape(0);
+            bool ok = true;
+            const int32_t* stands = place.data();
+            for (int64_t k = 0; k < n; ++k)
+                ok = ok && r[k] >= 0 && r[k] < end && stands[r[k] / kBrickNodes] >= 0;
+            require(ok, "smooth_rows_: rows must be of bricks that stand somewhere, in [" +
+                            std::to_string(kMissingRows) + ", " + std::to_string(end) + ")");
+            T* g = grid.mutable_data();
+            py::gil_scoped_release nogil;
+            smooth_brick_rows(g, size.data(), nodes, stands, grid.shape(1), r, n, T(amount), order,
+                              threads);
+        },
+        py::arg("grid").noconvert(), py::arg("table").noconvert(), py::arg("place").noconvert(),
+        py::arg("size"), py::arg("rows").noconvert(), py::arg("amount"), py::arg("order"),
+        py::arg("threads"));
 }
 
 }  // namespace

@@ -2,8 +2,9 @@
 
 import pytest
 import torch
+from bricks import cut
 
-from univoxel.ops import brick_minimum, march, march_reference
+from univoxel.ops import brick_minimum, march, march_reference, use_backend
 
 
 def sphere(n=24, radius=0.6, dtype=torch.float64):
@@ -33,6 +34,46 @@ def test_native_equals_reference(inv_s):
     assert torch.equal(got.offsets, want.offsets)
     torch.testing.assert_close(got.t, want.t)
     assert torch.equal(got.connected, want.connected)
+
+
+@pytest.mark.parametrize("size", [41, 48])
+def test_a_sparse_grid_is_marched_as_the_dense_one(size):
+    sdf, voxel = sphere(size)
+    dense, pool, bricks = cut(sdf, far=4 * voxel)
+    assert (bricks.table == 0).any()
+    assert (bricks.table == 1).any()
+    rays, place = random_rays(500), ((-1.0,) * 3, voxel)
+    options = {"step": voxel, "inv_s": 2.1 / voxel, "min_weight": 1e-3}  # 8 s below 4 voxels
+    want = march(dense, brick_minimum(dense), *rays, *place, **options)
+    for backend in ("native", "reference"):
+        with use_backend(backend):
+            least = brick_minimum(pool, bricks)
+            got = march(pool, least, *rays, *place, **options, bricks=bricks)
+        assert torch.equal(got.offsets, want.offsets)
+        torch.testing.assert_close(got.t, want.t)
+        assert torch.equal(got.connected, want.connected)
+    assert got.offsets[-1] > 500
+
+
+def test_brick_minimum_of_a_sparse_grid():
+    dense, pool, bricks = cut(sphere(22, dtype=torch.float32)[0], far=0.3)
+    least = brick_minimum(pool, bricks)
+    with use_backend("reference"):
+        assert torch.equal(brick_minimum(pool, bricks), least)
+    whole, table = brick_minimum(dense), bricks.table
+    assert whole.shape == table.shape
+    assert torch.equal(least[table[table >= 2].long()], whole[table >= 2])
+    assert least[[0, 1, -1]].tolist() == [torch.inf, -torch.inf, torch.inf]
+
+
+def test_brick_minimum_of_another_grid():
+    _, pool, bricks = cut(sphere(8)[0], far=0.3)
+    with pytest.raises(ValueError, match="brick_minimum: sdf must be"):
+        brick_minimum(pool[:64], bricks)
+    rays, least = random_rays(3), brick_minimum(pool, bricks)
+    options = {"step": 0.1, "inv_s": 10.0}
+    with pytest.raises(ValueError, match="march: brick_min must be"):
+        march(pool, least[1:], *rays, (-1.0,) * 3, 0.1, **options, bricks=bricks)
 
 
 def test_samples_stand_around_the_surface():
@@ -91,8 +132,6 @@ def test_threads_do_not_change_the_bits():
 
 @pytest.mark.parametrize("shape", [(9, 5, 6), (4, 13, 2), (1, 1, 1)])
 def test_brick_minimum(shape):
-    from univoxel.ops import use_backend
-
     sdf = torch.randn(shape)
     with use_backend("reference"):
         expected = brick_minimum(sdf)

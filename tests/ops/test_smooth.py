@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from bricks import cut
 
 from univoxel.ops import smooth_rows_, smooth_rows_reference_
 
@@ -36,6 +37,46 @@ def test_runs_of_rows_and_shuffled_rows_give_the_same_bits(order, channels):
     wanted = smooth_rows_reference_(grid.clone(), rows, 0.3, order)
     # 25 products of numbers of order 1 in float32
     torch.testing.assert_close(found[0], wanted, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("shape", [(23, 18, 21), (6, 5, 3)])
+@pytest.mark.parametrize("channels", [1, 5])
+def test_a_sparse_grid_is_smoothed_as_the_dense_one(order, shape, channels):
+    x = [torch.arange(float(n)).double() for n in shape]
+    sdf = 0.3 * (x[0][:, None, None] + x[1][:, None] + x[2]) - 0.15 * sum(shape)
+    _, pool, bricks = cut(sdf + 0.2 * torch.randn(shape).double(), far=1.0)
+    pool = pool[:, None] * torch.linspace(1, 2, channels).double()
+    node_rows = bricks.grid_rows()
+    stored = (node_rows >= 128) & (torch.rand(shape) < 0.6)
+    rows = node_rows[stored].sort().values
+    dense = smooth_rows_(pool[node_rows], stored.flatten().nonzero()[:, 0], 0.3, order)
+    for found in (
+        smooth_rows_(pool.clone(), rows, 0.3, order, bricks),
+        smooth_rows_reference_(pool.clone(), rows, 0.3, order, bricks),
+    ):
+        torch.testing.assert_close(found[node_rows], dense)
+        untouched = torch.ones(len(pool), dtype=torch.bool).index_fill_(0, rows, False)
+        assert torch.equal(found[untouched], pool[untouched])
+    threads, many = torch.get_num_threads(), []
+    try:
+        for count, chosen in ((1, rows), (2, rows), (3, rows[torch.randperm(len(rows))])):
+            torch.set_num_threads(count)
+            many.append(smooth_rows_(pool.clone(), chosen, 0.3, order, bricks))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(many[0], many[1])
+    assert torch.equal(many[0], many[2])
+
+
+@pytest.mark.parametrize("row", [0, 127, 256, -1])
+def test_rows_of_no_brick(row):
+    _, pool, bricks = cut(torch.linspace(-1, 1, 4)[:, None, None].expand(4, 4, 4), far=1.0)
+    assert len(pool) == 256
+    with pytest.raises(ValueError, match="rows must be of bricks that stand somewhere"):
+        smooth_rows_(pool[:, None], torch.tensor([row]), 0.1, 1, bricks)
+    with pytest.raises(ValueError, match=r"grid must be \[256, C\]"):
+        smooth_rows_(pool[:64, None], torch.tensor([row]), 0.1, 1, bricks)
 
 
 def test_thin_plate_keeps_a_plane_and_lowers_a_bump():

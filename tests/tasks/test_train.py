@@ -10,8 +10,9 @@ from layouts import Scene, write_colmap
 from scipy.spatial.transform import Rotation
 
 from univoxel.color import linear_to_srgb
-from univoxel.config import StageConfig, TrainConfig, preset
+from univoxel.config import StageConfig, TrainConfig, preset, with_field
 from univoxel.data import load_photos
+from univoxel.fields.sparse import SparseField
 from univoxel.lights import EnvmapConfig, EnvmapSGConfig, MLPLightConfig, SGConfig, SHConfig
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import FILE, SceneConfig, load_scene
@@ -134,6 +135,42 @@ def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, capsys):
     assert abs(float(middle.norm() - centre.norm())) < 0.03 * scale
     views = photos_of_run(out)
     assert (views.downscale, views.cameras.width) == (2, 32)
+
+
+def test_a_sparse_fine_stage_is_as_good(data, run, tmp_path):
+    out = train(with_field(config(data, tmp_path / "run"), "sparse"))
+    scene, dense = load_scene(out), load_scene(run)
+    assert isinstance(scene.field, SparseField)
+    assert scene.field.grid == dense.field.grid
+    away = extract_mesh(scene).vertices.norm(dim=1) - RADIUS
+    assert away.abs().mean() < 0.03
+    photos = load_photos(data, "test")
+    pixels = torch.cartesian_prod(torch.arange(2), torch.arange(32), torch.arange(32))
+    psnr, of_dense = (task.held_out_psnr(s, photos, pixels, physical=True) for s in (scene, dense))
+    assert psnr > of_dense - 1.0  # two runs of 140 steps with other random numbers
+    with pytest.raises(ValueError, match="began with other stages"):
+        train(config(data, out), resume=True)
+
+
+def test_a_sparse_run_is_resumed(data, tmp_path, monkeypatch):
+    """In the middle of its fine stage, from the checkpoint of a sparse field."""
+    cfg = with_field(config(data, tmp_path / "run"), "sparse")
+    save, saved = task.save_scene, []
+
+    def killed(*arguments, **options):
+        save(*arguments, **options)
+        saved.append(1)
+        if len(saved) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(task, "save_scene", killed)
+    monkeypatch.setattr(task.Progress, "checkpoint_due", lambda self: self.step == 70)
+    with pytest.raises(KeyboardInterrupt):
+        train(cfg)
+    first = load_scene(cfg.out)
+    assert isinstance(first.field, SparseField)
+    train(cfg, resume=True)
+    assert not torch.equal(load_scene(cfg.out).field.sdf[:1000], first.field.sdf[:1000])
 
 
 def test_time_ends_a_run_with_a_usable_result(data, tmp_path):

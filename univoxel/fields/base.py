@@ -6,14 +6,22 @@ from abc import ABC, abstractmethod
 
 from torch import Tensor, nn
 
+from univoxel.fields.hull import GridShape
 from univoxel.records import FieldSample, Rays, Samples
 
 
 class AbstractField(nn.Module, ABC):
-    """A signed distance and C features everywhere in a box."""
+    """A signed distance and C features everywhere in a box.
 
+    Gradients to sdf and features are sparse: only the nodes around samples are in them, and
+    `RowAdam` updates only those. Their rows are the numbers of these nodes.
+    """
+
+    grid: GridShape
     channels: int  # C
     voxel_size: float  # finest resolution, world units
+    sdf: nn.Parameter
+    features: nn.Parameter  # as the sdf, and C
 
     @abstractmethod
     def sample(self, points: Tensor) -> FieldSample:
@@ -22,6 +30,35 @@ class AbstractField(nn.Module, ABC):
     @abstractmethod
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         """The samples along rays that matter under density sharpness 1 / s; no gradients."""
+
+    @abstractmethod
+    def refresh(self) -> None:
+        """Look again which bricks are empty, after the sdf has moved.
+
+        Where a field needs room for that, sdf and features are new parameters afterwards, with
+        more rows at the end: `RowAdam.follow` takes the optimiser along.
+        """
+
+    @abstractmethod
+    def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
+        """`ops.smooth_rows_` of something that has a value, or C, where the sdf has one."""
+
+    @abstractmethod
+    def blocks(self, far: float) -> Tensor:
+        """Whether the sdf can be nearer to 0 than far in each block of 4^3 voxels: [A, B, C]."""
+
+    @abstractmethod
+    def isosurface(self) -> tuple[Tensor, Tensor]:
+        """Vertices [P, 3] float32 and faces [F, 3] int32 of the zero level (marching cubes,
+        Lewiner et al. 2003), counter-clockwise seen from outside.
+
+        Raises:
+            ValueError: the sdf has no zero level.
+        """
+
+    @abstractmethod
+    def resized(self, grid: GridShape) -> AbstractField:
+        """The same field on another grid, by trilinear interpolation."""
 
     @abstractmethod
     def bounds(self) -> tuple[Tensor, Tensor]:

@@ -8,16 +8,12 @@ from torch import Tensor, nn
 
 from univoxel.fields.base import AbstractField
 from univoxel.fields.hull import GridShape, resample
-from univoxel.ops import brick_minimum, march, sample_dense
+from univoxel.ops import brick_minimum, march, sample_dense, smooth_rows_
 from univoxel.records import FieldSample, Rays, Samples
 
 
 class DenseField(AbstractField):
-    """SDF [X, Y, Z] and features [X, Y, Z, C] as parameters.
-
-    Gradients to the grids are sparse: only the nodes around samples are in them, and `RowAdam`
-    updates only those.
-    """
+    """SDF [X, Y, Z] and features [X, Y, Z, C] as parameters."""
 
     def __init__(self, grid: GridShape, channels: int, sdf: Tensor | None = None):
         super().__init__()
@@ -40,10 +36,11 @@ class DenseField(AbstractField):
         )
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
-        brick_min = self.refresh() if self._brick_min is None else self._brick_min
+        if self._brick_min is None:
+            self._brick_min = brick_minimum(self.sdf.detach())
         return march(
             self.sdf.detach(),
-            brick_min,
+            self._brick_min,
             rays.origin,
             rays.direction,
             jitter,
@@ -53,18 +50,17 @@ class DenseField(AbstractField):
             inv_s=inv_s,
         )
 
-    def refresh(self) -> Tensor:
-        """Look again which bricks are empty, after the sdf has moved: the least sdf of each."""
+    def refresh(self) -> None:
         self._brick_min = brick_minimum(self.sdf.detach())
-        return self._brick_min
+
+    def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
+        smooth_rows_(values.view(*self.grid.size, -1), rows, amount, order)
+
+    def blocks(self, far: float) -> Tensor:
+        sdf = self.sdf.detach()
+        return (brick_minimum(sdf) < far) & (brick_minimum(-sdf) < far)
 
     def isosurface(self) -> tuple[Tensor, Tensor]:
-        """Vertices [P, 3] float32 and faces [F, 3] int32 of the zero level (marching cubes,
-        Lewiner et al. 2003), counter-clockwise seen from outside.
-
-        Raises:
-            ValueError: the sdf has no zero level.
-        """
         sdf = self.sdf.detach().numpy()
         if not sdf.min() < 0 < sdf.max():
             raise ValueError("the field has no surface: its sdf does not change sign")
@@ -74,11 +70,9 @@ class DenseField(AbstractField):
         return world.float(), torch.from_numpy(faces.astype("int32"))
 
     def bounds(self) -> tuple[Tensor, Tensor]:
-        lower = torch.tensor(self.grid.origin)
-        return lower, lower + self.voxel_size * (torch.tensor(self.grid.size) - 1)
+        return self.grid.bounds()
 
     def resized(self, grid: GridShape) -> DenseField:
-        """The same field on another grid, by trilinear interpolation."""
         with torch.no_grad():
             field = DenseField(grid, self.channels, resample(self.sdf, self.grid, grid))
             field.features.copy_(resample(self.features, self.grid, grid))

@@ -25,6 +25,11 @@ class GridShape:
         x, y, z = self.size
         return x * y * z
 
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper corner [3], [3] of the box of the nodes, world units."""
+        lower = torch.tensor(self.origin)
+        return lower, lower + self.voxel_size * (torch.tensor(self.size) - 1)
+
     def nodes(self) -> Tensor:
         """World positions of the nodes: [X, Y, Z, 3] float32."""
         axes = [

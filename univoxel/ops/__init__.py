@@ -15,6 +15,7 @@ from univoxel.ops.shade import (
     shade_radiance_reference,
 )
 from univoxel.ops.smooth import smooth_rows_, smooth_rows_reference_
+from univoxel.ops.sparse_grid import sample_sparse, sample_sparse_reference
 from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference, occluded_reference
 
 __all__ = [
@@ -37,6 +38,8 @@ __all__ = [
     "relight",
     "sample_dense",
     "sample_dense_reference",
+    "sample_sparse",
+    "sample_sparse_reference",
     "shade_map",
     "shade_map_reference",
     "shade_radiance",

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from univoxel.records import Bricks
+
 
 def check(
     op: str, **arguments: tuple[Tensor, str] | tuple[Tensor, str, torch.dtype]
@@ -48,6 +50,26 @@ def check(
                 f"{str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
             )
     return sizes
+
+
+def check_bricks(op: str, bricks: Bricks, **pools: tuple[Tensor, str]) -> None:
+    """Check that pools of values have a row for each node of the bricks, or one for each brick.
+
+    Args:
+        pools: (tensor, sizes) as in `check`, the first size "R" for rows and "n" for bricks.
+
+    Raises:
+        TypeError, ValueError: as `check`; bricks is none, or of another size.
+    """
+    if not isinstance(bricks, Bricks):
+        raise TypeError(f"{op}: bricks must be Bricks, got {type(bricks).__name__}")
+    n = len(bricks.place)
+    wanted = {"R": Bricks.NODES * n, "n": n}
+    for name, (tensor, words) in pools.items():
+        letter, *rest = words.split()
+        check(op, **{name: (tensor, " ".join([str(wanted[letter]), *rest]))})
+        if tensor.device != bricks.table.device:
+            raise ValueError(f"{op}: bricks must be on {tensor.device}, got {bricks.table.device}")
 
 
 def _matches(word: str, size: int, sizes: dict[str, int]) -> bool:

@@ -67,12 +67,7 @@ def sample_dense(
     )
     if not sdf.numel():
         raise ValueError(f"sample_dense: sdf must have nodes, got {list(sdf.shape)}")
-    if sizes["M"] >= 2**31:
-        raise ValueError(f"sample_dense: points must be fewer than 2^31, got {sizes['M']}")
-    if len(origin) != 3 or not all(math.isfinite(x) for x in origin):
-        raise ValueError(f"sample_dense: origin must be 3 finite numbers, got {list(origin)}")
-    if not 0 < voxel_size < math.inf:
-        raise ValueError(f"sample_dense: voxel_size must be above 0, got {voxel_size}")
+    check_place("sample_dense", sizes["M"], origin, voxel_size)
     if native.serves(sdf):
         return _sample_dense(
             sdf.contiguous(),
@@ -83,8 +78,22 @@ def sample_dense(
             sparse_grad,
         )[:3]
     if sparse_grad:
-        sdf, features = _SparseGrad.apply(sdf), _SparseGrad.apply(features)
+        sdf, features = SparseGrad.apply(sdf, 3), SparseGrad.apply(features, 3)
     return sample_dense_reference(sdf, features, points, origin, voxel_size)
+
+
+def check_place(op: str, points: int, origin: Sequence[float], voxel_size: float) -> None:
+    """Check how many points are sampled, and where the grid lies.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+    if points >= 2**31:
+        raise ValueError(f"{op}: points must be fewer than 2^31, got {points}")
+    if len(origin) != 3 or not all(math.isfinite(x) for x in origin):
+        raise ValueError(f"{op}: origin must be 3 finite numbers, got {list(origin)}")
+    if not 0 < voxel_size < math.inf:
+        raise ValueError(f"{op}: voxel_size must be above 0, got {voxel_size}")
 
 
 def sample_dense_reference(
@@ -116,16 +125,18 @@ def sample_dense_reference(
     return value, torch.where(lost, torch.nan, gradient), torch.where(lost, torch.nan, feature)
 
 
-class _SparseGrad(torch.autograd.Function):
-    """The same grid with a sparse gradient: for backends whose own gradient is dense."""
+class SparseGrad(torch.autograd.Function):
+    """The same grid with a gradient that is sparse in its first dimensions: for backends whose own
+    gradient is dense."""
 
     @staticmethod
-    def forward(ctx, grid):
+    def forward(ctx, grid, dims):
+        ctx.dims = dims
         return grid.view_as(grid)
 
     @staticmethod
     def backward(ctx, grad):
-        return grad.to_sparse(3)
+        return grad.to_sparse(ctx.dims), None
 
 
 @torch.library.custom_op("univoxel::sample_dense", mutates_args=(), device_types="cpu")

@@ -8,21 +8,28 @@ import torch
 from torch import Tensor
 
 from univoxel.ops import native
-from univoxel.ops.checks import check
-from univoxel.records import Samples
+from univoxel.ops.checks import check, check_bricks
+from univoxel.records import Bricks, Samples
 
 BRICK = 4  # voxels along the side of a brick that is skipped as a whole; as in csrc/march.h
 
 
-def brick_minimum(sdf: Tensor) -> Tensor:
+def brick_minimum(sdf: Tensor, bricks: Bricks | None = None) -> Tensor:
     """Least sdf in each brick of 4^3 voxels (5^3 nodes; neighbours share their faces).
 
     Args:
-        sdf: [X, Y, Z] world units.
+        sdf: [X, Y, Z] world units; with bricks [64 n].
+        bricks: of a sparse grid.
 
     Returns:
-        [ceil((X - 1) / 4), ...] at least 1 along each axis.
+        [ceil((X - 1) / 4), ...] at least 1 along each axis; with bricks [n]: infinity for those
+        that are missing outside or stand nowhere, minus infinity for those missing inside.
+
+    Raises:
+        TypeError, ValueError: an argument of another size, dtype or device than above.
     """
+    if bricks is not None:
+        return _sparse_brick_minimum(sdf, bricks)
     check("brick_minimum", sdf=(sdf, "X Y Z"))
     if native.serves(sdf):
         out = sdf.new_empty([max(1, (n - 2) // BRICK + 1) for n in sdf.shape])
@@ -40,6 +47,28 @@ def brick_minimum(sdf: Tensor) -> Tensor:
     return sdf
 
 
+def _sparse_brick_minimum(sdf: Tensor, bricks: Bricks) -> Tensor:
+    check_bricks("brick_minimum", bricks, sdf=(sdf, "R"))
+    n = len(bricks.place)
+    if native.serves(sdf):
+        out = sdf.new_empty(n)
+        native.require().sparse_brick_minimum(
+            *native.arrays(sdf.contiguous(), bricks.table, bricks.place),
+            bricks.size,
+            out.numpy(),
+            native.threads(),
+        )
+        return out
+    out = sdf.new_full((n,), torch.inf)
+    out[1] = -torch.inf
+    stored = (bricks.place >= 0).nonzero()[:, 0]
+    face = torch.cartesian_prod(*[torch.arange(BRICK + 1, device=sdf.device)] * 3)
+    last = torch.tensor(bricks.size, device=sdf.device) - 1
+    nodes = torch.minimum(bricks.corners(stored)[:, None] + face, last)
+    out[stored] = sdf[bricks.rows(nodes)].amin(1)
+    return out
+
+
 def march(
     sdf: Tensor,  # [X, Y, Z]
     brick_min: Tensor,
@@ -53,6 +82,7 @@ def march(
     inv_s: float,
     min_weight: float = 1e-4,
     early_stop: float = 1e-3,
+    bricks: Bricks | None = None,
 ) -> Samples:
     """Samples along rays where the NeuS density of an SDF grid lets anything be seen.
 
@@ -66,8 +96,8 @@ def march(
     direction is shorter than 1e-3, gets no samples.
 
     Args:
-        sdf: [X, Y, Z] world units, negative inside.
-        brick_min: `brick_minimum(sdf)`; may lag a few optimisation steps behind.
+        sdf: [X, Y, Z] world units, negative inside; with bricks [64 n].
+        brick_min: `brick_minimum(sdf, bricks)`; may lag a few optimisation steps behind.
         origin, direction: [N, 3] rays in the world, direction unit.
         jitter: [N] in [0, 1): where in its first step a ray starts.
         grid_origin: world position of node (0, 0, 0).
@@ -76,16 +106,19 @@ def march(
         inv_s: 1 / s, sharpness of the density, 1 / world units, > 0.
         min_weight: in [0, 1].
         early_stop: a ray ends where its transmittance falls below this, in [0, 1].
+        bricks: of a sparse grid. Those that are missing outside are skipped.
 
     Raises:
         TypeError, ValueError: an argument of another size, dtype, device or range than above.
 
     Not differentiable. Source: Wang et al. 2021 (NeuS), eq. 13.
     """
+    if bricks is not None:
+        check_bricks("march", bricks, sdf=(sdf, "R"), brick_min=(brick_min, "n"))
     check(
         "march",
-        sdf=(sdf, "X Y Z"),
-        brick_min=(brick_min, "A B C"),
+        sdf=(sdf, "X Y Z" if bricks is None else "R"),
+        brick_min=(brick_min, "A B C" if bricks is None else "n"),
         origin=(origin, "N 3"),
         direction=(direction, "N 3"),
         jitter=(jitter, "N"),
@@ -98,7 +131,7 @@ def march(
             raise ValueError(f"march: {name} must be in [0, 1], got {number}")
     if not native.serves(sdf):
         return march_reference(
-            sdf,
+            sdf if bricks is None else sdf[bricks.grid_rows()],
             origin,
             direction,
             jitter,
@@ -118,6 +151,8 @@ def march(
         float(inv_s),
         float(min_weight),
         float(early_stop),
+        None if bricks is None else bricks.table.numpy(),
+        sdf.shape if bricks is None else bricks.size,
         native.threads(),
     )
     return Samples(

@@ -26,11 +26,12 @@ from univoxel.config import (
 )
 from univoxel.data import DataError, Photos, load_photos
 from univoxel.data.images import replacing
+from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
+from univoxel.fields.sparse import SparseField
 from univoxel.lights import priors
 from univoxel.metrics import psnr
-from univoxel.ops import smooth_rows_
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays, Surface
 from univoxel.render.picture import preview
@@ -126,7 +127,9 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
                 joint.solve(scene, photos, stage, cfg.seed, progress)
             else:
                 grid = fit_grid(*box, capacity.voxels(stage, progress.chosen))
-                if scene.field.grid != grid:
+                if stage.field == "sparse" and not isinstance(scene.field, SparseField):
+                    scene.field = SparseField.around(scene.field, grid)
+                elif scene.field.grid != grid:
                     scene.field = scene.field.resized(grid)
                 if cfg.capacity == "adaptive":
                     stage = capacity.on_grid(stage, box, grid.voxel_size)
@@ -205,7 +208,12 @@ def run_stage(
             group["lr"] = rate * guard.scale
         scene.inv_s = 1 / (between(stage.sharpness, done) * field.voxel_size)
         if progress.step % REFRESH == 0:
+            before = field.sdf, field.features
             field.refresh()
+            optimizer.follow(before[0], field.sdf)
+            optimizer.follow(before[1], field.features)
+            if len(scratch) != len(field.sdf):
+                scratch = torch.zeros_like(field.sdf.data)
         if progress.step % RETRACE == 0 and not stage.refit:
             scene.surface_moved()
 
@@ -310,7 +318,7 @@ def encoded_radiance(scene: Scene, surface: Surface, batch: Batch) -> Tensor:
     return losses.encode(scene.exposed(srgb_to_linear(encoded), batch.view))
 
 
-def spread_gradient(field: DenseField, passes: int, scratch: Tensor) -> None:
+def spread_gradient(field: AbstractField, passes: int, scratch: Tensor) -> None:
     """Diffuse the sdf's gradient over the nodes that it touches, before Adam sees it.
 
     Adam steps of neighbours then agree: the surface moves in large pieces, far and without the
@@ -318,26 +326,26 @@ def spread_gradient(field: DenseField, passes: int, scratch: Tensor) -> None:
     Steps in Inverse Rendering of Geometry).
 
     Args:
-        scratch: [X, Y, Z] of zeros, which is left so.
+        scratch: zeros as the sdf, which are left so.
     """
     grad = field.sdf.grad
     assert grad is not None
     rows = rows_of(grad)
     scratch.view(-1)[rows] = grad._values()
     for _ in range(passes):
-        smooth_rows_(scratch[..., None], rows, SPREAD, order=1)
+        field.smooth_rows_(scratch, rows, SPREAD, order=1)
     grad._values().copy_(scratch.view(-1)[rows])
     scratch.view(-1)[rows] = 0
 
 
-def smooth(field: DenseField, stage: StageConfig) -> None:
+def smooth(field: AbstractField, stage: StageConfig) -> None:
     """Regularise the nodes that the step has touched, beside the optimiser and not inside it."""
     sdf, features = field.sdf, field.features
     assert sdf.grad is not None
     assert features.grad is not None
     plate, diffusion = stage.plate * SMOOTH_EVERY, stage.diffusion * SMOOTH_EVERY
-    smooth_rows_(sdf.data[..., None], rows_of(sdf.grad), plate, order=2)
-    smooth_rows_(features.data, rows_of(features.grad), diffusion, order=1)
+    field.smooth_rows_(sdf.data, rows_of(sdf.grad), plate, order=2)
+    field.smooth_rows_(features.data, rows_of(features.grad), diffusion, order=1)
 
 
 def split_pixels(distance: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,203 @@
+"""The sparse field: what the dense one is near its surface, and bricks that follow it."""
+
+import copy
+
+import pytest
+import torch
+from analytic import cameras_around
+from lopsided import lopsided
+from lopsided import sdf as lopsided_sdf
+
+from univoxel.fields.dense import DenseField
+from univoxel.fields.hull import GridShape, fit_grid
+from univoxel.fields.sparse import BAND, SparseField, pack_bricks, unpack_bricks
+from univoxel.optim import RowAdam
+from univoxel.render.pipeline import surface_of_view
+
+RADIUS = 0.5
+
+
+def sphere(n=40, channels=2, radius=RADIUS):
+    grid = GridShape((-0.7,) * 3, 1.4 / (n - 1), (n, n, n))
+    field = DenseField(grid, channels, grid.nodes().norm(dim=-1) - radius)
+    with torch.no_grad():
+        field.features.copy_(grid.nodes()[..., :channels])
+    return field
+
+
+def near_surface(count, distance, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=1)
+    return direction * (RADIUS + distance * (2 * torch.rand(count, 1, generator=g) - 1))
+
+
+@pytest.mark.parametrize("nodes", [40, 41, 80])
+def test_near_the_surface_it_is_the_dense_field(nodes):
+    dense, fine = sphere(), sphere(nodes).grid
+    wanted, field = dense.resized(fine), SparseField.around(dense, fine)
+    points = near_surface(2000, 1.5 * fine.voxel_size)  # a node 2.45 voxels away is not cut off
+    a, b = field.sample(points), wanted.sample(points)
+    for name in ("sdf", "gradient", "features"):
+        # `resample` places nodes in float32, `sample` in double
+        torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=0, atol=3e-5)
+    centre, corner = field.sample(torch.tensor([[0.0, 0.0, 0.0], [0.7, 0.7, 0.7]])).sdf
+    assert corner.item() == pytest.approx(BAND * fine.voxel_size)
+    assert centre.item() == pytest.approx(-BAND * fine.voxel_size)
+    # each side of the surface a band, and what of a brick is beyond it
+    thick = (2 * BAND + 7) * fine.voxel_size
+    stored = 64 * (field.count - 2) * fine.voxel_size**3
+    assert stored < thick * 4 * torch.pi * RADIUS**2
+
+
+def test_a_part_of_the_box_and_another_origin():
+    """Every brick of the other grid that the band meets is found, off the source's lattice."""
+    dense = sphere(33)
+    fine = GridShape((-0.71, 0.013, -0.63), 0.0137, (101, 51, 90))
+    field, wanted = SparseField.around(dense, fine), dense.resized(fine)
+    near = wanted.sdf.abs() < field.far - 1e-4
+    rows = field.bricks.grid_rows()
+    assert near.any()
+    assert (rows[near] >= 128).all()
+    torch.testing.assert_close(
+        field.sdf[rows], wanted.sdf.clamp(-field.far, field.far), rtol=0, atol=3e-5
+    )
+
+
+def images(scene, of_field):
+    scene = copy.copy(scene)
+    scene._modules = scene._modules | {"field": of_field}
+    scene.inv_s = 2 / of_field.voxel_size
+    surface, _ = surface_of_view(scene, cameras_around(2, size=96), 0)
+    return surface.albedo * surface.opacity[:, None]
+
+
+def psnr(a, b):
+    return -10 * (a - b).square().mean().log10().item()
+
+
+def test_conversion_keeps_the_picture():
+    """Dense to sparse, to finer and to finer still: less than 0.05 dB of 34."""
+    scene = lopsided(32**3)
+    lower, upper = scene.field.bounds()
+    finer, finest = (fit_grid(lower, upper, n**3) for n in (64, 128))
+    dense = scene.field.resized(finer)
+    before = images(scene, dense)
+    truth = (before + 0.02 * torch.randn(before.shape)).clamp(0, 1)
+    once = SparseField.around(scene.field, finer)
+    assert psnr(images(scene, once), truth) == pytest.approx(psnr(before, truth), abs=0.05)
+    twice, whole = once.resized(finest), dense.resized(finest)
+    before, after = images(scene, whole), images(scene, twice)
+    truth = (before + 0.02 * torch.randn(before.shape)).clamp(0, 1)
+    assert psnr(after, truth) == pytest.approx(psnr(before, truth), abs=0.05)
+    assert twice.sdf.numel() < 0.3 * whole.sdf.numel()
+
+
+def test_the_isosurface_is_the_dense_one():
+    dense = sphere(41)
+    field = SparseField.around(dense, dense.grid)
+    assert (field.bricks.table == 1).any()
+    for a, b in zip(field.isosurface(), dense.isosurface(), strict=True):
+        torch.testing.assert_close(a, b)
+    for a, b in zip(field.bounds(), dense.bounds(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_no_surface():
+    dense = DenseField(sphere(12).grid, 1, torch.ones(12, 12, 12))
+    field = SparseField.around(dense, dense.grid)
+    assert field.count == 2
+    with pytest.raises(ValueError, match="the field has no surface"):
+        field.isosurface()
+    field.refresh()
+    assert field.count == 2
+
+
+def test_bricks_follow_the_surface():
+    """A sphere that grows by 9 voxels, one between looks, always has its bricks."""
+    dense = sphere(64, radius=0.4)
+    field = SparseField.around(dense, dense.grid)
+    before, pool, distance = field.count, len(field.sdf), dense.grid.nodes().norm(dim=-1)
+    for step in range(1, 10):
+        wanted = distance - 0.4 - step * field.voxel_size
+        rows = field.bricks.grid_rows()
+        stored = rows >= 128
+        with torch.no_grad():
+            field.sdf[rows[stored]] = wanted[stored].clamp(-field.far, field.far)
+        field.refresh()
+        rows = field.bricks.grid_rows()
+        assert (rows[wanted.abs() < field.voxel_size] >= 128).all()
+        # What is carried on goes along the axes: the way round a corner is longer by a half
+        near = (wanted > 0) & (wanted < 2 * field.voxel_size)
+        error = field.sdf[rows] - wanted
+        assert error[near].abs().max() < 1.5 * field.voxel_size
+    assert field.count > before
+    assert len(field.sdf) > pool  # it grew beyond the room there was
+    assert len(field.features) == len(field.sdf) == 64 * len(field.bricks.place)
+
+
+def test_new_bricks_carry_distances_on():
+    """Past a plane that comes near the last stored brick."""
+    grid = GridShape((0.0, 0.0, 0.0), 1.0, (32, 8, 8))
+    x = torch.arange(32.0)[:, None, None].expand(32, 8, 8)
+    dense = DenseField(grid, 1, (x - 8.5).contiguous())
+    field = SparseField.around(dense, grid)
+    with torch.no_grad():
+        field.sdf[128 : 64 * field.count] -= 3  # the plane stands at x = 11.5
+    assert field.bricks.table[:, 0, 0].tolist() == [1, 2, 6, 10, 0, 0, 0, 0]
+    field.refresh()
+    assert (field.bricks.table[4] >= 2).all()
+    line = field.sdf[field.bricks.grid_rows()[:, 3, 3]]
+    # nodes 13 .. 15 were cut off at 4 before the plane moved by 3
+    wanted = torch.tensor([-1.5, -0.5, 0.5, 1.0, 1.0, 1.0, 2.0, 3.0, 4.0, 4.0])
+    torch.testing.assert_close(line[10:20], wanted)
+
+
+def test_the_optimiser_goes_on_when_bricks_come():
+    field = SparseField.around(sphere(48), sphere(48).grid)
+    optimizer = RowAdam([field.sdf, field.features], lr=1e-3)
+    points = near_surface(300, 0.02)
+    for _ in range(3):
+        optimizer.zero_grad()
+        sample = field.sample(points)
+        (sample.sdf.sum() + sample.features.square().sum()).backward()
+        optimizer.step()
+        moments = optimizer.state[field.sdf]["exp_avg"].clone()
+        with torch.no_grad():
+            field.sdf.view(-1, 64)[2 : field.count] -= 3 * field.voxel_size
+        before = field.sdf, field.features
+        field.refresh()
+        optimizer.follow(before[0], field.sdf)
+        optimizer.follow(before[1], field.features)
+    assert len(moments) < len(field.sdf)
+    optimizer.zero_grad()
+    field.sample(points).sdf.sum().backward()
+    optimizer.step()
+    state = optimizer.state[field.sdf]
+    assert state["step"] == 4
+    assert state["exp_avg"].shape == field.sdf.shape
+    touched = field.sdf.grad.coalesce().indices()[0]
+    still = torch.ones(len(moments), dtype=torch.bool)
+    still[touched[touched < len(moments)]] = False
+    assert torch.equal(state["exp_avg"][: len(moments)][still], moments[still])
+
+
+def test_bricks_pack_and_unpack():
+    field = SparseField.around(sphere(41), sphere(41).grid)
+    parts = pack_bricks(field)
+    bricks = unpack_bricks(parts["place"], parts["inside"], field.grid.size)
+    assert torch.equal(bricks.table, field.bricks.table)
+    assert len(bricks.place) == field.count
+    with pytest.raises((ValueError, IndexError)):
+        unpack_bricks(parts["place"], parts["inside"], (8, 8, 8))
+
+
+def test_rays_meet_the_same_surface_through_a_moved_scene():
+    """March and sample agree with the dense field on an object that is no sphere."""
+    scene = lopsided(48**3)
+    dense = scene.field
+    assert isinstance(dense, DenseField)
+    sparse = SparseField.around(dense, dense.grid)
+    a, b = images(scene, sparse), images(scene, dense)
+    assert psnr(a, b) > 55
+    nodes = dense.grid.nodes()
+    torch.testing.assert_close(dense.sdf.detach(), lopsided_sdf(nodes))

@@ -1,0 +1,244 @@
+"""Sampling of a sparse grid: against the dense one it stands for, sparse gradients, bad input."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from bricks import cut
+from check_op import check_op
+
+from univoxel.ops import sample_dense, sample_sparse, sample_sparse_reference, use_backend
+from univoxel.ops.sparse_grid import _sample_sparse, _sample_sparse_backward
+from univoxel.records import Bricks
+
+ORIGIN = [0.125, -0.25, 0.375]
+H = 0.25
+
+
+def case(shape=(9, 10, 11), channels=3, m=60, seed=0, margin=0.2, needs=(True, True, True)):
+    """A plane of random bumps through the grid, and points of which some fall outside it."""
+    g = torch.Generator().manual_seed(seed)
+    nodes = torch.stack(
+        torch.meshgrid(*[torch.arange(float(n)).double() for n in shape], indexing="ij"), -1
+    )
+    sdf = nodes @ torch.tensor([0.5, 0.4, 0.7]).double() - 0.25 * sum(shape)
+    sdf = sdf + 0.3 * torch.randn(shape, generator=g, dtype=torch.float64)
+    _, pool, bricks = cut(sdf, far=1.0)
+    features = torch.randn(len(pool), channels, generator=g, dtype=torch.float64)
+    features[:128] = 0
+    extent = (torch.tensor(shape) - 1) * H
+    points = torch.rand(m, 3, generator=g, dtype=torch.float64) * (1 + 2 * margin) - margin
+    # On a float32 lattice, so that both precisions see the same points.
+    points = (points * extent + torch.tensor(ORIGIN)).float().double()
+    leaves = [t.requires_grad_(n) for t, n in zip((pool, features, points), needs, strict=True)]
+    return (*leaves[:2], bricks, leaves[2], ORIGIN, H)
+
+
+def grads_of(op, arguments, seed=0, **options):
+    """Gradients of a random projection of the outputs."""
+    g = torch.Generator().manual_seed(seed)
+    outputs = op(*arguments, **options)
+    pulls = [torch.randn(o.shape, generator=g, dtype=torch.float64).to(o.dtype) for o in outputs]
+    leaves = [a for a in arguments if isinstance(a, torch.Tensor) and a.requires_grad]
+    pulled = [(o * p).sum() for o, p in zip(outputs, pulls, strict=True) if o.requires_grad]
+    return torch.autograd.grad(sum(pulled), leaves)
+
+
+def as_dense(pool, features, bricks, points, *place):
+    rows = bricks.grid_rows()
+    return pool[rows], features[rows], points, *place
+
+
+def split(arguments):
+    """The same with rows of missing bricks as arguments of their own, without gradient."""
+    pools = [a.detach() for a in arguments[:2]]
+    leaves = [p[128:].requires_grad_() for p in pools]
+    return (*[p[:128] for p in pools], *leaves, *arguments[2:])
+
+
+def joined(op):
+    """An op over what `split` gives: numerical differences see no more than backward does."""
+    return lambda sdf, features, *rest: op(
+        torch.cat([sdf, rest[0]]), torch.cat([features, rest[1]]), *rest[2:]
+    )
+
+
+def test_native_equals_reference():
+    cases = [
+        case((5, 6, 6), channels=2, m=20),
+        case((1, 1, 1), channels=1, m=5),
+        case((2, 1, 9), channels=0, m=10),
+        case((4, 4, 3), channels=16, m=3),
+        case((5, 4, 4), channels=1, m=5, margin=30.0),
+        case((5, 4, 4), channels=1, m=0),
+    ]
+    check_op(joined(sample_sparse), joined(sample_sparse_reference), [split(c) for c in cases])
+
+
+@pytest.mark.parametrize("shape", [(40, 35, 70), (17, 9, 10), (9, 33, 4)])
+def test_the_same_as_the_dense_grid_it_stands_for(shape):
+    """Several slabs, chunks and threads; gradients of missing nodes are 0."""
+    arguments = case(shape, channels=8, m=5000)
+    assert (arguments[2].table < 2).any()
+    dense = [t.detach().requires_grad_() if isinstance(t, torch.Tensor) else t
+             for t in as_dense(*arguments)]  # fmt: skip
+    for a, b in zip(sample_sparse(*arguments), sample_dense(*dense), strict=True):
+        torch.testing.assert_close(a, b)
+    wanted, rows = grads_of(sample_dense, dense), arguments[2].grid_rows()
+    stored = rows >= 128
+    threads = torch.get_num_threads()
+    for sparse in (False, True):
+        got = []
+        for n in (1, 2, 3):
+            torch.set_num_threads(n)
+            grads = grads_of(sample_sparse, arguments, sparse_grad=sparse)
+            got.append([g.to_dense() for g in grads])
+        torch.set_num_threads(threads)
+        assert not got[0][0][:128].any()
+        assert not got[0][1][:128].any()
+        for k in (0, 1):
+            torch.testing.assert_close(got[0][k][rows][stored], wanted[k][stored])
+        torch.testing.assert_close(got[0][2], wanted[2])
+        for a, b, c in zip(*got, strict=True):
+            assert torch.equal(a, b)
+            assert torch.equal(a, c)
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_sparse_gradient_is_the_dense_one(backend):
+    arguments = case((20, 11, 40), channels=4, m=30)
+    with use_backend(backend):
+        dense = grads_of(sample_sparse, arguments)
+        sparse = grads_of(sample_sparse, arguments, sparse_grad=True)
+    for g, d, dims in zip(sparse[:2], dense[:2], (0, 1), strict=True):
+        assert g.is_sparse
+        assert g.is_coalesced()
+        assert (g.sparse_dim(), g.dense_dim()) == (1, dims)
+        checked = torch.sparse_coo_tensor(g.indices(), g.values(), g.shape, check_invariants=True)
+        assert torch.equal(checked.coalesce().indices(), g.indices()), "rows double or unsorted"
+        torch.testing.assert_close(g.to_dense(), d)
+        assert (g.indices() >= 128).all()
+    assert torch.equal(sparse[2], dense[2])
+
+
+def test_sparse_rows_are_the_touched_ones():
+    """One point in the middle: 8 rows of features, 32 of the sdf."""
+    _, pool, bricks = cut(torch.linspace(-0.5, 0.5, 30)[:, None, None].expand(30, 30, 30), 1.0)
+    pool, features = pool.requires_grad_(), torch.zeros(len(pool), 2, requires_grad=True)
+    points = torch.tensor([[15.5, 7.5, 11.5]])  # across three borders of bricks
+    arguments = (pool, features, bricks, points, (0, 0, 0), 1.0)
+    g_sdf, g_features = grads_of(sample_sparse, arguments, sparse_grad=True)
+    assert g_sdf._nnz() == 32
+    nodes = torch.tensor([[x, y, z] for x in (15, 16) for y in (7, 8) for z in (11, 12)])
+    assert set(bricks.rows(nodes).tolist()) == set(g_features.indices()[0].tolist())
+
+
+def test_a_missing_node_is_far_and_without_features():
+    """Deep outside, inside, and where a sample meets both a stored and a missing brick."""
+    x = torch.arange(20.0)[:, None, None].expand(20, 4, 4)
+    _, pool, bricks = cut(x - 9.5, far=1.0)  # bricks 2 (nodes 8 .. 11) alone is stored
+    assert (bricks.table >= 2).sum() == 1
+    features = torch.ones(len(pool), 1)
+    features[:128] = 0
+    points = torch.tensor([[15.0, 1.0, 1.0], [2.0, 1.0, 1.0], [11.25, 1.0, 1.0]])
+    value, gradient, feature = sample_sparse(pool, features, bricks, points, (0, 0, 0), 1.0)
+    assert value.tolist() == [1.0, -1.0, 1.0]
+    assert not gradient[:2].any()
+    assert feature[:, 0].tolist() == [0.0, 0.0, 0.75]
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_nan_and_infinite_points(backend):
+    pool, features, bricks, points, *place = case(m=50)
+    with torch.no_grad():
+        points[3, 1], points[7] = torch.nan, torch.nan
+        points[9, 0], points[11] = torch.inf, -torch.inf
+    with use_backend(backend):
+        outputs = sample_sparse(pool, features, bricks, points, *place)
+        grads = grads_of(sample_sparse, (pool, features, bricks, points, *place))
+    for o in outputs:
+        assert o.reshape(50, -1).isnan().all(1).nonzero()[:, 0].tolist() == [3, 7]
+    assert all(g.isfinite().all() for g in grads)
+
+
+@pytest.mark.parametrize("needed", range(3))
+def test_gradient_of_one_argument(needed):
+    arguments = case(needs=[i == needed for i in range(3)])
+    (wanted,) = grads_of(sample_sparse_reference, arguments)
+    for sparse in (False, True):
+        (got,) = grads_of(sample_sparse, arguments, sparse_grad=sparse)
+        torch.testing.assert_close(got.to_dense(), wanted)
+
+
+def test_opcheck():
+    pool, features, bricks, points, *place = case((5, 4, 4))
+    place = (list(bricks.size), *place)
+    torch.library.opcheck(_sample_sparse, (pool, features, bricks.table, points, *place, False))
+    pool, features, points = (a.detach() for a in (pool, features, points))
+    *pulls, order = _sample_sparse(pool, features, bricks.table, points, *place, False)
+    for needs in ([True, True, True], [True, False, False]):
+        torch.library.opcheck(
+            _sample_sparse_backward,
+            (pool, features, bricks.table, points, order, *pulls, *place, needs),
+        )
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"sdf": [0.5]}, TypeError, "sdf must be a tensor, got list"),
+        ({"sdf": torch.rand(64)}, ValueError, r"sdf must be \[256\]"),
+        ({"features": torch.rand(256)}, ValueError, r"features must be \[256, C\]"),
+        ({"bricks": None}, TypeError, "bricks must be Bricks, got NoneType"),
+        ({"points": torch.rand(7, 2)}, ValueError, r"points must be \[M, 3\]"),
+        ({"points": torch.rand(7, 3).double()}, ValueError, "points must be .* float32"),
+        ({"points": torch.rand(1, 3).expand(2**31, 3)}, ValueError, r"fewer than 2\^31"),
+        ({"origin": (0.0, 1.0)}, ValueError, "origin must be 3 finite numbers, got"),
+        ({"voxel_size": 0.0}, ValueError, "voxel_size must be above 0, got 0.0"),
+        (
+            {"bricks": Bricks(torch.zeros(0, 1, 1).int(), torch.full((4,), -1).int(), (0, 4, 4))},
+            ValueError,
+            r"bricks must have nodes, got size \[0, 4, 4\]",
+        ),
+    ],
+)
+def test_bad_arguments(change, error, message):
+    arguments = {
+        "sdf": torch.rand(256),
+        "features": torch.rand(256, 2),
+        "bricks": BRICKS,
+        "points": torch.rand(7, 3),
+        "origin": (0.0, 0.0, 0.0),
+        "voxel_size": 0.5,
+    }
+    sample_sparse(**arguments)
+    with pytest.raises(error, match=message):
+        sample_sparse(**(arguments | change))
+
+
+BRICKS = Bricks(
+    torch.tensor([[[0, 2], [3, 1]]]).int(), torch.tensor([-1, -1, 1, 2]).int(), (3, 8, 5)
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"table": BRICKS.table.long()}, r"table must be \[1, 2, 2\] int32"),
+        ({"size": (5, 8, 5)}, r"table must be \[2, 2, 2\] int32 for size \[5, 8, 5\], got"),
+        ({"place": torch.zeros(1).int()}, r"place must be \[2\] int32"),
+        ({"table": torch.tensor([[[0, 2], [4, 1]]]).int()}, "table must hold each of 4 bricks"),
+        ({"table": torch.tensor([[[0, 2], [2, 1]]]).int()}, "table must hold each of 4 bricks"),
+        ({"table": torch.tensor([[[-1, 2], [3, 1]]]).int()}, "table must hold each of 4 bricks"),
+        ({"place": torch.tensor([-1, -1, 2, 1]).int()}, "table must hold each of 4 bricks"),
+    ],
+)
+def test_bricks_that_do_not_fit(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(BRICKS, **change)
+
+
+def test_rows_and_corners():
+    assert BRICKS.corners(torch.tensor([2, 3])).tolist() == [[0, 0, 4], [0, 4, 0]]
+    assert BRICKS.rows(torch.tensor([[2, 7, 1], [0, 0, 0]])).tolist() == [3 * 64 + 32 + 12 + 1, 0]
+    assert BRICKS.grid_rows().shape == (3, 8, 5)

@@ -1,0 +1,245 @@
+"""A sparse grid: the nodes of bricks around the surface, and a far distance everywhere else."""
+
+from __future__ import annotations
+
+import torch
+from skimage.measure import marching_cubes
+from torch import Tensor, nn
+
+from univoxel.fields.base import AbstractField
+from univoxel.fields.hull import GridShape
+from univoxel.ops import brick_minimum, march, sample_sparse, smooth_rows_
+from univoxel.records import Bricks, FieldSample, Rays, Samples
+
+BAND = 4.0  # voxels from the surface at which the sdf is cut off: 8 s at a sharpness of 0.5 voxels
+SPARE = 0.05  # share of the bricks that may come without moving the others in memory
+BRICKS_AT_ONCE = 4096
+
+
+class SparseField(AbstractField):
+    """SDF [R] and features [R, C] as parameters, R the rows of `bricks`.
+
+    The sdf is cut off at BAND voxels; bricks in which it is so everywhere are missing. Memory and
+    time grow with the surface. `refresh` adds bricks where the surface comes near.
+    """
+
+    def __init__(self, grid: GridShape, channels: int, bricks: Bricks):
+        super().__init__()
+        self.grid, self.channels, self.voxel_size = grid, channels, grid.voxel_size
+        self.bricks = bricks
+        rows = Bricks.NODES * len(bricks.place)
+        self.sdf = nn.Parameter(torch.full((rows,), self.far))
+        self.features = nn.Parameter(torch.zeros(rows, channels))
+        self.sdf.data[Bricks.NODES : 2 * Bricks.NODES] = -self.far
+        self._brick_min: Tensor | None = None
+
+    @property
+    def far(self) -> float:
+        """Distance beyond which nothing is stored, world units."""
+        return BAND * self.voxel_size
+
+    @property
+    def count(self) -> int:
+        """Bricks that are in use: the first ones."""
+        return Bricks.MISSING + int((self.bricks.place >= 0).sum())
+
+    @classmethod
+    @torch.no_grad()
+    def around(cls, source: AbstractField, grid: GridShape) -> SparseField:
+        """What another field is near its surface, on another grid."""
+        far = BAND * grid.voxel_size
+        shape = [-(-n // Bricks.SIDE) for n in grid.size]
+        near = _overlapped(source, grid, far).flatten()
+        origin = torch.tensor(grid.origin, dtype=torch.float64)
+        inside = torch.cartesian_prod(*[torch.arange(Bricks.SIDE)] * 3)
+
+        def nodes(flat: Tensor, of_brick: Tensor = inside) -> Tensor:
+            """World positions of nodes [K] of bricks [N]: [N K, 3]."""
+            node = torch.stack(torch.unravel_index(flat, tuple(shape)), -1) * Bricks.SIDE
+            node = (node[:, None] + of_brick).reshape(-1, 3)
+            return (origin + grid.voxel_size * node.double()).float()
+
+        stored = [
+            part[(source.sample(nodes(part)).sdf.view(-1, Bricks.NODES).abs() < far).any(1)]
+            for part in near.nonzero()[:, 0].split(BRICKS_AT_ONCE)
+        ]
+        stored = torch.cat(stored) if stored else near.nonzero()[:, 0]
+        table = torch.empty(len(near), dtype=torch.int32)
+        for part in torch.arange(len(near)).split(Bricks.NODES * BRICKS_AT_ONCE):
+            table[part] = (source.sample(nodes(part, inside[:1])).sdf < 0).int()
+        table[stored] = Bricks.MISSING + torch.arange(len(stored), dtype=torch.int32)
+        used = Bricks.MISSING + len(stored)
+        place = torch.full((round((1 + SPARE) * used),), -1, dtype=torch.int32)
+        place[Bricks.MISSING : used] = stored.int()
+
+        field = cls(grid, source.channels, Bricks(table.view(shape), place, grid.size))
+        begin = Bricks.MISSING * Bricks.NODES
+        for part in stored.split(BRICKS_AT_ONCE):
+            sample, end = source.sample(nodes(part)), begin + len(part) * Bricks.NODES
+            field.sdf[begin:end] = sample.sdf.clamp(-far, far)
+            field.features[begin:end] = sample.features
+            begin = end
+        return field
+
+    def sample(self, points: Tensor) -> FieldSample:
+        return FieldSample(
+            *sample_sparse(
+                self.sdf,
+                self.features,
+                self.bricks,
+                points,
+                self.grid.origin,
+                self.voxel_size,
+                sparse_grad=True,
+            )
+        )
+
+    def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
+        if self._brick_min is None:
+            self._brick_min = brick_minimum(self.sdf.detach(), self.bricks)
+        return march(
+            self.sdf.detach(),
+            self._brick_min,
+            rays.origin,
+            rays.direction,
+            jitter,
+            self.grid.origin,
+            self.voxel_size,
+            step=self.voxel_size,
+            inv_s=inv_s,
+            bricks=self.bricks,
+        )
+
+    @torch.no_grad()
+    def refresh(self) -> None:
+        self._grow()
+        self._brick_min = brick_minimum(self.sdf.detach(), self.bricks)
+
+    def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
+        smooth_rows_(values.view(len(values), -1), rows, amount, order, self.bricks)
+
+    def blocks(self, far: float) -> Tensor:
+        stored = torch.nn.functional.pad(self.bricks.table >= Bricks.MISSING, (0, 1) * 3)
+        for axis in range(3):  # nodes at the upper faces of a block are the next one's
+            n = stored.shape[axis] - 1
+            stored = stored.narrow(axis, 0, n) | stored.narrow(axis, 1, n)
+        return stored
+
+    def isosurface(self) -> tuple[Tensor, Tensor]:
+        table, size = self.bricks.table.long(), self.grid.size
+        pool = self.sdf.detach().view(-1, *[Bricks.SIDE] * 3)
+        low, high = pool.min(), pool.max()
+        if self.count == Bricks.MISSING or not low < 0 < high:
+            raise ValueError("the field has no surface: its sdf does not change sign")
+        sdf = torch.empty(size)
+        for a, plane in enumerate(table):
+            part = pool[plane].permute(2, 0, 3, 1, 4).flatten(3, 4).flatten(1, 2)
+            part = part[:, : size[1], : size[2]]
+            sdf[Bricks.SIDE * a : Bricks.SIDE * (a + 1)] = part[: size[0] - Bricks.SIDE * a]
+        vertices, faces, _, _ = marching_cubes(sdf.numpy(), 0.0, gradient_direction="descent")
+        world = torch.tensor(self.grid.origin) + self.voxel_size * torch.from_numpy(vertices.copy())
+        return world.float(), torch.from_numpy(faces.astype("int32"))
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        return self.grid.bounds()
+
+    def resized(self, grid: GridShape) -> SparseField:
+        return SparseField.around(self, grid)
+
+    def _grow(self) -> None:
+        """Store every brick beside one that the surface comes within a voxel of."""
+        bricks, count = self.bricks, self.count
+        low, high = torch.aminmax(self.sdf.detach()[: count * Bricks.NODES].view(count, -1), dim=1)
+        met = (low < self.voxel_size) & (high > -self.voxel_size)
+        met[: Bricks.MISSING] = False
+        beside = torch.cartesian_prod(*[torch.arange(-1, 2)] * 3)
+        shape = torch.tensor(bricks.table.shape)
+        at = (bricks.corners(met.nonzero()[:, 0])[:, None] // Bricks.SIDE + beside).reshape(-1, 3)
+        at = torch.minimum(at.clamp_min(0), shape - 1)
+        flat = (at[:, 0] * shape[1] + at[:, 1]) * shape[2] + at[:, 2]
+        new = flat[bricks.table.flatten()[flat] < Bricks.MISSING].unique()
+        if not len(new):
+            return
+        table, place = bricks.table.flatten().clone(), bricks.place
+        short = count + len(new) - len(place)
+        if short > 0:  # make room, and some more
+            short += round(SPARE * len(place))
+            place = torch.cat([place, place.new_full((short,), -1)])
+            more = short * Bricks.NODES
+            sdf, features = self.sdf.detach(), self.features.detach()
+            sdf = torch.cat([sdf, sdf.new_full((more,), self.far)])
+            features = torch.cat([features, features.new_zeros(more, self.channels)])
+            self.sdf = nn.Parameter(sdf, self.sdf.requires_grad)
+            self.features = nn.Parameter(features, self.features.requires_grad)
+        else:
+            place = place.clone()
+        sign = 1 - 2 * table[new].float()  # before there was a brick
+        number = torch.arange(count, count + len(new))
+        table[new], place[number] = number.int(), new.int()
+        self.bricks = Bricks(table.view(bricks.table.shape), place, bricks.size)
+        rows = (Bricks.NODES * number[:, None] + torch.arange(Bricks.NODES)).flatten()
+        self.sdf[rows] = self.far * sign.repeat_interleave(Bricks.NODES)
+        self._extend(number, sign)
+
+    def _extend(self, number: Tensor, sign: Tensor) -> None:
+        """Carry distances on into new bricks [N], whose nodes have lain at sign [N] times far."""
+        around = torch.cartesian_prod(*[torch.arange(-1, Bricks.SIDE + 1)] * 3)
+        node = self.bricks.corners(number)[:, None] + around
+        node = torch.minimum(node.clamp_min(0), torch.tensor(self.grid.size) - 1)
+        # In front of the surface seen from here: what is across it is below 0
+        ahead = sign[:, None] * self.sdf.detach()[self.bricks.rows(node)]
+        ahead = ahead.view(-1, *[Bricks.SIDE + 2] * 3)
+        within = ahead[:, 1:-1, 1:-1, 1:-1]
+        for _ in range(Bricks.SIDE):  # a voxel at a time
+            for axis in range(1, 4):
+                for begin in (0, 2):
+                    beside = ahead.narrow(axis, begin, Bricks.SIDE)
+                    for other in {1, 2, 3} - {axis}:
+                        beside = beside.narrow(other, 1, Bricks.SIDE)
+                    torch.minimum(within, beside + self.voxel_size, out=within)
+        found = sign[:, None] * within.reshape(len(number), -1)
+        self.sdf.view(-1, Bricks.NODES)[number] = found
+
+
+def _overlapped(source: AbstractField, grid: GridShape, far: float) -> Tensor:
+    """Which bricks of a grid meet blocks of the source that have something nearer than far."""
+    near = source.blocks(far)
+    for axis in range(3):
+        brick = torch.arange(-(-grid.size[axis] // Bricks.SIDE)) * Bricks.SIDE
+        start = (grid.origin[axis] - source.grid.origin[axis]) / source.voxel_size
+        scale = grid.voxel_size / source.voxel_size
+        last = near.shape[axis] - 1
+        low, high = (
+            ((start + scale * (brick + by)) / Bricks.SIDE).floor().long().clamp(0, last)
+            for by in (-0.01, Bricks.SIDE - 0.99)  # rounding may not lose a neighbour
+        )
+        count = torch.nn.functional.pad(
+            near.movedim(axis, -1).to(torch.int32).cumsum(-1, dtype=torch.int32), (1, 0)
+        )
+        near = (count[..., high + 1] > count[..., low]).movedim(-1, axis)
+    return near
+
+
+def pack_bricks(field: SparseField) -> dict[str, Tensor]:
+    """What of a field's bricks a file needs: where they stand, and bits of what is inside."""
+    inside = (field.bricks.table == 1).flatten()
+    bits = torch.nn.functional.pad(inside, (0, -len(inside) % 8)).view(-1, 8).to(torch.uint8)
+    weights = 2 ** torch.arange(8, dtype=torch.uint8)
+    return {
+        "place": field.bricks.place[: field.count].clone(),
+        "inside": (bits * weights).sum(1, dtype=torch.uint8),
+    }
+
+
+def unpack_bricks(place: Tensor, inside: Tensor, size: tuple[int, int, int]) -> Bricks:
+    """The bricks that `pack_bricks` told of.
+
+    Raises:
+        ValueError, IndexError: they do not fit a grid of this size.
+    """
+    shape = [-(-n // Bricks.SIDE) for n in size]
+    bits = inside[:, None] >> torch.arange(8, dtype=torch.uint8) & 1
+    table = bits.flatten()[: shape[0] * shape[1] * shape[2]].to(torch.int32)
+    stored = place[Bricks.MISSING :].long()
+    table[stored] = Bricks.MISSING + torch.arange(len(stored), dtype=torch.int32)
+    return Bricks(table.view(shape), place, size)
