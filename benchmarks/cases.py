@@ -94,6 +94,28 @@ def sample_dense(resolution: int, channels: int = 16) -> Case:
     )
 
 
+def encode_hash(levels: int = 8, rows: int = 2**17, features: int = 2) -> Case:
+    g = torch.Generator().manual_seed(0)
+    table = torch.randn(levels * rows, features, generator=g).requires_grad_()
+    points = _points_on_rays(g)
+    finest, coarsest = 1 / 160, 1 / 16
+    sizes = [coarsest * (finest / coarsest) ** (i / (levels - 1)) for i in range(levels)]
+
+    def ours(*arguments):
+        return ops.encode_hash(*arguments, sparse_grad=True)
+
+    m = len(points)
+    return Case(
+        "encode_hash",
+        f"{m:,} points, {levels} levels of {rows:,} rows of {features}",
+        ours,
+        ops.encode_hash_reference,
+        (table, points, (0.0,) * 3, (1.0,) * 3, sizes),
+        # eight rows a level read forward and added to backward
+        {"fma": 2.0 * 2 * 8 * m * levels * features},
+    )
+
+
 def shade_sg() -> Case:
     g = torch.Generator().manual_seed(0)
 
@@ -300,6 +322,7 @@ CASES: list[tuple[str, Callable[[], Case]]] = [
     ("composite", composite),
     ("sample_dense", lambda: sample_dense(160)),
     ("sample_dense", lambda: sample_dense(256)),
+    ("encode_hash", encode_hash),
     ("shade_sg", shade_sg),
     ("mlp", lambda: mlp(65_536, 28, 128, 128, 4)),
     ("mlp", lambda: mlp(4096, 8, 64, 64, 4)),

@@ -25,6 +25,7 @@ inline void require(bool ok, const std::string& message) {
 /// Add the functions of one family to the module; each in a file of its own.
 void bind_composite_ops(py::module_& m);
 void bind_dense_grid_ops(py::module_& m);
+void bind_hash_grid_ops(py::module_& m);
 void bind_march_ops(py::module_& m);
 void bind_mlp_ops(py::module_& m);
 void bind_rows_ops(py::module_& m);

@@ -80,6 +80,23 @@ def test_sample_dense_is_finite(seed, shape, n_channels, n_points, sparse):
 
 
 @few
+@given(seeds, st.integers(0, 30), st.integers(1, 4), st.booleans())
+def test_encode_hash_is_finite(seed, n_points, n_features, sparse):
+    g = torch.Generator().manual_seed(seed)
+    table = pick(g, WILD, 2 * 32, n_features).requires_grad_()
+    points = pick(g, (*WILD, math.inf, -math.inf, 2.0, 3.0), n_points, 3).requires_grad_()
+    place = ((-0.5, 0.0, 1e-3), (2.5, 3.0, 3.0), (1.0, 0.3))
+
+    def op(*arguments):
+        return ops.encode_hash(*arguments, *place, sparse_grad=sparse)
+
+    def reference(*arguments):
+        return ops.encode_hash_reference(*arguments, *place)
+
+    check_finite(op, reference, (table, points))
+
+
+@few
 @given(seeds, st.integers(0, 29), st.integers(0, 2), st.booleans())
 def test_sample_dense_keeps_nan_at_its_point(seed, lost, axis, sparse):
     def op(sdf, features, points):

@@ -3,6 +3,7 @@
 from univoxel.ops.adam import adam_rows_, adam_rows_reference_
 from univoxel.ops.composite import composite, composite_reference
 from univoxel.ops.dense_grid import sample_dense, sample_dense_reference
+from univoxel.ops.hash_grid import encode_hash, encode_hash_reference
 from univoxel.ops.integrator import EnvTables, Lamp, Sun, relight
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.mlp import mlp, mlp_reference
@@ -30,6 +31,8 @@ __all__ = [
     "closest_hit_reference",
     "composite",
     "composite_reference",
+    "encode_hash",
+    "encode_hash_reference",
     "march",
     "march_reference",
     "mlp",

@@ -1,0 +1,191 @@
+"""Hash encoding: native against reference, definitions, sparse gradients, bad input."""
+
+import pytest
+import torch
+from check_op import check_op
+
+from univoxel.ops import encode_hash, encode_hash_reference, use_backend
+from univoxel.ops.hash_grid import _encode_hash, _encode_hash_backward, lattice_sizes
+
+LOWER, UPPER = [0.125, -0.25, 0.375], [1.125, 0.5, 1.875]
+
+
+def case(voxel_sizes=(0.5, 0.2), rows=32, features=2, m=30, seed=0, needs=(True, True)):
+    """A random table, and points of which some fall outside the box."""
+    g = torch.Generator().manual_seed(seed)
+    table = torch.randn(len(voxel_sizes) * rows, features, generator=g, dtype=torch.float64)
+    lower, upper = torch.tensor(LOWER), torch.tensor(UPPER)
+    points = lower + (upper - lower) * (1.4 * torch.rand(m, 3, generator=g) - 0.2)
+    # On a float32 lattice, so that both precisions see the same points.
+    leaves = [t.requires_grad_(n) for t, n in zip((table, points.double()), needs, strict=True)]
+    return (*leaves, LOWER, UPPER, list(voxel_sizes))
+
+
+def grads_of(arguments, **options):
+    """Gradients of a random projection of the output."""
+    out = encode_hash(*arguments, **options)
+    pull = torch.randn(out.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    leaves = [a for a in arguments[:2] if a.requires_grad]
+    return torch.autograd.grad((out * pull.to(out.dtype)).sum(), leaves)
+
+
+def test_native_equals_reference():
+    check_op(
+        encode_hash,
+        encode_hash_reference,
+        [
+            case(),
+            case((0.3,), rows=512, features=4),  # every node has a row of its own
+            case((0.9, 0.4, 0.15), rows=2, features=3),  # many nodes share one
+            case((5.0,), rows=8, features=1),  # one cell
+            case(needs=(True, False)),
+            case(m=0),
+        ],
+    )
+
+
+def test_many_points_and_levels():
+    # Several chunks and a team of threads. Gradcheck would take minutes.
+    arguments = case((0.5, 0.2, 0.1, 0.03), rows=256, m=5000)
+    torch.testing.assert_close(encode_hash(*arguments), encode_hash_reference(*arguments))
+    with use_backend("reference"):
+        wanted = grads_of(arguments)
+    threads = torch.get_num_threads()
+    for sparse in (False, True):
+        got = []
+        for n in (1, 2, 3):
+            torch.set_num_threads(n)
+            got.append([g.to_dense() for g in grads_of(arguments, sparse_grad=sparse)])
+        torch.set_num_threads(threads)
+        for a, b, c, d in zip(*got, wanted, strict=True):
+            torch.testing.assert_close(a, d)
+            assert torch.equal(a, b)
+            assert torch.equal(a, c)
+
+
+def test_a_level_that_fits_is_a_dense_grid():
+    """Its value is torch's own trilinear lookup, clamped to the border."""
+    h, rows = 0.25, 512
+    table, points, *_ = case((h,), rows=rows, features=3, m=200)
+    shape = lattice_sizes(LOWER, UPPER, [h])[0]
+    assert shape == [5, 4, 7]
+    grid = table[: 5 * 4 * 7].view(5, 4, 7, 3).permute(3, 0, 1, 2)[None].detach()
+    low, high = torch.tensor(LOWER).double(), torch.tensor(UPPER).double()
+    at = ((points - low) / (high - low) * 2 - 1).flip(-1)[None, None, None].detach()
+    wanted = torch.nn.functional.grid_sample(
+        grid, at, align_corners=True, padding_mode="border"
+    ).flatten(1)[:3]
+    got = encode_hash(table, points, LOWER, UPPER, [h])
+    torch.testing.assert_close(got, wanted.view(3, -1).T)
+
+
+def test_hash_of_a_node():
+    """A point on a node reads the row that the formula names."""
+    table = torch.arange(16.0)[:, None]
+    node = (3, 5, 2)
+    row = (node[0] ^ node[1] * 2654435761 ^ node[2] * 805459861) % 16
+    point = torch.tensor([node], dtype=torch.float32)
+    assert encode_hash(table, point, [0] * 3, [9] * 3, [1.0]).item() == row
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_sparse_gradient_is_the_dense_one(backend):
+    arguments = case((0.5, 0.05), rows=4096, m=20)
+    with use_backend(backend):
+        dense, sparse = grads_of(arguments), grads_of(arguments, sparse_grad=True)
+    g = sparse[0]
+    assert g.is_sparse
+    assert g.is_coalesced()
+    assert (g.sparse_dim(), g.dense_dim()) == (1, 1)
+    rows = g.indices()[0]
+    assert (rows[1:] > rows[:-1]).all()
+    assert g._nnz() <= 2 * 8 * 20
+    assert torch.equal(g.to_dense(), dense[0])
+    assert torch.equal(sparse[1], dense[1])
+
+
+@pytest.mark.parametrize("needed", range(2))
+def test_gradient_of_one_argument(needed):
+    arguments = case(needs=[i == needed for i in range(2)])
+    with use_backend("reference"):
+        (wanted,) = grads_of(arguments)
+    for sparse in (False, True):
+        (got,) = grads_of(arguments, sparse_grad=sparse)
+        assert got.is_sparse is (sparse and needed == 0)
+        torch.testing.assert_close(got.to_dense(), wanted)
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+@pytest.mark.parametrize("sparse", [False, True])
+def test_nan_and_infinite_points(backend, sparse):
+    arguments = case(m=12)
+    with torch.no_grad():
+        arguments[1][3, 1], arguments[1][7] = torch.nan, torch.nan
+        arguments[1][9, 0], arguments[1][11] = torch.inf, -torch.inf
+    with use_backend(backend):
+        out = encode_hash(*arguments)
+        table, points = grads_of(arguments, sparse_grad=sparse)
+    lost = torch.zeros(12, dtype=torch.bool)
+    lost[[3, 7]] = True
+    assert torch.equal(out.isnan().all(1), lost)
+    assert torch.equal(out.isnan().any(1), lost)
+    assert table.to_dense().isfinite().all()
+    assert points.isfinite().all()
+    assert not points[[3, 7, 11]].any()
+
+
+def test_opcheck():
+    arguments = case((0.5,), rows=8, m=5)
+    torch.library.opcheck(_encode_hash, (*arguments, False))
+    table, points = (a.detach() for a in arguments[:2])
+    pull = _encode_hash(table, points, *arguments[2:], False)
+    for needs in ([True, True], [False, True]):
+        torch.library.opcheck(_encode_hash_backward, (table, points, pull, *arguments[2:], needs))
+
+
+def test_whole_graph_compiles():
+    arguments = case(needs=(True, False))
+
+    @torch.compile(fullgraph=True)
+    def loss(table):
+        return encode_hash(table, *arguments[1:]).square().sum()
+
+    loss(arguments[0]).backward()
+    wanted = torch.autograd.grad(encode_hash_reference(*arguments).square().sum(), arguments[0])
+    torch.testing.assert_close(arguments[0].grad, wanted[0])
+
+
+def test_second_order_raises():
+    arguments = case()
+    out = encode_hash(*arguments)
+    (first,) = torch.autograd.grad(out.square().sum(), arguments[1], create_graph=True)
+    with pytest.raises(RuntimeError, match=r"does not require grad|no autograd"):
+        first.sum().backward()
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"table": [0.5]}, TypeError, "table must be a tensor, got list"),
+        ({"table": torch.rand(63, 2)}, ValueError, "power of two rows for each of 2 levels"),
+        ({"table": torch.rand(24, 2)}, ValueError, "power of two rows .* got 24 in all"),
+        ({"table": torch.rand(0, 2)}, ValueError, "power of two rows .* got 0 in all"),
+        ({"points": torch.rand(7, 2)}, ValueError, r"points must be \[M, 3\]"),
+        ({"points": torch.rand(7, 3).double()}, ValueError, "points must be .* float32"),
+        ({"lower": (0.0, 1.0)}, ValueError, "lower must be 3 finite numbers"),
+        ({"upper": (0.0, 1.0, float("nan"))}, ValueError, "upper must be 3 finite numbers"),
+        ({"lower": (9.0, 0.0, 0.0)}, ValueError, "lower must be at most upper"),
+        ({"voxel_sizes": ()}, ValueError, "voxel_sizes must be numbers above 0, at least one"),
+        ({"voxel_sizes": (0.5, 0.0)}, ValueError, "voxel_sizes must be numbers above 0"),
+    ],
+)
+def test_bad_arguments(change, error, message):
+    arguments = {
+        "table": torch.rand(64, 2),
+        "points": torch.rand(7, 3),
+        "lower": LOWER,
+        "upper": UPPER,
+        "voxel_sizes": (0.5, 0.2),
+    }
+    with pytest.raises(error, match=message):
+        encode_hash(**(arguments | change))

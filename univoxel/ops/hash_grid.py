@@ -1,0 +1,254 @@
+"""Multiresolution hash encoding: features at points from small tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from univoxel.ops import native
+from univoxel.ops.checks import check
+
+PRIMES = (1, 2654435761, 805459861)
+
+
+def encode_hash(
+    table: Tensor,  # [L * R, F]
+    points: Tensor,  # [M, 3]
+    lower: Sequence[float],
+    upper: Sequence[float],
+    voxel_sizes: Sequence[float],
+    sparse_grad: bool = False,
+) -> Tensor:
+    """Encode points of a box by L lattices whose nodes share tables of R rows.
+
+    Level l has nodes at lower + voxel_sizes[l] * (i, j, k) up to the first at or beyond upper along
+    each axis. Where they are at most R, each node has a row of its own, z fastest; otherwise its
+    row is
+
+        (i xor 2654435761 j xor 805459861 k) mod R
+
+    and nodes may share one: which of them the row serves is up to what is learned. A level's
+    output is the trilinear interpolant of the rows of the eight nodes around the point.
+
+    A point outside is first moved to the nearest point of the level's border; along an axis on
+    which it moved, derivatives to the point are 0. A NaN point yields NaN and contributes to no
+    gradient.
+
+    Args:
+        table: [L * R, F] level after level; R a power of two, at most 2^31.
+        points: [M, 3] world.
+        lower, upper: corners of the box, world: 3 finite numbers each, lower at most upper.
+        voxel_sizes: L distances of nodes, world units, above 0.
+        sparse_grad: the gradient of table comes back as a coalesced ``sparse_coo`` tensor that
+            holds only the rows some point touched: what ``RowAdam`` takes. Eager only: under
+            torch.compile ask for dense gradients.
+
+    Returns:
+        [M, L * F], level after level.
+
+    Raises:
+        TypeError, ValueError: an argument is no tensor, or of another size, dtype or device than
+            above; corners or voxel_sizes out of range; rows that are no power of two a level.
+
+    Differentiable in: table, points. Second order raises.
+    Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", section 3.
+    """
+    sizes = check("encode_hash", table=(table, "N F"), points=(points, "M 3"))
+    levels = len(voxel_sizes)
+    for name, corner in (("lower", lower), ("upper", upper)):
+        if len(corner) != 3 or not all(math.isfinite(x) for x in corner):
+            raise ValueError(f"encode_hash: {name} must be 3 finite numbers, got {list(corner)}")
+    if any(a > b for a, b in zip(lower, upper, strict=True)):
+        raise ValueError(
+            f"encode_hash: lower must be at most upper, got {list(lower)} and {list(upper)}"
+        )
+    if not levels or not all(0 < h < math.inf for h in voxel_sizes):
+        raise ValueError(
+            f"encode_hash: voxel_sizes must be numbers above 0, at least one, got "
+            f"{list(voxel_sizes)}"
+        )
+    rows = sizes["N"] // levels
+    if rows * levels != sizes["N"] or rows < 1 or rows & (rows - 1) or rows > 2**31:
+        raise ValueError(
+            f"encode_hash: table must have a power of two rows for each of {levels} levels, got "
+            f"{sizes['N']} in all"
+        )
+    place = ([float(x) for x in lower], [float(x) for x in upper], [float(h) for h in voxel_sizes])
+    if native.serves(table):
+        return _encode_hash(table.contiguous(), points.contiguous(), *place, sparse_grad)
+    if sparse_grad:
+        table = _SparseRows.apply(table)
+    return encode_hash_reference(table, points, *place)
+
+
+def lattice_sizes(
+    lower: Sequence[float], upper: Sequence[float], voxel_sizes: Sequence[float]
+) -> list[list[int]]:
+    """Nodes of every level along x, y and z."""
+    extents = [b - a for a, b in zip(lower, upper, strict=True)]
+    # A box that is a whole number of voxels up to rounding gets no node beyond it
+    return [[math.ceil(e / h - 1e-6) + 1 for e in extents] for h in voxel_sizes]
+
+
+def encode_hash_reference(
+    table: Tensor,
+    points: Tensor,
+    lower: Sequence[float],
+    upper: Sequence[float],
+    voxel_sizes: Sequence[float],
+) -> Tensor:
+    """The same in eager torch: level by level, corner by corner."""
+    rows = len(table) // len(voxel_sizes)
+    lost = points.isnan().any(1, keepdim=True)
+    start = torch.tensor(lower, dtype=torch.float64, device=points.device)
+    outputs = []
+    for level, (h, shape) in enumerate(
+        zip(voxel_sizes, lattice_sizes(lower, upper, voxel_sizes), strict=True)
+    ):
+        size = torch.tensor(shape, device=points.device)
+        # Locate in double, so that a float32 point far from the box's corner keeps its fraction.
+        at = (torch.where(lost, 0.0, points).double() - start) * (1 / h)
+        at = torch.minimum(at.clamp_min(0.0), (size - 1).double())
+        cell = torch.minimum(at.detach().long(), (size - 2).clamp_min(0))
+        t = (at - cell).to(points.dtype)
+        total = table.new_zeros(len(points), table.shape[1])
+        for corner in torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3):
+            weight = torch.where(corner == 1, t, 1 - t).prod(1)
+            i, j, k = torch.minimum(cell + corner, size - 1).unbind(1)
+            if math.prod(shape) <= rows:
+                row = (i * shape[1] + j) * shape[2] + k
+            else:
+                row = (i ^ (j * PRIMES[1]) ^ (k * PRIMES[2])) & (rows - 1)
+            total = total + weight[:, None] * table[level * rows + row]
+        outputs.append(torch.where(lost, torch.nan, total))
+    return torch.cat(outputs, 1)
+
+
+class _SparseRows(torch.autograd.Function):
+    """The same table with a sparse gradient: for backends whose own gradient is dense."""
+
+    @staticmethod
+    def forward(ctx, table):
+        return table.view_as(table)
+
+    @staticmethod
+    def backward(ctx, grad):
+        return grad.to_sparse(1)
+
+
+@torch.library.custom_op("univoxel::encode_hash", mutates_args=(), device_types="cpu")
+def _encode_hash(
+    table: Tensor,
+    points: Tensor,
+    lower: list[float],
+    upper: list[float],
+    voxel_sizes: list[float],
+    sparse_grad: bool,
+) -> Tensor:
+    out = points.new_empty(len(points), len(voxel_sizes) * table.shape[1])
+    native.require().encode_hash_forward(
+        *native.arrays(table, points, out), *_place(lower, upper, voxel_sizes), native.threads()
+    )
+    return out
+
+
+def _place(lower: list[float], upper: list[float], voxel_sizes: list[float]) -> tuple:
+    """Levels as the extension takes them."""
+    return lattice_sizes(lower, upper, voxel_sizes), lower, voxel_sizes
+
+
+@torch.library.custom_op("univoxel::encode_hash_backward", mutates_args=(), device_types="cpu")
+def _encode_hash_backward(
+    table: Tensor,
+    points: Tensor,
+    grad_out: Tensor,
+    lower: list[float],
+    upper: list[float],
+    voxel_sizes: list[float],
+    needs: list[bool],
+) -> tuple[Tensor, Tensor]:
+    grads = _empty_grads(table, points, needs)
+    wanted = [g if need else None for g, need in zip(grads, needs, strict=True)]
+    place = _place(lower, upper, voxel_sizes)
+    _backward_into(table, points, grad_out, wanted[0], None, wanted[1], place)
+    return grads
+
+
+def _empty_grads(table: Tensor, points: Tensor, needs: list[bool]) -> tuple[Tensor, Tensor]:
+    """Gradients to fill; one that nobody needs is empty, because an op cannot return None."""
+    return (
+        torch.empty_like(table) if needs[0] else table.new_empty(0),
+        torch.empty_like(points) if needs[1] else points.new_empty(0),
+    )
+
+
+def _backward_into(
+    table: Tensor,
+    points: Tensor,
+    grad_out: Tensor,
+    grad_table: Tensor | None,
+    touched,
+    grad_points: Tensor | None,
+    place: tuple,
+) -> None:
+    native.require().encode_hash_backward(
+        *native.arrays(table, points, grad_out),
+        None if grad_table is None else grad_table.numpy(),
+        touched,
+        None if grad_points is None else grad_points.numpy(),
+        *place,
+        native.threads(),
+    )
+
+
+def _sparse_backward(
+    table: Tensor, points: Tensor, grad_out: Tensor, place: tuple, needs: list[bool]
+) -> tuple[Tensor | None, Tensor | None]:
+    """The backward into touched rows; no op: how many there are depends on data."""
+    grad_points = torch.empty_like(points) if needs[1] else None
+    if not needs[0]:
+        _backward_into(table, points, grad_out, None, None, grad_points, place)
+        return None, grad_points
+    touched = native.require().hash_rows(*native.arrays(table, points), *place, native.threads())
+    rows = torch.empty(len(touched), dtype=torch.int64)
+    touched.write(rows.numpy(), native.threads())
+    values = table.new_empty(len(touched), table.shape[1])
+    _backward_into(table, points, grad_out, values, touched, grad_points, place)
+    # The rows are distinct, in order and inside by construction: checking costs more than they do.
+    grad = torch.sparse_coo_tensor(
+        rows[None], values, table.shape, is_coalesced=True, check_invariants=False
+    )
+    return grad, grad_points
+
+
+@_encode_hash.register_fake
+def _(table, points, lower, upper, voxel_sizes, sparse_grad):
+    return points.new_empty(len(points), len(voxel_sizes) * table.shape[1])
+
+
+@_encode_hash_backward.register_fake
+def _(table, points, grad_out, lower, upper, voxel_sizes, needs):
+    return _empty_grads(table, points, needs)
+
+
+def _save(ctx, inputs, output):
+    table, points, ctx.lower, ctx.upper, ctx.voxel_sizes, ctx.sparse_grad = inputs
+    ctx.save_for_backward(table, points)
+
+
+def _backward(ctx, grad_out):
+    table, points = ctx.saved_tensors
+    needs, grad_out = list(ctx.needs_input_grad[:2]), grad_out.contiguous()
+    place = (ctx.lower, ctx.upper, ctx.voxel_sizes)
+    if ctx.sparse_grad:
+        grads = _sparse_backward(table, points, grad_out, _place(*place), needs)
+    else:
+        dense = _encode_hash_backward(table, points, grad_out, *place, needs)
+        grads = [g if need else None for g, need in zip(dense, needs, strict=True)]
+    return *grads, None, None, None, None
+
+
+_encode_hash.register_autograd(_backward, setup_context=_save)
