@@ -116,21 +116,23 @@ def test_bricks_follow_the_surface():
     """A sphere that grows by 9 voxels, one between looks, always has its bricks."""
     dense = sphere(64, radius=0.4)
     field = SparseField.around(dense, dense.grid)
-    before, pool, distance = field.count, len(field.sdf), dense.grid.nodes().norm(dim=-1)
+    first, pool, distance = field.count, len(field.sdf), dense.grid.nodes().norm(dim=-1)
     for step in range(1, 10):
         wanted = distance - 0.4 - step * field.voxel_size
         rows = field.bricks.grid_rows()
         stored = rows >= 128
         with torch.no_grad():
             field.sdf[rows[stored]] = wanted[stored].clamp(-field.far, field.far)
-        field.refresh()
+        before, grown = field.count, field.refresh()
+        assert grown == (field.count > before)
         rows = field.bricks.grid_rows()
         assert (rows[wanted.abs() < field.voxel_size] >= 128).all()
         # What is carried on goes along the axes: the way round a corner is longer by a half
         near = (wanted > 0) & (wanted < 2 * field.voxel_size)
         error = field.sdf[rows] - wanted
         assert error[near].abs().max() < 1.5 * field.voxel_size
-    assert field.count > before
+    assert field.count > first
+    assert not field.refresh()
     assert len(field.sdf) > pool  # it grew beyond the room there was
     assert len(field.features) == len(field.sdf) == 64 * len(field.bricks.place)
 

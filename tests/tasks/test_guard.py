@@ -257,6 +257,20 @@ def test_a_copy_of_another_grid_is_not_taken(followed):
     assert grown.tolist() == [1.0, 1.0]
 
 
+def test_a_copy_that_is_forgotten_is_not_taken(followed):
+    """As when bricks have come in the room there was: same sizes, another meaning."""
+    number, optimizer, steps, watch = followed
+    for _ in range(3):
+        step(number, optimizer, watch)
+    before = number.item()
+    watch.forget()
+    watch.judge(20.0, False)  # takes a new copy
+    watch.forget()
+    watch.judge(1.0, False)
+    assert number.item() == before
+    assert "went back" not in steps.troubles[0]
+
+
 def test_a_system_is_damped_only_as_it_needs():
     g = torch.Generator().manual_seed(0)
     root = torch.randn(2, 5, 5, generator=g)

@@ -32,8 +32,8 @@ class AbstractField(nn.Module, ABC):
         """The samples along rays that matter under density sharpness 1 / s; no gradients."""
 
     @abstractmethod
-    def refresh(self) -> None:
-        """Look again which bricks are empty, after the sdf has moved.
+    def refresh(self) -> bool:
+        """Look again which bricks are empty, after the sdf has moved; True: nodes were added.
 
         Where a field needs room for that, sdf and features are new parameters afterwards, with
         more rows at the end: `RowAdam.follow` takes the optimiser along.

@@ -50,8 +50,9 @@ class DenseField(AbstractField):
             inv_s=inv_s,
         )
 
-    def refresh(self) -> None:
+    def refresh(self) -> bool:
         self._brick_min = brick_minimum(self.sdf.detach())
+        return False
 
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
         smooth_rows_(values.view(*self.grid.size, -1), rows, amount, order)

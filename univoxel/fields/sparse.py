@@ -111,9 +111,10 @@ class SparseField(AbstractField):
         )
 
     @torch.no_grad()
-    def refresh(self) -> None:
-        self._grow()
+    def refresh(self) -> bool:
+        grown = self._grow()
         self._brick_min = brick_minimum(self.sdf.detach(), self.bricks)
+        return grown
 
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
         smooth_rows_(values.view(len(values), -1), rows, amount, order, self.bricks)
@@ -146,8 +147,9 @@ class SparseField(AbstractField):
     def resized(self, grid: GridShape) -> SparseField:
         return SparseField.around(self, grid)
 
-    def _grow(self) -> None:
-        """Store every brick beside one that the surface comes within a voxel of."""
+    def _grow(self) -> bool:
+        """Store every brick beside one that the surface comes within a voxel of; False: there is
+        none to store."""
         bricks, count = self.bricks, self.count
         low, high = torch.aminmax(self.sdf.detach()[: count * Bricks.NODES].view(count, -1), dim=1)
         met = (low < self.voxel_size) & (high > -self.voxel_size)
@@ -159,7 +161,7 @@ class SparseField(AbstractField):
         flat = (at[:, 0] * shape[1] + at[:, 1]) * shape[2] + at[:, 2]
         new = flat[bricks.table.flatten()[flat] < Bricks.MISSING].unique()
         if not len(new):
-            return
+            return False
         table, place = bricks.table.flatten().clone(), bricks.place
         short = count + len(new) - len(place)
         if short > 0:  # make room, and some more
@@ -180,6 +182,7 @@ class SparseField(AbstractField):
         rows = (Bricks.NODES * number[:, None] + torch.arange(Bricks.NODES)).flatten()
         self.sdf[rows] = self.far * sign.repeat_interleave(Bricks.NODES)
         self._extend(number, sign)
+        return True
 
     def _extend(self, number: Tensor, sign: Tensor) -> None:
         """Carry distances on into new bricks [N], whose nodes have lain at sign [N] times far."""

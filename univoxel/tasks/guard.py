@@ -45,6 +45,10 @@ class Guard:
         self._optimizer, self._next = optimizer, -math.inf
         self.keep()
 
+    def forget(self) -> None:
+        """Do not go back to the copy: what the parameters stand for has changed since."""
+        self._copy, self._next = [], -math.inf
+
     @torch.no_grad()
     def keep(self) -> None:
         """Copy the parameters as a good state, unless copies would take too long.
@@ -112,7 +116,8 @@ class Guard:
         self._failures, self._sound = self._failures + 1, 0
         self.scale /= 2
         parameters = self._parameters()
-        if back and self._fits(parameters):  # else the copy is of a grid that is no more
+        back = back and self._fits(parameters)  # else the copy is of a grid that is no more
+        if back:
             assert self._optimizer is not None
             for parameter, copy in zip(parameters, self._copy, strict=True):
                 parameter.copy_(copy)

@@ -86,13 +86,13 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             belongs to another configuration.
     """
     film = None if timelapse is None else Timelapse(timelapse, cfg)
-    begin = time.monotonic()
     torch.manual_seed(cfg.seed)
     photos = load_photos(cfg.data, "train", cfg.downscale)
     if not resume and (cfg.out / FILE).exists():
         raise FileExistsError(f"{cfg.out} holds a run already: pass --resume or another --out")
     print(photos.about)
 
+    begin = time.monotonic()  # only now: how long reading takes is the photographs' affair
     distance = mask_distances(photos.coverage())
     pixels, held_out = split_pixels(distance)
     try:
@@ -209,7 +209,8 @@ def run_stage(
         scene.inv_s = 1 / (between(stage.sharpness, done) * field.voxel_size)
         if progress.step % REFRESH == 0:
             before = field.sdf, field.features
-            field.refresh()
+            if field.refresh():
+                guard.forget()
             optimizer.follow(before[0], field.sdf)
             optimizer.follow(before[1], field.features)
             if len(scratch) != len(field.sdf):
