@@ -126,7 +126,6 @@ CASES = {
     "clipped": colored(255),
     "dark": every_picture(dark),
     "mirror": every_picture(mirror),
-    "no mask": every_picture(opaque),
     "one pixel": on_the_axis,
     "cut off on all sides": cut_off,
     "cut off on one side": every_picture(half_cut_off),
@@ -166,7 +165,7 @@ def test_a_result_with_finite_numbers(template, tmp_path, capsys, case):
     run(data, tmp_path, "hybrid", capsys)
 
 
-@pytest.mark.parametrize("case", ["black", "no mask", "one pixel"])
+@pytest.mark.parametrize("case", ["black", "cut off on all sides", "one pixel"])
 def test_the_same_under_traced_light(template, tmp_path, capsys, case):
     data = Path(shutil.copytree(template, tmp_path / "data"))
     CASES[case](data)
@@ -177,6 +176,7 @@ def test_the_same_under_traced_light(template, tmp_path, capsys, case):
     ("change", "message"),
     [
         (every_picture(lambda p, *_: 0 * p), "all 6 pictures are fully transparent"),
+        (every_picture(opaque), "all 6 pictures are fully opaque"),
         (every_picture(one_pixel), "the silhouettes of the photographs share no volume"),
     ],
 )

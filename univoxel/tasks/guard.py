@@ -15,7 +15,7 @@ FAR = 6.0  # dB below its best at which held-out quality has collapsed: four tim
 ENOUGH = 40.0  # dB; a best beyond counts as this: falls from there are no collapse
 LIMIT = 3  # failures in a row that are mended; the next one ends the stage
 PROOF = 50  # sound steps after which a failure is over
-COPYING = 0.005  # share of the time that copies of the parameters may take
+COPYING = 0.002  # share of the time that copies of the parameters may take
 
 
 class Guard:
