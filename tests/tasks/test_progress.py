@@ -119,6 +119,7 @@ def test_a_pause_does_not_count(tmp_path, clock):
         before = progress.seconds, progress.due(), progress.checkpoint_due()
         with progress.paused():
             clock.now += 100
+            assert progress.seconds == before[0]
         assert (progress.seconds, progress.due(), progress.checkpoint_due()) == before
     assert progress.made == [1.0]
 

@@ -42,6 +42,7 @@ class Progress:
             state: as `state` gave it.
         """
         self.cfg, self.begin = cfg, begin
+        self._stopped: float | None = None  # when the clock was, see `paused`
         self.stage, self.done, self.step = state["stage"], state["progress"], state["step"]
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
         self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
@@ -85,7 +86,8 @@ class Progress:
     @property
     def seconds(self) -> float:
         """Training time so far, over all sittings."""
-        return time.monotonic() - self.begin
+        now = time.monotonic() if self._stopped is None else self._stopped
+        return now - self.begin
 
     def state(self) -> dict:
         """What a later sitting needs to go on, and what evaluation reports; JSON."""
@@ -202,9 +204,9 @@ class Progress:
     @contextmanager
     def paused(self) -> Iterator[None]:
         """A block whose time does not count at all."""
-        begin = time.monotonic()
+        self._stopped = time.monotonic()
         yield
-        spent = time.monotonic() - begin
+        spent, self._stopped = time.monotonic() - self._stopped, None
         self.begin, self._told, self._saved = (
             x + spent for x in (self.begin, self._told, self._saved)
         )
