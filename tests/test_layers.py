@@ -25,6 +25,7 @@ LAYERS = [
     {"experiments.worker"},
     {"experiments.runner"},
     {"experiments"},
+    {"commands"},
     {"cli"},
 ]
 HELPERS = {

@@ -268,7 +268,7 @@ def test_a_copy_that_is_forgotten_is_not_taken(followed):
     watch.forget()
     watch.judge(1.0, False)
     assert number.item() == before
-    assert "went back" not in steps.troubles[0]
+    assert "there is no state to go back to" in steps.troubles[0]
 
 
 def test_a_system_is_damped_only_as_it_needs():

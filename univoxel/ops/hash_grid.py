@@ -10,6 +10,7 @@ from torch import Tensor
 
 from univoxel.ops import native
 from univoxel.ops.checks import check
+from univoxel.ops.dense_grid import SparseGrad
 
 PRIMES = (1, 2654435761, 805459861)
 
@@ -80,7 +81,7 @@ def encode_hash(
     if native.serves(table):
         return _encode_hash(table.contiguous(), points.contiguous(), *place, sparse_grad)
     if sparse_grad:
-        table = _SparseRows.apply(table)
+        table = SparseGrad.apply(table, 1)
     return encode_hash_reference(table, points, *place)
 
 
@@ -125,18 +126,6 @@ def encode_hash_reference(
             total = total + weight[:, None] * table[level * rows + row]
         outputs.append(torch.where(lost, torch.nan, total))
     return torch.cat(outputs, 1)
-
-
-class _SparseRows(torch.autograd.Function):
-    """The same table with a sparse gradient: for backends whose own gradient is dense."""
-
-    @staticmethod
-    def forward(ctx, table):
-        return table.view_as(table)
-
-    @staticmethod
-    def backward(ctx, grad):
-        return grad.to_sparse(1)
 
 
 @torch.library.custom_op("univoxel::encode_hash", mutates_args=(), device_types="cpu")

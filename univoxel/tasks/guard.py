@@ -85,7 +85,7 @@ class Guard:
             return True
         value = loss.item()
         what = "a gradient is not finite" if math.isfinite(value) else f"the loss is {value}"
-        self._fail(what, back=self._failures > 0)
+        self._fail(what, self._failures > 0, "dropped this step")
         return False
 
     def judge(self, psnr: float, kind: bool) -> None:
@@ -98,7 +98,9 @@ class Guard:
             self._best, self._kind = -math.inf, kind
         if not psnr > self._best - FAR:  # NaN too
             best = f", {self._best:.1f} dB at best" if math.isfinite(self._best) else ""
-            self._fail(f"held-out quality is {psnr:.1f} dB{best}", back=True)
+            self._fail(
+                f"held-out quality is {psnr:.1f} dB{best}", True, "there is no state to go back to"
+            )
             return
         self._best = min(max(self._best, psnr), ENOUGH)
         if psnr > self._best - FAR / 2:
@@ -112,7 +114,7 @@ class Guard:
         return [p.shape for p in parameters] == [c.shape for c in self._copy]
 
     @torch.no_grad()
-    def _fail(self, what: str, back: bool) -> None:
+    def _fail(self, what: str, back: bool, otherwise: str) -> None:
         self._failures, self._sound = self._failures + 1, 0
         self.scale /= 2
         parameters = self._parameters()
@@ -131,5 +133,5 @@ class Guard:
             )
             self._progress.abandon()
             return
-        done = "went back to the last good state" if back else "dropped this step"
+        done = "went back to the last good state" if back else otherwise
         self._progress.trouble(f"{where}; {done}, steps are {self.scale:g} times as long from here")

@@ -1,0 +1,456 @@
+"""What the command line offers: a function per command, which checks and calls one task.
+
+Tasks are imported by the command that runs them: `univoxel --help` does not wait for torch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
+Scenes: TypeAlias = Annotated[Positional[tuple[Path, ...]], arg(metavar="SCENE [SCENE ...]")]
+Changes: TypeAlias = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    arg(metavar="FIELD=VALUE", help_behavior_hint="(repeatable)"),
+]
+LightOf: TypeAlias = Annotated[
+    str | None, arg(metavar="VIEW", help_behavior_hint="(default: the mean of all)")
+]
+
+
+def train(
+    data: Annotated[Positional[Path], arg(metavar="DATA")],
+    /,
+    out: Annotated[Path, arg(metavar="RUN")],
+    preset: Literal["auto", "draft", "fast", "full"] = "auto",
+    light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
+    varying: Literal["none", "exposure", "light"] = "none",
+    downscale: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
+    ] = None,
+    field: Literal["dense", "sparse"] = "dense",
+    minutes: Annotated[
+        float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
+    ] = None,
+    adaptive: bool = False,
+    budget_mb: Annotated[
+        float | None, arg(metavar="MB", help_behavior_hint="(default: no limit)")
+    ] = None,
+    resume: bool = False,
+    timelapse: Annotated[
+        str | None, arg(metavar="FILE.gif|FILE.mp4|DIR/", help_behavior_hint="(default: none)")
+    ] = None,
+    set: Changes = (),
+) -> None:
+    """Recover geometry, materials and light from posed photographs.
+
+    Args:
+        data: folder of the photographs and their cameras
+        out: folder that the run is written to
+        preset: how much work goes in: draft is a look, 1 minute on two cores, fast the usual, 4,
+            full the best, 12; auto is what fits into --minutes, or else fast
+        light: sg, local lobes as published; hybrid, then one environment map with traced
+            visibility, which cleans shadows from the albedo; others to compare with: sh and mlp,
+            local too, envmap-sg and envmap, one map from the beginning
+        varying: what differs from photograph to photograph: exposure, with the colour balance, or
+            the light itself too
+        downscale: train on photographs of 1/N of their width and height
+        field: sparse stores bricks around the surface alone, for finer grids than the presets',
+            such as --set stages.1.voxels=30
+        minutes: wall-clock limit, above 0; training ends in time with what it has
+        adaptive: no larger a model than the scene needs, as held-out pixels tell: coarser grid,
+            fewer feature channels, lobes and hidden units; `univoxel info` says what was chosen
+        budget_mb: most that the file of the model may have, in millions of bytes; implies
+            --adaptive
+        resume: go on with the run in --out
+        timelapse: picture of a test view over training time, or a folder of its frames; making
+            them does not count as training
+        set: for experts: one field of the configuration, such as loss.radiance=0.5 or
+            stages.1.voxels=3; config.json in a run's folder holds them all
+    """
+    from univoxel.config import chosen, with_field
+    from univoxel.overrides import changed
+    from univoxel.tasks import train as task
+
+    _check_minutes(minutes)
+    if not resume and (out / "scene.safetensors").exists():
+        raise FileExistsError(f"{out} holds a run already: add --resume, or choose another --out")
+    if downscale is not None and downscale < 1:
+        raise ValueError(f"--downscale must be at least 1, got {downscale}")
+    config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
+    config = dataclasses.replace(config, downscale=downscale or 0)
+    if adaptive or budget_mb is not None:
+        config = dataclasses.replace(config, capacity="adaptive", budget_mb=budget_mb)
+    config = with_field(config, field)
+    print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
+
+
+def evaluate(
+    run: Run,
+    /,
+    data: Annotated[
+        Path | None, arg(metavar="DATA", help_behavior_hint="(default: the data trained on)")
+    ] = None,
+    save: Annotated[
+        Path | None, arg(metavar="DIR", help_behavior_hint="(default: none are written)")
+    ] = None,
+    json: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: only printed)")
+    ] = None,
+    samples: int = 64,
+    bounces: int = 2,
+    light_of: LightOf = None,
+) -> None:
+    """Measure a run on the test views and print the table.
+
+    Args:
+        run: folder of a trained run
+        data: folder of the photographs
+        save: folder for the rendered pictures
+        json: file for the measures
+        samples: of the light, per pixel of relit pictures
+        bounces: reflections between parts of the object in relit pictures, 0 for none
+        light_of: training view, by name or number, in whose light novel views are rendered, where
+            the run was trained with --varying
+    """
+    from univoxel.tasks import evaluate as task
+
+    options = {"samples": samples, "bounces": bounces, "light_of": light_of}
+    task.evaluate(run, data=data, save=save, json=json, **options)
+
+
+def relight(
+    run: Run,
+    /,
+    envmap: Annotated[tuple[Path, ...], arg(metavar="MAP [MAP ...]")] = (),
+    sun: Annotated[
+        UseAppendAction[tuple[tuple[float, ...], ...]],
+        arg(metavar="AZIMUTH ELEVATION IRRADIANCE [ANGLE]"),
+    ] = (),
+    point: Annotated[
+        UseAppendAction[tuple[tuple[float, float, float, float], ...]],
+        arg(metavar="X Y Z INTENSITY"),
+    ] = (),
+    out: Annotated[
+        Path | None, arg(metavar="DIR", help_behavior_hint="(default: in RUN/relight)")
+    ] = None,
+    cameras: Annotated[str, arg(metavar="test|orbit|FILE")] = "test",
+    orbit: Annotated[int | None, arg(metavar="FRAMES")] = None,
+    elevation: Annotated[float, arg(metavar="DEGREES")] = 25.0,
+    turn: Annotated[int | None, arg(metavar="FRAMES")] = None,
+    resolution: Annotated[
+        int | None, arg(metavar="PIXELS", help_behavior_hint="(default: the data's; orbits: 512)")
+    ] = None,
+    rotate: Annotated[float, arg(metavar="DEGREES")] = 0.0,
+    exposure: Annotated[float, arg(metavar="FACTOR")] = 1.0,
+    samples: int = 64,
+    noise: Annotated[float | None, arg(metavar="SHARE")] = None,
+    bounces: int = 2,
+    background: Literal["transparent", "map", "black"] = "transparent",
+    ground: Annotated[str | None, arg(metavar="lowest|HEIGHT")] = None,
+    animation: tuple[Literal["gif", "mp4"], ...] = (),
+    resume: bool = False,
+) -> None:
+    """Render a run under other light: environment maps, suns, points.
+
+    Args:
+        run: folder of a trained run
+        envmap: equirectangular maps, twice as wide as high, .exr or .hdr, linear radiance
+        sun: a far light: degrees from +X counter-clockwise and above the horizon, irradiance,
+            degrees across (0.53 if not given; 0: hard shadows); repeatable
+        point: a near light: where it stands, irradiance at distance 1; repeatable
+        out: folder for the pictures, with a folder for each map where there are several
+        cameras: the test views, an orbit around the object, or a path in a transforms.json
+        orbit: frames of an orbit; the same as --cameras "orbit FRAMES"
+        elevation: of an orbit above the horizon, degrees
+        turn: frames of a turn of the light under the first camera
+        resolution: width of the pictures
+        rotate: turn maps and suns counter-clockwise about +Z, degrees
+        exposure: factor on all light
+        samples: of the light, per pixel
+        noise: instead of --samples: as many as bring the relative noise below this, such as 0.02
+        bounces: reflections between parts of the object
+        background: what stands behind the object
+        ground: z of a floor that catches the object's shadow, or lowest for its lowest point
+        animation: the frames as a moving picture too
+        resume: keep the frames that are there
+    """
+    from univoxel.tasks import relight as task
+    from univoxel.tasks.lights import parse_ground, point_light, sun_light
+
+    if orbit is not None:
+        if cameras != "test":
+            raise ValueError(f"expected --orbit or --cameras, got {orbit} and {cameras}")
+        cameras = f"orbit {orbit}"
+    if out is None:
+        out = run / "relight" / envmap[0].stem if len(envmap) == 1 else run / "relight"
+    task.relight(
+        run,
+        envmap[0] if len(envmap) == 1 else envmap,
+        out,
+        suns=[sun_light(values) for values in sun],
+        lamps=[point_light(values) for values in point],
+        cameras=cameras,
+        elevation=elevation,
+        turn=turn,
+        resolution=resolution,
+        rotate=rotate,
+        exposure=exposure,
+        samples=samples,
+        noise=noise,
+        bounces=bounces,
+        background=background,
+        ground=parse_ground(ground),
+        animation=animation,
+        resume=resume,
+    )
+    print(out)
+
+
+def export(
+    run: Run,
+    /,
+    mesh: Annotated[Path, arg(metavar="FILE.glb|obj|ply")],
+    faces: Annotated[
+        int | None,
+        arg(metavar="N", help_behavior_hint="(default: 20000 with textures, all without)"),
+    ] = None,
+    texture_size: Annotated[int, arg(metavar="TEXELS")] = 1024,
+    watertight: bool = False,
+) -> None:
+    """Write the surface as a mesh with its materials, for any renderer.
+
+    Args:
+        run: folder of a trained run
+        mesh: the file to write: .glb and .obj hold textures, .ply materials at the vertices
+        faces: most triangles, at least 4
+        texture_size: width of the square textures, a power of 2 up to 4096
+        watertight: close holes, or fail
+    """
+    from univoxel.tasks import export as task
+
+    task.export(run, mesh, faces=faces, texture_size=texture_size, watertight=watertight)
+    print(mesh)
+
+
+def envmap(
+    run: Run,
+    /,
+    out: Annotated[Path, arg(metavar="FILE.exr")],
+    height: Annotated[int, arg(metavar="ROWS")] = 128,
+    light_of: LightOf = None,
+) -> None:
+    """Write the light that the photographs were taken in, as an environment map.
+
+    Args:
+        run: folder of a trained run
+        out: the map, linear radiance; a picture of it goes beside, with the true map if the data
+            set has it
+        height: rows of the map; it is twice as wide
+        light_of: training view, by name or number, whose map it is, where the run was trained with
+            --varying
+    """
+    from univoxel.tasks import envmap as task
+
+    found = task.envmap(run, out, height=height, light_of=light_of)
+    print(out)
+    if found:
+        print(f"grey ball under it: PSNR {found.ball_psnr:.1f} dB, a scale per channel")
+        print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
+
+
+def inspect(
+    run: Run,
+    /,
+    view: Annotated[str, arg(metavar="VIEW")],
+    pixel: Annotated[str, arg(metavar="COLUMN,ROW")],
+    out: Annotated[
+        Path | None,
+        arg(metavar="FILE.png", help_behavior_hint="(default: in RUN/inspect)"),
+    ] = None,
+    light_of: LightOf = None,
+) -> None:
+    """Draw the light that falls on one point of the surface, beside the truth where it is known.
+
+    Args:
+        run: folder of a trained run
+        view: name or number of a test view
+        pixel: whose surface point; 0,0 is the top left
+        out: the picture; an .exr file with the layers goes beside
+        light_of: training view, by name or number, whose light it is, where the run was trained
+            with --varying
+    """
+    from univoxel.tasks import inspect as task
+
+    print(task.inspect(run, view, task.parse_pixel(pixel), out, light_of=light_of))
+
+
+def info(
+    run: Run,
+    /,
+    json: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: only printed)")
+    ] = None,
+    picture: Annotated[
+        Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: none)")
+    ] = None,
+) -> None:
+    """Say what a model consists of: parameters and bytes by part, sizes, and what was chosen.
+
+    Args:
+        run: folder of a trained run
+        json: file for the numbers
+        picture: where the grid's nodes are that hold features, and a bar of bytes by part
+    """
+    from univoxel.tasks import info as task
+
+    task.info(run, json=json, picture=picture)
+
+
+def compare(
+    scenes: Scenes,
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    preset: Literal["auto", "draft", "fast", "full"] = "auto",
+    light: Annotated[tuple[str, ...], arg(metavar="LIGHT [LIGHT ...]")] = (
+        *("hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"),
+    ),
+    minutes: Annotated[
+        float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
+    ] = None,
+    samples: int = 64,
+    set: Changes = (),
+) -> None:
+    """Train scenes with every model of light and put their measures side by side.
+
+    Writes DIR/compare.md, compare.json, compare.png and compare.svg. Every training is kept in
+    DIR/SCENE/LIGHT with all its measures (result.json); the same command again goes on after an
+    interruption and tries again what failed. Trainings run one after another, each in a process of
+    its own: leave the machine to them, or their times say little.
+
+    Args:
+        scenes: folders of photographs
+        out: folder for the results
+        preset: how much work goes into each training, as of train
+        light: models of light, as of train --light; sg:lobes=12 changes a field of the light's
+            configuration, sg:lobes=12,hidden=32 two
+        minutes: wall-clock limit of each training, above 0
+        samples: of the light, per pixel of relit pictures
+        set: one field of the configuration of all trainings, as of train
+    """
+    from univoxel.experiments import compare as experiment
+
+    _check_minutes(minutes)
+    print(experiment.compare(scenes, out, preset, light, minutes, set, samples))
+
+
+def chart(
+    scenes: Scenes,
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    preset: Literal["draft", "fast", "full"] = "fast",
+    light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
+    quick: bool = False,
+    only: Annotated[
+        tuple[str, ...], arg(metavar="SETTING [SETTING ...]", help_behavior_hint="(default: all)")
+    ] = (),
+    samples: int = 64,
+    set: Changes = (),
+) -> None:
+    """Draw quality against training time: presets, and single knobs around one of them.
+
+    Trains draft, fast, full, and --preset with one knob turned: voxels-x0.5 (half the voxels of the
+    finest grid), voxels-x2, rays-x0.5 (half the rays of a step), rays-x2, steps-, directions- and
+    lobes- alike, light-sg and so on. Writes DIR/chart.png, chart.svg and chart.json with every
+    measure, the log of each training, and the Pareto front of each measure: settings that no other
+    beats in both time and quality. Published figures, of other data and of GPUs, are marked.
+    Trainings are kept, and gone on with, as of compare.
+
+    Args:
+        scenes: folders of photographs
+        out: folder for the results
+        preset: what the knobs are turned around
+        light: of the presets and the knobs
+        quick: five settings instead of all
+        only: names of settings
+        samples: of the light, per pixel of relit pictures
+        set: one field of the configuration of all trainings, as of train
+    """
+    from univoxel.experiments import chart as experiment
+
+    print(experiment.chart(scenes, out, preset, light, quick, only, set, samples))
+
+
+def stress(
+    out: Annotated[Path, arg(metavar="DIR")],
+    quick: bool = False,
+    only: Annotated[
+        tuple[str, ...], arg(metavar="AXIS [AXIS ...]", help_behavior_hint="(default: all)")
+    ] = (),
+    light: Annotated[
+        tuple[str, ...],
+        arg(
+            metavar="LIGHT [LIGHT ...]",
+            help_behavior_hint="(default: sg sh envmap hybrid; with --quick: hybrid)",
+        ),
+    ] = (),
+    seeds: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: 3; with --quick: 1)")
+    ] = None,
+    set: Changes = (),
+) -> None:
+    """Find out where the method breaks: scenes of known truth, made harder along one axis each.
+
+    Renders small scenes with Mitsuba 3, spoils their photographs, trains and measures. Writes
+    DIR/stress.md with the breaking point of each axis, stress.json, stress.png and stress.svg.
+    Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, thin, noise,
+    placement, dark, bright; exposure-varying and light-varying are trained with --varying. A
+    training that fails is a result. What is done is kept: the same command goes on.
+
+    Args:
+        out: folder for scenes, photographs, trainings and results
+        quick: fewer severities of each axis
+        only: names of axes
+        light: models of light, as of train
+        seeds: trainings of each level, with other random numbers
+        set: one field of the configuration of all trainings, as of train
+    """
+    from univoxel.experiments.stress import suite
+
+    print(suite.stress(out, only, light, seeds, quick, set))
+
+
+def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> None:
+    """Train, evaluate and relight the small scene that comes with the package, in minutes.
+
+    Args:
+        out: folder for everything it writes; the page to open is DIR/index.html
+    """
+    from univoxel.tasks import demo as task
+
+    print(task.demo(out))
+
+
+def _check_minutes(minutes: float | None) -> None:
+    if minutes is not None and not minutes > 0:
+        raise ValueError(f"--minutes must be above 0, got {minutes:g}")
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "train": train,
+    "eval": evaluate,
+    "relight": relight,
+    "export": export,
+    "envmap": envmap,
+    "inspect": inspect,
+    "info": info,
+    "compare": compare,
+    "chart": chart,
+    "stress": stress,
+    "demo": demo,
+}
