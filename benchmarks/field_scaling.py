@@ -59,7 +59,7 @@ def random_rays() -> Rays:
     return Rays(origin, torch.nn.functional.normalize(target - origin, dim=1))
 
 
-def step(field: AbstractField, optimizer: RowAdam, scratch: torch.Tensor) -> None:
+def step(field: AbstractField, optimizer: RowAdam) -> None:
     """One step towards features that are the position, at sharp opacity."""
     channels = field.channels
     rays, inv_s = random_rays(), 1 / (SHARPNESS * field.voxel_size)
@@ -74,7 +74,7 @@ def step(field: AbstractField, optimizer: RowAdam, scratch: torch.Tensor) -> Non
     loss = (seen[:, :channels] - wanted).square().mean() + 0.1 * (length - 1).square().mean()
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
-    train.spread_gradient(field, 4, scratch)
+    train.spread_gradient(field, 4)
     optimizer.step()
 
 
@@ -87,13 +87,12 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
     """One field at one resolution, in this process."""
     torch.manual_seed(0)
     coarse, grid = ball(channels), cube(size)
-    step(coarse, RowAdam([coarse.sdf, coarse.features]), torch.zeros_like(coarse.sdf.data))
+    step(coarse, RowAdam([coarse.sdf, coarse.features]))
     before, begin = resident(), time.perf_counter()
     field = SparseField.around(coarse, grid) if kind == "sparse" else coarse.resized(grid)
     field.refresh()  # the first look brings what the surface's own bricks lack beside them
     made = time.perf_counter() - begin
     optimizer = RowAdam([field.sdf, field.features], lr=0.01 * field.voxel_size, eps=1e-4)
-    scratch = torch.zeros_like(field.sdf.data)
     seconds, looks = [], []
     for i in range(steps):
         if i % train.REFRESH == 0:
@@ -101,10 +100,9 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
             field.refresh()
             for a, b in zip(old, (field.sdf, field.features), strict=True):
                 optimizer.follow(a, b)
-            scratch = scratch if len(scratch) == len(field.sdf) else torch.zeros_like(field.sdf)
             looks.append(time.perf_counter() - begin)
         begin = time.perf_counter()
-        step(field, optimizer, scratch)
+        step(field, optimizer)
         if i % train.SMOOTH_EVERY == 0:
             for values, order in ((field.sdf, 2), (field.features, 1)):
                 rows = train.rows_of(values.grad)  # type: ignore[arg-type]

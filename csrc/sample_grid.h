@@ -182,8 +182,7 @@ inline int64_t slot(const AllBrickRows&, const Located<T, BrickNodes>& at, int a
     return row < kMissingRows ? -1 : row;
 }
 template <class T>
-inline int64_t slot(const TouchedBrickRows& rows, const Located<T, BrickNodes>& at, int a, int b,
-                    int c) {
+inline int64_t slot(const RowSet& rows, const Located<T, BrickNodes>& at, int a, int b, int c) {
     const int64_t row = at.row(a, b, c);
     return row < kMissingRows ? -1 : rows.slot(row);
 }

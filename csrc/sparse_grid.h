@@ -9,7 +9,7 @@ template <class T>
 using SparseGrid = Sampling<T, BrickNodes>;
 
 template <class T>
-using SparseGridGrads = SamplingGrads<T, TouchedBrickRows>;
+using SparseGridGrads = SamplingGrads<T, RowSet>;
 
 template <class T>
 void sample_sparse_forward(const SparseGrid<T>& in, T* value, T* gradient, T* feature, int threads);

@@ -4,6 +4,7 @@
 
 #include "adam.h"
 #include "bindings/grids.h"
+#include "diffuse.h"
 #include "smooth.h"
 
 namespace univoxel {
@@ -83,6 +84,51 @@ void bind_smooth(py::module_& m) {
         py::arg("threads"));
 }
 
+/// Rows [n] in [first, end), each above the one before.
+void require_ascending(const int64_t* rows, int64_t n, int64_t first, int64_t end) {
+    bool ok = n == 0 || (rows[0] >= first && rows[n - 1] < end);
+    for (int64_t k = 1; k < n; ++k) ok &= rows[k - 1] < rows[k];
+    require(ok, "diffuse_rows_: rows must ascend in [" + std::to_string(first) + ", " +
+                    std::to_string(end) + ")");
+}
+
+template <class T>
+void bind_diffuse(py::module_& m) {
+    m.def(
+        "diffuse_rows",
+        [](array<T>& values, const Size3& size, const array<int64_t>& rows, double amount,
+           int passes, int threads) {
+            T* v = values.mutable_data();
+            const int64_t* r = rows.data();
+            const int64_t n = rows.size();
+            require_ascending(r, n, 0, size[0] * size[1] * size[2]);
+            py::gil_scoped_release nogil;
+            diffuse_rows(v, size.data(), r, n, T(amount), passes, threads);
+        },
+        py::arg("values").noconvert(), py::arg("size"), py::arg("rows").noconvert(),
+        py::arg("amount"), py::arg("passes"), py::arg("threads"));
+    m.def(
+        "diffuse_brick_rows",
+        [](array<T>& values, const array<int32_t>& table, const array<int32_t>& place,
+           const Size3& size, const array<int64_t>& rows, double amount, int passes, int threads) {
+            const BrickNodes nodes = brick_nodes_of(table, size);
+            T* v = values.mutable_data();
+            const int32_t* stands = place.data();
+            const int64_t* r = rows.data();
+            const int64_t n = rows.size(), end = place.size() * kBrickNodes;
+            require_ascending(r, n, kMissingRows, end);
+            bool ok = true;
+            for (int64_t k = 0; k < n; ++k) ok &= stands[r[k] / kBrickNodes] >= 0;
+            require(ok, "diffuse_rows_: rows must be of bricks that stand somewhere");
+            py::gil_scoped_release nogil;
+            diffuse_brick_rows(v, size.data(), nodes, stands, end, r, n, T(amount), passes,
+                               threads);
+        },
+        py::arg("values").noconvert(), py::arg("table").noconvert(), py::arg("place").noconvert(),
+        py::arg("size"), py::arg("rows").noconvert(), py::arg("amount"), py::arg("passes"),
+        py::arg("threads"));
+}
+
 }  // namespace
 
 void bind_rows_ops(py::module_& m) {
@@ -90,6 +136,8 @@ void bind_rows_ops(py::module_& m) {
     bind_adam<double>(m);
     bind_smooth<float>(m);
     bind_smooth<double>(m);
+    bind_diffuse<float>(m);
+    bind_diffuse<double>(m);
 }
 
 }  // namespace univoxel

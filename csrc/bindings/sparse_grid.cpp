@@ -56,9 +56,8 @@ void bind_sparse_grid(py::module_& m) {
            const array<int32_t>& order, const array<int32_t>& table, const array<T>& grad_value,
            const array<T>& grad_gradient, const array<T>& grad_feature,
            std::optional<array<T>> grad_sdf, std::optional<array<T>> grad_features,
-           std::optional<array<T>> grad_points, const TouchedBrickRows* sdf_rows,
-           const TouchedBrickRows* feature_rows, const Size3& size, const Vec3& origin,
-           double voxel_size, int threads) {
+           std::optional<array<T>> grad_points, const RowSet* sdf_rows, const RowSet* feature_rows,
+           const Size3& size, const Vec3& origin, double voxel_size, int threads) {
             const auto in =
                 sparse_grid_of(sdf, features, points, order, table, size, origin, voxel_size);
             const auto data = [](auto& a) { return a ? a->mutable_data() : nullptr; };
@@ -89,8 +88,8 @@ void bind_sparse_grid(py::module_& m) {
             py::gil_scoped_release nogil;
             const auto columns = occupied_columns(grid, p, o, slab_bounds(grid, p, n, o), threads);
             const auto rows = [&](bool wanted, bool wide) {
-                return wanted ? std::make_unique<TouchedBrickRows>(grid, nodes, n_rows, columns,
-                                                                   wide, threads)
+                return wanted ? std::make_unique<RowSet>(
+                                    touched_brick_rows(grid, nodes, n_rows, columns, wide, threads))
                               : nullptr;
             };
             return std::pair(rows(sdf, true), rows(features, false));
@@ -103,15 +102,15 @@ void bind_sparse_grid(py::module_& m) {
 }  // namespace
 
 void bind_sparse_grid_ops(py::module_& m) {
-    py::class_<TouchedBrickRows>(m, "TouchedBrickRows")
-        .def("__len__", &TouchedBrickRows::count)
+    py::class_<RowSet>(m, "RowSet")
+        .def("__len__", &RowSet::count)
         .def(
             "write_rows",
-            [](const TouchedBrickRows& touched, array<int64_t>& rows, int threads) {
+            [](const RowSet& touched, array<int64_t>& rows, int threads) {
                 require(rows.size() == touched.count(), "touched_brick_rows: rows of another size");
                 int64_t* out = rows.mutable_data();
                 py::gil_scoped_release nogil;
-                touched.write_rows(out, threads);
+                touched.write_rows(out, team_for(touched.count(), threads));
             },
             py::arg("rows").noconvert(), py::arg("threads"));
     bind_sparse_grid<float>(m);

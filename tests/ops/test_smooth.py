@@ -4,7 +4,12 @@ import pytest
 import torch
 from bricks import cut
 
-from univoxel.ops import smooth_rows_, smooth_rows_reference_
+from univoxel.ops import (
+    diffuse_rows_,
+    diffuse_rows_reference_,
+    smooth_rows_,
+    smooth_rows_reference_,
+)
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -112,3 +117,68 @@ def test_bad_arguments(change, message):
     smooth_rows_(**arguments)
     with pytest.raises(ValueError, match=message):
         smooth_rows_(**(arguments | change))
+
+
+@pytest.mark.parametrize("shape", [(9, 8, 70), (2, 1, 4)])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_diffusion_equals_reference(shape, dtype):
+    n = torch.Size(shape).numel()
+    rows = torch.randperm(n)[: n // 2].sort().values
+    values = torch.randn(len(rows), dtype=dtype)
+    found = [
+        op(values.clone(), rows, shape, 0.8, 3) for op in (diffuse_rows_, diffuse_rows_reference_)
+    ]
+    torch.testing.assert_close(*found)
+    assert not torch.equal(found[0], values)
+
+
+def test_diffusion_in_bricks_equals_that_in_the_dense_grid():
+    shape = (10, 9, 13)
+    x = [torch.arange(float(n)).double() for n in shape]
+    sdf = 0.3 * (x[0][:, None, None] + x[1][:, None] + x[2]) - 0.15 * sum(shape)
+    _, _, bricks = cut(sdf, far=1.0)
+    node_rows = bricks.grid_rows()
+    stored = (node_rows >= 128) & (torch.rand(shape) < 0.6)
+    of_bricks, order = node_rows[stored].sort()
+    values = torch.randn(len(of_bricks)).double()
+    dense = torch.empty_like(values)
+    dense[order] = values
+    diffuse_rows_(dense, stored.flatten().nonzero()[:, 0], shape, 0.8, 4)
+    for op in (diffuse_rows_, diffuse_rows_reference_):
+        found = op(values.clone(), of_bricks, shape, 0.8, 4, bricks)
+        torch.testing.assert_close(found, dense[order])
+
+
+def test_diffusion_is_the_same_on_any_number_of_threads():
+    rows = torch.arange(3, 20 * 15 * 45)
+    values, threads, found = torch.randn(len(rows)), torch.get_num_threads(), []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            found.append(diffuse_rows_(values.clone(), rows, (20, 15, 45), 0.8, 4))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(*found)
+
+
+def test_diffusion_of_nothing_and_of_no_pass_changes_nothing():
+    none = torch.zeros(0, dtype=torch.int64)
+    assert diffuse_rows_(torch.zeros(0), none, (2, 2, 2), 0.5, 2).numel() == 0
+    values = torch.randn(2)
+    assert torch.equal(diffuse_rows_(values.clone(), torch.tensor([1, 2]), (2, 2, 2), 1, 0), values)
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "says"),
+    [
+        ([1, 0], {}, "ascend"),
+        ([0, 8], {}, "ascend"),
+        ([0, 1], {"amount": 1.5}, "amount must be in"),
+        ([0, 1], {"passes": -1}, "passes must be at least 0"),
+        ([0, 1], {"size": (2, 2)}, "size must be that of the grid"),
+    ],
+)
+def test_diffusion_refuses(rows, options, says):
+    options = {"size": (2, 2, 2), "amount": 0.5, "passes": 1} | options
+    with pytest.raises(ValueError, match=says):
+        diffuse_rows_(torch.ones(2), torch.tensor(rows), **options)

@@ -28,6 +28,10 @@ class AbstractField(nn.Module, ABC):
         """SDF, its spatial gradient and features at world points [M, 3]."""
 
     @abstractmethod
+    def features_at(self, points: Tensor) -> Tensor:
+        """The features [M, C] alone: no gradient to the sdf, not even one of zeros."""
+
+    @abstractmethod
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         """The samples along rays that matter under density sharpness 1 / s; no gradients."""
 
@@ -42,6 +46,10 @@ class AbstractField(nn.Module, ABC):
     @abstractmethod
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
         """`ops.smooth_rows_` of something that has a value, or C, where the sdf has one."""
+
+    @abstractmethod
+    def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
+        """`ops.diffuse_rows_` of values [K] of nodes of the sdf."""
 
     @abstractmethod
     def blocks(self, far: float) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from univoxel.fields.base import AbstractField
 from univoxel.fields.hull import GridShape, resample
-from univoxel.ops import brick_minimum, march, sample_dense, smooth_rows_
+from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_dense, smooth_rows_
 from univoxel.records import FieldSample, Rays, Samples
 
 
@@ -24,16 +24,14 @@ class DenseField(AbstractField):
         self._brick_min: Tensor | None = None
 
     def sample(self, points: Tensor) -> FieldSample:
-        return FieldSample(
-            *sample_dense(
-                self.sdf,
-                self.features,
-                points,
-                self.grid.origin,
-                self.voxel_size,
-                sparse_grad=True,
-            )
-        )
+        return self._sample(self.sdf, points)
+
+    def features_at(self, points: Tensor) -> Tensor:
+        return self._sample(self.sdf.detach(), points).features
+
+    def _sample(self, sdf: Tensor, points: Tensor) -> FieldSample:
+        place = self.grid.origin, self.voxel_size
+        return FieldSample(*sample_dense(sdf, self.features, points, *place, sparse_grad=True))
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         if self._brick_min is None:
@@ -56,6 +54,9 @@ class DenseField(AbstractField):
 
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
         smooth_rows_(values.view(*self.grid.size, -1), rows, amount, order)
+
+    def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
+        diffuse_rows_(values, rows, self.grid.size, amount, passes)
 
     def blocks(self, far: float) -> Tensor:
         sdf = self.sdf.detach()

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from univoxel.fields.base import AbstractField
 from univoxel.fields.hull import GridShape
-from univoxel.ops import brick_minimum, march, sample_sparse, smooth_rows_
+from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_sparse, smooth_rows_
 from univoxel.records import Bricks, FieldSample, Rays, Samples
 
 BAND = 4.0  # voxels from the surface at which the sdf is cut off: 8 s at a sharpness of 0.5 voxels
@@ -82,17 +82,15 @@ class SparseField(AbstractField):
         return field
 
     def sample(self, points: Tensor) -> FieldSample:
-        return FieldSample(
-            *sample_sparse(
-                self.sdf,
-                self.features,
-                self.bricks,
-                points,
-                self.grid.origin,
-                self.voxel_size,
-                sparse_grad=True,
-            )
-        )
+        return self._sample(self.sdf, points)
+
+    def features_at(self, points: Tensor) -> Tensor:
+        return self._sample(self.sdf.detach(), points).features
+
+    def _sample(self, sdf: Tensor, points: Tensor) -> FieldSample:
+        place = points, self.grid.origin, self.voxel_size
+        grids = sdf, self.features, self.bricks
+        return FieldSample(*sample_sparse(*grids, *place, sparse_grad=True))
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         if self._brick_min is None:
@@ -118,6 +116,9 @@ class SparseField(AbstractField):
 
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
         smooth_rows_(values.view(len(values), -1), rows, amount, order, self.bricks)
+
+    def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
+        diffuse_rows_(values, rows, self.grid.size, amount, passes, self.bricks)
 
     def blocks(self, far: float) -> Tensor:
         stored = torch.nn.functional.pad(self.bricks.table >= Bricks.MISSING, (0, 1) * 3)

@@ -15,7 +15,12 @@ from univoxel.ops.shade import (
     shade_radiance,
     shade_radiance_reference,
 )
-from univoxel.ops.smooth import smooth_rows_, smooth_rows_reference_
+from univoxel.ops.smooth import (
+    diffuse_rows_,
+    diffuse_rows_reference_,
+    smooth_rows_,
+    smooth_rows_reference_,
+)
 from univoxel.ops.sparse_grid import sample_sparse, sample_sparse_reference
 from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference, occluded_reference
 
@@ -31,6 +36,8 @@ __all__ = [
     "closest_hit_reference",
     "composite",
     "composite_reference",
+    "diffuse_rows_",
+    "diffuse_rows_reference_",
     "encode_hash",
     "encode_hash_reference",
     "march",

@@ -89,7 +89,7 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
         raise ValueError("no photograph sees a point of the surface")
     direction = scene.sky.direction
     transport = trace(seen, tracer, mesh, bright, direction, cfg.tracing, offset, generator)
-    metal = scene.material(scene.field.sample(position).features)[2] > METAL
+    metal = scene.material(scene.field.features_at(position))[2] > METAL
     return Problem(seen, transport, losses.encode(seen.color), metal, offset)
 
 
@@ -175,17 +175,18 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
     seen, transport = problem.seen, problem.transport
     index, sighting = draw(problem, cfg.rays // cfg.views, cfg.views)
     points = index[:: cfg.views]
-    material = scene.material(scene.field.sample(seen.position[points]).features)
-    albedo, roughness, metallic = material
+    position = seen.position[points]
+    beside = position + 2 * problem.voxel_size * torch.randn_like(position)
+    # One sampling, one gradient: adding up sparse ones costs more than either
+    features = scene.field.features_at(torch.cat([position, beside]))
+    parts = (x.chunk(2) for x in scene.material(features))
+    (albedo, albedo_near), (roughness, roughness_near), (metallic, _) = parts
     diffuse, f0 = brdf.split(albedo, metallic * problem.metal[points])
     assert isinstance(f0, Tensor)
     repeat = torch.arange(len(points)).repeat_interleave(cfg.views)
     roughness_shown = widened(roughness, len(transport.direction))
     shown = diffuse[repeat], roughness_shown[repeat], f0[repeat]
     rgb = draw_sightings(scene, problem, index, sighting, *shown)
-    beside = seen.position[points]
-    beside = beside + 2 * problem.voxel_size * torch.randn_like(beside)
-    albedo_near, roughness_near, _ = scene.material(scene.field.sample(beside).features)
     encoded, target = losses.encode(rgb), problem.target[sighting]
     return {
         "joint": losses.photometric(encoded, target, clipped=CLIPPED),
@@ -273,7 +274,7 @@ def newton_round(
     chosen = rich[torch.randperm(len(rich))[: cfg.newton_points]]
     if not len(chosen):
         return []
-    albedo, roughness, _ = scene.material(scene.field.sample(seen.position[chosen]).features)
+    albedo, roughness, _ = scene.material(scene.field.features_at(seen.position[chosen]))
     log_albedo = albedo.clamp_min(1e-3).log()
     which = (torch.rand(len(chosen), cfg.newton_views) * counts[chosen][:, None]).long()
     sighting = seen.offsets[chosen][:, None] + which

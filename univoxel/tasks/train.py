@@ -193,7 +193,6 @@ def run_stage(
         ],
         betas=MOMENTS,
     )
-    scratch = torch.zeros_like(field.sdf.data)
     plateau = Plateau(cfg.patience)
     guard = Guard(progress, restored=lambda: moved(scene))
     guard.follow(optimizer)
@@ -213,8 +212,6 @@ def run_stage(
                 guard.forget()
             optimizer.follow(before[0], field.sdf)
             optimizer.follow(before[1], field.features)
-            if len(scratch) != len(field.sdf):
-                scratch = torch.zeros_like(field.sdf.data)
         if progress.step % RETRACE == 0 and not stage.refit:
             scene.surface_moved()
 
@@ -230,7 +227,7 @@ def run_stage(
             assert field.features.grad is not None
             field.features.grad._values()[:, : scene.material.channels] = 0
         if stage.spread and not stage.refit:
-            spread_gradient(field, stage.spread, scratch)
+            spread_gradient(field, stage.spread)
         optimizer.step()
         if progress.step % SMOOTH_EVERY == 0 and not stage.refit:
             smooth(field, stage)
@@ -295,7 +292,7 @@ def objective(
     shaded = shade(scene, met, batch.wo[hit], torch.default_generator, view)
     encoded = losses.encode(shaded * opacity + behind * (1 - opacity))
     beside = met.position.detach() + scene.field.voxel_size * torch.randn_like(met.position)
-    near = scene.field.sample(beside).features
+    near = scene.field.features_at(beside)
     albedo, roughness, _ = scene.material(near)
     assert met.metallic is not None
     here = replace(met, features=scene.coded(met.features, view))
@@ -319,24 +316,12 @@ def encoded_radiance(scene: Scene, surface: Surface, batch: Batch) -> Tensor:
     return losses.encode(scene.exposed(srgb_to_linear(encoded), batch.view))
 
 
-def spread_gradient(field: AbstractField, passes: int, scratch: Tensor) -> None:
-    """Diffuse the sdf's gradient over the nodes that it touches, before Adam sees it.
-
-    Adam steps of neighbours then agree: the surface moves in large pieces, far and without the
-    bumps that steps of single nodes leave (a Sobolev gradient, as in Nicolet et al. 2021, Large
-    Steps in Inverse Rendering of Geometry).
-
-    Args:
-        scratch: zeros as the sdf, which are left so.
-    """
+def spread_gradient(field: AbstractField, passes: int) -> None:
+    """Diffuse the sdf's gradient over the nodes that it touches, before Adam sees it: the surface
+    then moves in large pieces, far and without the bumps that steps of single nodes leave."""
     grad = field.sdf.grad
     assert grad is not None
-    rows = rows_of(grad)
-    scratch.view(-1)[rows] = grad._values()
-    for _ in range(passes):
-        field.smooth_rows_(scratch, rows, SPREAD, order=1)
-    grad._values().copy_(scratch.view(-1)[rows])
-    scratch.view(-1)[rows] = 0
+    field.diffuse_rows_(grad._values(), rows_of(grad), SPREAD, passes)
 
 
 def smooth(field: AbstractField, stage: StageConfig) -> None:

@@ -143,7 +143,7 @@ def compare(
     in sRGB, and the root mean square of its slope by roughness; 0 where there is no sighting.
     """
     point, sighting = which
-    features = scene.field.sample(seen.position).features
+    features = scene.field.features_at(seen.position)
     albedo, roughness, metallic = scene.material(features)
     step = torch.where(roughness > 0.5, -STEP, STEP)
     surface = Surface(

@@ -1,0 +1,100 @@
+#include "diffuse.h"
+
+#include <algorithm>
+#include <memory>
+#include <vector>
+
+#include "bricks.h"
+#include "row_set.h"
+
+namespace univoxel {
+namespace {
+
+constexpr int64_t kRowsPerChunk = 4096;
+
+struct Node {
+    int64_t x, y, z;
+};
+
+/// node_of(row) -> Node, row_of(x, y, z) -> row.
+template <class T, class NodeOf, class RowOf>
+void diffuse(T* values, const int64_t size[3], int64_t n_rows, const int64_t* rows, int64_t n,
+             T amount, int passes, int threads, NodeOf&& node_of, RowOf&& row_of) {
+    threads = team_for(n, threads);
+    RowSet chosen(n_rows);
+    for (int64_t k = 0; k < n; ++k) chosen.mark(rows[k]);
+    chosen.number();
+    // Neighbours by slot, looked up once for all passes; slot n holds the 0 of all other nodes.
+    const std::unique_ptr<int32_t[]> near(new int32_t[6 * n]);
+    const auto slot = [&](int64_t row) {
+        return static_cast<int32_t>(chosen.has(row) ? chosen.slot(row) : n);
+    };
+    parallel_for(n, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
+        for (int64_t k = begin; k < end; ++k) {
+            const Node at = node_of(rows[k]);
+            const auto put = [&](int side, bool inside, int64_t x, int64_t y, int64_t z) {
+                near[side * n + k] = inside ? slot(row_of(x, y, z)) : static_cast<int32_t>(k);
+            };
+            put(0, at.x > 0, at.x - 1, at.y, at.z);
+            put(1, at.x + 1 < size[0], at.x + 1, at.y, at.z);
+            put(2, at.y > 0, at.x, at.y - 1, at.z);
+            put(3, at.y + 1 < size[1], at.x, at.y + 1, at.z);
+            put(4, at.z > 0, at.x, at.y, at.z - 1);
+            put(5, at.z + 1 < size[2], at.x, at.y, at.z + 1);
+        }
+    });
+    std::vector<T> from(values, values + n), to(n + 1);
+    from.push_back(T(0));
+    to[n] = T(0);
+    const int32_t *a = near.get(), *b = a + n, *c = b + n, *d = c + n, *e = d + n, *f = e + n;
+    for (int pass = 0; pass < passes; ++pass) {
+        const T* v = from.data();
+        T* out = pass + 1 < passes ? to.data() : values;
+        parallel_for(n, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
+#pragma omp simd
+            for (int64_t k = begin; k < end; ++k) {
+                const T sum = (v[a[k]] + v[b[k]]) + (v[c[k]] + v[d[k]]) + (v[e[k]] + v[f[k]]);
+                out[k] = v[k] + amount * (sum / 6 - v[k]);
+            }
+        });
+        std::swap(from, to);
+    }
+}
+
+}  // namespace
+
+template <class T>
+void diffuse_rows(T* values, const int64_t size[3], const int64_t* rows, int64_t n, T amount,
+                  int passes, int threads) {
+    const DenseNodes nodes{size[1], size[2]};
+    const auto node_of = [&](int64_t row) {
+        const int64_t line = row / size[2], x = line / size[1];
+        return Node{x, line - x * size[1], row - line * size[2]};
+    };
+    const auto row_of = [&](int64_t x, int64_t y, int64_t z) { return nodes.row(x, y, z); };
+    diffuse(values, size, size[0] * size[1] * size[2], rows, n, amount, passes, threads, node_of,
+            row_of);
+}
+
+template <class T>
+void diffuse_brick_rows(T* values, const int64_t size[3], const BrickNodes& nodes,
+                        const int32_t* place, int64_t n_rows, const int64_t* rows, int64_t n,
+                        T amount, int passes, int threads) {
+    const auto node_of = [&](int64_t row) {
+        const int64_t stands = place[row / kBrickNodes], inside = row % kBrickNodes;
+        const int64_t ab = stands / nodes.bricks_z, c = stands % nodes.bricks_z;
+        return Node{ab / nodes.bricks_y * kBrick + (inside >> 4),
+                    ab % nodes.bricks_y * kBrick + (inside >> 2 & 3), c * kBrick + (inside & 3)};
+    };
+    const auto row_of = [&](int64_t x, int64_t y, int64_t z) { return nodes.row(x, y, z); };
+    diffuse(values, size, n_rows, rows, n, amount, passes, threads, node_of, row_of);
+}
+
+template void diffuse_rows(float*, const int64_t[3], const int64_t*, int64_t, float, int, int);
+template void diffuse_rows(double*, const int64_t[3], const int64_t*, int64_t, double, int, int);
+template void diffuse_brick_rows(float*, const int64_t[3], const BrickNodes&, const int32_t*,
+                                 int64_t, const int64_t*, int64_t, float, int, int);
+template void diffuse_brick_rows(double*, const int64_t[3], const BrickNodes&, const int32_t*,
+                                 int64_t, const int64_t*, int64_t, double, int, int);
+
+}  // namespace univoxel

@@ -1,0 +1,60 @@
+// Which rows of a table are chosen, and a number for each.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "parallel.h"
+
+namespace univoxel {
+
+/// A number (slot) for each chosen row of a table, ascending with the rows. Mark rows, then
+/// `number` them. A bit per row: costs 16 bytes for 64 rows of the table.
+class RowSet {
+  public:
+    explicit RowSet(int64_t n_rows) : words_((n_rows + 63) / 64, Word{0, 0}) {}
+
+    void mark(int64_t row) { words_[row >> 6].bits |= uint64_t(1) << (row & 63); }
+    /// Mark those of rows 64 word .. 64 word + 63 whose bit is set.
+    void mark(int64_t word, uint64_t bits) { words_[word].bits |= bits; }
+    /// After the last mark.
+    void number() {
+        for (Word& w : words_) {
+            w.first = count_;
+            count_ += __builtin_popcountll(w.bits);
+        }
+    }
+    int64_t count() const { return count_; }
+
+    bool has(int64_t row) const { return words_[row >> 6].bits >> (row & 63) & 1; }
+    /// Slot of a marked row.
+    int64_t slot(int64_t row) const {
+        const Word& w = words_[row >> 6];
+        return w.first + __builtin_popcountll(w.bits & ((uint64_t(1) << (row & 63)) - 1));
+    }
+
+    /// Write the row of every slot to rows [count].
+    void write_rows(int64_t* rows, int threads) const {
+        const int64_t n = static_cast<int64_t>(words_.size());
+        parallel_for(n, kWordsPerChunk, threads, [&](int64_t begin, int64_t end) {
+            for (int64_t w = begin; w < end; ++w) {
+                int64_t* out = rows + words_[w].first;
+                for (uint64_t bits = words_[w].bits; bits; bits &= bits - 1) {
+                    *out++ = 64 * w + __builtin_ctzll(bits);
+                }
+            }
+        });
+    }
+
+  private:
+    static constexpr int64_t kWordsPerChunk = 4096;
+
+    struct Word {
+        uint64_t bits;
+        int64_t first;  // marked rows before this word
+    };
+    std::vector<Word> words_;
+    int64_t count_ = 0;
+};
+
+}  // namespace univoxel
