@@ -21,9 +21,11 @@ class MaterialHead(nn.Module):
         self.channels = channels
         self.net = MLP([channels, hidden, hidden, 5])
         last = self.net.linear[-1]
-        with torch.no_grad():  # start mid-grey, rather rough and no metal, whatever the features
+        # Start mid-grey, glossy and no metal, whatever the features. Glossy: what is rough becomes
+        # so, but for what starts rough the light makes itself sharp enough, and too bright.
+        with torch.no_grad():
             last.weight.mul_(0.1)
-            last.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.5, -4.0]))
+            last.bias.copy_(torch.tensor([0.0, 0.0, 0.0, -1.3, -4.0]))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         out = torch.sigmoid(self.net(features[:, : self.channels]))
