@@ -75,7 +75,7 @@ def test_equations_are_the_schur_complement_of_the_dense_system(rows_and_map):
     rows, map, log_albedo = rows_and_map
     weight = weights(rows, map, log_albedo)
     assert 0 < int((weight == 0).sum()) < weight.numel() / 2  # clipped sightings are among them
-    block = equations.normal_equations(rows, map, log_albedo)
+    eliminated, right, tie = equations.normal_equations(rows, map, log_albedo)
     cost = 0.0
     for c in range(3):
 
@@ -94,26 +94,22 @@ def test_equations_are_the_schur_complement_of_the_dense_system(rows_and_map):
         own = hessian[12:, 12:] + 1e-6 * torch.eye(5)
         cross, inverse = hessian[:12, 12:], torch.linalg.inv(own)
         exact = {"rtol": 1e-6, "atol": 1e-9}  # double, but for float32 constants of the curve
-        assert torch.allclose(
-            block.hessian[c], hessian[:12, :12] - cross @ inverse @ cross.T, **exact
-        )
-        assert torch.allclose(
-            block.gradient[c], gradient[:12] - cross @ inverse @ gradient[12:], **exact
-        )
-        assert torch.allclose(block.own[c], gradient[12:], **exact)
-        assert torch.allclose(block.norm[c], own.diagonal(), **exact)
-        assert torch.allclose(block.cross[c], cross.T, **exact)
+        assert torch.allclose(eliminated[c], hessian[:12, :12] - cross @ inverse @ cross.T, **exact)
+        assert torch.allclose(right[c], gradient[:12] - cross @ inverse @ gradient[12:], **exact)
+        assert torch.allclose(tie.own[c], gradient[12:], **exact)
+        assert torch.allclose(tie.norm[c], own.diagonal(), **exact)
+        assert torch.allclose(tie.cross[c], cross.T, **exact)
 
         # One step of the eliminated system and what it says of the albedo: the dense solution
         damping = 1e-4 * torch.eye(12)
         dense = hessian.clone()
         dense[12:, 12:], dense[:12, :12] = own, hessian[:12, :12] + damping
         solution = torch.linalg.solve(dense, gradient)
-        step = torch.linalg.solve(block.hessian[c] + damping, block.gradient[c])
-        change = (block.own[c] - block.cross[c] @ step) / block.norm[c]
+        step = torch.linalg.solve(eliminated[c] + damping, right[c])
+        change = (tie.own[c] - tie.cross[c] @ step) / tie.norm[c]
         assert torch.allclose(step, solution[:12], rtol=1e-4, atol=1e-7)
         assert torch.allclose(change, solution[12:], rtol=1e-4, atol=1e-7)
-    assert block.cost == pytest.approx(float(cost), rel=1e-9)
+    assert tie.cost == pytest.approx(float(cost), rel=1e-9)
 
 
 def test_the_gradient_is_that_of_the_cost_at_fixed_weights(rows_and_map):
@@ -125,19 +121,19 @@ def test_the_gradient_is_that_of_the_cost_at_fixed_weights(rows_and_map):
         return (weight * residual**2).sum()
 
     x, a = map.log(), log_albedo
-    block = equations.normal_equations(rows, map, log_albedo)
+    _, right, tie = equations.normal_equations(rows, map, log_albedo)
     h = 1e-5
     for node, c in ((0, 0), (5, 1), (11, 2)):
         step = torch.zeros_like(x)
         step[node, c] = h
         slope = (cost(x + step, a) - cost(x - step, a)) / (2 * h)
         # The elimination's share of the gradient put back
-        g = block.gradient[c] + block.cross[c].T @ (block.own[c] / block.norm[c])
+        g = right[c] + tie.cross[c].T @ (tie.own[c] / tie.norm[c])
         assert g[node].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
     step = torch.zeros_like(a)
     step[3, 1] = h
     slope = (cost(x, a + step) - cost(x, a - step)) / (2 * h)
-    assert block.own[1, 3].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
+    assert tie.own[1, 3].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
 
 
 def test_slope_is_the_derivative_of_the_curve():

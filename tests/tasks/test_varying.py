@@ -87,16 +87,16 @@ def test_equations_know_what_differs():
     weight = weight.masked_fill((rows.target > equations.CLIPPED) & (residual < 0), 0.0)
     cost = (weight * residual.square()).sum()
     by_map, by_albedo, by_gain, by_weights = torch.autograd.grad(cost, (x, a, g, w))
-    block = equations.normal_equations(
+    _, right, tie = equations.normal_equations(
         rows, map.double(), a.detach(), equations.Differs(gain, change, basis)
     )
-    assert block.cost == pytest.approx(cost.item(), rel=1e-6)
+    assert tie.cost == pytest.approx(cost.item(), rel=1e-6)
     # The elimination's share of the gradient put back
-    full = block.gradient + torch.einsum("cpd,cp->cd", block.cross, block.own / block.norm)
+    full = right + torch.einsum("cpd,cp->cd", tie.cross, tie.own / tie.norm)
     exact = {"rtol": 1e-5, "atol": 1e-7}
     torch.testing.assert_close(full[:, :NODES], -by_map.T / 2, **exact)
     torch.testing.assert_close(full[:, NODES:], -by_gain.T / 2, **exact)
-    torch.testing.assert_close(block.own, -by_albedo.T / 2, **exact)
+    torch.testing.assert_close(tie.own, -by_albedo.T / 2, **exact)
     differs = equations.Differs(gain, change, basis)
     _, slopes = equations.view_equations(rows, map.double(), a.detach(), differs)
     torch.testing.assert_close(slopes[..., -1], -by_gain.T / 2, **exact)

@@ -47,14 +47,10 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Block:
-    """Normal equations of some points: the light's part, and what ties it to their albedo.
+class Tie:
+    """What ties light to the albedo of some points, and their cost. The light is the log map of D
+    directions and, where views differ, their B log gains after it."""
 
-    The light is the log map of D directions and, where views differ, their B log gains after it.
-    """
-
-    hessian: Tensor  # [3, D + B, D + B]
-    gradient: Tensor  # [3, D + B]
     cross: Tensor  # [3, P, D + B] light against log albedo
     own: Tensor  # [3, P] gradient of log albedo
     norm: Tensor  # [3, P] curvature of log albedo
@@ -89,10 +85,15 @@ def linearised(
 
 def normal_equations(
     rows: Rows, light: Tensor, log_albedo: Tensor, differs: Differs | None = None
-) -> Block:
-    """The block of some points for map `light` [D, 3] and `log_albedo` [P, 3].
+) -> tuple[Tensor, Tensor, Tie]:
+    """What some points say of the light, once their albedo is eliminated: the Hessian
+    [3, D + B, D + B] and the gradient [3, D + B]; and what gives their albedo back.
 
     Changes of a view's map stay as they are.
+
+    Args:
+        light: [D, 3] the map.
+        log_albedo: [P, 3].
     """
     hessian, gradient, cross, own, norm, cost = [], [], [], [], [], 0.0
     for c in range(3):
@@ -110,14 +111,8 @@ def normal_equations(
         own.append(g)
         norm.append(n)
         cost += r.square().sum().item()
-    return Block(
-        torch.stack(hessian),
-        torch.stack(gradient),
-        torch.stack(cross),
-        torch.stack(own),
-        torch.stack(norm),
-        cost,
-    )
+    tie = Tie(torch.stack(cross), torch.stack(own), torch.stack(norm), cost)
+    return torch.stack(hessian), torch.stack(gradient), tie
 
 
 def view_equations(

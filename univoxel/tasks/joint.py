@@ -300,25 +300,22 @@ def newton_round(
     for _ in range(cfg.newton_steps):
         differs = view_differences(scene)
         if differs is not None and differs.basis is not None:
-            found = [
-                view_equations(r, sky.radiance, log_albedo[k], differs)
-                for r, k in zip(rows, parts, strict=True)
-            ]
-            hessian = torch.stack([h for h, _ in found]).sum(0) / sighting.numel()
-            slope = torch.stack([g for _, g in found]).sum(0) / sighting.numel()
+            hessian = slope = torch.zeros(())
+            for r, k in zip(rows, parts, strict=True):
+                h, g = view_equations(r, sky.radiance, log_albedo[k], differs)
+                hessian, slope = hessian + h / sighting.numel(), slope + g / sighting.numel()
             if not views_step(scene, hessian, slope, cfg.newton_smooth):
                 tell(UNSOLVABLE)
                 break
             differs = view_differences(scene)
-        blocks = [
-            normal_equations(r, sky.radiance, log_albedo[k], differs)
-            for r, k in zip(rows, parts, strict=True)
-        ]
         x = sky.log_radiance.T  # [3, D]
         x = torch.nn.functional.pad(x, (0, unknowns - x.shape[1]))  # no gain is likelier than 1
-        system = torch.stack([b.hessian for b in blocks]).sum(0) / sighting.numel() + smooth
+        system, right, ties = smooth, -x @ smooth, []
+        for r, k in zip(rows, parts, strict=True):  # added up at once: all would take much memory
+            h, g, tie = normal_equations(r, sky.radiance, log_albedo[k], differs)
+            system, right = system + h / sighting.numel(), right + g / sighting.numel()
+            ties.append(tie)
         system.diagonal(dim1=1, dim2=2).add_(cfg.newton_smooth)
-        right = torch.stack([b.gradient for b in blocks]).sum(0) / sighting.numel() - x @ smooth
         step = solve_damped(system, right)
         if step is None:
             tell(UNSOLVABLE)
@@ -328,9 +325,9 @@ def newton_round(
         sky.log_radiance.add_(to_map.T)
         if scene.views is not None:
             sky.log_radiance.add_(scene.views.add(to_gain.T))
-        change = [(b.own - torch.einsum("cpd,cd->cp", b.cross, step)) / b.norm for b in blocks]
+        change = [(t.own - torch.einsum("cpd,cd->cp", t.cross, step)) / t.norm for t in ties]
         log_albedo = (log_albedo + torch.cat(change, 1).T.clamp(-0.5, 0.5)).clamp(-7.0, 0.0)
-        costs.append(sum(b.cost for b in blocks) / sighting.numel())
+        costs.append(sum(t.cost for t in ties) / sighting.numel())
     return costs
 
 
