@@ -318,6 +318,20 @@ def smooth_rows(rows: int = 130_000, channels: int = 1, order: int = 2) -> Case:
     )
 
 
+def diffuse_rows(rows: int = 130_000, passes: int = 4) -> Case:
+    sdf, *_ = _ellipsoid((200, 155, 130))
+    near = sdf.abs().flatten().argsort()[:rows].sort().values
+    values = torch.randn(rows, generator=torch.Generator().manual_seed(0))
+    return Case(
+        "diffuse_rows_",
+        f"{rows:,} rows, {passes} passes",
+        lambda values: ops.diffuse_rows_(values, near, sdf.shape, 0.8, passes),
+        lambda values: ops.diffuse_rows_reference_(values, near, sdf.shape, 0.8, passes),
+        (values,),
+        {"read": 4.0 * 3 * rows + 8.0 * rows},  # values as in smooth_rows_, and the rows
+    )
+
+
 CASES: list[tuple[str, Callable[[], Case]]] = [
     ("composite", composite),
     ("sample_dense", lambda: sample_dense(160)),
@@ -333,4 +347,5 @@ CASES: list[tuple[str, Callable[[], Case]]] = [
     ("march", march),
     ("smooth_rows_", smooth_rows),
     ("smooth_rows_", lambda: smooth_rows(channels=12, order=1)),
+    ("diffuse_rows_", diffuse_rows),
 ]
