@@ -36,7 +36,7 @@ demo: dev
 	$(BIN)/univoxel demo --out runs/demo
 
 test: dev
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 lint: $(SETUP)
 	$(BIN)/ruff format --check .

@@ -20,6 +20,9 @@ function(add_core_variants)
     target_include_directories(univoxel_bindings PRIVATE csrc)
     target_link_libraries(univoxel_bindings PRIVATE
         pybind11::module univoxel_embree univoxel_warnings univoxel_sanitizers glm::glm)
+    if(UNIVOXEL_SANITIZE)  # instrumented templates of pybind11 take minutes to optimise
+        target_compile_options(univoxel_bindings PRIVATE -O1)
+    endif()
     foreach(variant IN LISTS UNIVOXEL_VARIANTS)
         add_library(kernels_${variant} STATIC ${ARG_KERNELS})
         target_include_directories(kernels_${variant} PUBLIC csrc)
