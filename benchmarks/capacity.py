@@ -1,4 +1,4 @@
-"""Quality against the size of the model: fixed sizes, and what --adaptive makes of the scene.
+"""Quality against the size of the model: fixed sizes, and what adapting them makes of the scene.
 
     python benchmarks/capacity.py DATA [--preset draft] [--settings fixed voxels-0.25 adaptive ...]
 
@@ -100,7 +100,7 @@ def main() -> None:
         if name in result["runs"]:
             continue
         run = arguments.work / name.replace(" ", "_")
-        base = preset(arguments.preset, arguments.data, run)
+        base = replace(preset(arguments.preset, arguments.data, run), capacity="fixed")
         cfg = replace(configured(base, setting), minutes=arguments.minutes)
         train(cfg, resume=(run / FILE).is_file())
         found = info(run)

@@ -35,7 +35,7 @@ class Config:
     minutes: float = 4.0
     downscale: int = 0
     seed: int = 0
-    capacity: str = "fixed"
+    capacity: str = "as preset"
     budget_mb: float | None = None
     loss: LossConfig = LossConfig()
     stages: tuple[StageConfig, ...] = (StageConfig(), StageConfig())
@@ -123,12 +123,18 @@ def test_train_keeps_the_minutes_of_the_preset(calls, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "budget"), [(["--adaptive"], None), (["--budget-mb", "2.5"], 2.5)]
+    ("options", "expected"),
+    [
+        ([], ("as preset", None)),
+        (["--capacity", "adaptive"], ("adaptive", None)),
+        (["--capacity", "fixed"], ("fixed", None)),
+        (["--budget-mb", "2.5"], ("adaptive", 2.5)),
+    ],
 )
-def test_train_fits_the_model_to_the_scene(calls, tmp_path, options, budget):
+def test_train_fits_the_model_to_the_scene(calls, tmp_path, options, expected):
     assert main(["train", "photos", "--out", str(tmp_path / "run"), *options]) == 0
     config = calls.noted[0][1][0]
-    assert (config.capacity, config.budget_mb) == ("adaptive", budget)
+    assert (config.capacity, config.budget_mb) == expected
 
 
 def test_info(calls):

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from univoxel.config import (
+    LIGHTS,
     JointConfig,
     LossConfig,
     StageConfig,
@@ -39,9 +40,17 @@ def test_presets(name):
 def test_fine_stages_may_be_sparse():
     config = with_field(preset("fast", Path("photos"), Path("run")), "sparse")
     assert [getattr(s, "field", None) for s in config.stages] == ["dense", "sparse", None, "sparse"]
-    assert with_field(config, "dense") == preset("fast", Path("photos"), Path("run"))
+    assert config.capacity == "fixed"
+    dense = preset("fast", Path("photos"), Path("run"))
+    assert with_field(config, "dense") == replace(dense, capacity="fixed")
+    assert with_field(dense, "dense") == dense
     with pytest.raises(ValueError, match="no dense stage can follow a sparse one, got sparse, d"):
         replace(CONFIG, stages=(replace(STAGE, field="sparse"), STAGE))
+
+
+def test_capacity_adapts_unless_lights_are_compared():
+    kinds = [preset("fast", Path("a"), Path("b"), light).capacity for light in LIGHTS]
+    assert kinds == ["adaptive" if light == "hybrid" else "fixed" for light in LIGHTS]
 
 
 @pytest.mark.parametrize("light", ["hybrid", "sg", "envmap"])
@@ -148,6 +157,7 @@ def test_the_file_holds_every_field(tmp_path):
         (JointConfig(), {"newton_views": 1}, "newton_views must be at least 2, got 1"),
         (CONFIG, {"patience": -0.1}, "patience must be at least 0, got -0.1"),
         (CONFIG, {"downscale": -1}, "downscale must be at least 0, got -1"),
+        (CONFIG, {"voxel_pixels": -1}, "voxel_pixels must be at least 0, got -1"),
         (CONFIG, {"minutes": 0.0}, "minutes must be above 0, got 0.0"),
         (SceneConfig(), {"channels": 0}, "channels must be at least 1, got 0"),
         (SceneConfig(), {"hidden": 0}, "hidden must be at least 1, got 0"),

@@ -37,7 +37,7 @@ def train(
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
-    adaptive: bool = False,
+    capacity: Literal["auto", "adaptive", "fixed"] = "auto",
     budget_mb: Annotated[
         float | None, arg(metavar="MB", help_behavior_hint="(default: no limit)")
     ] = None,
@@ -63,10 +63,11 @@ def train(
         field: sparse stores bricks around the surface alone, for finer grids than the presets',
             such as --set stages.1.voxels=30
         minutes: wall-clock limit, above 0; training ends in time with what it has
-        adaptive: no larger a model than the scene needs, as held-out pixels tell: coarser grid,
-            fewer feature channels, lobes and hidden units; `univoxel info` says what was chosen
+        capacity: adaptive makes no larger a model than the scene needs, as held-out pixels tell:
+            coarser grid, fewer feature channels, lobes and hidden units; `univoxel info` says what
+            was chosen. auto is that, but fixed for --field sparse and lights other than hybrid
         budget_mb: most that the file of the model may have, in millions of bytes; implies
-            --adaptive
+            --capacity adaptive
         resume: go on with the run in --out
         timelapse: picture of a test view over training time, or a folder of its frames; making
             them does not count as training
@@ -84,9 +85,11 @@ def train(
         raise ValueError(f"--downscale must be at least 1, got {downscale}")
     config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
     config = dataclasses.replace(config, downscale=downscale or 0)
-    if adaptive or budget_mb is not None:
-        config = dataclasses.replace(config, capacity="adaptive", budget_mb=budget_mb)
     config = with_field(config, field)
+    if budget_mb is not None and capacity == "auto":
+        capacity = "adaptive"
+    if capacity != "auto":
+        config = dataclasses.replace(config, capacity=capacity, budget_mb=budget_mb)
     print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
 
 

@@ -31,7 +31,7 @@ LIGHTS: tuple[LightName, ...] = get_args(LightName)
 class StageConfig:
     """One stage of training, on a grid of its own resolution."""
 
-    voxels: float  # millions of voxels in the object's box, > 0
+    voxels: float  # millions in the object's box at most, > 0; see TrainConfig.voxel_pixels
     iterations: int  # optimisation steps, >= 1; fewer when time runs out
     share: float  # of the time budget, (0, 1]
     rays: int = 2048  # per step, >= 1
@@ -124,6 +124,9 @@ class TrainConfig:
     # pixels of the photographs along a side of one that is trained on, >= 1; 0: 1, but large
     # photographs are refused
     downscale: int = 0
+    # pixels of the photographs, where the object is, that a voxel is at least as wide as, >= 0: a
+    # finer grid would only learn their noise
+    voxel_pixels: float = 1.0
     seed: int = 0
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
@@ -147,19 +150,22 @@ class TrainConfig:
             )
         if self.capacity == "adaptive" and "sparse" in kinds:
             raise ValueError(
-                "TrainConfig: adaptive capacity fits dense grids: leave --field sparse out"
+                "TrainConfig: adaptive capacity fits dense grids: leave the sparse field out, or "
+                "take --capacity fixed"
             )
         if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
             raise ValueError(
                 "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
             )
         _check(self, "above 0", lambda x: x > 0, "minutes")
-        _check(self, "at least 0", lambda x: 0 <= x < math.inf, "patience", "downscale")
+        names = ("patience", "downscale", "voxel_pixels")
+        _check(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
         _check(self, "fixed or adaptive", lambda x: x in get_args(Capacity), "capacity")
         _check(self, "above 0 or None", lambda x: x is None or 0 < x < math.inf, "budget_mb")
         if self.budget_mb is not None and self.capacity == "fixed":
             raise ValueError(
-                f"TrainConfig: budget_mb {self.budget_mb:g} needs capacity adaptive, got fixed"
+                f"TrainConfig: budget_mb {self.budget_mb:g} needs adaptive capacity and dense "
+                "fields, got fixed"
             )
 
 
@@ -198,12 +204,12 @@ def check_same(cfg: TrainConfig) -> None:
         raise ValueError(f"{path}: cannot be read, so the run cannot go on: {error}") from None
     now = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
     # of configurations from before there were any
-    since = {"downscale": 0, "capacity": "fixed", "budget_mb": None}
+    since = {"downscale": 0, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
     for name in ("stages", "scene", *since):
         if not isinstance(before, dict) or before.get(name, since.get(name)) != now[name]:
             raise ValueError(
                 f"{path}: the run began with other {name}: resume with the same --preset, "
-                "--minutes, --light, --downscale, --adaptive, --budget-mb and --set as then"
+                "--minutes, --light, --downscale, --capacity, --budget-mb and --set as then"
             )
 
 
@@ -228,6 +234,9 @@ def preset(
     name: str, data: Path, out: Path, light: LightName = "hybrid", varying: Varying = "none"
 ) -> TrainConfig:
     """The configuration of a preset: draft (1 minute), fast (4) or full (12) on two cores.
+
+    Its sizes are limits: capacity is adaptive under the hybrid light, and fixed under others, which
+    are there to be compared.
 
     Args:
         light, varying: see `budget`.
@@ -282,10 +291,12 @@ def chosen(
 
 
 def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
-    """The same with fine stages on such a field; the first, a coarse one, stays dense."""
+    """The same with fine stages on such a field; the first, a coarse one, stays dense. A sparse
+    field's capacity is fixed."""
     first, *rest = cfg.stages
     fine = [replace(s, field=kind) if isinstance(s, StageConfig) else s for s in rest]
-    return replace(cfg, stages=(first, *fine))
+    capacity = cfg.capacity if kind == "dense" else "fixed"
+    return replace(cfg, stages=(first, *fine), capacity=capacity)
 
 
 def work_in(minutes: float) -> Work:
@@ -341,7 +352,8 @@ def _configuration(
                 refit=True,
             )
             scene = SceneConfig(varying=varying)
-            return TrainConfig(data, out, (coarse, fine, joint, refit), minutes, scene=scene)
+            stages = (coarse, fine, joint, refit)
+            return TrainConfig(data, out, stages, minutes, capacity="adaptive", scene=scene)
         case _ if light in alone:
             scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=varying)
             # Lobes that light the materials to the end: what leaves least shading in the albedo

@@ -7,7 +7,7 @@ import pytest
 import torch
 from analytic import photos_of, sphere_scene, write_scene
 
-from univoxel.config import StageConfig, TrainConfig
+from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.scene import FILE, SceneConfig, load_checkpoint, load_scene, save_scene
 from univoxel.tasks import capacity, spare
@@ -144,6 +144,23 @@ def test_edges_stay_as_sharp_on_a_coarser_grid():
     assert coarse.sharpness == pytest.approx((0.3, 0.15))  # voxels twice as wide
 
 
+def test_no_grid_is_finer_than_the_photographs(tmp_path):
+    photos = photos_of(3, 24)
+    pixel = 1.8 / 24  # a picture is 1.8 wide at the origin
+    grids = [StageConfig(voxels=v, iterations=1, share=0.5) for v in (5e-4, 1.0)]
+    cfg = TrainConfig(tmp_path, tmp_path, (grids[0], JointConfig(), grids[1]), minutes=1.0)
+    box = torch.tensor([-0.5, -0.5, -1.0]), torch.tensor([0.5, 0.5, 1.0])
+    for wide in (1.0, 2.0):
+        cut = capacity.within_pixels(
+            dataclasses.replace(cfg, voxel_pixels=wide), photos.cameras, box
+        )
+        assert cut.stages[:2] == cfg.stages[:2]
+        grid = capacity.fit_grid(*box, capacity.voxels(cut.stages[2], []))
+        assert grid.voxel_size == pytest.approx(wide * pixel, rel=1e-3)
+    free = dataclasses.replace(cfg, voxel_pixels=0.0)
+    assert capacity.within_pixels(free, photos.cameras, box) == free
+
+
 def test_a_budget_is_kept_at_any_cost(looks, tmp_path):
     look, _ = looks
     scene = feature_scene()
@@ -178,7 +195,7 @@ def config(data, out, light=LIGHT, **changes):
     )
     scene = SceneConfig(channels=4, material_channels=2, hidden=16, light=light, sky_nodes=0)
     cfg = TrainConfig(data, out, stages, minutes=2.0, scene=scene, capacity="adaptive")
-    return dataclasses.replace(cfg, **changes)
+    return dataclasses.replace(cfg, voxel_pixels=0.0, **changes)  # pictures are 32 pixels wide
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +269,7 @@ def test_a_light_without_networks_is_adapted_too(data, tmp_path):
     [
         ({"capacity": "elastic"}, "capacity must be fixed or adaptive, got 'elastic'"),
         ({"budget_mb": -1.0}, "budget_mb must be above 0 or None, got -1"),
-        ({"budget_mb": 1.0, "capacity": "fixed"}, "budget_mb 1 needs capacity adaptive"),
+        ({"budget_mb": 1.0, "capacity": "fixed"}, "budget_mb 1 needs adaptive capacity"),
     ],
 )
 def test_bad_configurations(data, tmp_path, changes, message):

@@ -37,6 +37,7 @@ def config(data, out, **changes) -> TrainConfig:
         out,
         stages,
         minutes=2.0,
+        voxel_pixels=0.0,  # the pictures are 32 pixels wide
         scene=SceneConfig(channels=4, material_channels=2, hidden=16, light=light),
     )
     return dataclasses.replace(cfg, **changes)

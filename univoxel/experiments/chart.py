@@ -247,6 +247,8 @@ def _knobs(config: TrainConfig) -> dict[str, tuple[str, ...]]:
     stages = list(enumerate(config.stages))
     finest = max(s.voxels for _, s in stages if isinstance(s, StageConfig))
     found: dict[str, tuple[str, ...]] = {}
+    if config.capacity == "adaptive":
+        found["capacity-fixed"] = ("capacity=fixed",)
 
     def turn(name: str, wanted: Callable[[Any], bool], field: str, factor: float) -> None:
         own = []

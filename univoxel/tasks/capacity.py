@@ -1,7 +1,8 @@
 """How much model a scene needs: what is chosen, when, and how large its file may be.
 
-After the coarse stage the grid, by rehearsals of the next; after the first stage with light the
-channels, lobes and hidden units; at the end how far from the surface nodes are stored.
+No grid is finer than the photographs. Capacity that adapts chooses more: after the coarse stage
+the grid, by rehearsals of the next; after the first stage with light the channels, lobes and hidden
+units; at the end how far from the surface nodes are stored.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from univoxel.camera import Cameras
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.fields.hull import fit_grid
 from univoxel.lights import LocalSG
@@ -240,6 +242,22 @@ def on_grid(stage: StageConfig, box: tuple[Tensor, Tensor], voxel_size: float) -
     own = fit_grid(*box, round(1e6 * stage.voxels)).voxel_size
     begin, end = (s * min(own / voxel_size, 1.0) for s in stage.sharpness)
     return replace(stage, sharpness=(begin, end))
+
+
+def within_pixels(cfg: TrainConfig, cameras: Cameras, box: tuple[Tensor, Tensor]) -> TrainConfig:
+    """The same with no grid finer than the photographs are: voxels of cfg.voxel_pixels pixels or
+    more, as half of the cameras see them at the middle of the box."""
+    if not cfg.voxel_pixels:
+        return cfg
+    lower, upper = box
+    away = (cameras.camera_to_world[:, :, 3] - (lower + upper) / 2).norm(dim=1)
+    pixel = float((away / cameras.focal.mean(1)).median())
+    most = float((upper - lower).prod()) / (cfg.voxel_pixels * pixel) ** 3 / 1e6
+    stages = (
+        replace(s, voxels=min(s.voxels, most)) if isinstance(s, StageConfig) else s
+        for s in cfg.stages
+    )
+    return replace(cfg, stages=tuple(stages))
 
 
 def voxels(stage: StageConfig, chosen: list[dict]) -> int:

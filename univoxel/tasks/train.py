@@ -100,9 +100,10 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     except ValueError as error:
         raise DataError(f"{cfg.data}: {error}") from None
     box = lower, upper
+    asked, cfg = cfg, capacity.within_pixels(cfg, photos.cameras, box)
     if resume:
         scene, state = load_checkpoint(cfg.out)
-        check_same(cfg)
+        check_same(asked)
         begin -= state["seconds"]
     else:
         assert isinstance(cfg.stages[0], StageConfig)
@@ -117,7 +118,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             capacity.check_budget(scene, cfg.budget_mb)
 
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
-    save_config(cfg)
+    save_config(asked)
     with Progress(cfg, begin, state) as progress:
         if film:
             progress.watch = lambda: film.look(scene, progress)

@@ -27,6 +27,7 @@ MINUTES = 60.0
 SECONDS = 30.0  # that a training may take, a guess
 IDENTITY = "damage.json"
 SMALL = (
+    "capacity=fixed",
     *("stages.0.voxels=0.1", "stages.0.iterations=120", "stages.0.rays=512"),
     *("stages.1.voxels=0.25", "stages.1.iterations=160", "stages.1.rays=1024"),
 )
