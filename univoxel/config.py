@@ -337,8 +337,9 @@ def _configuration(
     }
     match light:
         case "hybrid":
-            coarse, fine = replace(coarse, share=0.1), replace(fine, share=0.4)
-            joint = JointConfig(iterations=steps, share=0.35)
+            # Shares are what the stages cost where none is cut
+            coarse, fine = replace(coarse, share=0.12), replace(fine, share=0.52)
+            joint = JointConfig(iterations=steps, share=0.21)
             refit = StageConfig(
                 voxels=voxels,
                 iterations=steps // 3,
