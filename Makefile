@@ -9,6 +9,9 @@ export OMP_WAIT_POLICY ?= passive
 DEPS := $(CURDIR)/.deps/usr/include
 export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE_PATH))
 
+# Tests in two processes of one thread each: most are too small for a second thread to help.
+TWO := -n 2 --dist loadfile
+
 .PHONY: help dev demo test lint format bench asan clean
 .DELETE_ON_ERROR:
 
@@ -36,7 +39,7 @@ demo: dev
 	$(BIN)/univoxel demo --out runs/demo
 
 test: dev
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(TWO)
 
 lint: $(SETUP)
 	$(BIN)/ruff format --check .
@@ -72,7 +75,7 @@ asan: build-asan/.installed
 		build-asan/site/univoxel/
 	cd build-asan/site && ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 		LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libubsan.so)" \
-		$(CURDIR)/$(BIN)/python -m pytest -q -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
+		OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -q $(TWO) -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
 		-p no:cacheprovider -k "not compile" $(CURDIR)/tests/ops
 
 clean:
