@@ -50,6 +50,7 @@ METAL = 0.2  # metallic from which on a point is taken for metal
 NEWTON_COST = 2.7  # of a sighting in a Newton step, over one in a step of Adam; measured
 UNSOLVABLE = "the equations for the map have no solution: it stays as it is in this round"
 LEAST_CHUNKS, LEAST_POINTS = 2, 2000  # on a machine however slow
+LEAST_VIEWS = 2  # of a point in a Newton round
 
 
 @dataclass(frozen=True)
@@ -269,8 +270,11 @@ def newton_round(
     seen, sky = problem.seen, scene.sky
     assert sky is not None
     counts = seen.offsets.diff()
-    # A metal has no albedo to eliminate
-    rich = ((counts >= cfg.newton_views // 2) & ~problem.metal).nonzero()[:, 0]
+    # Points that are seen as often as usual: of few photographs that is less than is wanted. In one
+    # view the albedo explains everything; a metal has no albedo to eliminate
+    usual = float(counts[counts > 0].float().median())
+    least = max(LEAST_VIEWS, min(cfg.newton_views // 2, usual))
+    rich = ((counts >= least) & ~problem.metal).nonzero()[:, 0]
     chosen = rich[torch.randperm(len(rich))[: cfg.newton_points]]
     if not len(chosen):
         return []
