@@ -226,7 +226,7 @@ class Work:
 PRESETS = {
     "draft": Work(1.0, voxels=1.0, steps=400, rays=1024),
     "fast": Work(4.0, voxels=2.0, steps=1200, rays=2048),
-    "full": Work(12.0, voxels=4.0, steps=2500, rays=2048),
+    "full": Work(12.0, voxels=4.0, steps=4200, rays=2048),
 }
 
 
