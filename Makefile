@@ -75,8 +75,8 @@ asan: build-asan/.installed
 		build-asan/site/univoxel/
 	cd build-asan/site && ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 		LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libubsan.so)" \
-		OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -q $(TWO) -c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) \
-		-p no:cacheprovider -k "not compile" $(CURDIR)/tests/ops
+		OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -q $(TWO) \
+		-c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) -p no:cacheprovider -k "not compile" $(CURDIR)/tests/ops
 
 clean:
 	rm -rf build build-asan .deps .venv univoxel/_core

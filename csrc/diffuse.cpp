@@ -16,10 +16,10 @@ struct Node {
     int64_t x, y, z;
 };
 
-/// node_of(row) -> Node, row_of(x, y, z) -> row.
-template <class T, class NodeOf, class RowOf>
-void diffuse(T* values, const int64_t size[3], int64_t n_rows, const int64_t* rows, int64_t n,
-             T amount, int passes, int threads, NodeOf&& node_of, RowOf&& row_of) {
+/// node_of(row) -> Node, which nodes.row undoes.
+template <class T, class Nodes, class NodeOf>
+void diffuse(T* values, const int64_t size[3], const Nodes& nodes, int64_t n_rows,
+             const int64_t* rows, int64_t n, T amount, int passes, int threads, NodeOf&& node_of) {
     threads = team_for(n, threads);
     RowSet chosen(n_rows);
     for (int64_t k = 0; k < n; ++k) chosen.mark(rows[k]);
@@ -33,7 +33,7 @@ void diffuse(T* values, const int64_t size[3], int64_t n_rows, const int64_t* ro
         for (int64_t k = begin; k < end; ++k) {
             const Node at = node_of(rows[k]);
             const auto put = [&](int side, bool inside, int64_t x, int64_t y, int64_t z) {
-                near[side * n + k] = inside ? slot(row_of(x, y, z)) : static_cast<int32_t>(k);
+                near[side * n + k] = inside ? slot(nodes.row(x, y, z)) : static_cast<int32_t>(k);
             };
             put(0, at.x > 0, at.x - 1, at.y, at.z);
             put(1, at.x + 1 < size[0], at.x + 1, at.y, at.z);
@@ -71,9 +71,8 @@ void diffuse_rows(T* values, const int64_t size[3], const int64_t* rows, int64_t
         const int64_t line = row / size[2], x = line / size[1];
         return Node{x, line - x * size[1], row - line * size[2]};
     };
-    const auto row_of = [&](int64_t x, int64_t y, int64_t z) { return nodes.row(x, y, z); };
-    diffuse(values, size, size[0] * size[1] * size[2], rows, n, amount, passes, threads, node_of,
-            row_of);
+    const int64_t n_rows = size[0] * size[1] * size[2];
+    diffuse(values, size, nodes, n_rows, rows, n, amount, passes, threads, node_of);
 }
 
 template <class T>
@@ -86,8 +85,7 @@ void diffuse_brick_rows(T* values, const int64_t size[3], const BrickNodes& node
         return Node{ab / nodes.bricks_y * kBrick + (inside >> 4),
                     ab % nodes.bricks_y * kBrick + (inside >> 2 & 3), c * kBrick + (inside & 3)};
     };
-    const auto row_of = [&](int64_t x, int64_t y, int64_t z) { return nodes.row(x, y, z); };
-    diffuse(values, size, n_rows, rows, n, amount, passes, threads, node_of, row_of);
+    diffuse(values, size, nodes, n_rows, rows, n, amount, passes, threads, node_of);
 }
 
 template void diffuse_rows(float*, const int64_t[3], const int64_t*, int64_t, float, int, int);

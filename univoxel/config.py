@@ -150,8 +150,8 @@ class TrainConfig:
             )
         if self.capacity == "adaptive" and "sparse" in kinds:
             raise ValueError(
-                "TrainConfig: adaptive capacity fits dense grids: leave the sparse field out, or "
-                "take --capacity fixed"
+                "TrainConfig: adaptive capacity, and so --budget-mb, is for dense grids: leave it "
+                "out, or the sparse field"
             )
         if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
             raise ValueError(

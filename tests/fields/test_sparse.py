@@ -31,6 +31,18 @@ def near_surface(count, distance, seed=0):
     return direction * (RADIUS + distance * (2 * torch.rand(count, 1, generator=g) - 1))
 
 
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_features_alone_send_nothing_to_the_sdf(kind):
+    dense = sphere()
+    field = dense if kind == "dense" else SparseField.around(dense, dense.grid)
+    points = near_surface(50, field.voxel_size)
+    features = field.features_at(points)
+    assert torch.equal(features, field.sample(points).features)
+    features.sum().backward()
+    assert field.sdf.grad is None
+    assert field.features.grad is not None
+
+
 @pytest.mark.parametrize("nodes", [40, 41, 80])
 def test_near_the_surface_it_is_the_dense_field(nodes):
     dense, fine = sphere(), sphere(nodes).grid

@@ -1,5 +1,7 @@
 """Smoothing at chosen nodes."""
 
+import dataclasses
+
 import pytest
 import torch
 from bricks import cut
@@ -182,3 +184,16 @@ def test_diffusion_refuses(rows, options, says):
     options = {"size": (2, 2, 2), "amount": 0.5, "passes": 1} | options
     with pytest.raises(ValueError, match=says):
         diffuse_rows_(torch.ones(2), torch.tensor(rows), **options)
+
+
+def test_diffusion_refuses_what_does_not_fit_its_memory_or_its_bricks():
+    one, rows = torch.ones(1), torch.tensor([128])
+    _, _, bricks = cut(torch.linspace(-1, 1, 512).view(8, 8, 8), far=1.0)
+    with pytest.raises(ValueError, match="values must be contiguous"):
+        diffuse_rows_(torch.ones(4)[::2], torch.tensor([0, 1]), (2, 2, 2), 0.5, 1)
+    with pytest.raises(ValueError, match="size must be that of the grid"):
+        diffuse_rows_(one, rows, (8, 8, 9), 0.5, 1, bricks)
+    spare = torch.cat([bricks.place, bricks.place.new_full((1,), -1)])
+    wider = dataclasses.replace(bricks, place=spare)
+    with pytest.raises(ValueError, match="bricks that stand somewhere"):
+        diffuse_rows_(one, torch.tensor([64 * len(bricks.place)]), (8, 8, 8), 0.5, 1, wider)

@@ -145,8 +145,8 @@ def test_edges_stay_as_sharp_on_a_coarser_grid():
 
 
 def test_no_grid_is_finer_than_the_photographs(tmp_path):
-    photos = photos_of(3, 24)
-    pixel = 1.8 / 24  # a picture is 1.8 wide at the origin
+    photos = photos_of(3, 48)
+    pixel = 1.8 / 48  # a picture is 1.8 wide at the origin
     grids = [StageConfig(voxels=v, iterations=1, share=0.5) for v in (5e-4, 1.0)]
     cfg = TrainConfig(tmp_path, tmp_path, (grids[0], JointConfig(), grids[1]), minutes=1.0)
     box = torch.tensor([-0.5, -0.5, -1.0]), torch.tensor([0.5, 0.5, 1.0])
@@ -157,6 +157,8 @@ def test_no_grid_is_finer_than_the_photographs(tmp_path):
         assert cut.stages[:2] == cfg.stages[:2]
         grid = capacity.fit_grid(*box, capacity.voxels(cut.stages[2], []))
         assert grid.voxel_size == pytest.approx(wide * pixel, rel=1e-3)
+    cut = capacity.within_pixels(dataclasses.replace(cfg, voxel_pixels=99.0), photos.cameras, box)
+    assert capacity.voxels(cut.stages[2], []) == capacity.FEWEST_VOXELS
     free = dataclasses.replace(cfg, voxel_pixels=0.0)
     assert capacity.within_pixels(free, photos.cameras, box) == free
 

@@ -37,10 +37,10 @@ def config(data, out, **changes) -> TrainConfig:
         out,
         stages,
         minutes=2.0,
-        voxel_pixels=0.0,  # the pictures are 32 pixels wide
         scene=SceneConfig(channels=4, material_channels=2, hidden=16, light=light),
     )
-    return dataclasses.replace(cfg, **changes)
+    # The pictures are 32 pixels wide
+    return dataclasses.replace(cfg, **{"voxel_pixels": 0.0} | changes)
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +91,12 @@ def test_every_light_learns_the_photographs(data, tmp_path, light):
     pixels = torch.cartesian_prod(torch.arange(2), torch.arange(32), torch.arange(32))
     psnr = task.held_out_psnr(scene, photos, pixels, physical=True)
     assert psnr > 18  # black gives 9 dB, the right sphere in one mean colour 16
+
+
+def test_grids_of_a_training_are_no_finer_than_its_photographs(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(task, "run_stage", lambda *_: None)
+    scene = load_scene(train(config(data, tmp_path / "run", voxel_pixels=1.2)))
+    assert scene.field.voxel_size == pytest.approx(1.2 * 1.8 / 32, rel=0.05)  # cameras differ
 
 
 def test_a_gradient_spreads_over_the_nodes_that_it_touches():

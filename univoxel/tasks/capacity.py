@@ -252,7 +252,8 @@ def within_pixels(cfg: TrainConfig, cameras: Cameras, box: tuple[Tensor, Tensor]
     lower, upper = box
     away = (cameras.camera_to_world[:, :, 3] - (lower + upper) / 2).norm(dim=1)
     pixel = float((away / cameras.focal.mean(1)).median())
-    most = float((upper - lower).prod()) / (cfg.voxel_pixels * pixel) ** 3 / 1e6
+    most = float((upper - lower).prod()) / (cfg.voxel_pixels * pixel) ** 3
+    most = max(most, FEWEST_VOXELS) / 1e6
     stages = (
         replace(s, voxels=min(s.voxels, most)) if isinstance(s, StageConfig) else s
         for s in cfg.stages
