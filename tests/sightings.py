@@ -16,7 +16,7 @@ from univoxel.data import Photos
 from univoxel.ops import shade_map
 from univoxel.render.transport import Observations, Transport
 from univoxel.sphere import fibonacci_sphere
-from univoxel.tasks import joint
+from univoxel.tasks.sightings import Problem, widened
 
 
 def facing(normal: torch.Tensor, least: float) -> torch.Tensor:
@@ -26,7 +26,7 @@ def facing(normal: torch.Tensor, least: float) -> torch.Tensor:
     return normalize(wo + least * normal, dim=1)
 
 
-def problem_on_a_sphere(points: int, views: int, nodes: int) -> joint.Problem:
+def problem_on_a_sphere(points: int, views: int, nodes: int) -> Problem:
     """Points that see everything above their horizon, and black photographs of them."""
     normal = normalize(torch.randn(points, 3), dim=1)
     wo = facing(normal.repeat_interleave(views, 0), 0.3)
@@ -38,10 +38,10 @@ def problem_on_a_sphere(points: int, views: int, nodes: int) -> joint.Problem:
     indirect = torch.zeros(points, nodes, 3, dtype=torch.float16)
     transport = Transport(fibonacci_sphere(nodes), open_share, indirect)
     no_metal = torch.zeros(points, dtype=torch.bool)
-    return joint.Problem(seen, transport, black, no_metal, 0.05)
+    return Problem(seen, transport, black, no_metal, 0.05)
 
 
-def photographed(problem: joint.Problem, map, albedo, roughness, f0=None) -> joint.Problem:
+def photographed(problem: Problem, map, albedo, roughness, f0=None) -> Problem:
     """The same with the sightings that a map [D, 3] and materials [P, 3], [P] make."""
     point = torch.repeat_interleave(problem.seen.offsets.diff())
     t, seen = problem.transport, problem.seen
@@ -53,7 +53,7 @@ def photographed(problem: joint.Problem, map, albedo, roughness, f0=None) -> joi
     return replace(problem, seen=seen, target=losses.encode(color))
 
 
-def random_problem(points: int = 5, views: int = 4, nodes: int = 12) -> joint.Problem:
+def random_problem(points: int = 5, views: int = 4, nodes: int = 12) -> Problem:
     """With half-open directions and light from what blocks them."""
     torch.manual_seed(1)
     problem = problem_on_a_sphere(points, views, nodes)
@@ -124,7 +124,7 @@ def photographs_under(
         wo = normalize(cameras.camera_to_world[v, :, 3] - RADIUS * n, dim=1)
         count = len(n)
         albedo = torch.where(n[:, :1] > 0, RED, BLUE)
-        shown = joint.widened(torch.full((count,), roughness), len(map))
+        shown = widened(torch.full((count,), roughness), len(map))
         rgb = shade_map(
             map, torch.full((count, len(map)), 255, dtype=torch.uint8),
             torch.zeros(count, len(map), 3).half(), torch.arange(count), n, wo, albedo,

@@ -12,7 +12,7 @@ from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.lights import SGConfig
 from univoxel.optim import RowAdam
 from univoxel.scene import SceneConfig, load_scene
-from univoxel.tasks import equations, guard, joint
+from univoxel.tasks import equations, guard, joint, newton
 from univoxel.tasks import progress as progress_module
 from univoxel.tasks import train as task
 from univoxel.tasks.guard import LIMIT, PROOF, Guard
@@ -292,7 +292,7 @@ def test_a_system_is_damped_only_as_it_needs():
 def test_a_newton_round_without_a_solution_leaves_the_map(monkeypatch):
     scene, told = sphere_scene(32), []
     problem = problem_on_a_sphere(100, 12, 32)
-    monkeypatch.setattr(joint, "solve_damped", lambda *_: None)
-    assert joint.newton_round(scene, problem, JOINT, tell=told.append) == []
-    assert told == [joint.UNSOLVABLE]
+    monkeypatch.setattr(newton, "solve_damped", lambda *_: None)
+    assert newton.newton_round(scene, problem, JOINT, tell=told.append) == []
+    assert told == [newton.UNSOLVABLE]
     assert (scene.sky.log_radiance == 0).all()

@@ -26,7 +26,8 @@ from univoxel.data.images import read_image
 from univoxel.lights import SGConfig
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import Scene, SceneConfig, load_checkpoint, load_scene, save_scene
-from univoxel.tasks import equations, joint
+from univoxel.tasks import equations, joint, newton
+from univoxel.tasks.sightings import draw_sightings, widened
 from univoxel.tasks.train import held_out_psnr, train
 
 NODES = 12
@@ -53,7 +54,7 @@ def test_sightings_are_drawn_in_the_light_of_their_photographs():
     order = torch.randperm(20)
     with torch.no_grad():
         drawn = torch.empty(20, 3)
-        drawn[order] = joint.draw_sightings(
+        drawn[order] = draw_sightings(
             scene, problem, point[order], order, albedo[point][order], roughness[point][order], f0
         )
         for v in range(4):
@@ -68,7 +69,7 @@ def test_equations_know_what_differs():
     map, albedo = 0.5 + torch.rand(NODES, 3), 0.2 + 0.6 * torch.rand(5, 3)
     problem = photographed(problem, map, albedo, torch.full((5,), 0.3))
     sighting = torch.arange(20).view(5, 4)
-    rows = joint.light_rows(problem, torch.arange(5), sighting, torch.full((5,), 0.3))
+    rows = newton.light_rows(problem, torch.arange(5), sighting, torch.full((5,), 0.3))
     assert torch.equal(rows.view, sighting % 4)
     values = {f.name: getattr(rows, f.name) for f in dataclasses.fields(rows)}
     rows = equations.Rows(**{k: v.double() if k != "view" else v for k, v in values.items()})
@@ -79,7 +80,7 @@ def test_equations_know_what_differs():
     x, a, g, w = (value.double().requires_grad_() for value in start)
     more = torch.einsum("vrc,rd->vdc", w, basis)
     light = x.exp() * (change * more.exp())[rows.view]  # [P, V, D, 3]
-    diffuse = torch.einsum("pd,pvdc->pvc", rows.diffuse, light) * rows.through[..., None]
+    diffuse = torch.einsum("pxd,pvdc->pvc", rows.diffuse, light) * rows.through[..., None]
     shine = torch.einsum("pvd,pvdc->pvc", rows.shine, light)
     drawn = a.exp()[:, None] * (diffuse + rows.diffuse_blocked) + shine + rows.shine_blocked
     residual = rows.target - losses.encode(g.exp()[rows.view] * drawn)
@@ -122,7 +123,7 @@ def test_newton_finds_gains_and_what_each_map_has_of_its_own():
             problem,
             map * change[v].exp() * 2 ** wanted[v],
             torch.tensor([0.5, 0.4, 0.3]).expand(400, 3),
-            joint.widened(torch.full((400,), 0.3), nodes),
+            widened(torch.full((400,), 0.3), nodes),
         ).seen.color[v::views]
         for v in range(views)
     ]
@@ -132,8 +133,8 @@ def test_newton_finds_gains_and_what_each_map_has_of_its_own():
         scene.views.gain_steps.zero_()
         scene.views.sky_weights.zero_()
     cfg = JointConfig(newton_points=400, newton_views=12, newton_steps=8)
-    costs = joint.newton_round(scene, problem, cfg)
-    costs += joint.newton_round(scene, problem, cfg)
+    costs = newton.newton_round(scene, problem, cfg)
+    costs += newton.newton_round(scene, problem, cfg)
     assert costs[-1] < 0.03 * costs[0]
     # A view sees half a sphere of normals, on which a change of degree 2 or 3 is nearly a gain and
     # one of degree 1: between them part stays open, though what they draw together does not

@@ -35,12 +35,16 @@ def view_differences(scene: Scene) -> Differs | None:
 
 @dataclass(frozen=True)
 class Rows:
-    """What light does at V sightings of P points, linear in the map; constant in a round."""
+    """What light does at V sightings of P points, linear in the map; constant in a round.
 
-    diffuse: Tensor  # [P, D] sky into irradiance: cosine, open share and solid angle
-    through: Tensor  # [P, V] irradiance into radiance, for albedo 1
-    shine: Tensor  # [P, V, D] sky into specular radiance
-    diffuse_blocked: Tensor  # [P, V, 3] radiance from the blocked share, for albedo 1
+    A base colour, the albedo, multiplies part of it: of a dielectric the irradiance, [P, 1, D], as
+    the sightings share it; of a metal the mirrored light, [P, V, D].
+    """
+
+    diffuse: Tensor  # sky into what the base multiplies: cosine, open share, solid angle, BRDF
+    through: Tensor  # [P, V] that into radiance, for base 1
+    shine: Tensor  # [P, V, D] sky into radiance that does not depend on the base
+    diffuse_blocked: Tensor  # [P, V, 3] radiance from the blocked share, for base 1
     shine_blocked: Tensor  # [P, V, 3]
     target: Tensor  # [P, V, 3] sRGB-encoded
     view: Tensor  # [P, V] int64: which photograph
@@ -63,7 +67,7 @@ def linearised(
     """One channel's weighted residuals [P, V], and their slopes, weighted and encoded: by the log
     map [P, V, D], by log albedo [P, V], and by a factor on everything [P, V]."""
     albedo = log_albedo[:, c, None].exp()
-    by_diffuse, by_shine, gain = rows.diffuse[:, None], rows.shine, 1.0
+    by_diffuse, by_shine, gain = rows.diffuse, rows.shine, 1.0
     if differs is not None:
         gain = differs.gain[rows.view, c]
         if differs.change is not None:

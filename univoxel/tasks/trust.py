@@ -27,8 +27,8 @@ from univoxel.render.transport import (
 )
 from univoxel.scene import Scene
 from univoxel.sphere import fibonacci_sphere
-from univoxel.tasks import joint
 from univoxel.tasks.equations import CLIPPED
+from univoxel.tasks.sightings import Problem, draw_sightings, unexposed, widened
 
 POINTS, FEW_POINTS = 20000, 2000  # on the surface: for maps, and for words alone
 SIGHTINGS = 8  # of a point that are rendered again, at most
@@ -92,7 +92,7 @@ def survey(scene: Scene, photos: Photos, points: int = POINTS) -> Survey:
     direction = scene.sky.direction if scene.sky else fibonacci_sphere(DIRECTIONS)
     # What blocks light is as bright as the nearest point is in the photographs
     near = KDTree(position.numpy()).query(mesh.vertices.numpy(), workers=-1)[1]
-    bright = mean_colors(joint.unexposed(scene, seen))[torch.from_numpy(near)]
+    bright = mean_colors(unexposed(scene, seen))[torch.from_numpy(near)]
     transport = trace(seen, tracer, mesh, bright, direction, 1, offset, generator)
 
     cosine = (normal @ direction.T).clamp_min(0)
@@ -191,10 +191,10 @@ def render(
     assert surface.metallic is not None
     diffuse, f0 = brdf.split(surface.albedo, surface.metallic)
     assert isinstance(f0, Tensor)
-    roughness = joint.widened(surface.roughness, len(transport.direction))
+    roughness = widened(surface.roughness, len(transport.direction))
     no_metal = torch.zeros(len(surface.albedo), dtype=torch.bool)
-    problem = joint.Problem(seen, transport, seen.color, no_metal, scene.field.voxel_size)
-    return joint.draw_sightings(
+    problem = Problem(seen, transport, seen.color, no_metal, scene.field.voxel_size)
+    return draw_sightings(
         scene, problem, point, sighting, diffuse[point], roughness[point], f0[point]
     )
 
