@@ -1,5 +1,6 @@
 """Metal or not: decided on a sphere of known materials under a known map."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,7 @@ from sightings import lamps, photographed, problem_on_a_sphere
 from univoxel import brdf, losses
 from univoxel.config import JointConfig
 from univoxel.tasks.equations import CAUCHY
+from univoxel.tasks.joint import supposed
 from univoxel.tasks.metals import ASKED, METAL_BASE, evidence, find_metal, fitted
 from univoxel.tasks.sightings import widened
 
@@ -91,3 +93,25 @@ def test_fitted_finds_the_best_base_within_its_bounds():
         assert cost[p] < 1.5 * best + 1e-5
     held = fitted(constant, slope, torch.zeros(6, 5, 3), METAL_BASE)
     assert (held > fitted(constant, slope, torch.zeros(6, 5, 3), 0.0)).all()
+
+
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_the_better_supposition_is_found_without_a_map(metallic):
+    """All of metal, or none: Newton under the wrong one leaves more of the photographs."""
+    scene, problem = sphere_of((0.9, 0.6, 0.4), metallic, 0.3)
+    with torch.no_grad():
+        scene.sky.log_radiance.zero_()
+    cfg = replace(CFG, newton_steps=4)
+    found = supposed(scene, problem, cfg, math.inf, pytest.fail)
+    # Two short rounds from no map at all: where no lamp shines there is little evidence as yet
+    assert (found.metal.float().mean() - metallic).abs() < 0.1
+    error = (scene.sky.log_radiance - lamps(NODES).log()).detach()
+    # Albedo and light share a scale; lamps are ten times as bright as the rest
+    assert (error - error.mean()).abs().mean() < 0.5
+
+
+def test_without_sightings_nothing_is_supposed():
+    scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3, views=1)
+    before = scene.sky.log_radiance.detach().clone()
+    assert supposed(scene, problem, CFG, math.inf, pytest.fail) is problem
+    assert torch.equal(scene.sky.log_radiance, before)

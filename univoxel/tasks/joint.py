@@ -8,6 +8,9 @@ map and materials alternate with Gauss-Newton steps on the map.
 
 from __future__ import annotations
 
+import copy
+import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -29,6 +32,9 @@ from univoxel.tasks.sightings import Problem, draw, draw_sightings, pose, widene
 
 NEWTON_COST = 2.7  # of a sighting in a Newton step, over one in a step of Adam; measured
 LEAST_POINTS = 2000  # on a machine however slow
+FEW = 3  # one in so many points serves to tell what to suppose at first
+TRIALS = 4 / FEW  # rounds of Newton that this takes
+CONVINCING = 0.8  # times the other's residual: what is left if metal everywhere is to be supposed
 
 
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
@@ -51,8 +57,12 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     for done in progress.steps(newton_share(cfg)):
         if done >= turn:
             if more < cfg.rounds:
+                seconds = progress.reserved / more
+                if more == cfg.rounds - 1:  # the first round
+                    seconds = progress.reserved / (more + TRIALS)
+                    with progress.apart():
+                        problem = supposed(scene, problem, cfg, seconds, progress.trouble)
                 with progress.apart():
-                    seconds = progress.reserved / more
                     newton_round(scene, problem, cfg, seconds, progress.trouble)
                     problem = replace(problem, metal=find_metal(scene, problem, cfg))
                 more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
@@ -87,9 +97,43 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             guard.keep()
 
 
+def supposed(
+    scene: Scene, problem: Problem, cfg: JointConfig, seconds: float, tell: Callable[[str], None]
+) -> Problem:
+    """The problem with its metals, and the scene's map, from the better of two suppositions.
+
+    Light and metal are found from one another: where all is metal, a map for dielectrics is so
+    bright that nothing looks like metal under it. So one trial starts from what the stages before
+    took for metal, one from metal everywhere: a round of Newton, metals under its map, and a round
+    of Newton with them, whose residual decides.
+
+    Args:
+        seconds: that a round of Newton may take, about.
+    """
+    few = replace(cfg, newton_points=-(-cfg.newton_points // FEW))
+    lights = [light for light in (scene.sky, scene.views) if light is not None]
+    before = [copy.deepcopy(light.state_dict()) for light in lights]
+    suppositions = (problem.metal, 1.0), (torch.ones_like(problem.metal), CONVINCING)
+    least, best = math.inf, (problem, before)
+    for metal, share in suppositions:
+        for light, state in zip(lights, before, strict=True):
+            light.load_state_dict(state)
+        trial = replace(problem, metal=metal)
+        newton_round(scene, trial, few, seconds / FEW, tell)
+        trial = replace(problem, metal=find_metal(scene, trial, cfg))
+        costs = newton_round(scene, trial, few, seconds / FEW, tell)
+        if costs and costs[-1] < share * least:
+            least = costs[-1]
+            best = trial, [copy.deepcopy(light.state_dict()) for light in lights]
+    for light, state in zip(lights, best[1], strict=True):
+        light.load_state_dict(state)
+    return best[0]
+
+
 def newton_share(cfg: JointConfig) -> float:
     """Share of the stage's time that Newton rounds take if nothing is cut."""
-    sightings = cfg.newton_points * cfg.newton_views * cfg.newton_steps * (cfg.rounds - 1)
+    rounds = cfg.rounds - 1 + TRIALS if cfg.rounds > 1 else 0
+    sightings = cfg.newton_points * cfg.newton_views * cfg.newton_steps * rounds
     newton = NEWTON_COST * sightings
     return newton / (newton + cfg.iterations * cfg.rays)
 
