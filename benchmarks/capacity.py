@@ -1,12 +1,14 @@
-"""Quality against the size of the model: fixed sizes, and what adapting them makes of the scene.
+"""Quality against the size of the model and training time: kinds of fields, and fixed sizes.
 
-    python benchmarks/capacity.py DATA [--preset draft] [--settings fixed voxels-0.25 adaptive ...]
+    python benchmarks/capacity.py DATA ... [--preset draft] [--settings dense sparse hash adaptive]
 
-Trains and evaluates DATA with every setting, all steps, relit with 16 samples; what is done
-already is not done again. A setting is `fixed`, the preset as it is; `voxels-X`, X million voxels
-in its fine stages; `channels-N`, N feature channels, half of them of material; `adaptive`; or
-`budget-X`, adaptive in X million bytes. Parameters are counted as `univoxel info` does, in the
-model's file. Writes results/capacity.json, .png and .svg; the result names the command.
+Trains and evaluates every DATA with every setting, all steps, relit with 16 samples; what is done
+already is not done again. `ball` for DATA makes the scene of ball.py. A setting is `dense`,
+`sparse` or `hash`, the preset's sizes on such a field; `adaptive`, its sizes as limits;
+`budget-X`, adaptive in X million bytes; `voxels-X`, dense with X million voxels in the fine stages;
+`channels-N`, dense with N feature channels, half of them of material. Parameters are counted as
+`univoxel info` does, in the model's file. Writes results/capacity.json, .png and .svg; the result
+names the command.
 """
 
 from __future__ import annotations
@@ -17,7 +19,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from univoxel.config import StageConfig, TrainConfig, preset
+from ball import write
+
+from univoxel.config import StageConfig, TrainConfig, preset, with_field
 from univoxel.data.images import replacing
 from univoxel.experiments import plots
 from univoxel.scene import FILE
@@ -25,8 +29,9 @@ from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.info import info
 from univoxel.tasks.train import train
 
-SETTINGS = ["fixed", "voxels-0.5", "voxels-0.25", "voxels-0.125", "channels-8", "adaptive"]
-PANELS = [plots.NVS, plots.ALBEDO, plots.RELIT, plots.NORMAL]
+SETTINGS = ["dense", "sparse", "hash", "adaptive"]
+PANELS = [plots.NVS, plots.ALBEDO, plots.RELIT]
+ACROSS = [("stored_parameters", "parameters in the model's file"), ("train_seconds", "training, s")]
 
 
 def configured(base: TrainConfig, setting: str) -> TrainConfig:
@@ -37,8 +42,8 @@ def configured(base: TrainConfig, setting: str) -> TrainConfig:
     """
     kind, _, value = setting.partition("-")
     match kind:
-        case "fixed":
-            return base
+        case "dense" | "sparse" | "hash":
+            return with_field(base, kind)
         case "voxels":
             first, *rest = base.stages
             fewer = [
@@ -56,36 +61,41 @@ def configured(base: TrainConfig, setting: str) -> TrainConfig:
 
 
 def draw(runs: dict[str, dict], stem: Path) -> None:
-    """Write the chart: a panel for each measure, parameters across."""
+    """Write the chart: a column for each measure, a row for size and one for time; a line joins
+    the settings of a scene."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter, NullFormatter
 
-    figure = Figure(figsize=(3.6 * len(PANELS), 3.6), layout="constrained")
-    for axes, measure in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
-        for k, (name, own) in enumerate(runs.items()):
-            adapted = name.split()[-1].startswith(("adaptive", "budget"))
-            x, y = own["stored_parameters"], own[measure.key]
-            axes.scatter(x, y, color=plots.color(1 if adapted else 0), zorder=2)
-            axes.annotate(
-                name.split()[-1],
-                (x, y),
-                xytext=(4, 4 - 12 * (k % 2)),
-                textcoords="offset points",
-                fontsize=7,
-            )
-        axes.set(xscale="log", xlabel="parameters in the model's file", title=measure.title)
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.margins(x=0.25, y=0.1)
-        axes.grid(alpha=0.3)
-        if not measure.more:
-            axes.invert_yaxis()
+    scenes = list(dict.fromkeys(name.split()[0] for name in runs))
+    settings = list(dict.fromkeys(name.split()[-1] for name in runs))
+    figure = Figure(figsize=(4 * len(PANELS), 7), layout="constrained")
+    grid = figure.subplots(len(ACROSS), len(PANELS), squeeze=False)
+    for row, (key, label) in zip(grid, ACROSS, strict=True):
+        for axes, measure in zip(row, PANELS, strict=True):
+            for mark, scene in zip("osD^vP*", scenes, strict=False):
+                own = {n.split()[-1]: r for n, r in runs.items() if n.split()[0] == scene}
+                own = {n: r for n, r in own.items() if measure.key in r}
+                points = sorted((r[key], r[measure.key]) for r in own.values())
+                axes.plot(*zip(*points, strict=True), color="0.8", zorder=1) if points else None
+                for name, r in own.items():
+                    number = settings.index(name)
+                    axes.scatter(r[key], r[measure.key], color=plots.color(number), marker=mark)
+            axes.set(xscale="log", xlabel=label, title=measure.title)
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.xaxis.set_minor_formatter(NullFormatter())
+            axes.grid(alpha=0.3)
+    first = grid[0][0]
+    for k, name in enumerate(settings):
+        first.scatter([], [], color=plots.color(k), label=name)
+    for mark, scene in zip("osD^vP*", scenes, strict=False):
+        first.scatter([], [], color="0.5", marker=mark, label=scene)
+    first.legend(fontsize=7)
     plots.save_figure(figure, stem)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("data", type=Path)
+    parser.add_argument("data", nargs="+", type=Path)
     parser.add_argument("--preset", default="draft")
     parser.add_argument("--settings", nargs="+", default=SETTINGS)
     parser.add_argument("--minutes", type=float, default=9999.0, help="so many that steps decide")
@@ -95,22 +105,25 @@ def main() -> None:
     plots.require()
     result = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {"runs": {}}
     result["command"] = " ".join(["python", *sys.argv])
-    for setting in arguments.settings:
-        name = f"{arguments.data.name} {arguments.preset} {setting}"
-        if name in result["runs"]:
-            continue
-        run = arguments.work / name.replace(" ", "_")
-        base = replace(preset(arguments.preset, arguments.data, run), capacity="fixed")
-        cfg = replace(configured(base, setting), minutes=arguments.minutes)
-        train(cfg, resume=(run / FILE).is_file())
-        found = info(run)
-        own = evaluate(run, samples=16) | {
-            "stored_parameters": found["parameters"],
-            "chosen": [c["said"] for c in found["chosen"]],
-        }
-        result["runs"][name] = own
-        with replacing(arguments.out) as temporary:
-            temporary.write_text(json.dumps(result, indent=1) + "\n")
+    for data in arguments.data:
+        source = write(arguments.work / "data/ball") if str(data) == "ball" else data
+        for setting in arguments.settings:
+            name = f"{data.name} {arguments.preset} {setting}"
+            if name in result["runs"]:
+                continue
+            run = arguments.work / name.replace(" ", "_")
+            base = replace(preset(arguments.preset, source, run), capacity="fixed")
+            cfg = replace(configured(base, setting), minutes=arguments.minutes)
+            train(cfg, resume=(run / FILE).is_file())
+            found = info(run)
+            own = evaluate(run, samples=16) | {
+                "stored_parameters": found["parameters"],
+                "bytes": found["bytes"],
+                "chosen": [c["said"] for c in found["chosen"]],
+            }
+            result["runs"][name] = own
+            with replacing(arguments.out) as temporary:
+                temporary.write_text(json.dumps(result, indent=1) + "\n")
     draw(result["runs"], arguments.out.with_suffix(""))
 
 

@@ -24,6 +24,7 @@ from train_step import OTHER, STAGES, Clock
 
 from univoxel.config import JointConfig, TrainConfig, chosen
 from univoxel.ops import VisibilityScene
+from univoxel.solve import sightings
 from univoxel.tasks import joint, train
 
 HERE = Path(__file__).parent
@@ -31,7 +32,7 @@ FIXED = ("joint: pose and trace", "joint: Newton", "previews", "checkpoints", "h
 EVERY = 16  # backward passes of which one is divided
 START = "before"  # loading, hull; also what lies between the stages
 PARTS = STAGES | {
-    "light": [*STAGES["light"], (joint, "shade_map")],
+    "light": [*STAGES["light"], (sightings, "shade_map")],
     "joint: pose and trace": [(joint, "pose")],
     "joint: Newton": [(joint, "newton_round")],
     "hull": [(train, name) for name in ("mask_distances", "estimate_bounds", "visual_hull")],

@@ -15,8 +15,8 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.ops import shade_map
 from univoxel.render.transport import Observations, Transport
+from univoxel.solve.sightings import Problem, widened
 from univoxel.sphere import fibonacci_sphere
-from univoxel.tasks.sightings import Problem, widened
 
 
 def facing(normal: torch.Tensor, least: float) -> torch.Tensor:

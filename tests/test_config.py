@@ -50,6 +50,19 @@ def test_fine_stages_may_be_sparse():
         replace(CONFIG, stages=(replace(STAGE, field="sparse"), STAGE))
 
 
+def test_all_stages_are_hashed_or_none():
+    dense = preset("fast", Path("photos"), Path("run"))
+    config = with_field(dense, "hash")
+    assert {s.field for s in config.stages if isinstance(s, StageConfig)} == {"hash"}
+    assert config.capacity == "fixed"
+    with pytest.raises(ValueError, match=r"adaptive capacity.* leave it out, or the hash field"):
+        replace(config, capacity="adaptive")
+    with pytest.raises(ValueError, match="hash is for all stages or none, got dense, hash"):
+        replace(CONFIG, stages=(STAGE, replace(STAGE, field="hash")))
+    with pytest.raises(ValueError, match=r"scene.channels must be even, got 7"):
+        replace(config, scene=SceneConfig(channels=7, material_channels=3))
+
+
 def test_capacity_adapts_unless_lights_are_compared():
     kinds = [preset("fast", Path("a"), Path("b"), light).capacity for light in LIGHTS]
     assert kinds == ["adaptive" if light == "hybrid" else "fixed" for light in LIGHTS]
@@ -139,7 +152,7 @@ def test_the_file_holds_every_field(tmp_path):
         (STAGE, {"spread": -1}, "spread must be at least 0, got -1"),
         (STAGE, {"diffusion": -0.1}, r"diffusion must be in \[0, 0.25\], got -0.1"),
         (STAGE, {"diffusion": 0.3}, r"diffusion must be in \[0, 0.25\], got 0.3"),
-        (STAGE, {"field": "hash"}, "field must be dense or sparse, got 'hash'"),
+        (STAGE, {"field": "octree"}, "field must be dense, sparse or hash, got 'octree'"),
         (STAGE, {"physical_from": 2.0}, r"physical_from must be in \[0, 1\], got 2.0"),
         (LossConfig(), {"silhouette": -1.0}, "silhouette must be at least 0, got -1.0"),
         (LossConfig(), {"map_smoothness": -1.0}, "map_smoothness must be at least 0, got -1.0"),

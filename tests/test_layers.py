@@ -19,6 +19,7 @@ LAYERS = [
     {"scene"},
     {"assets", "distributed", "losses", "metrics", "render"},
     {"config", "overrides"},
+    {"solve"},
     {"tasks"},
     {"tasks.demo"},
     {"experiments.plots", "experiments.record"},
@@ -30,16 +31,16 @@ LAYERS = [
 ]
 HELPERS = {
     "ops": {"checks", "dense_grid", "native", "reflectance", "visibility"},
-    "fields": {"base", "hull"},
+    "fields": {"base", "dense", "hull"},
     "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
+    "solve": {"equations", "newton", "sightings"},
     "tasks": {
-        *("animation", "capacity", "contact_sheet", "envmap", "equations", "frames", "guard"),
-        *("joint", "layers", "look", "plateau", "progress", "shrink", "spare", "timelapse"),
-        "trust",
+        *("animation", "capacity", "contact_sheet", "envmap", "frames", "guard", "joint"),
+        *("layers", "look", "plateau", "progress", "shrink", "spare", "timelapse", "trust"),
     },
 }
 # Extras: imported inside the function that needs one

@@ -9,6 +9,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from univoxel.fields.dense import DenseField
+from univoxel.fields.hashed import HashField, Levels
 from univoxel.fields.hull import fit_grid
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import (
@@ -100,6 +101,23 @@ def test_a_checkpoint_of_a_sparse_field(tmp_path):
     assert torch.equal(again.sdf, field.sdf[:rows])
     assert torch.equal(again.features, field.features[:rows])
     again.refresh()  # it can go on
+
+
+def test_a_checkpoint_of_a_hash_field(tmp_path):
+    scene = small_scene()
+    grid, channels = scene.field.grid, scene.cfg.channels
+    levels = Levels.of(grid.bounds(), grid.voxel_size, channels // 2)
+    scene.field = field = HashField(grid, channels, levels, scene.field.sdf.detach())
+    with torch.no_grad():
+        field.features[::3] = torch.randn(len(field.features[::3]), 2)
+    for slim in (False, True):
+        save_scene(scene, tmp_path, {}, slim=slim)
+        again = load_scene(tmp_path).field
+        assert isinstance(again, HashField)
+        assert (again.grid, again.levels) == (field.grid, field.levels)
+        tolerance = 2**-11 if slim else 0.0
+        torch.testing.assert_close(again.features, field.features, rtol=tolerance, atol=1e-7 * slim)
+        torch.testing.assert_close(again.sdf, field.sdf, rtol=tolerance, atol=0)
 
 
 def test_a_slim_file_of_a_sparse_field_is_smaller(tmp_path):

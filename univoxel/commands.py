@@ -33,7 +33,7 @@ def train(
     downscale: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
     ] = None,
-    field: Literal["dense", "sparse"] = "dense",
+    field: Literal["dense", "sparse", "hash"] = "dense",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
@@ -61,11 +61,12 @@ def train(
             the light itself too
         downscale: train on photographs of 1/N of their width and height
         field: sparse stores bricks around the surface alone, for finer grids than the presets',
-            such as --set stages.1.voxels=30
+            such as --set stages.1.voxels=30; hash takes features from a small table of many
+            resolutions, for small models
         minutes: wall-clock limit, above 0; training ends in time with what it has
         capacity: adaptive makes no larger a model than the scene needs, as held-out pixels tell:
             coarser grid, fewer feature channels, lobes and hidden units; `univoxel info` says what
-            was chosen. auto is that, but fixed for --field sparse and lights other than hybrid
+            was chosen. auto is that, but fixed for other fields and for lights other than hybrid
         budget_mb: most that the file of the model may have, in millions of bytes; implies
             --capacity adaptive
         resume: go on with the run in --out

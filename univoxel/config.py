@@ -21,7 +21,7 @@ from univoxel.lights import (
 )
 from univoxel.scene import SceneConfig, Varying
 
-FieldName: TypeAlias = Literal["dense", "sparse"]
+FieldName: TypeAlias = Literal["dense", "sparse", "hash"]
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
 Capacity: TypeAlias = Literal["fixed", "adaptive"]
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
@@ -44,7 +44,8 @@ class StageConfig:
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 0.25]
     physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
     refit: bool = False  # geometry and materials stay; light and radiance follow them
-    field: FieldName = "dense"  # sparse: only bricks around the surface are stored
+    # sparse: only bricks around the surface are stored; hash: features come from a hash table
+    field: FieldName = "dense"
 
     def __post_init__(self):
         _check(self, "above 0", lambda x: 0 < x < math.inf, "voxels")
@@ -60,7 +61,7 @@ class StageConfig:
         _check(self, "in [0, 0.125]", lambda x: 0 <= x <= 0.125, "plate")
         _check(self, "in [0, 0.25]", lambda x: 0 <= x <= 0.25, "diffusion")
         _check(self, "in [0, 1]", lambda x: 0 <= x <= 1, "physical_from")
-        _check(self, "dense or sparse", lambda x: x in get_args(FieldName), "field")
+        _check(self, "dense, sparse or hash", lambda x: x in get_args(FieldName), "field")
 
 
 @dataclass(frozen=True)
@@ -144,14 +145,21 @@ class TrainConfig:
             "stages",
         )
         kinds = [s.field for s in self.stages if isinstance(s, StageConfig)]
+        if "hash" in kinds and set(kinds) != {"hash"}:
+            raise ValueError(f"TrainConfig: hash is for all stages or none, got {', '.join(kinds)}")
         if kinds != sorted(kinds):
             raise ValueError(
                 f"TrainConfig: no dense stage can follow a sparse one, got {', '.join(kinds)}"
             )
-        if self.capacity == "adaptive" and "sparse" in kinds:
+        if "hash" in kinds and self.scene.channels % 2:
+            raise ValueError(
+                "TrainConfig: the hash field has two channels a level: scene.channels must be "
+                f"even, got {self.scene.channels}"
+            )
+        if self.capacity == "adaptive" and set(kinds) != {"dense"}:
             raise ValueError(
                 "TrainConfig: adaptive capacity, and so --budget-mb, is for dense grids: leave it "
-                "out, or the sparse field"
+                f"out, or the {kinds[-1]} field"
             )
         if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
             raise ValueError(
@@ -291,12 +299,13 @@ def chosen(
 
 
 def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
-    """The same with fine stages on such a field; the first, a coarse one, stays dense. A sparse
-    field's capacity is fixed."""
-    first, *rest = cfg.stages
-    fine = [replace(s, field=kind) if isinstance(s, StageConfig) else s for s in rest]
+    """The same with stages on such a field; only the first, a coarse one, stays dense where the
+    others are sparse. Capacity is fixed where they are not dense."""
+    stages = [replace(s, field=kind) if isinstance(s, StageConfig) else s for s in cfg.stages]
+    if kind == "sparse":
+        stages[0] = cfg.stages[0]
     capacity = cfg.capacity if kind == "dense" else "fixed"
-    return replace(cfg, stages=(first, *fine), capacity=capacity)
+    return replace(cfg, stages=tuple(stages), capacity=capacity)
 
 
 def work_in(minutes: float) -> Work:
@@ -339,7 +348,13 @@ def _configuration(
         case "hybrid":
             # Shares are what the stages cost where none is cut
             coarse, fine = replace(coarse, share=0.12), replace(fine, share=0.52)
-            joint = JointConfig(iterations=steps, share=0.21)
+            # What Newton and tracing cost follows the steps, or little work would be nothing else
+            joint = JointConfig(
+                iterations=steps,
+                share=0.21,
+                points=min(20000, 25 * steps),
+                newton_points=min(6000, 5 * steps),
+            )
             refit = StageConfig(
                 voxels=voxels,
                 iterations=steps // 3,

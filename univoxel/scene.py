@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
+from univoxel.fields.hashed import HashField, Levels
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.fields.hull import GridShape
 from univoxel.fields.sparse import SparseField, pack_bricks, unpack_bricks
@@ -174,11 +175,14 @@ def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict
         tensors |= {f"field.{k}": v for k, v in pack_bricks(scene.field).items()}
         sdf = tensors["field.sdf"] = sdf[: Bricks.NODES * scene.field.count]
     # Features that no sample has touched are 0: only the others are stored.
-    features = scene.field.features.detach().flatten(0, -2)[: sdf.numel()]
+    features = scene.field.features.detach().flatten(0, -2)
+    if not isinstance(scene.field, HashField):
+        features = features[: sdf.numel()]
     touched = features.any(1)
     if slim:
         shell = (reach or SHELL) * scene.field.voxel_size
-        touched &= sdf.flatten().abs() < shell
+        if not isinstance(scene.field, HashField):  # whose rows serve nodes near and far alike
+            touched &= sdf.flatten().abs() < shell
         if reach is not None:
             packed = pack(tensors.pop("field.sdf"), shell)
             tensors |= {f"field.sdf_{name}": value for name, value in packed.items()}
@@ -209,11 +213,13 @@ def save_scene(
     meta = {
         "format": FORMAT,
         "scene": asdict(scene.cfg),
-        "field": "sparse" if isinstance(scene.field, SparseField) else "dense",
+        "field": scene.field.kind,
         "grid": asdict(scene.field.grid),
         "inv_s": scene.inv_s,
         "state": state,
     }
+    if isinstance(scene.field, HashField):
+        meta["levels"] = astuple(scene.field.levels)
     path = run / FILE
     temporary = path.with_suffix(".partial")
     try:
@@ -255,7 +261,11 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
         grid = GridShape(
             tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
         )
-        if meta.get("field", "dense") == "sparse":
+        kind = meta.get("field", "dense")
+        if kind == "hash":
+            levels = Levels(*(tuple(x) for x in meta["levels"]))
+            field = HashField(grid, cfg.channels, levels)
+        elif kind == "sparse":
             where = tensors.pop("field.place"), tensors.pop("field.inside")
             field = SparseField(grid, cfg.channels, unpack_bricks(*where, grid.size))
         else:

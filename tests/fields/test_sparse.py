@@ -114,6 +114,16 @@ def test_the_isosurface_is_the_dense_one():
         assert torch.equal(a, b)
 
 
+def test_occupied_nodes_are_the_dense_ones():
+    dense = sphere(41)
+    with torch.no_grad():
+        dense.features.copy_((dense.sdf.abs() < dense.voxel_size)[..., None])
+        field = SparseField.around(dense, dense.grid)
+        field.features.masked_fill_(field.features < 0.5, 0.0)  # nodes were placed by rounding
+    assert 0.01 < dense.occupied().float().mean() < 0.2
+    assert torch.equal(field.occupied(), dense.occupied())
+
+
 def test_no_surface():
     dense = DenseField(sphere(12).grid, 1, torch.ones(12, 12, 12))
     field = SparseField.around(dense, dense.grid)

@@ -12,7 +12,8 @@ from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.lights import SGConfig
 from univoxel.optim import RowAdam
 from univoxel.scene import SceneConfig, load_scene
-from univoxel.tasks import equations, guard, joint, newton
+from univoxel.solve import equations, newton
+from univoxel.tasks import guard, joint
 from univoxel.tasks import progress as progress_module
 from univoxel.tasks import train as task
 from univoxel.tasks.guard import LIMIT, PROOF, Guard

@@ -27,10 +27,11 @@ from univoxel.ops import shade_map
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig
+from univoxel.solve import equations, newton
+from univoxel.solve.sightings import draw, widened
 from univoxel.sphere import fibonacci_sphere
-from univoxel.tasks import equations, joint, newton
+from univoxel.tasks import joint
 from univoxel.tasks import train as train_task
-from univoxel.tasks.sightings import draw, widened
 
 
 @pytest.fixture(params=["dielectric", "metal"])

@@ -18,6 +18,7 @@ from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import FILE, SceneConfig, load_scene
 from univoxel.tasks import train as task
 from univoxel.tasks.frames import photos_of as photos_of_run
+from univoxel.tasks.info import info
 from univoxel.tasks.train import batch_at, split_pixels, train
 
 
@@ -142,10 +143,13 @@ def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, capsys):
     assert (views.downscale, views.cameras.width) == (2, 32)
 
 
-def test_a_sparse_fine_stage_is_as_good(data, run, tmp_path):
-    out = train(with_field(config(data, tmp_path / "run"), "sparse"))
+@pytest.mark.parametrize("kind", ["sparse", "hash"])
+def test_another_field_is_as_good(data, run, tmp_path, kind):
+    out = train(with_field(config(data, tmp_path / "run"), kind))
     scene, dense = load_scene(out), load_scene(run)
-    assert isinstance(scene.field, SparseField)
+    assert scene.field.kind == kind
+    found = info(out, picture=tmp_path / "info.png")
+    assert 0 < found["grid"]["share_with_features"] < 0.9
     assert scene.field.grid == dense.field.grid
     away = extract_mesh(scene).vertices.norm(dim=1) - RADIUS
     assert away.abs().mean() < 0.03

@@ -26,8 +26,9 @@ from univoxel.data.images import read_image
 from univoxel.lights import SGConfig
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import Scene, SceneConfig, load_checkpoint, load_scene, save_scene
-from univoxel.tasks import equations, joint, newton
-from univoxel.tasks.sightings import draw_sightings, widened
+from univoxel.solve import equations, newton
+from univoxel.solve.sightings import draw_sightings, widened
+from univoxel.tasks import joint
 from univoxel.tasks.train import held_out_psnr, train
 
 NODES = 12

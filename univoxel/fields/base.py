@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 from torch import Tensor, nn
 
 from univoxel.fields.hull import GridShape
 from univoxel.records import FieldSample, Rays, Samples
+
+BAND = 4.0  # voxels from the surface beyond which density is nothing: 8 s at a sharpness of 0.5
 
 
 class AbstractField(nn.Module, ABC):
@@ -17,11 +20,12 @@ class AbstractField(nn.Module, ABC):
     `RowAdam` updates only those. Their rows are the numbers of these nodes.
     """
 
+    kind: ClassVar[str]  # its name in configurations and files
     grid: GridShape
     channels: int  # C
     voxel_size: float  # finest resolution, world units
     sdf: nn.Parameter
-    features: nn.Parameter  # as the sdf, and C
+    features: nn.Parameter  # as the sdf, and C; or a table of its own
 
     @abstractmethod
     def sample(self, points: Tensor) -> FieldSample:
@@ -50,6 +54,19 @@ class AbstractField(nn.Module, ABC):
     @abstractmethod
     def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
         """`ops.diffuse_rows_` of values [K] of nodes of the sdf."""
+
+    def smooth_features_(self, rows: Tensor, amount: float) -> None:
+        """`smooth_rows_` of the features of these rows, where rows are nodes."""
+        self.smooth_rows_(self.features.data, rows, amount, order=1)
+
+    def hold_channels_(self, count: int) -> None:
+        """Drop the gradient to the first channels, which then stay as they are."""
+        assert self.features.grad is not None
+        self.features.grad._values()[:, :count] = 0
+
+    @abstractmethod
+    def occupied(self) -> Tensor:
+        """Which nodes of the grid have features: [X, Y, Z] bool."""
 
     @abstractmethod
     def blocks(self, far: float) -> Tensor:

@@ -15,6 +15,8 @@ from univoxel.records import FieldSample, Rays, Samples
 class DenseField(AbstractField):
     """SDF [X, Y, Z] and features [X, Y, Z, C] as parameters."""
 
+    kind = "dense"
+
     def __init__(self, grid: GridShape, channels: int, sdf: Tensor | None = None):
         super().__init__()
         self.grid, self.channels, self.voxel_size = grid, channels, grid.voxel_size
@@ -57,6 +59,9 @@ class DenseField(AbstractField):
 
     def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
         diffuse_rows_(values, rows, self.grid.size, amount, passes)
+
+    def occupied(self) -> Tensor:
+        return self.features.detach().any(-1)
 
     def blocks(self, far: float) -> Tensor:
         sdf = self.sdf.detach()

@@ -6,12 +6,11 @@ import torch
 from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
-from univoxel.fields.base import AbstractField
+from univoxel.fields.base import BAND, AbstractField
 from univoxel.fields.hull import GridShape
 from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_sparse, smooth_rows_
 from univoxel.records import Bricks, FieldSample, Rays, Samples
 
-BAND = 4.0  # voxels from the surface at which the sdf is cut off: 8 s at a sharpness of 0.5 voxels
 SPARE = 0.05  # share of the bricks that may come without moving the others in memory
 BRICKS_AT_ONCE = 4096
 
@@ -22,6 +21,8 @@ class SparseField(AbstractField):
     The sdf is cut off at BAND voxels; bricks in which it is so everywhere are missing. Memory and
     time grow with the surface. `refresh` adds bricks where the surface comes near.
     """
+
+    kind = "sparse"
 
     def __init__(self, grid: GridShape, channels: int, bricks: Bricks):
         super().__init__()
@@ -127,17 +128,24 @@ class SparseField(AbstractField):
             stored = stored.narrow(axis, 0, n) | stored.narrow(axis, 1, n)
         return stored
 
-    def isosurface(self) -> tuple[Tensor, Tensor]:
-        table, size = self.bricks.table.long(), self.grid.size
-        pool = self.sdf.detach().view(-1, *[Bricks.SIDE] * 3)
-        low, high = pool.min(), pool.max()
-        if self.count == Bricks.MISSING or not low < 0 < high:
-            raise ValueError("the field has no surface: its sdf does not change sign")
-        sdf = torch.empty(size)
-        for a, plane in enumerate(table):
+    def occupied(self) -> Tensor:
+        return self._whole(self.features.detach().any(-1))
+
+    def _whole(self, values: Tensor) -> Tensor:
+        """Values [R] of the rows at all nodes of the grid: [X, Y, Z]."""
+        pool, size = values.view(-1, *[Bricks.SIDE] * 3), self.grid.size
+        whole = values.new_empty(size)
+        for a, plane in enumerate(self.bricks.table.long()):
             part = pool[plane].permute(2, 0, 3, 1, 4).flatten(3, 4).flatten(1, 2)
             part = part[:, : size[1], : size[2]]
-            sdf[Bricks.SIDE * a : Bricks.SIDE * (a + 1)] = part[: size[0] - Bricks.SIDE * a]
+            whole[Bricks.SIDE * a : Bricks.SIDE * (a + 1)] = part[: size[0] - Bricks.SIDE * a]
+        return whole
+
+    def isosurface(self) -> tuple[Tensor, Tensor]:
+        values = self.sdf.detach()
+        if self.count == Bricks.MISSING or not values.min() < 0 < values.max():
+            raise ValueError("the field has no surface: its sdf does not change sign")
+        sdf = self._whole(values)
         vertices, faces, _, _ = marching_cubes(sdf.numpy(), 0.0, gradient_direction="descent")
         world = torch.tensor(self.grid.origin) + self.voxel_size * torch.from_numpy(vertices.copy())
         return world.float(), torch.from_numpy(faces.astype("int32"))

@@ -101,7 +101,7 @@ def parts(run: Path) -> dict[str, Part]:
 def facts(scene: Scene, parts: dict[str, Part], state: dict) -> dict:
     """The numbers, see `info`."""
     grid, cfg = scene.field.grid, scene.cfg
-    features = scene.field.features.detach().any(-1)
+    features = scene.field.occupied()
     return {
         "parameters": sum(p.parameters for p in parts.values()),
         "bytes": sum(p.bytes for p in parts.values()),
@@ -154,7 +154,7 @@ def draw(scene: Scene, found: dict) -> np.ndarray:
     Nodes with features, counted along each axis of the grid, the brightest where there are most;
     under them a bar of the file's bytes by part.
     """
-    used = scene.field.features.detach().any(-1)
+    used = scene.field.occupied()
     counts = [used.sum(axis).float() for axis in range(3)]
     most = max(max(float(c.max()) for c in counts), 1.0)
     longest = max(used.shape)

@@ -23,17 +23,17 @@ from univoxel.data import Photos
 from univoxel.lights import priors
 from univoxel.optim import RowAdam
 from univoxel.scene import Scene
-from univoxel.tasks.equations import CLIPPED
+from univoxel.solve.equations import CLIPPED
+from univoxel.solve.metals import find_metal
+from univoxel.solve.newton import newton_round
+from univoxel.solve.sightings import Problem, draw, draw_sightings, pose, widened
 from univoxel.tasks.guard import Guard
-from univoxel.tasks.metals import find_metal
-from univoxel.tasks.newton import newton_round
 from univoxel.tasks.progress import Progress
-from univoxel.tasks.sightings import Problem, draw, draw_sightings, pose, widened
 
 NEWTON_COST = 2.7  # of a sighting in a Newton step, over one in a step of Adam; measured
 LEAST_POINTS = 2000  # on a machine however slow
-FEW = 3  # one in so many points serves to tell what to suppose at first
-TRIALS = 4 / FEW  # rounds of Newton that this takes
+TRIED = 300  # points of Newton rounds that tell what to suppose at first, of which there are
+TRIALS = 4
 CONVINCING = 0.8  # times the other's residual: what is left if metal everywhere is to be supposed
 
 
@@ -59,12 +59,12 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             if more < cfg.rounds:
                 seconds = progress.reserved / more
                 if more == cfg.rounds - 1:  # the first round
-                    seconds = progress.reserved / (more + TRIALS)
                     with progress.apart():
                         problem = supposed(scene, problem, cfg, seconds, progress.trouble)
                 with progress.apart():
                     newton_round(scene, problem, cfg, seconds, progress.trouble)
-                    problem = replace(problem, metal=find_metal(scene, problem, cfg))
+                    sure = 1 - (more - 1) / max(cfg.rounds - 2, 1)
+                    problem = replace(problem, metal=find_metal(scene, problem, cfg, sure))
                 more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
             groups = [
                 {"params": [scene.field.features], "eps": 1e-8},
@@ -108,9 +108,9 @@ def supposed(
     of Newton with them, whose residual decides.
 
     Args:
-        seconds: that a round of Newton may take, about.
+        seconds: that the rounds of Newton may take together.
     """
-    few = replace(cfg, newton_points=-(-cfg.newton_points // FEW))
+    few = replace(cfg, newton_points=min(cfg.newton_points, TRIED))
     lights = [light for light in (scene.sky, scene.views) if light is not None]
     before = [copy.deepcopy(light.state_dict()) for light in lights]
     suppositions = (problem.metal, 1.0), (torch.ones_like(problem.metal), CONVINCING)
@@ -119,9 +119,9 @@ def supposed(
         for light, state in zip(lights, before, strict=True):
             light.load_state_dict(state)
         trial = replace(problem, metal=metal)
-        newton_round(scene, trial, few, seconds / FEW, tell)
-        trial = replace(problem, metal=find_metal(scene, trial, cfg))
-        costs = newton_round(scene, trial, few, seconds / FEW, tell)
+        newton_round(scene, trial, few, seconds / TRIALS, tell)
+        trial = replace(problem, metal=find_metal(scene, trial, cfg, 0.0))
+        costs = newton_round(scene, trial, few, seconds / TRIALS, tell)
         if costs and costs[-1] < share * least:
             least = costs[-1]
             best = trial, [copy.deepcopy(light.state_dict()) for light in lights]
@@ -132,8 +132,10 @@ def supposed(
 
 def newton_share(cfg: JointConfig) -> float:
     """Share of the stage's time that Newton rounds take if nothing is cut."""
-    rounds = cfg.rounds - 1 + TRIALS if cfg.rounds > 1 else 0
-    sightings = cfg.newton_points * cfg.newton_views * cfg.newton_steps * rounds
+    points = cfg.newton_points * (cfg.rounds - 1)
+    if cfg.rounds > 1:
+        points += TRIALS * min(cfg.newton_points, TRIED)
+    sightings = points * cfg.newton_views * cfg.newton_steps
     newton = NEWTON_COST * sightings
     return newton / (newton + cfg.iterations * cfg.rays)
 

@@ -28,7 +28,8 @@ from univoxel.data import DataError, Photos, load_photos
 from univoxel.data.images import replacing
 from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
-from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
+from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
+from univoxel.fields.hull import GridShape, estimate_bounds, fit_grid, mask_distances, visual_hull
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import priors
 from univoxel.metrics import psnr
@@ -109,7 +110,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         assert isinstance(cfg.stages[0], StageConfig)
         first = fit_grid(*box, capacity.voxels(cfg.stages[0], []))
         hull = visual_hull(distance, photos.cameras, first)
-        field = DenseField(first, cfg.scene.channels, hull)
+        field = first_field(cfg, first, hull, box)
         light = lights.scaled(cfg.scene.light, float((upper - lower).max()) / 2)
         views = tuple(photos.names) if cfg.scene.varying != "none" else ()
         scene = Scene(replace(cfg.scene, light=light, views=views), field)
@@ -151,6 +152,18 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             film.finish(scene, progress)
     say_trust(scene, photos, cfg.out, progress.troubles)
     return cfg.out
+
+
+def first_field(
+    cfg: TrainConfig, grid: GridShape, hull: Tensor, box: tuple[Tensor, Tensor]
+) -> AbstractField:
+    """The field that training starts with, on the grid of the first stage."""
+    stages = [s for s in cfg.stages if isinstance(s, StageConfig)]
+    if stages[0].field != "hash":
+        return DenseField(grid, cfg.scene.channels, hull)
+    finest = min(fit_grid(*box, capacity.voxels(s, [])).voxel_size for s in stages)
+    levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL)
+    return HashField(grid, cfg.scene.channels, levels, hull)
 
 
 def say_trust(scene: Scene, photos: Photos, out: Path, troubles: list[str]) -> None:
@@ -225,8 +238,7 @@ def run_stage(
         if not guard.sound(loss):
             continue
         if stage.refit:
-            assert field.features.grad is not None
-            field.features.grad._values()[:, : scene.material.channels] = 0
+            field.hold_channels_(scene.material.channels)
         if stage.spread and not stage.refit:
             spread_gradient(field, stage.spread)
         optimizer.step()
@@ -330,9 +342,8 @@ def smooth(field: AbstractField, stage: StageConfig) -> None:
     sdf, features = field.sdf, field.features
     assert sdf.grad is not None
     assert features.grad is not None
-    plate, diffusion = stage.plate * SMOOTH_EVERY, stage.diffusion * SMOOTH_EVERY
-    field.smooth_rows_(sdf.data, rows_of(sdf.grad), plate, order=2)
-    field.smooth_rows_(features.data, rows_of(features.grad), diffusion, order=1)
+    field.smooth_rows_(sdf.data, rows_of(sdf.grad), stage.plate * SMOOTH_EVERY, order=2)
+    field.smooth_features_(rows_of(features.grad), stage.diffusion * SMOOTH_EVERY)
 
 
 def split_pixels(distance: Tensor) -> tuple[Tensor, Tensor]:

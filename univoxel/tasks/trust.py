@@ -26,9 +26,9 @@ from univoxel.render.transport import (
     trace,
 )
 from univoxel.scene import Scene
+from univoxel.solve.equations import CLIPPED
+from univoxel.solve.sightings import Problem, draw_sightings, unexposed, widened
 from univoxel.sphere import fibonacci_sphere
-from univoxel.tasks.equations import CLIPPED
-from univoxel.tasks.sightings import Problem, draw_sightings, unexposed, widened
 
 POINTS, FEW_POINTS = 20000, 2000  # on the surface: for maps, and for words alone
 SIGHTINGS = 8  # of a point that are rendered again, at most

@@ -1,4 +1,4 @@
-"""Gauss-Newton on the light of photographs: the normal equations that joint.py solves."""
+"""Gauss-Newton on the light of photographs: the normal equations that newton.py solves."""
 
 from __future__ import annotations
 

@@ -16,8 +16,8 @@ from univoxel.brdf import F0
 from univoxel.color import srgb_to_linear
 from univoxel.config import JointConfig
 from univoxel.scene import Scene
-from univoxel.tasks.equations import CAUCHY, CLIPPED, encoded_slope
-from univoxel.tasks.sightings import LEAST_VIEWS, Problem, draw_sightings, widened
+from univoxel.solve.equations import CAUCHY, CLIPPED, encoded_slope
+from univoxel.solve.sightings import LEAST_VIEWS, Problem, draw_sightings, widened
 
 ROUGHNESS = (0.1, 0.2, 0.3, 0.45, 0.65, 0.9)  # that are tried
 STEPS = 5  # of Gauss-Newton on a base colour
@@ -26,12 +26,18 @@ METAL_BASE = 0.25  # the brightest channel of a metal; those in use reflect 0.4 
 NEIGHBOURS = 32  # points whose evidence is averaged: one alone is too noisy
 NEAR, ALIKE = 4.0, 0.5  # voxels, and units of log albedo, that count alike as distance
 BOUND = 2.0  # of one point's log ratio
-ASKED = -0.1  # log ratio of residuals, metal over dielectric, from which on it is metal
+# Log ratio of residuals, metal over dielectric, from which on it is metal: under the first map and
+# under the last. While the map is wrong, so is much that it says; and metals make the next map
+ASKED = -0.4, -0.15
 
 
-def find_metal(scene: Scene, problem: Problem, cfg: JointConfig) -> Tensor:
-    """Decide under the present map which of the problem's points are metal: [P] bool."""
-    return evidence(scene, problem, cfg) < ASKED
+def find_metal(scene: Scene, problem: Problem, cfg: JointConfig, done: float) -> Tensor:
+    """Decide under the present map which of the problem's points are metal: [P] bool.
+
+    Args:
+        done: progress of the map in [0, 1], from the first round of Newton to the last.
+    """
+    return evidence(scene, problem, cfg) < ASKED[0] + done * (ASKED[1] - ASKED[0])
 
 
 @torch.no_grad()

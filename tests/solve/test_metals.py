@@ -10,10 +10,10 @@ from sightings import lamps, photographed, problem_on_a_sphere
 
 from univoxel import brdf, losses
 from univoxel.config import JointConfig
-from univoxel.tasks.equations import CAUCHY
+from univoxel.solve.equations import CAUCHY
+from univoxel.solve.metals import ASKED, METAL_BASE, evidence, find_metal, fitted
+from univoxel.solve.sightings import widened
 from univoxel.tasks.joint import supposed
-from univoxel.tasks.metals import ASKED, METAL_BASE, evidence, find_metal, fitted
-from univoxel.tasks.sightings import widened
 
 NODES, COUNT = 128, 800
 CFG = JointConfig(newton_points=500, newton_views=8)
@@ -42,7 +42,7 @@ def test_copper_is_told_from_paint_of_its_colour(roughness):
     scene, problem = sphere_of(
         (0.9, 0.6, 0.4), lambda n: (n[:, 0] > 0).float(), roughness, noise=0.02
     )
-    found = find_metal(scene, problem, CFG)
+    found = find_metal(scene, problem, CFG, 1.0)
     assert found.dtype == torch.bool
     x = problem.seen.normal[:, 0]
     # 32 neighbours of 500 points lie within half a radian: the mean over them blurs the border
@@ -53,7 +53,7 @@ def test_copper_is_told_from_paint_of_its_colour(roughness):
 def test_black_plastic_is_no_black_metal():
     """A dielectric of no albedo reflects as a metal of F0 = 0.04 does: metals reflect more."""
     scene, problem = sphere_of((0.0, 0.0, 0.0), 0.0, 0.2)
-    assert not find_metal(scene, problem, CFG).any()
+    assert not find_metal(scene, problem, CFG, 1.0).any()
     assert evidence(scene, problem, CFG).median() > 1.0
 
 
@@ -65,14 +65,14 @@ def test_under_even_light_nothing_is_taken_for_metal():
     grey, rough = torch.full((COUNT, 3), 0.5), torch.full((COUNT,), 0.9)
     problem = photographed(problem, torch.ones(NODES, 3), grey, rough)
     noisy = problem.target + 0.02 * torch.randn_like(problem.target)
-    assert not find_metal(scene, replace(problem, target=noisy), CFG).any()
+    assert not find_metal(scene, replace(problem, target=noisy), CFG, 1.0).any()
 
 
 def test_one_sighting_says_nothing():
     scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3, views=1)
     assert torch.equal(evidence(scene, problem, CFG), torch.zeros(COUNT))
-    assert not find_metal(scene, problem, CFG).any()
-    assert ASKED < 0
+    assert not find_metal(scene, problem, CFG, 1.0).any()
+    assert max(ASKED) < 0
 
 
 def test_fitted_finds_the_best_base_within_its_bounds():

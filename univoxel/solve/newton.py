@@ -12,7 +12,7 @@ from torch import Tensor
 from univoxel import brdf
 from univoxel.config import JointConfig
 from univoxel.scene import Scene
-from univoxel.tasks.equations import (
+from univoxel.solve.equations import (
     Rows,
     graph_laplacian,
     normal_equations,
@@ -20,7 +20,7 @@ from univoxel.tasks.equations import (
     view_differences,
     view_equations,
 )
-from univoxel.tasks.sightings import LEAST_VIEWS, Problem, widened
+from univoxel.solve.sightings import LEAST_VIEWS, Problem, widened
 
 NEWTON_CHUNK = 256  # points whose equations are built at once
 WEIGHTS_PRIOR = 10.0  # on changes of a view's map, in units of the Laplacian's weight

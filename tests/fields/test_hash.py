@@ -1,0 +1,89 @@
+"""The hash field: the dense one's distances, features of a table of many resolutions."""
+
+import pytest
+import torch
+from torch import nn
+
+from univoxel.fields.dense import DenseField
+from univoxel.fields.hashed import COARSEST, PER_LEVEL, ROWS, HashField, Levels
+from univoxel.fields.hull import GridShape
+from univoxel.ops import encode_hash
+
+GRID = GridShape((-0.7,) * 3, 1.4 / 39, (40, 40, 40))
+COUNT = 4  # levels
+
+
+def ball() -> HashField:
+    levels = Levels.of(GRID.bounds(), GRID.voxel_size, COUNT)
+    field = HashField(GRID, 2 * COUNT, levels, GRID.nodes().norm(dim=-1) - 0.5)
+    torch.manual_seed(0)
+    nn.init.normal_(field.features)
+    return field
+
+
+def test_levels_go_from_coarse_to_fine():
+    levels = Levels.of(GRID.bounds(), GRID.voxel_size, COUNT)
+    sizes = torch.tensor(levels.voxel_sizes)
+    assert sizes[0].item() == pytest.approx(1.4 / COARSEST)
+    assert sizes[-1].item() == pytest.approx(GRID.voxel_size)
+    ratios = sizes[1:] / sizes[:-1]
+    assert torch.allclose(ratios, ratios[:1].expand(3))
+    assert ratios[0] < 1
+    assert Levels.of(GRID.bounds(), 1.0, 2).voxel_sizes == (1.0, 1.0)  # coarser than the coarsest
+    assert len(Levels.of(GRID.bounds(), 0.1, 1).voxel_sizes) == 1
+
+
+def test_distances_are_the_dense_fields_and_features_the_tables():
+    field = ball()
+    dense = DenseField(GRID, 1, field.sdf.detach().clone())
+    points = 1.2 * torch.rand(200, 3) - 0.6
+    found, wanted = field.sample(points), dense.sample(points)
+    assert torch.equal(found.sdf, wanted.sdf)
+    assert torch.equal(found.gradient, wanted.gradient)
+    levels = field.levels
+    table = encode_hash(field.features, points, levels.lower, levels.upper, levels.voxel_sizes)
+    for level in range(COUNT):
+        for k in range(PER_LEVEL):
+            assert torch.equal(found.features[:, k * COUNT + level], table[:, 2 * level + k])
+    vertices, faces = field.isosurface()
+    assert (vertices.norm(dim=1) - 0.5).abs().max() < 0.01
+    assert len(faces) > 1000
+
+
+def test_held_channels_get_no_gradient():
+    field = ball()
+    points = torch.rand(100, 3) - 0.5
+    field.features_at(points).square().sum().backward()
+    whole = field.features.grad.to_dense()
+    field.hold_channels_(COUNT + 1)  # the first of each level, and the second of the coarsest
+    held = field.features.grad.to_dense().view(COUNT, ROWS, PER_LEVEL)
+    whole = whole.view(COUNT, ROWS, PER_LEVEL)
+    assert (held[:, :, 0] == 0).all()
+    assert (held[0] == 0).all()
+    assert torch.equal(held[1:, :, 1], whole[1:, :, 1])
+    assert whole[0, :, 1].any()
+
+
+def test_another_grid_keeps_the_features():
+    field = ball()
+    fine = GridShape((-0.7,) * 3, 1.4 / 79, (80, 80, 80))
+    finer = field.resized(fine)
+    points = torch.rand(100, 3) - 0.5
+    assert torch.equal(finer.features_at(points), field.features_at(points))
+    assert finer.sdf.shape == (80, 80, 80)
+    assert finer.features.data_ptr() != field.features.data_ptr()
+    assert finer.occupied().float().mean() < field.occupied().float().mean()
+
+
+def test_smoothing_leaves_the_table():
+    field = ball()
+    before = field.features.detach().clone()
+    field.features_at(torch.rand(10, 3)).sum().backward()
+    field.smooth_features_(torch.arange(10), 0.1)
+    assert torch.equal(field.features, before)
+
+
+def test_channels_fit_the_levels():
+    levels = Levels.of(GRID.bounds(), GRID.voxel_size, COUNT)
+    with pytest.raises(ValueError, match=r"HashField: 4 levels have 8 channels, got 16"):
+        HashField(GRID, 16, levels)
