@@ -74,9 +74,9 @@ def draw(runs: dict[str, dict], stem: Path) -> None:
         for axes, measure in zip(row, PANELS, strict=True):
             for mark, scene in zip("osD^vP*", scenes, strict=False):
                 own = {n.split()[-1]: r for n, r in runs.items() if n.split()[0] == scene}
-                own = {n: r for n, r in own.items() if measure.key in r}
+                own = {n: r for n, r in own.items() if {key, measure.key} <= r.keys()}
                 points = sorted((r[key], r[measure.key]) for r in own.values())
-                axes.plot(*zip(*points, strict=True), color="0.8", zorder=1) if points else None
+                axes.plot([x for x, _ in points], [y for _, y in points], color="0.8", zorder=1)
                 for name, r in own.items():
                     number = settings.index(name)
                     axes.scatter(r[key], r[measure.key], color=plots.color(number), marker=mark)

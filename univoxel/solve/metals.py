@@ -57,12 +57,9 @@ def evidence(scene: Scene, problem: Problem, cfg: JointConfig) -> Tensor:
     chosen = rich[torch.randperm(len(rich))[: cfg.newton_points]]
     which = (torch.rand(len(chosen), cfg.newton_views) * counts[chosen][:, None]).long()
     sighting = seen.offsets[chosen][:, None] + which
-    best = None
-    for roughness in ROUGHNESS:
-        costs = residuals(scene, problem, chosen, sighting, roughness)
-        best = costs if best is None else torch.minimum(best, costs)
-    assert best is not None
-    ratio = (best[1] / best[0]).log().clamp(-BOUND, BOUND)
+    tried = [residuals(scene, problem, chosen, sighting, r) for r in ROUGHNESS]
+    dielectric, metal = torch.stack(tried).amin(0)
+    ratio = (metal / dielectric).log().clamp(-BOUND, BOUND)
 
     albedo = scene.material(scene.field.features_at(seen.position))[0].clamp_min(1e-2).log()
     key = torch.cat([seen.position / (NEAR * problem.voxel_size), albedo / ALIKE], 1).numpy()
