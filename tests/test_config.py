@@ -59,7 +59,7 @@ def test_all_stages_are_hashed_or_none():
         replace(config, capacity="adaptive")
     with pytest.raises(ValueError, match="hash is for all stages or none, got dense, hash"):
         replace(CONFIG, stages=(STAGE, replace(STAGE, field="hash")))
-    with pytest.raises(ValueError, match=r"scene.channels must be even, got 7"):
+    with pytest.raises(ValueError, match=r"scene.channels must be a multiple of that, got 7"):
         replace(config, scene=SceneConfig(channels=7, material_channels=3))
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
 from univoxel.data.images import replacing
+from univoxel.fields.hashed import PER_LEVEL
 from univoxel.lights import (
     EnvmapConfig,
     EnvmapSGConfig,
@@ -151,10 +152,10 @@ class TrainConfig:
             raise ValueError(
                 f"TrainConfig: no dense stage can follow a sparse one, got {', '.join(kinds)}"
             )
-        if "hash" in kinds and self.scene.channels % 2:
+        if "hash" in kinds and self.scene.channels % PER_LEVEL:
             raise ValueError(
-                "TrainConfig: the hash field has two channels a level: scene.channels must be "
-                f"even, got {self.scene.channels}"
+                f"TrainConfig: the hash field has {PER_LEVEL} channels a level: scene.channels "
+                f"must be a multiple of that, got {self.scene.channels}"
             )
         if self.capacity == "adaptive" and set(kinds) != {"dense"}:
             raise ValueError(

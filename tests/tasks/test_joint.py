@@ -293,7 +293,7 @@ def test_metals_show_the_map():
     costs = newton.newton_round(scene, problem, CFG) + newton.newton_round(scene, problem, CFG)
     assert costs[-1] < 1e-3 * costs[0]
     error = scene.sky.log_radiance.detach() - true.log()
-    # As a dielectric the copper half alone would leave more than the whole
+    # What is left is the smoothness, as above
     assert error.abs().mean() < 0.25 * true.log().abs().mean()
 
 

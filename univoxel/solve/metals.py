@@ -17,7 +17,7 @@ from univoxel.color import srgb_to_linear
 from univoxel.config import JointConfig
 from univoxel.scene import Scene
 from univoxel.solve.equations import CAUCHY, CLIPPED, encoded_slope
-from univoxel.solve.sightings import LEAST_VIEWS, Problem, draw_sightings, widened
+from univoxel.solve.sightings import LEAST_VIEWS, Problem, draw_sightings, sightings_of, widened
 
 ROUGHNESS = (0.1, 0.2, 0.3, 0.45, 0.65, 0.9)  # that are tried
 STEPS = 5  # of Gauss-Newton on a base colour
@@ -55,8 +55,7 @@ def evidence(scene: Scene, problem: Problem, cfg: JointConfig) -> Tensor:
     if not len(rich):
         return torch.zeros(len(counts))
     chosen = rich[torch.randperm(len(rich))[: cfg.newton_points]]
-    which = (torch.rand(len(chosen), cfg.newton_views) * counts[chosen][:, None]).long()
-    sighting = seen.offsets[chosen][:, None] + which
+    sighting = sightings_of(problem, chosen, cfg.newton_views)
     tried = [residuals(scene, problem, chosen, sighting, r) for r in ROUGHNESS]
     dielectric, metal = torch.stack(tried).amin(0)
     ratio = (metal / dielectric).log().clamp(-BOUND, BOUND)

@@ -20,7 +20,7 @@ from univoxel.solve.equations import (
     view_differences,
     view_equations,
 )
-from univoxel.solve.sightings import LEAST_VIEWS, Problem, widened
+from univoxel.solve.sightings import LEAST_VIEWS, Problem, sightings_of, widened
 
 NEWTON_CHUNK = 256  # points whose equations are built at once
 WEIGHTS_PRIOR = 10.0  # on changes of a view's map, in units of the Laplacian's weight
@@ -64,8 +64,7 @@ def newton_round(
     chosen, parts = in_parts(chosen, problem.metal)
     albedo, roughness, _ = scene.material(scene.field.features_at(seen.position[chosen]))
     log_albedo = albedo.clamp_min(1e-3).log()
-    which = (torch.rand(len(chosen), cfg.newton_views) * counts[chosen][:, None]).long()
-    sighting = seen.offsets[chosen][:, None] + which
+    sighting = sightings_of(problem, chosen, cfg.newton_views)
     roughness = widened(roughness, len(sky.direction))
     rows, spent = [], 0.0  # on the equations of one part
     for k in parts:

@@ -29,7 +29,7 @@ LEAST_VIEWS = 2  # of a point that is to tell anything: in one, its colour expla
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything about the photographs and the geometry that stays fixed."""
+    """Everything about the photographs and the geometry, which stay fixed, and what is metal."""
 
     seen: Observations
     transport: Transport
@@ -78,9 +78,14 @@ def draw(problem: Problem, points: int, views: int) -> tuple[Tensor, Tensor]:
     counts = problem.seen.offsets.diff()
     usable = (counts > 0).nonzero()[:, 0]
     point = usable[torch.randint(len(usable), (points,))]
-    which = (torch.rand(points, views) * counts[point][:, None]).long()
-    sighting = problem.seen.offsets[point][:, None] + which
-    return point.repeat_interleave(views), sighting.reshape(-1)
+    return point.repeat_interleave(views), sightings_of(problem, point, views).reshape(-1)
+
+
+def sightings_of(problem: Problem, point: Tensor, views: int) -> Tensor:
+    """Random sightings [P, views] of points [P], each of which has some."""
+    offsets = problem.seen.offsets
+    which = (torch.rand(len(point), views) * offsets.diff()[point][:, None]).long()
+    return offsets[point][:, None] + which
 
 
 def draw_sightings(
