@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from analytic import RADIUS, cameras_around, sphere_normals
+from analytic import RADIUS, cameras_around, scene_of, sphere_normals
 from torch.nn.functional import normalize
 
 from univoxel import brdf, losses
@@ -74,7 +74,7 @@ class Steps:
         self.troubles, self.abandoned = [], False
 
     def steps(self, apart):
-        assert 0 < apart < 1
+        assert 0 <= apart < 1
         for i in range(self.count):
             if self.abandoned:
                 return
@@ -109,6 +109,27 @@ def lamps(nodes: int) -> torch.Tensor:
         lobe = (12 * (direction @ normalize(torch.tensor(axis), dim=0) - 1)).exp()
         map += lobe[:, None] * torch.tensor([3.3, 3.0, 2.7])
     return map
+
+
+NODES, COUNT = 128, 800  # of the map and the points of `sphere_of`
+
+
+def sphere_of(base, metallic, roughness, views=12, noise=0.0):
+    """A scene with the map known and the material not, and photographs of a sphere [COUNT]."""
+    torch.manual_seed(1)
+    map = lamps(NODES)
+    scene = scene_of((0.5, 0.5, 0.5), 0.5, NODES)
+    with torch.no_grad():
+        scene.sky.log_radiance.copy_(map.log())
+    problem = problem_on_a_sphere(COUNT, views, NODES)
+    metallic = (
+        metallic(problem.seen.normal) if callable(metallic) else torch.full((COUNT,), metallic)
+    )
+    diffuse, f0 = brdf.split(torch.tensor(base).expand(COUNT, 3), metallic)
+    shown = widened(torch.full((COUNT,), roughness), NODES)
+    problem = photographed(problem, map, diffuse, shown, f0)
+    target = problem.target + noise * torch.randn_like(problem.target)
+    return scene, replace(problem, target=target.clamp(0, 1))
 
 
 def photographs_under(

@@ -1,40 +1,17 @@
 """Metal or not: decided on a sphere of known materials under a known map."""
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
-from analytic import scene_of
-from sightings import lamps, photographed, problem_on_a_sphere
+from sightings import COUNT, NODES, photographed, sphere_of
 
-from univoxel import brdf, losses
+from univoxel import losses
 from univoxel.config import JointConfig
 from univoxel.solve.equations import CAUCHY
 from univoxel.solve.metals import ASKED, METAL_BASE, evidence, find_metal, fitted
-from univoxel.solve.sightings import widened
-from univoxel.tasks.joint import supposed
 
-NODES, COUNT = 128, 800
 CFG = JointConfig(newton_points=500, newton_views=8)
-
-
-def sphere_of(base, metallic, roughness, views=12, noise=0.0):
-    """A scene with the map known and the material not, and photographs of a sphere [COUNT]."""
-    torch.manual_seed(1)
-    map = lamps(NODES)
-    scene = scene_of((0.5, 0.5, 0.5), 0.5, NODES)
-    with torch.no_grad():
-        scene.sky.log_radiance.copy_(map.log())
-    problem = problem_on_a_sphere(COUNT, views, NODES)
-    metallic = (
-        metallic(problem.seen.normal) if callable(metallic) else torch.full((COUNT,), metallic)
-    )
-    diffuse, f0 = brdf.split(torch.tensor(base).expand(COUNT, 3), metallic)
-    shown = widened(torch.full((COUNT,), roughness), NODES)
-    problem = photographed(problem, map, diffuse, shown, f0)
-    target = problem.target + noise * torch.randn_like(problem.target)
-    return scene, replace(problem, target=target.clamp(0, 1))
 
 
 @pytest.mark.parametrize("roughness", [0.1, 0.35, 0.7])
@@ -93,25 +70,3 @@ def test_fitted_finds_the_best_base_within_its_bounds():
         assert cost[p] < 1.5 * best + 1e-5
     held = fitted(constant, slope, torch.zeros(6, 5, 3), METAL_BASE)
     assert (held > fitted(constant, slope, torch.zeros(6, 5, 3), 0.0)).all()
-
-
-@pytest.mark.parametrize("metallic", [0.0, 1.0])
-def test_the_better_supposition_is_found_without_a_map(metallic):
-    """All of metal, or none: Newton under the wrong one leaves more of the photographs."""
-    scene, problem = sphere_of((0.9, 0.6, 0.4), metallic, 0.3)
-    with torch.no_grad():
-        scene.sky.log_radiance.zero_()
-    cfg = replace(CFG, newton_steps=4)
-    found = supposed(scene, problem, cfg, math.inf, pytest.fail)
-    # Two short rounds from no map at all: where no lamp shines there is little evidence as yet
-    assert (found.metal.float().mean() - metallic).abs() < 0.1
-    error = (scene.sky.log_radiance - lamps(NODES).log()).detach()
-    # Albedo and light share a scale; lamps are ten times as bright as the rest
-    assert (error - error.mean()).abs().mean() < 0.5
-
-
-def test_without_sightings_nothing_is_supposed():
-    scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3, views=1)
-    before = scene.sky.log_radiance.detach().clone()
-    assert supposed(scene, problem, CFG, math.inf, pytest.fail) is problem
-    assert torch.equal(scene.sky.log_radiance, before)

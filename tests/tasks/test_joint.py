@@ -379,7 +379,7 @@ def test_no_time_is_no_tracing():
 
 @pytest.mark.parametrize(
     ("rooms", "newton", "asked"),
-    [((), [0.25, 0.5, 0.75], [2, 1, 0]), ((1, 0), [0.25, 0.625], [2, 0]), ((0,), [0.25], [2])],
+    [((), [0, 0.25, 0.5, 0.75], [3, 2, 1, 0]), ((1, 0), [0, 0.5], [3, 0]), ((0,), [0], [3])],
 )
 def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, asked):
     """With less room than rounds there are fewer rounds, each of them longer."""

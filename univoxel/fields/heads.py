@@ -32,6 +32,14 @@ class MaterialHead(nn.Module):
         low = self.min_roughness
         return out[:, :3], low + (1 - low) * out[:, 3], out[:, 4]
 
+    @torch.no_grad()
+    def shift_roughness(self, features: Tensor, median: float) -> None:
+        """Make everything rougher or smoother, to that median over features [N, C]."""
+        low = self.min_roughness
+        medians = torch.stack([torch.tensor(median), self(features)[1].median()])
+        wanted, now = torch.logit((medians - low) / (1 - low), eps=1e-4)
+        self.net.linear[-1].bias[3] += wanted - now
+
 
 class RadianceHead(nn.Module):
     """Outgoing radiance without any model of light: it lets geometry converge early.

@@ -2,15 +2,12 @@
 
 Local lobes explain every photograph and leave shadows in the albedo. Once geometry stands, the
 light is known to be one distant map that reaches a point where nothing is in the way, and what is
-in the way shines as bright as the photographs show it. That leaves few unknowns: rounds of Adam on
-map and materials alternate with Gauss-Newton steps on the map.
+in the way shines as bright as the photographs show it. That leaves few unknowns: Gauss-Newton steps
+on the map alternate with rounds of Adam on map and materials.
 """
 
 from __future__ import annotations
 
-import copy
-import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -27,14 +24,12 @@ from univoxel.solve.equations import CLIPPED
 from univoxel.solve.metals import find_metal
 from univoxel.solve.newton import newton_round
 from univoxel.solve.sightings import Problem, draw, draw_sightings, pose, widened
+from univoxel.solve.start import STEPS, TRIALS, TRIED, supposed
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.progress import Progress
 
 NEWTON_COST = 2.7  # of a sighting in a Newton step, over one in a step of Adam; measured
 LEAST_POINTS = 2000  # on a machine however slow
-TRIED = 300  # points of Newton rounds that tell what to suppose at first, of which there are
-TRIALS = 4
-CONVINCING = 0.8  # times the other's residual: what is left if metal everywhere is to be supposed
 
 
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
@@ -56,16 +51,15 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     guard = Guard(progress)
     for done in progress.steps(newton_share(cfg)):
         if done >= turn:
-            if more < cfg.rounds:
-                seconds = progress.reserved / more
-                if more == cfg.rounds - 1:  # the first round
-                    with progress.apart():
-                        problem = supposed(scene, problem, cfg, seconds, progress.trouble)
+            seconds = progress.reserved / more
+            if more == cfg.rounds:
                 with progress.apart():
-                    newton_round(scene, problem, cfg, seconds, progress.trouble)
-                    sure = 1 - (more - 1) / max(cfg.rounds - 2, 1)
-                    problem = replace(problem, metal=find_metal(scene, problem, cfg, sure))
-                more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
+                    problem = supposed(scene, problem, cfg, seconds, progress.trouble)
+            with progress.apart():
+                costs = newton_round(scene, problem, cfg, seconds, progress.trouble)
+                sure = 1 - (more - 1) / max(cfg.rounds - 1, 1)
+                problem = replace(problem, metal=find_metal(scene, problem, cfg, sure))
+            more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
             groups = [
                 {"params": [scene.field.features], "eps": 1e-8},
                 {"params": list(scene.material.parameters())},
@@ -81,7 +75,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         fade = 0.1 ** ((done - first) / (turn - first))
         # After a Newton round light is better than what Adam would make of it while the albedo
         # follows: the map moves slowly, gains do not
-        of_map, of_gains = (1.0, 1.0) if more == cfg.rounds - 1 else (0.1, 0.0)
+        of_map, of_gains = (0.1, 0.0) if costs else (1.0, 1.0)
         rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * of_map, cfg.lr_networks * of_gains)
         for group, rate in zip(optimizer.param_groups, rates, strict=False):
             group["lr"] = rate * fade * guard.scale
@@ -97,45 +91,12 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             guard.keep()
 
 
-def supposed(
-    scene: Scene, problem: Problem, cfg: JointConfig, seconds: float, tell: Callable[[str], None]
-) -> Problem:
-    """The problem with its metals, and the scene's map, from the better of two suppositions.
-
-    Light and metal are found from one another: where all is metal, a map for dielectrics is so
-    bright that nothing looks like metal under it. So one trial starts from what the stages before
-    took for metal, one from metal everywhere: a round of Newton, metals under its map, and a round
-    of Newton with them, whose residual decides.
-
-    Args:
-        seconds: that the rounds of Newton may take together.
-    """
-    few = replace(cfg, newton_points=min(cfg.newton_points, TRIED))
-    lights = [light for light in (scene.sky, scene.views) if light is not None]
-    before = [copy.deepcopy(light.state_dict()) for light in lights]
-    suppositions = (problem.metal, 1.0), (torch.ones_like(problem.metal), CONVINCING)
-    least, best = math.inf, (problem, before)
-    for metal, share in suppositions:
-        for light, state in zip(lights, before, strict=True):
-            light.load_state_dict(state)
-        trial = replace(problem, metal=metal)
-        newton_round(scene, trial, few, seconds / TRIALS, tell)
-        trial = replace(problem, metal=find_metal(scene, trial, cfg, 0.0))
-        costs = newton_round(scene, trial, few, seconds / TRIALS, tell)
-        if costs and costs[-1] < share * least:
-            least = costs[-1]
-            best = trial, [copy.deepcopy(light.state_dict()) for light in lights]
-    for light, state in zip(lights, best[1], strict=True):
-        light.load_state_dict(state)
-    return best[0]
-
-
 def newton_share(cfg: JointConfig) -> float:
     """Share of the stage's time that Newton rounds take if nothing is cut."""
-    points = cfg.newton_points * (cfg.rounds - 1)
-    if cfg.rounds > 1:
-        points += TRIALS * min(cfg.newton_points, TRIED)
-    sightings = points * cfg.newton_views * cfg.newton_steps
+    if not cfg.newton_steps:
+        return 0.0
+    points = cfg.rounds * cfg.newton_steps * cfg.newton_points + TRIALS * STEPS * TRIED
+    sightings = points * cfg.newton_views
     newton = NEWTON_COST * sightings
     return newton / (newton + cfg.iterations * cfg.rays)
 
