@@ -17,7 +17,8 @@ from torch import Tensor
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data.images import write_png
-from univoxel.experiments.stress.render import name_of, write_cameras
+from univoxel.data.transforms import write_cameras
+from univoxel.experiments.stress.render import name_of
 
 SIZE, FINER, DISTANCE, RADIUS = 100, 8, 2.0, 0.5
 COLOR = torch.tensor([0.6, 0.4, 0.2])
@@ -55,7 +56,7 @@ def write(folder: Path) -> Path:
     """The data set; what is there is replaced."""
     for split, count, turn in (("train", 40, 0.0), ("test", 6, 0.5)):
         (folder / split).mkdir(parents=True, exist_ok=True)
-        write_cameras(folder, split, cameras(count, SIZE, turn))
+        write_cameras(folder, split, cameras(count, SIZE, turn), [name_of(v) for v in range(count)])
         fine = cameras(count, SIZE * FINER, turn)
         for view in range(count):
             write_png(folder / split / f"{name_of(view)}.png", picture(fine, view).numpy())

@@ -110,9 +110,19 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
 
 
+def test_cutout(calls, capsys):
+    calls.replace("cutout", Path("cut"))
+    options = ["--box", "-1", "-2", "0", "1", "2", "0.5", "--downscale", "2"]
+    assert main(["cutout", "photos", "--out", "cut", *options]) == 0
+    given = {"box": (-1.0, -2.0, 0.0, 1.0, 2.0, 0.5), "downscale": 2}
+    assert calls.noted == [("cutout", (Path("photos"), Path("cut")), given)]
+    assert capsys.readouterr().out == "cut\n"
+
+
+@pytest.mark.parametrize("command", ["train", "cutout"])
 @pytest.mark.parametrize("factor", ["0", "-2"])
-def test_downscale_out_of_range(calls, tmp_path, capsys, factor):
-    assert main(["train", "photos", "--out", str(tmp_path / "run"), "--downscale", factor]) == 2
+def test_downscale_out_of_range(calls, tmp_path, capsys, command, factor):
+    assert main([command, "photos", "--out", str(tmp_path / "run"), "--downscale", factor]) == 2
     assert f"--downscale must be at least 1, got {factor}" in capsys.readouterr().err
     assert not calls.noted
 
@@ -299,8 +309,8 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "Unrecognized options: sing"),
         (
             [],
-            "Expected one of {train, eval, relight, export, envmap, inspect, info, compare, "
-            "chart, stress, demo}",
+            "Expected one of {cutout, train, eval, relight, export, envmap, inspect, info, "
+            "compare, chart, stress, demo}",
         ),
     ],
 )

@@ -37,10 +37,20 @@ HELPERS = {
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
-    "solve": {"equations", "newton", "sightings"},
+    "solve": {"equations", "metals", "newton", "sightings"},
     "tasks": {
-        *("animation", "capacity", "contact_sheet", "envmap", "frames", "guard", "joint"),
-        *("layers", "look", "plateau", "progress", "shrink", "spare", "timelapse", "trust"),
+        *("animation", "capacity", "contact_sheet", "descent", "envmap", "frames", "guard"),
+        *(
+            "joint",
+            "layers",
+            "look",
+            "plateau",
+            "progress",
+            "shrink",
+            "spare",
+            "timelapse",
+            "trust",
+        ),
     },
 }
 # Extras: imported inside the function that needs one

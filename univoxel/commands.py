@@ -94,6 +94,37 @@ def train(
     print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
 
 
+def cutout(
+    data: Annotated[Positional[Path], arg(metavar="DATA")],
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: around what cameras look at)"),
+    ] = None,
+    downscale: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
+    ] = None,
+) -> None:
+    """Cut the object out of photographs without masks.
+
+    Writes them with their alpha, and their cameras, as a new folder to train on: look at it, and
+    mend what is wrong in any image editor.
+
+    Args:
+        data: folder of the photographs and their cameras; masks in it are not looked at
+        out: folder to write
+        box: lower and upper corner of where the object is, in the world of the cameras; what lies
+            in it, such as a table, is part of the object
+        downscale: write photographs of 1/N of their width and height
+    """
+    from univoxel.tasks import cutout as task
+
+    if downscale is not None and downscale < 1:
+        raise ValueError(f"--downscale must be at least 1, got {downscale}")
+    print(task.cutout(data, out, box=box, downscale=downscale or 0))
+
+
 def evaluate(
     run: Run,
     /,
@@ -446,6 +477,7 @@ def _check_minutes(minutes: float | None) -> None:
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
+    "cutout": cutout,
     "train": train,
     "eval": evaluate,
     "relight": relight,

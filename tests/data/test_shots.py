@@ -7,7 +7,7 @@ from layouts import FOCAL, HEIGHT, WIDTH, Scene, scene, write_colmap, write_nerf
 
 from univoxel.camera import project
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.data import DataError, load_photos, shots
+from univoxel.data import DataError, load_photos, shots, splits_of
 from univoxel.data.images import write_exr, write_png
 
 
@@ -108,6 +108,31 @@ def test_masks_in_a_folder_beside_that_of_the_photographs(tmp_path):
     write_png(tmp_path / "test_mask" / "p_000.png", np.full((HEIGHT, WIDTH), 9, np.uint8))
     assert load_photos(tmp_path, "test").alpha.unique().tolist() == [9]
     assert np.array_equal(load_photos(tmp_path).alpha[0], written.pictures[1, ..., 3])
+
+
+@pytest.mark.parametrize("writer", [write_nerf, write_nerfstudio, write_colmap])
+def test_photographs_as_they_are(tmp_path, writer):
+    """Without masks the whole picture is opaque, in every layout, and no colour changes."""
+    written = scene()
+    writer(tmp_path, written)
+    plain, masked = (load_photos(tmp_path, masks=masks) for masks in (False, True))
+    assert plain.alpha.unique().tolist() == [255]
+    assert torch.equal(plain.color, masked.color)
+    assert not torch.equal(plain.alpha, masked.alpha)
+
+
+@pytest.mark.parametrize(
+    ("files", "splits"),
+    [
+        (("transforms_train.json", "transforms_test.json"), ["train", "test"]),
+        (("transforms_train.json",), ["train"]),
+        (("transforms.json",), ["train", "test"]),
+    ],
+)
+def test_splits(tmp_path, files, splits):
+    for file in files:
+        (tmp_path / file).write_text("{}")
+    assert splits_of(tmp_path) == splits
 
 
 def test_focal_lengths_are_divided(tmp_path):

@@ -20,6 +20,7 @@ __all__ = [
     "load_relit",
     "load_truth",
     "relight_maps",
+    "splits_of",
 ]
 
 # In this order: data sets with splits of their own come first
@@ -31,7 +32,9 @@ _LAYOUTS = (
 )
 
 
-def load_photos(folder: str | Path, split: str = "train", downscale: int = 0) -> Photos:
+def load_photos(
+    folder: str | Path, split: str = "train", downscale: int = 0, masks: bool = True
+) -> Photos:
     """Read the photographs of one split in whatever layout the folder has.
 
     Lens distortion is taken out. docs/data.md shows the layouts.
@@ -39,6 +42,7 @@ def load_photos(folder: str | Path, split: str = "train", downscale: int = 0) ->
     Args:
         downscale: side of the squares of pixels that become one, >= 1; 0 for 1, refused where the
             photographs are so large that training them would take gigabytes of memory.
+        masks: False for photographs as they are, the whole picture opaque.
 
     Raises:
         DataError: one line that names the file, what was expected and what came.
@@ -49,7 +53,7 @@ def load_photos(folder: str | Path, split: str = "train", downscale: int = 0) ->
         raise DataError(f"{folder}: expected a folder with a scene, got {what}")
     for fits, load in _LAYOUTS:
         if fits(folder, split):
-            return load(folder, split, downscale)
+            return load(folder, split, downscale, masks)
     files = sorted(path.name for path in folder.iterdir())
     came = ", ".join(files[:5]) + (", ..." if len(files) > 5 else "") or "an empty folder"
     raise DataError(
@@ -57,3 +61,9 @@ def load_photos(folder: str | Path, split: str = "train", downscale: int = 0) ->
         f"transforms_{split}.json, transforms.json, cameras and images (.bin or .txt) of COLMAP in "
         f"sparse/0, sparse, colmap/sparse/0 and here, {split}_000/metadata.json)"
     )
+
+
+def splits_of(folder: Path) -> list[str]:
+    """The splits that a folder has: train, and test unless its transforms name none."""
+    named = [(folder / f"transforms_{split}.json").is_file() for split in ("train", "test")]
+    return ["train"] if named == [True, False] else ["train", "test"]

@@ -21,7 +21,9 @@ def is_blender(folder: Path, split: str) -> bool:
     return any((folder / f"transforms_{s}.json").is_file() for s in ("train", split))
 
 
-def load_blender(folder: Path, split: str = "train", downscale: int = 0) -> Photos:
+def load_blender(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+) -> Photos:
     """Photographs and cameras of one split.
 
     Raises:
@@ -32,7 +34,7 @@ def load_blender(folder: Path, split: str = "train", downscale: int = 0) -> Phot
         raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
     _, shots = read_frames(path)
     shots = [replace(shot, mask=shot.mask or _mask(shot.image)) for shot in shots]
-    return read_shots(folder, "NeRF layout", split, shots, downscale)
+    return read_shots(folder, "NeRF layout", split, shots, downscale, masks=masks)
 
 
 def _mask(image: Path) -> Path | None:

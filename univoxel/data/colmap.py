@@ -44,7 +44,9 @@ def is_colmap(folder: Path, split: str) -> bool:
     return _model(folder) is not None
 
 
-def load_colmap(folder: Path, split: str = "train", downscale: int = 0) -> Photos:
+def load_colmap(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+) -> Photos:
     """Photographs and cameras of one split: every eighth is for tests.
 
     The world keeps its scale and origin, and is turned so that +Z is up.
@@ -92,7 +94,7 @@ def load_colmap(folder: Path, split: str = "train", downscale: int = 0) -> Photo
         shots.append(Shot(name, str(images_file), path, mask, image.pose, lens))
     shots, remarks = upright(shots)
     shots = every_eighth(folder, shots, split)
-    return read_shots(folder, "COLMAP model", split, shots, downscale, remarks)
+    return read_shots(folder, "COLMAP model", split, shots, downscale, remarks, masks)
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:

@@ -21,7 +21,9 @@ def is_nerfstudio(folder: Path, split: str) -> bool:
     return (folder / "transforms.json").is_file()
 
 
-def load_nerfstudio(folder: Path, split: str = "train", downscale: int = 0) -> Photos:
+def load_nerfstudio(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+) -> Photos:
     """Photographs and cameras of one split: without one in the file, every eighth is for tests.
 
     Raises:
@@ -36,7 +38,7 @@ def load_nerfstudio(folder: Path, split: str = "train", downscale: int = 0) -> P
         shots = every_eighth(folder, shots, split)
     else:
         shots = _named(path, shots, f"{split}_filenames", chosen)
-    return read_shots(folder, "nerfstudio layout", split, shots, downscale, remarks)
+    return read_shots(folder, "nerfstudio layout", split, shots, downscale, remarks, masks)
 
 
 def _named(path: Path, shots: list[Shot], key: str, chosen: object) -> list[Shot]:

@@ -25,7 +25,7 @@ LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
 # How far +Z may be from the cameras' common up direction in a world that is taken as upright:
 # cameras are held askew and lean over, but worlds that are not upright are turned by much more.
 LEAN = math.radians(30)
-HOW_TO_MASK = "cut the object out of its background, see docs/data.md#masks"
+HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/data.md#masks"
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ def read_shots(
     shots: Sequence[Shot],
     downscale: int = 0,
     remarks: Sequence[str] = (),
+    masks: bool = True,
 ) -> Photos:
     """Photographs as pinholes see them, all of one size.
 
@@ -56,6 +57,7 @@ def read_shots(
         kind: of the data set, for people.
         downscale: means over squares of so many pixels; 0 for 1, refused where that is large.
         remarks: on how the files were read, for people.
+        masks: False for photographs as they are, the whole picture opaque.
 
     Raises:
         DataError: one line that names the file, what was expected and what came.
@@ -69,7 +71,7 @@ def read_shots(
     lenses: list[Lens] = []
     last, grid = None, None
     for shot in shots:
-        color, alpha = read_photo(shot.image, shot.mask)
+        color, alpha = read_photo(shot.image, shot.mask, masks)
         if colors and color.dtype != colors[0].dtype:
             raise DataError(
                 f"{shot.image}: expected the format of {shots[0].name} in all photographs"
@@ -91,7 +93,9 @@ def read_shots(
         alphas = [a if a.is_floating_point() else a / 255 for a in alphas]
     if not any(bool(alpha.any()) for alpha in alphas):
         raise DataError(f"{folder}: all {len(alphas)} pictures are fully transparent")
-    if all(bool((alpha == (1 if alpha.is_floating_point() else 255)).all()) for alpha in alphas):
+    if masks and all(
+        bool((alpha == (1 if alpha.is_floating_point() else 255)).all()) for alpha in alphas
+    ):
         raise DataError(f"{folder}: all {len(alphas)} pictures are fully opaque: {HOW_TO_MASK}")
 
     told = [f"{len(shots)} photographs of {lenses[0].width}x{lenses[0].height} pixels in {split}"]
@@ -119,12 +123,15 @@ def cameras_of(poses: Sequence[np.ndarray], lenses: Sequence[Lens]) -> Cameras:
     )
 
 
-def read_photo(path: Path, mask: Path | None = None) -> tuple[Tensor, Tensor]:
+def read_photo(path: Path, mask: Path | None = None, masks: bool = True) -> tuple[Tensor, Tensor]:
     """Colour [H, W, 3] and alpha [H, W] of one photograph, stored as in `Photos`.
 
     Without a mask: its alpha channel, or <name>_mask.png or <name>_alpha.png beside it. The colour
     of an EXR with alpha is premultiplied, as OpenEXR has it, and is divided; negative values, which
     denoisers and filters leave, become 0.
+
+    Args:
+        masks: False to look for none: alpha is 1 everywhere.
     """
     image = read_image(path)
     channels = image.shape[-1]
@@ -135,6 +142,8 @@ def read_photo(path: Path, mask: Path | None = None) -> tuple[Tensor, Tensor]:
     if linear and alpha is not None:
         alpha = alpha.clamp(0, 1)
         color = torch.where(alpha[..., None] > 0, color / alpha[..., None], 0.0)
+    if not masks:
+        alpha, mask = torch.full_like(color[..., 0], 1 if linear else 255), None
     stem = path.stem.removesuffix("_rgb")
     beside = [path.with_name(f"{stem}_{what}.png") for what in ("mask", "alpha")]
     if mask is None and alpha is None:

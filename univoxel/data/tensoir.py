@@ -22,7 +22,9 @@ def is_tensoir(folder: Path, split: str) -> bool:
     return any(folder.glob("*_[0-9][0-9][0-9]/metadata.json"))
 
 
-def load_tensoir(folder: Path, split: str = "train", downscale: int = 0) -> Photos:
+def load_tensoir(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+) -> Photos:
     """Photographs and cameras of one split, under the light of the training views.
 
     Raises:
@@ -34,7 +36,7 @@ def load_tensoir(folder: Path, split: str = "train", downscale: int = 0) -> Phot
     picture = photographed(folder)
     shots = [_shot(view, picture) for view in views]
     kind = f"TensoIR layout ({picture})"
-    return read_shots(folder, kind, split, shots, downscale)
+    return read_shots(folder, kind, split, shots, downscale, masks=masks)
 
 
 def photographed(folder: Path) -> str:

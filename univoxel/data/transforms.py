@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from univoxel.camera import Cameras
 from univoxel.data.base import DataError
-from univoxel.data.images import SUFFIXES, image_size
+from univoxel.data.images import SUFFIXES, image_size, replacing
 from univoxel.data.lens import Lens
 from univoxel.data.shots import Shot, cameras_of
 
@@ -192,6 +193,26 @@ def number(values: dict, key: str, where: str, low: float, high: float) -> float
 def short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def write_cameras(folder: Path, split: str, cameras: Cameras, names: Sequence[str]) -> None:
+    """Write transforms_SPLIT.json for pictures SPLIT/NAME of the cameras.
+
+    Raises:
+        OSError: it cannot be written; what was there before stays.
+    """
+    frames = []
+    for view, pose in enumerate(cameras.camera_to_world.tolist()):
+        (x, y), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
+        frames.append(
+            {
+                "file_path": f"{split}/{names[view]}",
+                "transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]],
+                **{"fl_x": x, "fl_y": y, "cx": cx, "cy": cy},
+            }
+        )
+    with replacing(folder / f"transforms_{split}.json") as temporary:
+        temporary.write_text(json.dumps({"frames": frames}, indent=1), encoding="utf-8")
 
 
 def _mask(folder: Path, frame: dict, where: str) -> Path | None:

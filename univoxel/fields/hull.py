@@ -97,18 +97,22 @@ def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
     return torch.where(sdf.isinf(), torch.inf, sdf)
 
 
+def looked_at(cameras: Cameras) -> Tensor:
+    """The point [3] nearest to all optical axes."""
+    position, axis = cameras.camera_to_world[:, :, 3], -cameras.camera_to_world[:, :, 2]
+    across = torch.eye(3) - axis[:, :, None] * axis[:, None]
+    system = across.mean(0) + 1e-6 * torch.eye(3)
+    return torch.linalg.solve(system, (across @ position[:, :, None]).mean(0)[:, 0])
+
+
 def estimate_bounds(distance: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Corners [3], [3] of a box around the visual hull, with a margin of 3 % of its diagonal.
 
     Raises:
         ValueError: the silhouettes share no volume.
     """
-    # The point nearest to all optical axes, and what the cameras see around it
-    position, axis = cameras.camera_to_world[:, :, 3], -cameras.camera_to_world[:, :, 2]
-    across = torch.eye(3) - axis[:, :, None] * axis[:, None]
-    system = across.mean(0) + 1e-6 * torch.eye(3)
-    centre = torch.linalg.solve(system, (across @ position[:, :, None]).mean(0)[:, 0])
-    away = (position - centre).norm(dim=1)
+    centre = looked_at(cameras)
+    away = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
     field_of_view = max(cameras.width, cameras.height) / (2 * cameras.focal.min(1).values)
     half = float((away * field_of_view).max()) * 1.2
     lower, upper = centre - half, centre + half

@@ -33,12 +33,22 @@ from univoxel.fields.hull import GridShape, estimate_bounds, fit_grid, mask_dist
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import priors
 from univoxel.metrics import psnr
-from univoxel.optim import RowAdam, rows_of
+from univoxel.optim import RowAdam
 from univoxel.records import Rays, Surface
 from univoxel.render.picture import preview
 from univoxel.render.pipeline import at_rays, shade, surface_at
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
 from univoxel.tasks import capacity, joint, trust
+from univoxel.tasks.descent import (
+    EPS_FEATURES,
+    EPS_SDF,
+    MOMENTS,
+    REFRESH,
+    SMOOTH_EVERY,
+    between,
+    smooth,
+    spread_gradient,
+)
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress, Rehearsal
@@ -46,15 +56,8 @@ from univoxel.tasks.timelapse import Timelapse
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
-SMOOTH_EVERY = 4  # steps between smoothings of what the step has touched
-SPREAD = 0.8  # share of the neighbours' mean that a node's gradient takes on in a pass
-REFRESH = 16  # steps between looks at which bricks are empty
 RETRACE = 100  # steps after which light is traced through the surface as it has become
-MOMENTS = (0.9, 0.99)
 RATES = ("lr_sdf", "lr_features", "lr_networks")
-# Adam's epsilon for the grids. Far above 0 on purpose: a node's gradient is then scaled by the
-# batch, not by its own history, and nodes that few rays see do not jump.
-EPS_SDF, EPS_FEATURES = 1e-4, 1e-8
 MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silhouette's fringe
 
 
@@ -329,23 +332,6 @@ def encoded_radiance(scene: Scene, surface: Surface, batch: Batch) -> Tensor:
     return losses.encode(scene.exposed(srgb_to_linear(encoded), batch.view))
 
 
-def spread_gradient(field: AbstractField, passes: int) -> None:
-    """Diffuse the sdf's gradient over the nodes that it touches, before Adam sees it: the surface
-    then moves in large pieces, far and without the bumps that steps of single nodes leave."""
-    grad = field.sdf.grad
-    assert grad is not None
-    field.diffuse_rows_(grad._values(), rows_of(grad), SPREAD, passes)
-
-
-def smooth(field: AbstractField, stage: StageConfig) -> None:
-    """Regularise the nodes that the step has touched, beside the optimiser and not inside it."""
-    sdf, features = field.sdf, field.features
-    assert sdf.grad is not None
-    assert features.grad is not None
-    field.smooth_rows_(sdf.data, rows_of(sdf.grad), stage.plate * SMOOTH_EVERY, order=2)
-    field.smooth_features_(rows_of(features.grad), stage.diffusion * SMOOTH_EVERY)
-
-
 def split_pixels(distance: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels [P, 3] (view, row, column) in or near silhouettes: to train on, and held out."""
     pixels = (distance < MARGIN).nonzero()
@@ -393,8 +379,3 @@ def look_at(photos: Photos, pixels: Tensor) -> capacity.Look:
         target,
         radiance=lambda scene, surface: encoded_radiance(scene, surface, batch),
     )
-
-
-def between(ends: tuple[float, float], done: float) -> float:
-    """Geometric interpolation."""
-    return ends[0] * (ends[1] / ends[0]) ** done

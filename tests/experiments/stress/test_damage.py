@@ -110,11 +110,35 @@ def test_a_mask_grows_and_shows_what_is_behind(scene):
     assert (module.masked(photos, 0, NO_MASK)[1] == 1).all()
 
 
-def test_without_masks_the_loader_may_refuse_but_the_suite_goes_on(scene, tmp_path):
+def test_without_masks_the_loader_may_refuse_but_the_suite_goes_on(scene, tmp_path, monkeypatch):
+    def find_object(photos, lower, upper, watch):
+        raise module.NothingFound
+
+    monkeypatch.setattr(module, "find_object", find_object)
     out = damaged(scene, tmp_path / "out", Damage(views=2, dilation=NO_MASK))
     with pytest.raises(DataError, match="fully opaque"):
         load_photos(out, "train")
     assert 0 < module.clipped(out) < 1
+
+
+def test_without_masks_the_suite_cuts_out(scene, tmp_path, monkeypatch):
+    """From what the photographs show, with the room behind the object."""
+    before = load_photos(scene, "train")
+
+    def find_object(photos, lower, upper, watch):
+        outside = before.coverage()[:2] == 0
+        assert photos.color[outside].any()
+        assert not before.color[:2][outside].any()
+        return photos
+
+    def mask(found, photos, view):
+        assert found is photos
+        return torch.full((24, 24), 0.2 * (view + 1))
+
+    monkeypatch.setattr(module, "find_object", find_object)
+    monkeypatch.setattr(module, "mask", mask)
+    photos = load_photos(damaged(scene, tmp_path / "out", Damage(views=2, dilation=NO_MASK)))
+    assert [int(a) for a in photos.alpha.flatten(1).unique(dim=1)[:, 0]] == [51, 102]
 
 
 def test_a_damaged_scene(scene, tmp_path):

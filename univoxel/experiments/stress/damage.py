@@ -16,10 +16,12 @@ from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos, load_photos
 from univoxel.data.images import read_image, write_exr, write_png
+from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
-from univoxel.experiments.stress.render import SPEC, write_cameras
+from univoxel.experiments.stress.render import SPEC
+from univoxel.tasks.cutout import NothingFound, find_object, mask, surroundings
 
-NO_MASK = math.inf  # as a dilation
+NO_MASK = math.inf  # as a dilation: masks are found by `cutout`
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Damage:
     pose: float = 0.0  # standard deviation of a camera's turn about each of its axes, degrees
     stops: float = 0.0  # exposures differ by up to so many, from -stops to +stops
     light: float = 0.0  # largest share of the second light in a photograph, in [0, 1]
-    dilation: float = 0.0  # of the masks, pixels; NO_MASK: the whole picture is the object
+    dilation: float = 0.0  # of the masks, pixels; NO_MASK: there are none, and `cutout` finds some
     noise: float = 0.0  # standard deviation, of sRGB in [0, 1]
     exposure: float = 0.0  # stops, of all photographs and of the test views
 
@@ -65,16 +67,31 @@ def damaged(
     shutil.rmtree(out, ignore_errors=True)
     (out / "train").mkdir(parents=True)
     write_cameras(out, "train", turned(photos.cameras, damage.pose, random), photos.names)
-    for view, name in enumerate(photos.names):
+    pictures, alphas = [], []
+    for view in range(len(photos)):
         if damage.dilation:
             shown, alpha = masked(photos, view, damage.dilation)
         else:
             shown, alpha = photos.picture(view)
-        picture = photographed(shown * gain[view], damage.noise, random)
+        pictures.append(photographed(shown * gain[view], damage.noise, random))
+        alphas.append(alpha)
+    if damage.dilation == NO_MASK:
+        alphas = cut_out(replace(photos, color=torch.stack(pictures)))
+    for name, picture, alpha in zip(photos.names, pictures, alphas, strict=True):
         rgba = torch.cat([picture, torch.round(255 * alpha)[..., None].byte()], -1)
         write_png(out / "train" / f"{name}.png", rgba.numpy())
     _copy_tests(scene, out, 2**damage.exposure)
     return out
+
+
+def cut_out(photos: Photos) -> list[Tensor]:
+    """Masks [H, W] as `univoxel cutout` finds them; all of them opaque where it finds none."""
+    torch.manual_seed(0)
+    try:
+        found = find_object(photos, *surroundings(photos.cameras), watch=lambda _: None)
+    except NothingFound:
+        return list(torch.ones(photos.color.shape[:3]))
+    return [mask(found, photos, view) for view in range(len(photos))]
 
 
 def turned(cameras: Cameras, degrees: float, random: np.random.Generator) -> Cameras:

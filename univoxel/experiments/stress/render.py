@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from univoxel.camera import Cameras
-from univoxel.data.images import replacing, write_exr
+from univoxel.data.images import write_exr
+from univoxel.data.transforms import write_cameras
 from univoxel.experiments.stress import scenes
 from univoxel.experiments.stress.scenes import RELIGHT, Spec
 from univoxel.experiments.stress.shapes import Part
@@ -93,7 +94,7 @@ def write_known(spec: Spec, folder: Path, parts: Sequence[Part]) -> None:
     for split, cameras in splits.items():
         if len(cameras):
             (folder / split).mkdir(exist_ok=True)
-            write_cameras(folder, split, cameras)
+            write_cameras(folder, split, cameras, [name_of(v) for v in range(len(cameras))])
     (folder / "envmaps").mkdir(exist_ok=True)
     for name, file in ((spec.light, "train"), *((m, m) for m in RELIGHT if spec.tests)):
         _write_picture(folder / "envmaps" / f"{file}.exr", scenes.environment(spec, name))
@@ -105,22 +106,6 @@ def write_known(spec: Spec, folder: Path, parts: Sequence[Part]) -> None:
         arrays = scenes.truth_of_view(parts, splits["test"], view)
         path = folder / "test" / "gt" / f"{name_of(view)}.npz"
         np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]
-
-
-def write_cameras(
-    folder: Path, split: str, cameras: Cameras, names: Sequence[str] | None = None
-) -> None:
-    """Write transforms_SPLIT.json for pictures SPLIT/NAME of the cameras."""
-    frames = []
-    for view, pose in enumerate(cameras.camera_to_world.tolist()):
-        name = names[view] if names else name_of(view)
-        matrix = [*pose, [0.0, 0.0, 0.0, 1.0]]
-        frames.append({"file_path": f"{split}/{name}", "transform_matrix": matrix})
-    x, y = cameras.focal[0].tolist()
-    cx, cy = cameras.centre[0].tolist()
-    root = {"fl_x": x, "fl_y": y, "cx": cx, "cy": cy, "frames": frames}
-    with replacing(folder / f"transforms_{split}.json") as temporary:
-        temporary.write_text(json.dumps(root, indent=1), encoding="utf-8")
 
 
 def name_of(view: int) -> str:

@@ -1,0 +1,37 @@
+"""How fields are descended on: what every stage that moves a surface does beside its losses."""
+
+from __future__ import annotations
+
+from univoxel.config import StageConfig
+from univoxel.fields.base import AbstractField
+from univoxel.optim import rows_of
+
+SMOOTH_EVERY = 4  # steps between smoothings of what the step has touched
+SPREAD = 0.8  # share of the neighbours' mean that a node's gradient takes on in a pass
+REFRESH = 16  # steps between looks at which bricks are empty
+MOMENTS = (0.9, 0.99)
+# Adam's epsilon for the grids. Far above 0 on purpose: a node's gradient is then scaled by the
+# batch, not by its own history, and nodes that few rays see do not jump.
+EPS_SDF, EPS_FEATURES = 1e-4, 1e-8
+
+
+def spread_gradient(field: AbstractField, passes: int) -> None:
+    """Diffuse the sdf's gradient over the nodes that it touches, before Adam sees it: the surface
+    then moves in large pieces, far and without the bumps that steps of single nodes leave."""
+    grad = field.sdf.grad
+    assert grad is not None
+    field.diffuse_rows_(grad._values(), rows_of(grad), SPREAD, passes)
+
+
+def smooth(field: AbstractField, stage: StageConfig) -> None:
+    """Regularise the nodes that the step has touched, beside the optimiser and not inside it."""
+    sdf, features = field.sdf, field.features
+    assert sdf.grad is not None
+    assert features.grad is not None
+    field.smooth_rows_(sdf.data, rows_of(sdf.grad), stage.plate * SMOOTH_EVERY, order=2)
+    field.smooth_features_(rows_of(features.grad), stage.diffusion * SMOOTH_EVERY)
+
+
+def between(ends: tuple[float, float], done: float) -> float:
+    """Geometric interpolation."""
+    return ends[0] * (ends[1] / ends[0]) ** done
