@@ -1,7 +1,7 @@
 """univoxel: from photographs to a relightable object, on a plain CPU.
 
-The tasks of the command line are functions here: `univoxel.train(config)`,
-`univoxel.evaluate(run)`, `univoxel.relight(run, envmap)`, which returns pictures, and
+The tasks of the command line are functions here: `univoxel.cutout(data, out)` for photographs
+without masks, `univoxel.train(config)`, `univoxel.evaluate(run)`, `univoxel.relight(run, envmap)`, which returns pictures, and
 `univoxel.export(run, mesh)`.
 """
 
@@ -11,6 +11,7 @@ __version__ = "0.1.0"
 
 # Imported when asked for: `import univoxel` does not wait for torch.
 _TASKS = {
+    "cutout": ("univoxel.tasks.cutout", "cutout"),
     "train": ("univoxel.tasks.train", "train"),
     "evaluate": ("univoxel.tasks.evaluate", "evaluate"),
     "relight": ("univoxel.tasks.relight", "images"),

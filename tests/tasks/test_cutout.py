@@ -46,15 +46,24 @@ def overlap(found, true) -> float:
     return float((found & true).sum() / (found | true).sum())
 
 
+def stages(steps):
+    coarse, fine = task.STAGES
+    return (
+        replace(coarse, voxels=0.03, iterations=steps, rays=512),
+        replace(fine, voxels=0.06, iterations=steps // 5, rays=1024),
+    )
+
+
 @pytest.fixture
 def quick(monkeypatch):
     """Stages that suffice for a sphere of 20 pixels."""
-    coarse, fine = task.STAGES
-    stages = (
-        replace(coarse, voxels=0.03, iterations=300, rays=512),
-        replace(fine, voxels=0.06, iterations=60, rays=1024),
-    )
-    monkeypatch.setattr(task, "STAGES", stages)
+    monkeypatch.setattr(task, "STAGES", stages(300))
+
+
+@pytest.fixture
+def hasty(monkeypatch):
+    """Stages that leave little more than the ball that the object is at first."""
+    monkeypatch.setattr(task, "STAGES", stages(20))
 
 
 def test_a_sphere_is_told_from_what_is_behind(tmp_path, quick):
@@ -67,13 +76,13 @@ def test_a_sphere_is_told_from_what_is_behind(tmp_path, quick):
     torch.manual_seed(0)
     box, seen = (torch.tensor([-0.9, -0.6, -0.7]), torch.tensor([0.6, 0.9, 0.8])), []
     found = task.find_object(photos, *box, seen.append)
-    # Balls in the middle of that box would have 0.3 to 0.6
+    # Balls in the middle of that box have 0.5 and 0.6
     assert overlap(masks(found), true) > 0.85
     assert len(seen) == 2 * 300 + 60
     assert np.mean(seen[-20:]) > np.mean(seen[:20]) + 3
 
 
-def test_a_start_that_vanishes_is_none(tmp_path, quick, monkeypatch):
+def test_a_start_that_vanishes_is_none(tmp_path, hasty, monkeypatch):
     """The others count; where all vanish, nothing was found."""
     photos, asked = photographs(tmp_path), []
 
@@ -119,7 +128,7 @@ def test_small_parts_are_chaff():
     assert (field.sdf - ball).abs().max() < 0.9 * grid.voxel_size
 
 
-def test_what_is_written_can_be_trained_on(tmp_path, quick, capsys):
+def test_what_is_written_can_be_trained_on(tmp_path, hasty, capsys):
     data = write_scene(tmp_path / "data", VIEWS, SIZE)
     photos = photographs(tmp_path)
     for view, name in enumerate(photos.names):  # no alpha at all
@@ -136,7 +145,7 @@ def test_what_is_written_can_be_trained_on(tmp_path, quick, capsys):
         torch.testing.assert_close(cut.cameras.focal, source.cameras.focal)
         torch.testing.assert_close(cut.cameras.camera_to_world, source.cameras.camera_to_world)
         true = torch.stack([photograph(source.cameras, v)[1] for v in range(count)])
-        assert overlap(cut.coverage(), true) > 0.75
+        assert overlap(cut.coverage(), true) > 0.6  # each mask with its photograph
     with pytest.raises(FileExistsError, match="cut is there already: choose another --out"):
         task.cutout(data, out)
 
@@ -151,7 +160,7 @@ def test_linear_photographs_stay_linear(tmp_path):
     assert torch.equal(found, alpha)
 
 
-def test_a_data_set_without_test_views(tmp_path, quick):
+def test_a_data_set_without_test_views(tmp_path, hasty):
     data = write_scene(tmp_path / "data", VIEWS, SIZE)
     (data / "transforms_test.json").unlink()
     out = task.cutout(data, tmp_path / "cut")
