@@ -1,8 +1,8 @@
 """univoxel: from photographs to a relightable object, on a plain CPU.
 
 The tasks of the command line are functions here: `univoxel.cutout(data, out)` for photographs
-without masks, `univoxel.train(config)`, `univoxel.evaluate(run)`, `univoxel.relight(run, envmap)`, which returns pictures, and
-`univoxel.export(run, mesh)`.
+without masks, `univoxel.train(config)`, `univoxel.evaluate(run)`,
+`univoxel.relight(run, envmap)`, which returns pictures, and `univoxel.export(run, mesh)`.
 """
 
 from importlib import import_module
