@@ -74,6 +74,7 @@ def calls(monkeypatch):
 
     stand_in("univoxel.config", chosen=chosen, with_field=with_field)
     replace("train", Path("run"))
+    replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5})
     replace("relight", None)
     replace("export", None)
@@ -111,7 +112,6 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
 
 
 def test_cutout(calls, capsys):
-    calls.replace("cutout", Path("cut"))
     options = ["--box", "-1", "-2", "0", "1", "2", "0.5", "--downscale", "2"]
     assert main(["cutout", "photos", "--out", "cut", *options]) == 0
     given = {"box": (-1.0, -2.0, 0.0, 1.0, 2.0, 0.5), "downscale": 2}
