@@ -73,7 +73,7 @@ class JointConfig:
     share: float = 0.4  # of the time budget, (0, 1]
     rays: int = 4096  # sightings per step, >= views
     views: int = 4  # sightings of a point per step, >= 1
-    rounds: int = 4  # of Adam, >= 1, with Newton steps on the map between them
+    rounds: int = 4  # of Newton steps on the map and then of Adam, >= 1
     points: int = 20000  # on the surface, >= 1
     tracing: int = 2  # visibility rays per point and direction, >= 1
     lr_features: float = 0.03  # at the begin of a round; all rates > 0
@@ -82,7 +82,7 @@ class JointConfig:
     albedo_smoothness: float = 0.005  # weights >= 0
     roughness_smoothness: float = 0.02
     metallic: float = 0.01
-    newton_steps: int = 4  # between rounds, >= 0
+    newton_steps: int = 4  # at the begin of a round, >= 0
     newton_points: int = 6000  # of the points, >= 1
     newton_views: int = 8  # sightings of each, >= 2
     newton_smooth: float = 1e-7  # Laplacian on the log map against the mean squared residual, > 0

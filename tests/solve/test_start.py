@@ -77,3 +77,16 @@ def test_rounds_that_solve_nothing_change_nothing(monkeypatch):
     assert supposed(scene, problem, CFG, math.inf, pytest.fail) is problem
     after = scene.state_dict()
     assert all(torch.equal(after[k], before[k]) for k in after)
+
+
+@pytest.mark.parametrize(("left", "taken"), [(0.9, False), (0.7, True)])
+def test_metal_everywhere_has_to_be_convincing(monkeypatch, left, taken):
+    """It leaves less of the photographs in either case: under a wrong map so it may by chance."""
+    scene, problem = sphere_of((0.5, 0.3, 0.2), 0.0, 0.4)
+
+    def newton_round(scene, problem, *_):
+        return [left if problem.metal.all() else 1.0]
+
+    monkeypatch.setattr(start, "newton_round", newton_round)
+    monkeypatch.setattr(start, "find_metal", lambda scene, problem, *_: problem.metal)
+    assert bool(supposed(scene, problem, CFG, math.inf, pytest.fail).metal.all()) == taken

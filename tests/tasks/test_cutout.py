@@ -1,4 +1,4 @@
-"""Masks found where there are none: a sphere before a far and before a near background."""
+"""Masks found where there are none: a sphere in a room."""
 
 from dataclasses import replace
 
@@ -97,6 +97,32 @@ def test_a_start_that_vanishes_is_none(tmp_path, hasty, monkeypatch):
     assert len(asked) == 3
     with pytest.raises(ValueError, match=r"no object was found .* --box"):
         task.find_object(photos, *task.surroundings(photos.cameras), lambda _: None)
+
+
+@pytest.mark.parametrize("quality", [(30.0, 20.0), (20.0, 30.0)])
+def test_the_start_that_draws_the_photographs_better_is_kept(tmp_path, hasty, monkeypatch, quality):
+    photos, left = photographs(tmp_path), [*quality, 25.0]
+    monkeypatch.setattr(task, "separate", lambda *_: left.pop(0))
+    lower, upper = task.surroundings(photos.cameras)
+    found = task.find_object(photos, lower, upper, lambda _: None)
+    radius = found.field.isosurface()[0].norm(dim=1).mean()  # nothing was fitted: a ball is left
+    kept = task.STARTS[quality.index(30.0)] * float(upper[0] - lower[0]) / 2
+    assert radius == pytest.approx(kept, rel=0.05)  # of the two, which differ by 0.3
+
+
+def test_what_cannot_be_written_leaves_nothing_behind_that_looks_whole(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError("no space left")
+
+    data, out = write_scene(tmp_path / "data", 3, 8), tmp_path / "cut"
+    monkeypatch.setattr(task, "find_object", lambda *_: None)
+    monkeypatch.setattr(task, "mask", lambda scene, photos, view: torch.ones(8, 8))
+    with monkeypatch.context() as patch:
+        patch.setattr(task, "write_cameras", full)
+        with pytest.raises(OSError, match="no space left"):
+            task.cutout(data, out)
+    assert not out.exists()
+    assert task.cutout(data, out).is_dir()  # what was begun is not in the way
 
 
 def test_a_field_without_an_inside_is_nothing():
