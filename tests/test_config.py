@@ -54,9 +54,7 @@ def test_all_stages_are_hashed_or_none():
     dense = preset("fast", Path("photos"), Path("run"))
     config = with_field(dense, "hash")
     assert {s.field for s in config.stages if isinstance(s, StageConfig)} == {"hash"}
-    assert config.capacity == "fixed"
-    with pytest.raises(ValueError, match=r"adaptive capacity.* leave it out, or the hash field"):
-        replace(config, capacity="adaptive")
+    assert config.capacity == "adaptive"
     with pytest.raises(ValueError, match="hash is for all stages or none, got dense, hash"):
         replace(CONFIG, stages=(STAGE, replace(STAGE, field="hash")))
     with pytest.raises(ValueError, match=r"scene.channels must be a multiple of that, got 7"):

@@ -157,10 +157,10 @@ class TrainConfig:
                 f"TrainConfig: the hash field has {PER_LEVEL} channels a level: scene.channels "
                 f"must be a multiple of that, got {self.scene.channels}"
             )
-        if self.capacity == "adaptive" and set(kinds) != {"dense"}:
+        if self.capacity == "adaptive" and "sparse" in kinds:
             raise ValueError(
-                "TrainConfig: adaptive capacity, and so --budget-mb, is for dense grids: leave it "
-                f"out, or the {kinds[-1]} field"
+                "TrainConfig: adaptive capacity, and so --budget-mb, is for dense and hash fields: "
+                "leave it out, or the sparse field"
             )
         if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
             raise ValueError(
@@ -301,11 +301,11 @@ def chosen(
 
 def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
     """The same with stages on such a field; only the first, a coarse one, stays dense where the
-    others are sparse. Capacity is fixed where they are not dense."""
+    others are sparse. Capacity is fixed where they are."""
     stages = [replace(s, field=kind) if isinstance(s, StageConfig) else s for s in cfg.stages]
     if kind == "sparse":
         stages[0] = cfg.stages[0]
-    capacity = cfg.capacity if kind == "dense" else "fixed"
+    capacity = "fixed" if kind == "sparse" else cfg.capacity
     return replace(cfg, stages=tuple(stages), capacity=capacity)
 
 

@@ -263,7 +263,8 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
         )
         kind = meta.get("field", "dense")
         if kind == "hash":
-            levels = Levels(*(tuple(x) for x in meta["levels"]))
+            lower, upper, sizes, *rows = meta["levels"]
+            levels = Levels(tuple(lower), tuple(upper), tuple(sizes), *rows)
             field = HashField(grid, cfg.channels, levels)
         elif kind == "sparse":
             where = tensors.pop("field.place"), tensors.pop("field.inside")

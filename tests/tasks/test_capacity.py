@@ -8,8 +8,9 @@ import torch
 from analytic import photos_of, sphere_scene, write_scene
 
 from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.fields.hashed import FEWEST_ROWS, ROWS, HashField, Levels
 from univoxel.lights import EnvmapConfig, SGConfig
-from univoxel.scene import FILE, SceneConfig, load_checkpoint, load_scene, save_scene
+from univoxel.scene import FILE, Scene, SceneConfig, load_checkpoint, load_scene, save_scene
 from univoxel.tasks import capacity, spare
 from univoxel.tasks import train as task
 from univoxel.tasks.info import info
@@ -256,6 +257,77 @@ def test_resume_goes_on_with_what_was_chosen(data, tmp_path, monkeypatch):
     monkeypatch.setattr(task, "run_stage", lambda scene, *_: seen.append(scene.field.grid))
     train(cfg, resume=True)
     assert [grid.nodes_count for grid in seen] == [coarsest]
+
+
+@pytest.fixture(scope="module")
+def hashed(data, tmp_path_factory):
+    cfg = config(data, tmp_path_factory.mktemp("hashed") / "run", budget_mb=0.3)
+    stages = tuple(dataclasses.replace(s, field="hash") for s in cfg.stages)
+    return train(dataclasses.replace(cfg, stages=stages))
+
+
+def test_a_hash_table_is_adapted_by_levels(hashed, data):
+    found = info(hashed)
+    assert [c["what"] for c in found["chosen"]][:2] == ["voxels", "levels"]
+    assert found["bytes"] == (hashed / FILE).stat().st_size <= 0.3e6
+    scene = load_scene(hashed)
+    assert scene.field.kind == "hash"
+    assert scene.cfg.channels == 2 * len(scene.field.levels.voxel_sizes)
+    pixels = torch.cartesian_prod(torch.arange(12), torch.arange(32), torch.arange(32))
+    # as above
+    assert task.held_out_psnr(scene, photos_of(12, 32), pixels, physical=True) > 17
+
+
+def hash_scene():
+    """Random features on four levels, of which two are read."""
+    grid = capacity.fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 15**3)
+    levels = Levels.of(grid.bounds(), grid.voxel_size, 4)
+    g = torch.Generator().manual_seed(1)
+    torch.manual_seed(0)
+    field = HashField(grid, 8, levels, grid.nodes().norm(dim=-1) - 0.5)
+    scene = Scene(SceneConfig(8, 4, 16, sky_nodes=0, light=LIGHT), field).eval()
+    scene.inv_s = 60.0
+    with torch.no_grad():
+        field.features.normal_(generator=g)
+        for owner, name in spare.shrink.heads(scene):
+            unread = [1, 2] if owner is scene.material else [1, 2, 5, 6]
+            getattr(owner, name).linear[0].weight[:, unread] = 0
+        scene.light.head.linear[-1].weight.normal_(0, 0.1, generator=g)
+    return scene
+
+
+def test_levels_that_nothing_reads_are_dropped(looks):
+    scene = hash_scene()
+    look, lesson = looks
+    surface = look.meet(scene)
+    sizes = scene.field.levels.voxel_sizes
+    with torch.no_grad():  # as above
+        drawn = look.decode(scene, surface, surface.features)["physical"]
+    noise = 0.05 * torch.randn(drawn.shape, generator=torch.Generator().manual_seed(0))
+    look = dataclasses.replace(look, target=drawn + noise)
+    choice = spare.fewer_levels(scene, look, lesson, 1e-4)
+    assert (choice.before, choice.after) == (4, 2)
+    assert scene.field.levels.voxel_sizes == (sizes[0], sizes[3])
+    assert (scene.cfg.channels, scene.cfg.material_channels) == (4, 2)
+    assert choice.cost <= 1e-4
+
+
+def test_a_trial_of_fewer_levels_is_undone(looks):
+    scene = hash_scene()
+    field, before = scene.field, scene.field.features
+    with spare.trial(scene):
+        spare.shrink.drop_channels(scene, field.channels_of(torch.tensor([0])), torch.zeros(8))
+        assert field.channels == 2
+    assert field.features is before
+    assert (field.channels, len(field.levels.voxel_sizes)) == (8, 4)
+
+
+def test_a_budget_decides_on_the_rows_of_a_hash_table():
+    scene = SceneConfig()  # 16 channels: 8 levels
+    assert capacity.table_rows(scene, None) == ROWS
+    assert capacity.table_rows(scene, 100.0) == ROWS
+    assert capacity.table_rows(scene, 1.0) == 2**12  # 8 levels of 8 bytes a row: half of 0.5 MB
+    assert capacity.table_rows(scene, 1e-3) == FEWEST_ROWS
 
 
 def test_a_light_without_networks_is_adapted_too(data, tmp_path):

@@ -24,6 +24,7 @@ class AbstractField(nn.Module, ABC):
     grid: GridShape
     channels: int  # C
     voxel_size: float  # finest resolution, world units
+    sized: ClassVar[tuple[str, ...]] = ("features", "channels")  # what `keep_channels` replaces
     sdf: nn.Parameter
     features: nn.Parameter  # as the sdf, and C; or a table of its own
 
@@ -58,6 +59,11 @@ class AbstractField(nn.Module, ABC):
     def smooth_features_(self, rows: Tensor, amount: float) -> None:
         """`smooth_rows_` of the features of these rows, where rows are nodes."""
         self.smooth_rows_(self.features.data, rows, amount, order=1)
+
+    def keep_channels(self, keep: Tensor) -> None:
+        """Have only the channels of these numbers [K], increasing; features are a new parameter."""
+        self.features = nn.Parameter(self.features.data[..., keep].contiguous())
+        self.channels = len(keep)
 
     def hold_channels_(self, count: int) -> None:
         """Drop the gradient to the first channels, which then stay as they are."""

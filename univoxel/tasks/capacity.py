@@ -17,9 +17,10 @@ from torch import Tensor, nn
 
 from univoxel.camera import Cameras
 from univoxel.config import StageConfig, TrainConfig
+from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS, HashField
 from univoxel.fields.hull import fit_grid
 from univoxel.lights import LocalSG
-from univoxel.scene import SHELL, Scene, stored
+from univoxel.scene import SHELL, Scene, SceneConfig, stored
 from univoxel.tasks import spare
 from univoxel.tasks.look import TOLERANCE, Choice, Look, smallest
 
@@ -32,6 +33,7 @@ FEWEST_STEPS = 8  # of a rehearsal: fewer tell nothing
 LESSON = 1024  # rays of the training photographs that heads settle on
 REACH_TOLERANCE = 0.05  # dB that nodes far from the surface may be worth and are not stored
 REACHES = (3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5, 1.25, 1.0)  # voxels
+ROW_BYTES = 4 + 2 * PER_LEVEL  # of a row of a hash table: its number, and features in halves
 HEADER, NAME = 8192, 64  # bytes of a model's file that hold no numbers, and of a view's name
 
 
@@ -114,7 +116,8 @@ def paid(scene: Scene, look: Look, before: dict[str, Tensor], reach: float) -> f
     near = sdf.abs() < reach * field.voxel_size
     try:
         field.sdf = nn.Parameter(torch.where(near, sdf, SHELL * field.voxel_size * sdf.sign()))
-        field.features = nn.Parameter(features * near[..., None])
+        if not isinstance(field, HashField):  # whose features are not stored by nodes
+            field.features = nn.Parameter(features * near[..., None])
         surface = look.meet(scene)
         return look.cost(before, look.decode(scene, surface, surface.features))
     finally:
@@ -159,7 +162,9 @@ def adapt(
         found.append(choice)
     if isinstance(stage, StageConfig) and not stage.refit and stage.physical_from < 1:
         tolerance = REGAINED if after else TOLERANCE
-        found.append(spare.fewer_channels(scene, look, lesson, tolerance))
+        hashed = isinstance(scene.field, HashField)
+        fewer = spare.fewer_levels if hashed else spare.fewer_channels
+        found.append(fewer(scene, look, lesson, tolerance))
         if spare.share_of_heads(scene) > spare.WORTH:
             if isinstance(scene.light, LocalSG):
                 found.append(spare.fewer_lobes(scene, look, lesson))
@@ -222,15 +227,26 @@ def affordable(scene: Scene, budget: float) -> int:
     return max(FEWEST_VOXELS, int(scene.field.grid.nodes_count * (room / near) ** 1.5))
 
 
+def table_rows(scene: SceneConfig, budget_mb: float | None) -> int:
+    """Rows of a level's hash table: as many as half of the budget has room for, if there is one."""
+    if budget_mb is None:
+        return ROWS
+    room = 0.5e6 * budget_mb / (scene.channels // PER_LEVEL * ROW_BYTES)
+    return min(max(2 ** int(math.log2(max(room, 1.0))), FEWEST_ROWS), ROWS)
+
+
 def _node_bytes(scene: Scene) -> int:
-    """Of a node near the surface: numbers of its row twice, distance and features in halves."""
-    return 4 + 4 + 2 + 2 * scene.cfg.channels
+    """Of a node near the surface: number of its row and distance, in halves; and, where features
+    are of nodes, its number again and features."""
+    features = 0 if isinstance(scene.field, HashField) else 4 + 2 * scene.cfg.channels
+    return 4 + 2 + features
 
 
 def _apart_from_grid(scene: Scene) -> int:
     rest = (x for name, x in scene.state_dict().items() if not name.startswith("field."))
     names = NAME * len(scene.cfg.views)
-    return HEADER + names + sum(x.numel() * x.element_size() for x in rest)
+    rows = len(scene.field.features) if isinstance(scene.field, HashField) else 0
+    return HEADER + names + ROW_BYTES * rows + sum(x.numel() * x.element_size() for x in rest)
 
 
 def on_grid(stage: StageConfig, box: tuple[Tensor, Tensor], voxel_size: float) -> StageConfig:

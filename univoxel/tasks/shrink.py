@@ -35,7 +35,7 @@ def parts_of(scene: Scene) -> Parts:
     """The present networks, features and sizes of a scene."""
     names = [
         (scene, ("cfg",)),
-        (scene.field, ("features", "channels")),
+        (scene.field, scene.field.sized),
         (scene.material, ("net", "channels")),
         (scene.radiance, ("net",)),
     ]
@@ -100,8 +100,7 @@ def drop_channels(scene: Scene, keep: Tensor, mean: Tensor) -> None:
         setattr(owner, name, _network(weights, biases))
     scene.material.channels = int((keep < of_material).sum())
     scene.cfg = replace(scene.cfg, channels=len(keep), material_channels=scene.material.channels)
-    scene.field.features = nn.Parameter(scene.field.features.data[..., keep].contiguous())
-    scene.field.channels = len(keep)
+    scene.field.keep_channels(keep)
 
 
 def drop_lobes(scene: Scene, keep: Tensor) -> None:

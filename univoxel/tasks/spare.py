@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
+from univoxel.fields.hashed import PER_LEVEL, HashField
 from univoxel.lights import LocalSG
 from univoxel.records import Surface
 from univoxel.scene import SHELL, Scene
@@ -114,6 +115,32 @@ def fewer_channels(scene: Scene, look: Look, lesson: Look, limit: float) -> Choi
     return _spare("channels", scene, look, lesson, scene.cfg.channels, reduce, limit)
 
 
+def fewer_levels(scene: Scene, look: Look, lesson: Look, limit: float) -> Choice:
+    """Drop levels of a hash table, those whose going alone costs least first."""
+    field = scene.field
+    assert isinstance(field, HashField)
+    count = len(field.levels.voxel_sizes)
+    surface = look.meet(scene)
+    mean = mean_features(surface)
+
+    def reduce(levels: Tensor) -> Tensor:
+        keep = field.channels_of(levels.sort().values)
+        shrink.drop_channels(scene, keep, mean)
+        return keep
+
+    with torch.no_grad():
+        before = look.decode(scene, surface, surface.features)
+        costs = []
+        for gone in range(count if count > 1 else 0):
+            with trial(scene):
+                keep = reduce(torch.tensor([k for k in range(count) if k != gone]))
+                costs.append(
+                    look.cost(before, look.decode(scene, surface, surface.features[:, keep]))
+                )
+    order = torch.tensor(costs).argsort(descending=True)
+    return _spare("levels", scene, look, lesson, count, lambda kept: reduce(order[:kept]), limit)
+
+
 def fewer_units(scene: Scene, look: Look, lesson: Look, limit: float = TOLERANCE) -> Choice:
     """Narrow the hidden layers of all heads."""
     surface = lesson.meet(scene)
@@ -177,7 +204,12 @@ def _spare(
 def share_of_heads(scene: Scene) -> float:
     """Share of the parameters near the surface and of the heads that the heads have."""
     rest = sum(x.numel() for name, x in scene.named_parameters() if not name.startswith("field."))
-    return rest / (rest + nodes_near(scene) * (1 + scene.cfg.channels))
+    near = nodes_near(scene)
+    if isinstance(scene.field, HashField):
+        features = scene.field.features.detach().any(1).sum().item() * PER_LEVEL
+    else:
+        features = near * scene.cfg.channels
+    return rest / (rest + near + features)
 
 
 def nodes_near(scene: Scene) -> int:

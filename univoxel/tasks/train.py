@@ -165,7 +165,8 @@ def first_field(
     if stages[0].field != "hash":
         return DenseField(grid, cfg.scene.channels, hull)
     finest = min(fit_grid(*box, capacity.voxels(s, [])).voxel_size for s in stages)
-    levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL)
+    rows = capacity.table_rows(cfg.scene, cfg.budget_mb)
+    levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL, rows)
     return HashField(grid, cfg.scene.channels, levels, hull)
 
 
