@@ -33,6 +33,7 @@ class Config:
     light: str
     varying: str
     minutes: float = 4.0
+    cameras: str = "auto"
     downscale: int = 0
     seed: int = 0
     capacity: str = "as preset"
@@ -98,12 +99,14 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
         "2",
         "--downscale",
         "4",
+        "--cameras",
+        "refined",
         *(f"--set={change}" for change in changes),
     ]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
     stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0)
     expected = Config(
-        *(Path("photos"), out, "draft", "sg", "exposure", 2.0, 4, 7),
+        *(Path("photos"), out, "draft", "sg", "exposure", 2.0, "refined", 4, 7),
         loss=LossConfig(2.0),
         stages=stages,
     )

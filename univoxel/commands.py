@@ -30,6 +30,7 @@ def train(
     preset: Literal["auto", "draft", "fast", "full"] = "auto",
     light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
     varying: Literal["none", "exposure", "light"] = "none",
+    cameras: Literal["auto", "given", "refined"] = "auto",
     downscale: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
     ] = None,
@@ -59,6 +60,8 @@ def train(
             local too, envmap-sg and envmap, one map from the beginning
         varying: what differs from photograph to photograph: exposure, with the colour balance, or
             the light itself too
+        cameras: refined puts the photographs' cameras right, before training and in it; auto does
+            so where their silhouettes contradict one another
         downscale: train on photographs of 1/N of their width and height
         field: sparse stores bricks around the surface alone, for finer grids than the presets',
             such as --set stages.1.voxels=30; hash takes features from a small table of many
@@ -85,7 +88,7 @@ def train(
     if downscale is not None and downscale < 1:
         raise ValueError(f"--downscale must be at least 1, got {downscale}")
     config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
-    config = dataclasses.replace(config, downscale=downscale or 0)
+    config = dataclasses.replace(config, cameras=cameras, downscale=downscale or 0)
     config = with_field(config, field)
     if budget_mb is not None and capacity == "auto":
         capacity = "adaptive"

@@ -25,6 +25,7 @@ from univoxel.scene import SceneConfig, Varying
 FieldName: TypeAlias = Literal["dense", "sparse", "hash"]
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
 Capacity: TypeAlias = Literal["fixed", "adaptive"]
+CamerasFrom: TypeAlias = Literal["auto", "given", "refined"]
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
 
 
@@ -40,6 +41,7 @@ class StageConfig:
     lr_sdf: tuple[float, float] = (0.2, 0.02)  # at begin and end, voxels per step; all rates > 0
     lr_features: tuple[float, float] = (0.1, 0.01)
     lr_networks: tuple[float, float] = (3e-3, 3e-4)
+    lr_poses: tuple[float, float] = (1e-3, 1e-4)  # radians, radii; of cameras that are refined
     plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.125]
     spread: int = 4  # passes that smooth the sdf's gradient before the optimiser, >= 0
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 0.25]
@@ -56,7 +58,7 @@ class StageConfig:
             self,
             "two numbers above 0",
             lambda x: len(x) == 2 and all(0 < v < math.inf for v in x),
-            *("sharpness", "lr_sdf", "lr_features", "lr_networks"),
+            *("sharpness", "lr_sdf", "lr_features", "lr_networks", "lr_poses"),
         )
         _check(self, "at least 0", lambda x: x >= 0, "spread")
         _check(self, "in [0, 0.125]", lambda x: 0 <= x <= 0.125, "plate")
@@ -130,6 +132,9 @@ class TrainConfig:
     # finer grid would only learn their noise
     voxel_pixels: float = 1.0
     seed: int = 0
+    # refined: the photographs' cameras are put right, before training and in it; auto: where their
+    # silhouettes contradict one another
+    cameras: CamerasFrom = "given"
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
     capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see tasks/capacity.py
@@ -170,6 +175,7 @@ class TrainConfig:
         names = ("patience", "downscale", "voxel_pixels")
         _check(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
         _check(self, "fixed or adaptive", lambda x: x in get_args(Capacity), "capacity")
+        _check(self, "auto, given or refined", lambda x: x in get_args(CamerasFrom), "cameras")
         _check(self, "above 0 or None", lambda x: x is None or 0 < x < math.inf, "budget_mb")
         if self.budget_mb is not None and self.capacity == "fixed":
             raise ValueError(
@@ -214,11 +220,13 @@ def check_same(cfg: TrainConfig) -> None:
     now = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
     # of configurations from before there were any
     since = {"downscale": 0, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
+    since |= {"cameras": "given"}
     for name in ("stages", "scene", *since):
         if not isinstance(before, dict) or before.get(name, since.get(name)) != now[name]:
             raise ValueError(
                 f"{path}: the run began with other {name}: resume with the same --preset, "
-                "--minutes, --light, --downscale, --capacity, --budget-mb and --set as then"
+                "--minutes, --light, --cameras, --downscale, --capacity, --budget-mb and --set as "
+                "then"
             )
 
 
@@ -370,12 +378,15 @@ def _configuration(
             )
             scene = SceneConfig(varying=varying)
             stages = (coarse, fine, joint, refit)
-            return TrainConfig(data, out, stages, minutes, capacity="adaptive", scene=scene)
+            return TrainConfig(
+                data, out, stages, minutes, cameras="auto", capacity="adaptive", scene=scene
+            )
         case _ if light in alone:
             scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=varying)
             # Lobes that light the materials to the end: what leaves least shading in the albedo
             loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
-            return TrainConfig(data, out, (coarse, fine), minutes, scene=scene, loss=loss)
+            stages = (coarse, fine)
+            return TrainConfig(data, out, stages, minutes, cameras="auto", scene=scene, loss=loss)
         case _:
             names = ", ".join(("hybrid", *alone))
             raise ValueError(f"light must be one of {names}, got {light!r}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, astuple, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from univoxel.data import Photos
 from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import HashField, Levels
@@ -37,6 +38,7 @@ from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.views import ViewLights
 from univoxel.ops import VisibilityScene
 from univoxel.packing import PACKED, pack, unpack
+from univoxel.poses import PoseSteps
 from univoxel.records import Bricks
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
@@ -59,7 +61,10 @@ class SceneConfig:
     light: LightConfig = field(default_factory=SGConfig)
     varying: Varying = "none"  # what differs from photograph to photograph, see ViewLights
     codes: int = 8  # numbers that tell the light of a view, where that varies, >= 1
-    views: tuple[str, ...] = ()  # names of the photographs, which training fills in where it varies
+    # Training fills in whether the photographs' cameras are learned too, see PoseSteps, and their
+    # names where something differs from one to another
+    refined: bool = False
+    views: tuple[str, ...] = ()
 
     def __post_init__(self):
         for name in ("channels", "material_channels", "hidden", "codes"):
@@ -106,6 +111,7 @@ class Scene(nn.Module):
         if cfg.varying != "none":
             directions = self.sky.direction if codes and self.sky else None
             self.views = ViewLights(cfg.views, codes, directions)
+        self.poses = PoseSteps(len(cfg.views)) if cfg.refined else None
         if codes:  # at first they change nothing
             assert isinstance(self.light, LocalSG | LocalSH | LocalMLP)
             nets = [self.radiance.net, self.light.head]
@@ -128,6 +134,16 @@ class Scene(nn.Module):
     def exposed(self, radiance: Tensor, view: Tensor | int | None = None) -> Tensor:
         """Linear radiance [N, 3] with the gain of photographs; view as in `coded`."""
         return radiance if self.views is None else radiance * self.views.gain(view)
+
+    def registered(self, photos: Photos) -> Photos:
+        """The photographs that it was trained on, their cameras where they are believed to be.
+
+        Raises:
+            ValueError: other photographs, where cameras are refined.
+        """
+        if self.poses is None:
+            return photos
+        return replace(photos, cameras=self.poses.corrected(photos.cameras))
 
     def show_light_of(self, view: str | None) -> None:
         """Choose the photograph, by name or number, whose light is shown; None: the mean of all.

@@ -29,7 +29,7 @@ from univoxel.data.images import replacing
 from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
-from univoxel.fields.hull import GridShape, estimate_bounds, fit_grid, mask_distances, visual_hull
+from univoxel.fields.hull import GridShape, fit_grid, mask_distances, visual_hull
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import priors
 from univoxel.metrics import psnr
@@ -52,6 +52,7 @@ from univoxel.tasks.descent import (
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress, Rehearsal
+from univoxel.tasks.registration import object_box, put_right
 from univoxel.tasks.timelapse import Timelapse
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
@@ -100,10 +101,9 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     distance = mask_distances(photos.coverage())
     pixels, held_out = split_pixels(distance)
     try:
-        lower, upper = estimate_bounds(distance, photos.cameras)
+        box, refined = object_box(distance, photos.cameras, cfg.cameras)
     except ValueError as error:
         raise DataError(f"{cfg.data}: {error}") from None
-    box = lower, upper
     asked, cfg = cfg, capacity.within_pixels(cfg, photos.cameras, box)
     if resume:
         scene, state = load_checkpoint(cfg.out)
@@ -112,11 +112,16 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     else:
         assert isinstance(cfg.stages[0], StageConfig)
         first = fit_grid(*box, capacity.voxels(cfg.stages[0], []))
-        hull = visual_hull(distance, photos.cameras, first)
+        poses = put_right(distance, photos.cameras, box) if refined else None
+        cameras = poses.corrected(photos.cameras) if poses else photos.cameras
+        hull = visual_hull(distance, cameras, first)
         field = first_field(cfg, first, hull, box)
-        light = lights.scaled(cfg.scene.light, float((upper - lower).max()) / 2)
-        views = tuple(photos.names) if cfg.scene.varying != "none" else ()
-        scene = Scene(replace(cfg.scene, light=light, views=views), field)
+        light = lights.scaled(cfg.scene.light, float((box[1] - box[0]).max()) / 2)
+        views = tuple(photos.names) if refined or cfg.scene.varying != "none" else ()
+        own = replace(cfg.scene, light=light, refined=refined, views=views)
+        scene = Scene(own, field)
+        if poses:
+            scene.poses = poses
         state = {"stage": 0, "progress": 0.0, "step": 0}
         if cfg.budget_mb is not None:
             capacity.check_budget(scene, cfg.budget_mb)
@@ -129,7 +134,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         for index in range(state["stage"], len(cfg.stages)):
             stage = cfg.stages[index]
             if isinstance(stage, JointConfig):
-                joint.solve(scene, photos, stage, cfg.seed, progress)
+                joint.solve(scene, scene.registered(photos), stage, cfg.seed, progress)
             else:
                 grid = fit_grid(*box, capacity.voxels(stage, progress.chosen))
                 if stage.field == "sparse" and not isinstance(scene.field, SparseField):
@@ -143,14 +148,15 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             if cfg.capacity == "adaptive" and (done or not progress.over):
                 rehearse = partial(rehearsal, cfg, photos, pixels, held_out)
                 lesson = pixels[torch.randperm(len(pixels))[: capacity.LESSON]]
-                looks = look_at(photos, held_out), look_at(photos, lesson)
+                shot = scene.registered(photos)
+                looks = look_at(shot, held_out), look_at(shot, lesson)
                 chosen = capacity.adapt(scene, cfg, index, box, *looks, rehearse, progress.pace)
                 progress.chosen += [choice.noted() for choice in chosen]
                 if capacity.rehearsed(chosen):
                     progress.credit(capacity.REHEARSAL)
             reach = capacity.reach(progress.chosen)
             save_scene(scene, cfg.out, progress.state(), slim=done, reach=reach)
-            preview(scene, photos, cfg.out / "preview.png")
+            preview(scene, scene.registered(photos), cfg.out / "preview.png")
         if film:
             film.finish(scene, progress)
     say_trust(scene, photos, cfg.out, progress.troubles)
@@ -203,11 +209,16 @@ def run_stage(
     if scene.views:
         scene.views.gain_steps.requires_grad_(not stage.refit)
         networks.append(scene.views)
+    poses = []
+    if scene.poses is not None:
+        scene.poses.requires_grad_(not stage.refit)
+        poses = [scene.poses.steps]
     optimizer = RowAdam(
         [
             {"params": [field.sdf], "eps": EPS_SDF},
             {"params": [field.features], "eps": EPS_FEATURES},
             {"params": [p for net in networks for p in net.parameters()]},
+            {"params": poses},
         ],
         betas=MOMENTS,
     )
@@ -220,6 +231,7 @@ def run_stage(
             between(stage.lr_sdf, done) * field.voxel_size,
             between(stage.lr_features, done),
             between(stage.lr_networks, done),
+            between(stage.lr_poses, done),
         )
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate * guard.scale
@@ -233,7 +245,7 @@ def run_stage(
         if progress.step % RETRACE == 0 and not stage.refit:
             scene.surface_moved()
 
-        batch = random_batch(photos, pixels, stage.rays)
+        batch = random_batch(scene.registered(photos), pixels, stage.rays)
         surface = surface_at(scene, batch.rays, torch.rand(stage.rays))
         terms = objective(scene, cfg.loss, surface, batch, physical)
         loss = torch.stack(list(terms.values())).sum()
@@ -359,7 +371,7 @@ def batch_at(photos: Photos, pixels: Tensor) -> Batch:
 def held_out_psnr(scene: Scene, photos: Photos, pixels: Tensor, physical: bool) -> float:
     """PSNR in sRGB on black over held-out pixels, of the physically based render once there is one
     and of the radiance head before."""
-    batch = batch_at(photos, pixels)
+    batch = batch_at(scene.registered(photos), pixels)
     surface = surface_at(scene, batch.rays)
     if physical:
         shaded = shade(scene, surface, batch.wo, view=batch.view)

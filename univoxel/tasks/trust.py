@@ -86,6 +86,7 @@ def survey(scene: Scene, photos: Photos, points: int = POINTS) -> Survey:
         ValueError: the scene has no surface.
     """
     generator = torch.Generator().manual_seed(0)
+    photos = scene.registered(photos)
     mesh, tracer, offset = extract_mesh(scene), scene.occluder(), scene.field.voxel_size
     position, normal = surface_points(mesh, points, generator)
     seen = observe(position, normal, photos, tracer, offset)
