@@ -4,7 +4,8 @@
 
 Trains and evaluates every DATA with every setting, all steps, relit with 16 samples; what is done
 already is not done again. `ball` for DATA makes the scene of ball.py. A setting is `dense`,
-`sparse` or `hash`, the preset's sizes on such a field; `adaptive`, its sizes as limits;
+`sparse` or `hash`, the preset's sizes on such a field; `adaptive`, its sizes as limits, and
+`dense-adaptive`, those on dense grids;
 `budget-X`, adaptive in X million bytes; `voxels-X`, dense with X million voxels in the fine stages;
 `channels-N`, dense with N feature channels, half of them of material. Parameters are counted as
 `univoxel info` does, in the model's file. Writes results/capacity.json, .png and .svg; the result
@@ -35,22 +36,26 @@ ACROSS = [("stored_parameters", "parameters in the model's file"), ("train_secon
 
 
 def configured(base: TrainConfig, setting: str) -> TrainConfig:
-    """The configuration of a setting.
+    """The configuration of a setting, on the fields of `base` where it names no others.
 
     Raises:
         ValueError: no such setting.
     """
     kind, _, value = setting.partition("-")
     match kind:
+        case "dense" if value == "adaptive":
+            return replace(with_field(base, "dense"), capacity="adaptive")
         case "dense" | "sparse" | "hash":
             return with_field(base, kind)
         case "voxels":
+            base = with_field(base, "dense")
             first, *rest = base.stages
             fewer = [
                 replace(s, voxels=float(value)) if isinstance(s, StageConfig) else s for s in rest
             ]
             return replace(base, stages=(first, *fewer))
         case "channels":
+            base = with_field(base, "dense")
             count = int(value)
             return replace(
                 base, scene=replace(base.scene, channels=count, material_channels=count // 2)

@@ -104,7 +104,7 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
         *(f"--set={change}" for change in changes),
     ]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
-    stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0)
+    stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0, field="hash")
     expected = Config(
         *(Path("photos"), out, "draft", "sg", "exposure", 2.0, "refined", 4, 7),
         loss=LossConfig(2.0),

@@ -34,7 +34,7 @@ def train(
     downscale: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
     ] = None,
-    field: Literal["dense", "sparse", "hash"] = "dense",
+    field: Literal["hash", "dense", "sparse"] = "hash",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
@@ -63,13 +63,14 @@ def train(
         cameras: refined puts the photographs' cameras right, before training and in it; auto does
             so where their silhouettes contradict one another
         downscale: train on photographs of 1/N of their width and height
-        field: sparse stores bricks around the surface alone, for finer grids than the presets',
-            such as --set stages.1.voxels=30; hash takes features from a small table of many
-            resolutions, for small models
+        field: hash takes features from a small table of many resolutions; dense stores them at
+            every node of the grid, sparse in bricks around the surface alone, for finer grids than
+            the presets', such as --set stages.1.voxels=30
         minutes: wall-clock limit, above 0; training ends in time with what it has
         capacity: adaptive makes no larger a model than the scene needs, as held-out pixels tell:
-            coarser grid, fewer feature channels, lobes and hidden units; `univoxel info` says what
-            was chosen. auto is that, but fixed for other fields and for lights other than hybrid
+            coarser grid, fewer levels or channels of features, fewer lobes and hidden units;
+            `univoxel info` says what was chosen. auto is that, but fixed for sparse fields and for
+            lights other than hybrid
         budget_mb: most that the file of the model may have, in millions of bytes; implies
             --capacity adaptive
         resume: go on with the run in --out

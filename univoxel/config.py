@@ -179,8 +179,8 @@ class TrainConfig:
         _check(self, "above 0 or None", lambda x: x is None or 0 < x < math.inf, "budget_mb")
         if self.budget_mb is not None and self.capacity == "fixed":
             raise ValueError(
-                f"TrainConfig: budget_mb {self.budget_mb:g} needs adaptive capacity and dense "
-                "fields, got fixed"
+                f"TrainConfig: budget_mb {self.budget_mb:g} needs adaptive capacity, got "
+                "fixed"
             )
 
 
@@ -308,11 +308,11 @@ def chosen(
 
 
 def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
-    """The same with stages on such a field; only the first, a coarse one, stays dense where the
+    """The same with stages on such a field; only the first, a coarse one, is dense where the
     others are sparse. Capacity is fixed where they are."""
     stages = [replace(s, field=kind) if isinstance(s, StageConfig) else s for s in cfg.stages]
-    if kind == "sparse":
-        stages[0] = cfg.stages[0]
+    if kind == "sparse" and isinstance(stages[0], StageConfig):
+        stages[0] = replace(stages[0], field="dense")
     capacity = "fixed" if kind == "sparse" else cfg.capacity
     return replace(cfg, stages=tuple(stages), capacity=capacity)
 
@@ -339,7 +339,9 @@ def _configuration(
 ) -> TrainConfig:
     minutes, voxels = work.minutes, round(work.voxels, 3)
     steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
-    coarse = StageConfig(0.9, steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35))
+    coarse = StageConfig(
+        0.9, steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35), field="hash"
+    )
     fine = StageConfig(
         voxels=voxels,
         iterations=steps,
@@ -348,6 +350,7 @@ def _configuration(
         sharpness=(0.5, 0.3),
         lr_sdf=(0.05, 0.005),
         physical_from=0.3,
+        field="hash",
     )
     alone: dict[str, LightConfig] = {
         c.kind: c
@@ -375,6 +378,7 @@ def _configuration(
                 diffusion=0.0,
                 physical_from=0.0,
                 refit=True,
+                field="hash",
             )
             scene = SceneConfig(varying=varying)
             stages = (coarse, fine, joint, refit)

@@ -1,8 +1,8 @@
 """How much model a scene needs: what is chosen, when, and how large its file may be.
 
 No grid is finer than the photographs. Capacity that adapts chooses more: after the coarse stage
-the grid, by rehearsals of the next; after the first stage with light the channels, lobes and hidden
-units; at the end how far from the surface nodes are stored.
+the grid and the levels of a hash table, by rehearsals of the next; after the first stage with light
+the channels of a dense grid, lobes and hidden units; at the end how far from the surface nodes are stored.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS, HashField
 from univoxel.fields.hull import fit_grid
 from univoxel.lights import LocalSG
 from univoxel.scene import SHELL, Scene, SceneConfig, stored
-from univoxel.tasks import spare
+from univoxel.tasks import shrink, spare
 from univoxel.tasks.look import TOLERANCE, Choice, Look, smallest
 
 REGAINED = 0.1  # dB that channels may cost where training goes on with what is left
@@ -79,6 +79,41 @@ def coarser_grid(
     why = "held-out rays after rehearsals: "
     why += ", ".join(f"{v:,} {found[v]:.2f} dB" for v in sorted(found, reverse=True))
     return Choice("voxels", most, chosen, max(found.values()) - found[chosen], why)
+
+
+def fewer_levels(scene: Scene, look: Look, rehearse: Callable[[Scene], float]) -> Choice:
+    """Halve the levels of a hash table, from the finest on, for as long as a rehearsal of the next
+    stage draws as well without them; the scene goes on from the one with those that stay."""
+    assert isinstance(scene.field, HashField)
+    count = len(scene.field.levels.voxel_sizes)
+    mean = spare.mean_features(look.meet(scene))
+    found: dict[int, float] = {}
+
+    def attempt(levels: int) -> Scene:
+        tried = copy.deepcopy(scene)
+        coarsest(tried, levels, mean)
+        found[levels] = rehearse(tried)
+        return tried
+
+    chosen, kept = count, attempt(count)
+    while chosen > 1:
+        fewer = chosen // 2
+        tried = attempt(fewer)
+        if found[fewer] < max(found.values()) - GRID_TOLERANCE:
+            break
+        chosen, kept = fewer, tried
+    coarsest(scene, chosen, mean)
+    copy_over(kept, scene)
+    why = "held-out rays after rehearsals: "
+    why += ", ".join(f"{n} {found[n]:.2f} dB" for n in sorted(found, reverse=True))
+    return Choice("levels", count, chosen, max(found.values()) - found[chosen], why)
+
+
+def coarsest(scene: Scene, levels: int, mean: Tensor) -> None:
+    """Keep so many levels of a hash table; of the others heads see the mean [C] from now on."""
+    assert isinstance(scene.field, HashField)
+    if levels < len(scene.field.levels.voxel_sizes):
+        shrink.drop_channels(scene, scene.field.channels_of(torch.arange(levels)), mean)
 
 
 def copy_over(source: Scene, target: Scene) -> None:
@@ -160,11 +195,12 @@ def adapt(
             why = f"the budget leaves room for {most:,}; {choice.why}"
             choice = replace(choice, before=limit, why=why)
         found.append(choice)
+        if isinstance(scene.field, HashField):
+            found.append(fewer_levels(scene, look, rehearsed))
     if isinstance(stage, StageConfig) and not stage.refit and stage.physical_from < 1:
         tolerance = REGAINED if after else TOLERANCE
-        hashed = isinstance(scene.field, HashField)
-        fewer = spare.fewer_levels if hashed else spare.fewer_channels
-        found.append(fewer(scene, look, lesson, tolerance))
+        if not isinstance(scene.field, HashField):
+            found.append(spare.fewer_channels(scene, look, lesson, tolerance))
         if spare.share_of_heads(scene) > spare.WORTH:
             if isinstance(scene.light, LocalSG):
                 found.append(spare.fewer_lobes(scene, look, lesson))
@@ -283,9 +319,9 @@ def voxels(stage: StageConfig, chosen: list[dict]) -> int:
     return min([round(1e6 * stage.voxels), *fewer])
 
 
-def rehearsed(choices: list[Choice]) -> bool:
-    """Whether the coming stage has made its first steps in a rehearsal."""
-    return any(c.what == "voxels" for c in choices[:1])
+def rehearsed(choices: list[Choice]) -> float:
+    """Share of the coming stage's steps that it has made in rehearsals."""
+    return REHEARSAL * sum(c.what in ("voxels", "levels") for c in choices)
 
 
 def reach(chosen: list[dict]) -> float | None:

@@ -115,32 +115,6 @@ def fewer_channels(scene: Scene, look: Look, lesson: Look, limit: float) -> Choi
     return _spare("channels", scene, look, lesson, scene.cfg.channels, reduce, limit)
 
 
-def fewer_levels(scene: Scene, look: Look, lesson: Look, limit: float) -> Choice:
-    """Drop levels of a hash table, those whose going alone costs least first."""
-    field = scene.field
-    assert isinstance(field, HashField)
-    count = len(field.levels.voxel_sizes)
-    surface = look.meet(scene)
-    mean = mean_features(surface)
-
-    def reduce(levels: Tensor) -> Tensor:
-        keep = field.channels_of(levels.sort().values)
-        shrink.drop_channels(scene, keep, mean)
-        return keep
-
-    with torch.no_grad():
-        before = look.decode(scene, surface, surface.features)
-        costs = []
-        for gone in range(count if count > 1 else 0):
-            with trial(scene):
-                keep = reduce(torch.tensor([k for k in range(count) if k != gone]))
-                costs.append(
-                    look.cost(before, look.decode(scene, surface, surface.features[:, keep]))
-                )
-    order = torch.tensor(costs).argsort(descending=True)
-    return _spare("levels", scene, look, lesson, count, lambda kept: reduce(order[:kept]), limit)
-
-
 def fewer_units(scene: Scene, look: Look, lesson: Look, limit: float = TOLERANCE) -> Choice:
     """Narrow the hidden layers of all heads."""
     surface = lesson.meet(scene)

@@ -152,8 +152,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
                 looks = look_at(shot, held_out), look_at(shot, lesson)
                 chosen = capacity.adapt(scene, cfg, index, box, *looks, rehearse, progress.pace)
                 progress.chosen += [choice.noted() for choice in chosen]
-                if capacity.rehearsed(chosen):
-                    progress.credit(capacity.REHEARSAL)
+                if share := capacity.rehearsed(chosen):
+                    progress.credit(share)
             reach = capacity.reach(progress.chosen)
             save_scene(scene, cfg.out, progress.state(), slim=done, reach=reach)
             preview(scene, scene.registered(photos), cfg.out / "preview.png")
