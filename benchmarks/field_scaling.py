@@ -1,4 +1,4 @@
-"""What a dense and a sparse field cost as their resolution grows: memory, and time of a step.
+"""What dense, sparse and hash fields cost as their resolution grows: memory, and time of a step.
 
     python benchmarks/field_scaling.py [--sizes 64 96 128 192 256 384 512] [--out FILE.json]
 
@@ -27,10 +27,11 @@ import torch
 
 from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
+from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
 from univoxel.fields.hull import GridShape
 from univoxel.fields.sparse import SparseField
 from univoxel.ops import composite
-from univoxel.optim import RowAdam
+from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays
 from univoxel.render.density import section_alpha
 from univoxel.tasks import train
@@ -38,6 +39,7 @@ from univoxel.tasks import train
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "field_scaling.json"
 RAYS, COARSE = 2048, 48
+KINDS = ("dense", "sparse", "hash")
 SHARPNESS = 0.5  # s of the density, voxels
 
 
@@ -50,6 +52,17 @@ def ball(channels: int) -> DenseField:
     x = grid.nodes()
     bumps = 0.03 * (9 * x).sin().prod(-1)
     return DenseField(grid, channels, x.norm(dim=-1) - 0.87 + bumps)
+
+
+def refined(coarse: DenseField, grid: GridShape, kind: str) -> AbstractField:
+    """The ball on a fine grid, on a field of a kind."""
+    if kind == "sparse":
+        return SparseField.around(coarse, grid)
+    if kind == "dense":
+        return coarse.resized(grid)
+    levels = Levels.of(grid.bounds(), grid.voxel_size, coarse.channels // PER_LEVEL)
+    distances = DenseField(coarse.grid, 0, coarse.sdf.detach())
+    return HashField(distances, levels).resized(grid)
 
 
 def random_rays() -> Rays:
@@ -89,7 +102,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
     coarse, grid = ball(channels), cube(size)
     step(coarse, RowAdam([coarse.sdf, coarse.features]))
     before, begin = resident(), time.perf_counter()
-    field = SparseField.around(coarse, grid) if kind == "sparse" else coarse.resized(grid)
+    field = refined(coarse, grid, kind)
     field.refresh()  # the first look brings what the surface's own bricks lack beside them
     made = time.perf_counter() - begin
     optimizer = RowAdam([field.sdf, field.features], lr=0.01 * field.voxel_size, eps=1e-4)
@@ -104,9 +117,10 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
         begin = time.perf_counter()
         step(field, optimizer)
         if i % train.SMOOTH_EVERY == 0:
-            for values, order in ((field.sdf, 2), (field.features, 1)):
-                rows = train.rows_of(values.grad)  # type: ignore[arg-type]
-                field.smooth_rows_(values.data, rows, 0.01, order)
+            assert field.sdf.grad is not None
+            assert field.features.grad is not None
+            field.smooth_rows_(field.sdf.data, rows_of(field.sdf.grad), 0.01, order=2)
+            field.smooth_features_(rows_of(field.features.grad), 0.01)
         seconds.append(time.perf_counter() - begin)
     peak = resident()
     begin = time.perf_counter()
@@ -180,7 +194,7 @@ def main() -> None:
         return
     rows: list[dict] = []
     for size in options.sizes:
-        for kind in ("dense", "sparse"):
+        for kind in KINDS:
             row = 3 * 4 * (1 + options.channels)  # bytes of a node: value and two moments
             if kind == "dense" and size**3 * row > options.most * 1e9:
                 continue
@@ -201,7 +215,7 @@ def main() -> None:
         "cases": rows,
         "exponents": {
             kind: {c: exponent([r for r in rows if r["kind"] == kind], c) for c in costs}
-            for kind in ("dense", "sparse")
+            for kind in KINDS
         },
     }
     options.out.write_text(json.dumps(found, indent=2) + "\n")

@@ -31,7 +31,7 @@ LAYERS = [
 ]
 HELPERS = {
     "ops": {"checks", "dense_grid", "native", "reflectance", "visibility"},
-    "fields": {"base", "dense", "hull"},
+    "fields": {"base", "dense", "hull", "sparse"},
     "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},

@@ -8,6 +8,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from univoxel.fields import hashed
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import HashField, Levels
 from univoxel.fields.hull import fit_grid
@@ -107,7 +108,7 @@ def test_a_checkpoint_of_a_hash_field(tmp_path):
     scene = small_scene()
     grid, channels = scene.field.grid, scene.cfg.channels
     levels = Levels.of(grid.bounds(), grid.voxel_size, channels // 2)
-    scene.field = field = HashField(grid, channels, levels, scene.field.sdf.detach())
+    scene.field = field = HashField(DenseField(grid, 0, scene.field.sdf.detach()), levels)
     with torch.no_grad():
         field.features[::3] = torch.randn(len(field.features[::3]), 2)
     for slim in (False, True):
@@ -118,6 +119,36 @@ def test_a_checkpoint_of_a_hash_field(tmp_path):
         tolerance = 2**-11 if slim else 0.0
         torch.testing.assert_close(again.features, field.features, rtol=tolerance, atol=1e-7 * slim)
         torch.testing.assert_close(again.sdf, field.sdf, rtol=tolerance, atol=0)
+
+
+def test_a_checkpoint_of_a_hash_field_over_bricks(tmp_path, monkeypatch):
+    monkeypatch.setattr(hashed, "DENSE_MOST", 1000)
+    scene = small_scene()
+    grid = scene.field.grid
+    levels = Levels.of(grid.bounds(), grid.voxel_size, scene.cfg.channels // 2)
+    scene.field = HashField(DenseField(grid, 0, scene.field.sdf.detach()), levels)
+    scene.field = field = scene.field.resized(fit_grid(*grid.bounds(), 40**3))
+    with torch.no_grad():
+        field.features[::3] = 1.0
+    for slim in (False, True):
+        save_scene(scene, tmp_path, {}, slim=slim)
+        again = load_scene(tmp_path).field
+        assert isinstance(again.distances, SparseField)
+        rows = len(again.sdf)
+        tolerance = 2**-11 if slim else 0.0
+        torch.testing.assert_close(again.sdf, field.sdf[:rows], rtol=tolerance, atol=0)
+        assert torch.equal(again.features, field.features)
+        again.refresh()  # it can go on
+
+
+def test_a_file_whose_field_has_other_channels_is_refused(tmp_path):
+    scene = small_scene()
+    grid = scene.field.grid
+    levels = Levels.of(grid.bounds(), grid.voxel_size, 1 + scene.cfg.channels // 2)
+    scene.field = HashField(DenseField(grid, 0, scene.field.sdf.detach()), levels)
+    save_scene(scene, tmp_path, {})
+    with pytest.raises(ValueError, match=r"6 channels in its field, 4 in its networks"):
+        load_scene(tmp_path)
 
 
 def test_a_slim_file_of_a_sparse_field_is_smaller(tmp_path):

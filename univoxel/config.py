@@ -179,8 +179,7 @@ class TrainConfig:
         _check(self, "above 0 or None", lambda x: x is None or 0 < x < math.inf, "budget_mb")
         if self.budget_mb is not None and self.capacity == "fixed":
             raise ValueError(
-                f"TrainConfig: budget_mb {self.budget_mb:g} needs adaptive capacity, got "
-                "fixed"
+                f"TrainConfig: budget_mb {self.budget_mb:g} needs adaptive capacity, got fixed"
             )
 
 

@@ -187,17 +187,17 @@ def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict
     """The tensors of a scene's file, see `save_scene`."""
     tensors = {k: v.contiguous() for k, v in scene.state_dict().items() if k != "field.features"}
     sdf = scene.field.sdf.detach()
-    if isinstance(scene.field, SparseField):
-        tensors |= {f"field.{k}": v for k, v in pack_bricks(scene.field).items()}
-        sdf = tensors["field.sdf"] = sdf[: Bricks.NODES * scene.field.count]
+    if isinstance(bricks := scene.field.distances, SparseField):
+        tensors |= {f"field.{k}": v for k, v in pack_bricks(bricks).items()}
+        sdf = tensors["field.sdf"] = sdf[: Bricks.NODES * bricks.count]
     # Features that no sample has touched are 0: only the others are stored.
     features = scene.field.features.detach().flatten(0, -2)
-    if not isinstance(scene.field, HashField):
+    if scene.field.by_node:
         features = features[: sdf.numel()]
     touched = features.any(1)
     if slim:
         shell = (reach or SHELL) * scene.field.voxel_size
-        if not isinstance(scene.field, HashField):  # whose rows serve nodes near and far alike
+        if scene.field.by_node:  # rows of a table serve nodes near and far alike
             touched &= sdf.flatten().abs() < shell
         if reach is not None:
             packed = pack(tensors.pop("field.sdf"), shell)
@@ -278,15 +278,20 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
             tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
         )
         kind = meta.get("field", "dense")
+        channels = 0 if kind == "hash" else cfg.channels
+        if "field.place" in tensors:
+            where = tensors.pop("field.place"), tensors.pop("field.inside")
+            field = SparseField(grid, channels, unpack_bricks(*where, grid.size))
+        else:
+            field = DenseField(grid, channels)
         if kind == "hash":
             lower, upper, sizes, *rows = meta["levels"]
             levels = Levels(tuple(lower), tuple(upper), tuple(sizes), *rows)
-            field = HashField(grid, cfg.channels, levels)
-        elif kind == "sparse":
-            where = tensors.pop("field.place"), tensors.pop("field.inside")
-            field = SparseField(grid, cfg.channels, unpack_bricks(*where, grid.size))
-        else:
-            field = DenseField(grid, cfg.channels)
+            field = HashField(field, levels)
+        if field.channels != cfg.channels:
+            raise ValueError(
+                f"{field.channels} channels in its field, {cfg.channels} in its networks"
+            )
         scene = Scene(cfg, field, meta["inv_s"])
         rows, values = tensors.pop("field.feature_rows"), tensors.pop("field.feature_values")
         features = field.features.data.flatten(0, -2)

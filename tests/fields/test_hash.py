@@ -1,13 +1,18 @@
 """The hash field: the dense one's distances, features of a table of many resolutions."""
 
+import copy
+
 import pytest
 import torch
 from torch import nn
 
+from univoxel.fields import hashed
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import COARSEST, PER_LEVEL, ROWS, HashField, Levels
 from univoxel.fields.hull import GridShape
+from univoxel.fields.sparse import SparseField
 from univoxel.ops import encode_hash
+from univoxel.records import Rays
 
 GRID = GridShape((-0.7,) * 3, 1.4 / 39, (40, 40, 40))
 COUNT = 4  # levels
@@ -15,7 +20,7 @@ COUNT = 4  # levels
 
 def ball() -> HashField:
     levels = Levels.of(GRID.bounds(), GRID.voxel_size, COUNT)
-    field = HashField(GRID, 2 * COUNT, levels, GRID.nodes().norm(dim=-1) - 0.5)
+    field = HashField(DenseField(GRID, 0, GRID.nodes().norm(dim=-1) - 0.5), levels)
     torch.manual_seed(0)
     nn.init.normal_(field.features)
     return field
@@ -85,7 +90,7 @@ def test_levels_are_kept_whole():
 
 def test_tables_may_be_smaller():
     levels = Levels.of(GRID.bounds(), GRID.voxel_size, COUNT, rows=2**10)
-    field = HashField(GRID, 2 * COUNT, levels, GRID.nodes().norm(dim=-1) - 0.5)
+    field = HashField(DenseField(GRID, 0, GRID.nodes().norm(dim=-1) - 0.5), levels)
     assert field.features.shape == (COUNT * 2**10, PER_LEVEL)
     field.features_at(torch.rand(500, 3) - 0.5).sum().backward()
     touched = field.features.grad.coalesce().indices()[0]
@@ -115,7 +120,54 @@ def test_smoothing_leaves_the_table():
     assert torch.equal(field.features, before)
 
 
-def test_channels_fit_the_levels():
-    levels = Levels.of(GRID.bounds(), GRID.voxel_size, COUNT)
-    with pytest.raises(ValueError, match=r"HashField: 4 levels have 8 channels, got 16"):
-        HashField(GRID, 16, levels)
+FINE = GridShape((-0.7,) * 3, 1.4 / 199, (200, 200, 200))
+
+
+@pytest.fixture
+def bricks(monkeypatch):
+    """The ball on a grid so fine that only bricks around its surface are stored."""
+    monkeypatch.setattr(hashed, "DENSE_MOST", 1_000_000)
+    return ball().resized(FINE)
+
+
+def test_distances_of_a_fine_grid_lie_in_bricks(bricks):
+    dense = ball()
+    assert isinstance(bricks.distances, SparseField)
+    assert bricks.sdf is bricks.distances.sdf
+    assert bricks.sdf.numel() < 0.2 * FINE.nodes_count
+    direction = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
+    points = (0.49 + 0.02 * torch.rand(200, 1)) * direction
+    found, wanted = bricks.sample(points), dense.sample(points)
+    assert torch.equal(found.features, wanted.features)
+    torch.testing.assert_close(found.sdf, wanted.sdf, atol=1e-3, rtol=0)  # a voxel is 0.036 there
+    assert 0.01 < bricks.occupied().float().mean() < 0.1
+    vertices, _ = bricks.isosurface()
+    assert (vertices.norm(dim=1) - 0.5).abs().max() < 0.01
+
+
+def test_bricks_learn_and_grow(bricks):
+    """Gradients reach distances and table; where the surface moves, bricks follow."""
+    rays = Rays(torch.tensor([[0.0, 0.1, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]]))
+    samples = bricks.march(rays, torch.zeros(1), 2 / FINE.voxel_size)
+    assert len(samples.t) > 2
+    found = bricks.sample(rays.origin + samples.t[:, None] * rays.direction)
+    (found.sdf.sum() + found.features.sum()).backward()
+    assert bricks.sdf.grad.coalesce().values().any()
+    assert bricks.features.grad.coalesce().values().any()
+    before = len(bricks.sdf)
+    with torch.no_grad():
+        bricks.sdf[128:] -= 3 * FINE.voxel_size  # the ball grows by three voxels
+    assert bricks.refresh()
+    assert len(bricks.sdf) > before
+    assert bricks.sdf is bricks.distances.sdf
+
+
+def test_a_copy_stands_on_its_own(bricks):
+    copied = copy.deepcopy(bricks)
+    assert copied.sdf is copied.distances.sdf
+    assert copied.sdf is not bricks.sdf
+    assert torch.equal(copied.sdf, bricks.sdf)
+
+
+def test_once_in_bricks_always_in_bricks(bricks):
+    assert isinstance(bricks.resized(GRID).distances, SparseField)

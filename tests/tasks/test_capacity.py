@@ -8,6 +8,7 @@ import torch
 from analytic import photos_of, sphere_scene, write_scene
 
 from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import FEWEST_ROWS, ROWS, HashField, Levels
 from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.scene import FILE, Scene, SceneConfig, load_checkpoint, load_scene, save_scene
@@ -284,7 +285,7 @@ def hash_scene():
     levels = Levels.of(grid.bounds(), grid.voxel_size, 4)
     g = torch.Generator().manual_seed(1)
     torch.manual_seed(0)
-    field = HashField(grid, 8, levels, grid.nodes().norm(dim=-1) - 0.5)
+    field = HashField(DenseField(grid, 0, grid.nodes().norm(dim=-1) - 0.5), levels)
     scene = Scene(SceneConfig(8, 4, 16, sky_nodes=0, light=LIGHT), field).eval()
     scene.inv_s = 60.0
     with torch.no_grad():

@@ -24,9 +24,15 @@ class AbstractField(nn.Module, ABC):
     grid: GridShape
     channels: int  # C
     voxel_size: float  # finest resolution, world units
+    by_node: ClassVar[bool] = True  # whether each row of the features is a node's
     sized: ClassVar[tuple[str, ...]] = ("features", "channels")  # what `keep_channels` replaces
     sdf: nn.Parameter
     features: nn.Parameter  # as the sdf, and C; or a table of its own
+
+    @property
+    def distances(self) -> AbstractField:
+        """What keeps the distances: this field, or one within."""
+        return self
 
     @abstractmethod
     def sample(self, points: Tensor) -> FieldSample:
@@ -73,6 +79,10 @@ class AbstractField(nn.Module, ABC):
     @abstractmethod
     def occupied(self) -> Tensor:
         """Which nodes of the grid have features: [X, Y, Z] bool."""
+
+    @abstractmethod
+    def within(self, far: float) -> Tensor:
+        """Which nodes of the grid have an sdf nearer to 0 than far: [X, Y, Z] bool."""
 
     @abstractmethod
     def blocks(self, far: float) -> Tensor:

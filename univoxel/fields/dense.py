@@ -63,6 +63,9 @@ class DenseField(AbstractField):
     def occupied(self) -> Tensor:
         return self.features.detach().any(-1)
 
+    def within(self, far: float) -> Tensor:
+        return self.sdf.detach().abs() < far
+
     def blocks(self, far: float) -> Tensor:
         sdf = self.sdf.detach()
         return (brick_minimum(sdf) < far) & (brick_minimum(-sdf) < far)

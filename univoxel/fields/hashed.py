@@ -1,4 +1,4 @@
-"""A dense grid of distances, and features from a multiresolution hash table."""
+"""Distances of a dense or sparse grid, and features from a multiresolution hash table."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from univoxel.fields.base import BAND
+from univoxel.fields.base import BAND, AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import GridShape, resample
-from univoxel.ops import encode_hash, sample_dense
-from univoxel.records import FieldSample
+from univoxel.fields.sparse import SparseField
+from univoxel.ops import encode_hash
+from univoxel.records import FieldSample, Rays, Samples
 
 PER_LEVEL = 2  # channels; so levels are half as many as channels
 COARSEST = 16  # voxels along the longest side of the box at the coarsest level
 ROWS = 2**17  # of a level's table: what the nodes around a surface of 150^3 to 250^3 want
 FEWEST_ROWS = 2**10
+DENSE_MOST = 8_000_000  # nodes; of finer grids bricks around the surface cost less
 
 
 @dataclass(frozen=True)
@@ -37,29 +39,40 @@ class Levels:
         return cls(lower, upper, tuple(coarsest * ratio**k for k in range(count)), rows)
 
 
-class HashField(DenseField):
-    """SDF [X, Y, Z] and a table [L * rows, PER_LEVEL] of features as parameters.
+class HashField(AbstractField):
+    """Features from a table [L * rows, PER_LEVEL], over the distances of another field.
 
-    Features cost what the table costs, however fine the grid. The first L channels are the first of
-    each level, and so on: a head that reads the first half reads all resolutions.
+    Features cost what the table costs, however fine the grid; distances lie on a dense grid, or, on
+    one of more than DENSE_MOST nodes, in bricks around the surface. The first L channels are the
+    first of each level, and so on: a head that reads the first half reads all resolutions.
 
     Source: Mueller et al. 2022, "Instant Neural Graphics Primitives"; distances stay on a grid, for
     they are marched through, smoothed and cut at zero.
     """
 
     kind = "hash"
+    by_node = False
     sized = ("features", "channels", "levels")
 
-    def __init__(self, grid: GridShape, channels: int, levels: Levels, sdf: Tensor | None = None):
-        if channels != PER_LEVEL * len(levels.voxel_sizes):
-            raise ValueError(
-                f"HashField: {len(levels.voxel_sizes)} levels have "
-                f"{PER_LEVEL * len(levels.voxel_sizes)} channels, got {channels}"
-            )
-        super().__init__(grid, 0, sdf)
-        self.channels, self.levels = channels, levels
-        self._no_features = self.features.detach()
+    def __init__(self, distances: DenseField | SparseField, levels: Levels):
+        """
+        Args:
+            distances: a field without features, which becomes part of this one.
+        """
+        super().__init__()
+        distances.features.requires_grad_(False)
+        self._held = (distances,)  # in a tuple: its sdf is a parameter of this module
+        self.sdf = distances.sdf
+        self.grid, self.voxel_size = distances.grid, distances.voxel_size
+        self.channels, self.levels = PER_LEVEL * len(levels.voxel_sizes), levels
         self.features = nn.Parameter(torch.zeros(len(levels.voxel_sizes) * levels.rows, PER_LEVEL))
+
+    @property
+    def distances(self) -> DenseField | SparseField:
+        return self._held[0]
+
+    def sample(self, points: Tensor) -> FieldSample:
+        return replace(self.distances.sample(points), features=self.features_at(points))
 
     def features_at(self, points: Tensor) -> Tensor:
         levels = self.levels
@@ -68,12 +81,19 @@ class HashField(DenseField):
         found = found.view(len(points), len(levels.voxel_sizes), PER_LEVEL)
         return found.transpose(1, 2).reshape(len(points), self.channels)
 
-    def sample(self, points: Tensor) -> FieldSample:
-        place = self.grid.origin, self.voxel_size
-        sdf, gradient, _ = sample_dense(
-            self.sdf, self._no_features, points, *place, sparse_grad=True
-        )
-        return FieldSample(sdf, gradient, self.features_at(points))
+    def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
+        return self.distances.march(rays, jitter, inv_s)
+
+    def refresh(self) -> bool:
+        grown = self.distances.refresh()
+        self.sdf = self.distances.sdf
+        return grown
+
+    def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
+        self.distances.smooth_rows_(values, rows, amount, order)
+
+    def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
+        self.distances.diffuse_rows_(values, rows, amount, passes)
 
     @property
     def tables(self) -> Tensor:
@@ -111,11 +131,27 @@ class HashField(DenseField):
         """Nothing: rows have no neighbours, and what is smooth the coarse levels say."""
 
     def occupied(self) -> Tensor:
-        return self.sdf.detach().abs() < BAND * self.voxel_size
+        return self.within(BAND * self.voxel_size)
 
+    def within(self, far: float) -> Tensor:
+        return self.distances.within(far)
+
+    def blocks(self, far: float) -> Tensor:
+        return self.distances.blocks(far)
+
+    def isosurface(self) -> tuple[Tensor, Tensor]:
+        return self.distances.isosurface()
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        return self.grid.bounds()
+
+    @torch.no_grad()
     def resized(self, grid: GridShape) -> HashField:
-        with torch.no_grad():
-            sdf = resample(self.sdf, self.grid, grid)
-            field = HashField(grid, self.channels, self.levels, sdf)
-            field.features.copy_(self.features)
+        source = self.distances
+        if isinstance(source, SparseField) or grid.nodes_count > DENSE_MOST:
+            distances = SparseField.around(source, grid)
+        else:
+            distances = DenseField(grid, 0, resample(source.sdf, source.grid, grid))
+        field = HashField(distances, self.levels)
+        field.features.copy_(self.features)
         return field

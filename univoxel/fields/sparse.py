@@ -128,6 +128,9 @@ class SparseField(AbstractField):
             stored = stored.narrow(axis, 0, n) | stored.narrow(axis, 1, n)
         return stored
 
+    def within(self, far: float) -> Tensor:
+        return self._whole(self.sdf.detach().abs() < far)
+
     def occupied(self) -> Tensor:
         return self._whole(self.features.detach().any(-1))
 

@@ -1,8 +1,9 @@
 """How much model a scene needs: what is chosen, when, and how large its file may be.
 
-No grid is finer than the photographs. Capacity that adapts chooses more: after the coarse stage
-the grid and the levels of a hash table, by rehearsals of the next; after the first stage with light
-the channels of a dense grid, lobes and hidden units; at the end how far from the surface nodes are stored.
+No grid is finer than the photographs. Capacity that adapts chooses more: after the coarse stage,
+by rehearsals of the next, the levels of a hash table or the voxels of a dense grid; after the first
+stage with light the channels of a dense grid, lobes and hidden units; at the end how far from the
+surface nodes are stored.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from univoxel.camera import Cameras
 from univoxel.config import StageConfig, TrainConfig
+from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS, HashField
 from univoxel.fields.hull import fit_grid
 from univoxel.lights import LocalSG
@@ -144,19 +146,20 @@ def shorter_reach(scene: Scene, look: Look, limit: float = REACH_TOLERANCE) -> C
 
 
 @torch.no_grad()
-def paid(scene: Scene, look: Look, before: dict[str, Tensor], reach: float) -> float:
-    """dB that a scene loses against `before` when it is stored only so many voxels far."""
+def paid(scene: Scene, look: Look, before: dict[str, Tensor], reach: float | None) -> float:
+    """dB that a scene loses against `before` when it is stored only so many voxels far; None: when
+    it is stored as it is."""
     field = scene.field
-    sdf, features = field.sdf, field.features
-    near = sdf.abs() < reach * field.voxel_size
+    sdf, features = field.sdf.data, field.features.data
+    near = sdf.abs() < (math.inf if reach is None else reach * field.voxel_size)
     try:
-        field.sdf = nn.Parameter(torch.where(near, sdf, SHELL * field.voxel_size * sdf.sign()))
-        if not isinstance(field, HashField):  # whose features are not stored by nodes
-            field.features = nn.Parameter(features * near[..., None])
+        field.sdf.data = torch.where(near, sdf, SHELL * field.voxel_size * sdf.sign())
+        if field.by_node:
+            field.features.data = features * near[..., None]
         surface = look.meet(scene)
         return look.cost(before, look.decode(scene, surface, surface.features))
     finally:
-        field.sdf, field.features = sdf, features
+        field.sdf.data, field.features.data = sdf, features
 
 
 def adapt(
@@ -190,25 +193,31 @@ def adapt(
         def rehearsed(tried: Scene) -> float:
             return rehearse(tried, on_grid(follows, box, tried.field.voxel_size), steps)
 
-        choice = coarser_grid(scene, most, box, rehearsed)
-        if most < limit:
-            why = f"the budget leaves room for {most:,}; {choice.why}"
-            choice = replace(choice, before=limit, why=why)
-        found.append(choice)
-        if isinstance(scene.field, HashField):
+        room = f"the budget leaves room for {most:,}"
+        if scene.field.by_node:
+            choice = coarser_grid(scene, most, box, rehearsed)
+            if most < limit:
+                choice = replace(choice, before=limit, why=f"{room}; {choice.why}")
+            found.append(choice)
+        else:  # a node is one number there: a coarser grid saves little, and costs in the end
+            scene.field = scene.field.resized(fit_grid(*box, most))
+            scene.surface_moved()
+            if most < limit:
+                found.append(Choice("voxels", limit, most, 0.0, room))
             found.append(fewer_levels(scene, look, rehearsed))
     if isinstance(stage, StageConfig) and not stage.refit and stage.physical_from < 1:
         tolerance = REGAINED if after else TOLERANCE
-        if not isinstance(scene.field, HashField):
+        if scene.field.by_node:
             found.append(spare.fewer_channels(scene, look, lesson, tolerance))
         if spare.share_of_heads(scene) > spare.WORTH:
             if isinstance(scene.light, LocalSG):
                 found.append(spare.fewer_lobes(scene, look, lesson))
             found.append(spare.fewer_units(scene, look, lesson))
     if not after:
-        found.append(shorter_reach(scene, look))
+        if isinstance(scene.field.distances, DenseField):
+            found.append(shorter_reach(scene, look))
         if cfg.budget_mb:
-            found += within(scene, look, found[-1].after, 1e6 * cfg.budget_mb)
+            found += within(scene, look, reach([c.noted() for c in found]), 1e6 * cfg.budget_mb)
     return found
 
 
@@ -227,11 +236,15 @@ def check_budget(scene: Scene, megabytes: float) -> None:
         )
 
 
-def within(scene: Scene, look: Look, reach: float, budget: float) -> list[Choice]:
+def within(scene: Scene, look: Look, reach: float | None, budget: float) -> list[Choice]:
     """Bring a finished scene into a file of `budget` bytes, whatever that costs: first less far
-    from the surface, then on a coarser grid."""
+    from the surface, then on a coarser grid.
 
-    def size(reach: float) -> int:
+    Args:
+        reach: voxels from the surface that nodes are stored; None: bricks are, as they are.
+    """
+
+    def size(reach: float | None) -> int:
         tensors = stored(scene, slim=True, reach=reach).values()
         names = NAME * len(scene.cfg.views)
         return HEADER + names + sum(x.numel() * x.element_size() for x in tensors)
@@ -240,16 +253,20 @@ def within(scene: Scene, look: Look, reach: float, budget: float) -> list[Choice
         return []
     with torch.no_grad():
         before = look.decode(scene, surface := look.meet(scene), surface.features)
-    shorter = [r for r in REACHES if r < reach]
-    least = next((r for r in shorter if size(r) <= budget), REACHES[-1])
+    least = reach
+    if reach is not None:
+        shorter = [r for r in REACHES if r < reach]
+        least = next((r for r in shorter if size(r) <= budget), REACHES[-1])
     nodes = count = scene.field.grid.nodes_count
     while size(least) > budget and count > FEWEST_VOXELS:
         count = round(0.8 * count)
         scene.field = scene.field.resized(fit_grid(*scene.field.bounds(), count))
     scene.surface_moved()
-    found = [Choice("reach", reach, least, paid(scene, look, before, least), "for the budget")]
+    cost, found = paid(scene, look, before, least), []
+    if reach is not None and least is not None:
+        found.append(Choice("reach", reach, least, cost, "for the budget"))
     if count < nodes:
-        found.append(Choice("voxels", nodes, count, found[0].cost, "for the budget"))
+        found.append(Choice("voxels", nodes, count, cost, "for the budget"))
     return found
 
 
@@ -274,14 +291,14 @@ def table_rows(scene: SceneConfig, budget_mb: float | None) -> int:
 def _node_bytes(scene: Scene) -> int:
     """Of a node near the surface: number of its row and distance, in halves; and, where features
     are of nodes, its number again and features."""
-    features = 0 if isinstance(scene.field, HashField) else 4 + 2 * scene.cfg.channels
+    features = 4 + 2 * scene.cfg.channels if scene.field.by_node else 0
     return 4 + 2 + features
 
 
 def _apart_from_grid(scene: Scene) -> int:
     rest = (x for name, x in scene.state_dict().items() if not name.startswith("field."))
     names = NAME * len(scene.cfg.views)
-    rows = len(scene.field.features) if isinstance(scene.field, HashField) else 0
+    rows = 0 if scene.field.by_node else len(scene.field.features)
     return HEADER + names + ROW_BYTES * rows + sum(x.numel() * x.element_size() for x in rest)
 
 
@@ -319,9 +336,9 @@ def voxels(stage: StageConfig, chosen: list[dict]) -> int:
     return min([round(1e6 * stage.voxels), *fewer])
 
 
-def rehearsed(choices: list[Choice]) -> float:
-    """Share of the coming stage's steps that it has made in rehearsals."""
-    return REHEARSAL * sum(c.what in ("voxels", "levels") for c in choices)
+def rehearsed(choices: list[Choice]) -> bool:
+    """Whether the coming stage has made its first steps in a rehearsal."""
+    return any(c.what in ("voxels", "levels") for c in choices)
 
 
 def reach(chosen: list[dict]) -> float | None:

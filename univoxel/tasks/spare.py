@@ -8,7 +8,6 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor, nn
 
-from univoxel.fields.hashed import PER_LEVEL, HashField
 from univoxel.lights import LocalSG
 from univoxel.records import Surface
 from univoxel.scene import SHELL, Scene
@@ -179,10 +178,9 @@ def share_of_heads(scene: Scene) -> float:
     """Share of the parameters near the surface and of the heads that the heads have."""
     rest = sum(x.numel() for name, x in scene.named_parameters() if not name.startswith("field."))
     near = nodes_near(scene)
-    if isinstance(scene.field, HashField):
-        features = scene.field.features.detach().any(1).sum().item() * PER_LEVEL
-    else:
-        features = near * scene.cfg.channels
+    features = near * scene.cfg.channels
+    if not scene.field.by_node:
+        features = scene.field.features.shape[1] * int(scene.field.features.detach().any(1).sum())
     return rest / (rest + near + features)
 
 

@@ -152,8 +152,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
                 looks = look_at(shot, held_out), look_at(shot, lesson)
                 chosen = capacity.adapt(scene, cfg, index, box, *looks, rehearse, progress.pace)
                 progress.chosen += [choice.noted() for choice in chosen]
-                if share := capacity.rehearsed(chosen):
-                    progress.credit(share)
+                if not done and capacity.rehearsed(chosen):
+                    progress.credit(capacity.REHEARSAL)
             reach = capacity.reach(progress.chosen)
             save_scene(scene, cfg.out, progress.state(), slim=done, reach=reach)
             preview(scene, scene.registered(photos), cfg.out / "preview.png")
@@ -173,7 +173,7 @@ def first_field(
     finest = min(fit_grid(*box, capacity.voxels(s, [])).voxel_size for s in stages)
     rows = capacity.table_rows(cfg.scene, cfg.budget_mb)
     levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL, rows)
-    return HashField(grid, cfg.scene.channels, levels, hull)
+    return HashField(DenseField(grid, 0, hull), levels)
 
 
 def say_trust(scene: Scene, photos: Photos, out: Path, troubles: list[str]) -> None:
