@@ -7,7 +7,9 @@ import torch
 from analytic import cameras_around
 from lopsided import lopsided
 from lopsided import sdf as lopsided_sdf
+from scipy.spatial import KDTree
 
+from univoxel.fields import sparse
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import GridShape, fit_grid
 from univoxel.fields.sparse import BAND, SparseField, pack_bricks, unpack_bricks
@@ -112,6 +114,21 @@ def test_the_isosurface_is_the_dense_one():
         torch.testing.assert_close(a, b)
     for a, b in zip(field.bounds(), dense.bounds(), strict=True):
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("planes", [8, 12, 40])  # the last: one plane of cells is left over
+def test_a_surface_found_in_slabs_is_sewn_together(monkeypatch, planes):
+    monkeypatch.setattr(sparse, "SLAB", planes)
+    dense = sphere(42)
+    vertices, faces = SparseField.around(dense, dense.grid).isosurface()
+    wanted, whole = dense.isosurface()
+    assert (len(vertices), len(faces)) == (len(wanted), len(whole))
+    found = KDTree(vertices.numpy()).query(wanted.numpy())
+    assert found[0].max() < 1e-5
+    assert len(set(found[1])) == len(wanted)
+    edges = faces.long()[:, [0, 1, 1, 2, 2, 0]].view(-1, 2)
+    forth, back = (e[:, 0] * len(vertices) + e[:, 1] for e in (edges, edges.flip(1)))
+    assert torch.equal(forth.sort().values, back.sort().values)  # closed, and turned alike
 
 
 def test_occupied_nodes_are_the_dense_ones():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
@@ -11,6 +13,7 @@ from univoxel.fields.hull import GridShape
 from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_sparse, smooth_rows_
 from univoxel.records import Bricks, FieldSample, Rays, Samples
 
+SLAB = 64  # planes of the grid whose surface is found at once; whole bricks
 SPARE = 0.05  # share of the bricks that may come without moving the others in memory
 BRICKS_AT_ONCE = 4096
 
@@ -129,28 +132,36 @@ class SparseField(AbstractField):
         return stored
 
     def within(self, far: float) -> Tensor:
-        return self._whole(self.sdf.detach().abs() < far)
+        return self._slab(self.sdf.detach().abs() < far)
 
     def occupied(self) -> Tensor:
-        return self._whole(self.features.detach().any(-1))
+        return self._slab(self.features.detach().any(-1))
 
-    def _whole(self, values: Tensor) -> Tensor:
-        """Values [R] of the rows at all nodes of the grid: [X, Y, Z]."""
-        pool, size = values.view(-1, *[Bricks.SIDE] * 3), self.grid.size
-        whole = values.new_empty(size)
-        for a, plane in enumerate(self.bricks.table.long()):
+    def _slab(self, values: Tensor, begin: int = 0, end: int | None = None) -> Tensor:
+        """Values [R] of the rows at all nodes from plane `begin` to before `end`: [end - begin, Y,
+        Z]; begin is where a brick begins."""
+        pool, (x, y, z) = values.view(-1, *[Bricks.SIDE] * 3), self.grid.size
+        end = x if end is None else min(end, x)
+        slab = values.new_empty(end - begin, y, z)
+        for first in range(begin, end, Bricks.SIDE):
+            plane = self.bricks.table[first // Bricks.SIDE].long()
             part = pool[plane].permute(2, 0, 3, 1, 4).flatten(3, 4).flatten(1, 2)
-            part = part[:, : size[1], : size[2]]
-            whole[Bricks.SIDE * a : Bricks.SIDE * (a + 1)] = part[: size[0] - Bricks.SIDE * a]
-        return whole
+            at = first - begin
+            slab[at : at + Bricks.SIDE] = part[: end - first, :y, :z]
+        return slab
 
     def isosurface(self) -> tuple[Tensor, Tensor]:
-        values = self.sdf.detach()
+        values, (planes, *_) = self.sdf.detach(), self.grid.size
         if self.count == Bricks.MISSING or not values.min() < 0 < values.max():
             raise ValueError("the field has no surface: its sdf does not change sign")
-        sdf = self._whole(values)
-        vertices, faces, _, _ = marching_cubes(sdf.numpy(), 0.0, gradient_direction="descent")
-        world = torch.tensor(self.grid.origin) + self.voxel_size * torch.from_numpy(vertices.copy())
+        parts = []
+        for begin in range(0, planes - 1, SLAB):  # the whole grid would take much memory
+            slab = self._slab(values, begin, begin + SLAB + 1).numpy()
+            if slab.min() < 0 < slab.max():
+                vertices, faces, _, _ = marching_cubes(slab, 0.0, gradient_direction="descent")
+                parts.append((vertices + np.float32([begin, 0, 0]), faces))
+        vertices, faces = _sewn(parts)
+        world = torch.tensor(self.grid.origin) + self.voxel_size * torch.from_numpy(vertices)
         return world.float(), torch.from_numpy(faces.astype("int32"))
 
     def bounds(self) -> tuple[Tensor, Tensor]:
@@ -214,6 +225,28 @@ class SparseField(AbstractField):
                     torch.minimum(within, beside + self.voxel_size, out=within)
         found = sign[:, None] * within.reshape(len(number), -1)
         self.sdf.view(-1, Bricks.NODES)[number] = found
+
+
+def _sewn(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Meshes of slabs along x in one: vertices of two in the plane between them become one.
+
+    Args:
+        parts: vertices [P, 3] in voxels and faces [F, 3]; slabs meet where x is a multiple of SLAB.
+    """
+    vertices = np.concatenate([v for v, _ in parts])
+    counts = np.cumsum([0, *(len(v) for v, _ in parts)])
+    faces = np.concatenate([f + n for (_, f), n in zip(parts, counts, strict=False)])
+    number = np.arange(len(vertices))
+    between = np.flatnonzero(vertices[:, 0] % SLAB == 0)
+    if len(between):
+        # By rounding they lie some 1e-6 apart; others in the plane, where an edge meets none, 1e-3
+        pairs = KDTree(vertices[between]).query_pairs(1e-5, output_type="ndarray")
+        first, second = np.sort(between[pairs], axis=1).T
+        number[second] = first
+    kept, number = np.unique(number, return_inverse=True)
+    faces = number[faces]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(1)
+    return vertices[kept], faces[whole]
 
 
 def _overlapped(source: AbstractField, grid: GridShape, far: float) -> Tensor:
