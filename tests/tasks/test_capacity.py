@@ -269,7 +269,7 @@ def hashed(data, tmp_path_factory):
 
 def test_a_hash_table_is_adapted_by_levels(hashed, data):
     found = info(hashed)
-    assert [c["what"] for c in found["chosen"]][:2] == ["voxels", "levels"]
+    assert "levels" in [c["what"] for c in found["chosen"]]
     assert found["bytes"] == (hashed / FILE).stat().st_size <= 0.3e6
     scene = load_scene(hashed)
     assert scene.field.kind == "hash"
