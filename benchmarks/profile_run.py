@@ -23,6 +23,8 @@ import torch
 from train_step import OTHER, STAGES, Clock
 
 from univoxel.config import JointConfig, TrainConfig, chosen
+from univoxel.fields.dense import DenseField
+from univoxel.fields.hashed import HashField
 from univoxel.ops import VisibilityScene
 from univoxel.solve import sightings
 from univoxel.tasks import joint, train
@@ -32,10 +34,12 @@ FIXED = ("joint: pose and trace", "joint: Newton", "previews", "checkpoints", "h
 EVERY = 16  # backward passes of which one is divided
 START = "before"  # loading, hull; also what lies between the stages
 PARTS = STAGES | {
+    "sample": [(f, n) for f in (DenseField, HashField) for n in ("sample", "features_at")],
     "light": [*STAGES["light"], (sightings, "shade_map")],
     "joint: pose and trace": [(joint, "pose")],
     "joint: Newton": [(joint, "newton_round")],
-    "hull": [(train, name) for name in ("mask_distances", "estimate_bounds", "visual_hull")],
+    "hull": [(train, name) for name in ("mask_distances", "object_box", "visual_hull")],
+    "cameras": [(train, "put_right")],
     "loading": [(train, "load_photos")],
     "held-out rays": [(train, "held_out_psnr")],
     "previews": [(train, "preview")],
