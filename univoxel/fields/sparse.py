@@ -159,7 +159,7 @@ class SparseField(AbstractField):
             slab = self._slab(values, begin, begin + SLAB + 1).numpy()
             if slab.min() < 0 < slab.max():
                 vertices, faces, _, _ = marching_cubes(slab, 0.0, gradient_direction="descent")
-                parts.append((vertices + np.float32([begin, 0, 0]), faces))
+                parts.append((vertices + np.array([begin, 0, 0], np.float32), faces))
         vertices, faces = _sewn(parts)
         world = torch.tensor(self.grid.origin) + self.voxel_size * torch.from_numpy(vertices)
         return world.float(), torch.from_numpy(faces.astype("int32"))
