@@ -6,12 +6,14 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from univoxel import losses
 from univoxel.config import JointConfig
 from univoxel.data import Photos
 from univoxel.ops import shade_map
+from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh
 from univoxel.render.transport import (
     Observations,
@@ -23,6 +25,7 @@ from univoxel.render.transport import (
 )
 from univoxel.scene import Scene
 
+VERTICES = 300_000  # of a mesh that are looked at; the presets' have fewer
 METAL = 0.2  # metallic from which on the stages before have taken a point for metal
 LEAST_VIEWS = 2  # of a point that is to tell anything: in one, its colour explains everything
 
@@ -55,9 +58,7 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     assert scene.sky is not None
     tracer = scene.occluder()
     offset = scene.field.voxel_size
-    bright = mean_colors(
-        unexposed(scene, observe(mesh.vertices, mesh.normals, photos, tracer, offset))
-    )
+    bright = vertex_colors(scene, mesh, photos)
     position, normal = surface_points(mesh, cfg.points, generator)
     seen = observe(position, normal, photos, tracer, offset)
     if not len(seen.view):
@@ -66,6 +67,20 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     transport = trace(seen, tracer, mesh, bright, direction, cfg.tracing, offset, generator)
     metal = scene.material(scene.field.features_at(position))[2] > METAL
     return Problem(seen, transport, losses.encode(seen.color), metal, offset)
+
+
+def vertex_colors(scene: Scene, mesh: Mesh, photos: Photos) -> Tensor:
+    """Mean colour [P, 3] of a mesh's vertices in the photographs; of a large mesh that of the
+    nearest of some, for each has a sighting in every other photograph."""
+    assert mesh.normals is not None
+    step = -(-len(mesh.vertices) // VERTICES)
+    some, normal = mesh.vertices[::step], mesh.normals[::step]
+    seen = observe(some, normal, photos, scene.occluder(), scene.field.voxel_size)
+    color = mean_colors(unexposed(scene, seen))
+    if step == 1:
+        return color
+    near = KDTree(some.numpy()).query(mesh.vertices.numpy(), workers=-1)[1]
+    return color[torch.from_numpy(near)]
 
 
 def unexposed(scene: Scene, seen: Observations) -> Observations:
