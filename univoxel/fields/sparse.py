@@ -204,11 +204,14 @@ class SparseField(AbstractField):
         self.bricks = Bricks(table.view(bricks.table.shape), place, bricks.size)
         rows = (Bricks.NODES * number[:, None] + torch.arange(Bricks.NODES)).flatten()
         self.sdf[rows] = self.far * sign.repeat_interleave(Bricks.NODES)
-        self._extend(number, sign)
+        parts = zip(number.split(BRICKS_AT_ONCE), sign.split(BRICKS_AT_ONCE), strict=True)
+        found = torch.cat([self._carried(*part) for part in parts])
+        self.sdf.view(-1, Bricks.NODES)[number] = found
         return True
 
-    def _extend(self, number: Tensor, sign: Tensor) -> None:
-        """Carry distances on into new bricks [N], whose nodes have lain at sign [N] times far."""
+    def _carried(self, number: Tensor, sign: Tensor) -> Tensor:
+        """Distances [N, 64] carried on into new bricks [N], whose nodes have lain at sign [N] times
+        far."""
         around = torch.cartesian_prod(*[torch.arange(-1, Bricks.SIDE + 1)] * 3)
         node = self.bricks.corners(number)[:, None] + around
         node = torch.minimum(node.clamp_min(0), torch.tensor(self.grid.size) - 1)
@@ -223,8 +226,7 @@ class SparseField(AbstractField):
                     for other in {1, 2, 3} - {axis}:
                         beside = beside.narrow(other, 1, Bricks.SIDE)
                     torch.minimum(within, beside + self.voxel_size, out=within)
-        found = sign[:, None] * within.reshape(len(number), -1)
-        self.sdf.view(-1, Bricks.NODES)[number] = found
+        return sign[:, None] * within.reshape(len(number), -1)
 
 
 def _sewn(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
