@@ -10,7 +10,7 @@ from analytic import cameras_around, photos_of
 from univoxel.camera import project
 from univoxel.experiments.stress.damage import turned
 from univoxel.fields.hull import mask_distances
-from univoxel.fields.registration import align, contradiction
+from univoxel.fields.registration import Edges, align, contradiction
 from univoxel.poses import PoseSteps
 
 VIEWS, SIZE = 16, 64
@@ -74,6 +74,14 @@ def test_a_view_says_nothing_of_what_lies_beyond_its_picture():
     centre[3, 0] -= SIZE // 2
     distance[3] = torch.where(torch.arange(SIZE) < SIZE // 2, cut, 20.0)
     assert contradiction(distance, replace(cameras, centre=centre), BOX) < -0.1
+
+
+def test_places_that_no_picture_shows_are_no_part_of_the_object():
+    """In a box far too large rays go on behind the one camera that they are held against."""
+    edges = Edges(distances(), (6 * BOX[0], 6 * BOX[1]))
+    pixels = edges.draw(200, torch.Generator().manual_seed(0))
+    missed = edges.missed(cameras_around(VIEWS, SIZE), pixels, torch.tensor([0]))
+    assert missed.quantile(0.95) < 0.1
 
 
 def test_without_silhouettes_nothing_is_said_and_nothing_moves():

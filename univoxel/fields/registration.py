@@ -86,7 +86,7 @@ class Edges:
             seen = (depth > 0) & (uv.abs() <= 1).all(1)  # beyond its picture a view says nothing
             further = seen & (d > most)
             most[further], worst[further] = d[further], v
-        return most, worst
+        return torch.where(most.isinf(), torch.inf, most), worst  # unseen places are outside
 
 
 def contradiction(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tensor]) -> float:
