@@ -62,8 +62,9 @@ def evidence(scene: Scene, problem: Problem, cfg: JointConfig) -> Tensor:
 
     albedo = scene.material(scene.field.features_at(seen.position))[0].clamp_min(1e-2).log()
     key = torch.cat([seen.position / (NEAR * problem.voxel_size), albedo / ALIKE], 1).numpy()
-    tree = KDTree(key[chosen])
-    near = tree.query(key[chosen], k=min(NEIGHBOURS, len(chosen)), workers=-1)[1]
+    some = key[chosen.numpy()]  # a tensor of one index would be taken for a number
+    tree = KDTree(some)
+    near = tree.query(some, k=min(NEIGHBOURS, len(chosen)), workers=-1)[1]
     mean = ratio[torch.from_numpy(near).reshape(len(chosen), -1)].mean(1)
     return mean[torch.from_numpy(tree.query(key, workers=-1)[1])]
 
