@@ -135,6 +135,9 @@ class TrainConfig:
     # refined: the photographs' cameras are put right, before training and in it; auto: where their
     # silhouettes contradict one another
     cameras: CamerasFrom = "given"
+    # whether hollows that no silhouette shows are opened before training, where photographs agree
+    # on them: not where their light varies
+    hollows: bool = False
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
     capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see tasks/capacity.py
@@ -382,14 +385,23 @@ def _configuration(
             scene = SceneConfig(varying=varying)
             stages = (coarse, fine, joint, refit)
             return TrainConfig(
-                data, out, stages, minutes, cameras="auto", capacity="adaptive", scene=scene
+                data,
+                out,
+                stages,
+                minutes,
+                cameras="auto",
+                hollows=True,
+                capacity="adaptive",
+                scene=scene,
             )
         case _ if light in alone:
             scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=varying)
             # Lobes that light the materials to the end: what leaves least shading in the albedo
             loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
             stages = (coarse, fine)
-            return TrainConfig(data, out, stages, minutes, cameras="auto", scene=scene, loss=loss)
+            return TrainConfig(
+                data, out, stages, minutes, cameras="auto", hollows=True, scene=scene, loss=loss
+            )
         case _:
             names = ", ".join(("hybrid", *alone))
             raise ValueError(f"light must be one of {names}, got {light!r}")

@@ -32,6 +32,7 @@ void bind_rows_ops(py::module_& m);
 void bind_sg_ops(py::module_& m);
 void bind_shade_ops(py::module_& m);
 void bind_sparse_grid_ops(py::module_& m);
+void bind_stereo_ops(py::module_& m);
 void bind_visibility_ops(py::module_& m);
 
 }  // namespace univoxel

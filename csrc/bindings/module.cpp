@@ -11,5 +11,6 @@ PYBIND11_MODULE(_core, m) {
     univoxel::bind_sg_ops(m);
     univoxel::bind_shade_ops(m);
     univoxel::bind_sparse_grid_ops(m);
+    univoxel::bind_stereo_ops(m);
     univoxel::bind_visibility_ops(m);
 }

@@ -56,7 +56,8 @@ def test_one_point_speaks_for_all():
     """A scene may have no other whose sightings suffice."""
     scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3)
     found = evidence(scene, problem, replace(CFG, newton_points=1))
-    assert len(found) == COUNT and len(found.unique()) == 1
+    assert len(found) == COUNT
+    assert len(found.unique()) == 1
 
 
 def test_fitted_finds_the_best_base_within_its_bounds():

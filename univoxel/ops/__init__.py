@@ -22,6 +22,12 @@ from univoxel.ops.smooth import (
     smooth_rows_reference_,
 )
 from univoxel.ops.sparse_grid import sample_sparse, sample_sparse_reference
+from univoxel.ops.stereo import (
+    match_cost,
+    match_cost_reference,
+    semi_global,
+    semi_global_reference,
+)
 from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference, occluded_reference
 
 __all__ = [
@@ -42,6 +48,8 @@ __all__ = [
     "encode_hash_reference",
     "march",
     "march_reference",
+    "match_cost",
+    "match_cost_reference",
     "mlp",
     "mlp_reference",
     "occluded_reference",
@@ -50,6 +58,8 @@ __all__ = [
     "sample_dense_reference",
     "sample_sparse",
     "sample_sparse_reference",
+    "semi_global",
+    "semi_global_reference",
     "shade_map",
     "shade_map_reference",
     "shade_radiance",

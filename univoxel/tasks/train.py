@@ -14,7 +14,7 @@ from rich.text import Text
 from torch import Tensor
 
 from univoxel import lights, losses
-from univoxel.camera import pixel_rays
+from univoxel.camera import Cameras, pixel_rays
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.config import (
     JointConfig,
@@ -29,7 +29,8 @@ from univoxel.data.images import replacing
 from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
-from univoxel.fields.hull import GridShape, fit_grid, mask_distances, visual_hull
+from univoxel.fields.hollows import hollowed
+from univoxel.fields.hull import GridShape, fit_grid, looked_at, mask_distances, visual_hull
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import priors
 from univoxel.metrics import psnr
@@ -115,6 +116,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         poses = put_right(distance, photos.cameras, box) if refined else None
         cameras = poses.corrected(photos.cameras) if poses else photos.cameras
         hull = visual_hull(distance, cameras, first)
+        if cfg.hollows and cfg.scene.varying == "none":
+            hull = hollowed(hull, first, *pictures_of(photos, cameras, first.voxel_size))
         field = first_field(cfg, first, hull, box)
         light = lights.scaled(cfg.scene.light, float((box[1] - box[0]).max()) / 2)
         views = tuple(photos.names) if refined or cfg.scene.varying != "none" else ()
@@ -174,6 +177,27 @@ def first_field(
     rows = capacity.table_rows(cfg.scene, cfg.budget_mb)
     levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL, rows)
     return HashField(DenseField(grid, 0, hull), levels)
+
+
+def pictures_of(photos: Photos, cameras: Cameras, voxel_size: float) -> tuple[Tensor, Cameras]:
+    """The photographs as `hollowed` takes them, with pixels at most a voxel wide and few."""
+    away = (cameras.camera_to_world[:, :, 3] - looked_at(cameras)).norm(dim=1)
+    pixel = float((away / cameras.focal.mean(1)).median())
+    factor = max(1, int(voxel_size / pixel))
+    pictures = []
+    for view in range(len(photos)):
+        color, alpha = photos.picture(view)
+        premultiplied = torch.cat([linear_to_srgb(color) * alpha[..., None], alpha[..., None]], 2)
+        shrunk = torch.nn.functional.avg_pool2d(premultiplied.permute(2, 0, 1), factor)
+        pictures.append(shrunk.permute(1, 2, 0))
+    height, width = pictures[0].shape[:2]
+    return torch.stack(pictures), replace(
+        cameras,
+        focal=cameras.focal / factor,
+        centre=cameras.centre / factor,
+        width=width,
+        height=height,
+    )
 
 
 def say_trust(scene: Scene, photos: Photos, out: Path, troubles: list[str]) -> None:

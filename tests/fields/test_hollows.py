@@ -1,0 +1,107 @@
+"""Hollows: a ball with a pit is opened, a mirror and a plain ball are left as they are."""
+
+from functools import cache
+
+import pytest
+import torch
+from analytic import cameras_around, look_at
+
+from univoxel.camera import Cameras, image_rays
+from univoxel.fields.hollows import hollowed
+from univoxel.fields.hull import fit_grid, mask_distances, visual_hull
+
+SIZE, VIEWS = 64, 40
+PIT = torch.tensor([0.0, 0.0, 0.55]), 0.35
+
+
+def with_pit(point):
+    """A ball of radius 0.5 without another one: its rim is the circle at z = 0.39, r = 0.31."""
+    return torch.maximum(point.norm(dim=-1) - 0.5, PIT[1] - (point - PIT[0]).norm(dim=-1))
+
+
+def ball(point):
+    return point.norm(dim=-1) - 0.5
+
+
+def checks(point, normal, wo):
+    """Colours [N, 3] painted on it."""
+    return 0.5 + 0.4 * torch.sin(14 * point + torch.tensor([0.0, 1.0, 2.0]))
+
+
+def plain(point, normal, wo):
+    return torch.full_like(point, 0.4)
+
+
+def mirrored(point, normal, wo):
+    """Stripes all around, far away, in a mirror."""
+    reflected = 2 * (normal * wo).sum(-1, keepdim=True) * normal - wo
+    return 0.5 + 0.4 * torch.sin(7 * reflected + torch.tensor([0.0, 1.0, 2.0]))
+
+
+def photographed(shape, look, cameras):
+    """Pictures [V, H, W, 4] by sphere tracing."""
+    pictures = []
+    for view in range(len(cameras)):
+        rays = image_rays(cameras, view)
+        point = rays.origin.clone()
+        for _ in range(80):
+            point = point + 0.8 * shape(point)[:, None] * rays.direction
+        normal = torch.func.vmap(torch.func.grad(shape))(point)
+        hit = (shape(point).abs() < 2e-3)[:, None].float()
+        color = look(point, torch.nn.functional.normalize(normal, dim=-1), -rays.direction)
+        pictures.append(torch.cat([color * hit, hit], 1).nan_to_num(0.0))
+    return torch.stack(pictures).view(len(cameras), cameras.height, cameras.width, 4)
+
+
+@cache
+def from_above(views=VIEWS):
+    """Cameras on a spiral above z = 0.5: what a table hides none sees."""
+    z = torch.linspace(0.25, 0.95, views)
+    phi = 2.4 * torch.arange(views)
+    r = (1 - z * z).sqrt()
+    at = 2 * torch.stack([r * phi.cos(), r * phi.sin(), z], 1)
+    half = torch.full((views, 2), SIZE / 2)
+    return Cameras(torch.stack([look_at(p) for p in at]), half * 3, half, SIZE, SIZE)
+
+
+@cache
+def opened(shape, look, cameras):
+    """The hull's SDF, what became of it, and the shape's own, on the same nodes."""
+    pictures = photographed(shape, look, cameras)
+    distance = mask_distances(pictures[..., 3].contiguous())
+    grid = fit_grid(torch.full((3,), -0.6), torch.full((3,), 0.6), 40_000)
+    hull = visual_hull(distance, cameras, grid)
+    return hull, hollowed(hull, grid, pictures, cameras), shape(grid.nodes()), grid.voxel_size
+
+
+def test_a_pit_is_opened():
+    hull, found, truth, voxel = opened(with_pit, checks, from_above())
+    pit = (hull < -voxel) & (truth > voxel)  # what silhouettes leave in
+    assert pit.sum() > 100
+    assert (found[pit] > 0).float().mean() > 0.8
+    rest = truth < -1.5 * voxel
+    assert (found[rest] < 0).float().mean() > 0.99
+    assert (found >= hull).all()
+
+
+def test_the_new_surface_lies_where_the_pit_is():
+    hull, found, truth, voxel = opened(with_pit, checks, from_above())
+    near = (truth.abs() < 2 * voxel) & (hull < -2 * voxel)
+    assert near.sum() > 100
+    assert (found - truth)[near].abs().median() < voxel
+    assert (hull - truth)[near].abs().median() > 1.5 * voxel
+
+
+@pytest.mark.parametrize("look", [plain, mirrored])
+def test_what_photographs_cannot_tell_stays(look):
+    """A plain ball says nothing; in a mirror all lies behind the surface, whose outline stays."""
+    hull, found, truth, voxel = opened(ball, look, cameras_around(VIEWS, SIZE))
+    solid = truth < -2 * voxel
+    assert (found[solid] < 0).float().mean() > 0.99
+    if look is plain:
+        assert torch.equal(found, hull)
+
+
+def test_two_views_open_nothing():
+    hull, found, _, _ = opened(with_pit, checks, from_above(2))
+    assert torch.equal(found, hull)

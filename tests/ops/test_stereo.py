@@ -1,0 +1,163 @@
+"""Plane sweep and semi-global matching, against their references and where the answer is known."""
+
+import math
+
+import pytest
+import torch
+from analytic import look_at
+
+from univoxel.camera import Cameras, image_rays, project
+from univoxel.fields.hollows import _projections
+from univoxel.ops import match_cost, native, semi_global, use_backend
+
+SIZE, VIEWS, STEP, STEPS = 24, 5, 0.1, 7
+TRUE = 3  # the step that the surface lies at
+
+
+def texture(point):
+    """Colours [..., 3] that change over space as slowly as pixels can show."""
+    return 0.5 + 0.3 * torch.sin(6 * point + torch.tensor([0.0, 1.0, 2.0]))
+
+
+def close_by():
+    """Cameras within half a radian that look at the origin from above."""
+    phi = torch.arange(VIEWS) * 2 * math.pi / VIEWS
+    at = torch.stack([0.4 * phi.cos(), 0.4 * phi.sin(), torch.full((VIEWS,), 2.0)], 1)
+    whole = torch.full((VIEWS, 2), float(SIZE))
+    return Cameras(torch.stack([look_at(p) for p in at]), whole, whole / 2, SIZE, SIZE)
+
+
+def case(holes=True, seed=0):
+    """Views of a textured table at z = 0, whose rays start before it."""
+    g = torch.Generator().manual_seed(seed)
+    cameras, pictures, starts = close_by(), [], []
+    for view in range(VIEWS):
+        rays = image_rays(cameras, view)
+        t = -rays.origin[:, 2] / rays.direction[:, 2]
+        color = texture(rays.origin + t[:, None] * rays.direction)
+        pictures.append(torch.cat([color, torch.ones(len(t), 1)], 1))
+        starts.append(t - TRUE * STEP)
+    pictures = torch.stack(pictures).view(VIEWS, SIZE, SIZE, 4)
+    inside = torch.rand(SIZE * SIZE, generator=g) < (0.8 if holes else 2)
+    rows = torch.where(inside, inside.long().cumsum(0) - 1, -1).view(SIZE, SIZE)
+    rays = image_rays(cameras, 0)
+    color = pictures[0].flatten(0, 1)[inside, :3]
+    lines = rays.origin[inside], rays.direction[inside], starts[0][inside], color
+    return pictures, _projections(cameras), *lines, rows, torch.arange(1, VIEWS)
+
+
+def test_projections_are_those_of_the_cameras():
+    cameras, points = close_by(), torch.randn(20, 3) * 0.3
+    for view, matrix in enumerate(_projections(cameras)):
+        found = points @ matrix[:, :3].T + matrix[:, 3]
+        pixel, depth = project(cameras, view, points)
+        torch.testing.assert_close(found[:, 2], depth)
+        torch.testing.assert_close(found[:, :2] / found[:, 2:], pixel, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize(("radius", "best"), [(0, 1), (1, 2), (2, 4)])
+def test_match_cost_equals_its_reference(radius, best):
+    arguments = list(case())
+    g = torch.Generator().manual_seed(1)
+    arguments[0] = torch.rand(arguments[0].shape, generator=g)  # coverage of all kinds too
+    arguments[4] = arguments[4] + torch.randn(
+        len(arguments[4]), generator=g
+    )  # behind views as well
+    options = dict(step=STEP, steps=STEPS, most=0.3, radius=radius, best=best)
+    found = match_cost(*arguments, **options)
+    with use_backend("reference"):
+        wanted = match_cost(*arguments, **options)
+    # Colours are divided by coverages down to a half; pixels of some 10 are rounded to 1e-6
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-4)
+    assert 0.2 < (wanted < 0.3).float().mean() < 1  # some are seen, some are not
+
+
+def test_photographs_agree_where_the_surface_is():
+    cost = match_cost(*case(holes=False), STEP, STEPS, best=2)
+    inner = cost.view(SIZE, SIZE, STEPS)[5:-5, 5:-5].flatten(0, 1)  # others see it too
+    assert (inner.argmin(1) == TRUE).float().mean() > 0.95
+    assert inner[:, TRUE].median() < 0.3 * inner[:, TRUE + 2].median()
+
+
+def test_a_view_that_sees_nothing_there_disagrees_most():
+    pictures, *others = case(holes=False)
+    for value in (0.0, torch.nan):
+        pictures[1:, ..., 3] = value
+        cost = match_cost(pictures, *others, STEP, 2)
+        torch.testing.assert_close(cost, torch.full_like(cost, 0.2))
+
+
+def volume(seed=0, holes=True):
+    g = torch.Generator().manual_seed(seed)
+    inside = torch.rand(9, 11, generator=g) < (0.8 if holes else 2)
+    rows = torch.where(inside, inside.flatten().long().cumsum(0).view(9, 11) - 1, -1)
+    return torch.rand(int(inside.sum()), STEPS, generator=g), rows
+
+
+@pytest.mark.parametrize(("small", "large"), [(0.0, 0.0), (0.05, 0.2), (0.3, 5.0)])
+def test_semi_global_equals_its_reference(small, large):
+    cost, rows = volume()
+    found = semi_global(cost, rows, small, large)
+    with use_backend("reference"):
+        wanted = semi_global(cost, rows, small, large)
+    torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-6)  # sums of 20 numbers of order 1
+
+
+def test_where_depths_may_not_change_a_line_shares_the_one_that_suits_it_best():
+    cost, rows = volume(holes=False)
+    total = semi_global(cost[:11], rows[:1], 1e3, 1e3)  # downwards and upwards a line is alone
+    along = total - 2 * cost[:11]
+    assert (along.argmin(1) == cost[:11].sum(0).argmin()).all()
+
+
+def test_where_depths_may_change_freely_each_pixel_takes_its_own():
+    cost, rows = volume()
+    assert torch.equal(semi_global(cost, rows, 0.0, 0.0).argmin(1), cost.argmin(1))
+
+
+@pytest.mark.skipif(native.core is None, reason="without the extension")
+def test_the_same_bits_on_any_number_of_threads():
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            found.append((match_cost(*case(), STEP, STEPS), semi_global(*volume(), 0.05, 0.2)))
+    finally:
+        torch.set_num_threads(threads)
+    for cost, total in found[1:]:
+        assert torch.equal(cost, found[0][0])
+        assert torch.equal(total, found[0][1])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(best=5), r"best must lie in \[1, 4\], got 5"),
+        (dict(best=0), r"best must lie in \[1, 4\], got 0"),
+        (dict(steps=0), "steps must be at least 1 and radius at least 0, got 0 and 1"),
+        (dict(radius=-1), "got 7 and -1"),
+        (dict(others=torch.tensor([1, 2, 3, VIEWS])), r"others must lie in \[0, 5\)"),
+        (dict(rows=torch.zeros(SIZE, SIZE, dtype=torch.int64)), "rows must name each of the"),
+        (dict(start=torch.zeros(3)), r"start must be \[N\]"),
+        (dict(pictures=torch.zeros(VIEWS, SIZE, SIZE, 3)), r"pictures must be \[V, H, W, 4\]"),
+    ],
+)
+def test_match_cost_refuses(change, message):
+    names = "pictures matrix origin direction start color rows others".split()
+    arguments = dict(zip(names, case(), strict=True)) | dict(step=STEP, steps=STEPS) | change
+    with pytest.raises(ValueError, match=message):
+        match_cost(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("small", "large", "rows", "message"),
+    [
+        (0.2, 0.1, None, "0 <= small <= large, got 0.2 and 0.1"),
+        (-0.1, 0.1, None, "got -0.1 and 0.1"),
+        (0.1, 0.2, torch.full((9, 11), -1), "rows must name each of the"),
+    ],
+)
+def test_semi_global_refuses(small, large, rows, message):
+    cost, known = volume()
+    with pytest.raises(ValueError, match=message):
+        semi_global(cost, known if rows is None else rows, small, large)

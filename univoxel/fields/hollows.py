@@ -1,0 +1,171 @@
+"""Hollows that no silhouette shows, such as of cups: opened where photographs agree on them.
+
+Depths come from a semi-global plane sweep below the visual hull. What lies in front of them for
+most views is taken away, if photographs that had no say agree too, and if every silhouette stays
+covered: what a mirror shows lies behind it for all views, yet without the mirror its outline is
+missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from scipy import ndimage
+from skimage import measure
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from univoxel.camera import Cameras, image_rays, project
+from univoxel.fields.dense import DenseField
+from univoxel.fields.hull import GridShape, looked_at
+from univoxel.ops import VisibilityScene, match_cost, semi_global
+
+STEPS = 48  # depths along a ray, a voxel apart
+OTHERS, BEST = 8, 4  # views that a view is compared with, and those that count
+SMALL, LARGE = 0.01, 0.04  # sRGB, what a step of one depth or of more between neighbours costs
+BEHIND = 2.5  # voxels behind a depth up to which its view has a say
+AGREE = 0.6  # share of the views with a say that see through
+BETTER = 0.1  # share of the disagreement that goes with what is taken away ...
+VISIBLE = 0.002  # ... and how much at least: half a step of 8 bits
+AROUND = 2.0  # voxels over which disagreement is averaged
+ROUNDS = 3  # in which silhouettes are covered again
+
+
+@torch.no_grad()
+def hollowed(hull: Tensor, grid: GridShape, pictures: Tensor, cameras: Cameras) -> Tensor:
+    """The SDF of a visual hull with hollows open, where photographs agree on them.
+
+    Args:
+        hull: [X, Y, Z] world units, negative inside.
+        grid: of the hull.
+        pictures: [V, H, W, 4] float32 sRGB colours times coverage, and coverage.
+        cameras: V, of the pictures' size; three or more, or nothing is opened.
+
+    Returns:
+        [X, Y, Z], at least hull.
+
+    Source: depths as in Hirschmueller 2005, "Accurate and efficient stereo processing by
+    semi-global matching"; what views see through as in Kutulakos and Seitz 2000, "A theory of shape
+    by space carving".
+    """
+    solid = hull <= 0
+    if len(cameras) < 3 or not solid.any() or solid.all():
+        return hull
+    nodes = grid.nodes()[solid]
+    start = list(_first_met(hull, grid, cameras))
+    free, say, gain, cost = torch.zeros(4, len(nodes))
+    for view, (depth, found, at_hull) in enumerate(
+        _depth_maps(pictures, cameras, start, grid.voxel_size)
+    ):
+        away, pixel = _seen(nodes, cameras, view)
+        before = depth.flatten()[pixel] - away  # NaN: the view says nothing
+        through = before > 0
+        free += through
+        say += before > -BEHIND * grid.voxel_size
+        gain += torch.where(through, (at_hull - found).flatten()[pixel], 0.0)
+        cost += torch.where(through, at_hull.flatten()[pixel], 0.0)
+    agreed = free > AGREE * say
+
+    def around(values: Tensor) -> Tensor:
+        spread = torch.zeros(hull.shape).masked_scatter(solid, torch.where(agreed, values, 0.0))
+        return torch.from_numpy(ndimage.gaussian_filter(spread.numpy(), AROUND))[solid]
+
+    gain = around(gain)
+    agreed &= (gain > BETTER * around(cost)) & (gain > VISIBLE * around(free))
+    taken = torch.zeros_like(solid).masked_scatter(solid, agreed)
+    covered = [c > 0.9 for c in pictures[..., 3]]
+    for _ in range(ROUNDS):
+        taken = _reached(taken, ~solid)
+        if not taken.any():
+            return hull
+        sdf = _without(taken, hull, grid)
+        crossed = torch.zeros(len(nodes), dtype=torch.bool)
+        for view, met in enumerate(_first_met(sdf, grid, cameras)):
+            lost = covered[view] & start[view].isfinite() & met.isinf()
+            if lost.any():
+                crossed |= lost.flatten()[_seen(nodes, cameras, view)[1]]
+        crossed &= taken[solid]
+        if not crossed.any():
+            break
+        taken[solid] &= ~crossed
+    return sdf
+
+
+def _first_met(sdf: Tensor, grid: GridShape, cameras: Cameras) -> Iterator[Tensor]:
+    """How far [H, W] pixels see to the surface, view after view; infinity: past it."""
+    surface = VisibilityScene(*DenseField(grid, 0, sdf).isosurface())
+    for view in range(len(cameras)):
+        rays = image_rays(cameras, view)
+        met = surface.closest_hit(rays.origin, rays.direction).t
+        yield met.view(cameras.height, cameras.width)
+
+
+def _depth_maps(
+    pictures: Tensor, cameras: Cameras, start: list[Tensor], step: float
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """View after view: how far its pixels see, and how badly views that had no say in that agree
+    there, and on the hull: three [H, W], NaN outside the object."""
+    matrix = _projections(cameras)
+    toward = normalize(cameras.camera_to_world[:, :, 3] - looked_at(cameras), dim=1)
+    alike = (toward @ toward.T).fill_diagonal_(-2.0)
+    for view in range(len(cameras)):
+        inside = (pictures[view, :, :, 3] > 0.5) & start[view].isfinite()
+        rows = torch.where(inside, inside.flatten().cumsum(0).view(inside.shape) - 1, -1)
+        rays, met = image_rays(cameras, view), start[view][inside]
+        color = pictures[view][inside]
+        of_pixels = color[:, :3] / color[:, 3:], rows
+        lines = pictures, matrix, rays.origin[inside.flatten()], rays.direction[inside.flatten()]
+        near = alike[view].topk(min(2 * OTHERS, len(cameras) - 1)).indices
+
+        def disagreement(at: Tensor, others: Tensor, steps: int) -> Tensor:
+            best = min(BEST, len(others))
+            return match_cost(*lines, at, *of_pixels, others, step, steps, best=best)  # noqa: B023
+
+        total = semi_global(disagreement(met, near[::2], STEPS), rows, SMALL, LARGE)
+        depth = met + step * total.argmin(1)
+        maps = torch.full((3, *inside.shape), torch.nan)
+        maps[:, inside] = torch.stack(
+            [depth, *(disagreement(at, near[1::2], 1)[:, 0] for at in (depth, met))]
+        )
+        yield maps[0], maps[1], maps[2]
+
+
+def _seen(points: Tensor, cameras: Cameras, view: int) -> tuple[Tensor, Tensor]:
+    """How far away points [P, 3] are from a camera, and the number of the pixel that shows them;
+    of points outside the picture, the nearest one's."""
+    pixel, _ = project(cameras, view, points)
+    column = pixel[:, 0].floor().clamp(0, cameras.width - 1).long()
+    row = pixel[:, 1].floor().clamp(0, cameras.height - 1).long()
+    away = (points - cameras.camera_to_world[view, :, 3]).norm(dim=1)
+    return away, row * cameras.width + column
+
+
+def _reached(taken: Tensor, outside: Tensor) -> Tensor:
+    """What of it is open to the outside."""
+    label = np.asarray(measure.label((taken | outside).numpy(), connectivity=1))
+    open_ = np.isin(label, np.unique(label[outside.numpy()]))
+    return taken & torch.from_numpy(open_)
+
+
+def _without(taken: Tensor, hull: Tensor, grid: GridShape) -> Tensor:
+    """The hull's SDF without some of its nodes; as it was, away from them."""
+    solid = ((hull <= 0) & ~taken).numpy()
+    away, into = (np.asarray(ndimage.distance_transform_edt(s)) for s in (~solid, solid))
+    # The surface lies halfway between nodes; half a voxel's blur takes the steps off
+    distance = ndimage.gaussian_filter(np.where(solid, 0.5 - into, away - 0.5), 0.7)
+    near = torch.from_numpy(ndimage.binary_dilation(taken.numpy(), iterations=3))
+    sdf = torch.from_numpy(distance).float() * grid.voxel_size
+    return torch.where(near, torch.maximum(hull, sdf), hull)
+
+
+def _projections(cameras: Cameras) -> Tensor:
+    """World to (x z, y z, z) of pixels: [V, 3, 4]."""
+    pose = cameras.camera_to_world
+    turn = pose[:, :, :3].transpose(1, 2) * torch.tensor([1.0, -1.0, -1.0])[:, None]
+    local = torch.cat([turn, -turn @ pose[:, :, 3:]], 2)  # x right, y down, z away
+    lens = torch.zeros(len(pose), 3, 3)
+    lens[:, 0, 0], lens[:, 1, 1] = cameras.focal.unbind(1)
+    lens[:, :2, 2], lens[:, 2, 2] = cameras.centre, 1.0
+    return lens @ local
