@@ -332,6 +332,63 @@ def diffuse_rows(rows: int = 130_000, passes: int = 4) -> Case:
     )
 
 
+def _table(views: int, side: int) -> tuple[Tensor, ...]:
+    """Cameras beside one another that look down on a painted table at z = 0 from z = 2: pictures,
+    matrices; origins, directions, starts, colours and rows of the first one's pixels; the others.
+    """
+    at = 0.2 * torch.randn(views, 2, generator=torch.Generator().manual_seed(0))
+    at[0] = 0.0
+    axis = (torch.arange(side) + 0.5) / side - 0.5  # focal length: one side
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    ground = torch.stack([2 * x, -2 * y], -1) + at[:, None, None]
+    color = 0.5 + 0.2 * (torch.sin(9 * ground[..., :1]) + torch.sin(7 * ground[..., 1:]))
+    pictures = torch.cat([color.expand(-1, -1, -1, 3), torch.ones(views, side, side, 1)], -1)
+    f, c, matrix = side, side / 2, torch.zeros(views, 3, 4)
+    matrix[:] = torch.tensor([[f, 0, -c, 2 * c], [0, -f, -c, 2 * c], [0, 0, -1, 2]])
+    matrix[:, 0, 3] -= f * at[:, 0]
+    matrix[:, 1, 3] += f * at[:, 1]
+    count = side * side
+    direction = torch.stack([x, -y, -torch.ones_like(x)], -1).reshape(-1, 3)
+    origin = torch.tensor([0.0, 0.0, 2.0]).expand(count, 3).contiguous()
+    start, seen = torch.full((count,), 1.8), pictures[0, ..., :3].reshape(-1, 3)
+    rows = torch.arange(count).view(side, side)
+    return pictures, matrix, origin, direction, start, seen, rows, torch.arange(1, views)
+
+
+def match_cost(side: int = 100, steps: int = 48) -> Case:
+    *floating, rows, others = _table(9, side)
+
+    def ours(*tensors):
+        return ops.match_cost(*tensors, rows, others, 0.01, steps)
+
+    def reference(*tensors):
+        return ops.match_cost_reference(*tensors, rows, others, 0.01, steps, 0.2, 1, 4)
+
+    return Case(
+        "match_cost",
+        f"{side * side:,} pixels, {steps} depths, {len(others)} views",
+        ours,
+        reference,
+        tuple(floating),
+        # Four corners of four numbers, and the window's sums, which neighbours could share
+        {"fma": 2.0 * side * side * steps * len(others) * (4 * 4 + 9)},
+        tolerance=1e-3,  # positions of 100 pixels, and views that just see a point
+    )
+
+
+def semi_global(side: int = 200, steps: int = 48) -> Case:
+    cost = torch.rand(side * side, steps, generator=torch.Generator().manual_seed(0))
+    rows = torch.arange(side * side).view(side, side)
+    return Case(
+        "semi_global",
+        f"{side * side:,} pixels, {steps} depths",
+        lambda cost: ops.semi_global(cost, rows, 0.01, 0.04),
+        lambda cost: ops.semi_global_reference(cost, rows, 0.01, 0.04),
+        (cost,),
+        {"read": 4.0 * 2 * cost.numel()},  # read, and sums written
+    )
+
+
 CASES: list[tuple[str, Callable[[], Case]]] = [
     ("composite", composite),
     ("sample_dense", lambda: sample_dense(160)),
@@ -348,4 +405,6 @@ CASES: list[tuple[str, Callable[[], Case]]] = [
     ("smooth_rows_", smooth_rows),
     ("smooth_rows_", lambda: smooth_rows(channels=12, order=1)),
     ("diffuse_rows_", diffuse_rows),
+    ("match_cost", match_cost),
+    ("semi_global", semi_global),
 ]

@@ -24,12 +24,15 @@ from univoxel.ops import VisibilityScene, match_cost, semi_global
 
 STEPS = 48  # depths along a ray, a voxel apart
 OTHERS, BEST = 8, 4  # views that a view is compared with, and those that count
-SMALL, LARGE = 0.01, 0.04  # sRGB, what a step of one depth or of more between neighbours costs
+SLOPE, JUMP = 0.01, 0.04  # sRGB, what a step of one depth or of more between neighbours costs
 BEHIND = 2.5  # voxels behind a depth up to which its view has a say
-AGREE = 0.6  # share of the views with a say that see through
-BETTER = 0.1  # share of the disagreement that goes with what is taken away ...
+AGREE = 0.6  # share of the views with a say that see through what is taken away ...
+LEAST = 0.2  # ... and of all views: fewer may see a lamp in something glossy
+BETTER = 0.1  # share of a pixel's disagreement that has to go with it ...
 VISIBLE = 0.002  # ... and how much at least: half a step of 8 bits
-AROUND = 2.0  # voxels over which disagreement is averaged
+HALF = 0.5  # share of the pixels that see through for which it does ...
+AROUND = 2.0  # ... within so many voxels
+PIECE = 2e-3  # share of the hull that a hollow has at least
 ROUNDS = 3  # in which silhouettes are covered again
 
 
@@ -55,29 +58,28 @@ def hollowed(hull: Tensor, grid: GridShape, pictures: Tensor, cameras: Cameras) 
         return hull
     nodes = grid.nodes()[solid]
     start = list(_first_met(hull, grid, cameras))
-    free, say, gain, cost = torch.zeros(4, len(nodes))
+    free, say, better = torch.zeros(3, len(nodes))
     for view, (depth, found, at_hull) in enumerate(
-        _depth_maps(pictures, cameras, start, grid.voxel_size)
+        _depth_maps(pictures, cameras, start, DenseField(grid, 0, hull))
     ):
         away, pixel = _seen(nodes, cameras, view)
         before = depth.flatten()[pixel] - away  # NaN: the view says nothing
         through = before > 0
         free += through
         say += before > -BEHIND * grid.voxel_size
-        gain += torch.where(through, (at_hull - found).flatten()[pixel], 0.0)
-        cost += torch.where(through, at_hull.flatten()[pixel], 0.0)
-    agreed = free > AGREE * say
+        gained = at_hull - found > (BETTER * at_hull).clamp_min(VISIBLE)
+        better += through & gained.flatten()[pixel]
+    agreed = (free > AGREE * say) & (free > LEAST * len(cameras))
 
     def around(values: Tensor) -> Tensor:
         spread = torch.zeros(hull.shape).masked_scatter(solid, torch.where(agreed, values, 0.0))
         return torch.from_numpy(ndimage.gaussian_filter(spread.numpy(), AROUND))[solid]
 
-    gain = around(gain)
-    agreed &= (gain > BETTER * around(cost)) & (gain > VISIBLE * around(free))
+    agreed &= around(better) > HALF * around(free)
     taken = torch.zeros_like(solid).masked_scatter(solid, agreed)
     covered = [c > 0.9 for c in pictures[..., 3]]
     for _ in range(ROUNDS):
-        taken = _reached(taken, ~solid)
+        taken = _large(taken, ~solid, PIECE * len(nodes))
         if not taken.any():
             return hull
         sdf = _without(taken, hull, grid)
@@ -103,10 +105,12 @@ def _first_met(sdf: Tensor, grid: GridShape, cameras: Cameras) -> Iterator[Tenso
 
 
 def _depth_maps(
-    pictures: Tensor, cameras: Cameras, start: list[Tensor], step: float
+    pictures: Tensor, cameras: Cameras, start: list[Tensor], hull: DenseField
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """View after view: how far its pixels see, and how badly views that had no say in that agree
-    there, and on the hull: three [H, W], NaN outside the object."""
+    there, and on the hull: three [H, W], NaN outside the object. What seems to lie beyond it, as in
+    a flat mirror, is taken for the hull."""
+    step = hull.voxel_size
     matrix = _projections(cameras)
     toward = normalize(cameras.camera_to_world[:, :, 3] - looked_at(cameras), dim=1)
     alike = (toward @ toward.T).fill_diagonal_(-2.0)
@@ -123,8 +127,10 @@ def _depth_maps(
             best = min(BEST, len(others))
             return match_cost(*lines, at, *of_pixels, others, step, steps, best=best)  # noqa: B023
 
-        total = semi_global(disagreement(met, near[::2], STEPS), rows, SMALL, LARGE)
+        total = semi_global(disagreement(met, near[::2], STEPS), rows, SLOPE, JUMP)
         depth = met + step * total.argmin(1)
+        seen = rays.origin[inside.flatten()] + depth[:, None] * rays.direction[inside.flatten()]
+        depth = torch.where(hull.sample(seen).sdf > 0.5 * step, met, depth)
         maps = torch.full((3, *inside.shape), torch.nan)
         maps[:, inside] = torch.stack(
             [depth, *(disagreement(at, near[1::2], 1)[:, 0] for at in (depth, met))]
@@ -142,11 +148,12 @@ def _seen(points: Tensor, cameras: Cameras, view: int) -> tuple[Tensor, Tensor]:
     return away, row * cameras.width + column
 
 
-def _reached(taken: Tensor, outside: Tensor) -> Tensor:
-    """What of it is open to the outside."""
+def _large(taken: Tensor, outside: Tensor, least: float) -> Tensor:
+    """The pieces of it that are open to the outside and large: others are left to training."""
     label = np.asarray(measure.label((taken | outside).numpy(), connectivity=1))
-    open_ = np.isin(label, np.unique(label[outside.numpy()]))
-    return taken & torch.from_numpy(open_)
+    reached = taken & torch.from_numpy(np.isin(label, np.unique(label[outside.numpy()])))
+    piece = np.asarray(measure.label(reached.numpy(), connectivity=1))
+    return reached & torch.from_numpy((np.bincount(piece.ravel()) >= least)[piece])
 
 
 def _without(taken: Tensor, hull: Tensor, grid: GridShape) -> Tensor:

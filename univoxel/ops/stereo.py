@@ -114,7 +114,7 @@ def match_cost_reference(
         seen = inside & (found[..., 3] >= 0.5)
         apart.append(torch.where(seen, off.clamp_max(most), most))
     pixel = (rows.flatten() >= 0).nonzero()[:, 0]
-    spread = torch.zeros(len(apart) * steps + 1, height * width)
+    spread = start.new_zeros(len(apart) * steps + 1, height * width)
     values = torch.stack(apart).permute(0, 2, 1).reshape(-1, len(start))
     spread[:-1, pixel], spread[-1, pixel] = values[:, rows.flatten()[pixel]], 1.0
     mean = torch.nn.functional.avg_pool2d(
