@@ -10,7 +10,7 @@ from univoxel.camera import Cameras, image_rays
 from univoxel.fields.hollows import hollowed
 from univoxel.fields.hull import fit_grid, mask_distances, visual_hull
 
-SIZE, VIEWS = 64, 40
+SIZE, VIEWS = 48, 30
 PIT = torch.tensor([0.0, 0.0, 0.55]), 0.35
 
 
@@ -32,6 +32,11 @@ def plain(point, normal, wo):
     return torch.full_like(point, 0.4)
 
 
+def noisy(point, normal, wo):
+    """Plain, as 8 bits of a grainy photograph show it."""
+    return plain(point, normal, wo) + 0.006 * torch.randn(point.shape)
+
+
 def mirrored(point, normal, wo):
     """Stripes all around, far away, in a mirror."""
     reflected = 2 * (normal * wo).sum(-1, keepdim=True) * normal - wo
@@ -44,7 +49,7 @@ def photographed(shape, look, cameras):
     for view in range(len(cameras)):
         rays = image_rays(cameras, view)
         point = rays.origin.clone()
-        for _ in range(80):
+        for _ in range(50):
             point = point + 0.8 * shape(point)[:, None] * rays.direction
         normal = torch.func.vmap(torch.func.grad(shape))(point)
         hit = (shape(point).abs() < 2e-3)[:, None].float()
@@ -92,13 +97,13 @@ def test_the_new_surface_lies_where_the_pit_is():
     assert (hull - truth)[near].abs().median() > 1.5 * voxel
 
 
-@pytest.mark.parametrize("look", [plain, mirrored])
+@pytest.mark.parametrize("look", [plain, noisy, mirrored])
 def test_what_photographs_cannot_tell_stays(look):
-    """A plain ball says nothing; in a mirror all lies behind the surface, whose outline stays."""
+    """A plain ball says nothing, noise no more; in a mirror all lies behind the surface, whose outline stays."""
     hull, found, truth, voxel = opened(ball, look, cameras_around(VIEWS, SIZE))
     solid = truth < -2 * voxel
     assert (found[solid] < 0).float().mean() > 0.99
-    if look is plain:
+    if look is not mirrored:
         assert torch.equal(found, hull)
 
 

@@ -100,6 +100,36 @@ def test_grids_of_a_training_are_no_finer_than_its_photographs(data, tmp_path, m
     assert scene.field.voxel_size == pytest.approx(1.2 * 1.8 / 32, rel=0.05)  # cameras differ
 
 
+@pytest.mark.parametrize(
+    ("hollows", "varying", "wanted"),
+    [(True, "none", True), (True, "light", False), (False, "none", False)],
+)
+def test_hollows_are_opened_where_light_is_the_same(
+    data, tmp_path, monkeypatch, hollows, varying, wanted
+):
+    """What training starts with is what `hollowed` makes of the hull."""
+    monkeypatch.setattr(task, "run_stage", lambda *_: None)
+    monkeypatch.setattr(task, "hollowed", lambda hull, *_: hull + 0.25)
+    cfg = config(data, tmp_path / "run", hollows=hollows)
+    cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, varying=varying))
+    away = extract_mesh(load_scene(train(cfg))).vertices.norm(dim=1)
+    assert away.mean() == pytest.approx(RADIUS - 0.25 * wanted, abs=0.03)  # half a voxel
+
+
+def test_pictures_are_shrunk_to_what_a_voxel_shows():
+    """Pixels are 0.028 wide at the object."""
+    photos = photos_of(3, 64)
+    pictures, cameras = task.pictures_of(photos, photos.cameras, 0.06)
+    assert pictures.shape == (3, 32, 32, 4)
+    assert (cameras.width, cameras.height) == (32, 32)
+    torch.testing.assert_close(cameras.focal * 2, photos.cameras.focal)
+    torch.testing.assert_close(cameras.centre * 2, photos.cameras.centre)
+    color, alpha = photos.picture(1)
+    whole = torch.cat([linear_to_srgb(color) * alpha[..., None], alpha[..., None]], -1)
+    torch.testing.assert_close(pictures[1, 10, 12], whole[20:22, 24:26].mean((0, 1)))
+    assert task.pictures_of(photos, photos.cameras, 0.02)[0].shape == (3, 64, 64, 4)
+
+
 def test_a_gradient_spreads_over_the_nodes_that_it_touches():
     field = sphere_scene(0, voxel_size=0.1).field
     x, y, z = torch.cartesian_prod(*[torch.arange(2, 7)] * 3).unbind(1)

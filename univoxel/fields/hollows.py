@@ -82,17 +82,15 @@ def hollowed(hull: Tensor, grid: GridShape, pictures: Tensor, cameras: Cameras) 
         taken = _large(taken, ~solid, PIECE * len(nodes))
         if not taken.any():
             return hull
-        sdf = _without(taken, hull, grid)
         crossed = torch.zeros(len(nodes), dtype=torch.bool)
-        for view, met in enumerate(_first_met(sdf, grid, cameras)):
+        for view, met in enumerate(_first_met(_without(taken, hull, grid), grid, cameras)):
             lost = covered[view] & start[view].isfinite() & met.isinf()
             if lost.any():
                 crossed |= lost.flatten()[_seen(nodes, cameras, view)[1]]
-        crossed &= taken[solid]
-        if not crossed.any():
+        if not (crossed & taken[solid]).any():
             break
         taken[solid] &= ~crossed
-    return sdf
+    return _without(_large(taken, ~solid, PIECE * len(nodes)), hull, grid)
 
 
 def _first_met(sdf: Tensor, grid: GridShape, cameras: Cameras) -> Iterator[Tensor]:
