@@ -130,6 +130,15 @@ def test_pictures_are_shrunk_to_what_a_voxel_shows():
     assert task.pictures_of(photos, photos.cameras, 0.02)[0].shape == (3, 64, 64, 4)
 
 
+def test_of_many_photographs_some_say_what_is_hollow(monkeypatch):
+    monkeypatch.setattr(task, "HOLLOWS_VIEWS", 4)
+    photos = photos_of(10, 16)
+    pictures, cameras = task.pictures_of(photos, photos.cameras, 0.01)
+    assert len(pictures) == len(cameras) == 4
+    torch.testing.assert_close(cameras.camera_to_world, photos.cameras.camera_to_world[::3])
+    torch.testing.assert_close(pictures[2, ..., 3], photos.alpha[6])
+
+
 def test_a_gradient_spreads_over_the_nodes_that_it_touches():
     field = sphere_scene(0, voxel_size=0.1).field
     x, y, z = torch.cartesian_prod(*[torch.arange(2, 7)] * 3).unbind(1)

@@ -58,6 +58,7 @@ from univoxel.tasks.timelapse import Timelapse
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
+HOLLOWS_VIEWS = 100  # photographs at most that say what is hollow: a tenth of a second each
 RETRACE = 100  # steps after which light is traced through the surface as it has become
 RATES = ("lr_sdf", "lr_features", "lr_networks")
 MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silhouette's fringe
@@ -180,24 +181,21 @@ def first_field(
 
 
 def pictures_of(photos: Photos, cameras: Cameras, voxel_size: float) -> tuple[Tensor, Cameras]:
-    """The photographs as `hollowed` takes them, with pixels at most a voxel wide and few."""
+    """Photographs and cameras as `hollowed` takes them: some, with pixels between half a voxel and
+    a voxel wide where the photographs' are narrower."""
+    some = torch.arange(0, len(photos), -(-len(photos) // HOLLOWS_VIEWS))
     away = (cameras.camera_to_world[:, :, 3] - looked_at(cameras)).norm(dim=1)
     pixel = float((away / cameras.focal.mean(1)).median())
     factor = max(1, int(voxel_size / pixel))
     pictures = []
-    for view in range(len(photos)):
+    for view in some.tolist():
         color, alpha = photos.picture(view)
         premultiplied = torch.cat([linear_to_srgb(color) * alpha[..., None], alpha[..., None]], 2)
         shrunk = torch.nn.functional.avg_pool2d(premultiplied.permute(2, 0, 1), factor)
         pictures.append(shrunk.permute(1, 2, 0))
     height, width = pictures[0].shape[:2]
-    return torch.stack(pictures), replace(
-        cameras,
-        focal=cameras.focal / factor,
-        centre=cameras.centre / factor,
-        width=width,
-        height=height,
-    )
+    pose, focal, centre = cameras.camera_to_world[some], cameras.focal[some], cameras.centre[some]
+    return torch.stack(pictures), Cameras(pose, focal / factor, centre / factor, width, height)
 
 
 def say_trust(scene: Scene, photos: Photos, out: Path, troubles: list[str]) -> None:
