@@ -99,7 +99,7 @@ def test_the_new_surface_lies_where_the_pit_is():
 
 @pytest.mark.parametrize("look", [plain, noisy, mirrored])
 def test_what_photographs_cannot_tell_stays(look):
-    """A plain ball says nothing, noise no more; a mirror shows all behind it, yet has its outline."""
+    """A plain ball says nothing, noise no more; a mirror shows all behind it but its outline."""
     hull, found, truth, voxel = opened(ball, look, cameras_around(VIEWS, SIZE))
     solid = truth < -2 * voxel
     assert (found[solid] < 0).float().mean() > 0.99
