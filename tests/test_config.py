@@ -73,6 +73,11 @@ def test_a_preset_is_a_point_of_the_curve(name, light):
     assert budget(config.minutes, Path("photos"), Path("run"), light) == config
 
 
+def test_hollows_are_opened_where_there_is_time():
+    found = {m: budget(m, Path("data"), Path("run")).hollows for m in (1, 2, 2.1, 4, 12)}
+    assert found == {1: False, 2: False, 2.1: True, 4: True, 12: True}
+
+
 def test_more_minutes_are_more_work():
     minutes = [0.05, 0.5, 1.0, 1.7, 3.9, 4.0, 4.1, 8.0, 12.0, 13.0, 60.0]
     configs = [budget(m, Path("photos"), Path("run")) for m in minutes]

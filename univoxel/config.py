@@ -247,6 +247,7 @@ PRESETS = {
     "fast": Work(4.0, voxels=2.0, steps=1200, rays=2048),
     "full": Work(12.0, voxels=4.0, steps=4200, rays=2048),
 }
+HOLLOWS_MINUTES = 2.0  # up to which opening hollows costs more, in seconds, than it brings
 
 
 def preset(
@@ -340,6 +341,7 @@ def _configuration(
     work: Work, data: Path, out: Path, light: LightName, varying: Varying
 ) -> TrainConfig:
     minutes, voxels = work.minutes, round(work.voxels, 3)
+    hollows = minutes > HOLLOWS_MINUTES
     steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
     coarse = StageConfig(
         0.9, steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35), field="hash"
@@ -390,7 +392,7 @@ def _configuration(
                 stages,
                 minutes,
                 cameras="auto",
-                hollows=True,
+                hollows=hollows,
                 capacity="adaptive",
                 scene=scene,
             )
@@ -400,7 +402,7 @@ def _configuration(
             loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
             stages = (coarse, fine)
             return TrainConfig(
-                data, out, stages, minutes, cameras="auto", hollows=True, scene=scene, loss=loss
+                data, out, stages, minutes, cameras="auto", hollows=hollows, scene=scene, loss=loss
             )
         case _:
             names = ", ".join(("hybrid", *alone))
