@@ -60,9 +60,8 @@ def test_match_cost_equals_its_reference(radius, best):
     arguments = list(case())
     g = torch.Generator().manual_seed(1)
     arguments[0] = torch.rand(arguments[0].shape, generator=g)  # coverage of all kinds too
-    arguments[4] = arguments[4] + torch.randn(
-        len(arguments[4]), generator=g
-    )  # behind views as well
+    start = arguments[4]
+    arguments[4] = start + torch.randn(len(start), generator=g)  # behind views as well
     options = dict(step=STEP, steps=STEPS, most=0.3, radius=radius, best=best)
     found = match_cost(*arguments, **options)
     with use_backend("reference"):

@@ -109,7 +109,7 @@ def match_cost_reference(
             pictures[view].permute(2, 0, 1)[None], at[None], align_corners=False
         )[0].permute(1, 2, 0)
         off = (found[..., :3] / found[..., 3:] - color[:, None]).abs().mean(-1)
-        half = torch.tensor([0.5 / width, 0.5 / height]) * 2
+        half = at.new_tensor([1 / width, 1 / height])  # of a pixel: pictures are 2 wide
         inside = ((at >= half - 1) & (at < 1 - half)).all(-1) & (z > 0)
         seen = inside & (found[..., 3] >= 0.5)
         apart.append(torch.where(seen, off.clamp_max(most), most))
@@ -162,7 +162,7 @@ def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tenso
 def semi_global_reference(cost: Tensor, rows: Tensor, small: float, large: float) -> Tensor:
     """The same in eager torch, line after line."""
     there = rows >= 0
-    volume = torch.zeros(*rows.shape, cost.shape[1], dtype=cost.dtype)
+    volume = cost.new_zeros(*rows.shape, cost.shape[1])
     volume[there] = cost[rows[there]]
     total = torch.zeros_like(volume)
     for across in (False, True):
