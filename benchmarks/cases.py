@@ -343,6 +343,7 @@ def _table(views: int, side: int) -> tuple[Tensor, ...]:
     ground = torch.stack([2 * x, -2 * y], -1) + at[:, None, None]
     color = 0.5 + 0.2 * (torch.sin(9 * ground[..., :1]) + torch.sin(7 * ground[..., 1:]))
     pictures = torch.cat([color.expand(-1, -1, -1, 3), torch.ones(views, side, side, 1)], -1)
+    pictures = (255 * pictures).round().byte()
     f, c, matrix = side, side / 2, torch.zeros(views, 3, 4)
     matrix[:] = torch.tensor([[f, 0, -c, 2 * c], [0, -f, -c, 2 * c], [0, 0, -1, 2]])
     matrix[:, 0, 3] -= f * at[:, 0]
@@ -350,19 +351,19 @@ def _table(views: int, side: int) -> tuple[Tensor, ...]:
     count = side * side
     direction = torch.stack([x, -y, -torch.ones_like(x)], -1).reshape(-1, 3)
     origin = torch.tensor([0.0, 0.0, 2.0]).expand(count, 3).contiguous()
-    start, seen = torch.full((count,), 1.8), pictures[0, ..., :3].reshape(-1, 3)
+    start, seen = torch.full((count,), 1.8), pictures[0, ..., :3].reshape(-1, 3) / 255
     rows = torch.arange(count).view(side, side)
     return pictures, matrix, origin, direction, start, seen, rows, torch.arange(1, views)
 
 
 def match_cost(side: int = 100, steps: int = 48) -> Case:
-    *floating, rows, others = _table(9, side)
+    pictures, *floating, rows, others = _table(9, side)
 
     def ours(*tensors):
-        return ops.match_cost(*tensors, rows, others, 0.01, steps)
+        return ops.match_cost(pictures, *tensors, rows, others, 0.01, steps)
 
     def reference(*tensors):
-        return ops.match_cost_reference(*tensors, rows, others, 0.01, steps, 0.2, 1, 4)
+        return ops.match_cost_reference(pictures, *tensors, rows, others, 0.01, steps, 0.2, 1, 4)
 
     return Case(
         "match_cost",

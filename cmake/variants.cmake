@@ -13,7 +13,7 @@ function(add_core_variants)
     cmake_parse_arguments(ARG "" "" "BINDINGS;KERNELS" ${ARGN})
     # The compiler takes gathers to be slow unless told of a processor where they are not.
     if(CMAKE_SYSTEM_PROCESSOR MATCHES "x86_64|AMD64")
-        set_source_files_properties(csrc/integrator.cpp PROPERTIES
+        set_source_files_properties(csrc/integrator.cpp csrc/stereo.cpp PROPERTIES
             COMPILE_OPTIONS -mtune=icelake-server)
     endif()
     add_library(univoxel_bindings OBJECT ${ARG_BINDINGS})

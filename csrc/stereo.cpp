@@ -9,73 +9,73 @@
 namespace univoxel {
 namespace {
 
-constexpr int64_t kRaysPerChunk = 64;
+constexpr int64_t kRowsPerChunk = 16;  // of pixels; those next to a chunk are looked up twice
 constexpr int64_t kLinesPerChunk = 16;
 
-/// Where a ray runs in a picture: (x, y) = (a + t b) / (c + t d) pixels.
-struct Line {
+/// Differences [steps] of a pixel's colour, in units of 1/255, from another view's picture at
+/// points along its ray; `most` where that shows nothing.
+void differences(const Match& in, int64_t view, int64_t ray, float* out) {
+    // It runs in the picture along (x, y) = (a + t b) / (c + t d)
+    const float *m = in.matrix + 12 * view, *o = in.origin + 3 * ray, *d = in.direction + 3 * ray;
     float a[3], b[3];
-
-    Line(const float* m, const float* o, const float* d) {
-        for (int i = 0; i < 3; ++i, m += 4) {
-            a[i] = m[0] * o[0] + m[1] * o[1] + m[2] * o[2] + m[3];
-            b[i] = m[0] * d[0] + m[1] * d[1] + m[2] * d[2];
-        }
+    for (int i = 0; i < 3; ++i, m += 4) {
+        a[i] = m[0] * o[0] + m[1] * o[1] + m[2] * o[2] + m[3];
+        b[i] = m[0] * d[0] + m[1] * d[1] + m[2] * d[2];
     }
+    const int32_t *picture = in.pictures + view * in.H * in.W, *right_of = picture + 1,
+                  *below = picture + in.W, *beyond = below + 1;
+    const float red = 255 * in.color[3 * ray], green = 255 * in.color[3 * ray + 1],
+                blue = 255 * in.color[3 * ray + 2], start = in.start[ray], step = in.step,
+                most = in.most, right = in.W - 1, bottom = in.H - 1;
+    const int steps = in.steps, W = in.W;
+#pragma omp simd
+    for (int k = 0; k < steps; ++k) {
+        const float t = start + k * step, z = a[2] + t * b[2];
+        const float x = (a[0] + t * b[0]) / z - 0.5f, y = (a[1] + t * b[1]) / z - 0.5f;
+        const bool inside = (z > 0) & (x >= 0) & (y >= 0) & (x < right) & (y < bottom);
+        const float there_x = inside ? x : 0.f, there_y = inside ? y : 0.f;
+        const int i = static_cast<int>(there_x), j = static_cast<int>(there_y), at = j * W + i;
+        const float u = there_x - i, v = there_y - j;
+        const int32_t p = picture[at], q = right_of[at], r = below[at], s = beyond[at];
+        const auto mix = [&](int shift) {
+            const auto of = [&](int32_t c) { return static_cast<float>(c >> shift & 255); };
+            return (1 - v) * ((1 - u) * of(p) + u * of(q)) + v * ((1 - u) * of(r) + u * of(s));
+        };
+        const float cover = mix(24), share = cover / 255;
+        const float off = std::abs(mix(0) - share * red) + std::abs(mix(8) - share * green) +
+                          std::abs(mix(16) - share * blue);
+        out[k] = inside & (cover >= 127.5f) ? std::min(most, off / (3 * cover)) : most;
+    }
+}
+
+/// What a chunk of rows of pixels needs: the differences of some rows, and the sums over a window.
+struct Window {
+    explicit Window(const Match& in)
+        : sum(in.M * in.steps),
+          least(in.best * in.steps),
+          apart((2 * in.radius + 1) * in.M * in.W * in.steps) {}
+
+    std::vector<float> sum, least;  // [M, steps], [best, steps]
+    std::vector<float> apart;       // [2 radius + 1, M, W, steps]
 };
 
-/// Mean difference of a colour from a picture's at a point, `most` where that shows nothing.
-inline float difference(const float* picture, int64_t H, int64_t W, float x, float y,
-                        const float* color, float most) {
-    x -= 0.5f, y -= 0.5f;
-    if (!(x >= 0 && y >= 0 && x < W - 1 && y < H - 1)) return most;
-    const int64_t i = static_cast<int64_t>(x), j = static_cast<int64_t>(y);
-    const float u = x - i, v = y - j;
-    const float *p = picture + (j * W + i) * 4, *q = p + W * 4;
-    float c[4];
-    for (int k = 0; k < 4; ++k)
-        c[k] = (1 - v) * ((1 - u) * p[k] + u * p[4 + k]) + v * ((1 - u) * q[k] + u * q[4 + k]);
-    if (!(c[3] >= 0.5f)) return most;
-    float sum = 0;
-    for (int k = 0; k < 3; ++k) sum += std::abs(c[k] / c[3] - color[k]);
-    return std::min(most, sum / 3);
-}
-
-/// Differences [M, N, steps] from each of the other views.
-void differences(const Match& in, float* out, int threads) {
-    parallel_for(in.N, kRaysPerChunk, threads, [&](int64_t begin, int64_t end) {
-        for (int64_t m = 0; m < in.M; ++m) {
-            const int64_t view = in.others[m];
-            const float* picture = in.pictures + view * in.H * in.W * 4;
-            for (int64_t n = begin; n < end; ++n) {
-                const Line line(in.matrix + 12 * view, in.origin + 3 * n, in.direction + 3 * n);
-                float* o = out + (m * in.N + n) * in.steps;
-                for (int64_t k = 0; k < in.steps; ++k) {
-                    const float t = in.start[n] + k * in.step, z = line.a[2] + t * line.b[2];
-                    o[k] = z > 0 ? difference(picture, in.H, in.W, (line.a[0] + t * line.b[0]) / z,
-                                              (line.a[1] + t * line.b[1]) / z, in.color + 3 * n,
-                                              in.most)
-                                 : in.most;
-                }
+/// Means [steps] of the `best` lowest of M values of each step, which are lost.
+void mean_of_best(const Match& in, float* values, float scale, float* least, float* mean) {
+    std::fill(least, least + in.best * in.steps, HUGE_VALF);
+    for (int64_t m = 0; m < in.M; ++m)
+        for (int64_t j = 0; j < in.best; ++j) {  // lower ones stay, higher ones go on
+            float *value = values + m * in.steps, *low = least + j * in.steps;
+#pragma omp simd
+            for (int64_t k = 0; k < in.steps; ++k) {
+                const float here = value[k];
+                value[k] = std::max(low[k], here);
+                low[k] = std::min(low[k], here);
             }
         }
-    });
-}
-
-/// The mean of the `best` lowest of M numbers `stride` apart; `least` has room for as many.
-inline float mean_of_best(const float* values, int64_t M, int64_t stride, int64_t best,
-                          float* least) {
-    for (int64_t m = 0; m < M; ++m) {
-        const float value = values[m * stride];
-        int64_t at = std::min(m, best);
-        if (at == best && value >= least[best - 1]) continue;
-        at = std::min(at, best - 1);
-        for (; at > 0 && least[at - 1] > value; --at) least[at] = least[at - 1];
-        least[at] = value;
-    }
-    float sum = 0;
-    for (int64_t m = 0; m < best; ++m) sum += least[m];
-    return sum / best;
+    std::fill(mean, mean + in.steps, 0.f);
+    for (int64_t j = 0; j < in.best; ++j)
+        for (int64_t k = 0; k < in.steps; ++k) mean[k] += least[j * in.steps + k];
+    for (int64_t k = 0; k < in.steps; ++k) mean[k] *= scale / in.best;
 }
 
 /// Least costs along one path of pixels, `stride` apart in `rows`, added to `sum`.
@@ -109,34 +109,46 @@ void follow(const float* cost, const int64_t* rows, int64_t count, int64_t strid
 }  // namespace
 
 void match_cost(const Match& in, float* cost, int threads) {
-    std::vector<float> apart(in.M * in.N * in.steps);
-    differences(in, apart.data(), threads);
-    parallel_for(in.H, 1, threads, [&](int64_t begin, int64_t end) {
-        std::vector<float> mean(in.M * in.steps), least(in.best);
-        for (int64_t y = begin; y < end; ++y)
+    if (in.W < 2 || in.H < 2) {  // nothing lies between four pixels
+        std::fill(cost, cost + in.N * in.steps, in.most);
+        return;
+    }
+    const int64_t kept = 2 * in.radius + 1;
+    parallel_for(in.H, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
+        Window w(in);
+        const auto apart = [&](int64_t y, int64_t m) {
+            return w.apart.data() + (y % kept * in.M + m) * in.W * in.steps;
+        };
+        int64_t known = std::max<int64_t>(0, begin - in.radius);
+        for (int64_t y = begin; y < end; ++y) {
+            const int64_t top = std::max<int64_t>(0, y - in.radius);
+            const int64_t bottom = std::min(in.H - 1, y + in.radius);
+            for (; known <= bottom; ++known)
+                for (int64_t m = 0; m < in.M; ++m)
+                    for (int64_t x = 0; x < in.W; ++x) {
+                        const int64_t ray = in.rows[known * in.W + x];
+                        if (ray < 0) continue;
+                        differences(in, in.others[m], ray, apart(known, m) + x * in.steps);
+                    }
             for (int64_t x = 0; x < in.W; ++x) {
                 const int64_t row = in.rows[y * in.W + x];
                 if (row < 0) continue;
-                std::fill(mean.begin(), mean.end(), 0.f);
+                std::fill(w.sum.begin(), w.sum.end(), 0.f);
                 int64_t count = 0;
-                for (int64_t j = std::max<int64_t>(0, y - in.radius);
-                     j <= std::min(in.H - 1, y + in.radius); ++j)
+                for (int64_t j = top; j <= bottom; ++j)
                     for (int64_t i = std::max<int64_t>(0, x - in.radius);
                          i <= std::min(in.W - 1, x + in.radius); ++i) {
-                        const int64_t near = in.rows[j * in.W + i];
-                        if (near < 0) continue;
+                        if (in.rows[j * in.W + i] < 0) continue;
                         ++count;
                         for (int64_t m = 0; m < in.M; ++m) {
-                            const float* from = apart.data() + (m * in.N + near) * in.steps;
-                            float* to = mean.data() + m * in.steps;
+                            const float* from = apart(j, m) + i * in.steps;
+                            float* to = w.sum.data() + m * in.steps;
                             for (int64_t k = 0; k < in.steps; ++k) to[k] += from[k];
                         }
                     }
-                for (int64_t k = 0; k < in.steps; ++k)
-                    cost[row * in.steps + k] =
-                        mean_of_best(mean.data() + k, in.M, in.steps, in.best, least.data()) /
-                        count;
+                mean_of_best(in, w.sum.data(), 1.f / count, w.least.data(), cost + row * in.steps);
             }
+        }
     });
 }
 

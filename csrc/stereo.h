@@ -8,14 +8,14 @@ namespace univoxel {
 
 /// Arguments of match_cost; see univoxel/ops/stereo.py.
 struct Match {
-    const float* pictures;   // [V, H, W, 4] colour times coverage, coverage
-    const float* matrix;     // [V, 3, 4] world to (x z, y z, z) of pixels
-    const float* origin;     // [N, 3]
-    const float* direction;  // [N, 3]
-    const float* start;      // [N]
-    const float* color;      // [N, 3] what the pixels show
-    const int64_t* rows;     // [H, W] which of the N rays is a pixel's; -1: none
-    const int64_t* others;   // [M] views to compare with
+    const int32_t* pictures;  // [V, H, W] colour times coverage, coverage: bytes, red the lowest
+    const float* matrix;      // [V, 3, 4] world to (x z, y z, z) of pixels
+    const float* origin;      // [N, 3]
+    const float* direction;   // [N, 3]
+    const float* start;       // [N]
+    const float* color;       // [N, 3] what the pixels show
+    const int64_t* rows;      // [H, W] which of the N rays is a pixel's; -1: none
+    const int64_t* others;    // [M] views to compare with
     int64_t H, W, N, M, steps;
     float step, most;
     int64_t radius, best;

@@ -28,15 +28,16 @@ def pixel_rays(cameras: Cameras, view: Tensor, pixel: Tensor) -> Rays:
     """Rays through points of the pictures.
 
     Args:
-        view: [N] int64, which camera.
+        view: [N] int64, which camera; or [], one for all.
         pixel: [N, 2] x to the right and y down in pixels; pixel (column i, row j) has its centre at
             (i + 0.5, j + 0.5).
     """
     pose, focal, centre = cameras.camera_to_world[view], cameras.focal[view], cameras.centre[view]
     x, y = ((pixel - centre) / focal).unbind(-1)
     local = torch.stack([x, -y, -torch.ones_like(x)], -1)
-    direction = torch.einsum("nij,nj->ni", pose[:, :, :3], local)
-    return Rays(pose[:, :, 3], torch.nn.functional.normalize(direction, dim=-1))
+    direction = torch.einsum("...ij,...j->...i", pose[..., :3], local)
+    origin = pose[..., 3].expand_as(direction)
+    return Rays(origin, torch.nn.functional.normalize(direction, dim=-1))
 
 
 def image_rays(cameras: Cameras, view: int) -> Rays:
@@ -45,7 +46,7 @@ def image_rays(cameras: Cameras, view: int) -> Rays:
         torch.arange(cameras.height), torch.arange(cameras.width), indexing="ij"
     )
     pixel = torch.stack([column, row], -1).reshape(-1, 2) + 0.5
-    return pixel_rays(cameras, torch.full((len(pixel),), view), pixel)
+    return pixel_rays(cameras, torch.tensor(view), pixel)
 
 
 def project(cameras: Cameras, view: int, points: Tensor) -> tuple[Tensor, Tensor]:

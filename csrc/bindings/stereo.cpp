@@ -7,7 +7,7 @@ namespace univoxel {
 void bind_stereo_ops(py::module_& m) {
     m.def(
         "match_cost",
-        [](const array<float>& pictures, const array<float>& matrix, const array<float>& origin,
+        [](const array<int32_t>& pictures, const array<float>& matrix, const array<float>& origin,
            const array<float>& direction, const array<float>& start, const array<float>& color,
            const array<int64_t>& rows, const array<int64_t>& others, array<float>& cost, float step,
            float most, int64_t radius, int64_t best, int threads) {

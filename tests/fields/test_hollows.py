@@ -7,6 +7,7 @@ import torch
 from analytic import cameras_around, look_at
 
 from univoxel.camera import Cameras, image_rays
+from univoxel.fields import hollows
 from univoxel.fields.hollows import hollowed
 from univoxel.fields.hull import fit_grid, mask_distances, visual_hull
 
@@ -44,7 +45,7 @@ def mirrored(point, normal, wo):
 
 
 def photographed(shape, look, cameras):
-    """Pictures [V, H, W, 4] by sphere tracing."""
+    """Pictures [V, H, W, 4] in bytes by sphere tracing."""
     pictures = []
     for view in range(len(cameras)):
         rays = image_rays(cameras, view)
@@ -55,7 +56,8 @@ def photographed(shape, look, cameras):
         hit = (shape(point).abs() < 2e-3)[:, None].float()
         color = look(point, torch.nn.functional.normalize(normal, dim=-1), -rays.direction)
         pictures.append(torch.cat([color * hit, hit], 1).nan_to_num(0.0))
-    return torch.stack(pictures).view(len(cameras), cameras.height, cameras.width, 4)
+    pictures = (255 * torch.stack(pictures)).round().byte()
+    return pictures.view(len(cameras), cameras.height, cameras.width, 4)
 
 
 @cache
@@ -70,13 +72,19 @@ def from_above(views=VIEWS):
 
 
 @cache
+def hull_of(shape, look, cameras):
+    """What `hollowed` takes."""
+    pictures = photographed(shape, look, cameras)
+    distance = mask_distances(pictures[..., 3] / 255)
+    grid = fit_grid(torch.full((3,), -0.6), torch.full((3,), 0.6), 40_000)
+    return visual_hull(distance, cameras, grid), grid, pictures, cameras
+
+
+@cache
 def opened(shape, look, cameras):
     """The hull's SDF, what became of it, and the shape's own, on the same nodes."""
-    pictures = photographed(shape, look, cameras)
-    distance = mask_distances(pictures[..., 3].contiguous())
-    grid = fit_grid(torch.full((3,), -0.6), torch.full((3,), 0.6), 40_000)
-    hull = visual_hull(distance, cameras, grid)
-    return hull, hollowed(hull, grid, pictures, cameras), shape(grid.nodes()), grid.voxel_size
+    hull, grid, *photos = hull_of(shape, look, cameras)
+    return hull, hollowed(hull, grid, *photos), shape(grid.nodes()), grid.voxel_size
 
 
 def test_a_pit_is_opened():
@@ -105,6 +113,34 @@ def test_what_photographs_cannot_tell_stays(look):
     assert (found[solid] < 0).float().mean() > 0.99
     if look is not mirrored:
         assert torch.equal(found, hull)
+
+
+@pytest.mark.parametrize(
+    ("rule", "strict"),
+    [("AGREE", 1.0), ("LEAST", 1.0), ("HALF", 1.0), ("BETTER", 1.0), ("PIECE", 0.2)],
+)
+def test_each_rule_can_keep_the_pit_closed(monkeypatch, rule, strict):
+    monkeypatch.setattr(hollows, rule, strict)
+    case = hull_of(with_pit, checks, from_above())
+    assert torch.equal(hollowed(*case), case[0])
+
+
+@cache
+def mostly_from_below():
+    """A sixth of the cameras see into the pit."""
+    cameras = from_above()
+    low = torch.arange(VIEWS) < VIEWS * 5 // 6
+    at = cameras.camera_to_world[:, :, 3]
+    at = torch.where(low[:, None], at * torch.tensor([1.0, 1.0, -1.0]), at)
+    return Cameras(torch.stack([look_at(p) for p in at]), cameras.focal, cameras.centre, SIZE, SIZE)
+
+
+def test_what_few_views_see_through_stays(monkeypatch):
+    """They may all look at a lamp in something glossy."""
+    case = hull_of(with_pit, checks, mostly_from_below())
+    assert torch.equal(hollowed(*case), case[0])
+    monkeypatch.setattr(hollows, "LEAST", 0.1)
+    assert not torch.equal(hollowed(*case), case[0])
 
 
 def test_two_views_open_nothing():

@@ -14,6 +14,10 @@ SIZE, VIEWS, STEP, STEPS = 24, 5, 0.1, 7
 TRUE = 3  # the step that the surface lies at
 
 
+def bytes_of(pictures):
+    return (255 * pictures).round().byte()
+
+
 def texture(point):
     """Colours [..., 3] that change over space as slowly as pixels can show."""
     return 0.5 + 0.3 * torch.sin(6 * point + torch.tensor([0.0, 1.0, 2.0]))
@@ -37,11 +41,11 @@ def case(holes=True, seed=0):
         color = texture(rays.origin + t[:, None] * rays.direction)
         pictures.append(torch.cat([color, torch.ones(len(t), 1)], 1))
         starts.append(t - TRUE * STEP)
-    pictures = torch.stack(pictures).view(VIEWS, SIZE, SIZE, 4)
+    pictures = bytes_of(torch.stack(pictures)).view(VIEWS, SIZE, SIZE, 4)
     inside = torch.rand(SIZE * SIZE, generator=g) < (0.8 if holes else 2)
     rows = torch.where(inside, inside.long().cumsum(0) - 1, -1).view(SIZE, SIZE)
     rays = image_rays(cameras, 0)
-    color = pictures[0].flatten(0, 1)[inside, :3]
+    color = pictures[0].flatten(0, 1)[inside, :3] / 255
     lines = rays.origin[inside], rays.direction[inside], starts[0][inside], color
     return pictures, _projections(cameras), *lines, rows, torch.arange(1, VIEWS)
 
@@ -59,7 +63,8 @@ def test_projections_are_those_of_the_cameras():
 def test_match_cost_equals_its_reference(radius, best):
     arguments = list(case())
     g = torch.Generator().manual_seed(1)
-    arguments[0] = torch.rand(arguments[0].shape, generator=g)  # coverage of all kinds too
+    # Coverage of all kinds too
+    arguments[0] = bytes_of(torch.rand(arguments[0].shape, generator=g))
     start = arguments[4]
     arguments[4] = start + torch.randn(len(start), generator=g)  # behind views as well
     options = dict(step=STEP, steps=STEPS, most=0.3, radius=radius, best=best)
@@ -80,10 +85,17 @@ def test_photographs_agree_where_the_surface_is():
 
 def test_a_view_that_sees_nothing_there_disagrees_most():
     pictures, *others = case(holes=False)
-    for value in (0.0, torch.nan):
-        pictures[1:, ..., 3] = value
-        cost = match_cost(pictures, *others, STEP, 2)
-        torch.testing.assert_close(cost, torch.full_like(cost, 0.2))
+    pictures[1:, ..., 3] = 0
+    cost = match_cost(pictures, *others, STEP, 2)
+    torch.testing.assert_close(cost, torch.full_like(cost, 0.2))
+
+
+def test_views_of_one_line_of_pixels_see_nothing():
+    pictures, *others, rows, views = case(holes=False)
+    cost = match_cost(
+        pictures[:, :1], *others[:1], *(x[:SIZE] for x in others[1:]), rows[:1], views, STEP, 2
+    )
+    torch.testing.assert_close(cost, torch.full_like(cost, 0.2))
 
 
 def volume(seed=0, holes=True):
@@ -138,7 +150,10 @@ def test_the_same_bits_on_any_number_of_threads():
         (dict(others=torch.tensor([1, 2, 3, VIEWS])), r"others must lie in \[0, 5\)"),
         (dict(rows=torch.zeros(SIZE, SIZE, dtype=torch.int64)), "rows must name each of the"),
         (dict(start=torch.zeros(3)), r"start must be \[N\]"),
-        (dict(pictures=torch.zeros(VIEWS, SIZE, SIZE, 3)), r"pictures must be \[V, H, W, 4\]"),
+        (
+            dict(pictures=torch.zeros(VIEWS, SIZE, SIZE, 3, dtype=torch.uint8)),
+            r"pictures must be \[V, H, W, 4\]",
+        ),
     ],
 )
 def test_match_cost_refuses(change, message):

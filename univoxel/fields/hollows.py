@@ -32,7 +32,7 @@ BETTER = 0.1  # share of a pixel's disagreement that has to go with it ...
 VISIBLE = 0.002  # ... and how much at least: half a step of 8 bits
 HALF = 0.5  # share of the pixels that see through for which it does ...
 AROUND = 2.0  # ... within so many voxels
-PIECE = 2e-3  # share of the hull that a hollow has at least
+PIECE = 5e-4  # share of the hull that a hollow has at least
 ROUNDS = 3  # in which silhouettes are covered again
 
 
@@ -43,7 +43,7 @@ def hollowed(hull: Tensor, grid: GridShape, pictures: Tensor, cameras: Cameras) 
     Args:
         hull: [X, Y, Z] world units, negative inside.
         grid: of the hull.
-        pictures: [V, H, W, 4] float32 sRGB colours times coverage, and coverage.
+        pictures: [V, H, W, 4] uint8 sRGB colours times coverage, and coverage.
         cameras: V, of the pictures' size; three or more, or nothing is opened.
 
     Returns:
@@ -77,7 +77,7 @@ def hollowed(hull: Tensor, grid: GridShape, pictures: Tensor, cameras: Cameras) 
 
     agreed &= around(better) > HALF * around(free)
     taken = torch.zeros_like(solid).masked_scatter(solid, agreed)
-    covered = [c > 0.9 for c in pictures[..., 3]]
+    covered = pictures[..., 3] > 0.9 * 255
     for _ in range(ROUNDS):
         taken = _large(taken, ~solid, PIECE * len(nodes))
         if not taken.any():
@@ -113,10 +113,10 @@ def _depth_maps(
     toward = normalize(cameras.camera_to_world[:, :, 3] - looked_at(cameras), dim=1)
     alike = (toward @ toward.T).fill_diagonal_(-2.0)
     for view in range(len(cameras)):
-        inside = (pictures[view, :, :, 3] > 0.5) & start[view].isfinite()
+        inside = (pictures[view, :, :, 3] >= 128) & start[view].isfinite()
         rows = torch.where(inside, inside.flatten().cumsum(0).view(inside.shape) - 1, -1)
         rays, met = image_rays(cameras, view), start[view][inside]
-        color = pictures[view][inside]
+        color = pictures[view][inside].float()
         of_pixels = color[:, :3] / color[:, 3:], rows
         lines = pictures, matrix, rays.origin[inside.flatten()], rays.direction[inside.flatten()]
         near = alike[view].topk(min(2 * OTHERS, len(cameras) - 1)).indices

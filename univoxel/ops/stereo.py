@@ -33,11 +33,11 @@ def match_cost(
     window of pixels of one k, and over the `best` views that agree most: others may not see it.
 
     Args:
-        pictures: [V, H, W, 4] float32 colours times coverage, and coverage.
+        pictures: [V, H, W, 4] uint8 colours times coverage, and coverage.
         matrix: [V, 3, 4] float32 world to (x z, y z, z): pixels from the top left corner, depth.
         origin, direction: [N, 3] float32 rays of the pixels.
         start: [N] float32 where they start.
-        color: [N, 3] float32 straight colours of the pixels.
+        color: [N, 3] float32 straight colours of the pixels, in [0, 1].
         rows: [H, W] int64 which ray is a pixel's; -1: none.
         others: [M] int64 views to compare with.
         step: between points, world units where directions are unit.
@@ -53,7 +53,7 @@ def match_cost(
     """
     sizes = check(
         "match_cost",
-        pictures=(pictures, "V H W 4", torch.float32),
+        pictures=(pictures, "V H W 4", torch.uint8),
         matrix=(matrix, "V 3 4", torch.float32),
         origin=(origin, "N 3", torch.float32),
         direction=(direction, "N 3", torch.float32),
@@ -72,10 +72,11 @@ def match_cost(
             f"match_cost: steps must be at least 1 and radius at least 0, got {steps} and {radius}"
         )
     rays = (origin, direction, start, color, rows, others)
-    if not native.serves(pictures):
+    if not native.serves(start):
         return match_cost_reference(pictures, matrix, *rays, step, steps, most, radius, best)
-    cost = pictures.new_empty(sizes["N"], steps)
-    tensors = [t.contiguous() for t in (pictures, matrix, *rays)]
+    cost = start.new_empty(sizes["N"], steps)
+    pixels = pictures.contiguous().view(torch.int32)[..., 0]
+    tensors = [t.contiguous() for t in (pixels, matrix, *rays)]
     native.require().match_cost(
         *native.arrays(*tensors, cost), step, most, radius, best, native.threads()
     )
@@ -106,7 +107,7 @@ def match_cost_reference(
         x, y, z = (point @ matrix[view, :, :3].T + matrix[view, :, 3]).unbind(-1)
         at = torch.stack([x / z / width, y / z / height], -1) * 2 - 1
         found = torch.nn.functional.grid_sample(
-            pictures[view].permute(2, 0, 1)[None], at[None], align_corners=False
+            pictures[view].permute(2, 0, 1)[None].float() / 255, at[None], align_corners=False
         )[0].permute(1, 2, 0)
         off = (found[..., :3] / found[..., 3:] - color[:, None]).abs().mean(-1)
         half = at.new_tensor([1 / width, 1 / height])  # of a pixel: pictures are 2 wide

@@ -192,7 +192,7 @@ def pictures_of(photos: Photos, cameras: Cameras, voxel_size: float) -> tuple[Te
         color, alpha = photos.picture(view)
         premultiplied = torch.cat([linear_to_srgb(color) * alpha[..., None], alpha[..., None]], 2)
         shrunk = torch.nn.functional.avg_pool2d(premultiplied.permute(2, 0, 1), factor)
-        pictures.append(shrunk.permute(1, 2, 0))
+        pictures.append((255 * shrunk.permute(1, 2, 0)).round().byte())
     height, width = pictures[0].shape[:2]
     pose, focal, centre = cameras.camera_to_world[some], cameras.focal[some], cameras.centre[some]
     return torch.stack(pictures), Cameras(pose, focal / factor, centre / factor, width, height)
