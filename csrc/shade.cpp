@@ -81,9 +81,9 @@ struct Sample {
     Frame<T> frame;
     LocalBrdf<T, F0> brdf;
 
-    Sample(const Shade<T>& in, int64_t i, const F0& f0)
-        : frame(load3(in.normal, i)),
-          brdf(local(load3(in.wo, i)), load3(in.albedo, i), in.roughness[i], f0) {}
+    Sample(const Shade<T>& in, int64_t i, const F0& f0) : Sample(in, i, f0, load3(in.albedo, i)) {}
+    Sample(const Shade<T>& in, int64_t i, const F0& f0, const vec3<T>& albedo)
+        : frame(load3(in.normal, i)), brdf(local(load3(in.wo, i)), albedo, in.roughness[i], f0) {}
 
     vec3<T> local(const vec3<T>& w) const {
         return {glm::dot(frame.tangent, w), glm::dot(frame.bitangent, w),
@@ -266,6 +266,19 @@ struct MapReader {
 }  // namespace
 
 template <class T>
+void specular_response(const Shade<T>& in, T* response, int threads) {
+    const Rows3<T> world = world_directions(in);
+    parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
+        Directions<T> dir(in.n_directions);
+        for (int64_t i = begin; i < end; ++i) {
+            look(Sample<T, T>(in, i, *in.f0, vec3<T>(0)), world, dir);
+            T* out = response + i * in.n_directions;
+            for (int64_t d = 0; d < in.n_directions; ++d) out[d] = in.solid_angle * dir.layer[d];
+        }
+    });
+}
+
+template <class T>
 void shade_radiance_forward(const Shade<T>& in, const T* radiance, T* rgb, int threads) {
     const Rows3<T> world = world_directions(in);
     const int64_t D = in.n_directions;
@@ -375,6 +388,8 @@ void shade_map_backward(const Shade<T>& in, const MapLight<T>& light, const T* g
     }
 }
 
+template void specular_response(const Shade<float>&, float*, int);
+template void specular_response(const Shade<double>&, double*, int);
 template void shade_radiance_forward(const Shade<float>&, const float*, float*, int);
 template void shade_radiance_forward(const Shade<double>&, const double*, double*, int);
 template void shade_radiance_backward(const Shade<float>&, const float*, const float*,

@@ -36,6 +36,11 @@ struct ShadeGrad {
     T *light, *normal, *albedo, *roughness, *f0;
 };
 
+/// response [N, D] = solid_angle D F V max(n.w_d, 0), the specular layer alone for F0 = *f0; albedo
+/// may be null.
+template <class T>
+void specular_response(const Shade<T>& in, T* response, int threads);
+
 /// rgb [N, 3] = solid_angle sum_d radiance_nd f(w_d, wo_n) max(n.w_d, 0); radiance [N, D, 3].
 template <class T>
 void shade_radiance_forward(const Shade<T>& in, const T* radiance, T* rgb, int threads);

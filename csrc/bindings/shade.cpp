@@ -78,6 +78,29 @@ void bind_shade_radiance(py::module_& m) {
 }
 
 template <class T>
+void bind_specular_response(py::module_& m) {
+    m.def(
+        "specular_response",
+        [](const array<T>& normal, const array<T>& wo, const array<T>& roughness,
+           const array<T>& directions, array<T>& response, double f0, double solid_angle,
+           int threads) {
+            const int64_t n = roughness.size(), d = directions.size() / 3;
+            require(normal.size() == 3 * n && wo.size() == 3 * n && response.size() == n * d,
+                    "specular_response: sizes do not fit");
+            const T reflectance = T(f0);
+            const Shade<T> in{normal.data(),     wo.data(),    nullptr, roughness.data(),
+                              directions.data(), &reflectance, n,       d,
+                              T(solid_angle),    false};
+            T* out = response.mutable_data();
+            py::gil_scoped_release nogil;
+            specular_response(in, out, threads);
+        },
+        py::arg("normal").noconvert(), py::arg("wo").noconvert(), py::arg("roughness").noconvert(),
+        py::arg("directions").noconvert(), py::arg("response").noconvert(), py::arg("f0"),
+        py::arg("solid_angle"), py::arg("threads"));
+}
+
+template <class T>
 using Fractions = std::variant<array<uint8_t>, array<T>>;
 template <class T>
 using Halves = std::variant<array<uint16_t>, array<T>>;
@@ -153,6 +176,8 @@ void bind_shade_map(py::module_& m) {
 }  // namespace
 
 void bind_shade_ops(py::module_& m) {
+    bind_specular_response<float>(m);
+    bind_specular_response<double>(m);
     bind_shade_radiance<float>(m);
     bind_shade_radiance<double>(m);
     bind_shade_map<float>(m);

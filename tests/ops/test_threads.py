@@ -43,6 +43,12 @@ def shade_radiance():
     return rgb, [radiance, n, albedo, roughness, f0]
 
 
+def specular_response():
+    n, wo = unit(N, grad=False), unit(N, seed=1, grad=False)
+    rows = ops.specular_response(n, wo, torch.full((N,), 0.4), sphere.fibonacci_sphere(16), 0.1)
+    return rows, []
+
+
 def march():
     x = torch.linspace(-1, 1, 40)
     sdf = torch.stack(torch.meshgrid(x, x, x, indexing="ij"), -1).norm(dim=-1) - 0.6
@@ -56,7 +62,7 @@ def march():
     return (least, samples.t, samples.connected, samples.offsets), []
 
 
-@pytest.mark.parametrize("op", [composite, shade_sg, shade_radiance, march])
+@pytest.mark.parametrize("op", [composite, shade_sg, shade_radiance, specular_response, march])
 def test_same_bits(op):
     before, runs = torch.get_num_threads(), []
     try:

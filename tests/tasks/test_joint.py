@@ -146,6 +146,12 @@ def test_the_gradient_is_that_of_the_cost_at_fixed_weights(rows_and_map):
     assert tie.own[1, 3].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
 
 
+@pytest.mark.parametrize(("count", "size"), [(30, 12), (3, 10), (5, 1), (0, 4)])
+def test_gram_is_the_product_with_the_transpose(count, size):
+    rows = torch.randn(count, size, dtype=torch.float64)
+    torch.testing.assert_close(equations.gram(rows), rows.T @ rows)
+
+
 def test_slope_is_the_derivative_of_the_curve():
     x = torch.tensor([0.0, 0.001, 0.00313, 0.0032, 0.1, 0.9, 3.0], dtype=torch.float64)
     x.requires_grad_()

@@ -8,6 +8,7 @@ from univoxel.ops.integrator import EnvTables, Lamp, Sun, relight
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.mlp import mlp, mlp_reference
 from univoxel.ops.native import use_backend
+from univoxel.ops.response import specular_response, specular_response_reference
 from univoxel.ops.sg import shade_sg, shade_sg_reference
 from univoxel.ops.shade import (
     shade_map,
@@ -68,5 +69,7 @@ __all__ = [
     "shade_sg_reference",
     "smooth_rows_",
     "smooth_rows_reference_",
+    "specular_response",
+    "specular_response_reference",
     "use_backend",
 ]

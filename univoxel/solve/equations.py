@@ -109,7 +109,7 @@ def normal_equations(
         tie = torch.einsum("pvd,pv->pd", jacobian, self_)
         g = (self_ * r).sum(1)
         flat, low = jacobian.flatten(0, 1), tie / n.sqrt()[:, None]
-        hessian.append(flat.T @ flat - low.T @ low)
+        hessian.append(gram(flat) - gram(low))
         gradient.append(r.flatten() @ flat - (g / n) @ tie)
         cross.append(tie)
         own.append(g)
@@ -117,6 +117,17 @@ def normal_equations(
         cost += r.square().sum().item()
     tie = Tie(torch.stack(cross), torch.stack(own), torch.stack(norm), cost)
     return torch.stack(hessian), torch.stack(gradient), tie
+
+
+def gram(rows: Tensor) -> Tensor:
+    """rows.T @ rows: [N, M] -> [M, M]. Symmetric: five eighths of it are computed."""
+    size = rows.shape[1]
+    result = rows.new_empty(size, size)
+    for first in range(0, size, step := -(-size // 4)):
+        part, rest = slice(first, first + step), slice(first + step, None)
+        result[part, first:] = rows[:, part].T @ rows[:, first:]
+        result[rest, part] = result[part, rest].T
+    return result
 
 
 def view_equations(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from univoxel import brdf
 from univoxel.config import JointConfig
+from univoxel.ops import specular_response
 from univoxel.scene import Scene
 from univoxel.solve.equations import (
     Rows,
@@ -156,14 +157,17 @@ def views_step(scene: Scene, hessian: Tensor, gradient: Tensor, smooth: float) -
 def light_rows(problem: Problem, point: Tensor, sighting: Tensor, roughness: Tensor) -> Rows:
     """Rows for points [P], all of metal or none, sightings [P, V] and roughness [P]."""
     transport, seen = problem.transport, problem.seen
+    count, views = sighting.shape
     normal, wo = seen.normal[point][:, None], seen.wo[sighting]
     cosine = (normal @ transport.direction.T).clamp_min(0) * problem.solid_angle  # [P, 1, D]
     share = transport.open[point].float()[:, None] / 255
     blocked = transport.indirect[point].float()  # [P, D, 3]
 
-    def layer(f0: float) -> Tensor:
-        directions = normal[:, :, None], wo[:, :, None], transport.direction
-        return cosine * brdf.specular(*directions, roughness[:, None, None], f0)  # [P, V, D]
+    def layer(f0: float) -> Tensor:  # [P, V, D]
+        of_sightings = normal.expand_as(wo).flatten(0, 1), wo.flatten(0, 1)
+        rough = roughness.repeat_interleave(views)
+        options = transport.direction, problem.solid_angle, f0
+        return specular_response(*of_sightings, rough, *options).view(count, views, -1)
 
     if problem.metal[point].any():
         shine = layer(0.0)

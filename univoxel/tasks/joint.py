@@ -28,7 +28,9 @@ from univoxel.solve.start import STEPS, TRIALS, TRIED, supposed
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.progress import Progress
 
-NEWTON_COST = 2.7  # of a sighting in a Newton step, over one in a step of Adam; measured
+# Of a sighting in a Newton step over one in a step of Adam, with trials and the search for metals;
+# measured
+NEWTON_COST = 4.7
 LEAST_POINTS = 2000  # on a machine however slow
 
 
