@@ -11,7 +11,7 @@ import peers
 import torch
 from torch import Tensor
 
-from univoxel import ops
+from univoxel import ops, sphere
 
 RAYS, SAMPLES = 4096, 64  # per ray: 262,144 samples
 POINTS, LOBES, DIRECTIONS = 4096, 16, 256
@@ -332,6 +332,22 @@ def diffuse_rows(rows: int = 130_000, passes: int = 4) -> Case:
     )
 
 
+def specular_response(sightings: int = 2048, directions: int = 512) -> Case:
+    g = torch.Generator().manual_seed(0)
+    normal, wo = torch.nn.functional.normalize(torch.randn(2, sightings, 3, generator=g), dim=-1)
+    roughness = 0.2 + 0.7 * torch.rand(sightings, generator=g)
+    inputs = normal, wo, roughness, sphere.fibonacci_sphere(directions)
+    angle = 4 * math.pi / directions
+    return Case(
+        "specular_response",
+        f"{sightings:,} sightings, {directions} directions",
+        lambda *tensors: ops.specular_response(*tensors, angle),
+        lambda *tensors: ops.specular_response_reference(*tensors, angle),
+        inputs,
+        {"read": 4.0 * sightings * directions},  # written
+    )
+
+
 def _table(views: int, side: int) -> tuple[Tensor, ...]:
     """Cameras beside one another that look down on a painted table at z = 0 from z = 2: pictures,
     matrices; origins, directions, starts, colours and rows of the first one's pixels; the others.
@@ -406,6 +422,7 @@ CASES: list[tuple[str, Callable[[], Case]]] = [
     ("smooth_rows_", smooth_rows),
     ("smooth_rows_", lambda: smooth_rows(channels=12, order=1)),
     ("diffuse_rows_", diffuse_rows),
+    ("specular_response", specular_response),
     ("match_cost", match_cost),
     ("semi_global", semi_global),
 ]

@@ -12,8 +12,8 @@ namespace {
 constexpr int64_t kRowsPerChunk = 16;  // of pixels; those next to a chunk are looked up twice
 constexpr int64_t kLinesPerChunk = 16;
 
-/// Differences [steps] of a pixel's colour, in units of 1/255, from another view's picture at
-/// points along its ray; `most` where that shows nothing.
+/// Differences [steps] of a pixel's colour from another view's picture at points along its ray;
+/// `most` where that shows nothing.
 void differences(const Match& in, int64_t view, int64_t ray, float* out) {
     // It runs in the picture along (x, y) = (a + t b) / (c + t d)
     const float *m = in.matrix + 12 * view, *o = in.origin + 3 * ray, *d = in.direction + 3 * ray;
@@ -48,18 +48,54 @@ void differences(const Match& in, int64_t view, int64_t ray, float* out) {
     }
 }
 
-/// What a chunk of rows of pixels needs: the differences of some rows, and the sums over a window.
-struct Window {
-    explicit Window(const Match& in)
-        : sum(in.M * in.steps),
-          least(in.best * in.steps),
-          apart((2 * in.radius + 1) * in.M * in.W * in.steps) {}
+/// Differences of the last 2 radius + 1 rows of pixels: as many as a window needs.
+class LastRows {
+  public:
+    explicit LastRows(const Match& in)
+        : in_(in), kept_(2 * in.radius + 1), buffer_(kept_ * in.M * in.W * in.steps) {}
 
-    std::vector<float> sum, least;  // [M, steps], [best, steps]
-    std::vector<float> apart;       // [2 radius + 1, M, W, steps]
+    void look_up(int64_t y) {
+        for (int64_t m = 0; m < in_.M; ++m)
+            for (int64_t x = 0; x < in_.W; ++x) {
+                const int64_t ray = in_.rows[y * in_.W + x];
+                if (ray >= 0) differences(in_, in_.others[m], ray, at(y, m, x));
+            }
+    }
+
+    /// Sums [M, steps] over the window around a pixel; returns how many pixels with a ray it has.
+    int64_t sum_around(int64_t y, int64_t x, float* sum) {
+        std::fill(sum, sum + in_.M * in_.steps, 0.f);
+        int64_t count = 0;
+        for (int64_t j = first(y); j <= last(y, in_.H); ++j)
+            for (int64_t i = first(x); i <= last(x, in_.W); ++i) {
+                if (in_.rows[j * in_.W + i] < 0) continue;
+                ++count;
+                for (int64_t m = 0; m < in_.M; ++m) {
+                    const float* from = at(j, m, i);
+                    float* to = sum + m * in_.steps;
+                    for (int64_t k = 0; k < in_.steps; ++k) to[k] += from[k];
+                }
+            }
+        return count;
+    }
+
+    /// The ends of a window around a pixel.
+    int64_t first(int64_t pixel) const { return std::max<int64_t>(0, pixel - in_.radius); }
+    int64_t last(int64_t pixel, int64_t count) const {
+        return std::min(count - 1, pixel + in_.radius);
+    }
+
+  private:
+    float* at(int64_t y, int64_t m, int64_t x) {
+        return buffer_.data() + ((y % kept_ * in_.M + m) * in_.W + x) * in_.steps;
+    }
+
+    const Match& in_;
+    int64_t kept_;
+    std::vector<float> buffer_;  // [kept, M, W, steps]
 };
 
-/// Means [steps] of the `best` lowest of M values of each step, which are lost.
+/// Means [steps], times `scale`, of the `best` lowest of M values of each step, which are lost.
 void mean_of_best(const Match& in, float* values, float scale, float* least, float* mean) {
     std::fill(least, least + in.best * in.steps, HUGE_VALF);
     for (int64_t m = 0; m < in.M; ++m)
@@ -113,40 +149,17 @@ void match_cost(const Match& in, float* cost, int threads) {
         std::fill(cost, cost + in.N * in.steps, in.most);
         return;
     }
-    const int64_t kept = 2 * in.radius + 1;
     parallel_for(in.H, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Window w(in);
-        const auto apart = [&](int64_t y, int64_t m) {
-            return w.apart.data() + (y % kept * in.M + m) * in.W * in.steps;
-        };
-        int64_t known = std::max<int64_t>(0, begin - in.radius);
+        LastRows window(in);
+        std::vector<float> sum(in.M * in.steps), least(in.best * in.steps);
+        int64_t known = window.first(begin);
         for (int64_t y = begin; y < end; ++y) {
-            const int64_t top = std::max<int64_t>(0, y - in.radius);
-            const int64_t bottom = std::min(in.H - 1, y + in.radius);
-            for (; known <= bottom; ++known)
-                for (int64_t m = 0; m < in.M; ++m)
-                    for (int64_t x = 0; x < in.W; ++x) {
-                        const int64_t ray = in.rows[known * in.W + x];
-                        if (ray < 0) continue;
-                        differences(in, in.others[m], ray, apart(known, m) + x * in.steps);
-                    }
+            while (known <= window.last(y, in.H)) window.look_up(known++);
             for (int64_t x = 0; x < in.W; ++x) {
-                const int64_t row = in.rows[y * in.W + x];
-                if (row < 0) continue;
-                std::fill(w.sum.begin(), w.sum.end(), 0.f);
-                int64_t count = 0;
-                for (int64_t j = top; j <= bottom; ++j)
-                    for (int64_t i = std::max<int64_t>(0, x - in.radius);
-                         i <= std::min(in.W - 1, x + in.radius); ++i) {
-                        if (in.rows[j * in.W + i] < 0) continue;
-                        ++count;
-                        for (int64_t m = 0; m < in.M; ++m) {
-                            const float* from = apart(j, m) + i * in.steps;
-                            float* to = w.sum.data() + m * in.steps;
-                            for (int64_t k = 0; k < in.steps; ++k) to[k] += from[k];
-                        }
-                    }
-                mean_of_best(in, w.sum.data(), 1.f / count, w.least.data(), cost + row * in.steps);
+                const int64_t ray = in.rows[y * in.W + x];
+                if (ray < 0) continue;
+                const int64_t count = window.sum_around(y, x, sum.data());
+                mean_of_best(in, sum.data(), 1.f / count, least.data(), cost + ray * in.steps);
             }
         }
     });

@@ -8,6 +8,7 @@ from sightings import COUNT, NODES, photographed, sphere_of
 
 from univoxel import losses
 from univoxel.config import JointConfig
+from univoxel.solve import metals
 from univoxel.solve.equations import CAUCHY
 from univoxel.solve.metals import ASKED, METAL_BASE, evidence, find_metal, fitted
 
@@ -78,3 +79,15 @@ def test_fitted_finds_the_best_base_within_its_bounds():
         assert cost[p] < 1.5 * best + 1e-5
     held = fitted(constant, slope, torch.zeros(6, 5, 3), METAL_BASE)
     assert (held > fitted(constant, slope, torch.zeros(6, 5, 3), 0.0)).all()
+
+
+def test_metal_takes_stronger_evidence_while_the_map_is_wrong(monkeypatch):
+    ratios = torch.tensor([-0.5, -0.3, -0.2, -0.1, 0.4])
+    monkeypatch.setattr(metals, "evidence", lambda *_: ratios)
+    scene, problem = sphere_of((0.9, 0.6, 0.4), 0.0, 0.5)
+    at_first, half_way, in_the_end = (
+        find_metal(scene, problem, CFG, done).tolist() for done in (0.0, 0.5, 1.0)
+    )
+    assert at_first == [True, False, False, False, False]
+    assert half_way == [True, True, False, False, False]
+    assert in_the_end == [True, True, True, False, False]

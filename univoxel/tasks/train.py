@@ -58,7 +58,7 @@ from univoxel.tasks.timelapse import Timelapse
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
-HOLLOWS_VIEWS = 100  # photographs at most that say what is hollow: a tenth of a second each
+HOLLOWS_VIEWS = 100  # photographs at most that say what is hollow: 0.07 seconds each
 RETRACE = 100  # steps after which light is traced through the surface as it has become
 RATES = ("lr_sdf", "lr_features", "lr_networks")
 MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silhouette's fringe
