@@ -107,7 +107,7 @@ def match_cost_reference(
         x, y, z = (point @ matrix[view, :, :3].T + matrix[view, :, 3]).unbind(-1)
         at = torch.stack([x / z / width, y / z / height], -1) * 2 - 1
         found = torch.nn.functional.grid_sample(
-            pictures[view].permute(2, 0, 1)[None].float() / 255, at[None], align_corners=False
+            pictures[view].permute(2, 0, 1)[None].to(at) / 255, at[None], align_corners=False
         )[0].permute(1, 2, 0)
         off = (found[..., :3] / found[..., 3:] - color[:, None]).abs().mean(-1)
         half = at.new_tensor([1 / width, 1 / height])  # of a pixel: pictures are 2 wide
