@@ -98,6 +98,13 @@ def test_views_of_one_line_of_pixels_see_nothing():
     torch.testing.assert_close(cost, torch.full_like(cost, 0.2))
 
 
+def test_pictures_may_begin_at_any_byte():
+    pictures, *others = case()
+    moved = torch.cat([torch.zeros(1, dtype=torch.uint8), pictures.flatten()])[1:]
+    found = match_cost(moved.view(pictures.shape), *others, STEP, 2)
+    assert torch.equal(found, match_cost(pictures, *others, STEP, 2))
+
+
 def volume(seed=0, holes=True):
     g = torch.Generator().manual_seed(seed)
     inside = torch.rand(9, 11, generator=g) < (0.8 if holes else 2)

@@ -75,7 +75,8 @@ def match_cost(
     if not native.serves(start):
         return match_cost_reference(pictures, matrix, *rays, step, steps, most, radius, best)
     cost = start.new_empty(sizes["N"], steps)
-    pixels = pictures.contiguous().view(torch.int32)[..., 0]
+    aligned = pictures.clone() if pictures.storage_offset() % 4 else pictures
+    pixels = aligned.contiguous().view(torch.int32)[..., 0]  # four bytes are looked up at once
     tensors = [t.contiguous() for t in (pixels, matrix, *rays)]
     native.require().match_cost(
         *native.arrays(*tensors, cost), step, most, radius, best, native.threads()
