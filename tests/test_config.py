@@ -172,6 +172,8 @@ def test_the_file_holds_every_field(tmp_path):
         (JointConfig(), {"rays": 3}, "rays must be at least views, got 3"),
         (JointConfig(), {"lr_map": 0.0}, "lr_map must be above 0, got 0.0"),
         (JointConfig(), {"newton_steps": -1}, "newton_steps must be at least 0, got -1"),
+        (JointConfig(), {"lr_sdf": -0.1}, "lr_sdf must be at least 0, got -0.1"),
+        (JointConfig(), {"newton_roughness": -1}, "newton_roughness must be at least 0, got -1"),
         (JointConfig(), {"newton_views": 1}, "newton_views must be at least 2, got 1"),
         (CONFIG, {"patience": -0.1}, "patience must be at least 0, got -0.1"),
         (CONFIG, {"downscale": -1}, "downscale must be at least 0, got -1"),

@@ -81,12 +81,14 @@ class JointConfig:
     lr_features: float = 0.03  # at the begin of a round; all rates > 0
     lr_networks: float = 3e-3
     lr_map: float = 0.05  # of the log map
+    lr_sdf: float = 0.04  # of the surface, voxels per step, >= 0; 0: it stays
     albedo_smoothness: float = 0.005  # weights >= 0
     roughness_smoothness: float = 0.02
     metallic: float = 0.01
-    newton_steps: int = 4  # at the begin of a round, >= 0
-    newton_points: int = 6000  # of the points, >= 1
+    newton_steps: int = 3  # at the begin of a round, >= 0
+    newton_points: int = 4000  # of the points, >= 1
     newton_views: int = 8  # sightings of each, >= 2
+    newton_roughness: float = 0.1  # how far roughness may be from what it is, >= 0; 0: it stays
     newton_smooth: float = 1e-7  # Laplacian on the log map against the mean squared residual, > 0
 
     def __post_init__(self):
@@ -96,8 +98,9 @@ class JointConfig:
         _check(self, "at least views", lambda x: x >= self.views, "rays")
         rates = ("lr_features", "lr_networks", "lr_map", "newton_smooth")
         _check(self, "above 0", lambda x: 0 < x < math.inf, *rates)
-        weights = ("albedo_smoothness", "roughness_smoothness", "metallic", "newton_steps")
-        _check(self, "at least 0", lambda x: 0 <= x < math.inf, *weights)
+        weights = ("albedo_smoothness", "roughness_smoothness", "metallic")
+        not_below = (*weights, "lr_sdf", "newton_steps", "newton_roughness")
+        _check(self, "at least 0", lambda x: 0 <= x < math.inf, *not_below)
         _check(self, "at least 2", lambda x: x >= 2, "newton_views")
 
 
@@ -363,13 +366,13 @@ def _configuration(
     match light:
         case "hybrid":
             # Shares are what the stages cost where none is cut
-            coarse, fine = replace(coarse, share=0.12), replace(fine, share=0.52)
+            coarse, fine = replace(coarse, share=0.12), replace(fine, share=0.48)
             # What Newton and tracing cost follows the steps, or little work would be nothing else
             joint = JointConfig(
                 iterations=steps,
-                share=0.21,
+                share=0.25,
                 points=min(20000, 25 * steps),
-                newton_points=min(6000, 5 * steps),
+                newton_points=min(4000, 3 * steps),
             )
             refit = StageConfig(
                 voxels=voxels,

@@ -56,7 +56,8 @@ def test_sightings_are_drawn_in_the_light_of_their_photographs():
     with torch.no_grad():
         drawn = torch.empty(20, 3)
         drawn[order] = draw_sightings(
-            scene, problem, point[order], order, albedo[point][order], roughness[point][order], f0
+            *(scene, problem, point[order], order, problem.seen.normal[point][order]),
+            *(albedo[point][order], roughness[point][order], f0),
         )
         for v in range(4):
             map = (scene.sky.log_radiance + views.sky_change()[v]).exp()

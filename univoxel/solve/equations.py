@@ -59,23 +59,56 @@ class Tie:
     own: Tensor  # [3, P] gradient of log albedo
     norm: Tensor  # [3, P] curvature of log albedo
     cost: float
+    roughness: RoughnessTie | None = None
+
+    def follow(self, step: Tensor) -> tuple[Tensor, Tensor]:
+        """What a step of the light [3, D + B] does to log albedo [P, 3] and to roughness [P]."""
+        moved = torch.einsum("cpd,cd->cp", self.cross, step)
+        rough = torch.zeros_like(self.own[0])
+        if (tie := self.roughness) is not None:
+            rough = (tie.own - torch.einsum("cpd,cd->p", tie.cross, step)) / tie.norm
+            moved = moved + tie.mixed * rough
+        return ((self.own - moved) / self.norm).T, rough
+
+
+@dataclass(frozen=True)
+class RoughnessTie:
+    """What ties light to the roughness of points, once their log albedo is eliminated."""
+
+    cross: Tensor  # [3, P, D + B] light against roughness
+    own: Tensor  # [P] gradient of roughness
+    norm: Tensor  # [P] curvature of roughness
+    mixed: Tensor  # [3, P] roughness against log albedo, not eliminated
+
+
+@dataclass(frozen=True)
+class Rougher:
+    """How roughness may change."""
+
+    rows: Rows  # as they are where roughness is larger
+    by: float  # so much larger, > 0
+    pull: float  # weight, > 0, of its squared distance from where it is likely
+    away: Tensor  # [P] how far it is from there
+
+
+@dataclass(frozen=True)
+class Linear:
+    """One channel of rows about a state: weighted, and encoded in sRGB."""
+
+    residual: Tensor  # [P, V]
+    by_light: Tensor  # [P, V, D] by the log map
+    by_albedo: Tensor  # [P, V] by log albedo
+    by_gain: Tensor  # [P, V] by a factor on everything, in log
+    weight: Tensor  # [P, V] of a change of linear radiance
 
 
 def linearised(
     rows: Rows, light: Tensor, log_albedo: Tensor, c: int, differs: Differs | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """One channel's weighted residuals [P, V], and their slopes, weighted and encoded: by the log
-    map [P, V, D], by log albedo [P, V], and by a factor on everything [P, V]."""
+) -> Linear:
+    """Residuals and slopes of channel c, with Cauchy weights."""
     albedo = log_albedo[:, c, None].exp()
-    by_diffuse, by_shine, gain = rows.diffuse, rows.shine, 1.0
-    if differs is not None:
-        gain = differs.gain[rows.view, c]
-        if differs.change is not None:
-            change = differs.change[rows.view, :, c]
-            by_diffuse, by_shine = by_diffuse * change, by_shine * change
-    sky = rows.through * (by_diffuse @ light[:, c])
-    diffuse = gain * albedo * (sky + rows.diffuse_blocked[..., c])
-    drawn = diffuse + gain * (by_shine @ light[:, c] + rows.shine_blocked[..., c])
+    diffuse, drawn = drawn_by(rows, light, log_albedo, c, differs)
+    by_diffuse, by_shine, gain = seen_of(rows, c, differs)
     target = rows.target[..., c]
     residual = target - losses.encode(drawn)
     weight = 1 / (1 + (residual / CAUCHY).square())
@@ -84,11 +117,36 @@ def linearised(
     slope = root * encoded_slope(drawn)
     jacobian = (albedo * rows.through)[..., None] * by_diffuse + by_shine
     jacobian = jacobian * (slope * gain)[..., None] * light[:, c]
-    return root * residual, jacobian, slope * diffuse, slope * drawn
+    return Linear(root * residual, jacobian, slope * diffuse, slope * drawn, slope)
+
+
+def seen_of(rows: Rows, c: int, differs: Differs | None) -> tuple[Tensor, Tensor, Tensor | float]:
+    """What rows make of the map in channel c, of the base and besides, and their gain."""
+    if differs is None:
+        return rows.diffuse, rows.shine, 1.0
+    gain = differs.gain[rows.view, c]
+    if differs.change is None:
+        return rows.diffuse, rows.shine, gain
+    change = differs.change[rows.view, :, c]
+    return rows.diffuse * change, rows.shine * change, gain
+
+
+def drawn_by(
+    rows: Rows, light: Tensor, log_albedo: Tensor, c: int, differs: Differs | None
+) -> tuple[Tensor, Tensor]:
+    """Linear radiance [P, V] of channel c: the part that the base multiplies, and all."""
+    by_diffuse, by_shine, gain = seen_of(rows, c, differs)
+    sky = rows.through * (by_diffuse @ light[:, c])
+    diffuse = gain * log_albedo[:, c, None].exp() * (sky + rows.diffuse_blocked[..., c])
+    return diffuse, diffuse + gain * (by_shine @ light[:, c] + rows.shine_blocked[..., c])
 
 
 def normal_equations(
-    rows: Rows, light: Tensor, log_albedo: Tensor, differs: Differs | None = None
+    rows: Rows,
+    light: Tensor,
+    log_albedo: Tensor,
+    differs: Differs | None = None,
+    rougher: Rougher | None = None,
 ) -> tuple[Tensor, Tensor, Tie]:
     """What some points say of the light, once their albedo is eliminated: the Hessian
     [3, D + B, D + B] and the gradient [3, D + B]; and what gives their albedo back.
@@ -98,13 +156,16 @@ def normal_equations(
     Args:
         light: [D, 3] the map.
         log_albedo: [P, 3].
+        rougher: roughness is unknown too; `free_roughness` eliminates it.
     """
     hessian, gradient, cross, own, norm, cost = [], [], [], [], [], 0.0
+    rough: list[tuple[Tensor, ...]] = []
     for c in range(3):
-        r, jacobian, self_, whole = linearised(rows, light, log_albedo, c, differs)
+        part = linearised(rows, light, log_albedo, c, differs)
+        r, jacobian, self_ = part.residual, part.by_light, part.by_albedo
         if differs is not None:
             of_view = torch.nn.functional.one_hot(rows.view, len(differs.gain))
-            jacobian = torch.cat([jacobian, whole[..., None] * of_view], 2)
+            jacobian = torch.cat([jacobian, part.by_gain[..., None] * of_view], 2)
         n = self_.square().sum(1) + 1e-6  # a point that shows no diffuse light keeps its albedo
         tie = torch.einsum("pvd,pv->pd", jacobian, self_)
         g = (self_ * r).sum(1)
@@ -115,8 +176,33 @@ def normal_equations(
         own.append(g)
         norm.append(n)
         cost += r.square().sum().item()
-    tie = Tie(torch.stack(cross), torch.stack(own), torch.stack(norm), cost)
+        if rougher is not None:
+            now, then = (
+                drawn_by(x, light, log_albedo, c, differs)[1] for x in (rows, rougher.rows)
+            )
+            slope = part.weight * (then - now) / rougher.by
+            mixed = (slope * self_).sum(1)
+            to_light = torch.einsum("pvd,pv->pd", jacobian, slope) - (mixed / n)[:, None] * tie
+            gained, curved = (
+                (slope * r).sum(1) - mixed * g / n,
+                slope.square().sum(1) - mixed**2 / n,
+            )
+            rough.append((to_light, gained, curved, mixed))
+    roughness = None
+    if rougher is not None:
+        to_light, gained, curved, mixed = (torch.stack(x) for x in zip(*rough, strict=True))
+        gained = gained.sum(0) - rougher.pull * rougher.away
+        roughness = RoughnessTie(to_light, gained, curved.sum(0) + rougher.pull, mixed)
+    tie = Tie(torch.stack(cross), torch.stack(own), torch.stack(norm), cost, roughness)
     return torch.stack(hessian), torch.stack(gradient), tie
+
+
+def free_roughness(tie: RoughnessTie) -> tuple[Tensor, Tensor]:
+    """What eliminating the roughness of points takes from the Hessian, [3 (D + B), 3 (D + B)], for
+    it ties the channels to one another, and from the gradient [3, D + B]."""
+    cross = torch.cat(list(tie.cross), 1)
+    taken = (tie.own / tie.norm) @ cross
+    return gram(cross / tie.norm.sqrt()[:, None]), taken.view(3, -1)
 
 
 def gram(rows: Tensor) -> Tensor:
@@ -141,10 +227,11 @@ def view_equations(
     gradient = light.new_zeros(3, views, count)
     of_view = rows.view.flatten()
     for c in range(3):
-        r, jacobian, _, whole = linearised(rows, light, log_albedo, c, differs)
-        own = torch.cat([jacobian @ differs.basis.T, whole[..., None]], 2).flatten(0, 1)
-        hessian[c].index_add_(0, of_view, own[:, :, None] * own[:, None])
-        gradient[c].index_add_(0, of_view, r.flatten()[:, None] * own)
+        part = linearised(rows, light, log_albedo, c, differs)
+        own = [part.by_light @ differs.basis.T, part.by_gain[..., None]]
+        flat = torch.cat(own, 2).flatten(0, 1)
+        hessian[c].index_add_(0, of_view, flat[:, :, None] * flat[:, None])
+        gradient[c].index_add_(0, of_view, part.residual.flatten()[:, None] * flat)
     return hessian, gradient
 
 

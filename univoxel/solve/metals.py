@@ -76,11 +76,12 @@ def residuals(
     metal of a roughness."""
     count, views = sighting.shape
     index, flat = point.repeat_interleave(views), sighting.flatten()
+    normal = problem.seen.normal[index]
     rough = widened(torch.full((len(flat),), roughness), len(problem.transport.direction))
 
     def drawn(diffuse: float, f0: float) -> Tensor:
         color = torch.ones(len(flat), 3)
-        args = scene, problem, index, flat, diffuse * color, rough, f0 * color
+        args = scene, problem, index, flat, normal, diffuse * color, rough, f0 * color
         return draw_sightings(*args).view(count, views, 3)
 
     target = problem.target[sighting]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from univoxel import losses
 from univoxel.config import JointConfig
@@ -69,6 +70,14 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     return Problem(seen, transport, losses.encode(seen.color), metal, offset)
 
 
+@torch.no_grad()
+def turned(scene: Scene, problem: Problem) -> Problem:
+    """The same with the normals that the surface has by now; points stay, and what they see."""
+    gradient = scene.field.sample(problem.seen.position).gradient
+    normal = normalize(gradient, dim=1, eps=1e-6)
+    return replace(problem, seen=replace(problem.seen, normal=normal))
+
+
 def vertex_colors(scene: Scene, mesh: Mesh, photos: Photos) -> Tensor:
     """Mean colour [P, 3] of a mesh's vertices in the photographs; of a large mesh that of the
     nearest of some, for each has a sighting in every other photograph."""
@@ -108,6 +117,7 @@ def draw_sightings(
     problem: Problem,
     point: Tensor,
     sighting: Tensor,
+    normal: Tensor,
     diffuse: Tensor,
     roughness: Tensor,
     f0: Tensor,
@@ -115,7 +125,7 @@ def draw_sightings(
     """What the map makes of sightings [N] of points [N], each in its photograph's light: [N, 3].
 
     Args:
-        diffuse, roughness, f0: of the points, [N, 3], [N] and [N, 3].
+        normal, diffuse, roughness, f0: of the points, [N, 3], [N, 3], [N] and [N, 3].
     """
     seen, transport, sky = problem.seen, problem.transport, scene.sky
     assert sky is not None
@@ -134,7 +144,7 @@ def draw_sightings(
                 transport.open,
                 transport.indirect,
                 point[part],
-                seen.normal[point[part]],
+                normal[part],
                 seen.wo[sighting[part]],
                 diffuse[part],
                 roughness[part],

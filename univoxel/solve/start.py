@@ -39,7 +39,8 @@ def supposed(
     Args:
         seconds: that the rounds of Newton may take together.
     """
-    few = replace(cfg, newton_points=TRIED, newton_steps=STEPS if cfg.newton_steps else 0)
+    steps = STEPS if cfg.newton_steps else 0
+    few = replace(cfg, newton_points=TRIED, newton_steps=steps, newton_roughness=0.0)
     parts = [part for part in (scene.material, scene.sky, scene.views) if part is not None]
     seed = int(torch.randint(2**31, ()))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from univoxel.config import StageConfig
 from univoxel.fields.base import AbstractField
 from univoxel.optim import rows_of
+from univoxel.scene import Scene
 
 SMOOTH_EVERY = 4  # steps between smoothings of what the step has touched
 SPREAD = 0.8  # share of the neighbours' mean that a node's gradient takes on in a pass
@@ -30,6 +31,12 @@ def smooth(field: AbstractField, stage: StageConfig) -> None:
     assert features.grad is not None
     field.smooth_rows_(sdf.data, rows_of(sdf.grad), stage.plate * SMOOTH_EVERY, order=2)
     field.smooth_features_(rows_of(features.grad), stage.diffusion * SMOOTH_EVERY)
+
+
+def moved(scene: Scene) -> None:
+    """Look again at what follows from the sdf."""
+    scene.field.refresh()
+    scene.surface_moved()
 
 
 def between(ends: tuple[float, float], done: float) -> float:

@@ -3,7 +3,8 @@
 Local lobes explain every photograph and leave shadows in the albedo. Once geometry stands, the
 light is known to be one distant map that reaches a point where nothing is in the way, and what is
 in the way shines as bright as the photographs show it. That leaves few unknowns: Gauss-Newton steps
-on the map alternate with rounds of Adam on map and materials.
+on the map alternate with rounds of Adam on map, materials and the surface's normals, which shading
+and highlights tell better than silhouettes and colours did.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy
+from torch.nn.functional import binary_cross_entropy, normalize
 
 from univoxel import brdf, losses
 from univoxel.config import JointConfig
@@ -23,19 +24,25 @@ from univoxel.scene import Scene
 from univoxel.solve.equations import CLIPPED
 from univoxel.solve.metals import find_metal
 from univoxel.solve.newton import newton_round
-from univoxel.solve.sightings import Problem, draw, draw_sightings, pose, widened
+from univoxel.solve.sightings import Problem, draw, draw_sightings, pose, turned, widened
 from univoxel.solve.start import STEPS, TRIALS, TRIED, supposed
+from univoxel.tasks.descent import EPS_SDF, moved, spread_gradient
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.progress import Progress
 
 # Of a sighting in a Newton step over one in a step of Adam, with trials and the search for metals;
 # measured
-NEWTON_COST = 4.7
+NEWTON_COST = 6.5
 LEAST_POINTS = 2000  # on a machine however slow
+SPREAD = 2  # passes that smooth the sdf's gradient: fewer than where geometry forms
+HOLD = 3e-4  # on the squared distance, in voxels, between the surface and its points
 
 
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
-    """Fit scene.sky and the materials to the photographs; geometry and other heads stay."""
+    """Fit scene.sky, the materials and the normals to the photographs; other heads stay.
+
+    What a point sees, and is seen by, is traced once: the surface turns, and hardly moves.
+    """
     assert scene.sky is not None
     if progress.over:
         progress.skip()
@@ -49,11 +56,13 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         progress.trouble(f"stage {progress.stage + 1}: {error}: light and materials stay")
         progress.skip()
         return
+    scene.field.sdf.requires_grad_(cfg.lr_sdf > 0)
     first, turn, more = 0.0, -1.0, cfg.rounds  # begin and end of a round, rounds to come
     guard = Guard(progress)
     for done in progress.steps(newton_share(cfg)):
         if done >= turn:
             seconds = progress.reserved / more
+            problem = turned(scene, problem)
             if more == cfg.rounds:
                 with progress.apart():
                     problem = supposed(scene, problem, cfg, seconds, progress.trouble)
@@ -66,6 +75,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
                 {"params": [scene.field.features], "eps": 1e-8},
                 {"params": list(scene.material.parameters())},
                 {"params": [scene.sky.log_radiance]},
+                {"params": [scene.field.sdf], "eps": EPS_SDF},
             ]
             if scene.views:
                 groups.append({"params": [scene.views.gain_steps]})
@@ -78,7 +88,13 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         # After a Newton round light is better than what Adam would make of it while the albedo
         # follows: the map moves slowly, gains do not
         of_map, of_gains = (0.1, 0.0) if costs else (1.0, 1.0)
-        rates = (cfg.lr_features, cfg.lr_networks, cfg.lr_map * of_map, cfg.lr_networks * of_gains)
+        rates = (
+            cfg.lr_features,
+            cfg.lr_networks,
+            cfg.lr_map * of_map,
+            cfg.lr_sdf * scene.field.voxel_size,
+            cfg.lr_networks * of_gains,
+        )
         for group, rate in zip(optimizer.param_groups, rates, strict=False):
             group["lr"] = rate * fade * guard.scale
         terms = objective(scene, problem, cfg)
@@ -87,10 +103,13 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         loss.backward()
         if not guard.sound(loss):
             continue
+        if cfg.lr_sdf:
+            spread_gradient(scene.field, SPREAD)
         optimizer.step()
         if progress.due():
             progress.report({k: v.item() for k, v in terms.items()}, None)
             guard.keep()
+    moved(scene)
 
 
 def newton_share(cfg: JointConfig) -> float:
@@ -111,19 +130,21 @@ def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Ten
     position = seen.position[points]
     beside = position + 2 * problem.voxel_size * torch.randn_like(position)
     # One sampling, one gradient: adding up sparse ones costs more than either
-    features = scene.field.features_at(torch.cat([position, beside]))
-    parts = (x.chunk(2) for x in scene.material(features))
+    sample = scene.field.sample(torch.cat([position, beside]))
+    parts = (x.chunk(2) for x in scene.material(sample.features))
     (albedo, albedo_near), (roughness, roughness_near), (metallic, _) = parts
     metal = problem.metal[points].float()
     diffuse, f0 = brdf.split(albedo, metallic * metal)
     assert isinstance(f0, Tensor)
     repeat = torch.arange(len(points)).repeat_interleave(cfg.views)
     roughness_shown = widened(roughness, len(transport.direction))
-    shown = diffuse[repeat], roughness_shown[repeat], f0[repeat]
+    normal = normalize(sample.gradient[: len(points)], dim=1, eps=1e-6)
+    shown = normal[repeat], diffuse[repeat], roughness_shown[repeat], f0[repeat]
     rgb = draw_sightings(scene, problem, index, sighting, *shown)
     encoded, target = losses.encode(rgb), problem.target[sighting]
     return {
         "joint": losses.photometric(encoded, target, clipped=CLIPPED),
+        "surface": HOLD * (sample.sdf[: len(points)] / problem.voxel_size).square().mean(),
         "albedo": cfg.albedo_smoothness * priors.smoothness(albedo, albedo_near),
         "roughness": cfg.roughness_smoothness * priors.smoothness(roughness, roughness_near),
         "metallic": cfg.metallic * binary_cross_entropy(metallic, metal),

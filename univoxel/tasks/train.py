@@ -47,6 +47,7 @@ from univoxel.tasks.descent import (
     REFRESH,
     SMOOTH_EVERY,
     between,
+    moved,
     smooth,
     spread_gradient,
 )
@@ -294,12 +295,6 @@ def run_stage(
             save_scene(scene, cfg.out, progress.state())
     moved(scene)
     scene.eval()
-
-
-def moved(scene: Scene) -> None:
-    """Look again at what follows from the sdf."""
-    scene.field.refresh()
-    scene.surface_moved()
 
 
 def rehearsal(

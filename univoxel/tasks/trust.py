@@ -195,9 +195,8 @@ def render(
     roughness = widened(surface.roughness, len(transport.direction))
     no_metal = torch.zeros(len(surface.albedo), dtype=torch.bool)
     problem = Problem(seen, transport, seen.color, no_metal, scene.field.voxel_size)
-    return draw_sightings(
-        scene, problem, point, sighting, diffuse[point], roughness[point], f0[point]
-    )
+    shown = seen.normal[point], diffuse[point], roughness[point], f0[point]
+    return draw_sightings(scene, problem, point, sighting, *shown)
 
 
 class Doubts:
