@@ -120,7 +120,10 @@ def begin(folder: Path, out: Path, name: str, term: str) -> TrainConfig:
     stages = list(cfg.stages)
     if term in ("geometry", "both"):  # one grid for all stages: resampling would round it off
         still = {"lr_sdf": (STILL, STILL), "plate": 0.0, "spread": 0}
-        stages = [replace(s, **still) if isinstance(s, StageConfig) else s for s in stages[1:]]
+        stages = [
+            replace(s, **(still if isinstance(s, StageConfig) else {"lr_sdf": 0.0}))
+            for s in stages[1:]
+        ]
     if term in ("light", "both"):
         fixed = {"lr_map": STILL, "newton_steps": 0}
         stages = [replace(s, **fixed) if isinstance(s, JointConfig) else s for s in stages]

@@ -46,7 +46,7 @@ class StageConfig:
     spread: int = 4  # passes that smooth the sdf's gradient before the optimiser, >= 0
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 0.25]
     physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
-    refit: bool = False  # geometry and materials stay; light and radiance follow them
+    refit: bool = False  # materials stay; light, radiance and silhouettes follow them
     # sparse: only bricks around the surface are stored; hash: features come from a hash table
     field: FieldName = "dense"
 
@@ -380,6 +380,7 @@ def _configuration(
                 share=0.15,
                 rays=rays,
                 sharpness=(0.3, 0.3),
+                lr_sdf=(0.015, 0.0015),
                 lr_features=(0.01, 0.001),
                 plate=0.0,
                 diffusion=0.0,

@@ -99,7 +99,8 @@ class Linear:
     by_light: Tensor  # [P, V, D] by the log map
     by_albedo: Tensor  # [P, V] by log albedo
     by_gain: Tensor  # [P, V] by a factor on everything, in log
-    weight: Tensor  # [P, V] of a change of linear radiance
+    weight: Tensor  # [P, V] of a change of linear radiance, and its encoding
+    drawn: Tensor  # [P, V] linear, as it is
 
 
 def linearised(
@@ -117,7 +118,7 @@ def linearised(
     slope = root * encoded_slope(drawn)
     jacobian = (albedo * rows.through)[..., None] * by_diffuse + by_shine
     jacobian = jacobian * (slope * gain)[..., None] * light[:, c]
-    return Linear(root * residual, jacobian, slope * diffuse, slope * drawn, slope)
+    return Linear(root * residual, jacobian, slope * diffuse, slope * drawn, slope, drawn)
 
 
 def seen_of(rows: Rows, c: int, differs: Differs | None) -> tuple[Tensor, Tensor, Tensor | float]:
@@ -177,16 +178,12 @@ def normal_equations(
         norm.append(n)
         cost += r.square().sum().item()
         if rougher is not None:
-            now, then = (
-                drawn_by(x, light, log_albedo, c, differs)[1] for x in (rows, rougher.rows)
-            )
-            slope = part.weight * (then - now) / rougher.by
+            _, more = drawn_by(rougher.rows, light, log_albedo, c, differs)
+            slope = part.weight * (more - part.drawn) / rougher.by
             mixed = (slope * self_).sum(1)
             to_light = torch.einsum("pvd,pv->pd", jacobian, slope) - (mixed / n)[:, None] * tie
-            gained, curved = (
-                (slope * r).sum(1) - mixed * g / n,
-                slope.square().sum(1) - mixed**2 / n,
-            )
+            gained = (slope * r).sum(1) - mixed * g / n
+            curved = slope.square().sum(1) - mixed.square() / n
             rough.append((to_light, gained, curved, mixed))
     roughness = None
     if rougher is not None:

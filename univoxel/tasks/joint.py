@@ -35,7 +35,7 @@ from univoxel.tasks.progress import Progress
 NEWTON_COST = 6.5
 LEAST_POINTS = 2000  # on a machine however slow
 SPREAD = 2  # passes that smooth the sdf's gradient: fewer than where geometry forms
-HOLD = 3e-4  # on the squared distance, in voxels, between the surface and its points
+HOLD = 3e-3  # on the squared distance, in voxels, between the surface and its points
 
 
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:

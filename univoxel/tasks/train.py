@@ -223,7 +223,7 @@ def run_stage(
     field = scene.field
     scene.train()
     scene.surface_moved()
-    field.sdf.requires_grad_(not stage.refit)
+    field.sdf.requires_grad_()
     scene.material.requires_grad_(not stage.refit)
     networks = [scene.material, scene.radiance, scene.light]
     if scene.mirrored:  # only with fixed materials: before, it would take their gloss upon itself
@@ -278,7 +278,7 @@ def run_stage(
             continue
         if stage.refit:
             field.hold_channels_(scene.material.channels)
-        if stage.spread and not stage.refit:
+        if stage.spread:
             spread_gradient(field, stage.spread)
         optimizer.step()
         if progress.step % SMOOTH_EVERY == 0 and not stage.refit:
