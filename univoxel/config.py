@@ -69,7 +69,7 @@ class StageConfig:
 
 @dataclass(frozen=True)
 class JointConfig:
-    """The stage that solves for one environment map and the materials, see tasks/joint.py."""
+    """The stage that solves for one map, the materials and normals, see tasks/joint.py."""
 
     iterations: int = 700  # Adam steps in all rounds, >= 1; fewer when time runs out
     share: float = 0.4  # of the time budget, (0, 1]

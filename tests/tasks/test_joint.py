@@ -335,6 +335,12 @@ def test_a_run_that_was_cut_traces_fewer_points(monkeypatch):
     assert asked == [10000, 5000, joint.LEAST_POINTS]
 
 
+def test_no_steps_of_newton_leave_the_map():
+    scene, problem = scene_of((0.5, 0.5, 0.5), 0.4, 32), problem_on_a_sphere(20, 8, 32)
+    assert newton.newton_round(scene, problem, replace(CFG, newton_steps=0), seconds=10.0) == []
+    assert (scene.sky.log_radiance == 0).all()
+
+
 def test_newton_without_rich_points_leaves_the_map():
     scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
     problem = problem_on_a_sphere(20, 1, 32)  # of one sighting the albedo explains everything

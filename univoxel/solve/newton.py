@@ -109,7 +109,7 @@ def newton_round(
     begin = time.monotonic()
     sky = scene.sky
     assert sky is not None
-    points = choose(scene, problem, cfg)
+    points = choose(scene, problem, cfg) if cfg.newton_steps else None
     if points is None:
         return []
     if seconds < math.inf:
