@@ -1,5 +1,6 @@
 """Sightings of the sphere for tests of the joint solve, drawn by the shading op."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -15,6 +16,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.ops import shade_map
 from univoxel.render.transport import Observations, Transport
+from univoxel.solve.equations import Rows
 from univoxel.solve.sightings import Problem, widened
 from univoxel.sphere import fibonacci_sphere
 
@@ -61,6 +63,11 @@ def random_problem(points: int = 5, views: int = 4, nodes: int = 12) -> Problem:
     indirect = torch.rand(points, nodes, 3).half()
     transport = Transport(problem.transport.direction, open_share, indirect)
     return replace(problem, transport=transport)
+
+
+def in_double(rows: Rows) -> Rows:
+    values = {f.name: getattr(rows, f.name) for f in dataclasses.fields(rows)}
+    return Rows(**{k: v.double() if k != "view" else v for k, v in values.items()})
 
 
 class Steps:

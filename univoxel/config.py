@@ -88,7 +88,7 @@ class JointConfig:
     newton_steps: int = 3  # at the begin of a round, >= 0
     newton_points: int = 4000  # of the points, >= 1
     newton_views: int = 8  # sightings of each, >= 2
-    newton_roughness: float = 0.1  # how far roughness may be from what it is, >= 0; 0: it stays
+    newton_roughness: float = 0.1  # standard deviation that roughness follows the map with; 0: none
     newton_smooth: float = 1e-7  # Laplacian on the log map against the mean squared residual, > 0
 
     def __post_init__(self):

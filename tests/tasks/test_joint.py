@@ -1,6 +1,5 @@
 """The stage that solves for one map: its equations against autograd, its answers against truth."""
 
-import dataclasses
 import math
 from dataclasses import replace
 
@@ -12,6 +11,7 @@ from sightings import (
     RED,
     Steps,
     facing,
+    in_double,
     lamps,
     photographed,
     photographs_under,
@@ -143,11 +143,6 @@ def test_the_gradient_is_that_of_the_cost_at_fixed_weights(rows_and_map):
     step[3, 1] = h
     slope = (cost(x, a + step) - cost(x, a - step)) / (2 * h)
     assert tie.own[1, 3].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
-
-
-def in_double(rows: equations.Rows) -> equations.Rows:
-    values = {f.name: getattr(rows, f.name) for f in dataclasses.fields(rows)}
-    return equations.Rows(**{k: v.double() if k != "view" else v for k, v in values.items()})
 
 
 def test_free_roughness_is_the_schur_complement_too():
@@ -291,7 +286,7 @@ def test_newton_finds_the_map_under_a_roughness_that_is_wrong():
         for _ in range(2):
             newton.newton_round(scene, problem, replace(CFG, newton_roughness=free))
         errors.append((scene.sky.log_radiance.detach() - lamps(nodes).log()).abs().mean())
-    assert errors[1] < 0.5 * errors[0]
+    assert errors[1] < 0.5 * errors[0]  # not all: roughness has a pull to where it was
 
 
 @pytest.mark.parametrize("views", [2, 3])

@@ -1,6 +1,5 @@
 """Photographs in varying light: what differs is found, and materials stay as under one light."""
 
-import dataclasses
 import math
 from dataclasses import replace
 
@@ -11,6 +10,7 @@ from sightings import (
     BLUE,
     RED,
     Steps,
+    in_double,
     lamps,
     photographed,
     photographs_under,
@@ -73,8 +73,7 @@ def test_equations_know_what_differs():
     sighting = torch.arange(20).view(5, 4)
     rows = newton.light_rows(problem, torch.arange(5), sighting, torch.full((5,), 0.3))
     assert torch.equal(rows.view, sighting % 4)
-    values = {f.name: getattr(rows, f.name) for f in dataclasses.fields(rows)}
-    rows = equations.Rows(**{k: v.double() if k != "view" else v for k, v in values.items()})
+    rows = in_double(rows)
     differs = equations.view_differences(varying(sphere_scene(NODES), 4))
     gain, change = differs.gain.detach().double(), differs.change.detach().double()
     basis = differs.basis.detach().double()

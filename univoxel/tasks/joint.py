@@ -26,7 +26,7 @@ from univoxel.solve.metals import find_metal
 from univoxel.solve.newton import newton_round
 from univoxel.solve.sightings import Problem, draw, draw_sightings, pose, turned, widened
 from univoxel.solve.start import STEPS, TRIALS, TRIED, supposed
-from univoxel.tasks.descent import EPS_SDF, moved, spread_gradient
+from univoxel.tasks.descent import EPS_FEATURES, EPS_SDF, MOMENTS, moved, spread_gradient
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.progress import Progress
 
@@ -72,7 +72,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
                 problem = replace(problem, metal=find_metal(scene, problem, cfg, sure))
             more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
             groups = [
-                {"params": [scene.field.features], "eps": 1e-8},
+                {"params": [scene.field.features], "eps": EPS_FEATURES},
                 {"params": list(scene.material.parameters())},
                 {"params": [scene.sky.log_radiance]},
                 {"params": [scene.field.sdf], "eps": EPS_SDF},
@@ -81,7 +81,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
                 groups.append({"params": [scene.views.gain_steps]})
                 if scene.views.sky_weights is not None:
                     groups[2]["params"] += [scene.views.sky_weights, scene.views.sky_basis]
-            optimizer = RowAdam(groups, betas=(0.9, 0.99))
+            optimizer = RowAdam(groups, betas=MOMENTS)
             guard.follow(optimizer)
             first, turn, more = done, done + (1 - done) / more, more - 1
         fade = 0.1 ** ((done - first) / (turn - first))
