@@ -24,6 +24,7 @@ from univoxel.lights import (
     scaled,
 )
 from univoxel.scene import FILE, Scene, SceneConfig, load_checkpoint, load_scene, save_scene
+from univoxel.tasks import shrink
 
 LIGHTS = [
     SGConfig(lobes=3),
@@ -41,8 +42,11 @@ def small_scene(light=None):
     with torch.no_grad():
         field.features[3:6, 3:6, 3:6] = torch.randn(3, 3, 3, 4)
     light = light or SGConfig()
-    cfg = SceneConfig(channels=4, material_channels=2, hidden=8, light=light)
-    return Scene(cfg, field, inv_s=20.0)
+    cfg = SceneConfig(channels=4, material_channels=2, hidden=8, mirror_levels=2, light=light)
+    scene = Scene(cfg, field, inv_s=20.0)
+    with torch.no_grad():
+        scene.radiance.directions.table[7:99] = torch.randn(92, 2)
+    return scene
 
 
 @pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.kind)
@@ -62,6 +66,21 @@ def test_a_checkpoint_gives_the_same_scene(tmp_path, light):
         assert torch.equal(a, b), name
 
 
+def test_a_file_without_a_table_of_directions_is_one_from_before_there_were_any(tmp_path):
+    scene = small_scene()
+    shrink.drop_mirror_levels(scene, 0)
+    path = save_scene(scene, tmp_path, {})
+    with safe_open(path, "pt") as file:
+        meta = json.loads(file.metadata()["univoxel"])
+    del meta["scene"]["mirror_levels"]
+    tensors = {k: v for k, v in load_file(path).items() if not k.startswith("radiance.direction_")}
+    save_file(tensors, path, {"univoxel": json.dumps(meta)})
+    again = load_scene(tmp_path)
+    assert again.cfg == scene.cfg
+    for name, value in scene.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value), name
+
+
 def test_a_slim_file_holds_what_is_seen(tmp_path):
     """Half the precision, and nothing of features where no ray stops."""
     scene = small_scene()
@@ -71,6 +90,7 @@ def test_a_slim_file_holds_what_is_seen(tmp_path):
     stored = load_file(save_scene(scene, tmp_path, {}, slim=True))
     assert stored["field.sdf"].dtype == stored["field.feature_values"].dtype == torch.float16
     assert len(stored["field.feature_rows"]) < scene.field.grid.nodes_count
+    assert stored["radiance.direction_values"].shape == (92, 2)
     again = load_scene(tmp_path)
     kept, wanted = again.field.features, scene.field.features.detach()
     assert kept.dtype == again.field.sdf.dtype == torch.float32

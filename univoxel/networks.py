@@ -1,4 +1,4 @@
-"""Small networks that decode what was composited along a ray."""
+"""Small networks that decode what was composited along a ray, and what they read of directions."""
 
 from __future__ import annotations
 
@@ -52,3 +52,52 @@ def waves(x: Tensor, octaves: int) -> list[Tensor]:
     Networks of low dimension learn detail from them. Source: Mildenhall et al. 2020, eq. 4.
     """
     return [wave for i in range(octaves) for wave in ((x * 2**i).sin(), (x * 2**i).cos())]
+
+
+class DirectionTable(nn.Module):
+    """Learned features [N, 2 L] of unit directions [N, 3], from lattices of L sizes: 29 degrees at
+    the coarsest, half as much at each of the next.
+
+    Networks of few inputs are smooth over directions; what a polished surface mirrors is not, and
+    is the same for all of its points. Zero at first. Only the coarsest levels pass gradients on to
+    the direction, and so to the normal that mirrors it: through the others it would feel what is a
+    few degrees around, which is noise to a normal that is off by more.
+
+    Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", on the sphere.
+    """
+
+    coarsest = 0.5  # side of a cell, of a box of 2 around the sphere
+    rows = 2**14  # of a level; of those from the fifth on several nodes share one
+    per_level = 2
+    felt = 3  # levels that the direction gets gradients from
+
+    def __init__(self, levels: int):
+        super().__init__()
+        self.table = nn.Parameter(torch.zeros(levels * self.rows, self.per_level))
+
+    @property
+    def levels(self) -> int:
+        return len(self.table) // self.rows
+
+    @property
+    def channels(self) -> int:
+        return self.per_level * self.levels
+
+    @classmethod
+    def rows_used(cls, level: int) -> int:
+        """Rows of a level, from 0 on, that any direction can meet, at most."""
+        return min(cls.rows, round(2 ** (level + 1) / cls.coarsest + 1) ** 3)
+
+    def forward(self, direction: Tensor) -> Tensor:
+        sizes = [self.coarsest / 2**k for k in range(self.levels)]
+        n = self.felt
+        parts = (
+            self._encode(direction, self.table[: n * self.rows], sizes[:n]),
+            self._encode(direction.detach(), self.table[n * self.rows :], sizes[n:]),
+        )
+        return torch.cat(parts, 1)
+
+    def _encode(self, direction: Tensor, table: Tensor, sizes: list[float]) -> Tensor:
+        if not sizes:
+            return direction[:, :0]
+        return ops.encode_hash(table, direction, (-1.0,) * 3, (1.0,) * 3, sizes)

@@ -36,6 +36,7 @@ from univoxel.lights import (
 from univoxel.lights.distant import DistantLight
 from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.views import ViewLights
+from univoxel.networks import DirectionTable
 from univoxel.ops import VisibilityScene
 from univoxel.packing import PACKED, pack, unpack
 from univoxel.poses import PoseSteps
@@ -43,6 +44,11 @@ from univoxel.records import Bricks
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
 FILE = "scene.safetensors"
+# A file holds their rows that are not 0: parameter, and names of the numbers and values of rows
+TABLES = {
+    "field.features": ("field.feature_rows", "field.feature_values"),
+    "radiance.directions.table": ("radiance.direction_rows", "radiance.direction_values"),
+}
 SHELL = 4.0  # voxels around the surface, beyond which a finished scene needs no features
 HALF_MAX = 65504.0
 
@@ -56,6 +62,7 @@ class SceneConfig:
     channels: int = 16  # features per voxel, >= 1
     material_channels: int = 8  # of them, that albedo and roughness are decoded from, >= 1
     hidden: int = 64  # width of the material and radiance heads, >= 1
+    mirror_levels: int = 5  # of the table of mirrored directions, 29 degrees and finer, [0, 8]
     sky_nodes: int = 512  # directions of the environment map, >= 0; 0: the scene has none
     mirrored: bool = True  # whether a local light gets a network for what is mirrored sharply
     light: LightConfig = field(default_factory=SGConfig)
@@ -72,6 +79,10 @@ class SceneConfig:
                 raise ValueError(
                     f"SceneConfig: {name} must be at least 1, got {getattr(self, name)}"
                 )
+        if not 0 <= self.mirror_levels <= 8:
+            raise ValueError(
+                f"SceneConfig: mirror_levels must be in [0, 8], got {self.mirror_levels}"
+            )
         if self.material_channels > self.channels:
             raise ValueError(
                 f"SceneConfig: material_channels must be at most channels ({self.channels}), "
@@ -101,12 +112,13 @@ class Scene(nn.Module):
         self.material = MaterialHead(cfg.material_channels, cfg.hidden)
         codes = cfg.codes if cfg.varying == "light" else 0
         inputs = cfg.channels + codes  # of what draws photographs: features and the view's code
-        self.radiance = RadianceHead(inputs, cfg.hidden)
+        self.radiance = RadianceHead(inputs, cfg.hidden, cfg.mirror_levels)
         self.light = build(inputs, cfg.light)
         self.sky = DistantLight(cfg.sky_nodes) if cfg.sky_nodes else None
         self.mirrored = None
         if cfg.mirrored and isinstance(cfg.light, SGConfig | SHConfig | MLPLightConfig):
-            self.mirrored = MirroredLight(inputs, cfg.hidden, cfg.light.scale)
+            known = self.radiance.directions.channels
+            self.mirrored = MirroredLight(inputs, cfg.hidden, cfg.light.scale, known)
         self.views = None
         if cfg.varying != "none":
             directions = self.sky.direction if codes and self.sky else None
@@ -185,7 +197,7 @@ class Scene(nn.Module):
 
 def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict[str, Tensor]:
     """The tensors of a scene's file, see `save_scene`."""
-    tensors = {k: v.contiguous() for k, v in scene.state_dict().items() if k != "field.features"}
+    tensors = {k: v.contiguous() for k, v in scene.state_dict().items() if k not in TABLES}
     sdf = scene.field.sdf.detach()
     if isinstance(bricks := scene.field.distances, SparseField):
         tensors |= {f"field.{k}": v for k, v in pack_bricks(bricks).items()}
@@ -202,11 +214,15 @@ def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict
         if reach is not None:
             packed = pack(tensors.pop("field.sdf"), shell)
             tensors |= {f"field.sdf_{name}": value for name, value in packed.items()}
-    rows = touched.nonzero()[:, 0]
-    tensors["field.feature_rows"], tensors["field.feature_values"] = rows.int(), features[rows]
+    directions = scene.radiance.directions.table.detach()
+    tables = (features, touched), (directions, directions.any(1))
+    for (rows_name, values_name), (table, kept) in zip(TABLES.values(), tables, strict=True):
+        rows = kept.nonzero()[:, 0]
+        tensors[rows_name], tensors[values_name] = rows.int(), table[rows]
     if slim:
         # sdf next to the surface is a small number: half precision keeps it to 1e-3 voxels
-        for name in {"field.sdf", "field.sdf_values", "field.feature_values"} & tensors.keys():
+        halves = {"field.sdf", "field.sdf_values", *(values for _, values in TABLES.values())}
+        for name in halves & tensors.keys():
             tensors[name] = tensors[name].clamp(-HALF_MAX, HALF_MAX).half()
     return tensors
 
@@ -273,6 +289,10 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
     try:
         light = read_config(meta["scene"].pop("light"))
         views = tuple(meta["scene"].pop("views", ()))
+        if "mirror_levels" not in meta["scene"]:  # a file from before there were any
+            meta["scene"]["mirror_levels"] = 0
+            none = torch.zeros(0, dtype=torch.int32), torch.zeros(0, DirectionTable.per_level)
+            tensors |= zip(TABLES["radiance.directions.table"], none, strict=True)
         cfg = SceneConfig(**meta["scene"], light=light, views=views)
         grid = GridShape(
             tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
@@ -293,10 +313,11 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
                 f"{field.channels} channels in its field, {cfg.channels} in its networks"
             )
         scene = Scene(cfg, field, meta["inv_s"])
-        rows, values = tensors.pop("field.feature_rows"), tensors.pop("field.feature_values")
-        features = field.features.data.flatten(0, -2)
-        features[rows.long()] = values.float()
-        tensors["field.features"] = field.features.data
+        tables = field.features.data, scene.radiance.directions.table.data
+        for (name, stored_as), table in zip(TABLES.items(), tables, strict=True):
+            rows, values = (tensors.pop(k) for k in stored_as)
+            table.flatten(0, -2)[rows.long()] = values.float()
+            tensors[name] = table
         packed = {n: tensors.pop(k) for n in PACKED if (k := f"field.sdf_{n}") in tensors}
         if packed:
             tensors["field.sdf"] = unpack(packed, grid.size, SHELL * grid.voxel_size)

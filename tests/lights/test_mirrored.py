@@ -5,7 +5,10 @@ from torch.nn.functional import normalize
 
 from univoxel import brdf
 from univoxel.lights.mirrored import MirroredLight
+from univoxel.networks import DirectionTable
 from univoxel.records import Surface
+
+NO_TABLE = DirectionTable(0)
 
 
 def mirror_ball(n: int, metallic: float) -> tuple[Surface, torch.Tensor]:
@@ -28,7 +31,7 @@ def mirror_ball(n: int, metallic: float) -> tuple[Surface, torch.Tensor]:
 
 def test_adds_nothing_at_first():
     surface, wo = mirror_ball(50, 1.0)
-    assert not MirroredLight(2, 8, 1.0)(surface, wo).any()
+    assert not MirroredLight(2, 8, 1.0)(surface, wo, NO_TABLE).any()
 
 
 def test_learns_an_edge_that_no_lobe_has():
@@ -41,7 +44,7 @@ def test_learns_an_edge_that_no_lobe_has():
         mirrored = 2 * (surface.normal * wo).sum(1, keepdim=True) * surface.normal - wo
         sky = (mirrored[:, 2:] > 0).float()  # white above the horizon, black below
         share = brdf.specular_albedo((surface.normal * wo).sum(1), surface.roughness, 1.0)
-        return (head(surface, wo) - share[:, None] * sky).square().mean()
+        return (head(surface, wo, NO_TABLE) - share[:, None] * sky).square().mean()
 
     before = error().item()
     for _ in range(150):
@@ -57,7 +60,9 @@ def test_a_dielectric_mirrors_as_much_less_as_its_layer_reflects():
     torch.nn.init.normal_(head.net.linear[-1].weight)
     surface, wo = mirror_ball(50, 1.0)
     cosine = (surface.normal * wo).sum(1)
-    metal = head(surface, wo) / brdf.specular_albedo(cosine, surface.roughness, 1.0)[:, None]
+    metal = (
+        head(surface, wo, NO_TABLE) / brdf.specular_albedo(cosine, surface.roughness, 1.0)[:, None]
+    )
     surface = Surface(**{**vars(surface), "metallic": None})
     share = brdf.specular_albedo(cosine, surface.roughness, brdf.F0)[:, None]
-    torch.testing.assert_close(head(surface, wo), share * metal)
+    torch.testing.assert_close(head(surface, wo, NO_TABLE), share * metal)

@@ -84,7 +84,7 @@ def test_light_reads_the_code_and_materials_do_not(light):
     for draw in (
         lambda s: scene.light.reflected(s, wo),
         lambda s: scene.radiance(s.features, s.normal, wo),
-        lambda s: scene.mirrored(s, wo),
+        lambda s: scene.mirrored(s, wo, scene.radiance.directions),
     ):
         drawn = draw(coded(scene, surface, torch.arange(30) % 3))
         alone = draw(coded(scene, surface, 1))

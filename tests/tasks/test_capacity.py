@@ -234,6 +234,32 @@ def test_the_log_tells_of_choices(run):
     assert state["chosen"][0]["said"].startswith("voxels 50,000 -> ")
 
 
+@pytest.mark.parametrize(
+    ("megabytes", "levels"), [(None, 5), (40.0, 5), (1.0, 3), (0.3, 2), (0.02, 1)]
+)
+def test_a_budget_leaves_room_for_some_mirror_levels(megabytes, levels):
+    assert capacity.mirror_levels(SceneConfig(), megabytes) == levels
+    assert capacity.mirror_levels(SceneConfig(mirror_levels=1), megabytes) == 1
+
+
+def test_mirror_levels_that_draw_nothing_are_dropped():
+    scene = sphere_scene(16).eval()
+    scene.inv_s = 60.0
+    table = scene.radiance.directions
+    with torch.no_grad():
+        table.table[: 2 * table.rows].normal_()
+        scene.radiance.net.linear[0].weight[:, -table.channels :] *= 10
+    photos = photos_of(4, 24)
+    pixels = torch.cartesian_prod(torch.arange(4), torch.arange(24), torch.arange(24))
+    look = look_at(photos, pixels)
+    with torch.no_grad():  # photographs that show what the coarse levels say
+        drawn = look.decode(scene, surface := look.meet(scene), surface.features)["radiance"]
+    look = dataclasses.replace(look, target=drawn + 0.01 * torch.randn_like(drawn))
+    choice = spare.fewer_mirror_levels(scene, look, look)
+    assert (choice.before, choice.after) == (5, 2)
+    assert scene.cfg.mirror_levels == table.levels == 2
+
+
 def test_resume_goes_on_with_what_was_chosen(data, tmp_path, monkeypatch):
     cfg = config(data, tmp_path / "run")
     original, sizes = task.run_stage, []

@@ -7,6 +7,7 @@ import torch
 from analytic import photos_of, sphere_scene
 
 from univoxel.lights import MLPLightConfig, SGConfig, SHConfig
+from univoxel.networks import DirectionTable
 from univoxel.scene import load_scene, save_scene
 from univoxel.tasks import shrink
 from univoxel.tasks.train import look_at
@@ -25,6 +26,7 @@ def lit_scene(light=LIGHTS[0]):
     g = torch.Generator().manual_seed(1)
     with torch.no_grad():
         scene.field.features.normal_(generator=g)
+        scene.radiance.directions.table[: DirectionTable.rows].normal_(generator=g)
         for owner, name in shrink.heads(scene):
             for layer in getattr(owner, name).linear:
                 layer.weight.normal_(0, 0.3, generator=g)
@@ -92,6 +94,19 @@ def test_a_dark_lobe_goes_without_a_trace(look):
     assert_same(scene, look, before)
 
 
+@pytest.mark.parametrize("kept", [0, 2])
+def test_mirror_levels_that_say_nothing_go_without_a_trace(look, kept):
+    scene = lit_scene()
+    table = scene.radiance.directions
+    with torch.no_grad():
+        table.table.zero_()[: kept * table.rows].normal_()
+    before, coarse = seen(scene, look), table.table.detach().clone()
+    shrink.drop_mirror_levels(scene, kept)
+    assert scene.cfg.mirror_levels == table.levels == kept
+    assert torch.equal(table.table, coarse[: kept * table.rows])
+    assert_same(scene, look, before)
+
+
 def test_units_that_nothing_reads_go_without_a_trace(look):
     scene = lit_scene()
     with torch.no_grad():
@@ -129,6 +144,7 @@ def test_a_trial_leaves_no_trace(look, light):
     before, cfg = seen(scene, look), scene.cfg
     parts = shrink.parts_of(scene)
     shrink.drop_channels(scene, torch.tensor([0, 3]), torch.zeros(4))
+    shrink.drop_mirror_levels(scene, 1)
     shrink.put_back(parts)
     assert scene.cfg == cfg
     assert_same(scene, look, before)
@@ -142,6 +158,7 @@ def test_a_smaller_scene_is_saved_and_loaded(look, light, tmp_path):
         look.decode(scene, surface, surface.features)
     shrink.drop_units(scene, 6, read)
     shrink.drop_channels(scene, torch.tensor([1, 2, 3]), torch.zeros(4))
+    shrink.drop_mirror_levels(scene, 1)
     if isinstance(light, SGConfig):
         shrink.drop_lobes(scene, torch.tensor([0, 2]))
     before = seen(scene, look)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from univoxel.networks import MLP, waves
+from univoxel.networks import MLP, DirectionTable, waves
 
 
 class MaterialHead(nn.Module):
@@ -44,16 +44,22 @@ class MaterialHead(nn.Module):
 class RadianceHead(nn.Module):
     """Outgoing radiance without any model of light: it lets geometry converge early.
 
-    Reads features, normal, the mirrored view direction (Verbin et al. 2022, Ref-NeRF) and n.wo;
-    returns sRGB-encoded colour, so that the network is as fine in the dark as the eye is.
+    Reads features, normal, the mirrored view direction (Verbin et al. 2022, Ref-NeRF), what a table
+    holds of it, and n.wo; returns sRGB-encoded colour, so that the network is as fine in the dark
+    as the eye is.
     """
 
-    def __init__(self, channels: int, hidden: int):
+    def __init__(self, channels: int, hidden: int, levels: int = 0):
+        """
+        Args:
+            levels: of the table of mirrored directions, >= 0.
+        """
         super().__init__()
-        self.net = MLP([channels + 3 + 9 + 1, hidden, hidden, 3])
+        self.directions = DirectionTable(levels)
+        self.net = MLP([channels + 3 + 9 + 1 + self.directions.channels, hidden, hidden, 3])
 
     def forward(self, features: Tensor, normal: Tensor, wo: Tensor) -> Tensor:
         cosine = (normal * wo).sum(1, keepdim=True)
         mirrored = 2 * cosine * normal - wo
-        fine = waves(2 * mirrored, 1)
-        return torch.sigmoid(self.net(torch.cat([features, normal, mirrored, *fine, cosine], 1)))
+        seen = [mirrored, *waves(2 * mirrored, 1), cosine, self.directions(mirrored)]
+        return torch.sigmoid(self.net(torch.cat([features, normal, *seen], 1)))

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from univoxel import brdf
 from univoxel.lights import head
-from univoxel.networks import MLP, waves
+from univoxel.networks import MLP, DirectionTable, waves
 from univoxel.records import Surface
 
 _OCTAVES = 4  # of the mirrored direction: sines of 1, 2, 4, 8 radians
@@ -22,28 +22,34 @@ class MirroredLight(nn.Module):
     can hold (Liu et al. 2023, NeRO). Signed, for it corrects the lobes; at first it is 0.
     """
 
-    def __init__(self, features: int, hidden: int, scale: float):
+    def __init__(self, features: int, hidden: int, scale: float, known: int = 0):
         """
         Args:
             features: C of Surface.features.
             hidden: width of the network.
             scale: world units: half the extent of what is lit.
+            known: channels of the table of directions.
         """
         super().__init__()
         self.scale = scale
-        inputs = features + 3 + 6 * head.FREQUENCIES + 6 * _OCTAVES + 2
+        inputs = features + 3 + 6 * head.FREQUENCIES + 6 * _OCTAVES + 2 + known
         self.net = MLP([inputs, hidden, hidden, 3])
         last = self.net.linear[-1]
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
 
-    def forward(self, surface: Surface, wo: Tensor) -> Tensor:
-        """Radiance [N, 3] towards unit directions wo [N, 3], to be added."""
+    def forward(self, surface: Surface, wo: Tensor, table: DirectionTable) -> Tensor:
+        """Radiance [N, 3] towards unit directions wo [N, 3], to be added.
+
+        Args:
+            table: of mirrored directions, with `known` channels; another network's too.
+        """
         cosine = (surface.normal * wo).sum(1, keepdim=True)
         mirrored = 2 * cosine * surface.normal - wo
         roughness = surface.roughness[:, None]
         place = head.encode(surface, self.scale)
-        light = self.net(torch.cat([place, *waves(mirrored, _OCTAVES), roughness, cosine], 1))
+        way = [*waves(mirrored, _OCTAVES), roughness, cosine, table(mirrored)]
+        light = self.net(torch.cat([place, *way], 1))
         _, f0 = brdf.split(surface.albedo, surface.metallic)
         share = brdf.specular_albedo(cosine[:, 0], surface.roughness, f0)
         return (share if share.dim() == 2 else share[:, None]) * light

@@ -77,7 +77,7 @@ def shade(
         surface = replace(surface, features=scene.coded(surface.features, view))
         rgb = light.reflected(surface, wo, generator=generator)
         if scene.mirrored is not None:
-            rgb = (rgb + scene.mirrored(surface, wo)).clamp_min(0)
+            rgb = (rgb + scene.mirrored(surface, wo, scene.radiance.directions)).clamp_min(0)
         return scene.exposed(rgb, view)
     parts = []
     for index in torch.arange(len(wo)).split(max(1, TRACED_AT_ONCE // light.directions)):

@@ -22,6 +22,7 @@ from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS, HashField
 from univoxel.fields.hull import fit_grid
 from univoxel.lights import LocalSG
+from univoxel.networks import DirectionTable
 from univoxel.scene import SHELL, Scene, SceneConfig, stored
 from univoxel.tasks import shrink, spare
 from univoxel.tasks.look import TOLERANCE, Choice, Look, smallest
@@ -36,6 +37,7 @@ LESSON = 1024  # rays of the training photographs that heads settle on
 REACH_TOLERANCE = 0.05  # dB that nodes far from the surface may be worth and are not stored
 REACHES = (3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5, 1.25, 1.0)  # voxels
 ROW_BYTES = 4 + 2 * PER_LEVEL  # of a row of a hash table: its number, and features in halves
+MIRROR_SHARE = 0.1  # of a budget, that the table of mirrored directions may have
 HEADER, NAME = 8192, 64  # bytes of a model's file that hold no numbers, and of a view's name
 
 
@@ -209,6 +211,8 @@ def adapt(
         tolerance = REGAINED if after else TOLERANCE
         if scene.field.by_node:
             found.append(spare.fewer_channels(scene, look, lesson, tolerance))
+        if scene.cfg.mirror_levels:
+            found.append(spare.fewer_mirror_levels(scene, look, lesson))
         if spare.share_of_heads(scene) > spare.WORTH:
             if isinstance(scene.light, LocalSG):
                 found.append(spare.fewer_lobes(scene, look, lesson))
@@ -288,6 +292,18 @@ def table_rows(scene: SceneConfig, budget_mb: float | None) -> int:
     return min(max(2 ** int(math.log2(max(room, 1.0))), FEWEST_ROWS), ROWS)
 
 
+def mirror_levels(scene: SceneConfig, budget_mb: float | None) -> int:
+    """Levels of the table of mirrored directions: as many as a share of the budget has room for."""
+    if budget_mb is None:
+        return scene.mirror_levels
+    levels = range(scene.mirror_levels + 1)
+    return max(n for n in levels if _direction_bytes(n) <= MIRROR_SHARE * 1e6 * budget_mb)
+
+
+def _direction_bytes(levels: int) -> int:
+    return ROW_BYTES * sum(DirectionTable.rows_used(k) for k in range(levels))
+
+
 def _node_bytes(scene: Scene) -> int:
     """Of a node near the surface: number of its row and distance, in halves; and, where features
     are of nodes, its number again and features."""
@@ -296,10 +312,12 @@ def _node_bytes(scene: Scene) -> int:
 
 
 def _apart_from_grid(scene: Scene) -> int:
-    rest = (x for name, x in scene.state_dict().items() if not name.startswith("field."))
+    tables = ("field.", "radiance.directions.")
+    rest = (x for name, x in scene.state_dict().items() if not name.startswith(tables))
     names = NAME * len(scene.cfg.views)
     rows = 0 if scene.field.by_node else len(scene.field.features)
-    return HEADER + names + ROW_BYTES * rows + sum(x.numel() * x.element_size() for x in rest)
+    rows_bytes = ROW_BYTES * rows + _direction_bytes(scene.cfg.mirror_levels)
+    return HEADER + names + rows_bytes + sum(x.numel() * x.element_size() for x in rest)
 
 
 def on_grid(stage: StageConfig, box: tuple[Tensor, Tensor], voxel_size: float) -> StageConfig:

@@ -30,7 +30,10 @@ PARTS = {
     "views.": "views",
 }
 # Not learned: where the numbers of a grid belong, and directions that are computed
-INDICES = ("field.feature_rows", "field.sdf_rows", "field.sdf_side", "sky.direction")
+INDICES = (
+    *("field.feature_rows", "field.sdf_rows", "field.sdf_side", "sky.direction"),
+    "radiance.direction_rows",
+)
 TILE, MARGIN, BAR = 260, 12, 26  # pixels of the picture
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999", "#f0e442")
 

@@ -38,6 +38,7 @@ def parts_of(scene: Scene) -> Parts:
         (scene.field, scene.field.sized),
         (scene.material, ("net", "channels")),
         (scene.radiance, ("net",)),
+        (scene.radiance.directions, ("table",)),
     ]
     if isinstance(scene.light, LocalSG | LocalSH | LocalMLP):
         names.append((scene.light, ("head", "base", "config")))
@@ -114,6 +115,20 @@ def drop_lobes(scene: Scene, keep: Tensor) -> None:
     light.base = nn.Parameter(light.base.data[keep])
     light.config = replace(light.config, lobes=len(keep))
     scene.cfg = replace(scene.cfg, light=light.config)
+
+
+def drop_mirror_levels(scene: Scene, levels: int) -> None:
+    """Keep the coarsest levels of the table of mirrored directions; of the others the networks that
+    read it see 0 from now on."""
+    table = scene.radiance.directions
+    gone = table.channels - table.per_level * levels
+    for owner in (scene.radiance, scene.mirrored):
+        if owner is not None:
+            weights, biases = _layers(owner.net)
+            weights[0] = weights[0][:, : weights[0].shape[1] - gone]
+            owner.net = _network(weights, biases)
+    table.table = nn.Parameter(table.table.data[: levels * table.rows].clone())
+    scene.cfg = replace(scene.cfg, mirror_levels=levels)
 
 
 def narrow(net: MLP, x: Tensor, width: int) -> MLP:

@@ -1,8 +1,8 @@
-"""Fewer feature channels, lobes and hidden units, for as long as held-out rays do not suffer."""
+"""Fewer feature channels, lobes, levels and hidden units, as long as held-out rays do not suffer."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
@@ -47,7 +47,7 @@ def fewer_lobes(scene: Scene, look: Look, lesson: Look, limit: float = TOLERANCE
     def reduce(kept: int) -> None:
         shrink.drop_lobes(scene, order[:kept].sort().values)
 
-    return _spare("lobes", scene, look, lesson, count, reduce, limit)
+    return _spare("lobes", scene, look, lesson, shares(count), reduce, limit)
 
 
 def channel_basis(scene: Scene, look: Look) -> tuple[Tensor, Tensor]:
@@ -111,7 +111,17 @@ def fewer_channels(scene: Scene, look: Look, lesson: Look, limit: float) -> Choi
         shrink.drop_channels(scene, keep, mean)
         return keep
 
-    return _spare("channels", scene, look, lesson, scene.cfg.channels, reduce, limit)
+    return _spare("channels", scene, look, lesson, shares(scene.cfg.channels), reduce, limit)
+
+
+def fewer_mirror_levels(scene: Scene, look: Look, lesson: Look, limit: float = TOLERANCE) -> Choice:
+    """Drop the finest levels of the table of mirrored directions."""
+
+    def reduce(levels: int) -> None:
+        shrink.drop_mirror_levels(scene, levels)
+
+    candidates = range(scene.cfg.mirror_levels, -1, -1)
+    return _spare("mirror levels", scene, look, lesson, candidates, reduce, limit)
 
 
 def fewer_units(scene: Scene, look: Look, lesson: Look, limit: float = TOLERANCE) -> Choice:
@@ -123,7 +133,12 @@ def fewer_units(scene: Scene, look: Look, lesson: Look, limit: float = TOLERANCE
     def reduce(units: int) -> None:
         shrink.drop_units(scene, units, read)
 
-    return _spare("hidden units", scene, look, lesson, scene.cfg.hidden, reduce, limit)
+    return _spare("hidden units", scene, look, lesson, shares(scene.cfg.hidden), reduce, limit)
+
+
+def shares(count: int) -> list[int]:
+    """SHARES of a number, from the number itself down to 1 at least."""
+    return sorted({max(1, round(s * count)) for s in SHARES}, reverse=True)
 
 
 def _spare(
@@ -131,14 +146,15 @@ def _spare(
     scene: Scene,
     look: Look,
     lesson: Look,
-    count: int,
+    candidates: Sequence[int],
     reduce: Callable[[int], Tensor | None],
     limit: float,
 ) -> Choice:
-    """Reduce something of a scene to the smallest SHARES of `count` that costs at most `limit` dB
-    after the heads have settled, where those are worth the time.
+    """Reduce something of a scene to the smallest number that costs at most `limit` dB after the
+    heads have settled, where those are worth the time.
 
     Args:
+        candidates: numbers that fall from what there is.
         lesson: rays of the training photographs, to settle on.
         reduce: does it, by `shrink`; returns the channels it kept where it dropped any.
     """
@@ -147,6 +163,7 @@ def _spare(
         before = look.decode(scene, surface, surface.features)
         wanted = lesson.decode(scene, taught, taught.features)
     settles = share_of_heads(scene) > WORTH
+    count = candidates[0]
     parts = {count: shrink.parts_of(scene)}
     paid = {count: 0.0}
 
@@ -165,7 +182,6 @@ def _spare(
             parts[kept] = shrink.parts_of(scene)
         return paid[kept]
 
-    candidates = sorted({max(1, round(s * count)) for s in SHARES}, reverse=True)
     kept = smallest(candidates, cost, limit)
     shrink.put_back(parts[kept])
     why = f"costs {paid[kept]:.3f} dB"
@@ -176,7 +192,8 @@ def _spare(
 
 def share_of_heads(scene: Scene) -> float:
     """Share of the parameters near the surface and of the heads that the heads have."""
-    rest = sum(x.numel() for name, x in scene.named_parameters() if not name.startswith("field."))
+    tables = ("field.", "radiance.directions.")
+    rest = sum(x.numel() for name, x in scene.named_parameters() if not name.startswith(tables))
     near = nodes_near(scene)
     features = near * scene.cfg.channels
     if not scene.field.by_node:

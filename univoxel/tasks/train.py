@@ -123,7 +123,13 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         field = first_field(cfg, first, hull, box)
         light = lights.scaled(cfg.scene.light, float((box[1] - box[0]).max()) / 2)
         views = tuple(photos.names) if refined or cfg.scene.varying != "none" else ()
-        own = replace(cfg.scene, light=light, refined=refined, views=views)
+        own = replace(
+            cfg.scene,
+            light=light,
+            refined=refined,
+            views=views,
+            mirror_levels=capacity.mirror_levels(cfg.scene, cfg.budget_mb),
+        )
         scene = Scene(own, field)
         if poses:
             scene.poses = poses
@@ -232,15 +238,15 @@ def run_stage(
     if scene.views:
         scene.views.gain_steps.requires_grad_(not stage.refit)
         networks.append(scene.views)
-    poses = []
+    table, poses = scene.radiance.directions.table, []
     if scene.poses is not None:
         scene.poses.requires_grad_(not stage.refit)
         poses = [scene.poses.steps]
     optimizer = RowAdam(
         [
             {"params": [field.sdf], "eps": EPS_SDF},
-            {"params": [field.features], "eps": EPS_FEATURES},
-            {"params": [p for net in networks for p in net.parameters()]},
+            {"params": [field.features, table], "eps": EPS_FEATURES},
+            {"params": [p for net in networks for p in net.parameters() if p is not table]},
             {"params": poses},
         ],
         betas=MOMENTS,
