@@ -1,4 +1,4 @@
-"""Fewer feature channels, lobes, levels and hidden units, as long as held-out rays do not suffer."""
+"""Fewer channels, lobes, levels and hidden units, for as long as held-out rays do not suffer."""
 
 from __future__ import annotations
 
