@@ -371,7 +371,7 @@ def _configuration(
             joint = JointConfig(
                 iterations=steps,
                 share=0.25,
-                points=min(20000, 25 * steps),
+                points=min(25 * steps, 15000 + 6 * steps),
                 newton_points=min(4000, 3 * steps),
             )
             refit = StageConfig(

@@ -67,7 +67,7 @@ class DirectionTable(nn.Module):
     """
 
     coarsest = 0.5  # side of a cell, of a box of 2 around the sphere
-    rows = 2**14  # of a level; of those from the fifth on several nodes share one
+    rows = 2**14  # of a level; of those from the fourth on several nodes share one
     per_level = 2
     felt = 3  # levels that the direction gets gradients from
 
