@@ -182,6 +182,8 @@ def test_the_file_holds_every_field(tmp_path):
         (SceneConfig(), {"channels": 0}, "channels must be at least 1, got 0"),
         (SceneConfig(), {"hidden": 0}, "hidden must be at least 1, got 0"),
         (SceneConfig(), {"material_channels": 99}, r"at most channels \(16\), got 99"),
+        (SceneConfig(), {"mirror_levels": -1}, r"mirror_levels must be in \[0, 8\], got -1"),
+        (SceneConfig(), {"mirror_levels": 9}, r"mirror_levels must be in \[0, 8\], got 9"),
     ],
 )
 def test_values_out_of_range(config, change, message):
