@@ -89,7 +89,7 @@ def test_a_table_learns_a_lamp_that_a_network_alone_blurs():
             optimizer.step()
         return miss.item()
 
-    assert error(5) < 0.3 * error(0)
+    assert error(5) < 0.3 * error(0)  # 0.11 here
 
 
 def test_a_direction_feels_the_coarsest_levels_alone():

@@ -83,3 +83,19 @@ def test_radiance_mirrors_the_view_about_the_normal():
             )
         ),
     )  # fmt: skip
+
+
+def test_radiance_reads_its_table_in_the_mirrored_direction():
+    head, n = RadianceHead(2, 8, levels=3), 40
+    features, normal, wo = torch.randn(n, 2), directions(n), directions(n)
+    before = head(features, normal, wo)
+    mirrored = 2 * (normal * wo).sum(1, keepdim=True) * normal - wo
+    with torch.no_grad():
+        head.directions.table.normal_()
+        said = head.directions(mirrored)
+        changed = head(features, normal, wo)
+        plain = [features, normal, mirrored, (2 * mirrored).sin(), (2 * mirrored).cos()]
+        cosine = (normal * wo).sum(1, keepdim=True)
+        wanted = torch.sigmoid(head.net(torch.cat([*plain, cosine, said], 1)))
+    torch.testing.assert_close(changed, wanted)
+    assert (changed - before).abs().max() > 1e-3

@@ -60,9 +60,22 @@ def test_a_dielectric_mirrors_as_much_less_as_its_layer_reflects():
     torch.nn.init.normal_(head.net.linear[-1].weight)
     surface, wo = mirror_ball(50, 1.0)
     cosine = (surface.normal * wo).sum(1)
-    metal = (
-        head(surface, wo, NO_TABLE) / brdf.specular_albedo(cosine, surface.roughness, 1.0)[:, None]
-    )
+    whole = brdf.specular_albedo(cosine, surface.roughness, 1.0)[:, None]
+    metal = head(surface, wo, NO_TABLE) / whole
     surface = Surface(**{**vars(surface), "metallic": None})
     share = brdf.specular_albedo(cosine, surface.roughness, brdf.F0)[:, None]
     torch.testing.assert_close(head(surface, wo, NO_TABLE), share * metal)
+
+
+def test_reads_the_table_where_the_eye_is_mirrored():
+    (surface, wo), asked = mirror_ball(50, 1.0), []
+
+    class Watched(DirectionTable):
+        def forward(self, direction):
+            asked.append(direction)
+            return super().forward(direction)
+
+    MirroredLight(2, 8, 1.0, known=4)(surface, wo, Watched(2))
+    # Halfway between both lies the normal
+    torch.testing.assert_close(normalize(asked[0] + wo, dim=1), surface.normal)
+    torch.testing.assert_close(asked[0].norm(dim=1), torch.ones(50))

@@ -74,6 +74,11 @@ def test_albedo_tells_the_sides_apart(run):
     assert mesh.albedo[blue].mean(0).argmax() == 2
 
 
+def test_every_level_of_the_mirrored_directions_is_learned(run):
+    table = load_scene(run).radiance.directions
+    assert table.table.view(table.levels, -1).any(1).tolist() == [True] * 5
+
+
 @pytest.mark.parametrize(
     "light",
     [

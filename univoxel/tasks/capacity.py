@@ -312,8 +312,7 @@ def _node_bytes(scene: Scene) -> int:
 
 
 def _apart_from_grid(scene: Scene) -> int:
-    tables = ("field.", "radiance.directions.")
-    rest = (x for name, x in scene.state_dict().items() if not name.startswith(tables))
+    rest = (x for name, x in scene.state_dict().items() if not name.startswith(spare.TABLES))
     names = NAME * len(scene.cfg.views)
     rows = 0 if scene.field.by_node else len(scene.field.features)
     rows_bytes = ROW_BYTES * rows + _direction_bytes(scene.cfg.mirror_levels)

@@ -17,6 +17,7 @@ from univoxel.tasks.look import TOLERANCE, Choice, Look, smallest
 SHARES = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2, 3 / 8, 1 / 4, 1 / 8)  # that are tried, of what there is
 WORTH = 0.1  # share of the parameters from which on it is worth the time to make heads smaller
 SETTLE_STEPS, SETTLE_RATE = 20, 1e-3  # of Adam, for heads of which something was taken
+TABLES = ("field.", "radiance.directions.")  # names of parameters that begin so are no head's
 PROBES = 8  # random mixtures of the outputs whose gradients tell what they depend on
 
 
@@ -192,8 +193,7 @@ def _spare(
 
 def share_of_heads(scene: Scene) -> float:
     """Share of the parameters near the surface and of the heads that the heads have."""
-    tables = ("field.", "radiance.directions.")
-    rest = sum(x.numel() for name, x in scene.named_parameters() if not name.startswith(tables))
+    rest = sum(x.numel() for name, x in scene.named_parameters() if not name.startswith(TABLES))
     near = nodes_near(scene)
     features = near * scene.cfg.channels
     if not scene.field.by_node:
