@@ -78,6 +78,22 @@ def test_hollows_are_opened_where_there_is_time():
     assert found == {1: False, 2: False, 2.1: True, 4: True, 12: True}
 
 
+@pytest.mark.parametrize("light", ["hybrid", "sg"])
+def test_exposures_are_looked_at_unless_it_is_said_what_differs(light):
+    found = {
+        varying: preset("fast", Path("a"), Path("b"), light, varying)
+        for varying in ("auto", "none", "exposure", "light")
+    }
+    assert {k: c.exposures for k, c in found.items()} == {
+        "auto": True,
+        "none": False,
+        "exposure": False,
+        "light": False,
+    }
+    assert [c.scene.varying for c in found.values()] == ["none", "none", "exposure", "light"]
+    assert preset("fast", Path("a"), Path("b"), light) == found["auto"]
+
+
 def test_more_minutes_are_more_work():
     minutes = [0.05, 0.5, 1.0, 1.7, 3.9, 4.0, 4.1, 8.0, 12.0, 13.0, 60.0]
     configs = [budget(m, Path("photos"), Path("run")) for m in minutes]

@@ -29,7 +29,7 @@ def train(
     out: Annotated[Path, arg(metavar="RUN")],
     preset: Literal["auto", "draft", "fast", "full"] = "auto",
     light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
-    varying: Literal["none", "exposure", "light"] = "none",
+    varying: Literal["auto", "none", "exposure", "light"] = "auto",
     cameras: Literal["auto", "given", "refined"] = "auto",
     downscale: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
@@ -59,7 +59,8 @@ def train(
             visibility, which cleans shadows from the albedo; others to compare with: sh and mlp,
             local too, envmap-sg and envmap, one map from the beginning
         varying: what differs from photograph to photograph: exposure, with the colour balance, or
-            the light itself too
+            the light itself too; auto is exposure where the photographs' are seen to differ, or
+            else none
         cameras: refined puts the photographs' cameras right, before training and in it; auto does
             so where their silhouettes contradict one another
         downscale: train on photographs of 1/N of their width and height

@@ -20,12 +20,13 @@ from univoxel.lights import (
     SGConfig,
     SHConfig,
 )
-from univoxel.scene import SceneConfig, Varying
+from univoxel.scene import SceneConfig
 
 FieldName: TypeAlias = Literal["dense", "sparse", "hash"]
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
 Capacity: TypeAlias = Literal["fixed", "adaptive"]
 CamerasFrom: TypeAlias = Literal["auto", "given", "refined"]
+Differing: TypeAlias = Literal["auto", "none", "exposure", "light"]
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
 
 
@@ -138,8 +139,11 @@ class TrainConfig:
     # refined: the photographs' cameras are put right, before training and in it; auto: where their
     # silhouettes contradict one another
     cameras: CamerasFrom = "given"
+    # whether photographs are looked at for exposures that differ; where they do, scene.varying
+    # becomes exposure, of none
+    exposures: bool = False
     # whether hollows that no silhouette shows are opened before training, where photographs agree
-    # on them: not where their light varies
+    # on them: not where their light varies, other than in exposure
     hollows: bool = False
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
@@ -225,13 +229,13 @@ def check_same(cfg: TrainConfig) -> None:
     now = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
     # of configurations from before there were any
     since = {"downscale": 0, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
-    since |= {"cameras": "given"}
+    since |= {"cameras": "given", "exposures": False}
     for name in ("stages", "scene", *since):
         if not isinstance(before, dict) or before.get(name, since.get(name)) != now[name]:
             raise ValueError(
                 f"{path}: the run began with other {name}: resume with the same --preset, "
-                "--minutes, --light, --cameras, --downscale, --capacity, --budget-mb and --set as "
-                "then"
+                "--minutes, --light, --varying, --cameras, --downscale, --capacity, --budget-mb "
+                "and --set as then"
             )
 
 
@@ -254,7 +258,7 @@ HOLLOWS_MINUTES = 2.0  # up to which opening hollows costs more, in seconds, tha
 
 
 def preset(
-    name: str, data: Path, out: Path, light: LightName = "hybrid", varying: Varying = "none"
+    name: str, data: Path, out: Path, light: LightName = "hybrid", varying: Differing = "auto"
 ) -> TrainConfig:
     """The configuration of a preset: draft (1 minute), fast (4) or full (12) on two cores.
 
@@ -273,7 +277,7 @@ def preset(
 
 
 def budget(
-    minutes: float, data: Path, out: Path, light: LightName = "hybrid", varying: Varying = "none"
+    minutes: float, data: Path, out: Path, light: LightName = "hybrid", varying: Differing = "auto"
 ) -> TrainConfig:
     """The configuration for any time, in minutes on two cores: the presets and what lies between.
 
@@ -284,7 +288,7 @@ def budget(
             "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
             traced visibility from the beginning. docs/lights.md tells them apart.
         varying: what differs from photograph to photograph: "none"; "exposure", a gain per channel;
-            "light", the light itself too.
+            "light", the light itself too; "auto", exposure where they are seen to differ.
 
     Raises:
         ValueError: minutes out of range, no such light, or varying light with a map from the
@@ -301,7 +305,7 @@ def chosen(
     data: Path,
     out: Path,
     light: LightName = "hybrid",
-    varying: Varying = "none",
+    varying: Differing = "auto",
 ) -> TrainConfig:
     """A preset within a limit of minutes; or for the name auto, the work that fits into them.
 
@@ -341,10 +345,11 @@ def work_in(minutes: float) -> Work:
 
 
 def _configuration(
-    work: Work, data: Path, out: Path, light: LightName, varying: Varying
+    work: Work, data: Path, out: Path, light: LightName, varying: Differing
 ) -> TrainConfig:
     minutes, voxels = work.minutes, round(work.voxels, 3)
     hollows = minutes > HOLLOWS_MINUTES
+    exposures, known = varying == "auto", "none" if varying == "auto" else varying
     steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
     coarse = StageConfig(
         0.9, steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35), field="hash"
@@ -388,7 +393,7 @@ def _configuration(
                 refit=True,
                 field="hash",
             )
-            scene = SceneConfig(varying=varying)
+            scene = SceneConfig(varying=known)
             stages = (coarse, fine, joint, refit)
             return TrainConfig(
                 data,
@@ -396,17 +401,26 @@ def _configuration(
                 stages,
                 minutes,
                 cameras="auto",
+                exposures=exposures,
                 hollows=hollows,
                 capacity="adaptive",
                 scene=scene,
             )
         case _ if light in alone:
-            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=varying)
+            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=known)
             # Lobes that light the materials to the end: what leaves least shading in the albedo
             loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
             stages = (coarse, fine)
             return TrainConfig(
-                data, out, stages, minutes, cameras="auto", hollows=hollows, scene=scene, loss=loss
+                data,
+                out,
+                stages,
+                minutes,
+                cameras="auto",
+                exposures=exposures,
+                hollows=hollows,
+                scene=scene,
+                loss=loss,
             )
         case _:
             names = ", ".join(("hybrid", *alone))

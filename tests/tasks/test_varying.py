@@ -29,6 +29,7 @@ from univoxel.scene import Scene, SceneConfig, load_checkpoint, load_scene, save
 from univoxel.solve import equations, newton
 from univoxel.solve.sightings import draw_sightings, widened
 from univoxel.tasks import joint
+from univoxel.tasks import train as task
 from univoxel.tasks.train import held_out_psnr, train
 
 NODES = 12
@@ -174,13 +175,26 @@ def test_training_explains_exposures(tmp_path):
     photos = load_photos(data, "train")
     pixels = torch.cartesian_prod(torch.arange(12), torch.arange(32), torch.arange(32))
     found = {}
-    for varying in ("none", "exposure", "light"):
-        scene = replace(sizes, varying=varying)
-        cfg = TrainConfig(data, tmp_path / varying, stages, minutes=2.0, scene=scene)
+    for varying in ("none", "auto", "exposure", "light"):
+        auto = varying == "auto"
+        scene = replace(sizes, varying="none" if auto else varying)
+        run = tmp_path / varying
+        cfg = TrainConfig(data, run, stages, minutes=2.0, exposures=auto, scene=scene)
         learned = load_scene(train(cfg))
+        assert learned.cfg.varying == ("exposure" if auto else varying)
         assert learned.cfg.views == (() if varying == "none" else tuple(photos.names))
         found[varying] = held_out_psnr(learned, photos, pixels, physical=True)
-    assert min(found["exposure"], found["light"]) > found["none"] + 1
+    assert min(v for k, v in found.items() if k != "none") > found["none"] + 1
+
+
+def test_training_starts_from_the_exposures_that_were_seen(tmp_path, monkeypatch):
+    wanted = stops(12, 1.5).mean(1, keepdim=True).expand(-1, 3)
+    data = write_scene(tmp_path / "data", gain=2**wanted)
+    monkeypatch.setattr(task, "run_stage", lambda *_: None)
+    stages = (StageConfig(voxels=0.01, iterations=1, share=1.0),)
+    cfg = TrainConfig(data, tmp_path / "run", stages, minutes=1.0, exposures=True)
+    found = load_scene(train(cfg)).views.log_gain.detach() / math.log(2)
+    assert (found - wanted).square().mean().sqrt() < 0.1
 
 
 def test_the_light_of_a_view_from_the_command_line(tmp_path, capsys):

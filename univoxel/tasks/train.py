@@ -51,6 +51,7 @@ from univoxel.tasks.descent import (
     smooth,
     spread_gradient,
 )
+from univoxel.tasks.exposures import exposures
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress, Rehearsal
@@ -118,14 +119,17 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         poses = put_right(distance, photos.cameras, box) if refined else None
         cameras = poses.corrected(photos.cameras) if poses else photos.cameras
         hull = visual_hull(distance, cameras, first)
-        if cfg.hollows and cfg.scene.varying == "none":
-            hull = hollowed(hull, first, *pictures_of(photos, cameras, first.voxel_size))
+        there = replace(photos, cameras=cameras)
+        varying, gains = exposures(there, hull, first, cfg.scene.varying, cfg.exposures)
+        if cfg.hollows and varying != "light":
+            hull = hollowed(hull, first, *pictures_of(there, first.voxel_size, gains))
         field = first_field(cfg, first, hull, box)
         light = lights.scaled(cfg.scene.light, float((box[1] - box[0]).max()) / 2)
-        views = tuple(photos.names) if refined or cfg.scene.varying != "none" else ()
+        views = tuple(photos.names) if refined or varying != "none" else ()
         own = replace(
             cfg.scene,
             light=light,
+            varying=varying,
             refined=refined,
             views=views,
             mirror_levels=capacity.mirror_levels(cfg.scene, cfg.budget_mb),
@@ -133,6 +137,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         scene = Scene(own, field)
         if poses:
             scene.poses = poses
+        if scene.views and gains is not None:
+            scene.views.add(gains[:, None].expand(-1, 3))
         state = {"stage": 0, "progress": 0.0, "step": 0}
         if cfg.budget_mb is not None:
             capacity.check_budget(scene, cfg.budget_mb)
@@ -187,9 +193,12 @@ def first_field(
     return HashField(DenseField(grid, 0, hull), levels)
 
 
-def pictures_of(photos: Photos, cameras: Cameras, voxel_size: float) -> tuple[Tensor, Cameras]:
+def pictures_of(
+    photos: Photos, voxel_size: float, gains: Tensor | None = None
+) -> tuple[Tensor, Cameras]:
     """Photographs and cameras as `hollowed` takes them: some, with pixels between half a voxel and
-    a voxel wide where the photographs' are narrower."""
+    a voxel wide where the photographs' are narrower, and without their log gains [V]."""
+    cameras = photos.cameras
     some = torch.arange(0, len(photos), -(-len(photos) // HOLLOWS_VIEWS))
     away = (cameras.camera_to_world[:, :, 3] - looked_at(cameras)).norm(dim=1)
     pixel = float((away / cameras.focal.mean(1)).median())
@@ -197,6 +206,8 @@ def pictures_of(photos: Photos, cameras: Cameras, voxel_size: float) -> tuple[Te
     pictures = []
     for view in some.tolist():
         color, alpha = photos.picture(view)
+        if gains is not None:
+            color = color / gains[view].exp()
         premultiplied = torch.cat([linear_to_srgb(color) * alpha[..., None], alpha[..., None]], 2)
         shrunk = torch.nn.functional.avg_pool2d(premultiplied.permute(2, 0, 1), factor)
         pictures.append((255 * shrunk.permute(1, 2, 0)).round().byte())

@@ -1,0 +1,66 @@
+"""How photographs' exposures differ, as far as what they show of the same places tells."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from univoxel.color import linear_to_srgb
+from univoxel.data import Photos
+from univoxel.fields.dense import DenseField
+from univoxel.fields.hull import GridShape
+from univoxel.ops import VisibilityScene
+from univoxel.records import Mesh
+from univoxel.render.transport import observe, surface_points
+from univoxel.solve.equations import CLIPPED
+
+POINTS = 6000  # of the surface
+DARK = 0.1  # sRGB; of what is darker, rounding to 8 bits and reflections are too large a part
+ALIKE = 0.07  # in log: what is seen of one point may differ by before it counts for less
+ROUNDS = 60
+
+
+@torch.no_grad()
+def log_gains(photos: Photos, sdf: Tensor, grid: GridShape) -> Tensor:
+    """The log gains of photographs that agree best on how bright a surface's points are.
+
+    log brightness_pv = log gain_v + log albedo_p, in robust least squares: many sightings are of
+    something else, where the surface is off, and highlights move.
+
+    Args:
+        photos: V, their cameras where they are believed to be.
+        sdf: [X, Y, Z] world units, such as of the visual hull.
+        grid: of the sdf.
+
+    Returns:
+        [V], of mean 0; 0 for all if the photographs show no surface.
+
+    Source: Brown and Lowe 2007, "Automatic panoramic image stitching using invariant features", for
+    gains from overlaps; Cauchy's weights, iterated, as in robust statistics.
+    """
+    count, field = len(photos), DenseField(grid, 0, sdf)
+    gain = torch.zeros(count)
+    if not sdf.min() < 0 < sdf.max():
+        return gain
+    vertices, faces = field.isosurface()
+    normals = normalize(field.sample(vertices).gradient, dim=1, eps=1e-6)
+    mesh = Mesh(vertices, faces, normals)
+    points = surface_points(mesh, POINTS, torch.Generator().manual_seed(0))
+    seen = observe(*points, photos, VisibilityScene(vertices, faces), grid.voxel_size)
+    encoded = linear_to_srgb(seen.color)
+    usable = (encoded.mean(1) > DARK) & (encoded < CLIPPED).all(1)
+    point = torch.repeat_interleave(seen.offsets.diff())[usable]
+    view, log = seen.view[usable], seen.color[usable].mean(1).log()
+
+    def mean(values: Tensor, weight: Tensor, index: Tensor, length: int) -> Tensor:
+        total, weights = (torch.bincount(index, x, length) for x in (weight * values, weight))
+        return total / weights.clamp_min(1e-6)
+
+    weight = torch.ones_like(log)
+    for _ in range(ROUNDS):
+        albedo = mean(log - gain[view], weight, point, POINTS)
+        gain = mean(log - albedo[point], weight, view, count)
+        gain = gain - gain.mean()
+        weight = 1 / (1 + ((log - albedo[point] - gain[view]) / ALIKE).square())
+    return gain
