@@ -33,6 +33,7 @@ class Config:
     light: str
     varying: str
     minutes: float = 4.0
+    masks: str = "auto"
     cameras: str = "auto"
     downscale: int = 0
     seed: int = 0
@@ -99,6 +100,8 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
         "2",
         "--downscale",
         "4",
+        "--masks",
+        "given",
         "--cameras",
         "refined",
         *(f"--set={change}" for change in changes),
@@ -106,7 +109,7 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     assert main(["train", "photos", "--out", str(out), *options]) == 0
     stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0, field="hash")
     expected = Config(
-        *(Path("photos"), out, "draft", "sg", "exposure", 2.0, "refined", 4, 7),
+        *(Path("photos"), out, "draft", "sg", "exposure", 2.0, "given", "refined", 4, 7),
         loss=LossConfig(2.0),
         stages=stages,
     )

@@ -41,6 +41,7 @@ HELPERS = {
     "tasks": {
         *("animation", "capacity", "contact_sheet", "descent", "envmap", "frames", "guard"),
         *(
+            "exposures",
             "joint",
             "layers",
             "look",

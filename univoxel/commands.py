@@ -30,6 +30,7 @@ def train(
     preset: Literal["auto", "draft", "fast", "full"] = "auto",
     light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
     varying: Literal["auto", "none", "exposure", "light"] = "auto",
+    masks: Literal["auto", "given"] = "auto",
     cameras: Literal["auto", "given", "refined"] = "auto",
     downscale: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
@@ -61,6 +62,7 @@ def train(
         varying: what differs from photograph to photograph: exposure, with the colour balance, or
             the light itself too; auto is exposure where the photographs' are seen to differ, or
             else none
+        masks: auto takes masks in that end outside of the object, as the photographs show it
         cameras: refined puts the photographs' cameras right, before training and in it; auto does
             so where their silhouettes contradict one another
         downscale: train on photographs of 1/N of their width and height
@@ -90,7 +92,7 @@ def train(
     if downscale is not None and downscale < 1:
         raise ValueError(f"--downscale must be at least 1, got {downscale}")
     config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
-    config = dataclasses.replace(config, cameras=cameras, downscale=downscale or 0)
+    config = dataclasses.replace(config, masks=masks, cameras=cameras, downscale=downscale or 0)
     config = with_field(config, field)
     if budget_mb is not None and capacity == "auto":
         capacity = "adaptive"

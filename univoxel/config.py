@@ -26,6 +26,7 @@ FieldName: TypeAlias = Literal["dense", "sparse", "hash"]
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
 Capacity: TypeAlias = Literal["fixed", "adaptive"]
 CamerasFrom: TypeAlias = Literal["auto", "given", "refined"]
+MasksFrom: TypeAlias = Literal["auto", "given"]
 Differing: TypeAlias = Literal["auto", "none", "exposure", "light"]
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
 
@@ -136,6 +137,8 @@ class TrainConfig:
     # finer grid would only learn their noise
     voxel_pixels: float = 1.0
     seed: int = 0
+    # auto: masks that end outside of the object, as the photographs show it, are taken in
+    masks: MasksFrom = "given"
     # refined: the photographs' cameras are put right, before training and in it; auto: where their
     # silhouettes contradict one another
     cameras: CamerasFrom = "given"
@@ -185,6 +188,7 @@ class TrainConfig:
         names = ("patience", "downscale", "voxel_pixels")
         _check(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
         _check(self, "fixed or adaptive", lambda x: x in get_args(Capacity), "capacity")
+        _check(self, "auto or given", lambda x: x in get_args(MasksFrom), "masks")
         _check(self, "auto, given or refined", lambda x: x in get_args(CamerasFrom), "cameras")
         _check(self, "above 0 or None", lambda x: x is None or 0 < x < math.inf, "budget_mb")
         if self.budget_mb is not None and self.capacity == "fixed":
@@ -229,13 +233,13 @@ def check_same(cfg: TrainConfig) -> None:
     now = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
     # of configurations from before there were any
     since = {"downscale": 0, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
-    since |= {"cameras": "given", "exposures": False}
+    since |= {"masks": "given", "cameras": "given", "exposures": False}
     for name in ("stages", "scene", *since):
         if not isinstance(before, dict) or before.get(name, since.get(name)) != now[name]:
             raise ValueError(
                 f"{path}: the run began with other {name}: resume with the same --preset, "
-                "--minutes, --light, --varying, --cameras, --downscale, --capacity, --budget-mb "
-                "and --set as then"
+                "--minutes, --light, --varying, --masks, --cameras, --downscale, --capacity, "
+                "--budget-mb and --set as then"
             )
 
 
@@ -400,6 +404,7 @@ def _configuration(
                 out,
                 stages,
                 minutes,
+                masks="auto",
                 cameras="auto",
                 exposures=exposures,
                 hollows=hollows,
@@ -416,6 +421,7 @@ def _configuration(
                 out,
                 stages,
                 minutes,
+                masks="auto",
                 cameras="auto",
                 exposures=exposures,
                 hollows=hollows,

@@ -13,7 +13,8 @@ from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
 from univoxel.experiments.stress.damage import turned
-from univoxel.lights import SGConfig
+from univoxel.fields.hull import mask_distances
+from univoxel.lights import EnvmapConfig, EnvmapSGConfig, MLPLightConfig, SGConfig, SHConfig
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig, load_scene
 from univoxel.tasks import train as task
@@ -112,11 +113,31 @@ def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):
     train(cfg, resume=True)
     torch.testing.assert_close(load_scene(cfg.out).poses.steps, before)
     box, _ = task.object_box(
-        task.mask_distances(load_photos(data, "train").coverage()),
+        mask_distances(load_photos(data, "train").coverage()),
         load_photos(data, "train").cameras,
         "auto",
     )
     assert seen == [task.fit_grid(*box, 20000)]
+
+
+@pytest.mark.parametrize(
+    "light",
+    [
+        SHConfig(hidden=16, directions=32, directions_eval=32),
+        MLPLightConfig(rank=4, hidden=16, directions=32, directions_eval=32),
+        EnvmapSGConfig(lobes=8, rows=8, directions=8, directions_eval=16),
+        EnvmapConfig(rows=8, directions=8, directions_eval=16),
+    ],
+    ids=lambda light: light.kind,
+)
+def test_cameras_are_refined_under_every_light(data, tmp_path, light):
+    """The directions to them have gradients, then, and what is drawn under the light takes some."""
+    cfg = config(data, tmp_path / "run")
+    stage = replace(cfg.stages[1], iterations=5, physical_from=0.0)
+    cfg = replace(cfg, stages=(stage,), scene=replace(cfg.scene, light=light, sky_nodes=0))
+    scene = load_scene(train(cfg))
+    assert scene.poses.steps.isfinite().all()
+    assert scene.cfg.refined
 
 
 def test_trust_looks_from_where_the_cameras_are(data, run):

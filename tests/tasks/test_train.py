@@ -7,11 +7,13 @@ import pytest
 import torch
 from analytic import RADIUS, photos_of, sphere_scene, write_scene
 from layouts import Scene, write_colmap
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from univoxel.color import linear_to_srgb
+from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.config import StageConfig, TrainConfig, preset, with_field
 from univoxel.data import load_photos
+from univoxel.data.images import read_image, write_png
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import EnvmapConfig, EnvmapSGConfig, MLPLightConfig, SGConfig, SHConfig
 from univoxel.render.pipeline import extract_mesh
@@ -103,6 +105,39 @@ def test_grids_of_a_training_are_no_finer_than_its_photographs(data, tmp_path, m
     monkeypatch.setattr(task, "run_stage", lambda *_: None)
     scene = load_scene(train(config(data, tmp_path / "run", voxel_pixels=1.2)))
     assert scene.field.voxel_size == pytest.approx(1.2 * 1.8 / 32, rel=0.05)  # cameras differ
+
+
+@pytest.mark.parametrize(
+    ("masks", "wide", "said"),
+    [
+        ("auto", True, "masks are 3 pixels too wide: they are taken in\n"),
+        ("given", True, "masks are 3 pixels too wide: see --masks auto\n"),
+        ("auto", False, None),
+    ],
+)
+def test_masks_that_are_too_wide_are_taken_in(tmp_path, monkeypatch, capsys, masks, wide, said):
+    """What training starts with is as large as the ball, or larger by 3 pixels of 0.028."""
+    folder = write_scene(tmp_path / "data", size=64)
+    grey = 0.2
+    for path in sorted((folder / "train").glob("*.png")):
+        rgba = read_image(path).float() / 255
+        color = linear_to_srgb(
+            srgb_to_linear(rgba[..., :3]) * rgba[..., 3:] + grey * (1 - rgba[..., 3:])
+        )
+        y, x = torch.meshgrid(torch.arange(-3, 4), torch.arange(-3, 4), indexing="ij")
+        disc = (x * x + y * y <= 9).numpy()
+        alpha = (
+            ndimage.grey_dilation(rgba[..., 3].numpy(), footprint=disc) if wide else rgba[..., 3]
+        )
+        both = torch.cat([color, torch.as_tensor(alpha)[..., None]], -1)
+        write_png(path, (255 * both).round().byte().numpy())
+    monkeypatch.setattr(task, "run_stage", lambda *_: None)
+    cfg = config(folder, tmp_path / "run", masks=masks)
+    away = extract_mesh(load_scene(train(cfg))).vertices.norm(dim=1).mean()
+    larger = 3 * 0.028 * (wide and masks == "given")
+    assert away == pytest.approx(RADIUS + larger, abs=0.02)
+    out = capsys.readouterr().out
+    assert said in out if said else "too wide" not in out
 
 
 @pytest.mark.parametrize(

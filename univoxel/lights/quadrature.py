@@ -113,7 +113,7 @@ def reflected_shared(
     All points share the D = light.directions directions, over the whole sphere, and
     `light.incident` takes them as [D, 3]: what a light does per direction it does D times, not N D
     times. An occlusion goes by the directions around each normal. Differentiable in what the light
-    is, and in the surface's normals and materials.
+    is, and in the surface's normals and materials; not in wo.
 
     Args:
         generator: turns the directions at random, as a whole.
@@ -126,7 +126,7 @@ def reflected_shared(
     return ops.shade_radiance(
         light.incident(surface, directions),
         surface.normal,
-        wo,
+        wo.detach(),  # cameras that are refined would ask for it
         diffuse,
         surface.roughness,
         directions,

@@ -1,16 +1,41 @@
-"""Whether photographs and cameras agree, and cameras that are put right where they do not."""
+"""Whether photographs, masks and cameras agree; what is put right where they do not."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from torch import Tensor
 
 from univoxel.camera import Cameras
-from univoxel.config import CamerasFrom
-from univoxel.fields.hull import estimate_bounds
+from univoxel.config import CamerasFrom, MasksFrom
+from univoxel.data import Photos
+from univoxel.fields.hull import estimate_bounds, mask_distances
+from univoxel.fields.outlines import taken_in, too_wide
 from univoxel.fields.registration import align, contradiction
 from univoxel.poses import PoseSteps
 
 AGREEING = 0.25  # pixels that silhouettes may contradict one another by: -0.4 where all is exact
+
+
+def masks_of(photos: Photos, wanted: MasksFrom) -> tuple[Photos, Tensor]:
+    """The photographs with masks that fit, as far as those are too wide, and `mask_distances`.
+
+    Args:
+        wanted: as of the configuration.
+    """
+    coverage = photos.coverage()
+    distance = mask_distances(coverage)
+    off = too_wide(photos.color, coverage, distance)
+    if not off:
+        return photos, distance
+    much = f"masks are {off} {'pixel' if off == 1 else 'pixels'} too wide"
+    if wanted == "given":
+        print(f"{much}: see --masks auto")
+        return photos, distance
+    print(f"{much}: they are taken in")
+    coverage = taken_in(distance, off)
+    stored = coverage if photos.alpha.is_floating_point() else (255 * coverage).round().byte()
+    return replace(photos, alpha=stored), mask_distances(coverage)
 
 
 def object_box(

@@ -30,7 +30,7 @@ from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
 from univoxel.fields.hollows import hollowed
-from univoxel.fields.hull import GridShape, fit_grid, looked_at, mask_distances, visual_hull
+from univoxel.fields.hull import GridShape, fit_grid, looked_at, visual_hull
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import priors
 from univoxel.metrics import psnr
@@ -55,7 +55,7 @@ from univoxel.tasks.exposures import exposures
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress, Rehearsal
-from univoxel.tasks.registration import object_box, put_right
+from univoxel.tasks.registration import masks_of, object_box, put_right
 from univoxel.tasks.timelapse import Timelapse
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
@@ -102,7 +102,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     print(photos.about)
 
     begin = time.monotonic()  # only now: how long reading takes is the photographs' affair
-    distance = mask_distances(photos.coverage())
+    photos, distance = masks_of(photos, cfg.masks)
     pixels, held_out = split_pixels(distance)
     try:
         box, refined = object_box(distance, photos.cameras, cfg.cameras)

@@ -1,0 +1,79 @@
+"""Masks that are too wide are told from the outline that photographs show inside of them."""
+
+import pytest
+import torch
+from scipy import ndimage
+
+from univoxel.fields.hull import mask_distances
+from univoxel.fields.outlines import taken_in, too_wide
+
+VIEWS, SIZE, RADIUS = 6, 96, 26
+
+
+def depth() -> torch.Tensor:
+    """Pixels inside the outline of a disc, elsewhere in each picture: [V, H, W]."""
+    y, x = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    generator = torch.Generator().manual_seed(0)
+    middle = SIZE / 2 + 8 * torch.rand(VIEWS, 2, 1, 1, generator=generator) - 4
+    return RADIUS - ((x - middle[:, 0]) ** 2 + (y - middle[:, 1]) ** 2).sqrt()
+
+
+def patterned(seed: int, low: float, high: float) -> torch.Tensor:
+    """Blotches of some pixels: [V, H, W, 3] in [low, high]."""
+    noise = torch.rand(VIEWS, SIZE, SIZE, 3, generator=torch.Generator().manual_seed(seed))
+    smooth = torch.from_numpy(ndimage.gaussian_filter(noise.numpy(), (0, 3, 3, 0)))
+    smooth = (smooth - smooth.min()) / (smooth.max() - smooth.min())
+    return low + (high - low) * smooth
+
+
+def coverage(pixels: float, sharp: bool = False) -> torch.Tensor:
+    """Masks of the disc that are so many pixels too wide."""
+    soft = (depth() + pixels + 0.5).clamp(0, 1)
+    return (soft > 0.5).float() if sharp else soft
+
+
+def before(surroundings: torch.Tensor, disc: torch.Tensor) -> torch.Tensor:
+    inside = coverage(0)[..., None]
+    return inside * disc + (1 - inside) * surroundings
+
+
+def found(color: torch.Tensor, masks: torch.Tensor) -> int:
+    return too_wide(color, masks, mask_distances(masks))
+
+
+@pytest.mark.parametrize("eight_bits", [False, True])
+@pytest.mark.parametrize("sharp", [False, True])
+@pytest.mark.parametrize("pixels", [0, 1, 2, 3, 6])
+def test_how_much_too_wide(pixels, sharp, eight_bits):
+    color = before(patterned(0, 0.0, 0.4), patterned(1, 0.3, 0.9))
+    color = (255 * color).byte() if eight_bits else color
+    assert found(color, coverage(pixels, sharp)) == pixels
+
+
+@pytest.mark.parametrize(("pixels", "wanted"), [(0, 0), (1, 0), (2, 0), (3, 3), (6, 6)])
+def test_of_objects_cut_out_only_the_inside_tells(pixels, wanted):
+    """Where they were cut is no outline; and what is 1 or 2 pixels inside looks like shading."""
+    masks = coverage(pixels)
+    color = before(patterned(0, 0.0, 0.4), patterned(1, 0.3, 0.9)) * (masks[..., None] > 0)
+    assert found(color, masks) == wanted
+
+
+def test_a_pattern_inside_is_no_outline():
+    """A white vase, painted in the middle, before a white wall."""
+    white, paint = torch.full((VIEWS, SIZE, SIZE, 3), 0.9), patterned(1, 0.0, 0.9)
+    painted = torch.lerp(white, paint, ((depth()[..., None] - 3) / 12).clamp(0, 1))
+    color = before(white, painted)
+    assert found(color, coverage(0)) == 0
+
+
+@pytest.mark.parametrize("masks", [torch.zeros(2, 9, 9), torch.ones(2, 9, 9)])
+def test_no_edge_says_nothing(masks):
+    assert found(torch.rand(2, 9, 9, 3), masks) == 0
+
+
+def test_taken_in_masks_end_where_the_object_does():
+    wide = mask_distances(coverage(3))
+    inner = taken_in(wide, 3)
+    # Distances to pixels, not to the true edge: up to half a pixel off
+    assert (inner - coverage(0)).abs().max() < 0.6
+    assert (inner - coverage(0)).abs().mean() < 0.01

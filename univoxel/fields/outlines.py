@@ -1,0 +1,71 @@
+"""Whether masks end where the object does: there pictures change more than beside it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from univoxel.color import linear_to_srgb
+
+REACH = 0.015, 6  # of a picture's larger side, and pixels at least: wider masks stay as they are
+BEYOND = 3, 5  # pixels further in, from and to, that the object is looked at for comparison
+CLEAR = 1.5  # times as much as at the masks' edges, and as further in, pictures change at outlines
+ONE_COLOR = 0.9  # share of what surrounds the object, from which on it counts as cut away
+FEW = 50  # pixels, below which a distance to the edge is left out
+
+
+@torch.no_grad()
+def too_wide(color: Tensor, coverage: Tensor, distance: Tensor) -> int:
+    """Pixels by which masks are too wide, all of them alike; 0 where they fit or nothing tells.
+
+    Across the edge of a mask, colours change most at the object's outline: in the mean over all
+    photographs everything else, the object's pattern or what stands behind it, lies anywhere.
+
+    Args:
+        color: [V, H, W, 3] of photographs, uint8 sRGB or linear. What surrounds the object may be
+            there, or cut away: then masks have to be too wide by 3 pixels to be seen so.
+        coverage: [V, H, W] in [0, 1], by masks.
+        distance: [V, H, W] from `hull.mask_distances`.
+    """
+    share, least = REACH
+    reach = max(least, round(share * max(distance.shape[1:])))
+    change = _change(color, coverage, distance, reach + BEYOND[1])
+    if change.isnan().all():
+        return 0
+    first = int((~change.isnan()).nonzero()[0])
+    # A sharp edge lies between the outermost pixel inside and the innermost outside: at 0 and at 1
+    edge = change[0:2].min() if first == 0 else change[first]
+    peak = int(change[: reach + 1].nan_to_num(0).argmax())
+    further = change[peak + BEYOND[0] : peak + BEYOND[1] + 1].mean()
+    if not (change[peak] > CLEAR * edge and change[peak] > CLEAR * further):
+        return 0
+    around = torch.arange(max(peak - 1, 0), peak + 2)
+    weight = change[around].nan_to_num(0).square()
+    return round(float((weight * around).sum() / weight.sum()))
+
+
+def _change(color: Tensor, coverage: Tensor, distance: Tensor, deepest: int) -> Tensor:
+    """How much colours change towards the masks' edges, in the mean over pixels whose depth inside
+    is 0, 1, ... deepest: [deepest + 1] sRGB a pixel; NaN where there are few."""
+    total, count = torch.zeros(2, deepest + 1)
+    for c, covered, d in zip(color, coverage, distance, strict=True):
+        encoded = c.float() / 255 if c.dtype == torch.uint8 else linear_to_srgb(c)
+        around = encoded[covered < 0.01]
+        same = (around == around.median(0).values).all(1) if len(around) else torch.ones(1)
+        cut_away = float(same.float().mean()) > ONE_COLOR
+        hidden = (covered < 0.99) if cut_away else torch.zeros_like(covered, dtype=torch.bool)
+        hidden = max_pool2d(hidden[None].float(), 3, 1, 1)[0] > 0
+        depth = (0.5 - d).floor().long()
+        y, x = (~hidden & (depth >= 0) & (depth <= deepest)).nonzero(as_tuple=True)
+        inward, slope = (torch.stack(torch.gradient(v, dim=(0, 1)))[:, y, x] for v in (d, encoded))
+        inward = inward / inward.norm(dim=0).clamp_min(1e-6)
+        along = (inward[..., None] * slope).sum(0).norm(dim=1)
+        total += torch.bincount(depth[y, x], along, deepest + 1)
+        count += torch.bincount(depth[y, x], minlength=deepest + 1)
+    return torch.where(count >= FEW, total / count, torch.nan)
+
+
+def taken_in(distance: Tensor, pixels: float) -> Tensor:
+    """Coverage [V, H, W] in [0, 1] by masks that end so many pixels further in."""
+    return (0.5 - pixels - distance).clamp(0, 1)
