@@ -4,6 +4,7 @@ import pytest
 import torch
 from scipy import ndimage
 
+from univoxel.fields import outlines
 from univoxel.fields.hull import mask_distances
 from univoxel.fields.outlines import taken_in, too_wide
 
@@ -69,6 +70,13 @@ def test_a_pattern_inside_is_no_outline():
 @pytest.mark.parametrize("masks", [torch.zeros(2, 9, 9), torch.ones(2, 9, 9)])
 def test_no_edge_says_nothing(masks):
     assert found(torch.rand(2, 9, 9, 3), masks) == 0
+
+
+def test_of_many_photographs_some_are_looked_at(monkeypatch):
+    monkeypatch.setattr(outlines, "VIEWS", 2)
+    color, masks = before(patterned(0, 0.0, 0.4), patterned(1, 0.3, 0.9)), coverage(0)
+    masks[::3] = coverage(3)[::3]  # two of six
+    assert found(color, masks) == 3
 
 
 def test_taken_in_masks_end_where_the_object_does():

@@ -8,6 +8,7 @@ from torch.nn.functional import max_pool2d
 
 from univoxel.color import linear_to_srgb
 
+VIEWS = 32  # photographs at most that are looked at
 REACH = 0.015, 6  # of a picture's larger side, and pixels at least: wider masks stay as they are
 BEYOND = 3, 5  # pixels further in, from and to, that the object is looked at for comparison
 CLEAR = 1.5  # times as much as at the masks' edges, and as further in, pictures change at outlines
@@ -30,7 +31,8 @@ def too_wide(color: Tensor, coverage: Tensor, distance: Tensor) -> int:
     """
     share, least = REACH
     reach = max(least, round(share * max(distance.shape[1:])))
-    change = _change(color, coverage, distance, reach + BEYOND[1])
+    step = -(-len(color) // VIEWS)
+    change = _change(color[::step], coverage[::step], distance[::step], reach + BEYOND[1])
     if change.isnan().all():
         return 0
     first = int((~change.isnan()).nonzero()[0])
