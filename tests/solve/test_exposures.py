@@ -79,6 +79,18 @@ def test_clipped_pixels_tell_no_gain(photos, hull):
     assert rms(found - stops(1.0)) < 0.04  # as if nothing were clipped 0.02
 
 
+def test_photographs_that_share_few_points():
+    """Five around a ball: each point is seen in one or two."""
+    photos = photos_of(5, 32)
+    distance = mask_distances(photos.coverage())
+    grid = fit_grid(*estimate_bounds(distance, photos.cameras), 20000)
+    wanted = torch.tensor([1.0, -0.5, 0.8, -1.2, -0.1])
+    color = photos.color / 4 * 2 ** wanted[:, None, None, None]
+    hull = visual_hull(distance, photos.cameras, grid)
+    found = log_gains(replace(photos, color=color), hull, grid) / math.log(2)
+    assert rms(found - wanted) < 0.15
+
+
 def test_no_surface_says_nothing(photos, hull):
     sdf, grid = hull
     assert not log_gains(photos, sdf.abs() + 1, grid).any()

@@ -18,7 +18,8 @@ from univoxel.solve.equations import CLIPPED
 POINTS = 6000  # of the surface
 DARK = 0.1  # sRGB; of what is darker, rounding to 8 bits and reflections are too large a part
 ALIKE = 0.07  # in log: what is seen of one point may differ by before it counts for less
-ROUNDS = 60
+ROUNDS = 20
+LOOSE = 1e-3  # points that speak for a gain of 1: of a photograph that shares none with others
 
 
 @torch.no_grad()
@@ -39,8 +40,7 @@ def log_gains(photos: Photos, sdf: Tensor, grid: GridShape) -> Tensor:
     Source: Brown and Lowe 2007, "Automatic panoramic image stitching using invariant features", for
     gains from overlaps; Cauchy's weights, iterated, as in robust statistics.
     """
-    count, field = len(photos), DenseField(grid, 0, sdf)
-    gain = torch.zeros(count)
+    field, gain = DenseField(grid, 0, sdf), torch.zeros(len(photos))
     if not sdf.min() < 0 < sdf.max():
         return gain
     vertices, faces = field.isosurface()
@@ -50,17 +50,17 @@ def log_gains(photos: Photos, sdf: Tensor, grid: GridShape) -> Tensor:
     seen = observe(*points, photos, VisibilityScene(vertices, faces), grid.voxel_size)
     encoded = linear_to_srgb(seen.color)
     usable = (encoded.mean(1) > DARK) & (encoded < CLIPPED).all(1)
-    point = torch.repeat_interleave(seen.offsets.diff())[usable]
-    view, log = seen.view[usable], seen.color[usable].mean(1).log()
-
-    def mean(values: Tensor, weight: Tensor, index: Tensor, length: int) -> Tensor:
-        total, weights = (torch.bincount(index, x, length) for x in (weight * values, weight))
-        return total / weights.clamp_min(1e-6)
-
-    weight = torch.ones_like(log)
+    where = torch.repeat_interleave(seen.offsets.diff())[usable], seen.view[usable]
+    log, there = torch.zeros(2, POINTS, len(photos), dtype=torch.double)
+    log[where], there[where] = seen.color[usable].mean(1).double().log(), 1.0
+    weight = there
     for _ in range(ROUNDS):
-        albedo = mean(log - gain[view], weight, point, POINTS)
-        gain = mean(log - albedo[point], weight, view, count)
+        share = weight / weight.sum(1, keepdim=True).clamp_min(1e-9)
+        # The albedos eliminated: a Laplacian of the photographs, tied by the points that they share
+        system = torch.diag(weight.sum(0) + LOOSE) - weight.T @ share
+        right = (weight * (log - (share * log).sum(1, keepdim=True))).sum(0)
+        gain = torch.linalg.solve(system, right)
         gain = gain - gain.mean()
-        weight = 1 / (1 + ((log - albedo[point] - gain[view]) / ALIKE).square())
-    return gain
+        albedo = (share * (log - gain)).sum(1, keepdim=True)
+        weight = there / (1 + ((log - gain - albedo) / ALIKE).square())
+    return gain.float()
