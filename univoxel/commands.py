@@ -451,8 +451,8 @@ def stress(
     Renders small scenes with Mitsuba 3, spoils their photographs, trains and measures. Writes
     DIR/stress.md with the breaking point of each axis, stress.json, stress.png and stress.svg.
     Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, thin, noise,
-    placement, dark, bright; exposure-varying and light-varying are trained with --varying. A
-    training that fails is a result. What is done is kept: the same command goes on.
+    placement, dark, bright; light-varying is trained with --varying light. A training that fails
+    is a result. What is done is kept: the same command goes on.
 
     Args:
         out: folder for scenes, photographs, trainings and results

@@ -61,7 +61,7 @@ def _photos(name: str, title: str, field: str, values: Sequence[float], sign=1, 
     return Axis(name, title, tuple(levels))
 
 
-_STOPS, _SHARES = (0.0, 0.5, 1.0, 2.0), (0.0, 0.25, 0.5, 1.0)
+_SHARES = 0.0, 0.25, 0.5, 1.0
 AXES = {
     axis.name: axis
     for axis in (
@@ -80,14 +80,7 @@ AXES = {
             _photos("pose", "error of the cameras, degrees", "pose", (0.0, 0.1, 0.3, 1.0)),
             quick=(0, 2, 3),
         ),
-        _photos("exposure", "exposures apart, +- stops", "stops", _STOPS),
-        _photos(
-            "exposure-varying",
-            "the same, with --varying exposure",
-            "stops",
-            _STOPS,
-            changes=("scene.varying=exposure",),
-        ),
+        _photos("exposure", "exposures apart, +- stops", "stops", (0.0, 0.5, 1.0, 2.0)),
         _photos("light", "share of a second light, up to", "light", _SHARES),
         _photos(
             "light-varying",
