@@ -12,10 +12,24 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import GridShape
-from univoxel.lights import LightConfig, SGConfig
+from univoxel.lights import (
+    EnvmapConfig,
+    EnvmapSGConfig,
+    LightConfig,
+    MLPLightConfig,
+    SGConfig,
+    SHConfig,
+)
 from univoxel.scene import Scene, SceneConfig
 
 RADIUS = 0.5
+# Every model of light beside lobes, small
+LIGHTS = (
+    SHConfig(hidden=16, directions=64, directions_eval=64),
+    MLPLightConfig(rank=4, hidden=16, directions=64, directions_eval=64),
+    EnvmapSGConfig(lobes=16, rows=16, directions=16, directions_eval=32),
+    EnvmapConfig(rows=16, directions=16, directions_eval=32),
+)
 
 
 def look_at(position: torch.Tensor) -> torch.Tensor:

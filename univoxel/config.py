@@ -397,37 +397,26 @@ def _configuration(
                 refit=True,
                 field="hash",
             )
-            scene = SceneConfig(varying=known)
-            stages = (coarse, fine, joint, refit)
-            return TrainConfig(
-                data,
-                out,
-                stages,
-                minutes,
-                masks="auto",
-                cameras="auto",
-                exposures=exposures,
-                hollows=hollows,
-                capacity="adaptive",
-                scene=scene,
-            )
+            scene, loss = SceneConfig(varying=known), LossConfig()
+            stages, capacity = (coarse, fine, joint, refit), "adaptive"
         case _ if light in alone:
             scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=known)
             # Lobes that light the materials to the end: what leaves least shading in the albedo
             loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
-            stages = (coarse, fine)
-            return TrainConfig(
-                data,
-                out,
-                stages,
-                minutes,
-                masks="auto",
-                cameras="auto",
-                exposures=exposures,
-                hollows=hollows,
-                scene=scene,
-                loss=loss,
-            )
+            stages, capacity = (coarse, fine), "fixed"
         case _:
             names = ", ".join(("hybrid", *alone))
             raise ValueError(f"light must be one of {names}, got {light!r}")
+    return TrainConfig(
+        data,
+        out,
+        stages,
+        minutes,
+        masks="auto",
+        cameras="auto",
+        exposures=exposures,
+        hollows=hollows,
+        capacity=capacity,
+        scene=scene,
+        loss=loss,
+    )

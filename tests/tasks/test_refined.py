@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from analytic import RADIUS, cameras_around, write_scene
+from analytic import LIGHTS, RADIUS, cameras_around, write_scene
 
 from univoxel.camera import project
 from univoxel.config import StageConfig, TrainConfig
@@ -14,7 +14,7 @@ from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
 from univoxel.experiments.stress.damage import turned
 from univoxel.fields.hull import mask_distances
-from univoxel.lights import EnvmapConfig, EnvmapSGConfig, MLPLightConfig, SGConfig, SHConfig
+from univoxel.lights import SGConfig
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig, load_scene
 from univoxel.tasks import train as task
@@ -120,16 +120,7 @@ def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):
     assert seen == [task.fit_grid(*box, 20000)]
 
 
-@pytest.mark.parametrize(
-    "light",
-    [
-        SHConfig(hidden=16, directions=32, directions_eval=32),
-        MLPLightConfig(rank=4, hidden=16, directions=32, directions_eval=32),
-        EnvmapSGConfig(lobes=8, rows=8, directions=8, directions_eval=16),
-        EnvmapConfig(rows=8, directions=8, directions_eval=16),
-    ],
-    ids=lambda light: light.kind,
-)
+@pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.kind)
 def test_cameras_are_refined_under_every_light(data, tmp_path, light):
     """The directions to them have gradients, then, and what is drawn under the light takes some."""
     cfg = config(data, tmp_path / "run")

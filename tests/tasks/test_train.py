@@ -5,7 +5,7 @@ import json
 
 import pytest
 import torch
-from analytic import RADIUS, photos_of, sphere_scene, write_scene
+from analytic import LIGHTS, RADIUS, photos_of, sphere_scene, write_scene
 from layouts import Scene, write_colmap
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
@@ -15,7 +15,7 @@ from univoxel.config import StageConfig, TrainConfig, preset, with_field
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.fields.sparse import SparseField
-from univoxel.lights import EnvmapConfig, EnvmapSGConfig, MLPLightConfig, SGConfig, SHConfig
+from univoxel.lights import SGConfig
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import FILE, SceneConfig, load_scene
 from univoxel.tasks import train as task
@@ -81,16 +81,7 @@ def test_every_level_of_the_mirrored_directions_is_learned(run):
     assert table.table.view(table.levels, -1).any(1).tolist() == [True] * 5
 
 
-@pytest.mark.parametrize(
-    "light",
-    [
-        SHConfig(hidden=16, directions=64, directions_eval=64),
-        MLPLightConfig(rank=4, hidden=16, directions=64, directions_eval=64),
-        EnvmapSGConfig(lobes=16, rows=16, directions=16, directions_eval=32),
-        EnvmapConfig(rows=16, directions=16, directions_eval=32),
-    ],
-    ids=lambda light: light.kind,
-)
+@pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.kind)
 def test_every_light_learns_the_photographs(data, tmp_path, light):
     cfg = config(data, tmp_path / "run")
     cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, light=light, sky_nodes=0))
