@@ -12,7 +12,7 @@ from univoxel.scene import Varying
 from univoxel.solve.exposures import log_gains
 
 # Stops, root mean square, up to which photographs count as exposed alike. Where they are, what
-# reflects and a hull that is too large look like 0.01 to 0.15. All of metal, or light that changes,
+# reflects and a hull that is too large look like 0.01 to 0.16. All of metal, or light that changes,
 # look like 0.25: gains do no harm there
 ALIKE = 0.2
 
