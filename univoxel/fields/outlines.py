@@ -35,9 +35,7 @@ def too_wide(color: Tensor, coverage: Tensor, distance: Tensor) -> int:
     change = _change(color[::step], coverage[::step], distance[::step], reach + BEYOND[1])
     if change.isnan().all():
         return 0
-    first = int((~change.isnan()).nonzero()[0])
-    # A sharp edge lies between the outermost pixel inside and the innermost outside: at 0 and at 1
-    edge = change[0:2].min() if first == 0 else change[first]
+    edge = change[int((~change.isnan()).nonzero()[0])]
     peak = int(change[: reach + 1].nan_to_num(0).argmax())
     further = change[peak + BEYOND[0] : peak + BEYOND[1] + 1].mean()
     if not (change[peak] > CLEAR * edge and change[peak] > CLEAR * further):
