@@ -195,6 +195,8 @@ def test_the_file_holds_every_field(tmp_path):
         (CONFIG, {"downscale": -1}, "downscale must be at least 0, got -1"),
         (CONFIG, {"voxel_pixels": -1}, "voxel_pixels must be at least 0, got -1"),
         (CONFIG, {"minutes": 0.0}, "minutes must be above 0, got 0.0"),
+        (CONFIG, {"masks": "wide"}, "masks must be auto or given, got 'wide'"),
+        (CONFIG, {"cameras": "wrong"}, "cameras must be auto, given or refined, got 'wrong'"),
         (SceneConfig(), {"channels": 0}, "channels must be at least 1, got 0"),
         (SceneConfig(), {"hidden": 0}, "hidden must be at least 1, got 0"),
         (SceneConfig(), {"material_channels": 99}, r"at most channels \(16\), got 99"),

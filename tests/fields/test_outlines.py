@@ -72,6 +72,13 @@ def test_no_edge_says_nothing(masks):
     assert found(torch.rand(2, 9, 9, 3), masks) == 0
 
 
+def test_wider_masks_than_are_looked_for_stay(monkeypatch):
+    color = before(patterned(0, 0.0, 0.4), patterned(1, 0.3, 0.9))
+    assert found(color, coverage(9)) == 0
+    monkeypatch.setattr(outlines, "REACH", (0.1, 6))  # of 96 pixels
+    assert found(color, coverage(9)) == 9
+
+
 def test_of_many_photographs_some_are_looked_at(monkeypatch):
     monkeypatch.setattr(outlines, "VIEWS", 2)
     color, masks = before(patterned(0, 0.0, 0.4), patterned(1, 0.3, 0.9)), coverage(0)

@@ -66,6 +66,6 @@ def _change(color: Tensor, coverage: Tensor, distance: Tensor, deepest: int) -> 
     return torch.where(count >= FEW, total / count, torch.nan)
 
 
-def taken_in(distance: Tensor, pixels: float) -> Tensor:
+def taken_in(distance: Tensor, pixels: int) -> Tensor:
     """Coverage [V, H, W] in [0, 1] by masks that end so many pixels further in."""
     return (0.5 - pixels - distance).clamp(0, 1)

@@ -11,10 +11,10 @@ from univoxel.fields.hull import GridShape
 from univoxel.scene import Varying
 from univoxel.solve.exposures import log_gains
 
-# Stops, root mean square, up to which photographs count as exposed alike. Where they are, what
+# Stops, root mean square, from which on exposures count as different. Where they are alike, what
 # reflects and a hull that is too large look like 0.01 to 0.16. All of metal, or light that changes,
 # look like 0.25: gains do no harm there
-ALIKE = 0.2
+DIFFERENT = 0.2
 
 
 def exposures(
@@ -34,7 +34,7 @@ def exposures(
     gains = log_gains(photos, hull, grid)
     stops = float(gains.square().mean().sqrt()) / math.log(2)
     if varying == "none":
-        if stops < ALIKE:
+        if stops < DIFFERENT:
             return varying, None
         varying = "exposure"
         print(
