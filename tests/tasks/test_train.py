@@ -300,6 +300,9 @@ def test_resume_refuses_another_configuration(run, data):
         train(dataclasses.replace(cfg, downscale=2), resume=True)
     with pytest.raises(ValueError, match="the run began with other stages: resume with the same"):
         train(dataclasses.replace(cfg, stages=cfg.stages[:1]), resume=True)
+    for change in ({"masks": "auto"}, {"exposures": True}):
+        with pytest.raises(ValueError, match=f"the run began with other {next(iter(change))}: "):
+            train(dataclasses.replace(cfg, **change), resume=True)
     train(dataclasses.replace(cfg, minutes=5.0), resume=True)  # more time is no other run
 
 
