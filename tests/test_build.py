@@ -98,3 +98,16 @@ def test_the_bundled_scene_is_complete():
         frames = json.loads((folder / "tiny" / f"transforms_{split}.json").read_text())["frames"]
         assert len(frames) == views
         assert all((folder / "tiny" / f"{f['file_path']}.png").exists() for f in frames)
+
+
+def test_the_first_call_of_an_op_imports_no_compiler():
+    """That takes a second and 70 MB, of every command."""
+    code = (
+        "import sys, torch\n"
+        "from univoxel.ops import composite\n"
+        "alpha = torch.rand(4, requires_grad=True)\n"
+        "out, _ = composite(alpha, torch.rand(4, 3), torch.tensor([0, 4]))\n"
+        "out.sum().backward()\n"
+        "print('torch._dynamo' in sys.modules, alpha.grad.norm() > 0)"
+    )
+    assert run(code) == "False tensor(True)\n"

@@ -98,9 +98,7 @@ def adam_rows_reference_(
     param[rows] -= lr / (1 - beta1**step) * m / (root + eps)
 
 
-@torch.library.custom_op(
-    "univoxel::adam_rows_", mutates_args=("param", "exp_avg", "exp_avg_sq"), device_types="cpu"
-)
+@native.operator("adam_rows_", mutates_args=("param", "exp_avg", "exp_avg_sq"))
 def _adam_rows(
     param: Tensor,
     exp_avg: Tensor,

@@ -70,7 +70,7 @@ def composite_reference(
     return out, weight
 
 
-@torch.library.custom_op("univoxel::composite", mutates_args=(), device_types="cpu")
+@native.operator("composite")
 def _composite(
     alpha: Tensor, value: Tensor, offsets: Tensor, early_stop: float
 ) -> tuple[Tensor, Tensor]:
@@ -81,7 +81,7 @@ def _composite(
     return out, weight
 
 
-@torch.library.custom_op("univoxel::composite_backward", mutates_args=(), device_types="cpu")
+@native.operator("composite_backward")
 def _composite_backward(
     alpha: Tensor,
     value: Tensor,

@@ -139,7 +139,7 @@ class SparseGrad(torch.autograd.Function):
         return grad.to_sparse(ctx.dims), None
 
 
-@torch.library.custom_op("univoxel::sample_dense", mutates_args=(), device_types="cpu")
+@native.operator("sample_dense")
 def _sample_dense(
     sdf: Tensor,
     features: Tensor,
@@ -170,7 +170,7 @@ def _empty_outputs(features: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Te
     )
 
 
-@torch.library.custom_op("univoxel::sample_dense_backward", mutates_args=(), device_types="cpu")
+@native.operator("sample_dense_backward")
 def _sample_dense_backward(
     sdf: Tensor,
     features: Tensor,

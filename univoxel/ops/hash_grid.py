@@ -128,7 +128,7 @@ def encode_hash_reference(
     return torch.cat(outputs, 1)
 
 
-@torch.library.custom_op("univoxel::encode_hash", mutates_args=(), device_types="cpu")
+@native.operator("encode_hash")
 def _encode_hash(
     table: Tensor,
     points: Tensor,
@@ -149,7 +149,7 @@ def _place(lower: list[float], upper: list[float], voxel_sizes: list[float]) -> 
     return lattice_sizes(lower, upper, voxel_sizes), lower, voxel_sizes
 
 
-@torch.library.custom_op("univoxel::encode_hash_backward", mutates_args=(), device_types="cpu")
+@native.operator("encode_hash_backward")
 def _encode_hash_backward(
     table: Tensor,
     points: Tensor,

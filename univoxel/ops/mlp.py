@@ -58,7 +58,7 @@ def mlp_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]
     return torch.nn.functional.linear(x, weights[-1], biases[-1])
 
 
-@torch.library.custom_op("univoxel::mlp", mutates_args=(), device_types="cpu")
+@native.operator("mlp")
 def _mlp(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
     out = x.new_empty(len(x), len(biases[-1]))
     native.require().mlp_forward(
@@ -71,7 +71,7 @@ def _mlp(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
     return out
 
 
-@torch.library.custom_op("univoxel::mlp_backward", mutates_args=(), device_types="cpu")
+@native.operator("mlp_backward")
 def _mlp_backward(
     x: Tensor,
     weights: list[Tensor],

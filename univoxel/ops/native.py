@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Literal
@@ -105,3 +105,23 @@ def arrays(*tensors: Tensor) -> list[np.ndarray]:
 def threads() -> int:
     """torch.set_num_threads rules the kernels too."""
     return torch.get_num_threads()
+
+
+def operator(
+    name: str, mutates_args: tuple[str, ...] = ()
+) -> Callable[[Callable], torch.library.CustomOpDef]:
+    """``torch.library.custom_op`` of a kernel for the CPU, ready to be called.
+
+    Kernels that custom_op registers itself import the compiler when first called: a second, and
+    70 MB, of every command.
+    """
+
+    def define(kernel: Callable) -> torch.library.CustomOpDef:
+        qualified = f"univoxel::{name}"
+        defined = torch.library.custom_op(
+            qualified, kernel, mutates_args=mutates_args, device_types=()
+        )
+        torch.library.impl(qualified, "cpu", kernel)
+        return defined
+
+    return define

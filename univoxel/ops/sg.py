@@ -105,7 +105,7 @@ def shade_sg_reference(
     return (2 * math.pi / len(directions)) * (radiance * f * cosine).sum(1)
 
 
-@torch.library.custom_op("univoxel::shade_sg", mutates_args=(), device_types="cpu")
+@native.operator("shade_sg")
 def _shade_sg(
     axis: Tensor,
     sharpness: Tensor,
@@ -124,7 +124,7 @@ def _shade_sg(
     return rgb
 
 
-@torch.library.custom_op("univoxel::shade_sg_backward", mutates_args=(), device_types="cpu")
+@native.operator("shade_sg_backward")
 def _shade_sg_backward(
     axis: Tensor,
     sharpness: Tensor,

@@ -191,7 +191,7 @@ def shade_map_reference(
     )
 
 
-@torch.library.custom_op("univoxel::shade_radiance", mutates_args=(), device_types="cpu")
+@native.operator("shade_radiance")
 def _shade_radiance(
     radiance: Tensor,
     normal: Tensor,
@@ -210,7 +210,7 @@ def _shade_radiance(
     return rgb
 
 
-@torch.library.custom_op("univoxel::shade_radiance_backward", mutates_args=(), device_types="cpu")
+@native.operator("shade_radiance_backward")
 def _shade_radiance_backward(
     radiance: Tensor,
     normal: Tensor,
@@ -232,7 +232,7 @@ def _shade_radiance_backward(
     return grads
 
 
-@torch.library.custom_op("univoxel::shade_map", mutates_args=(), device_types="cpu")
+@native.operator("shade_map")
 def _shade_map(
     map: Tensor,
     visibility: Tensor,
@@ -256,7 +256,7 @@ def _shade_map(
     return rgb
 
 
-@torch.library.custom_op("univoxel::shade_map_backward", mutates_args=(), device_types="cpu")
+@native.operator("shade_map_backward")
 def _shade_map_backward(
     map: Tensor,
     visibility: Tensor,

@@ -85,7 +85,7 @@ def sample_sparse_reference(
     return sample_dense_reference(whole, of_nodes, points, origin, voxel_size)
 
 
-@torch.library.custom_op("univoxel::sample_sparse", mutates_args=(), device_types="cpu")
+@native.operator("sample_sparse")
 def _sample_sparse(
     sdf: Tensor,
     features: Tensor,
@@ -119,7 +119,7 @@ def _empty_outputs(features: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Te
     )
 
 
-@torch.library.custom_op("univoxel::sample_sparse_backward", mutates_args=(), device_types="cpu")
+@native.operator("sample_sparse_backward")
 def _sample_sparse_backward(
     sdf: Tensor,
     features: Tensor,
