@@ -73,11 +73,6 @@ def test_a_preset_is_a_point_of_the_curve(name, light):
     assert budget(config.minutes, Path("photos"), Path("run"), light) == config
 
 
-def test_hollows_are_opened_where_there_is_time():
-    found = {m: budget(m, Path("data"), Path("run")).hollows for m in (1, 2, 2.1, 4, 12)}
-    assert found == {1: False, 2: False, 2.1: True, 4: True, 12: True}
-
-
 @pytest.mark.parametrize("light", ["hybrid", "sg"])
 def test_exposures_are_looked_at_unless_it_is_said_what_differs(light):
     found = {
@@ -194,6 +189,7 @@ def test_the_file_holds_every_field(tmp_path):
         (CONFIG, {"patience": -0.1}, "patience must be at least 0, got -0.1"),
         (CONFIG, {"downscale": -1}, "downscale must be at least 0, got -1"),
         (CONFIG, {"voxel_pixels": -1}, "voxel_pixels must be at least 0, got -1"),
+        (CONFIG, {"hollows": -0.1}, "hollows must be at least 0, got -0.1"),
         (CONFIG, {"minutes": 0.0}, "minutes must be above 0, got 0.0"),
         (CONFIG, {"masks": "wide"}, "masks must be auto or given, got 'wide'"),
         (CONFIG, {"cameras": "wrong"}, "cameras must be auto, given or refined, got 'wrong'"),

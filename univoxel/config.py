@@ -145,9 +145,10 @@ class TrainConfig:
     # whether photographs are looked at for exposures that differ; where they do, scene.varying
     # becomes exposure, of none
     exposures: bool = False
-    # whether hollows that no silhouette shows are opened before training, where photographs agree
-    # on them: not where their light varies, other than in exposure
-    hollows: bool = False
+    # share of the minutes, >= 0, that opening hollows before training may be expected to take, or
+    # they are left alone: hollows that no silhouette shows, where photographs agree on them. Never
+    # where their light varies, other than in exposure
+    hollows: float = 0.0
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
     capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see tasks/capacity.py
@@ -185,7 +186,7 @@ class TrainConfig:
                 "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
             )
         _check(self, "above 0", lambda x: x > 0, "minutes")
-        names = ("patience", "downscale", "voxel_pixels")
+        names = ("patience", "downscale", "voxel_pixels", "hollows")
         _check(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
         _check(self, "fixed or adaptive", lambda x: x in get_args(Capacity), "capacity")
         _check(self, "auto or given", lambda x: x in get_args(MasksFrom), "masks")
@@ -258,7 +259,7 @@ PRESETS = {
     "fast": Work(4.0, voxels=2.0, steps=1200, rays=2048),
     "full": Work(12.0, voxels=4.0, steps=4200, rays=2048),
 }
-HOLLOWS_MINUTES = 2.0  # up to which opening hollows costs more, in seconds, than it brings
+HOLLOWS = 0.04  # share of the time: where opening them takes more it costs more than it brings
 
 
 def preset(
@@ -352,7 +353,6 @@ def _configuration(
     work: Work, data: Path, out: Path, light: LightName, varying: Differing
 ) -> TrainConfig:
     minutes, voxels = work.minutes, round(work.voxels, 3)
-    hollows = minutes > HOLLOWS_MINUTES
     exposures, known = varying == "auto", "none" if varying == "auto" else varying
     steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
     coarse = StageConfig(
@@ -415,7 +415,7 @@ def _configuration(
         masks="auto",
         cameras="auto",
         exposures=exposures,
-        hollows=hollows,
+        hollows=HOLLOWS,
         capacity=capacity,
         scene=scene,
         loss=loss,

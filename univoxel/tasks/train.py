@@ -14,7 +14,7 @@ from rich.text import Text
 from torch import Tensor
 
 from univoxel import lights, losses
-from univoxel.camera import Cameras, pixel_rays
+from univoxel.camera import pixel_rays
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.config import (
     JointConfig,
@@ -29,8 +29,7 @@ from univoxel.data.images import replacing
 from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
-from univoxel.fields.hollows import hollowed
-from univoxel.fields.hull import GridShape, fit_grid, looked_at, visual_hull
+from univoxel.fields.hull import GridShape, fit_grid, visual_hull
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import priors
 from univoxel.metrics import psnr
@@ -53,6 +52,7 @@ from univoxel.tasks.descent import (
 )
 from univoxel.tasks.exposures import exposures
 from univoxel.tasks.guard import Guard
+from univoxel.tasks.hollows import opened
 from univoxel.tasks.plateau import Plateau
 from univoxel.tasks.progress import Progress, Rehearsal
 from univoxel.tasks.registration import masks_of, object_box, put_right
@@ -60,7 +60,6 @@ from univoxel.tasks.timelapse import Timelapse
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
-HOLLOWS_VIEWS = 100  # photographs at most that say what is hollow: 0.07 seconds each
 RETRACE = 100  # steps after which light is traced through the surface as it has become
 RATES = ("lr_sdf", "lr_features", "lr_networks")
 MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silhouette's fringe
@@ -122,7 +121,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         there = replace(photos, cameras=cameras)
         varying, gains = exposures(there, hull, first, cfg.scene.varying, cfg.exposures)
         if cfg.hollows and varying != "light":
-            hull = hollowed(hull, first, *pictures_of(there, first.voxel_size, gains))
+            hull = opened(hull, first, there, gains, cfg.hollows * 60 * cfg.minutes)
         field = first_field(cfg, first, hull, box)
         light = lights.scaled(cfg.scene.light, float((box[1] - box[0]).max()) / 2)
         views = tuple(photos.names) if refined or varying != "none" else ()
@@ -191,29 +190,6 @@ def first_field(
     rows = capacity.table_rows(cfg.scene, cfg.budget_mb)
     levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL, rows)
     return HashField(DenseField(grid, 0, hull), levels)
-
-
-def pictures_of(
-    photos: Photos, voxel_size: float, gains: Tensor | None = None
-) -> tuple[Tensor, Cameras]:
-    """Photographs and cameras as `hollowed` takes them: some, with pixels between half a voxel and
-    a voxel wide where the photographs' are narrower, and without their log gains [V]."""
-    cameras = photos.cameras
-    some = torch.arange(0, len(photos), -(-len(photos) // HOLLOWS_VIEWS))
-    away = (cameras.camera_to_world[:, :, 3] - looked_at(cameras)).norm(dim=1)
-    pixel = float((away / cameras.focal.mean(1)).median())
-    factor = max(1, int(voxel_size / pixel))
-    pictures = []
-    for view in some.tolist():
-        color, alpha = photos.picture(view)
-        if gains is not None:
-            color = color / gains[view].exp()
-        premultiplied = torch.cat([linear_to_srgb(color) * alpha[..., None], alpha[..., None]], 2)
-        shrunk = torch.nn.functional.avg_pool2d(premultiplied.permute(2, 0, 1), factor)
-        pictures.append((255 * shrunk.permute(1, 2, 0)).round().byte())
-    height, width = pictures[0].shape[:2]
-    pose, focal, centre = cameras.camera_to_world[some], cameras.focal[some], cameras.centre[some]
-    return torch.stack(pictures), Cameras(pose, focal / factor, centre / factor, width, height)
 
 
 def say_trust(scene: Scene, photos: Photos, out: Path, troubles: list[str]) -> None:
