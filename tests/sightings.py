@@ -78,7 +78,7 @@ class Steps:
 
     def __init__(self, count: int, rooms: Sequence[int] = ()):
         self.count, self.rooms, self.asked = count, list(rooms), []
-        self.troubles, self.abandoned = [], False
+        self.troubles, self.said, self.abandoned = [], [], False
 
     def steps(self, apart):
         assert 0 <= apart < 1
@@ -100,6 +100,9 @@ class Steps:
 
     def trouble(self, what: str) -> None:
         self.troubles.append(what)
+
+    def say(self, what: str) -> None:
+        self.said.append(what)
 
     def abandon(self) -> None:
         self.abandoned = True

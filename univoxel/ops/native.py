@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch  # first: the extension then shares torch's OpenMP runtime
@@ -107,16 +107,14 @@ def threads() -> int:
     return torch.get_num_threads()
 
 
-def operator(
-    name: str, mutates_args: tuple[str, ...] = ()
-) -> Callable[[Callable], torch.library.CustomOpDef]:
-    """``torch.library.custom_op`` of a kernel for the CPU, ready to be called.
+def operator(name: str, mutates_args: tuple[str, ...] = ()) -> Callable[[Callable], Any]:
+    """``torch.library.custom_op`` of a kernel for the CPU.
 
     Kernels that custom_op registers itself import the compiler when first called: a second, and
     70 MB, of every command.
     """
 
-    def define(kernel: Callable) -> torch.library.CustomOpDef:
+    def define(kernel: Callable) -> Any:
         qualified = f"univoxel::{name}"
         defined = torch.library.custom_op(
             qualified, kernel, mutates_args=mutates_args, device_types=()

@@ -136,6 +136,8 @@ def newton_round(
                 break
             differs = view_differences(scene)
         x = sky.log_radiance.T  # [3, D]
+        if problem.sun is not None:
+            x = x - problem.sun.T
         x = torch.nn.functional.pad(x, (0, unknowns - x.shape[1]))  # no gain is likelier than 1
         system, right, ties = smooth, -x @ smooth, []
         between = torch.zeros(())  # channels, which roughness ties to one another
@@ -176,6 +178,8 @@ def choose(scene: Scene, problem: Problem, cfg: JointConfig) -> Points | None:
     chosen, parts = in_parts(chosen, problem.metal)
     features = scene.field.features_at(problem.seen.position[chosen])
     albedo, roughness, _ = scene.material(features)
+    if problem.albedo is not None:
+        albedo = problem.albedo[chosen]
     log_albedo = albedo.clamp_min(1e-3).log()
     sighting = sightings_of(problem, chosen, cfg.newton_views)
     pull = (NOISE / cfg.newton_roughness) ** 2 if cfg.newton_roughness else 0.0

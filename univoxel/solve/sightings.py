@@ -40,6 +40,8 @@ class Problem:
     target: Tensor  # [S, 3] sRGB-encoded sightings
     metal: Tensor  # [P] bool, what is taken for metal; no other point can become it
     voxel_size: float
+    sun: Tensor | None = None  # [D, 3] what a sun adds to the log map, which else is smooth
+    albedo: Tensor | None = None  # [P, 3] under that sun, while the materials know nothing of it
 
     @property
     def solid_angle(self) -> float:

@@ -26,6 +26,7 @@ from univoxel.solve.metals import find_metal
 from univoxel.solve.newton import newton_round
 from univoxel.solve.sightings import Problem, draw, draw_sightings, pose, turned, widened
 from univoxel.solve.start import STEPS, TRIALS, TRIED, supposed
+from univoxel.solve.suns import sunlit
 from univoxel.tasks.descent import EPS_FEATURES, EPS_SDF, MOMENTS, moved, spread_gradient
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.progress import Progress
@@ -66,10 +67,12 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             if more == cfg.rounds:
                 with progress.apart():
                     problem = supposed(scene, problem, cfg, seconds, progress.trouble)
+                    problem = sunlit(scene, problem, progress.say)
             with progress.apart():
                 costs = newton_round(scene, problem, cfg, seconds, progress.trouble)
                 sure = 1 - (more - 1) / max(cfg.rounds - 1, 1)
-                problem = replace(problem, metal=find_metal(scene, problem, cfg, sure))
+                metal = find_metal(scene, problem, cfg, sure)
+                problem = replace(problem, metal=metal, albedo=None)
             more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
             groups = [
                 {"params": [scene.field.features], "eps": EPS_FEATURES},

@@ -76,9 +76,9 @@ class Progress:
             return
         for told in (*(c["said"] for c in self.chosen), self.cut()):
             if told:
-                self._say(told)
+                self.say(told)
         if self.troubles:
-            self._say(
+            self.say(
                 f"training met trouble and went on, {len(self.troubles)} times: look at the result "
                 f"before you trust it; the last was in {self.troubles[-1]}"
             )
@@ -179,9 +179,10 @@ class Progress:
         self.troubles.append(what)
         nothing = {"losses": {}, "held_out_psnr": None, "rays_per_second": None}
         append_line(self._log, json.dumps(self.state() | nothing | {"trouble": what}))
-        self._say(what)
+        self.say(what)
 
-    def _say(self, what: str) -> None:
+    def say(self, what: str) -> None:
+        """Tell at once of something that was found."""
         self._bar.console.print(what, markup=False, highlight=False)
 
     @contextmanager

@@ -1,0 +1,121 @@
+"""A sun is seen in the shadows that it would else leave in the albedo."""
+
+import math
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import scene_of
+from sightings import lamps, problem_on_a_sphere
+from torch.nn.functional import normalize
+
+from univoxel.config import JointConfig
+from univoxel.lights.views import ViewLights
+from univoxel.solve.newton import newton_round
+from univoxel.solve.suns import CELL, palette_entropy, sunlit
+
+NODES, POINTS = 128, 900
+PAINTS = torch.tensor([[0.7, 0.2, 0.1], [0.1, 0.3, 0.6], [0.5, 0.5, 0.4], [0.05, 0.06, 0.05]])
+SUN = normalize(torch.tensor([0.4, -0.3, 0.8]), dim=0)
+
+
+def painted(light, views=4, paints=PAINTS):
+    """A scene that knows no map yet, and a sphere behind random walls, of matte paints, under a map
+    [D, 3]; and the albedo [P, 3]."""
+    torch.manual_seed(3)
+    scene = scene_of((0.5, 0.5, 0.5), 0.5, NODES)
+    problem = problem_on_a_sphere(POINTS, views, NODES)
+    direction = problem.transport.direction
+    wall = normalize(torch.randn(POINTS, 3), dim=1) @ direction.T > 0.3
+    open_share = (~wall * 255).byte()
+    transport = replace(problem.transport, open=open_share)
+    cosine = (problem.seen.normal @ direction.T).clamp_min(0) * problem.solid_angle / math.pi
+    albedo = paints[torch.randint(len(paints), (POINTS,))]
+    color = albedo * ((cosine * ~wall) @ light)
+    seen = replace(problem.seen, color=color.repeat_interleave(views, 0))
+    return scene, replace(problem, seen=seen, transport=transport), albedo
+
+
+def with_sun(share):
+    """An even sky and, near SUN, a node that sends such a share of all light."""
+    direction = problem_on_a_sphere(1, 1, NODES).transport.direction
+    node = int((direction @ SUN).argmax())
+    map = torch.full((NODES, 3), 1 - share) * torch.tensor([0.8, 0.9, 1.1])
+    map[node] += share * NODES
+    return map, node
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8, 0.95])
+def test_a_sun_is_found(share):
+    map, node = with_sun(share)
+    scene, problem, albedo = painted(map)
+    said = []
+    found = sunlit(scene, problem, said.append)
+    assert found.sun is not None
+    assert said[0].startswith(f"a sun sends {share:.0%} of the light, from about azimuth ")
+    azimuth, elevation = (math.radians(int(x)) for x in re.findall(r"-?\d+", said[0])[1:])
+    across = math.cos(elevation)
+    told = across * math.cos(azimuth), across * math.sin(azimuth), math.sin(elevation)
+    assert torch.tensor(told) @ problem.transport.direction[node] > math.cos(math.radians(1))
+    assert (found.sun.amin(1) > 0).nonzero().flatten().tolist() == [node]
+    power = scene.sky.radiance.detach().mean(1)
+    # Shares are tried in steps of 0.05 to 0.15; walls make them differ by a little
+    assert float(power[node] / power.sum()) == pytest.approx(share, abs=0.1)
+    lit = albedo.mean(1) > 0.1
+    scale = (found.albedo[lit] / albedo[lit]).log()
+    scale = scale - scale.median(0).values
+    painted_shadows = (problem.seen.color.view(POINTS, -1, 3)[:, 0] / albedo)[lit].log()
+    assert scale.abs().mean() < 0.2 * (painted_shadows - painted_shadows.mean(0)).abs().mean()
+
+
+def test_smoothness_leaves_the_sun():
+    """Newton's equations, which diffuse points tell nothing, would take it down."""
+    map, node = with_sun(0.8)
+    scene, problem, _ = painted(map)
+    found = sunlit(scene, problem, print)
+    before = scene.sky.log_radiance.detach()[node] - scene.sky.log_radiance.detach().mean(0)
+    dark = replace(found, target=torch.zeros_like(found.target), albedo=None)
+    cfg = JointConfig(newton_points=300, newton_steps=2, newton_views=4, newton_smooth=1e3)
+    newton_round(scene, dark, cfg)
+    after = scene.sky.log_radiance.detach()[node] - scene.sky.log_radiance.detach().mean(0)
+    torch.testing.assert_close(after, before, atol=0.1, rtol=0)
+
+
+@pytest.mark.parametrize("light", ["even", "lamps", "known"])
+def test_where_there_is_none_the_map_stays(light):
+    map = {"even": torch.ones(NODES, 3), "lamps": lamps(NODES), "known": with_sun(0.8)[0]}[light]
+    scene, problem, _ = painted(map)
+    if light == "known":
+        scene.sky.log_radiance.data.copy_(map.log())
+    before = scene.sky.log_radiance.detach().clone()
+    assert sunlit(scene, problem, pytest.fail) is problem
+    assert torch.equal(scene.sky.log_radiance, before)
+
+
+@pytest.mark.parametrize("why", ["few points", "few sightings", "metal", "dark", "light varies"])
+def test_what_tells_nothing_is_not_asked(why):
+    scene, problem, _ = painted(with_sun(0.8)[0], views=2 if why == "few sightings" else 4)
+    if why == "few points":
+        problem = replace(problem, metal=torch.arange(POINTS) >= 299)
+    elif why == "metal":
+        problem = replace(problem, metal=~problem.metal)
+    elif why == "dark":
+        problem = replace(problem, seen=replace(problem.seen, color=problem.seen.color * 1e-3))
+    elif why == "light varies":
+        scene.views = ViewLights(("a", "b", "c", "d"), 2, scene.sky.direction)
+    assert sunlit(scene, problem, pytest.fail) is problem
+
+
+def test_entropy_counts_the_colours():
+    torch.manual_seed(0)
+    few = torch.randint(8, (2000,))
+    colors = 5 * torch.rand(8, 3)
+    share = torch.bincount(few) / 2000
+    wanted = -(share * share.log()).sum()
+    mixed = torch.stack([colors[few], colors[few] + 7.3, 5 * torch.rand(2000, 3)], 1)
+    found = palette_entropy(mixed)
+    torch.testing.assert_close(found[:2], wanted.expand(2), atol=1e-4, rtol=0)
+    # Nearly as many cells as points; some share an entry of the table
+    assert 0.9 * math.log(2000) < found[2] < math.log(2000)
+    assert (5 / CELL) ** 3 > 10 * 2000
