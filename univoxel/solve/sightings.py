@@ -41,7 +41,7 @@ class Problem:
     metal: Tensor  # [P] bool, what is taken for metal; no other point can become it
     voxel_size: float
     sun: Tensor | None = None  # [D, 3] what a sun adds to the log map, which else is smooth
-    albedo: Tensor | None = None  # [P, 3] under that sun, while the materials know nothing of it
+    albedo: Tensor | None = None  # [P, 3] where the materials do not follow the map yet
 
     @property
     def solid_angle(self) -> float:

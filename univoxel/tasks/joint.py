@@ -24,9 +24,9 @@ from univoxel.scene import Scene
 from univoxel.solve.equations import CLIPPED
 from univoxel.solve.metals import find_metal
 from univoxel.solve.newton import newton_round
+from univoxel.solve.palette import balance, mean_albedo, sunlit
 from univoxel.solve.sightings import Problem, draw, draw_sightings, pose, turned, widened
 from univoxel.solve.start import STEPS, TRIALS, TRIED, supposed
-from univoxel.solve.suns import sunlit
 from univoxel.tasks.descent import EPS_FEATURES, EPS_SDF, MOMENTS, moved, spread_gradient
 from univoxel.tasks.guard import Guard
 from univoxel.tasks.progress import Progress
@@ -68,8 +68,11 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
                 with progress.apart():
                     problem = supposed(scene, problem, cfg, seconds, progress.trouble)
                     problem = sunlit(scene, problem, progress.say)
+                    if balance(scene, problem) or problem.sun is not None:
+                        problem = replace(problem, albedo=mean_albedo(scene, problem))
             with progress.apart():
                 costs = newton_round(scene, problem, cfg, seconds, progress.trouble)
+                balance(scene, problem)
                 sure = 1 - (more - 1) / max(cfg.rounds - 1, 1)
                 metal = find_metal(scene, problem, cfg, sure)
                 problem = replace(problem, metal=metal, albedo=None)

@@ -1,4 +1,4 @@
-"""A sun is seen in the shadows that it would else leave in the albedo."""
+"""Paint comes in few colours: a sun is seen in its shadows, a sky in its shades."""
 
 import math
 import re
@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from univoxel.config import JointConfig
 from univoxel.lights.views import ViewLights
 from univoxel.solve.newton import newton_round
-from univoxel.solve.suns import CELL, palette_entropy, sunlit
+from univoxel.solve.palette import CELL, balance, mean_albedo, palette_entropy, sunlit
 
 NODES, POINTS = 128, 900
 PAINTS = torch.tensor([[0.7, 0.2, 0.1], [0.1, 0.3, 0.6], [0.5, 0.5, 0.4], [0.05, 0.06, 0.05]])
@@ -62,11 +62,12 @@ def test_a_sun_is_found(share):
     power = scene.sky.radiance.detach().mean(1)
     # Shares are tried in steps of 0.05 to 0.15; walls make them differ by a little
     assert float(power[node] / power.sum()) == pytest.approx(share, abs=0.1)
-    lit = albedo.mean(1) > 0.1
-    scale = (found.albedo[lit] / albedo[lit]).log()
-    scale = scale - scale.median(0).values
-    painted_shadows = (problem.seen.color.view(POINTS, -1, 3)[:, 0] / albedo)[lit].log()
-    assert scale.abs().mean() < 0.2 * (painted_shadows - painted_shadows.mean(0)).abs().mean()
+    # The material of the scene knows neither sun nor paints
+    found_albedo = mean_albedo(scene, found)
+    error = (found_albedo / albedo).log()
+    shadows = (problem.seen.color.view(POINTS, -1, 3)[:, 0] / albedo).log()
+    spread = (error - error.median(0).values).abs().mean()
+    assert spread < 0.2 * (shadows - shadows.median(0).values).abs().mean()
 
 
 def test_smoothness_leaves_the_sun():
@@ -75,7 +76,7 @@ def test_smoothness_leaves_the_sun():
     scene, problem, _ = painted(map)
     found = sunlit(scene, problem, print)
     before = scene.sky.log_radiance.detach()[node] - scene.sky.log_radiance.detach().mean(0)
-    dark = replace(found, target=torch.zeros_like(found.target), albedo=None)
+    dark = replace(found, target=torch.zeros_like(found.target))
     cfg = JointConfig(newton_points=300, newton_steps=2, newton_views=4, newton_smooth=1e3)
     newton_round(scene, dark, cfg)
     after = scene.sky.log_radiance.detach()[node] - scene.sky.log_radiance.detach().mean(0)
@@ -104,7 +105,56 @@ def test_what_tells_nothing_is_not_asked(why):
         problem = replace(problem, seen=replace(problem.seen, color=problem.seen.color * 1e-3))
     elif why == "light varies":
         scene.views = ViewLights(("a", "b", "c", "d"), 2, scene.sky.direction)
+    before = scene.sky.log_radiance.detach().clone()
     assert sunlit(scene, problem, pytest.fail) is problem
+    assert not balance(scene, problem)
+    assert torch.equal(scene.sky.log_radiance, before)
+
+
+def known(scene, map):
+    scene.sky.log_radiance.data.copy_(map.log())
+
+
+def tilt(scene, problem, map, change):
+    """How uneven the scene's map is over another, in log; and the mean log light on the points."""
+    known(scene, map * change.exp())
+    begin = mean_albedo(scene, problem).log().mean(0)
+    assert balance(scene, problem)
+    left = scene.sky.log_radiance.detach() - map.log()
+    # Some albedos are cut at 1, and so no part of that mean
+    end = mean_albedo(scene, problem).log().mean(0)
+    torch.testing.assert_close(end, begin, atol=0.01, rtol=0)
+    return (left - left.mean(0)).abs().mean(0), (change - change.mean(0)).abs().mean(0)
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_a_sky_that_leans_is_put_right(axis):
+    scene, problem, _ = painted(lamps(NODES))
+    along = problem.transport.direction[:, axis, None]
+    left, before = tilt(scene, problem, lamps(NODES), along * torch.tensor([0.8, 0.5, -0.4]))
+    # The last steps are of 0.06, half of that is the mean of a harmonic
+    assert (left < 0.05).all()
+    assert (before > 0.18).all()
+
+
+def test_a_sun_of_the_wrong_brightness_is_put_right():
+    map, node = with_sun(0.6)
+    scene, problem, _ = painted(map)
+    change = torch.zeros(NODES, 3)
+    change[node] = torch.tensor([0.7, 0.7, 0.3])
+    known(scene, map * change.exp())
+    balance(scene, replace(problem, sun=10 * change))
+    left = scene.sky.log_radiance.detach() - map.log()
+    assert (left[node] - left.median(0).values).abs().max() < 0.1
+
+
+def test_the_right_map_stays():
+    scene, problem, albedo = painted(lamps(NODES))
+    known(scene, lamps(NODES))
+    before = scene.sky.log_radiance.detach().clone()
+    assert not balance(scene, problem)
+    torch.testing.assert_close(scene.sky.log_radiance.detach(), before)
+    torch.testing.assert_close(mean_albedo(scene, problem), albedo, atol=1e-4, rtol=1e-3)
 
 
 def test_entropy_counts_the_colours():
