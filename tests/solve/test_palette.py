@@ -94,11 +94,16 @@ def test_where_there_is_none_the_map_stays(light):
     assert torch.equal(scene.sky.log_radiance, before)
 
 
-@pytest.mark.parametrize("why", ["few points", "few sightings", "metal", "dark", "light varies"])
+@pytest.mark.parametrize(
+    "why", ["few points", "few sightings", "metal", "mostly metal", "dark", "light varies"]
+)
 def test_what_tells_nothing_is_not_asked(why):
     scene, problem, _ = painted(with_sun(0.8)[0], views=2 if why == "few sightings" else 4)
     if why == "few points":
-        problem = replace(problem, metal=torch.arange(POINTS) >= 299)
+        lit = (torch.arange(POINTS) < 299).repeat_interleave(4)[:, None]
+        problem = replace(problem, seen=replace(problem.seen, color=problem.seen.color * lit))
+    elif why == "mostly metal":
+        problem = replace(problem, metal=torch.arange(POINTS) >= 400)
     elif why == "metal":
         problem = replace(problem, metal=~problem.metal)
     elif why == "dark":

@@ -29,6 +29,7 @@ from univoxel.sphere import real_harmonics
 POINTS, FEWEST = 3000, 300  # that are looked at
 SIGHTINGS = 3  # that each has at least
 DARKEST = 2e-3  # linear; less is noise of 8 bits
+PAINTED = 0.5  # least share of them that is no metal: a few may be metal that was not recognised
 CELL = 0.15  # of log albedo, whose colours count as one
 TABLE = 2**14  # entries for the occupied cells, by hash
 PRIMES = (73856093, 19349663, 83492791)
@@ -65,15 +66,15 @@ class Shown:
 
 
 def shown(scene: Scene, problem: Problem) -> Shown | None:
-    """Some points that are no metal, not dark and seen often; None: there are too few, or each
-    photograph has a light of its own, which tells more."""
+    """Some points that are no metal, not dark and seen often; None: there are too few, or most are
+    metal, or each photograph has a light of its own, which tells more."""
     if scene.views is not None and scene.views.sky_change() is not None:
         return None
     seen = unexposed(scene, problem.seen)
     color = mean_colors(seen)
-    usable = (seen.offsets.diff() >= SIGHTINGS) & ~problem.metal & (color.amin(1) > DARKEST)
-    point = usable.nonzero()[:, 0]
-    if len(point) < FEWEST:
+    usable = (seen.offsets.diff() >= SIGHTINGS) & (color.amin(1) > DARKEST)
+    point = (usable & ~problem.metal).nonzero()[:, 0]
+    if len(point) < max(FEWEST, PAINTED * int(usable.sum())):
         return None
     point = point[torch.randperm(len(point))[:POINTS]]
     return Shown(point, color[point], *_reaching(problem, point))
