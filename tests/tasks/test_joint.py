@@ -511,6 +511,44 @@ def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, 
         assert rate[-1] == pytest.approx(0.1 * cfg.lr_features, rel=0.03)  # of 100 steps, the last
 
 
+@pytest.mark.parametrize("changed", [True, False])
+def test_paint_is_asked_before_and_after_newton(monkeypatch, changed):
+    """Newton starts from the albedos under a map that the materials do not follow yet."""
+    told, begun = [], []
+
+    def newton_round(scene, problem, *_):
+        told.append("newton")
+        begun.append(problem.albedo)
+        return []
+
+    def balance(scene, problem):
+        told.append("balance")
+        return changed
+
+    monkeypatch.setattr(joint, "pose", lambda *_: random_problem())
+    monkeypatch.setattr(joint, "find_metal", lambda *_: torch.zeros(5, dtype=torch.bool))
+    monkeypatch.setattr(joint, "supposed", lambda scene, problem, *_: problem)
+    monkeypatch.setattr(joint, "sunlit", lambda scene, problem, _: problem)
+    monkeypatch.setattr(joint, "mean_albedo", lambda *_: torch.full((5, 3), 0.3))
+    monkeypatch.setattr(joint, "balance", balance)
+    monkeypatch.setattr(joint, "newton_round", newton_round)
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+    joint.solve(scene, photos_of(1, 8), replace(CFG, rounds=2), 0, Steps(4))
+    assert told == ["balance", "newton", "balance", "newton", "balance"]
+    assert [albedo is not None for albedo in begun] == [changed, False]
+
+
+def test_newton_starts_from_the_albedo_that_it_is_given():
+    scene, problem = scene_of((0.5, 0.5, 0.5), 0.4, 12), random_problem(50)
+    cfg = replace(CFG, newton_points=20, newton_views=2)
+    albedo = torch.rand(50, 3)
+    points = newton.choose(scene, replace(problem, albedo=albedo), cfg)
+    torch.testing.assert_close(points.log_albedo, albedo[points.point].clamp_min(1e-3).log())
+    torch.testing.assert_close(
+        newton.choose(scene, problem, cfg).log_albedo, torch.full((20, 3), 0.5).log()
+    )
+
+
 def test_a_refit_leaves_materials_bit_for_bit(tmp_path, monkeypatch):
     data = write_scene(tmp_path / "data", views=8, size=24)
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
