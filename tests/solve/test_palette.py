@@ -7,22 +7,23 @@ from dataclasses import replace
 import pytest
 import torch
 from analytic import scene_of
-from sightings import lamps, problem_on_a_sphere
+from sightings import lamps, photographed, problem_on_a_sphere
 from torch.nn.functional import normalize
 
 from univoxel.config import JointConfig
 from univoxel.lights.views import ViewLights
 from univoxel.solve.newton import newton_round
-from univoxel.solve.palette import CELL, balance, mean_albedo, palette_entropy, sunlit
+from univoxel.solve.palette import CELL, balance, matte_albedo, palette_entropy, shown, sunlit
+from univoxel.solve.sightings import widened
 
 NODES, POINTS = 128, 900
 PAINTS = torch.tensor([[0.7, 0.2, 0.1], [0.1, 0.3, 0.6], [0.5, 0.5, 0.4], [0.05, 0.06, 0.05]])
 SUN = normalize(torch.tensor([0.4, -0.3, 0.8]), dim=0)
 
 
-def painted(light, views=4, paints=PAINTS):
-    """A scene that knows no map yet, and a sphere behind random walls, of matte paints, under a map
-    [D, 3]; and the albedo [P, 3]."""
+def painted(light, views=4, shiny=False):
+    """A scene that knows no map yet, and a sphere behind random walls, of matte paints or of paints
+    under a layer as rough as the scene believes, under a map [D, 3]; and the albedo [P, 3]."""
     torch.manual_seed(3)
     scene = scene_of((0.5, 0.5, 0.5), 0.5, NODES)
     problem = problem_on_a_sphere(POINTS, views, NODES)
@@ -30,11 +31,20 @@ def painted(light, views=4, paints=PAINTS):
     wall = normalize(torch.randn(POINTS, 3), dim=1) @ direction.T > 0.3
     open_share = (~wall * 255).byte()
     transport = replace(problem.transport, open=open_share)
+    problem = replace(problem, transport=transport)
+    albedo = PAINTS[torch.randint(len(PAINTS), (POINTS,))]
+    if shiny:
+        shown = widened(torch.full((POINTS,), 0.5), NODES)
+        return scene, photographed(problem, light, albedo, shown), albedo
     cosine = (problem.seen.normal @ direction.T).clamp_min(0) * problem.solid_angle / math.pi
-    albedo = paints[torch.randint(len(paints), (POINTS,))]
-    color = albedo * ((cosine * ~wall) @ light)
-    seen = replace(problem.seen, color=color.repeat_interleave(views, 0))
-    return scene, replace(problem, seen=seen, transport=transport), albedo
+    color = (albedo * ((cosine * ~wall) @ light)).repeat_interleave(views, 0)
+    return scene, replace(problem, seen=replace(problem.seen, color=color)), albedo
+
+
+def believed(scene, problem):
+    """Albedo [P, 3] under the scene's map of matte paints, and which points."""
+    points = shown(scene, problem)
+    return points.color / points.lit(scene.sky.radiance.detach()), points.point
 
 
 def with_sun(share):
@@ -62,10 +72,9 @@ def test_a_sun_is_found(share):
     power = scene.sky.radiance.detach().mean(1)
     # Shares are tried in steps of 0.05 to 0.15; walls make them differ by a little
     assert float(power[node] / power.sum()) == pytest.approx(share, abs=0.1)
-    # The material of the scene knows neither sun nor paints
-    found_albedo = mean_albedo(scene, found)
-    error = (found_albedo / albedo).log()
-    shadows = (problem.seen.color.view(POINTS, -1, 3)[:, 0] / albedo).log()
+    under_sun, point = believed(scene, found)
+    error = (under_sun / albedo[point]).log()
+    shadows = (problem.seen.color.view(POINTS, -1, 3)[point, 0] / albedo[point]).log()
     spread = (error - error.median(0).values).abs().mean()
     assert spread < 0.2 * (shadows - shadows.median(0).values).abs().mean()
 
@@ -123,12 +132,10 @@ def known(scene, map):
 def tilt(scene, problem, map, change):
     """How uneven the scene's map is over another, in log; and the mean log light on the points."""
     known(scene, map * change.exp())
-    begin = mean_albedo(scene, problem).log().mean(0)
+    begin = believed(scene, problem)[0].log().mean(0)
     assert balance(scene, problem)
     left = scene.sky.log_radiance.detach() - map.log()
-    # Some albedos are cut at 1, and so no part of that mean
-    end = mean_albedo(scene, problem).log().mean(0)
-    torch.testing.assert_close(end, begin, atol=0.01, rtol=0)
+    torch.testing.assert_close(believed(scene, problem)[0].log().mean(0), begin)
     return (left - left.mean(0)).abs().mean(0), (change - change.mean(0)).abs().mean(0)
 
 
@@ -159,7 +166,38 @@ def test_the_right_map_stays():
     before = scene.sky.log_radiance.detach().clone()
     assert not balance(scene, problem)
     torch.testing.assert_close(scene.sky.log_radiance.detach(), before)
-    torch.testing.assert_close(mean_albedo(scene, problem), albedo, atol=1e-4, rtol=1e-3)
+    found, point = believed(scene, problem)
+    torch.testing.assert_close(found, albedo[point], atol=1e-4, rtol=1e-3)
+
+
+def test_paint_is_told_from_what_the_layer_mirrors():
+    scene, problem, albedo = painted(lamps(NODES), shiny=True)
+    known(scene, lamps(NODES))
+    offsets = problem.seen.offsets.clone()
+    offsets[1:] = offsets[1:].clamp_min(4) - 4  # nobody sees the first
+    seen = replace(
+        problem.seen,
+        offsets=offsets,
+        color=problem.seen.color[4:],
+        wo=problem.seen.wo[4:],
+        view=problem.seen.view[4:],
+    )
+    found = matte_albedo(scene, replace(problem, seen=seen))
+    assert found[0].isnan().all()
+    mirrored = problem.seen.color.view(POINTS, 4, 3).std(1).mean()
+    assert mirrored > 0.01
+    torch.testing.assert_close(found[1:], albedo[1:], atol=1e-3, rtol=1e-2)
+
+
+def test_of_gains_paint_knows_nothing():
+    scene, problem, albedo = painted(lamps(NODES), shiny=True)
+    known(scene, lamps(NODES))
+    scene.views = ViewLights(("a", "b", "c", "d"), 0)
+    gains = torch.tensor([0.5, 0.2, -0.3, -0.4])[:, None].expand(4, 3)
+    scene.views.add(gains)
+    color = scene.exposed(problem.seen.color, problem.seen.view).detach()
+    found = matte_albedo(scene, replace(problem, seen=replace(problem.seen, color=color)))
+    torch.testing.assert_close(found, albedo, atol=1e-3, rtol=1e-2)
 
 
 def test_entropy_counts_the_colours():

@@ -529,13 +529,45 @@ def test_paint_is_asked_before_and_after_newton(monkeypatch, changed):
     monkeypatch.setattr(joint, "find_metal", lambda *_: torch.zeros(5, dtype=torch.bool))
     monkeypatch.setattr(joint, "supposed", lambda scene, problem, *_: problem)
     monkeypatch.setattr(joint, "sunlit", lambda scene, problem, _: problem)
-    monkeypatch.setattr(joint, "mean_albedo", lambda *_: torch.full((5, 3), 0.3))
+    monkeypatch.setattr(joint, "matte_albedo", lambda *_: torch.full((5, 3), 0.3))
+    monkeypatch.setattr(joint, "follow", lambda *_: told.append("follow"))
     monkeypatch.setattr(joint, "balance", balance)
     monkeypatch.setattr(joint, "newton_round", newton_round)
     scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
     joint.solve(scene, photos_of(1, 8), replace(CFG, rounds=2), 0, Steps(4))
-    assert told == ["balance", "newton", "balance", "newton", "balance"]
+    first = ["balance", "newton", "balance", *["follow"] * changed]
+    assert told == [*first, "newton", "balance"]
     assert [albedo is not None for albedo in begun] == [changed, False]
+
+
+def test_materials_follow_a_map_that_was_changed(monkeypatch):
+    """Albedo goes to what the photographs say; the rest, metals, and what none sees stay."""
+    torch.manual_seed(0)
+    scene, problem = sphere_scene(12), problem_on_a_sphere(600, 4, 12)
+    wanted = torch.where(problem.seen.normal[:, :1] > 0, RED, BLUE)
+    told = wanted.clone()
+    told[:20] = torch.nan
+    told[20:40] = 1.0
+    monkeypatch.setattr(joint, "matte_albedo", lambda *_: told)
+    features = scene.field.features_at(problem.seen.position)
+    before = [m.detach() for m in scene.material(features)]
+    metal = torch.arange(600) // 20 == 1
+    cfg = replace(CFG, rays=512, lr_features=0.2, lr_networks=0.03)  # from features that are 0
+    joint.follow(scene, replace(problem, metal=metal), cfg)
+    after = scene.material(scene.field.features_at(problem.seen.position))
+    inside = problem.seen.normal[:, 0].abs() > 0.3  # between red and blue features are mixed
+    error = (after[0].detach() - wanted).abs().mean(1)[inside].mean()
+    assert error < 0.2 * (before[0] - wanted).abs().mean(1)[inside].mean()
+    for now, was in zip(after[1:], before[1:], strict=True):
+        assert (now - was).abs().mean() < 0.02
+
+
+def test_without_paint_materials_stay(monkeypatch):
+    scene, problem = scene_of((0.5, 0.5, 0.5), 0.4, 12), problem_on_a_sphere(50, 4, 12)
+    before = {k: v.clone() for k, v in scene.state_dict().items()}
+    joint.follow(scene, replace(problem, metal=~problem.metal), CFG)
+    after = scene.state_dict()
+    assert all(torch.equal(after[k], before[k]) for k in after)
 
 
 def test_newton_starts_from_the_albedo_that_it_is_given():

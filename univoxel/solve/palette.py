@@ -21,9 +21,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from univoxel import brdf
 from univoxel.render.transport import mean_colors
 from univoxel.scene import Scene
-from univoxel.solve.sightings import Problem, unexposed
+from univoxel.solve.sightings import (
+    Problem,
+    draw_sightings,
+    sightings_of,
+    unexposed,
+    widened,
+)
 from univoxel.sphere import real_harmonics
 
 POINTS, FEWEST = 3000, 300  # that are looked at
@@ -39,6 +46,8 @@ SHARES = (0.35, 0.5, 0.65, 0.8, 0.9, 0.95)  # of the surface's light, tried for 
 # eight scenes without, the best of all these suns saved up to 0.06
 CLEARER = 0.08
 AT_ONCE = 64  # suns
+PHOTOGRAPHS = 2  # of each point that tell its albedo, once the light is known
+LOWEST, HIGHEST = 0.01, 0.95  # albedo of what is matte: coal and snow
 LEAST_REACH = 0.02  # mean cosine that counts for a node that hardly reaches any of the surface
 
 ORDER = 2  # of the harmonics that change the log map
@@ -155,13 +164,29 @@ def balance(scene: Scene, problem: Problem) -> bool:
 
 
 @torch.no_grad()
-def mean_albedo(scene: Scene, problem: Problem) -> Tensor:
-    """Albedo [P, 3] of all points as their mean colours have it under the scene's map."""
-    assert scene.sky is not None
-    color = mean_colors(unexposed(scene, problem.seen))
-    reach, between = _reaching(problem, torch.arange(len(color)))
-    lit = reach @ scene.sky.radiance + between
-    return (color / lit.clamp_min(1e-6)).clamp(0, 1)
+def matte_albedo(scene: Scene, problem: Problem) -> Tensor:
+    """Albedo [P, 3] of all points as some photographs of each have it under the scene's map,
+    without what the specular layer sends there; NaN where none sees a point."""
+    sky, seen = scene.sky, problem.seen
+    assert sky is not None
+    albedo = torch.full_like(seen.position, torch.nan)
+    point = (seen.offsets.diff() > 0).nonzero()[:, 0]
+    normal = seen.normal[point]
+    _, roughness, _ = scene.material(scene.field.features_at(seen.position[point]))
+    roughness = widened(roughness, len(sky.direction))
+    black = torch.zeros_like(normal)
+    layer = normal, black, roughness, torch.full_like(black, brdf.F0)
+    reach, between = _reaching(problem, point)
+    lit = reach @ sky.radiance + between
+    found = torch.zeros_like(normal)
+    for sighting in sightings_of(problem, point, PHOTOGRAPHS).unbind(1):
+        shine = draw_sightings(scene, problem, point, sighting, *layer)
+        exposure = scene.exposed(torch.ones_like(shine), seen.view[sighting])
+        through = 1 - brdf.specular_albedo((normal * seen.wo[sighting]).sum(1), roughness)
+        matte = (seen.color[sighting] - shine) / exposure
+        found += (matte / (lit * through[:, None]).clamp_min(1e-6)).clamp(LOWEST, HIGHEST)
+    albedo[point] = found / PHOTOGRAPHS
+    return albedo
 
 
 def _reaching(problem: Problem, point: Tensor) -> tuple[Tensor, Tensor]:

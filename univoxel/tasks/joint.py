@@ -24,7 +24,7 @@ from univoxel.scene import Scene
 from univoxel.solve.equations import CLIPPED
 from univoxel.solve.metals import find_metal
 from univoxel.solve.newton import newton_round
-from univoxel.solve.palette import balance, mean_albedo, sunlit
+from univoxel.solve.palette import balance, matte_albedo, sunlit
 from univoxel.solve.sightings import Problem, draw, draw_sightings, pose, turned, widened
 from univoxel.solve.start import STEPS, TRIALS, TRIED, supposed
 from univoxel.tasks.descent import EPS_FEATURES, EPS_SDF, MOMENTS, moved, spread_gradient
@@ -36,6 +36,8 @@ from univoxel.tasks.progress import Progress
 NEWTON_COST = 6.5
 LEAST_POINTS = 2000  # on a machine however slow
 SPREAD = 2  # passes that smooth the sdf's gradient: fewer than where geometry forms
+FOLLOWING = 60  # steps in which materials follow a map that was changed
+FOLLOWED = 0.1  # weight of their loss: gradients as large as those of photographs, for Adam's eps
 HOLD = 3e-3  # on the squared distance, in voxels, between the surface and its points
 
 
@@ -69,13 +71,15 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
                     problem = supposed(scene, problem, cfg, seconds, progress.trouble)
                     problem = sunlit(scene, problem, progress.say)
                     if balance(scene, problem) or problem.sun is not None:
-                        problem = replace(problem, albedo=mean_albedo(scene, problem))
+                        problem = replace(problem, albedo=matte_albedo(scene, problem))
             with progress.apart():
                 costs = newton_round(scene, problem, cfg, seconds, progress.trouble)
                 balance(scene, problem)
                 sure = 1 - (more - 1) / max(cfg.rounds - 1, 1)
-                metal = find_metal(scene, problem, cfg, sure)
-                problem = replace(problem, metal=metal, albedo=None)
+                problem = replace(problem, metal=find_metal(scene, problem, cfg, sure))
+                if problem.albedo is not None:
+                    follow(scene, problem, cfg)
+                    problem = replace(problem, albedo=None)
             more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
             groups = [
                 {"params": [scene.field.features], "eps": EPS_FEATURES},
@@ -116,6 +120,37 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             progress.report({k: v.item() for k, v in terms.items()}, None)
             guard.keep()
     moved(scene)
+
+
+def follow(scene: Scene, problem: Problem, cfg: JointConfig) -> None:
+    """Teach the materials the albedos that the photographs have under a map that was changed.
+
+    Adam on the photographs does so too, in many more and dearer steps: paint that holds the shades
+    of another light, times this one, is far from them, and short trainings would end before. Metal,
+    roughness and metallic stay.
+    """
+    wanted = matte_albedo(scene, problem)
+    point = (wanted.isfinite().all(1) & ~problem.metal).nonzero()[:, 0]
+    if not len(point):
+        return
+    position, wanted = problem.seen.position[point], wanted[point].log()
+    with torch.no_grad():
+        _, rough, metallic = scene.material(scene.field.features_at(position))
+    materials = {"params": list(scene.material.parameters())}
+    optimizer = RowAdam([{"params": [scene.field.features], "eps": EPS_FEATURES}, materials])
+    for step in range(FOLLOWING):
+        rates = cfg.lr_features, cfg.lr_networks
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate * 0.1 ** (step / FOLLOWING)
+        some = torch.randint(len(point), (cfg.rays,))
+        found = scene.material(scene.field.features_at(position[some]))
+        albedo = found[0].clamp_min(1e-3).log()
+        loss = (albedo - wanted[some]).abs().mean()
+        for now, before in zip(found[1:], (rough, metallic), strict=True):
+            loss = loss + (now - before[some]).abs().mean()
+        optimizer.zero_grad(set_to_none=True)
+        (FOLLOWED * loss).backward()
+        optimizer.step()
 
 
 def newton_share(cfg: JointConfig) -> float:
