@@ -160,6 +160,18 @@ def test_a_sun_of_the_wrong_brightness_is_put_right():
     assert (left[node] - left.median(0).values).abs().max() < 0.1
 
 
+def test_points_that_nothing_seems_to_reach_spoil_nothing():
+    scene, problem, _ = painted(with_sun(0.8)[0])
+    open_share = problem.transport.open.clone()
+    open_share[:50] = 0  # and yet they are bright
+    problem = replace(problem, transport=replace(problem.transport, open=open_share))
+    found = sunlit(scene, problem, print)
+    assert found.sun is not None
+    assert balance(scene, found) in (True, False)
+    assert scene.sky.log_radiance.isfinite().all()
+    assert matte_albedo(scene, found).isfinite().all()
+
+
 def test_the_right_map_stays():
     scene, problem, albedo = painted(lamps(NODES))
     known(scene, lamps(NODES))

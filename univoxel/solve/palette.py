@@ -36,6 +36,7 @@ from univoxel.sphere import real_harmonics
 POINTS, FEWEST = 3000, 300  # that are looked at
 SIGHTINGS = 3  # that each has at least
 DARKEST = 2e-3  # linear; less is noise of 8 bits
+DARK = 1e-6  # light on a point that nothing seems to reach
 PAINTED = 0.5  # least share of them that is no metal: a few may be metal that was not recognised
 CELL = 0.15  # of log albedo, whose colours count as one
 TABLE = 2**14  # entries for the occupied cells, by hash
@@ -66,12 +67,12 @@ class Shown:
     between: Tensor  # [P, 3] what comes from the surface itself
 
     def lit(self, radiance: Tensor) -> Tensor:
-        """What reaches the points under a map [D, 3]: [P, 3]."""
-        return self.reach @ radiance + self.between
+        """What reaches the points under a map [D, 3]: [P, 3], above 0."""
+        return (self.reach @ radiance + self.between).clamp_min(DARK)
 
     def entropy(self, light: Tensor) -> Tensor:
         """Of the albedos, if light [P, K, 3] reaches the points: [K]."""
-        return palette_entropy((self.color[:, None] / light.clamp_min(1e-6)).log())
+        return palette_entropy((self.color[:, None] / light.clamp_min(DARK)).log())
 
 
 def shown(scene: Scene, problem: Problem) -> Shown | None:
@@ -184,7 +185,7 @@ def matte_albedo(scene: Scene, problem: Problem) -> Tensor:
         exposure = scene.exposed(torch.ones_like(shine), seen.view[sighting])
         through = 1 - brdf.specular_albedo((normal * seen.wo[sighting]).sum(1), roughness)
         matte = (seen.color[sighting] - shine) / exposure
-        found += (matte / (lit * through[:, None]).clamp_min(1e-6)).clamp(LOWEST, HIGHEST)
+        found += (matte / (lit * through[:, None]).clamp_min(DARK)).clamp(LOWEST, HIGHEST)
     albedo[point] = found / PHOTOGRAPHS
     return albedo
 
