@@ -42,6 +42,7 @@ HELPERS = {
         *("animation", "capacity", "contact_sheet", "descent", "envmap", "frames", "guard"),
         *(
             "exposures",
+            "hollows",
             "joint",
             "layers",
             "look",
