@@ -73,6 +73,11 @@ def test_a_preset_is_a_point_of_the_curve(name, light):
     assert budget(config.minutes, Path("photos"), Path("run"), light) == config
 
 
+def test_colours_are_asked_where_materials_have_time_to_follow():
+    found = {m: budget(m, Path("data"), Path("run")).stages[2].colors for m in (1, 1.5, 1.6, 12)}
+    assert found == {1: False, 1.5: False, 1.6: True, 12: True}
+
+
 @pytest.mark.parametrize("light", ["hybrid", "sg"])
 def test_exposures_are_looked_at_unless_it_is_said_what_differs(light):
     found = {

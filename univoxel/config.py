@@ -80,6 +80,7 @@ class JointConfig:
     rounds: int = 4  # of Newton steps on the map and then of Adam, >= 1
     points: int = 20000  # on the surface, >= 1
     tracing: int = 2  # visibility rays per point and direction, >= 1
+    colors: bool = True  # whether the few colours of paint tell of the light, see solve/palette.py
     lr_features: float = 0.03  # at the begin of a round; all rates > 0
     lr_networks: float = 3e-3
     lr_map: float = 0.05  # of the log map
@@ -259,6 +260,7 @@ PRESETS = {
     "fast": Work(4.0, voxels=2.0, steps=1200, rays=2048),
     "full": Work(12.0, voxels=4.0, steps=4200, rays=2048),
 }
+COLORS_MINUTES = 1.5  # up to which materials have no time to follow a map that colours changed
 HOLLOWS = 0.04  # share of the time: where opening them takes more it costs more than it brings
 
 
@@ -382,6 +384,7 @@ def _configuration(
                 share=0.25,
                 points=min(25 * steps, 15000 + 6 * steps),
                 newton_points=min(4000, 3 * steps),
+                colors=minutes > COLORS_MINUTES,
             )
             refit = StageConfig(
                 voxels=voxels,

@@ -538,6 +538,9 @@ def test_paint_is_asked_before_and_after_newton(monkeypatch, changed):
     first = ["balance", "newton", "balance", *["follow"] * changed]
     assert told == [*first, "newton", "balance"]
     assert [albedo is not None for albedo in begun] == [changed, False]
+    told.clear()
+    joint.solve(scene, photos_of(1, 8), replace(CFG, rounds=2, colors=False), 0, Steps(4))
+    assert told == ["newton", "newton"]
 
 
 def test_materials_follow_a_map_that_was_changed(monkeypatch):

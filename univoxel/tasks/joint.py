@@ -69,12 +69,14 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             if more == cfg.rounds:
                 with progress.apart():
                     problem = supposed(scene, problem, cfg, seconds, progress.trouble)
-                    problem = sunlit(scene, problem, progress.say)
-                    if balance(scene, problem) or problem.sun is not None:
-                        problem = replace(problem, albedo=matte_albedo(scene, problem))
+                    if cfg.colors:
+                        problem = sunlit(scene, problem, progress.say)
+                        if balance(scene, problem) or problem.sun is not None:
+                            problem = replace(problem, albedo=matte_albedo(scene, problem))
             with progress.apart():
                 costs = newton_round(scene, problem, cfg, seconds, progress.trouble)
-                balance(scene, problem)
+                if cfg.colors:
+                    balance(scene, problem)
                 sure = 1 - (more - 1) / max(cfg.rounds - 1, 1)
                 problem = replace(problem, metal=find_metal(scene, problem, cfg, sure))
                 if problem.albedo is not None:
