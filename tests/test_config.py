@@ -79,6 +79,11 @@ def test_colours_are_asked_where_materials_have_time_to_follow():
 
 
 @pytest.mark.parametrize("light", ["hybrid", "sg"])
+def test_presets_open_hollows_in_a_small_share_of_their_time(light):
+    assert 0 < preset("fast", Path("a"), Path("b"), light).hollows < 0.1
+
+
+@pytest.mark.parametrize("light", ["hybrid", "sg"])
 def test_exposures_are_looked_at_unless_it_is_said_what_differs(light):
     found = {
         varying: preset("fast", Path("a"), Path("b"), light, varying)

@@ -167,7 +167,7 @@ def test_points_that_nothing_seems_to_reach_spoil_nothing():
     problem = replace(problem, transport=replace(problem.transport, open=open_share))
     found = sunlit(scene, problem, print)
     assert found.sun is not None
-    assert balance(scene, found) in (True, False)
+    balance(scene, found)
     assert scene.sky.log_radiance.isfinite().all()
     assert matte_albedo(scene, found).isfinite().all()
 

@@ -37,7 +37,7 @@ NEWTON_COST = 6.5
 LEAST_POINTS = 2000  # on a machine however slow
 SPREAD = 2  # passes that smooth the sdf's gradient: fewer than where geometry forms
 FOLLOWING = 60  # steps in which materials follow a map that was changed
-FOLLOWED = 0.1  # weight of their loss: gradients as large as those of photographs, for Adam's eps
+FOLLOWED = 0.1  # weight of their loss, against Adam's eps; no other was tried
 HOLD = 3e-3  # on the squared distance, in voxels, between the surface and its points
 
 
