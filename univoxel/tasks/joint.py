@@ -132,19 +132,20 @@ def follow(scene: Scene, problem: Problem, cfg: JointConfig) -> None:
     roughness and metallic stay.
     """
     wanted = matte_albedo(scene, problem)
-    point = (wanted.isfinite().all(1) & ~problem.metal).nonzero()[:, 0]
-    if not len(point):
+    matte = wanted.isfinite().all(1) & ~problem.metal
+    if not matte.any():
         return
-    position, wanted = problem.seen.position[point], wanted[point].log()
+    position = problem.seen.position
     with torch.no_grad():
-        _, rough, metallic = scene.material(scene.field.features_at(position))
+        albedo, rough, metallic = scene.material(scene.field.features_at(position))
+    wanted = torch.where(matte[:, None], wanted, albedo.clamp_min(1e-3)).log()
     materials = {"params": list(scene.material.parameters())}
     optimizer = RowAdam([{"params": [scene.field.features], "eps": EPS_FEATURES}, materials])
     for step in range(FOLLOWING):
         rates = cfg.lr_features, cfg.lr_networks
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate * 0.1 ** (step / FOLLOWING)
-        some = torch.randint(len(point), (cfg.rays,))
+        some = torch.randint(len(position), (cfg.rays,))
         found = scene.material(scene.field.features_at(position[some]))
         albedo = found[0].clamp_min(1e-3).log()
         loss = (albedo - wanted[some]).abs().mean()
