@@ -36,6 +36,7 @@ from univoxel.records import Mesh
 
 SPP = [1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024]
 TRUTH_SPP = 8192
+THEIR_TRUTH_SPP = 16384
 THEIR_SPP = [16, 64, 256]
 COMMON = {"offset": 1e-3, "bounces": 2}
 
@@ -68,18 +69,18 @@ def strategies(scene: Scene) -> list[dict]:
     return rows
 
 
-def against_mitsuba(scene: Scene, ours: list[dict]) -> dict | None:
+def against_mitsuba(scene: Scene, own: list[dict]) -> dict | None:
     """PSNR between the two at many samples; time of both at equal error. None: it cannot run.
 
     Once with our BRDF written for Mitsuba, which draws by the cosine, and once with its own
     `principled`, each against its own picture of many samples.
     """
     truth = relight(*scene.ours, samples=TRUTH_SPP, seed=1, **COMMON)
-    own = [r for r in ours if r["strategy"] == "mis"]
+    own = [r for r in own if r["strategy"] == "mis"]
     times, errors = (np.log([r[key] for r in own]) for key in ("seconds", "error"))
     found = {}
     for principled in (False, True):
-        many = _by_mitsuba(scene, 4096, principled)
+        many = _by_mitsuba(scene, THEIR_TRUTH_SPP, principled)
         if many is None:
             return None
         rows = []
@@ -87,7 +88,7 @@ def against_mitsuba(scene: Scene, ours: list[dict]) -> dict | None:
             few = _by_mitsuba(scene, samples, principled)
             assert few is not None
             # The noise of their reference adds up to theirs: taken off again.
-            error = _error(few[0], many[0]) / math.sqrt(1 + samples / 4096)
+            error = _error(few[0], many[0]) / math.sqrt(1 + samples / THEIR_TRUTH_SPP)
             equal = float(np.exp(np.interp(-np.log(error), -errors, times)))
             rows.append(
                 {
@@ -101,7 +102,12 @@ def against_mitsuba(scene: Scene, ours: list[dict]) -> dict | None:
             print(rows[-1], flush=True)
         found["principled" if principled else "same_brdf"] = rows
         if not principled:
-            found["psnr_at_many_samples"] = psnr(truth.clamp_max(1), many[0].clamp_max(1))
+            ours, theirs = truth.clamp_max(1), many[0].clamp_max(1)
+            # Where interpolated normals look away from the eye Mitsuba's picture is black
+            facing = (scene.ours[4] * scene.ours[5]).sum(1) > 0
+            found["psnr_at_many_samples"] = psnr(ours, theirs)
+            found["psnr_facing"] = psnr(ours[facing], theirs[facing])
+            found["pixels_facing_away"] = int((~facing).sum())
     return found
 
 

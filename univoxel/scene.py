@@ -209,8 +209,7 @@ def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict
     touched = features.any(1)
     if slim:
         shell = (reach or SHELL) * scene.field.voxel_size
-        if scene.field.by_node:  # rows of a table serve nodes near and far alike
-            touched &= sdf.flatten().abs() < shell
+        touched &= scene.field.rows_near(shell)[: len(features)]
         if reach is not None:
             packed = pack(tensors.pop("field.sdf"), shell)
             tensors |= {f"field.sdf_{name}": value for name, value in packed.items()}

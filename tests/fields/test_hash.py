@@ -1,6 +1,8 @@
 """The hash field: the dense one's distances, features of a table of many resolutions."""
 
 import copy
+import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -99,6 +101,35 @@ def test_tables_may_be_smaller():
     held = field.features.grad.to_dense().view(COUNT, -1, PER_LEVEL)
     assert (held[:, :, 0] == 0).all()
     assert all(level.any() for level in held[:, :, 1])
+
+
+@pytest.mark.parametrize("finest", [1.0, 0.6, 0.4])  # voxels
+def test_rows_near_are_all_that_points_near_the_surface_read(finest):
+    field = ball()
+    levels = replace(Levels.of(field.bounds(), finest * field.voxel_size, 4), rows=2**14)
+    field = HashField(field.distances, levels)
+    near = field.rows_near(1.5 * field.voxel_size)
+    g = torch.Generator().manual_seed(0)
+    direction = torch.nn.functional.normalize(torch.randn(2_000_000, 3, generator=g))
+    away = 7 * torch.rand(2_000_000, generator=g) - 3.5  # voxels
+    points = direction * (0.5 + field.voxel_size * away[:, None])
+    # The node next to a point is up to 0.87 voxels away; and a cube around a near node reaches as
+    # far beyond it
+    rows = [rows_read(field, points[away.abs() < far]) for far in (0.6, 3.5)]
+    assert near[rows[0]].all()
+    read = torch.zeros(len(near), dtype=torch.bool)
+    read[rows[1]] = True
+    assert not (near & ~read).any()
+    assert 0 < near.sum() < 0.9 * read.sum()
+    assert field.rows_near(math.inf).all()
+
+
+def rows_read(field: HashField, points: torch.Tensor) -> torch.Tensor:
+    """Rows of its table that have a say at points."""
+    features = field.features_at(points)
+    (grad,) = torch.autograd.grad(features.sum(), field.features)
+    grad = grad.coalesce()
+    return grad.indices()[0][grad.values().abs().sum(1) > 0]
 
 
 def test_another_grid_keeps_the_features():

@@ -84,6 +84,10 @@ class AbstractField(nn.Module, ABC):
     def within(self, far: float) -> Tensor:
         """Which nodes of the grid have an sdf nearer to 0 than far: [X, Y, Z] bool."""
 
+    def rows_near(self, far: float) -> Tensor:
+        """Which rows of the features are read where the sdf is nearer to 0 than far: [R] bool."""
+        return self.sdf.detach().abs().flatten() < far
+
     @abstractmethod
     def blocks(self, far: float) -> Tensor:
         """Whether the sdf can be nearer to 0 than far in each block of 4^3 voxels: [A, B, C]."""

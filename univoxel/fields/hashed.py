@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,6 +19,7 @@ PER_LEVEL = 2  # channels; so levels are half as many as channels
 COARSEST = 16  # voxels along the longest side of the box at the coarsest level
 ROWS = 2**17  # of a level's table: what the nodes around a surface of 150^3 to 250^3 want
 FEWEST_ROWS = 2**10
+NODES_AT_ONCE = 16384
 DENSE_MOST = 8_000_000  # nodes; of finer grids bricks around the surface cost less
 
 
@@ -75,11 +77,14 @@ class HashField(AbstractField):
         return replace(self.distances.sample(points), features=self.features_at(points))
 
     def features_at(self, points: Tensor) -> Tensor:
+        found = self.encode(points).view(len(points), len(self.levels.voxel_sizes), PER_LEVEL)
+        return found.transpose(1, 2).reshape(len(points), self.channels)
+
+    def encode(self, points: Tensor) -> Tensor:
+        """The features [M, C], those of a level together."""
         levels = self.levels
         place = levels.lower, levels.upper, levels.voxel_sizes
-        found = encode_hash(self.features, points, *place, sparse_grad=True)
-        found = found.view(len(points), len(levels.voxel_sizes), PER_LEVEL)
-        return found.transpose(1, 2).reshape(len(points), self.channels)
+        return encode_hash(self.features, points, *place, sparse_grad=True)
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         return self.distances.march(rays, jitter, inv_s)
@@ -135,6 +140,24 @@ class HashField(AbstractField):
 
     def within(self, far: float) -> Tensor:
         return self.distances.within(far)
+
+    @torch.no_grad()
+    def rows_near(self, far: float) -> Tensor:
+        if math.isinf(far):
+            return torch.ones(len(self.features), dtype=torch.bool)
+        # The cube of a voxel around each near node: of every cell that it meets one of these points
+        # lies inside, for they are as close together as the nodes of the finest level
+        steps = math.ceil(self.voxel_size / min(self.levels.voxel_sizes) - 1e-3) + 1
+        around = torch.cartesian_prod(*[torch.linspace(-0.5, 0.5, max(steps, 2))] * 3)
+        origin = torch.tensor(self.grid.origin)
+        read = torch.zeros(len(self.features), dtype=torch.bool)
+        for node in self.within(far).nonzero().split(NODES_AT_ONCE):
+            points = origin + self.voxel_size * (node[:, None] + around).reshape(-1, 3)
+            with torch.enable_grad():
+                encoded = self.encode(points)
+            (grad,) = torch.autograd.grad(encoded, self.features, torch.ones_like(encoded))
+            read[grad._indices()[0]] = True
+        return read
 
     def blocks(self, far: float) -> Tensor:
         return self.distances.blocks(far)

@@ -153,11 +153,11 @@ def paid(scene: Scene, look: Look, before: dict[str, Tensor], reach: float | Non
     it is stored as it is."""
     field = scene.field
     sdf, features = field.sdf.data, field.features.data
-    near = sdf.abs() < (math.inf if reach is None else reach * field.voxel_size)
+    far = math.inf if reach is None else reach * field.voxel_size
     try:
-        field.sdf.data = torch.where(near, sdf, SHELL * field.voxel_size * sdf.sign())
-        if field.by_node:
-            field.features.data = features * near[..., None]
+        read = field.rows_near(far).view(*features.shape[:-1], 1)
+        field.sdf.data = torch.where(sdf.abs() < far, sdf, SHELL * field.voxel_size * sdf.sign())
+        field.features.data = features * read
         surface = look.meet(scene)
         return look.cost(before, look.decode(scene, surface, surface.features))
     finally:
