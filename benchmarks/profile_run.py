@@ -30,21 +30,29 @@ from univoxel.solve import sightings
 from univoxel.tasks import joint, train
 
 HERE = Path(__file__).parent
-FIXED = ("joint: pose and trace", "joint: Newton", "previews", "checkpoints", "held-out rays")
-EVERY = 16  # backward passes of which one is divided
-START = "before"  # loading, hull; also what lies between the stages
-PARTS = STAGES | {
-    "sample": [(f, n) for f in (DenseField, HashField) for n in ("sample", "features_at")],
-    "light": [*STAGES["light"], (sightings, "shade_map")],
+ONCE = {
     "joint: pose and trace": [(joint, "pose")],
+    "joint: trials": [(joint, "supposed")],
+    "joint: colors": [(joint, name) for name in ("sunlit", "balance", "matte_albedo")],
     "joint: Newton": [(joint, "newton_round")],
-    "hull": [(train, name) for name in ("mask_distances", "object_box", "visual_hull")],
-    "cameras": [(train, "put_right")],
-    "loading": [(train, "load_photos")],
+    "joint: metal": [(joint, "find_metal")],
     "held-out rays": [(train, "held_out_psnr")],
     "previews": [(train, "preview")],
     "checkpoints": [(train, "save_scene")],
+    "trust": [(train, "say_trust")],
+}  # seconds of a stage whatever the number of its steps
+EVERY = 16  # backward passes of which one is divided
+START = "before"  # loading, hull; also what lies between the stages
+PARTS = {
+    **STAGES,
+    "sample": [(f, n) for f in (DenseField, HashField) for n in ("sample", "features_at")],
+    "light": [*STAGES["light"], (sightings, "shade_map")],
+    "hull": [(train, name) for name in ("mask_distances", "object_box", "visual_hull")],
+    "hollows": [(train, "opened")],
+    "cameras": [(train, "put_right")],
+    "loading": [(train, "load_photos")],
     "mesh for rays": [(VisibilityScene, "__init__")],
+    **ONCE,
 }
 
 
@@ -142,7 +150,7 @@ def extrapolated(columns: dict, part: int) -> dict:
     found = {}
     for title, column in columns.items():
         rows = {
-            name: seconds * (1 if title == START or name in FIXED else part)
+            name: seconds * (1 if title == START or name in ONCE else part)
             for name, seconds in column["rows"].items()
         }
         found[title] = {
@@ -193,6 +201,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=HERE / "results" / "profile.json")
     options = parser.parse_args()
+    joint.FOLLOWING //= options.part
     with tempfile.TemporaryDirectory() as folder:
         cfg = chosen(options.preset, options.minutes, options.scene, Path(folder) / "run")
         stages = (replace(s, iterations=s.iterations // options.part) for s in cfg.stages)

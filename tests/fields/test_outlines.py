@@ -59,6 +59,25 @@ def test_of_objects_cut_out_only_the_inside_tells(pixels, wanted):
     assert found(color, masks) == wanted
 
 
+@pytest.mark.parametrize("spread", [True, False])
+def test_colours_of_the_edge_that_go_on_outside_are_no_surroundings(spread):
+    """Pictures for blending repeat the edge outwards; a rim that shades off is then no outline."""
+    shade = (1 - 0.7 * (-depth().clamp_min(0) / 2).exp())[..., None]
+    color, masks = shade * patterned(1, 0.3, 0.9), coverage(0)
+    for picture, solid in zip(color, masks > 0.99, strict=True):
+        nearest = ndimage.distance_transform_edt(
+            ~solid.numpy(), return_distances=False, return_indices=True
+        )
+        y, x = torch.from_numpy(nearest)
+        picture.copy_(picture[y, x])
+    distance = mask_distances(masks)
+    assert all(outlines._bled(c, d) for c, d in zip(color, distance, strict=True))
+    if not spread:  # what stands behind
+        color = before(patterned(0, 0.0, 0.4), color)
+        assert not any(outlines._bled(c, d) for c, d in zip(color, distance, strict=True))
+    assert found(color, masks) == 0
+
+
 def test_a_pattern_inside_is_no_outline():
     """A white vase, painted in the middle, before a white wall."""
     white, paint = torch.full((VIEWS, SIZE, SIZE, 3), 0.9), patterned(1, 0.0, 0.9)

@@ -12,6 +12,8 @@ VIEWS = 32  # photographs at most that are looked at
 REACH = 0.015, 6  # of a picture's larger side, and pixels at least: wider masks stay as they are
 BEYOND = 3, 5  # pixels further in, from and to, that the object is looked at for comparison
 CLEAR = 1.5  # times as much as at the masks' edges, and as further in, pictures change at outlines
+RING = 1.0, 4.0  # pixels outside, from and to, that tell whether colours of the edge are repeated
+REPEATED = 0.5  # change away from the edge over change along it, below which they are
 ONE_COLOR = 0.9  # share of what surrounds the object, from which on it counts as cut away
 FEW = 50  # pixels, below which a distance to the edge is left out
 
@@ -25,7 +27,8 @@ def too_wide(color: Tensor, coverage: Tensor, distance: Tensor) -> int:
 
     Args:
         color: [V, H, W, 3] of photographs, uint8 sRGB or linear. What surrounds the object may be
-            there, or cut away: then masks have to be too wide by 3 pixels to be seen so.
+            there, or be cut away or covered by colours of the object's edge: then masks have to be
+            too wide by 3 pixels to be seen so.
         coverage: [V, H, W] in [0, 1], by masks.
         distance: [V, H, W] from `hull.mask_distances`.
     """
@@ -53,17 +56,33 @@ def _change(color: Tensor, coverage: Tensor, distance: Tensor, deepest: int) -> 
         encoded = c.float() / 255 if c.dtype == torch.uint8 else linear_to_srgb(c)
         around = encoded[covered < 0.01]
         same = (around == around.median(0).values).all(1) if len(around) else torch.ones(1)
-        cut_away = float(same.float().mean()) > ONE_COLOR
+        cut_away = float(same.float().mean()) > ONE_COLOR or _bled(encoded, d)
         hidden = (covered < 0.99) if cut_away else torch.zeros_like(covered, dtype=torch.bool)
         hidden = max_pool2d(hidden[None].float(), 3, 1, 1)[0] > 0
         depth = (0.5 - d).floor().long()
         y, x = (~hidden & (depth >= 0) & (depth <= deepest)).nonzero(as_tuple=True)
-        inward, slope = (torch.stack(torch.gradient(v, dim=(0, 1)))[:, y, x] for v in (d, encoded))
-        inward = inward / inward.norm(dim=0).clamp_min(1e-6)
-        along = (inward[..., None] * slope).sum(0).norm(dim=1)
-        total += torch.bincount(depth[y, x], along, deepest + 1)
+        inward, _ = _slopes(encoded, d, y, x)
+        total += torch.bincount(depth[y, x], inward, deepest + 1)
         count += torch.bincount(depth[y, x], minlength=deepest + 1)
     return torch.where(count >= FEW, total / count, torch.nan)
+
+
+def _bled(encoded: Tensor, distance: Tensor) -> bool:
+    """Whether what surrounds the object repeats its edge, outwards, as pictures that are meant for
+    blending do: colours [H, W, 3] then change along the edge and hardly away from it."""
+    y, x = ((distance > RING[0]) & (distance < RING[1])).nonzero(as_tuple=True)
+    away, along = _slopes(encoded, distance, y, x)
+    return len(y) >= FEW and float(away.sum()) < REPEATED * float(along.sum())
+
+
+def _slopes(encoded: Tensor, distance: Tensor, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """How much colours [H, W, 3] change at pixels [N] across the masks' edges, and along: [N]."""
+    slope = torch.stack(torch.gradient(encoded, dim=(0, 1)))[:, y, x]
+    inward = torch.stack(torch.gradient(distance, dim=(0, 1)))[:, y, x]
+    inward = inward / inward.norm(dim=0).clamp_min(1e-6)
+    beside = torch.stack([-inward[1], inward[0]])
+    across, along = ((v[..., None] * slope).sum(0).norm(dim=1) for v in (inward, beside))
+    return across, along
 
 
 def taken_in(distance: Tensor, pixels: int) -> Tensor:
