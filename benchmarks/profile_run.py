@@ -47,7 +47,7 @@ PARTS = {
     **STAGES,
     "sample": [(f, n) for f in (DenseField, HashField) for n in ("sample", "features_at")],
     "light": [*STAGES["light"], (sightings, "shade_map")],
-    "hull": [(train, name) for name in ("mask_distances", "object_box", "visual_hull")],
+    "hull": [(train, name) for name in ("masks_of", "object_box", "visual_hull")],
     "hollows": [(train, "opened")],
     "cameras": [(train, "put_right")],
     "loading": [(train, "load_photos")],

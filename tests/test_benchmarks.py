@@ -11,3 +11,11 @@ def test_a_dying_contender_leaves_the_run_alone(monkeypatch):
     workers = pytest.importorskip("workers")
     with pytest.raises(RuntimeError, match="ended with -6"):
         workers.Worker(os.abort)
+
+
+def test_what_a_profile_times_is_there(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
+    profile_run = pytest.importorskip("profile_run")
+    for part, places in profile_run.PARTS.items():
+        for owner, name in places:
+            assert callable(getattr(owner, name, None)), f"{part}: {owner} has no {name}"
