@@ -63,6 +63,21 @@ class RunClock(Clock):
         super().__init__(now)
         self.cfg, self.columns, self.begin = cfg, {}, now()
         self.steps, self.spent = 0, 0.0  # backward passes and their seconds
+        self._once = False  # whether a part of ONCE runs, which includes what it calls
+
+    def timed(self, name: str, function):
+        timed = super().timed(name, function)
+
+        def call(*arguments, **options):
+            if self._once:
+                return function(*arguments, **options)
+            self._once = name in ONCE
+            try:
+                return timed(*arguments, **options)
+            finally:
+                self._once = False
+
+        return call
 
     def enter(self, title: str) -> None:
         """Book what was measured to a column and start anew."""
