@@ -171,22 +171,22 @@ def matte_albedo(scene: Scene, problem: Problem) -> Tensor:
     sky, seen = scene.sky, problem.seen
     assert sky is not None
     albedo = torch.full_like(seen.position, torch.nan)
-    point = (seen.offsets.diff() > 0).nonzero()[:, 0]
-    normal = seen.normal[point]
-    _, roughness, _ = scene.material(scene.field.features_at(seen.position[point]))
-    roughness = widened(roughness, len(sky.direction))
-    black = torch.zeros_like(normal)
-    layer = normal, black, roughness, torch.full_like(black, brdf.F0)
-    reach, between = _reaching(problem, point)
-    lit = reach @ sky.radiance + between
-    found = torch.zeros_like(normal)
-    for sighting in sightings_of(problem, point, PHOTOGRAPHS).unbind(1):
-        shine = draw_sightings(scene, problem, point, sighting, *layer)
-        exposure = scene.exposed(torch.ones_like(shine), seen.view[sighting])
-        through = 1 - brdf.specular_albedo((normal * seen.wo[sighting]).sum(1), roughness)
-        matte = (seen.color[sighting] - shine) / exposure
-        found += (matte / (lit * through[:, None]).clamp_min(DARK)).clamp(LOWEST, HIGHEST)
-    albedo[point] = found / PHOTOGRAPHS
+    for point in (seen.offsets.diff() > 0).nonzero()[:, 0].split(POINTS):  # bounds memory
+        normal = seen.normal[point]
+        _, roughness, _ = scene.material(scene.field.features_at(seen.position[point]))
+        roughness = widened(roughness, len(sky.direction))
+        black = torch.zeros_like(normal)
+        layer = normal, black, roughness, torch.full_like(black, brdf.F0)
+        reach, between = _reaching(problem, point)
+        lit = reach @ sky.radiance + between
+        found = torch.zeros_like(normal)
+        for sighting in sightings_of(problem, point, PHOTOGRAPHS).unbind(1):
+            shine = draw_sightings(scene, problem, point, sighting, *layer)
+            exposure = scene.exposed(torch.ones_like(shine), seen.view[sighting])
+            through = 1 - brdf.specular_albedo((normal * seen.wo[sighting]).sum(1), roughness)
+            matte = (seen.color[sighting] - shine) / exposure
+            found += (matte / (lit * through[:, None]).clamp_min(DARK)).clamp(LOWEST, HIGHEST)
+        albedo[point] = found / PHOTOGRAPHS
     return albedo
 
 
