@@ -1,6 +1,7 @@
 """The command line over stand-ins for the tasks: what is passed on, what a mistake prints."""
 
 import importlib
+import os
 import subprocess
 import sys
 import types
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from univoxel.cli import main
+from univoxel.cli import SPINS, main
 
 
 @dataclass(frozen=True)
@@ -338,6 +339,20 @@ def test_an_interrupt_says_what_was_kept(calls, tmp_path, capsys):
     (tmp_path / "scene.safetensors").touch()
     assert main(arguments) == 130
     assert capsys.readouterr().err.endswith("keeps the last saved state: go on with --resume\n")
+
+
+@pytest.mark.parametrize(
+    ("asked", "spins"),
+    [({}, SPINS), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "passive"}, None)],
+)
+def test_waiting_threads_soon_sleep_unless_asked_otherwise(calls, monkeypatch, asked, spins):
+    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
+        monkeypatch.setenv(name, "")  # is put back after the test
+        monkeypatch.delenv(name)
+    for name, value in asked.items():
+        monkeypatch.setenv(name, value)
+    assert main(["eval", "run"]) == 0
+    assert os.environ.get("GOMP_SPINCOUNT") == spins
 
 
 def test_help_does_not_wait_for_torch():

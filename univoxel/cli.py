@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -18,12 +19,18 @@ from univoxel.commands import COMMANDS, chart, compare, stress, train
 # What a command raises for a mistake of its user; all else is a bug and keeps its traceback.
 MISTAKES = (ValueError, OSError, RuntimeError, ImportError, FloatingPointError, MemoryError)
 
+# Turns that a thread waits before it leaves its core to other programs. By default it waits for
+# so long that a training beside one other program took six times as long (docs/speed.md)
+SPINS = "3000"
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 for a user's mistake, 130 when interrupted.
 
     The hidden flag --traceback shows where an error came from.
     """
+    if "OMP_WAIT_POLICY" not in os.environ:  # read when a command imports torch
+        os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments == ["--version"]:
         print(f"univoxel {__version__}")
