@@ -69,14 +69,14 @@ def strategies(scene: Scene) -> list[dict]:
     return rows
 
 
-def against_mitsuba(scene: Scene, own: list[dict]) -> dict | None:
+def against_mitsuba(scene: Scene, ours: list[dict]) -> dict | None:
     """PSNR between the two at many samples; time of both at equal error. None: it cannot run.
 
     Once with our BRDF written for Mitsuba, which draws by the cosine, and once with its own
     `principled`, each against its own picture of many samples.
     """
     truth = relight(*scene.ours, samples=TRUTH_SPP, seed=1, **COMMON)
-    own = [r for r in own if r["strategy"] == "mis"]
+    own = [r for r in ours if r["strategy"] == "mis"]
     times, errors = (np.log([r[key] for r in own]) for key in ("seconds", "error"))
     found = {}
     for principled in (False, True):
@@ -102,11 +102,11 @@ def against_mitsuba(scene: Scene, own: list[dict]) -> dict | None:
             print(rows[-1], flush=True)
         found["principled" if principled else "same_brdf"] = rows
         if not principled:
-            ours, theirs = truth.clamp_max(1), many[0].clamp_max(1)
+            pictures = truth.clamp_max(1), many[0].clamp_max(1)
             # Where interpolated normals look away from the eye Mitsuba's picture is black
             facing = (scene.ours[4] * scene.ours[5]).sum(1) > 0
-            found["psnr_at_many_samples"] = psnr(ours, theirs)
-            found["psnr_facing"] = psnr(ours[facing], theirs[facing])
+            found["psnr_at_many_samples"] = psnr(*pictures)
+            found["psnr_facing"] = psnr(*(p[facing] for p in pictures))
             found["pixels_facing_away"] = int((~facing).sum())
     return found
 

@@ -19,3 +19,14 @@ def test_what_a_profile_times_is_there(monkeypatch):
     for part, places in profile_run.PARTS.items():
         for owner, name in places:
             assert callable(getattr(owner, name, None)), f"{part}: {owner} has no {name}"
+
+
+def test_parts_that_run_once_include_what_they_call(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
+    profile_run = pytest.importorskip("profile_run")
+    clock = profile_run.RunClock(None, lambda: 0.0)
+    part = clock.timed("light", lambda: None)
+    clock.timed("joint: Newton", part)()
+    assert list(clock.forward) == ["joint: Newton"]
+    clock.timed("march", part)()
+    assert list(clock.forward) == ["joint: Newton", "light", "march"]

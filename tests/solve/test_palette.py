@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 
 from univoxel.config import JointConfig
 from univoxel.lights.views import ViewLights
+from univoxel.solve import palette
 from univoxel.solve.newton import newton_round
 from univoxel.solve.palette import CELL, balance, matte_albedo, palette_entropy, shown, sunlit
 from univoxel.solve.sightings import widened
@@ -224,3 +225,10 @@ def test_entropy_counts_the_colours():
     # Nearly as many cells as points; some share an entry of the table
     assert 0.9 * math.log(2000) < found[2] < math.log(2000)
     assert (5 / CELL) ** 3 > 10 * 2000
+
+
+def test_albedos_come_in_parts(monkeypatch):
+    scene, problem, _ = painted(lamps(NODES), shiny=True)
+    whole = matte_albedo(scene, problem)
+    monkeypatch.setattr(palette, "POINTS", 70)
+    torch.testing.assert_close(matte_albedo(scene, problem), whole, rtol=1e-5, atol=1e-6)

@@ -148,7 +148,7 @@ class HashField(AbstractField):
         # The cube of a voxel around each near node: of every cell that it meets one of these points
         # lies inside, for they are as close together as the nodes of the finest level
         steps = math.ceil(self.voxel_size / min(self.levels.voxel_sizes) - 1e-3) + 1
-        around = torch.cartesian_prod(*[torch.linspace(-0.5, 0.5, max(steps, 2))] * 3)
+        around = torch.cartesian_prod(*[torch.linspace(-0.5, 0.5, steps)] * 3)
         origin = torch.tensor(self.grid.origin)
         read = torch.zeros(len(self.features), dtype=torch.bool)
         for node in self.within(far).nonzero().split(NODES_AT_ONCE):
