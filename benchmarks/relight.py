@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from peers import BARE_EMBREE
 from relight_rays import ray_rates
 from relight_scenes import TESTS, Scene, mesh_scene, sphere_scene, true_mesh
 from torch import Tensor
@@ -262,6 +263,8 @@ def main() -> None:
     parser.add_argument("--only", default="rays,strategies,mitsuba,pictures")
     arguments = parser.parse_args()
     wanted = arguments.only.split(",")
+    if "rays" in wanted and not BARE_EMBREE.exists():
+        parser.error(f"rays need {BARE_EMBREE}, which is not there: `make build/.bench` builds it")
     data, size = arguments.data, arguments.size
     result = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {}
     scene = mesh_scene(data, size) if data else sphere_scene(size)

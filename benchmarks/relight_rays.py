@@ -18,7 +18,7 @@ import time
 
 import numpy as np
 import torch
-from peers import BARE_EMBREE, bare_embree
+from peers import bare_embree
 from relight_scenes import Scene
 from torch import Tensor
 
@@ -60,12 +60,11 @@ def ray_rates(scene: Scene, samples: int = 64, repeat: int = 9) -> dict:
     assert apart < 1e-2, f"these are not the integrator's rays: shading differs by {apart}"
 
     mesh = visibility.vertices, visibility.faces
-    works = {"integrator": whole}
-    if BARE_EMBREE.exists():
-        works["bare"] = bare_embree(*mesh, *rays, robust=True)
-        works["bare_packets"] = bare_embree(*mesh, *rays, robust=True, name="bare_occluded_8")
-    else:  # almost the same: also one ray after the other
-        works["bare"] = lambda: visibility.occluded(*rays, 0.0)
+    works = {
+        "integrator": whole,
+        "bare": bare_embree(*mesh, *rays, robust=True),
+        "bare_packets": bare_embree(*mesh, *rays, robust=True, name="bare_occluded_8"),
+    }
     times: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(repeat):  # in turns: the machine's speed drifts
         for name, work in works.items():

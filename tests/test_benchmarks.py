@@ -1,4 +1,5 @@
-"""The benchmarks' own machinery: a contender that dies must not take the run with it."""
+"""The benchmarks' own machinery: a contender that dies must not take the run with it, nor one that
+is not there be replaced."""
 
 import os
 from pathlib import Path
@@ -30,3 +31,13 @@ def test_parts_that_run_once_include_what_they_call(monkeypatch):
     assert list(clock.forward) == ["joint: Newton"]
     clock.timed("march", part)()
     assert list(clock.forward) == ["joint: Newton", "light", "march"]
+
+
+def test_rays_without_bare_embree_are_refused(monkeypatch, tmp_path, capsys):
+    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
+    monkeypatch.setattr("sys.argv", ["relight.py", str(tmp_path / "out.json"), "--only", "rays"])
+    benchmark = pytest.importorskip("relight", exc_type=ImportError)
+    monkeypatch.setattr(benchmark, "BARE_EMBREE", tmp_path / "none.so")
+    with pytest.raises(SystemExit):
+        benchmark.main()
+    assert "none.so, which is not there: `make build/.bench`" in capsys.readouterr().err
