@@ -33,6 +33,11 @@ def plain(point, normal, wo):
     return torch.full_like(point, 0.4)
 
 
+def dim(point, normal, wo):
+    """The same in the dark, two or three steps of 8 bits apart."""
+    return 0.04 + 0.005 * torch.sin(14 * point + torch.tensor([0.0, 1.0, 2.0]))
+
+
 def noisy(point, normal, wo):
     """Plain, as 8 bits of a grainy photograph show it."""
     return plain(point, normal, wo) + 0.006 * torch.randn(point.shape)
@@ -97,6 +102,15 @@ def test_a_pit_is_opened():
     assert (found >= hull).all()
 
 
+def test_a_dark_pit_is_opened(monkeypatch):
+    hull, found, truth, voxel = opened(with_pit, dim, from_above())
+    pit = (hull < -voxel) & (truth > voxel)
+    assert (found[pit] > 0).float().mean() > 0.8
+    monkeypatch.setattr(hollows, "DARK_SHARE", 0.0)
+    as_it_is = hollowed(*hull_of(with_pit, dim, from_above()))
+    assert (as_it_is[pit] > 0).float().mean() < (found[pit] > 0).float().mean() - 0.2
+
+
 def test_the_new_surface_lies_where_the_pit_is():
     hull, found, truth, voxel = opened(with_pit, checks, from_above())
     near = (truth.abs() < 2 * voxel) & (hull < -2 * voxel)
@@ -117,7 +131,7 @@ def test_what_photographs_cannot_tell_stays(look):
 
 @pytest.mark.parametrize(
     ("rule", "strict"),
-    [("AGREE", 1.0), ("LEAST", 1.0), ("HALF", 1.0), ("BETTER", 1.0), ("PIECE", 0.2)],
+    [("AGREE", 1.0), ("LEAST", 1.0), ("ENOUGH", 1.0), ("BETTER", 1.0), ("PIECE", 0.2)],
 )
 def test_each_rule_can_keep_the_pit_closed(monkeypatch, rule, strict):
     monkeypatch.setattr(hollows, rule, strict)
@@ -127,9 +141,9 @@ def test_each_rule_can_keep_the_pit_closed(monkeypatch, rule, strict):
 
 @cache
 def mostly_from_below():
-    """A sixth of the cameras see into the pit."""
+    """A tenth of the cameras see into the pit."""
     cameras = from_above()
-    low = torch.arange(VIEWS) < VIEWS * 5 // 6
+    low = torch.arange(VIEWS) < VIEWS * 9 // 10
     at = cameras.camera_to_world[:, :, 3]
     at = torch.where(low[:, None], at * torch.tensor([1.0, 1.0, -1.0]), at)
     return Cameras(torch.stack([look_at(p) for p in at]), cameras.focal, cameras.centre, SIZE, SIZE)
@@ -139,7 +153,7 @@ def test_what_few_views_see_through_stays(monkeypatch):
     """They may all look at a lamp in something glossy."""
     case = hull_of(with_pit, checks, mostly_from_below())
     assert torch.equal(hollowed(*case), case[0])
-    monkeypatch.setattr(hollows, "LEAST", 0.1)
+    monkeypatch.setattr(hollows, "LEAST", 0.05)
     assert not torch.equal(hollowed(*case), case[0])
 
 
