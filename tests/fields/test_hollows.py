@@ -111,6 +111,18 @@ def test_a_dark_pit_is_opened(monkeypatch):
     assert (as_it_is[pit] > 0).float().mean() < (found[pit] > 0).float().mean() - 0.2
 
 
+def test_dark_colours_are_taken_further_apart():
+    color = torch.tensor([0, 10, 20, 120, 245, 255], dtype=torch.uint8)
+    opaque = torch.stack([color] * 3 + [torch.full_like(color, 255)], 1)[None]
+    found = hollows._stretched(opaque)[0, :, 0].int()
+    assert found[0] == 0
+    assert found[-1] == 255
+    assert found[2] - found[1] > 3 * (found[5] - found[4])
+    half = torch.cat([opaque[..., :3] // 2, torch.full_like(opaque[..., 3:], 128)], 2)
+    assert (2 * hollows._stretched(half)[0, :, 0].int() - found).abs().max() < 8  # rounded
+    assert (hollows._stretched(half)[..., 3] == 128).all()
+
+
 def test_the_new_surface_lies_where_the_pit_is():
     hull, found, truth, voxel = opened(with_pit, checks, from_above())
     near = (truth.abs() < 2 * voxel) & (hull < -2 * voxel)

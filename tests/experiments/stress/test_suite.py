@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from univoxel.cli import main
-from univoxel.config import LIGHTS
+from univoxel.config import LIGHTS, JointConfig
 from univoxel.experiments.record import Outcome
 from univoxel.experiments.stress import axes, render, suite
 from univoxel.experiments.stress.axes import AXES, BASE, INTACT
@@ -62,6 +62,13 @@ def test_trainings_are_by_steps(light):
         assert config.seed == 2
         assert config.scene.varying == ("light" if level.changes else "none")
         assert one.name == f"{light}{'-light' if level.changes else ''}-s2"
+
+
+def test_colors_tell_of_the_light_as_in_longer_presets():
+    """They found suns until draft, whose trainings are made small here, left them alone."""
+    config = suite.setting("hybrid", 0, AXES["sun"].levels[1]).config(Path("photos"), Path("run"))
+    (joint,) = (s for s in config.stages if isinstance(s, JointConfig))
+    assert joint.colors
 
 
 @pytest.fixture
