@@ -34,7 +34,7 @@ def plain(point, normal, wo):
 
 
 def dim(point, normal, wo):
-    """The same in the dark, two or three steps of 8 bits apart."""
+    """Checks in the dark, two or three steps of 8 bits apart."""
     return 0.04 + 0.005 * torch.sin(14 * point + torch.tensor([0.0, 1.0, 2.0]))
 
 
@@ -119,7 +119,7 @@ def test_dark_colours_are_taken_further_apart():
     assert found[-1] == 255
     assert found[2] - found[1] > 3 * (found[5] - found[4])
     half = torch.cat([opaque[..., :3] // 2, torch.full_like(opaque[..., 3:], 128)], 2)
-    assert (2 * hollows._stretched(half)[0, :, 0].int() - found).abs().max() < 8  # rounded
+    assert (2 * hollows._stretched(half)[0, :, 0].int() - found).abs().max() < 8  # of a step in the dark
     assert (hollows._stretched(half)[..., 3] == 128).all()
 
 

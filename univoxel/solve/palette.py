@@ -44,7 +44,7 @@ PRIMES = (73856093, 19349663, 83492791)
 
 SHARES = (0.35, 0.5, 0.65, 0.8, 0.9, 0.95)  # of the surface's light, tried for every direction
 # Nats that a sun has to save of the entropy. Suns of half of the light or more save 0.12 to 0.3; of
-# some fifty trainings without one found a sun nevertheless, in grainy photographs
+# 46 trainings of the stress suite without one, one found a sun, in grainy photographs
 CLEARER = 0.08
 AT_ONCE = 64  # suns
 PHOTOGRAPHS = 2  # of each point that tell its albedo, once the light is known
