@@ -119,8 +119,10 @@ def test_dark_colours_are_taken_further_apart():
     assert found[-1] == 255
     assert found[2] - found[1] > 3 * (found[5] - found[4])
     half = torch.cat([opaque[..., :3] // 2, torch.full_like(opaque[..., 3:], 128)], 2)
-    assert (2 * hollows._stretched(half)[0, :, 0].int() - found).abs().max() < 8  # of a step in the dark
-    assert (hollows._stretched(half)[..., 3] == 128).all()
+    again = hollows._stretched(half)[0]
+    # Halves are rounded, and a step of them is several in the dark
+    assert (2 * again[:, 0].int() - found).abs().max() < 8
+    assert (again[:, 3] == 128).all()
 
 
 def test_the_new_surface_lies_where_the_pit_is():
