@@ -71,7 +71,7 @@ def train(
             the presets', such as --set stages.1.voxels=30
         minutes: wall-clock limit, above 0; training ends in time with what it has
         capacity: adaptive makes no larger a model than the scene needs, as held-out pixels tell:
-            coarser grid, fewer levels or channels of features, fewer lobes and hidden units;
+            coarser grid, fewer rows or channels of features, fewer lobes and hidden units;
             `univoxel info` says what was chosen. auto is that, but fixed for sparse fields and for
             lights other than hybrid
         budget_mb: most that the file of the model may have, in millions of bytes; implies

@@ -71,25 +71,6 @@ def test_held_channels_get_no_gradient():
     assert whole[0, :, 1].any()
 
 
-def test_levels_that_are_kept_say_what_they_said():
-    field = ball()
-    points = torch.rand(100, 3) - 0.5
-    before = field.features_at(points)
-    keep = field.channels_of(torch.tensor([0, 2]))
-    assert keep.tolist() == [0, 2, COUNT, COUNT + 2]
-    field.keep_channels(keep)
-    assert (field.channels, len(field.levels.voxel_sizes)) == (4, 2)
-    assert torch.equal(field.features_at(points), before[:, keep])
-    assert field.sample(points).features.shape == (100, 4)
-
-
-def test_levels_are_kept_whole():
-    with pytest.raises(
-        ValueError, match=r"channels \[0, 1, 4\] are not those of whole levels of 4"
-    ):
-        ball().keep_channels(torch.tensor([0, 1, 4]))
-
-
 def test_tables_may_be_smaller():
     levels = Levels.of(GRID.bounds(), GRID.voxel_size, COUNT, rows=2**10)
     field = HashField(DenseField(GRID, 0, GRID.nodes().norm(dim=-1) - 0.5), levels)

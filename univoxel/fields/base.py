@@ -25,7 +25,6 @@ class AbstractField(nn.Module, ABC):
     channels: int  # C
     voxel_size: float  # finest resolution, world units
     by_node: ClassVar[bool] = True  # whether each row of the features is a node's
-    sized: ClassVar[tuple[str, ...]] = ("features", "channels")  # what `keep_channels` replaces
     sdf: nn.Parameter
     features: nn.Parameter  # as the sdf, and C; or a table of its own
 
@@ -67,7 +66,9 @@ class AbstractField(nn.Module, ABC):
         self.smooth_rows_(self.features.data, rows, amount, order=1)
 
     def keep_channels(self, keep: Tensor) -> None:
-        """Have only the channels of these numbers [K], increasing; features are a new parameter."""
+        """Have only the channels of these numbers [K], increasing; features are a new parameter.
+        Of fields whose rows are nodes."""
+        assert self.by_node
         self.features = nn.Parameter(self.features.data[..., keep].contiguous())
         self.channels = len(keep)
 

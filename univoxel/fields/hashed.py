@@ -54,7 +54,6 @@ class HashField(AbstractField):
 
     kind = "hash"
     by_node = False
-    sized = ("features", "channels", "levels")
 
     def __init__(self, distances: DenseField | SparseField, levels: Levels):
         """
@@ -99,32 +98,6 @@ class HashField(AbstractField):
 
     def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
         self.distances.diffuse_rows_(values, rows, amount, passes)
-
-    @property
-    def tables(self) -> Tensor:
-        """The tables of the levels [L, rows, PER_LEVEL]."""
-        return self.features.view(-1, self.levels.rows, PER_LEVEL)
-
-    def channels_of(self, levels: Tensor) -> Tensor:
-        """Numbers of the channels, increasing, that levels [K], increasing, are seen in."""
-        first = torch.arange(PER_LEVEL) * len(self.levels.voxel_sizes)
-        return (first[:, None] + levels).flatten()
-
-    def keep_channels(self, keep: Tensor) -> None:
-        """Have only the channels of these numbers, which must be those of some levels.
-
-        Raises:
-            ValueError: they are not.
-        """
-        sizes = self.levels.voxel_sizes
-        levels = (keep % len(sizes)).unique()
-        if not torch.equal(keep, self.channels_of(levels)):
-            raise ValueError(
-                f"HashField: channels {keep.tolist()} are not those of whole levels of {len(sizes)}"
-            )
-        self.features = nn.Parameter(self.tables.data[levels].flatten(0, 1))
-        kept = tuple(sizes[k] for k in levels.tolist())
-        self.channels, self.levels = len(keep), replace(self.levels, voxel_sizes=kept)
 
     def hold_channels_(self, count: int) -> None:
         grad = self.features.grad

@@ -1,9 +1,9 @@
 """How much model a scene needs: what is chosen, when, and how large its file may be.
 
 No grid is finer than the photographs. Capacity that adapts chooses more: after the coarse stage,
-by rehearsals of the next, the levels of a hash table or the voxels of a dense grid; after the first
-stage with light the channels of a dense grid, lobes and hidden units; at the end how far from the
-surface nodes are stored.
+by rehearsals of the next, the voxels of a dense grid; after the first stage with light its
+channels, lobes and hidden units; at the end how far from the surface nodes are stored, and which
+rows of a hash table.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from torch import Tensor
 from univoxel.camera import Cameras
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.fields.dense import DenseField
-from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS, HashField
+from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS
 from univoxel.fields.hull import fit_grid
 from univoxel.lights import LocalSG
 from univoxel.networks import DirectionTable
 from univoxel.scene import SHELL, Scene, SceneConfig, stored
-from univoxel.tasks import shrink, spare
+from univoxel.tasks import spare
 from univoxel.tasks.look import TOLERANCE, Choice, Look, smallest
 
 REGAINED = 0.1  # dB that channels may cost where training goes on with what is left
@@ -35,6 +35,7 @@ REHEARSAL = 0.05  # share of a stage's steps that a grid is tried for; of the ch
 FEWEST_STEPS = 8  # of a rehearsal: fewer tell nothing
 LESSON = 1024  # rays of the training photographs that heads settle on
 REACH_TOLERANCE = 0.05  # dB that nodes far from the surface may be worth and are not stored
+PROBE, PROBES = 4096, 8  # rays that tell what rows of a table are worth, and how often so many
 REACHES = (3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5, 1.25, 1.0)  # voxels
 ROW_BYTES = 4 + 2 * PER_LEVEL  # of a row of a hash table: its number, and features in halves
 MIRROR_SHARE = 0.1  # of a budget, that the table of mirrored directions may have
@@ -83,41 +84,6 @@ def coarser_grid(
     why = "held-out rays after rehearsals: "
     why += ", ".join(f"{v:,} {found[v]:.2f} dB" for v in sorted(found, reverse=True))
     return Choice("voxels", most, chosen, max(found.values()) - found[chosen], why)
-
-
-def fewer_levels(scene: Scene, look: Look, rehearse: Callable[[Scene], float]) -> Choice:
-    """Halve the levels of a hash table, from the finest on, for as long as a rehearsal of the next
-    stage draws as well without them; the scene goes on from the one with those that stay."""
-    assert isinstance(scene.field, HashField)
-    count = len(scene.field.levels.voxel_sizes)
-    mean = spare.mean_features(look.meet(scene))
-    found: dict[int, float] = {}
-
-    def attempt(levels: int) -> Scene:
-        tried = copy.deepcopy(scene)
-        coarsest(tried, levels, mean)
-        found[levels] = rehearse(tried)
-        return tried
-
-    chosen, kept = count, attempt(count)
-    while chosen > 1:
-        fewer = chosen // 2
-        tried = attempt(fewer)
-        if found[fewer] < max(found.values()) - GRID_TOLERANCE:
-            break
-        chosen, kept = fewer, tried
-    coarsest(scene, chosen, mean)
-    copy_over(kept, scene)
-    why = "held-out rays after rehearsals: "
-    why += ", ".join(f"{n} {found[n]:.2f} dB" for n in sorted(found, reverse=True))
-    return Choice("levels", count, chosen, max(found.values()) - found[chosen], why)
-
-
-def coarsest(scene: Scene, levels: int, mean: Tensor) -> None:
-    """Keep so many levels of a hash table; of the others heads see the mean [C] from now on."""
-    assert isinstance(scene.field, HashField)
-    if levels < len(scene.field.levels.voxel_sizes):
-        shrink.drop_channels(scene, scene.field.channels_of(torch.arange(levels)), mean)
 
 
 def copy_over(source: Scene, target: Scene) -> None:
@@ -170,7 +136,7 @@ def adapt(
     index: int,
     box: tuple[Tensor, Tensor],
     look: Look,
-    lesson: Look,
+    lesson: Callable[[int], Look],
     rehearse: Callable[[Scene, StageConfig, int], float],
     pace: float = 1.0,
 ) -> list[Choice]:
@@ -178,7 +144,8 @@ def adapt(
 
     Args:
         box: corners [3], [3] of the grid.
-        look, lesson: held-out rays, and some of those that are trained on.
+        look: the held-out rays.
+        lesson: draws so many of those that are trained on.
         rehearse: trains a scene in a stage's manner in so many steps and returns the PSNR of its
             held-out rays.
         pace: share of its steps that time let the last stage make.
@@ -201,25 +168,25 @@ def adapt(
             if most < limit:
                 choice = replace(choice, before=limit, why=f"{room}; {choice.why}")
             found.append(choice)
-        else:  # a node is one number there: a coarser grid saves little, and costs in the end
-            scene.field = scene.field.resized(fit_grid(*box, most))
-            scene.surface_moved()
-            if most < limit:
-                found.append(Choice("voxels", limit, most, 0.0, room))
-            found.append(fewer_levels(scene, look, rehearsed))
+        elif most < limit:
+            # Only then: a node is one number there, and a coarser grid costs more than it saves
+            found.append(Choice("voxels", limit, most, 0.0, room))
     if isinstance(stage, StageConfig) and not stage.refit and stage.physical_from < 1:
-        tolerance = REGAINED if after else TOLERANCE
+        tolerance, taught = REGAINED if after else TOLERANCE, lesson(LESSON)
         if scene.field.by_node:
-            found.append(spare.fewer_channels(scene, look, lesson, tolerance))
+            found.append(spare.fewer_channels(scene, look, taught, tolerance))
         if scene.cfg.mirror_levels:
-            found.append(spare.fewer_mirror_levels(scene, look, lesson))
+            found.append(spare.fewer_mirror_levels(scene, look, taught))
         if spare.share_of_heads(scene) > spare.WORTH:
             if isinstance(scene.light, LocalSG):
-                found.append(spare.fewer_lobes(scene, look, lesson))
-            found.append(spare.fewer_units(scene, look, lesson))
+                found.append(spare.fewer_lobes(scene, look, taught))
+            found.append(spare.fewer_units(scene, look, taught))
     if not after:
         if isinstance(scene.field.distances, DenseField):
             found.append(shorter_reach(scene, look))
+        if not scene.field.by_node:
+            far = (reach([c.noted() for c in found]) or SHELL) * scene.field.voxel_size
+            found.append(spare.fewer_rows(scene, look, (lesson(PROBE) for _ in range(PROBES)), far))
         if cfg.budget_mb:
             found += within(scene, look, reach([c.noted() for c in found]), 1e6 * cfg.budget_mb)
     return found
@@ -353,9 +320,9 @@ def voxels(stage: StageConfig, chosen: list[dict]) -> int:
     return min([round(1e6 * stage.voxels), *fewer])
 
 
-def rehearsed(choices: list[Choice]) -> bool:
+def rehearsed(scene: Scene, choices: list[Choice]) -> bool:
     """Whether the coming stage has made its first steps in a rehearsal."""
-    return any(c.what in ("voxels", "levels") for c in choices)
+    return scene.field.by_node and any(c.what == "voxels" for c in choices)
 
 
 def reach(chosen: list[dict]) -> float | None:

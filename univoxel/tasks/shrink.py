@@ -35,7 +35,7 @@ def parts_of(scene: Scene) -> Parts:
     """The present networks, features and sizes of a scene."""
     names = [
         (scene, ("cfg",)),
-        (scene.field, scene.field.sized),
+        (scene.field, ("features", "channels")),
         (scene.material, ("net", "channels")),
         (scene.radiance, ("net",)),
         (scene.radiance.directions, ("table",)),

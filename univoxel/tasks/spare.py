@@ -1,8 +1,8 @@
-"""Fewer channels, lobes, levels and hidden units, for as long as held-out rays do not suffer."""
+"""Fewer channels, rows, lobes, levels and hidden units, while held-out rays do not suffer."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from univoxel.lights import LocalSG
 from univoxel.records import Surface
+from univoxel.render.pipeline import surface_at
 from univoxel.scene import SHELL, Scene
 from univoxel.tasks import shrink
 from univoxel.tasks.look import TOLERANCE, Choice, Look, smallest
@@ -19,6 +20,8 @@ WORTH = 0.1  # share of the parameters from which on it is worth the time to mak
 SETTLE_STEPS, SETTLE_RATE = 20, 1e-3  # of Adam, for heads of which something was taken
 TABLES = ("field.", "radiance.directions.")  # names of parameters that begin so are no head's
 PROBES = 8  # random mixtures of the outputs whose gradients tell what they depend on
+# Of the rows of a table, that may go
+DROPPED = (0, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 11 / 16, 3 / 4, 13 / 16, 7 / 8, 29 / 32, 15 / 16)
 
 
 @contextmanager
@@ -113,6 +116,66 @@ def fewer_channels(scene: Scene, look: Look, lesson: Look, limit: float) -> Choi
         return keep
 
     return _spare("channels", scene, look, lesson, shares(scene.cfg.channels), reduce, limit)
+
+
+def fewer_rows(
+    scene: Scene, look: Look, probes: Iterable[Look], far: float, limit: float = TOLERANCE
+) -> Choice:
+    """Let rows of a hash table be 0, which a file does not hold: those first that say least.
+
+    What a row says is, to first order, its features times the gradient of everything that is
+    decoded. Rows that no probe meets are not judged, and stay.
+
+    Args:
+        probes: rays of the training photographs, some at a time.
+        far: world units from the surface, beyond which rows are not looked at.
+
+    Source: as LeCun et al. 1990, "Optimal Brain Damage", with squared gradients for the Hessian.
+    """
+    features = scene.field.features
+    before_them = features.detach().clone()
+    there = before_them.any(1) & scene.field.rows_near(far)
+    squared = torch.zeros_like(before_them)
+    met = torch.zeros_like(there)
+    for probe in probes:
+        rows, slope = _slopes(scene, probe)
+        squared[rows] += slope.square()
+        met[rows] = True
+    said = (squared * before_them.square()).sum(1)
+    order = (there & met).nonzero()[:, 0]
+    order = order[said[order].argsort()]
+    with torch.no_grad():
+        before = look.decode(scene, surface := look.meet(scene), surface.features)
+    paid = {0.0: 0.0}
+
+    @torch.no_grad()
+    def drop(share: float) -> None:
+        features.copy_(before_them)
+        features[order[: round(share * len(order))]] = 0
+
+    def cost(share: float) -> float:
+        drop(share)
+        with torch.no_grad():
+            surface = look.meet(scene)
+            paid[share] = look.cost(before, look.decode(scene, surface, surface.features))
+        return paid[share]
+
+    share = smallest(DROPPED, cost, limit)
+    drop(share)
+    count = int(there.sum())
+    kept, why = count - round(share * len(order)), f"costs {paid[share]:.3f} dB"
+    return Choice("rows", count, kept, paid[share], why)
+
+
+def _slopes(scene: Scene, probe: Look) -> tuple[Tensor, Tensor]:
+    """Rows [K] of the features that rays read, and the gradient [K, F] of a random mixture of
+    everything that is decoded; its square is on average the sum of all outputs' squares."""
+    surface = surface_at(scene, probe.rays)
+    outputs = probe.decode(scene, surface, surface.features)
+    mixed = [(x * (torch.randint_like(x, 2) * 2 - 1)).sum() for x in outputs.values()]
+    (slope,) = torch.autograd.grad(torch.stack(mixed).sum(), scene.field.features)
+    slope = slope.coalesce()
+    return slope._indices()[0], slope._values()
 
 
 def fewer_mirror_levels(scene: Scene, look: Look, lesson: Look, limit: float = TOLERANCE) -> Choice:

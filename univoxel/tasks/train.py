@@ -163,12 +163,11 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             done = index + 1 == len(cfg.stages)
             if cfg.capacity == "adaptive" and (done or not progress.over):
                 rehearse = partial(rehearsal, cfg, photos, pixels, held_out)
-                lesson = pixels[torch.randperm(len(pixels))[: capacity.LESSON]]
                 shot = scene.registered(photos)
-                looks = look_at(shot, held_out), look_at(shot, lesson)
+                looks = look_at(shot, held_out), partial(random_look, shot, pixels)
                 chosen = capacity.adapt(scene, cfg, index, box, *looks, rehearse, progress.pace)
                 progress.chosen += [choice.noted() for choice in chosen]
-                if not done and capacity.rehearsed(chosen):
+                if not done and capacity.rehearsed(scene, chosen):
                     progress.credit(capacity.REHEARSAL)
             reach = capacity.reach(progress.chosen)
             save_scene(scene, cfg.out, progress.state(), slim=done, reach=reach)
@@ -390,6 +389,11 @@ def held_out_psnr(scene: Scene, photos: Photos, pixels: Tensor, physical: bool) 
         shaded = encoded_radiance(scene, surface, batch) * surface.opacity[:, None]
     target = linear_to_srgb(batch.color * batch.alpha[:, None])
     return psnr(shaded, target)
+
+
+def random_look(photos: Photos, pixels: Tensor, count: int) -> capacity.Look:
+    """`look_at` some of the pixels, `count` at most."""
+    return look_at(photos, pixels[torch.randperm(len(pixels))[:count]])
 
 
 def look_at(photos: Photos, pixels: Tensor) -> capacity.Look:
