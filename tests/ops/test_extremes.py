@@ -320,7 +320,8 @@ def test_rays_at_the_edge_meet_what_they_should(seed, n):
     assert ((hit.face >= -1) & (hit.face < 4)).all()
     assert scene.occluded(origin, direction).shape == (n + 1,)
     assert hit.face[n] == 0
-    assert hit.t[n] == 1
+    # Rounding: where there is no AVX-512, Embree divides by a refined estimate
+    torch.testing.assert_close(hit.t[n], torch.tensor(1.0))
 
 
 # --- strides

@@ -132,10 +132,13 @@ def test_cameras_are_refined_under_every_light(data, tmp_path, light):
 
 
 def test_trust_looks_from_where_the_cameras_are(data, run):
+    """As it would if they had been put there from the start, and not from where they were."""
     scene, photos = load_scene(run), load_photos(data, "train")
-    right = trust.survey(scene, photos, 200).disagreement.mean()
+    refined, moved = trust.survey(scene, photos, 200), scene.registered(photos)
     scene.poses.steps.data.zero_()
-    assert right < trust.survey(scene, photos, 200).disagreement.mean()
+    there, before = trust.survey(scene, moved, 200), trust.survey(scene, photos, 200)
+    torch.testing.assert_close(refined.disagreement, there.disagreement)
+    assert (before.disagreement - there.disagreement).abs().mean() > 1e-3
 
 
 def test_other_photographs_are_refused(data, run):
