@@ -16,12 +16,15 @@ from univoxel.solve.metals import find_metal
 from univoxel.solve.newton import newton_round
 from univoxel.solve.sightings import Problem
 
-TRIED = 100  # points of Newton rounds that tell what to suppose
+TRIED = 100  # points of Newton rounds that tell what roughness to suppose
+DECIDING = 3  # times as many, of the two that tell whether all is metal
 STEPS = 6  # of such a round; after three, from no map, too glossy still looks better than right
 ROUGHNESS = (0.25, 0.7)  # medians that are tried beside the present one
 BETTER = 0.95  # times the others' residual: what is left if another roughness is to be supposed
-CONVINCING = 0.8  # the same of metal everywhere
-TRIALS = 2 * (1 + len(ROUGHNESS) + 1)  # rounds of Newton that this takes
+# The same of metal everywhere, and where most is then found to be metal. In the stress suite that
+# is so of objects all of metal alone: 0.67 to 0.93 of them is, of dielectrics up to 0.24
+CONVINCING, MOSTLY = 0.8, 0.95
+TRIALS = 2 * (1 + len(ROUGHNESS) + DECIDING)  # rounds of Newton of so many points that this takes
 
 
 def supposed(
@@ -40,16 +43,16 @@ def supposed(
         seconds: that the rounds of Newton may take together.
     """
     steps = STEPS if cfg.newton_steps else 0
-    few = replace(cfg, newton_points=TRIED, newton_steps=steps, newton_roughness=0.0)
+    few = replace(cfg, newton_steps=steps, newton_roughness=0.0)
     parts = [part for part in (scene.material, scene.sky, scene.views) if part is not None]
     seed = int(torch.randint(2**31, ()))
 
-    def trial(metal: Tensor) -> float:
-        """What is left after a round on points that are the same in all trials."""
+    def trial(metal: Tensor, share: int = 1) -> float:
+        """What is left after a round on share * TRIED points, the same in all such trials."""
+        tried, points = replace(problem, metal=metal), replace(few, newton_points=share * TRIED)
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
-            tried = replace(problem, metal=metal)
-            costs = newton_round(scene, tried, few, seconds / TRIALS, tell)
+            costs = newton_round(scene, tried, points, seconds * share / TRIALS, tell)
         return costs[-1] if costs else math.inf
 
     def states() -> list[dict]:
@@ -61,8 +64,8 @@ def supposed(
 
     before = states()
     least, best = math.inf, (problem, before)
-    suppositions = (problem.metal, 1.0), (torch.ones_like(problem.metal), CONVINCING)
-    for metal, share in suppositions:
+    for metal in (problem.metal, torch.ones_like(problem.metal)):
+        everywhere = bool(metal.all())
         lowest, found = math.inf, before
         for roughness in (None, *ROUGHNESS):
             restore(before)
@@ -73,9 +76,12 @@ def supposed(
             if left < (lowest if roughness is None else BETTER * lowest):
                 lowest, found = left, states()
         restore(found)
-        metal = find_metal(scene, replace(problem, metal=metal), cfg, 0.0)
-        left = trial(metal)
-        if left < share * least:
+        # Under a map for metals what is no metal tells itself apart at once
+        sure = 1.0 if everywhere else 0.0
+        metal = find_metal(scene, replace(problem, metal=metal), cfg, sure)
+        left = trial(metal, DECIDING)
+        mostly = MOSTLY if metal.float().mean() > 0.5 else CONVINCING
+        if left < (mostly if everywhere else 1.0) * least:
             least, best = left, (replace(problem, metal=metal), states())
     restore(best[1])
     return best[0]
