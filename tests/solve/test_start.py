@@ -80,16 +80,22 @@ def test_rounds_that_solve_nothing_change_nothing(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("left", "share", "taken"),
-    [(0.9, 0.3, False), (0.7, 0.3, True), (0.98, 0.8, False), (0.9, 0.8, True)],
+    ("lowest", "left", "share", "taken"),
+    [
+        (0.5, 0.9, 0.3, False),
+        (0.9, 0.7, 0.3, True),
+        (0.98, 0.98, 0.8, False),
+        (0.98, 0.9, 0.8, True),
+        (0.9, 1.2, 0.8, True),
+    ],
 )
-def test_metal_everywhere_has_to_be_convincing(monkeypatch, left, share, taken):
-    """It leaves less of the photographs in each case: under a wrong map so it may by chance. Less
-    so where most of the surface is metal then."""
+def test_metal_everywhere_has_to_be_convincing(monkeypatch, lowest, left, share, taken):
+    """What it leaves of the photographs, everywhere or only where metal was found: under a wrong
+    map that is less by chance. Less so where most of the surface is metal then."""
     scene, problem = sphere_of((0.5, 0.3, 0.2), 0.0, 0.4)
 
     def newton_round(scene, problem, *_):
-        return [left if problem.metal.any() else 1.0]
+        return [lowest if problem.metal.all() else left if problem.metal.any() else 1.0]
 
     def find_metal(scene, problem, cfg, done):
         """A share is, of what is taken for metal everywhere; surely so, from a map for metals."""
