@@ -69,7 +69,7 @@ def draw(runs: dict[str, dict], stem: Path) -> None:
     """Write the chart: a column for each measure, a row for size and one for time; a line joins
     the settings of a scene."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import EngFormatter, NullFormatter
+    from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
     scenes = list(dict.fromkeys(name.split()[0] for name in runs))
     settings = list(dict.fromkeys(name.split()[-1] for name in runs))
@@ -86,6 +86,7 @@ def draw(runs: dict[str, dict], stem: Path) -> None:
                     number = settings.index(name)
                     axes.scatter(r[key], r[measure.key], color=plots.color(number), marker=mark)
             axes.set(xscale="log", xlabel=label, title=measure.title)
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.xaxis.set_minor_formatter(NullFormatter())
             axes.grid(alpha=0.3)
