@@ -21,7 +21,7 @@ TRIED = 100  # points of Newton rounds that tell what roughness to suppose
 DECIDING = 3  # times as many, of the two that tell whether all is metal
 STEPS = 6  # of such a round; after three, from no map, too glossy still looks better than right
 ROUGHNESS = (0.25, 0.7)  # medians that are tried beside the present one
-BETTER = 0.95  # times the others' residual: what is left if another roughness is to be supposed
+BETTER = 0.9  # times the others' residual: what is left if another roughness is to be supposed
 # The same of metal everywhere, and where most is then found to be metal: of objects all of metal
 # 0.67 to 0.93 is, of dielectrics hardly ever as much
 CONVINCING, MOSTLY = 0.8, 0.95
