@@ -13,7 +13,10 @@ from typing import Annotated, Literal, TypeAlias
 from tyro.conf import Positional, UseAppendAction, arg
 
 Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
-Scenes: TypeAlias = Annotated[Positional[tuple[Path, ...]], arg(metavar="SCENE [SCENE ...]")]
+Scenes: TypeAlias = Annotated[
+    Positional[tuple[Path, ...]],
+    arg(metavar="SCENE [SCENE ...]", help_behavior_hint="(required)"),
+]
 Changes: TypeAlias = Annotated[
     UseAppendAction[tuple[str, ...]],
     arg(metavar="FIELD=VALUE", help_behavior_hint="(repeatable)"),

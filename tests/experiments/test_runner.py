@@ -137,7 +137,7 @@ def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):
             runner.run(scenes, settings, out, samples)
 
     refused(ValueError, "expected scenes in folders of different names", [data, other])
-    refused(ValueError, "expected scenes in folders of different names", [])
+    refused(ValueError, "expected a scene, a folder of photographs, or more; got none", [])
     refused(DataError, "transforms_test", [other])
     refused(
         ValueError, r"settings of different names, got \['small', 'small'\]", [data], [SMALL] * 2

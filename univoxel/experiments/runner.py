@@ -119,7 +119,9 @@ def failures(outcomes: Sequence[Outcome]) -> str:
 def _named(scenes: Iterable[Path]) -> list[Path]:
     """Scenes as absolute folders, whose names tell them apart."""
     folders = [Path(scene).resolve() for scene in scenes]
-    if not folders or len({folder.name for folder in folders}) < len(folders):
+    if not folders:
+        raise ValueError("expected a scene, a folder of photographs, or more; got none")
+    if len({folder.name for folder in folders}) < len(folders):
         names = [str(folder) for folder in folders]
         raise ValueError(f"expected scenes in folders of different names, got {names}")
     return folders
