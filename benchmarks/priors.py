@@ -24,10 +24,11 @@ import torch
 from torch import Tensor
 from varying import exposed
 
+from univoxel.checkpoint import FILE
 from univoxel.config import LossConfig, TrainConfig, preset, save_config
 from univoxel.data import load_photos
-from univoxel.data.images import read_image, replacing, write_png
-from univoxel.scene import FILE
+from univoxel.data.images import read_image, write_png
+from univoxel.files import replacing
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from univoxel.config import LightName, TrainConfig, chosen
-from univoxel.data.images import replacing
+from univoxel.files import replacing
 from univoxel.overrides import changed
 
 RESULT = "result.json"
