@@ -23,12 +23,14 @@ from pathlib import Path
 from ball import write
 
 from univoxel.checkpoint import FILE
-from univoxel.config import StageConfig, TrainConfig, preset, with_field
+from univoxel.config import TrainConfig
 from univoxel.experiments import plots
 from univoxel.files import replacing
+from univoxel.presets import preset, with_field
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.info import info
 from univoxel.tasks.train import train
+from univoxel.training.config import StageConfig
 
 SETTINGS = ["dense", "sparse", "hash", "adaptive"]
 PANELS = [plots.NVS, plots.ALBEDO, plots.RELIT]

@@ -22,11 +22,13 @@ from pathlib import Path
 import torch
 from train_step import OTHER, STAGES, Clock
 
-from univoxel.config import JointConfig, TrainConfig, chosen
+from univoxel.config import TrainConfig
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import HashField
 from univoxel.joint import observations, stage
+from univoxel.joint.config import JointConfig
 from univoxel.ops import VisibilityScene
+from univoxel.presets import chosen
 from univoxel.tasks import train
 from univoxel.training import loop
 

@@ -23,7 +23,6 @@ from types import SimpleNamespace
 import torch
 
 from univoxel import losses, ops
-from univoxel.config import preset
 from univoxel.data import load_photos
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
@@ -33,6 +32,7 @@ from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.sg import LocalSG
 from univoxel.optim import RowAdam
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
+from univoxel.presets import preset
 from univoxel.render import pipeline
 from univoxel.scene import Scene
 from univoxel.tasks import train

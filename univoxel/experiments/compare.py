@@ -8,11 +8,11 @@ from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
 
-from univoxel.config import LIGHTS, LightName
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
 from univoxel.experiments.record import Outcome, Setting
 from univoxel.files import replacing
+from univoxel.names import LIGHTS, LightName
 
 COLUMNS = (
     plots.NVS,
