@@ -34,7 +34,7 @@ from univoxel.ops import composite
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays
 from univoxel.render.density import section_alpha
-from univoxel.tasks import train
+from univoxel.training import surface_update
 
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "field_scaling.json"
@@ -87,7 +87,7 @@ def step(field: AbstractField, optimizer: RowAdam) -> None:
     loss = (seen[:, :channels] - wanted).square().mean() + 0.1 * (length - 1).square().mean()
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
-    train.spread_gradient(field, 4)
+    surface_update.smooth_sdf_gradient_(field, 4)
     optimizer.step()
 
 

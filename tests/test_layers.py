@@ -44,7 +44,7 @@ HELPERS = {
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "preparation": {"hull"},
-    "training": {"divergence", "plateau", "progress", "surface_update"},
+    "training": {"clock", "divergence", "plateau", "progress", "surface_update"},
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
     "compression": {"prune", "quality", "search"},
     "pictures": {"animation"},
