@@ -27,9 +27,10 @@ void corners(const March<T>& in, const DenseNodes& nodes, const int64_t i[3], co
 template <class T>
 void corners(const March<T>& in, const BrickNodes& nodes, const int64_t i[3], const int64_t step[3],
              T* f) {
-    if ((i[0] & 3) < 3 && (i[1] & 3) < 3 && (i[2] & 3) < 3) {  // all in one brick
+    const auto next_inside = [&](int axis) { return (i[axis] & kBrickMask) < kBrickMask; };
+    if (next_inside(0) && next_inside(1) && next_inside(2)) {  // all in one brick
         const T* p = in.sdf + nodes.row(i[0], i[1], i[2]);
-        const int64_t x = step[0] << 4, y = step[1] << 2;
+        const int64_t x = step[0] << 2 * kBrickShift, y = step[1] << kBrickShift;
         for (int k = 0; k < 8; ++k) f[k] = p[(k >> 2) * x + (k >> 1 & 1) * y + (k & 1) * step[2]];
         return;
     }
@@ -184,14 +185,13 @@ void sparse_brick_minimum(const T* sdf, const int64_t size[3], const BrickNodes&
     out[0] = std::numeric_limits<T>::infinity();
     out[1] = -out[0];
     parallel_for(n, kBricksPerChunk, threads, [&](int64_t begin, int64_t end) {
-        for (int64_t brick = std::max<int64_t>(begin, 2); brick < end; ++brick) {
+        for (int64_t brick = std::max(begin, kMissingBricks); brick < end; ++brick) {
             if (place[brick] < 0) {
                 out[brick] = out[0];
                 continue;
             }
-            const int64_t c = place[brick] % nodes.bricks_z, ab = place[brick] / nodes.bricks_z;
-            const int64_t first[3] = {ab / nodes.bricks_y * kBrick, ab % nodes.bricks_y * kBrick,
-                                      c * kBrick};
+            const Node node = nodes.first_node(place[brick]);
+            const int64_t first[3] = {node.x, node.y, node.z};
             int64_t last[3];
             for (int a = 0; a < 3; ++a) last[a] = std::min(first[a] + kBrick, size[a] - 1);
             T lowest = std::numeric_limits<T>::infinity();

@@ -9,10 +9,10 @@
 #include <vector>
 
 #include "brick_rows.h"
-#include "bricks.h"
 #include "channels.h"
 #include "huge_pages.h"
 #include "nodes.h"
+#include "tiles.h"
 #include "trilinear.h"
 
 namespace univoxel {
@@ -23,7 +23,7 @@ struct Sampling {
     const T* sdf;          // [R]
     const T* features;     // [R, C]
     const T* points;       // [M, 3]  world; outside the lattice they are clamped to its border
-    const int32_t* order;  // [M]     from sort_by_brick
+    const int32_t* order;  // [M]     from sort_by_tile
     Lattice lattice;
     Nodes nodes;
     int64_t n_rows, n_points, n_channels;

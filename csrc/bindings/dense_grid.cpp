@@ -8,7 +8,7 @@
 #include <utility>
 
 #include "bindings/grids.h"
-#include "bricks.h"
+#include "tiles.h"
 
 namespace univoxel {
 namespace {
@@ -42,7 +42,7 @@ void bind_dense_grid(py::module_& m) {
             const auto in = dense_grid_of(sdf, features, points, order, origin, voxel_size);
             T *v = value.mutable_data(), *g = gradient.mutable_data(), *f = feature.mutable_data();
             py::gil_scoped_release nogil;
-            sort_by_brick(in.lattice, in.points, in.n_points, o, threads);
+            sort_by_tile(in.lattice, in.points, in.n_points, o, threads);
             sample_dense_forward(in, v, g, f, threads);
         },
         py::arg("sdf").noconvert(), py::arg("features").noconvert(), py::arg("points").noconvert(),

@@ -43,7 +43,7 @@ void bind_sparse_grid(py::module_& m) {
                 sparse_grid_of(sdf, features, points, order, table, size, origin, voxel_size);
             T *v = value.mutable_data(), *g = gradient.mutable_data(), *f = feature.mutable_data();
             py::gil_scoped_release nogil;
-            sort_by_brick(in.lattice, in.points, in.n_points, o, threads);
+            sort_by_tile(in.lattice, in.points, in.n_points, o, threads);
             sample_sparse_forward(in, v, g, f, threads);
         },
         py::arg("sdf").noconvert(), py::arg("features").noconvert(), py::arg("points").noconvert(),

@@ -1,4 +1,4 @@
-// Points grouped by bricks of 8^3 cells, and the grid rows that they touch.
+// Points grouped by tiles of 8^3 cells, and the grid rows that they touch.
 #pragma once
 
 #include <cstdint>
@@ -9,15 +9,18 @@
 
 namespace univoxel {
 
+constexpr int kTileShift = 3;
+constexpr int64_t kTile = int64_t(1) << kTileShift;  // cells along the side of a tile
+
 /// Threads for work on n points: few are done before a team stands.
 inline int team_for(int64_t n_points, int threads) {
     return n_points < 2048 ? 1 : threads;
 }
 
-/// Write to order [M] the points sorted by brick, x slowest; equal bricks keep their order.
+/// Write to order [M] the points sorted by tile, x slowest; points of one tile keep their order.
 template <class T>
-void sort_by_brick(const Lattice& grid, const T* points, int64_t n_points, int32_t* order,
-                   int threads);
+void sort_by_tile(const Lattice& grid, const T* points, int64_t n_points, int32_t* order,
+                  int threads);
 
 /// Bounds [n_slabs + 1] of the slabs in a sorted order. A slab is 8 cells thick along x.
 template <class T>
@@ -44,11 +47,12 @@ struct Planes {
 };
 Planes planes_to_clear(const Lattice& grid, int64_t slab, int64_t n_slabs);
 
-/// Cells x, y, z + i for every set bit i < 8 hold points.
+/// Cells x, y, z + i for every set bit i < kTile hold points.
 struct CellColumn {
     int32_t x, y, z;
     uint32_t cells;
 };
+static_assert(kTile <= 8, "a column of a tile is a byte of cells");
 
 /// Call f(x, y, inner) for the lines of nodes that a column of cells touches: the four at its
 /// corners (inner), and if wide the eight beside these.
