@@ -96,7 +96,7 @@ bool clip(vec3<T> o, vec3<T> d, vec3<T> upper, T& near, T& far) {
 
 /// Walk one ray; append its samples.
 template <class T, class Nodes>
-void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, Marched<T>& out) {
+void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, PackedSamples<T>& out) {
     // Change to grid coordinates; t stays in world units.
     const vec3<T> o = (load3(in.origin, ray) - in.grid_origin) / in.voxel_size;
     const vec3<T> d = load3(in.direction, ray) / in.voxel_size;
@@ -209,11 +209,11 @@ void sparse_brick_minimum(const T* sdf, const int64_t size[3], const BrickNodes&
 }
 
 template <class T>
-Marched<T> march(const March<T>& in, int threads) {
+PackedSamples<T> march(const March<T>& in, int threads) {
     const int64_t chunks = (in.n_rays + kRaysPerChunk - 1) / kRaysPerChunk;
-    std::vector<Marched<T>> parts(chunks);
+    std::vector<PackedSamples<T>> parts(chunks);
     parallel_for(in.n_rays, kRaysPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Marched<T>& part = parts[begin / kRaysPerChunk];
+        PackedSamples<T>& part = parts[begin / kRaysPerChunk];
         for (int64_t ray = begin; ray < end; ++ray) {
             if (in.table) {
                 march_ray(in, in.sparse(), ray, part);
@@ -223,9 +223,9 @@ Marched<T> march(const March<T>& in, int threads) {
             part.offsets.push_back(static_cast<int64_t>(part.t.size()));
         }
     });
-    Marched<T> all;
+    PackedSamples<T> all;
     all.offsets.push_back(0);
-    for (const Marched<T>& part : parts) {
+    for (const PackedSamples<T>& part : parts) {
         const int64_t base = all.offsets.back();
         all.t.insert(all.t.end(), part.t.begin(), part.t.end());
         all.connected.insert(all.connected.end(), part.connected.begin(), part.connected.end());
@@ -240,7 +240,7 @@ template void sparse_brick_minimum(const float*, const int64_t[3], const BrickNo
                                    const int32_t*, int64_t, float*, int);
 template void sparse_brick_minimum(const double*, const int64_t[3], const BrickNodes&,
                                    const int32_t*, int64_t, double*, int);
-template Marched<float> march(const March<float>&, int);
-template Marched<double> march(const March<double>&, int);
+template PackedSamples<float> march(const March<float>&, int);
+template PackedSamples<double> march(const March<double>&, int);
 
 }  // namespace univoxel

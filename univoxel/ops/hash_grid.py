@@ -10,7 +10,7 @@ from torch import Tensor
 
 from univoxel.ops import native
 from univoxel.ops.checks import check
-from univoxel.ops.dense_grid import SparseGrad
+from univoxel.ops.grid_sampling import SparseGrad
 
 PRIMES = (1, 2654435761, 805459861)
 
