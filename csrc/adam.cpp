@@ -2,11 +2,13 @@
 
 #include <cmath>
 
+#include "dcheck.h"
 #include "parallel.h"
 
 namespace univoxel {
 namespace {
 
+// Numbers of the table that a thread takes at a time: many, so that handing them out costs little.
 constexpr int64_t kNumbersPerChunk = 16384;
 
 }  // namespace

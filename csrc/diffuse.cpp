@@ -4,6 +4,7 @@
 #include <memory>
 #include <vector>
 
+#include "dcheck.h"
 #include "row_set.h"
 #include "tiles.h"
 

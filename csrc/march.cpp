@@ -4,6 +4,7 @@
 #include <cmath>
 #include <limits>
 
+#include "dcheck.h"
 #include "parallel.h"
 
 namespace univoxel {

@@ -3,6 +3,7 @@
 
 #include <cstdint>
 
+#include "dcheck.h"
 #include "trilinear.h"
 
 namespace univoxel {

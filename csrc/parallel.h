@@ -6,6 +6,8 @@
 #include <cstdint>
 #include <exception>
 
+#include "dcheck.h"
+
 namespace univoxel {
 
 /// Call f(begin, end) over [0, n) in chunks of `grain`, on up to `threads` threads.

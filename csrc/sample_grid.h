@@ -10,6 +10,7 @@
 
 #include "brick_rows.h"
 #include "channels.h"
+#include "dcheck.h"
 #include "huge_pages.h"
 #include "nodes.h"
 #include "tiles.h"
@@ -45,10 +46,16 @@ struct SamplingGrads {
 namespace sampling {
 
 constexpr int64_t kPointsPerChunk = 2048;
+// Numbers of a gradient that a thread clears at a time: many, so that handing them out costs
+// little, and few enough to share evenly.
 constexpr int64_t kNumbersPerChunk = 1 << 16;
-
-constexpr int64_t kBlock = 8;
-constexpr int64_t kAhead = 12;  // samples: sorted ones lie anywhere in the buffers of the caller
+// Samples whose nodes are fetched before the first of them is read: the fetches overlap, and their
+// cache lines, 24 a sample of 16 channels, fit the first-level cache together.
+constexpr int64_t kPointsPerBlock = 8;
+// How many samples ahead the caller's buffers are fetched, where sorted samples lie anywhere. More
+// than a block: what is fetched arrives while the block before is worked on.
+constexpr int64_t kAhead = 12;
+static_assert(kAhead > kPointsPerBlock);
 
 /// Fetch the cache lines of n numbers before they are read or written.
 template <class T>
@@ -373,9 +380,9 @@ void sample_forward(const Sampling<T, Nodes>& in, T* value, T* gradient, T* feat
     with_channels(C, [&](auto constant) {
         constexpr int64_t kC = decltype(constant)::value;
         parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
-            Located<T, Nodes> located[kBlock];
-            for (int64_t j = begin; j < end; j += kBlock) {
-                const int64_t n = std::min(kBlock, end - j);
+            Located<T, Nodes> located[kPointsPerBlock];
+            for (int64_t j = begin; j < end; j += kPointsPerBlock) {
+                const int64_t n = std::min(kPointsPerBlock, end - j);
                 // Locate a few samples and fetch what they need, then sample.
                 for (int64_t k = 0; k < n; ++k) {
                     const int64_t i = in.order[j + k];

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <memory>
 
+#include "dcheck.h"
 #include "parallel.h"
 
 namespace univoxel {

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <vector>
 
+#include "dcheck.h"
 #include "parallel.h"
 
 namespace univoxel {

@@ -4,6 +4,7 @@
 #include <numeric>
 #include <utility>
 
+#include "dcheck.h"
 #include "huge_pages.h"
 
 namespace univoxel {

@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "dcheck.h"
 #include "parallel.h"
 #include "trilinear.h"
 

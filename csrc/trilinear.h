@@ -5,6 +5,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "dcheck.h"
+
 namespace univoxel {
 
 /// Node (i, j, k) lies at origin + voxel_size * (i, j, k). Outside, the nearest border value holds.
