@@ -29,6 +29,7 @@ template <int64_t kC, class T>
 void forward_ray(const Composite<T>& in, int64_t ray, T* out, T* weight) {
     const int64_t C = kC ? kC : in.n_channels;
     const int64_t first = in.offsets[ray], n = in.offsets[ray + 1] - first;
+    DCHECK(first >= 0 && n >= 0);  // offsets rise
     const T* alpha = in.alpha + first;
     const T* value = in.value + first * C;
     T *sum = out + ray * C, *w = weight + first;
@@ -53,6 +54,7 @@ void backward_ray(const Composite<T>& in, int64_t ray, const T* grad_out, const 
                   T* grad_alpha, T* grad_value, T* trans, T* own) {
     const int64_t C = kC ? kC : in.n_channels;
     const int64_t first = in.offsets[ray], n = in.offsets[ray + 1] - first;
+    DCHECK(first >= 0 && n >= 0);  // offsets rise
     const T *alpha = in.alpha + first, *value = in.value + first * C, *g = grad_out + ray * C;
     T *ga = grad_alpha + first, *gv = grad_value + first * C;
     const int64_t used = transmittance(alpha, n, in.early_stop, trans);

@@ -21,6 +21,7 @@ void diffuse(T* values, const int64_t size[3], const Nodes& nodes, int64_t n_row
     RowSet chosen(n_rows);
     for (int64_t k = 0; k < n; ++k) chosen.mark(rows[k]);
     chosen.number();
+    DCHECK(chosen.count() == n && std::is_sorted(rows, rows + n));  // slot k is that of row k
     // Neighbours by slot, looked up once for all passes; slot n holds the 0 of all other nodes.
     const std::unique_ptr<int32_t[]> near(new int32_t[6 * n]);
     const auto slot = [&](int64_t row) {

@@ -77,6 +77,7 @@ class EnvMap {
 #pragma GCC ivdep
         for (int i = 0; i < d.n; ++i) {
             const int32_t row = d.row[i], column = d.column[i];
+            DCHECK(row >= 0 && row < height_ && column >= 0 && column < width_);
             const float* at = t_.column_cdf + row * pitch + column;
             const float share = at[1] - at[0];
             const float low = t_.row_cdf[row], share_of_row = t_.row_cdf[row + 1] - low;
@@ -105,6 +106,7 @@ class EnvMap {
     }
 
     float pdf(const MapPlace& at) const {
+        DCHECK(at.x >= 0 && at.x <= width_ && at.y >= 0 && at.y <= height_);
         const int32_t row = static_cast<int32_t>(std::min(at.y, height_ - 1.f));
         const int32_t column = static_cast<int32_t>(std::min(at.x, width_ - 1.f));
         return t_.texel[4 * (row * width_ + column) + 3];
@@ -142,6 +144,7 @@ class EnvMap {
 
     /// Texel i of the radiance and its density.
     float4 texel(int32_t i) const {
+        DCHECK(i >= 0 && i < width_ * height_);
         float4 out;
         std::memcpy(&out, t_.texel + 4 * i, sizeof out);
         return out;
@@ -176,6 +179,7 @@ class EnvMap {
     /// search in step: there is no branch to mispredict.
     template <class F>
     static void find(int32_t reach, const MapSamples& d, F&& table) {
+        DCHECK((reach & (reach - 1)) == 0);
         for (int32_t step = reach / 2; step > 0; step /= 2) {
 #pragma GCC ivdep
             for (int i = 0; i < d.n; ++i) {

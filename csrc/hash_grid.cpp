@@ -21,13 +21,17 @@ struct RowLookup {
 
     RowLookup(const Lattice& level, int64_t rows)
         : y(0), z(0), mask(static_cast<uint32_t>(rows - 1)) {
+        DCHECK(rows > 0 && (rows & (rows - 1)) == 0);  // the mask is all ones
         const double nodes = static_cast<double>(level.size[0]) *
                              static_cast<double>(level.size[1]) *
                              static_cast<double>(level.size[2]);
         if (nodes <= static_cast<double>(rows)) y = level.size[1], z = level.size[2];
     }
     int64_t at(int64_t i, int64_t j, int64_t k) const {
-        if (y) return (i * y + j) * z + k;
+        if (y) {
+            DCHECK(i >= 0 && j >= 0 && j < y && k >= 0 && k < z);
+            return (i * y + j) * z + k;
+        }
         return (static_cast<uint32_t>(i) ^ (static_cast<uint32_t>(j) * 2654435761u) ^
                 (static_cast<uint32_t>(k) * 805459861u)) &
                mask;

@@ -39,6 +39,7 @@ vec row(const float* p, int64_t i = 0) {
 
 /// Interpolate the mesh at a hit.
 Vertex vertex_at(const Relight& in, vec origin, vec direction, const Hit& hit) {
+    DCHECK(hit.face >= 0);
     const int32_t* face = in.scene->faces() + 3 * hit.face;
     const float w[3] = {1 - hit.u - hit.v, hit.u, hit.v};
     vec normal{}, albedo{}, f0{};
@@ -248,6 +249,7 @@ void relight(const Relight& in, float* rgb, int threads) {
         Wave& w = *wave;
         vec3<double> sum[kLanes];  // in float, equal addends of many samples drift
         const int points = static_cast<int>(end - begin), together = kLanes / points;
+        DCHECK(points <= kLanes && together >= 1);
         std::fill_n(sum, points, vec3<double>(0));
         w.first.n = 0;
         for (int64_t i = begin; i < end; ++i) {

@@ -53,6 +53,7 @@ T sdf_at(const March<T>& in, const Nodes& nodes, vec3<T> g) {
         step[a] = in.size[a] > 1;
     }
     corners(in, nodes, i, step, f);
+    for (int a = 0; a < 3; ++a) DCHECK(i[a] >= 0 && i[a] + step[a] < in.size[a]);
     const auto lerp = [](T a, T b, T t) { return a + t * (b - a); };
     const auto along_z = [&](int k) { return lerp(f[k], f[k + 1], w[2]); };
     const auto along_y = [&](int k) { return lerp(along_z(k), along_z(k + 2), w[1]); };
@@ -123,6 +124,7 @@ void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, PackedSample
             b[a] = std::min(std::max<int64_t>(static_cast<int64_t>(g[a]) / kBrick, 0), n - 1);
             corner[a] = T(kBrick * (b[a] + (d[a] > 0 ? 1 : 0)));
         }
+        DCHECK(k > before);  // a ray goes on
         if (least(in, nodes, b) > band) {
             T exit = far;
             for (int a = 0; a < 3; ++a)
@@ -146,6 +148,7 @@ void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, PackedSample
             out.t.push_back(start + T(k) * in.step);
             out.connected.push_back(0);
             emitted = k;
+            DCHECK(out.t.size() == out.connected.size());
         }
         trans *= 1 - alpha;
         log_before = log_here;

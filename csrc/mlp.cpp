@@ -123,6 +123,8 @@ inline void multiply_block(const Block<T> block) {
     using Vector = typename Simd<T>::Vector;
     constexpr int64_t W = kWidth<T>, L = Simd<T>::kCount;
     const T *a = block.a, *b = block.b, *start = block.start;
+    DCHECK(reinterpret_cast<uintptr_t>(b) % kVectorBytes == 0);
+    DCHECK(reinterpret_cast<uintptr_t>(block.c) % kVectorBytes == 0);
     Vector sum[kBlockRows][kVectors];
 #pragma GCC unroll 8
     for (int64_t i = 0; i < kBlockRows; ++i) {
@@ -189,6 +191,7 @@ struct Product {
 template <Finish kFinish, class T>
 void multiply(const Product<T>& p) {
     constexpr int64_t W = kWidth<T>, panel = kTileRows * W;
+    DCHECK(p.rows <= kTileRows && (kFinish != Finish::kMask || p.mask));
     for (int64_t j = 0; j < p.columns; j += W) {
         for (int64_t i = 0; i < p.rows; i += kBlockRows) {
             const int64_t at = j * kTileRows + i * W;

@@ -25,7 +25,10 @@ struct Node {
 struct DenseNodes {
     int64_t size_y, size_z;
 
-    int64_t row(int64_t x, int64_t y, int64_t z) const { return (x * size_y + y) * size_z + z; }
+    int64_t row(int64_t x, int64_t y, int64_t z) const {
+        DCHECK(x >= 0 && y >= 0 && y < size_y && z >= 0 && z < size_z);
+        return (x * size_y + y) * size_z + z;
+    }
 
     /// The nodes around a sample, by their numbers 0 .. 3 in its stencil along each axis.
     using Near = DenseNodes;
@@ -51,7 +54,10 @@ struct BrickNodes {
     int64_t bricks_y, bricks_z;
 
     int64_t brick(int64_t a, int64_t b, int64_t c) const {
-        return table[(a * bricks_y + b) * bricks_z + c];
+        DCHECK(a >= 0 && b >= 0 && b < bricks_y && c >= 0 && c < bricks_z);
+        const int64_t number = table[(a * bricks_y + b) * bricks_z + c];
+        DCHECK(number >= 0);
+        return number;
     }
     int64_t row(int64_t x, int64_t y, int64_t z) const {
         return brick(x >> kBrickShift, y >> kBrickShift, z >> kBrickShift) * kBrickNodes +
@@ -64,10 +70,12 @@ struct BrickNodes {
     }
     /// The way back: the node of that number, counted from the first of its brick.
     static Node offset(int64_t inside) {
+        DCHECK(inside >= 0 && inside < kBrickNodes);
         return {inside >> 2 * kBrickShift, inside >> kBrickShift & kBrickMask, inside & kBrickMask};
     }
     /// First node of the brick at a place of the table, counted through all its axes.
     Node first_node(int64_t place) const {
+        DCHECK(place >= 0);  // the brick stands somewhere
         const int64_t c = place % bricks_z, ab = place / bricks_z;
         return {ab / bricks_y * kBrick, ab % bricks_y * kBrick, c * kBrick};
     }

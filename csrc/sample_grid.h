@@ -78,7 +78,9 @@ struct Located {
 template <class T, class Nodes>
 inline Located<T, Nodes> locate(const Sampling<T, Nodes>& in, const T* point) {
     const Stencil3<T> s = stencil3(in.lattice, point);
-    return {s, in.nodes.near(s)};
+    const Located<T, Nodes> at{s, in.nodes.near(s)};
+    DCHECK(at.row(0, 0, 0) >= 0 && at.row(3, 3, 3) < in.n_rows);
+    return at;
 }
 
 /// The four nodes of the line (a, b); one load where they follow each other.
@@ -219,6 +221,7 @@ inline void scatter_sdf(const Rows& rows, const Located<T, Nodes>& at, const Pul
     const bool whole = at.run(0, 3), pair = at.run(1, 2);
     const auto add = [&](int a, int b, int c, T x) {
         const int64_t to = slot(rows, at, a, b, c);
+        DCHECK(!kComplete<Nodes> || to >= 0);
         if (kComplete<Nodes> || to >= 0) grad_sdf[to] += x;
     };
     for (int k = 0; k < 4; ++k) {
@@ -352,6 +355,7 @@ void scatter(const Sampling<T, Nodes>& in, const SamplingGrads<T, Touched>& grad
         }
         for (int64_t j = bounds[slab]; j < bounds[slab + 1]; ++j) {
             const int64_t i = in.order[j];
+            DCHECK(i >= 0 && i < in.n_points);
             const int64_t next = in.order[std::min(j + kAhead, bounds[slab + 1] - 1)];
             prefetch(in.points + 3 * next, 3);
             prefetch(grads.grad_value + next, 1);

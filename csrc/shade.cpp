@@ -241,6 +241,7 @@ struct MapReader {
 
     void load(int64_t i) {
         const int64_t count = map.count, p = light.index[i];
+        DCHECK(p >= 0);
         if (p == loaded) return;
         loaded = p;
         std::visit(

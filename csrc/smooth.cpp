@@ -156,6 +156,8 @@ void smooth_rows(T* grid, const int64_t size[3], int64_t C, const int64_t* rows,
             const int64_t longest = std::min(end - k, size[2] - order - z);
             int64_t run = 1;
             while (run < longest && rows[k + run] == rows[k] + run) ++run;
+            DCHECK(rows[k] * C >= weights.reach);
+            DCHECK((rows[k] + run) * C + weights.reach <= grid_end - grid);
             weights.apply(grid + rows[k] * C, run * C, grid_end, out);
             k += run;
         }
@@ -195,6 +197,7 @@ void smooth_brick_rows(T* grid, const int64_t size[3], const BrickNodes& nodes,
             int64_t run = 1;
             while (k + run < end && run < kBrick - z && rows[k + run] == rows[k] + run) ++run;
             const int64_t at = ((x + order) * width + y + order) * width + z + order;
+            DCHECK(at * C >= weights.reach && (at + run) * C + weights.reach <= numbers);
             weights.apply(around.get() + at * C, run * C, around.get() + numbers, out);
             k += run;
         }

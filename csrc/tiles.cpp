@@ -87,6 +87,7 @@ std::vector<int64_t> slab_bounds(const Lattice& grid, const T* points, int64_t n
         });
         bounds[s] = at - order;
     }
+    DCHECK(std::is_sorted(bounds.begin(), bounds.end()));
     return bounds;
 }
 
@@ -130,6 +131,7 @@ std::vector<std::vector<CellColumn>> occupied_columns(const Lattice& grid, const
                 flush();
                 for (int d = 0; d < 3; ++d) corner[d] = cell[d] & ~(kTile - 1);
             }
+            DCHECK(cell[0] >> kTileShift == s);  // the points are sorted by slab
             cells[cell[0] - corner[0]][cell[1] - corner[1]] |=
                 static_cast<uint8_t>(1 << (cell[2] - corner[2]));
         }

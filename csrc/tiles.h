@@ -80,6 +80,7 @@ struct NodesAlongZ {
 
 inline NodesAlongZ nodes_along_z(const Lattice& grid, const CellColumn& column, bool wide) {
     // Bit i stands for node z - 1 + i.
+    DCHECK(column.cells != 0 && column.z >= 0 && column.z < grid.size[2]);
     const uint64_t m = column.cells;
     uint64_t ends = m << 1 | m << 2, beyond = wide ? ends | m | m << 3 : ends;
     int64_t z = column.z - 1;
@@ -112,12 +113,17 @@ class TouchedRows {
     int64_t count() const { return count_; }
     /// Slot of a touched node.
     int64_t slot(int64_t x, int64_t y, int64_t z) const {
+        DCHECK(x < size_x_ && y < size_y_ && z < size_z_ && line_[x * size_y_ + y] >= 0);
         const Word& w = words_[line_[x * size_y_ + y] + (z >> 6)];
+        DCHECK(w.bits >> (z & 63) & 1);
         const uint64_t below = w.bits & ((uint64_t(1) << (z & 63)) - 1);
         return w.first + __builtin_popcountll(below);
     }
     /// How many slots lie in planes below x; x in [0, X].
-    int64_t slots_below(int64_t x) const { return plane_[x]; }
+    int64_t slots_below(int64_t x) const {
+        DCHECK(x >= 0 && x <= size_x_);
+        return plane_[x];
+    }
     /// Write the node of every slot to indices [3, count].
     void write_indices(int64_t* indices, int threads) const;
 

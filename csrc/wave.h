@@ -58,6 +58,7 @@ struct Paths {
 
     /// Add a path; `settle` has to follow.
     void push(const Vertex& v, float3 carries, uint32_t own, uint32_t number, int32_t place) {
+        DCHECK(n < kLanes && place >= 0 && place < kLanes);
         origin.set(n, v.origin), geometric.set(n, v.geometric), normal.set(n, v.normal);
         throughput.set(n, carries);
         wo.set(n, v.wo), diffuse.set(n, v.albedo), f0.set(n, v.f0), alpha[n] = v.roughness;
@@ -78,6 +79,7 @@ struct Paths {
 
     /// Add `count` times a path of others, settled; numbers and places count up.
     void repeat(const Paths& from, int lane, uint32_t number, int32_t place, int count) {
+        DCHECK(lane < from.n && n + count <= kLanes && place + count <= kLanes);
         const std::pair<Columns*, const Columns*> columns[] = {
             {&origin, &from.origin}, {&geometric, &from.geometric},
             {&normal, &from.normal}, {&throughput, &from.throughput},
