@@ -160,9 +160,9 @@ def _encode_hash_backward(
     needs: list[bool],
 ) -> tuple[Tensor, Tensor]:
     grads = _empty_grads(table, points, needs)
-    wanted = [g if need else None for g, need in zip(grads, needs, strict=True)]
+    into = [g if need else None for g, need in zip(grads, needs, strict=True)]
     place = _place(lower, upper, voxel_sizes)
-    _backward_into(table, points, grad_out, wanted[0], None, wanted[1], place)
+    _backward_into(table, points, grad_out, into[0], None, into[1], place)
     return grads
 
 
