@@ -37,7 +37,7 @@ LAYERS = [
     {"cli"},
 ]
 HELPERS = {
-    "ops": {"checks", "dense_grid", "native", "reflectance", "visibility"},
+    "ops": {"checks", "dense_grid", "grid_sampling", "native", "reflectance", "visibility"},
     "fields": {"base", "dense", "sparse"},
     "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
