@@ -11,7 +11,8 @@ ROOT = Path(__file__).parent.parent
 # From the bottom up. A module imports only from layers below its own and, inside its folder, the
 # helpers named here.
 LAYERS = [
-    {"errors", "files", "names", "records", "validation"},
+    {"errors"},
+    {"files", "names", "records", "validation"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "poses"},

@@ -182,9 +182,7 @@ def test_a_budget_is_kept_at_any_cost(looks, tmp_path):
 
 
 def test_a_budget_too_small_for_anything():
-    with pytest.raises(
-        ValueError, match=r"--budget-mb: 0.001 is too small for anything: .* need 0"
-    ):
+    with pytest.raises(ValueError, match=r"budget_mb: 0.001 is too small for anything: .* need 0"):
         plan.check_budget(sphere_scene(16), 0.001)
     plan.check_budget(sphere_scene(16), 1.0)
 
@@ -404,5 +402,5 @@ def test_bad_configurations(data, tmp_path, changes, message):
 
 
 def test_a_picture_of_another_kind_is_refused(run, tmp_path):
-    with pytest.raises(ValueError, match=r"--picture: expected a .png file, got .*a.jpg"):
+    with pytest.raises(ValueError, match=r"picture: expected a .png file, got .*a.jpg"):
         info(run, picture=tmp_path / "a.jpg")

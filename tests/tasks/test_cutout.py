@@ -96,7 +96,7 @@ def test_a_start_that_vanishes_is_none(tmp_path, hasty, monkeypatch):
     monkeypatch.setattr(task, "separate", separate)
     task.find_object(photos, *task.surroundings(photos.cameras), lambda _: None)
     assert len(asked) == 3
-    with pytest.raises(ValueError, match=r"no object was found .* --box"):
+    with pytest.raises(ValueError, match=r"no object was found .* box"):
         task.find_object(photos, *task.surroundings(photos.cameras), lambda _: None)
 
 
@@ -173,7 +173,7 @@ def test_what_is_written_can_be_trained_on(tmp_path, hasty, capsys):
         torch.testing.assert_close(cut.cameras.camera_to_world, source.cameras.camera_to_world)
         true = torch.stack([photograph(source.cameras, v)[1] for v in range(count)])
         assert overlap(cut.coverage(), true) > 0.6  # each mask with its photograph
-    with pytest.raises(FileExistsError, match="cut is there already: choose another --out"):
+    with pytest.raises(FileExistsError, match="cut is there already: choose another out"):
         task.cutout(data, out)
 
 
@@ -198,7 +198,7 @@ def test_a_data_set_without_test_views(tmp_path, hasty):
     "box", [(0, 0, 0, 1, 1), (0, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, float("nan"))]
 )
 def test_boxes_that_are_none(tmp_path, box):
-    with pytest.raises(ValueError, match="--box: expected X Y Z of the lower corner"):
+    with pytest.raises(ValueError, match="box: expected X Y Z of the lower corner"):
         task.corners(box)
 
 

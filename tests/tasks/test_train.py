@@ -270,7 +270,7 @@ def test_resume_goes_on_where_it_stopped(data, tmp_path, monkeypatch):
 
 def test_resume_refuses_another_configuration(run, data):
     cfg = config(data, run)
-    with pytest.raises(ValueError, match=r"the run began with other downscale: .* --downscale"):
+    with pytest.raises(ValueError, match=r"the run began with other downscale: .* downscale, "):
         train(dataclasses.replace(cfg, downscale=2), resume=True)
     with pytest.raises(ValueError, match="the run began with other stages: resume with the same"):
         train(dataclasses.replace(cfg, stages=cfg.stages[:1]), resume=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from univoxel.config import TrainConfig
+from univoxel.errors import DataError
 from univoxel.files import replacing
 from univoxel.names import LightName
 from univoxel.overrides import changed
@@ -74,7 +75,7 @@ def load_outcome(folder: Path) -> Outcome | None:
     try:
         return Outcome(**json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{path}: expected the record of a training: {error}") from None
+        raise DataError(f"{path}: expected the record of a training: {error}") from None
 
 
 def identity(config: TrainConfig, samples: int) -> dict:

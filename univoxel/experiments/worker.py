@@ -16,6 +16,7 @@ from pathlib import Path
 
 from univoxel.checkpoint import load_checkpoint
 from univoxel.config import TrainConfig, check_same
+from univoxel.errors import ProcessFailed, UserError
 from univoxel.experiments.record import Outcome, Setting, identity
 from univoxel.tasks.envmap import Comparison, envmap
 from univoxel.tasks.evaluate import evaluate
@@ -36,7 +37,7 @@ def work(folder: Path) -> None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise RuntimeError(f"{folder}: another process is at work there") from None
+            raise ProcessFailed(f"{folder}: another process is at work there") from None
         job = json.load(file)
         setting = Setting(**job["setting"] | {"changes": tuple(job["setting"]["changes"])})
         config = setting.config(Path(job["data"]), folder / RUN)
@@ -65,7 +66,7 @@ def finished(config: TrainConfig) -> bool:
     try:
         check_same(config)
         return load_checkpoint(config.out)[1]["stage"] == len(config.stages)
-    except (ValueError, FileNotFoundError):
+    except UserError:
         return False
 
 

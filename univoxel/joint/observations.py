@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 
 from univoxel import losses
 from univoxel.data import Photos
+from univoxel.errors import NoSurface
 from univoxel.joint.config import JointConfig
 from univoxel.ops import shade_map
 from univoxel.records import Mesh
@@ -53,7 +54,7 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     """Sample the surface, gather its sightings and trace what light can reach it.
 
     Raises:
-        ValueError: there is no surface, or no photograph sees it.
+        NoSurface: there is no surface, or no photograph sees it.
     """
     generator = torch.Generator().manual_seed(seed)
     mesh = extract_mesh(scene)
@@ -65,7 +66,7 @@ def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
     position, normal = surface_points(mesh, cfg.points, generator)
     seen = observe(position, normal, photos, tracer, offset)
     if not len(seen.view):
-        raise ValueError("no photograph sees a point of the surface")
+        raise NoSurface("no photograph sees a point of the surface")
     direction = scene.sky.direction
     transport = trace(seen, tracer, mesh, bright, direction, cfg.tracing, offset, generator)
     metal = scene.material(scene.field.features_at(position))[2] > METAL

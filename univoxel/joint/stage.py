@@ -18,6 +18,7 @@ from torch.nn.functional import binary_cross_entropy, normalize
 from univoxel import brdf, losses
 from univoxel.color import CLIPPED
 from univoxel.data import Photos
+from univoxel.errors import NoSurface
 from univoxel.joint.albedo_entropy import balance, matte_albedo, sunlit
 from univoxel.joint.config import JointConfig
 from univoxel.joint.initialise import STEPS, TRIALS, TRIED, supposed
@@ -55,7 +56,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     try:
         scene.occluder()
         problem = pose(scene, photos, replace(cfg, points=points), seed)
-    except ValueError as error:  # no surface, or none that is seen
+    except NoSurface as error:  # no surface, or none that is seen
         progress.trouble(f"stage {progress.stage + 1}: {error}: light and materials stay")
         progress.skip()
         return

@@ -24,7 +24,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
-from univoxel.errors import NothingFound
+from univoxel.errors import ExistingFile, NothingFound, UserError
 from univoxel.fields.backdrop import Backdrop
 from univoxel.fields.dense import DenseField
 from univoxel.grid import fit_grid
@@ -81,11 +81,11 @@ def cutout(
     Raises:
         DataError: photographs that cannot be used.
         FileExistsError: out is there already.
-        ValueError: the box is none, or, as NothingFound, no object is in it.
+        UserError: the box is none, or, as NothingFound, no object is in it.
         OSError: a file cannot be written.
     """
     if out.exists():
-        raise FileExistsError(f"{out} is there already: choose another --out")
+        raise ExistingFile(f"{out} is there already: choose another out", "out")
     splits = {name: load_photos(data, name, downscale, masks=False) for name in splits_of(data)}
     photos = splits["train"]
     print(photos.about)
@@ -119,9 +119,10 @@ def corners(box: tuple[float, ...]) -> tuple[Tensor, Tensor]:
     """Lower and upper corner [3] of six numbers."""
     values = torch.tensor(box)
     if len(box) != 6 or not values.isfinite().all() or not (values[:3] < values[3:]).all():
-        raise ValueError(
-            "--box: expected X Y Z of the lower corner and then of the upper, which is above it in "
-            f"all three, got {' '.join(f'{x:g}' for x in box)}"
+        raise UserError(
+            "box: expected X Y Z of the lower corner and then of the upper, which is above it in "
+            f"all three, got {' '.join(f'{x:g}' for x in box)}",
+            "box",
         )
     return values[:3], values[3:]
 

@@ -24,7 +24,7 @@ from univoxel.data.base import decode
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.maps import read_map
 from univoxel.envmap import tables
-from univoxel.errors import DataError
+from univoxel.errors import DataError, UserError
 from univoxel.files import replacing
 from univoxel.pictures.contact_sheet import Panel, contact_sheet, heat, shrink
 from univoxel.pictures.layers import Layers, Relighting, exr_channels, render_layers
@@ -120,13 +120,15 @@ def evaluate(
 
     Raises:
         DataError: the run or the data cannot be read.
-        ValueError: samples or bounces out of range; light_of is no training view, or light does not
+        UserError: samples or bounces out of range; light_of is no training view, or light does not
             vary.
         OSError: a result cannot be written.
     """
     if samples < 1 or bounces < 0:
-        raise ValueError(
-            f"evaluate: expected samples >= 1 and bounces >= 0, got {samples} and {bounces}"
+        raise UserError(
+            f"evaluate: expected samples >= 1 and bounces >= 0, got {samples} and {bounces}",
+            "samples",
+            "bounces",
         )
     run = Path(run)
     photos = photos_of(run, data)
@@ -227,7 +229,7 @@ def _survey(scene: Scene, run: Path, data: Path | None) -> Survey | None:
     """What the photographs that were trained on fix; None, with a line, where they are missing."""
     try:
         return survey(scene, photos_of(run, data, "train"))
-    except ValueError as error:  # no photographs to train on, or no surface
+    except UserError as error:  # no photographs to train on, or no surface
         print(Text(f"no trust report: {error}"))
         return None
 

@@ -15,6 +15,7 @@ from safetensors import safe_open
 
 from univoxel.checkpoint import FILE, load_checkpoint
 from univoxel.data.images import write_png
+from univoxel.errors import UserError
 from univoxel.files import replacing
 from univoxel.lights import LocalSG
 from univoxel.pictures.contact_sheet import heat
@@ -65,12 +66,12 @@ def info(run: Path, json: Path | None = None, picture: Path | None = None) -> di
         before, after, cost in dB and why.
 
     Raises:
-        FileNotFoundError, ValueError: no model there, or one that cannot be read.
+        UserError: no model there, or one that cannot be read.
         OSError: a file cannot be written.
     """
     run = Path(run)
     if picture is not None and picture.suffix.lower() != ".png":
-        raise ValueError(f"--picture: expected a .png file, got {picture}")
+        raise UserError(f"picture: expected a .png file, got {picture}", "picture")
     scene, state = load_checkpoint(run)
     found = facts(scene, parts(run), state)
     found["bytes"] = (run / FILE).stat().st_size

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from univoxel.errors import UserError
 from univoxel.experiments import plots, runner
 from univoxel.experiments.record import Outcome, Setting
 from univoxel.experiments.stress import axes as of_axes
@@ -62,16 +63,16 @@ def stress(
         out/stress.md. A training that failed is a result.
 
     Raises:
-        ValueError: an argument cannot be used, or `out` holds other scenes or settings.
-        ImportError: Mitsuba or matplotlib is missing.
-        RuntimeError: Mitsuba failed.
+        UserError: an argument cannot be used, or `out` holds other scenes or settings.
+        MissingExtra: Mitsuba or matplotlib is missing.
+        ProcessFailed: Mitsuba failed.
         OSError: a file cannot be written.
     """
     found = of_axes.chosen(only, quick)
     lights = _lights(light) or (("hybrid",) if quick else SHOWN)
     seeds = (1 if quick else SEEDS) if seeds is None else seeds
     if seeds < 1:
-        raise ValueError(f"--seeds must be at least 1, got {seeds}")
+        raise UserError(f"seeds must be at least 1, got {seeds}", "seeds")
     plots.require()
     render.require()
     prepared = photographs(found, seeds, out)
@@ -123,7 +124,7 @@ def setting(light: LightName, seed: int, level: Level, changes: tuple[str, ...] 
 
 def _lights(names: Sequence[str]) -> tuple[LightName, ...]:
     if unknown := [name for name in names if name not in LIGHTS]:
-        raise ValueError(f"--light must be of {', '.join(LIGHTS)}, got {', '.join(unknown)}")
+        raise UserError(f"light must be of {', '.join(LIGHTS)}, got {', '.join(unknown)}", "light")
     return tuple(light for light in LIGHTS if light in names)
 
 
@@ -146,10 +147,10 @@ def _train(
             place, one = data[level, seed], setting(light, seed, level, changes)
             try:
                 one.config(place, out)
-            except ValueError as error:
+            except UserError as error:
                 if not level.changes:
                     raise  # a mistake in `changes`
-                refused = Outcome(place.name, one.name, {}, error=f"ValueError: {error}")
+                refused = Outcome(place.name, one.name, {}, error=f"{_name(error)}: {error}")
                 done[place, one.name] = refused
             else:
                 wanted[place, one.name] = one
@@ -179,11 +180,16 @@ def _damaged(
     path = place / IDENTITY
     if path.exists():
         if path.read_text(encoding="utf-8") != identity:
-            raise ValueError(f"{path}: is of other photographs: choose another --out")
+            raise UserError(f"{path}: is of other photographs: choose another out", "out")
         return place
     damaged(scene, place, damage, seed, second)
     path.write_text(identity, encoding="utf-8")
     return place
+
+
+def _name(error: UserError) -> str:
+    """The exception as the last line of a traceback names it."""
+    return f"{type(error).__module__}.{type(error).__qualname__}"
 
 
 def _plain(measures: Mapping[str, float | int | None]) -> dict[str, float | int | str | None]:
