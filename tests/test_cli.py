@@ -90,13 +90,18 @@ def calls(monkeypatch):
         return replace_fields(config, stages=(config.stages[0], StageConfig(field=kind)))
 
     stand_in("univoxel.presets", chosen=chosen, with_field=with_field)
+
+    def as_table(found):
+        return f"table of {found}"
+
     replace("train", Path("run"))
     replace("cutout", Path("cut"))
-    replace("evaluate", {"psnr": 31.25, "views": 5})
+    replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)
     replace("relight", None)
     replace("export", None)
     replace("envmap", None)
-    replace("info", {})
+    found = {"chosen": [{"said": "lobes 24 -> 12"}]}
+    replace("info", found, tables=lambda found: ["parts", "sizes"])
     replace("demo", Path("demo/index.html"))
     return types.SimpleNamespace(noted=noted, replace=replace, stand_in=stand_in, task=task)
 
@@ -168,10 +173,11 @@ def test_train_fits_the_model_to_the_scene(calls, tmp_path, options, expected):
     assert (config.capacity, config.budget_mb) == expected
 
 
-def test_info(calls):
+def test_info(calls, capsys):
     assert main(["info", "run", "--json", "a.json", "--picture", "b.png"]) == 0
     expected = {"json": Path("a.json"), "picture": Path("b.png")}
     assert calls.noted == [("info", (Path("run"),), expected)]
+    assert capsys.readouterr().out == "parts\nsizes\nlobes 24 -> 12\n"
 
 
 def test_train_takes_a_sparse_field_before_changes(calls, tmp_path):
@@ -191,7 +197,7 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
     assert calls.noted[1][2] == {"resume": True, "timelapse": "frames/"}
 
 
-def test_eval(calls):
+def test_eval(calls, capsys):
     options = ["--samples", "8", "--bounces", "0", "--light-of", "r_7"]
     paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
     named = [str(part) for name, path in paths.items() for part in (f"--{name}", path)]
@@ -199,6 +205,7 @@ def test_eval(calls):
     assert main(["eval", "run"]) == 0
     default = {"data": None, "save": None, "json": None, "samples": 64, "bounces": 2}
     default["light_of"] = None
+    assert "table of {'psnr': 31.25, 'views': 5}" in capsys.readouterr().out
     assert calls.noted == [
         ("evaluate", (Path("run"),), {**paths, "samples": 8, "bounces": 0, "light_of": "r_7"}),
         ("evaluate", (Path("run"),), default),
@@ -343,7 +350,7 @@ def test_the_package_speaks_through_its_logger(calls, capsys):
             "%d pixels: see masks=auto", 3, extra={"arguments": ("masks",)}
         )
         logger.debug("nothing")
-        return {}
+        return {"chosen": []}
 
     calls.stand_in("univoxel.tasks.info", info=info, tables=lambda found: [])
     assert main(["info", "run"]) == 0
@@ -427,7 +434,7 @@ def test_waiting_threads_soon_sleep_unless_asked_otherwise(calls, monkeypatch, a
         monkeypatch.delenv(name)
     for name, value in asked.items():
         monkeypatch.setenv(name, value)
-    assert main(["eval", "run"]) == 0
+    assert main(["info", "run"]) == 0
     assert os.environ.get("GOMP_SPINCOUNT") == spins
 
 

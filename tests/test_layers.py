@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 # helpers named here.
 LAYERS = [
     {"errors"},
-    {"files", "names", "records", "validation"},
+    {"bars", "files", "names", "records", "validation"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "poses"},
@@ -28,6 +28,7 @@ LAYERS = [
     {"joint"},
     {"confidence"},
     {"compression", "pictures"},
+    {"evaluation", "segmentation"},
     {"tasks"},
     {"tasks.demo"},
     {"experiments.plots", "experiments.record"},
@@ -49,6 +50,8 @@ HELPERS = {
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
     "compression": {"prune", "quality", "search"},
     "pictures": {"animation"},
+    "evaluation": {"measures", "truth"},
+    "segmentation": {"config", "distances"},
     "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
 }
 # Extras: imported inside the function that needs one

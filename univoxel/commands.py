@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
+import rich
+from rich.text import Text
 from tyro.conf import Positional, UseAppendAction, arg
 
 from univoxel.errors import ExistingFile, UserError
@@ -257,7 +259,8 @@ def evaluate(
     from univoxel.tasks import evaluate as task
 
     options = {"samples": samples, "bounces": bounces, "light_of": light_of}
-    task.evaluate(run, data=data, save=save, json=json, **options)
+    measures = task.evaluate(run, data=data, save=save, json=json, **options)
+    rich.print(task.table(measures))
 
 
 def relight(
@@ -444,7 +447,11 @@ def info(
     """
     from univoxel.tasks import info as task
 
-    task.info(run, json=json, picture=picture)
+    found = task.info(run, json=json, picture=picture)
+    for table in task.tables(found):
+        rich.print(table)
+    for choice in found["chosen"]:
+        rich.print(Text(choice["said"]))
 
 
 def compare(

@@ -10,9 +10,9 @@ from analytic import write_scene
 
 from univoxel.checkpoint import FILE
 from univoxel.errors import DataError
+from univoxel.evaluation.measures import MEASURES
 from univoxel.experiments import runner, worker
 from univoxel.experiments.record import Setting, load_outcome
-from univoxel.tasks.evaluate import MEASURES
 
 TINY = (
     *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),

@@ -45,8 +45,8 @@ class Outcome:
     scene: str
     setting: str
     identity: dict  # what a later call must agree with to take this for its own; JSON
-    # By the keys of tasks.evaluate.MEASURES, steps_made (share of the planned ones), and map_*, the
-    # fields of tasks.envmap.Comparison
+    # By the keys of evaluation.measures.MEASURES, steps_made (share of the planned ones), and
+    # map_*, the fields of tasks.envmap.Comparison
     measures: Mapping[str, float | int | None] = dataclasses.field(default_factory=dict)
     log: list[dict] = dataclasses.field(default_factory=list)  # seconds, stage, held_out_psnr
     load_average: float | None = None  # of the machine when it began

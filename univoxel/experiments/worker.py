@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import fcntl
 import json
+import logging
 import os
 import shutil
 import sys
@@ -95,4 +96,5 @@ def read_log(path: Path) -> list[dict]:
 
 
 if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
     work(Path(sys.argv[1]))

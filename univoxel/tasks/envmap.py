@@ -17,6 +17,7 @@ from univoxel.data.images import write_exr, write_png
 from univoxel.data.maps import true_map
 from univoxel.envmap import EnvMap, lookup
 from univoxel.errors import UserError
+from univoxel.names import MAP_ROWS
 from univoxel.run import trained_on
 from univoxel.sphere import fibonacci_sphere, latlong_directions, texel_solid_angles
 
@@ -36,7 +37,7 @@ class Comparison:
 
 @torch.no_grad()
 def envmap(
-    run: Path, out: Path, height: int = 128, light_of: str | None = None
+    run: str | Path, out: str | Path, height: int = MAP_ROWS, light_of: str | None = None
 ) -> Comparison | None:
     """Write the recovered map of a run, and a picture of it beside; compare it with the true one.
 
@@ -61,6 +62,7 @@ def envmap(
             light does not vary.
         OSError: a file cannot be written.
     """
+    run, out = Path(run), Path(out)
     if height < 1:
         raise UserError(f"height must be at least 1, got {height}", "height")
     if out.suffix.lower() != ".exr":

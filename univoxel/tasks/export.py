@@ -11,6 +11,7 @@ from univoxel.assets.ply import write_ply
 from univoxel.assets.topology import clean, close, simplify
 from univoxel.checkpoint import load_scene
 from univoxel.errors import UserError
+from univoxel.names import TEXTURE_SIZE
 from univoxel.records import Mesh
 
 SUFFIXES = (".glb", ".obj", ".ply")
@@ -19,11 +20,11 @@ TEXTURE_SIZES = (16, 4096)
 
 
 def export(
-    run: Path,
-    mesh: Path,
+    run: str | Path,
+    mesh: str | Path,
     *,
     faces: int | None = None,
-    texture_size: int = 1024,
+    texture_size: int = TEXTURE_SIZE,
     watertight: bool = False,
 ) -> None:
     """Write the zero level of a scene's sdf with its materials; see docs/export.md.

@@ -19,6 +19,7 @@ from univoxel.data.maps import true_map
 from univoxel.data.mesh import read_ply
 from univoxel.envmap import EnvMap, lookup
 from univoxel.errors import UserError
+from univoxel.names import MAP_ROWS
 from univoxel.ops import VisibilityScene
 from univoxel.records import Rays, Surface
 from univoxel.render.occlusion import look, starts
@@ -43,11 +44,11 @@ class Incident:
 
 @torch.no_grad()
 def inspect(
-    run: Path,
+    run: str | Path,
     view: str,
     pixel: tuple[int, int],
-    out: Path | None = None,
-    height: int = 128,
+    out: str | Path | None = None,
+    height: int = MAP_ROWS,
     light_of: str | None = None,
 ) -> Path:
     """Draw the light that a scene says falls on the surface under a pixel; returns the picture.
@@ -75,6 +76,7 @@ def inspect(
             light_of is no training view, or light does not vary.
         OSError: a file cannot be written.
     """
+    run, out = Path(run), None if out is None else Path(out)
     if height < 1:
         raise UserError(f"inspect: height must be at least 1, got {height}", "height")
     if out is not None and out.suffix.lower() != ".png":

@@ -20,7 +20,8 @@ from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
 from univoxel.errors import NothingFound, UserError
 from univoxel.experiments.stress.render import SPEC
-from univoxel.tasks.cutout import find_object, mask, surroundings
+from univoxel.segmentation.distances import surroundings
+from univoxel.segmentation.separation import find_object, mask
 
 NO_MASK = math.inf  # as a dilation: masks are found by `cutout`
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -19,6 +20,8 @@ from univoxel.experiments.stress.report import Cell
 from univoxel.experiments.stress.scenes import Spec
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
+
+log = logging.getLogger("univoxel")
 
 SHOWN: tuple[LightName, ...] = ("hybrid", "sg", "sh", "envmap")
 SEEDS = 3
@@ -167,7 +170,7 @@ def _train(
 
 def _rendered(spec: Spec, place: Path) -> Path:
     if not render.rendered(spec, place):
-        print(f"rendering {place.name}", flush=True)
+        log.info("rendering %s", place.name)
     return render.render(spec, place)
 
 
