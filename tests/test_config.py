@@ -33,7 +33,7 @@ def test_fine_stages_may_be_sparse():
     config = with_field(preset("fast", Path("photos"), Path("run")), "sparse")
     assert [getattr(s, "field", None) for s in config.stages] == ["dense", "sparse", None, "sparse"]
     assert config.capacity == "fixed"
-    with pytest.raises(ValueError, match="adaptive capacity, and so --budget-mb, is for dense"):
+    with pytest.raises(ValueError, match="adaptive capacity, and so budget_mb, is for dense"):
         replace(config, capacity="adaptive")
     dense = with_field(preset("fast", Path("photos"), Path("run")), "dense")
     assert with_field(config, "dense") == replace(dense, capacity="fixed")

@@ -11,7 +11,8 @@ ROOT = Path(__file__).parent.parent
 # From the bottom up. A module imports only from layers below its own and, inside its folder, the
 # helpers named here.
 LAYERS = [
-    {"errors", "files", "names", "records", "validation"},
+    {"errors"},
+    {"bars", "files", "names", "records", "validation"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "poses"},
@@ -27,6 +28,7 @@ LAYERS = [
     {"joint"},
     {"confidence"},
     {"compression", "pictures"},
+    {"evaluation", "segmentation"},
     {"tasks"},
     {"tasks.demo"},
     {"experiments.plots", "experiments.record"},
@@ -48,6 +50,8 @@ HELPERS = {
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
     "compression": {"prune", "quality", "search"},
     "pictures": {"animation"},
+    "evaluation": {"measures", "truth"},
+    "segmentation": {"config", "distances"},
     "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
 }
 # Extras: imported inside the function that needs one

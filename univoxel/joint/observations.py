@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 
 from univoxel import losses
 from univoxel.data import Photos
+from univoxel.errors import NoSurface
 from univoxel.joint.config import JointConfig
 from univoxel.lights.distant import DistantLight
 from univoxel.ops import shade_map
@@ -64,7 +65,7 @@ def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> 
     can reach them.
 
     Raises:
-        ValueError: there is no surface, or no photograph sees it.
+        NoSurface: there is no surface, or no photograph sees it.
     """
     assert scene.sky is not None  # the configuration has seen to it
     generator = torch.Generator().manual_seed(seed)
@@ -75,7 +76,7 @@ def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> 
     position, normal = surface_points(mesh, cfg.points, generator)
     observations = observe(position, normal, photos, tracer, offset)
     if not len(observations.view):
-        raise ValueError("no photograph sees a point of the surface")
+        raise NoSurface("no photograph sees a point of the surface")
     direction = scene.sky.direction
     transport = trace(
         observations, tracer, mesh, vertex_color, direction, cfg.tracing, offset, generator

@@ -18,6 +18,7 @@ from torch.nn.functional import binary_cross_entropy, normalize
 from univoxel import brdf, losses
 from univoxel.color import CLIPPED
 from univoxel.data import Photos
+from univoxel.errors import NoSurface
 from univoxel.joint.albedo_entropy import diffuse_albedo, fit_sun_, minimise_entropy_
 from univoxel.joint.config import JointConfig
 from univoxel.joint.initialise import initialise_
@@ -108,7 +109,7 @@ def traced_problem(
     try:
         scene.occluder()
         return build_problem(scene, photos, replace(cfg, points=points), seed)
-    except ValueError as error:  # no surface, or none that is seen
+    except NoSurface as error:  # there is none, or none that is seen
         progress.trouble(f"stage {progress.clock.stage + 1}: {error}: light and materials stay")
         return None
 

@@ -17,6 +17,8 @@ import numpy as np
 import torch  # first: the extension then shares torch's OpenMP runtime
 from torch import Tensor
 
+from univoxel.errors import MissingNative
+
 Backend = Literal["auto", "native", "reference"]
 
 _backend: Backend = "auto"
@@ -93,7 +95,7 @@ def use_backend(name: Backend) -> Iterator[None]:
 def require() -> ModuleType:
     """The extension, or an error that says why it is missing."""
     if core is None:
-        raise RuntimeError(f"univoxel's compiled extension is not loaded: {variant}")
+        raise MissingNative(f"univoxel's compiled extension is not loaded: {variant}")
     return core
 
 

@@ -16,7 +16,7 @@ from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import write_png
 from univoxel.envmap import EnvMap, tables
-from univoxel.errors import DataError
+from univoxel.errors import DataError, UserError
 from univoxel.joint.config import JointConfig
 from univoxel.pictures.animation import KINDS, require, write_animation
 from univoxel.render.pipeline import extract_mesh, radiance_of, shade_hits, surface_of_view
@@ -42,15 +42,16 @@ class Timelapse:
                 its end.
 
         Raises:
-            ValueError: another ending.
-            ImportError: an MP4 without imageio-ffmpeg.
+            UserError: another ending.
+            MissingExtra: an MP4 without imageio-ffmpeg.
             DataError: the photographs cannot be used.
         """
         kind = Path(path).suffix
         folder = str(path).endswith("/") or not kind
         if not folder and kind[1:] not in KINDS:
-            raise ValueError(
-                f"--timelapse: expected a name that ends in .gif, .mp4 or / (a folder), got {path}"
+            raise UserError(
+                f"timelapse: expected a name that ends in .gif, .mp4 or / (a folder), got {path}",
+                "timelapse",
             )
         if not folder:
             require(kind[1:])
