@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from univoxel import sphere
+from univoxel.experiments.record import result_text
 from univoxel.ops import shade_sg
 
 HERE = Path(__file__).parent
@@ -141,7 +142,7 @@ def main() -> None:
         "shade_sg": measure(options.rounds),
         "load_average": os.getloadavg()[0],
     }
-    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    options.out.write_text(result_text(result))
     draw(options.out)
 
 

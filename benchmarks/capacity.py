@@ -25,6 +25,7 @@ from ball import write
 from univoxel.config import StageConfig, TrainConfig, preset, with_field
 from univoxel.data.images import replacing
 from univoxel.experiments import plots
+from univoxel.experiments.record import result_text
 from univoxel.scene import FILE
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.info import info
@@ -129,7 +130,7 @@ def main() -> None:
             }
             result["runs"][name] = own
             with replacing(arguments.out) as temporary:
-                temporary.write_text(json.dumps(result, indent=1) + "\n")
+                temporary.write_text(result_text(result))
     draw(result["runs"], arguments.out.with_suffix(""))
 
 

@@ -25,6 +25,7 @@ from statistics import median
 
 import torch
 
+from univoxel.experiments.record import result_text
 from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
@@ -218,7 +219,7 @@ def main() -> None:
             for kind in KINDS
         },
     }
-    options.out.write_text(json.dumps(found, indent=2) + "\n")
+    options.out.write_text(result_text(found))
     print(json.dumps(found["exponents"], indent=2))
     try:
         draw(found, options.out)

@@ -26,6 +26,8 @@ import torch
 import workers
 from torch import Tensor
 
+from univoxel.experiments.record import result_text
+
 HERE = Path(__file__).parent
 SLOW_MS = 3000.0
 COMPILED = "torch.compile"
@@ -209,7 +211,7 @@ def main() -> None:
     merged["cpu"] = torch.backends.cpu.get_cpu_capability()
     merged["load_average"] = os.getloadavg()[0]  # 1 minute; above the cores: others ran too
     merged["cores"] = len(os.sched_getaffinity(0))
-    options.out.write_text(json.dumps(merged, indent=1) + "\n")
+    options.out.write_text(result_text(merged))
     print(options.out)
 
 

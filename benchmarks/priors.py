@@ -27,6 +27,7 @@ from varying import exposed
 from univoxel.config import LossConfig, TrainConfig, preset, save_config
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, replacing, write_png
+from univoxel.experiments.record import result_text
 from univoxel.scene import FILE
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
@@ -193,7 +194,7 @@ def main() -> None:
         row = {"scene": scene, "light": light, "loss": asdict(loss)}
         result["runs"][key] = row | evaluate(cfg.out, samples=16)
         with replacing(arguments.out) as temporary:
-            temporary.write_text(json.dumps(result, indent=1) + "\n")
+            temporary.write_text(result_text(result))
         print(key, {m: round(result["runs"][key][m], 2) for m in MEASURES})
     chart(result, arguments.out)
 

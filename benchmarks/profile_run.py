@@ -10,7 +10,6 @@ of them is divided in these proportions.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import tempfile
 import time
@@ -23,6 +22,7 @@ import torch
 from train_step import OTHER, STAGES, Clock
 
 from univoxel.config import JointConfig, TrainConfig, chosen
+from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import HashField
 from univoxel.ops import VisibilityScene
@@ -231,7 +231,7 @@ def main() -> None:
         "torch": torch.__version__,
         "load_average": os.getloadavg()[0],
     }
-    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    options.out.write_text(result_text(result))
     print(table(result))
 
 

@@ -32,6 +32,7 @@ from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.envmap import EnvMap, tables
+from univoxel.experiments.record import result_text
 from univoxel.ops import VisibilityScene, relight
 from univoxel.records import Mesh
 
@@ -284,7 +285,7 @@ def main() -> None:
         result["mitsuba"] = against_mitsuba(scene, result["strategies"])
     if data and "pictures" in wanted:
         result["pictures"] = against_pictures(data, arguments.samples, arguments.every)
-    arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+    arguments.out.write_text(result_text(result))
     if "strategies" in result:
         draw(arguments.out)
 

@@ -22,6 +22,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos, load_relit, relight_maps
 from univoxel.data.base import decode
 from univoxel.envmap import tables
+from univoxel.experiments.record import result_text
 from univoxel.metrics import on_black, psnr
 from univoxel.records import Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view
@@ -124,7 +125,7 @@ def main() -> None:
                 for name, path in relight_maps(folder).items()
             }
         print(run.name, json.dumps(own, indent=1), flush=True)
-        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+        arguments.out.write_text(result_text(result))
 
 
 if __name__ == "__main__":

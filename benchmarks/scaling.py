@@ -11,7 +11,6 @@ the slope of log time over log size, 1 for a cost that is linear.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import multiprocessing
 import os
@@ -25,6 +24,8 @@ import cases
 import torch
 import workers
 from ops import arguments_as, forward_backward
+
+from univoxel.experiments.record import result_text
 
 OPS: dict[str, Callable[[], cases.Case]] = {
     "composite": cases.composite,
@@ -148,7 +149,7 @@ def main() -> None:
         result["growth"][name] = {"ms": times, "exponent": exponent(times)}
         row = " | ".join(f"{t:.1f}" for t in times.values())
         print(f"| `{name}` | {row} | {exponent(times):.2f} |", flush=True)
-    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    options.out.write_text(result_text(result))
 
 
 if __name__ == "__main__":

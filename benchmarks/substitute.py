@@ -32,6 +32,7 @@ from univoxel.config import JointConfig, StageConfig, TrainConfig, preset, save_
 from univoxel.data import load_photos, load_relit, load_truth, relight_maps
 from univoxel.data.base import decode
 from univoxel.envmap import tables
+from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hull import GridShape, estimate_bounds, fit_grid, mask_distances, visual_hull
 from univoxel.lights.distant import DistantLight
@@ -218,7 +219,7 @@ def main() -> None:
                 own[term] = {k: measured[k] for k in SHOWN}
             if term == "none" and "relit" not in own:
                 own["relit"] = relit_with_true_pixels(run, folder)
-            path.write_text(json.dumps(result, indent=1) + "\n")
+            path.write_text(result_text(result))
     path.with_suffix(".md").write_text(table(result))
     print(table(result))
 

@@ -11,7 +11,6 @@ references' is not: under the profiler that this takes their memory grew past 20
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 from collections import defaultdict
@@ -25,6 +24,7 @@ import torch
 from univoxel import losses, ops
 from univoxel.config import preset
 from univoxel.data import load_photos
+from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
@@ -206,7 +206,7 @@ def main() -> None:
         with ops.use_backend(backend):
             result[backend] = profile(scene, views, options.rays, count, backend == "native")
     result["load_average"] = os.getloadavg()[0]
-    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    options.out.write_text(result_text(result))
     print(table(result))
 
 

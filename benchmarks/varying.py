@@ -35,6 +35,7 @@ from univoxel.data import Photos, load_photos, load_truth
 from univoxel.data.images import replacing, write_png
 from univoxel.data.mesh import read_ply
 from univoxel.envmap import tables
+from univoxel.experiments.record import result_text
 from univoxel.records import Mesh, Surface
 from univoxel.render.relight import Lighting, relight_surface, stage, turned
 from univoxel.scene import FILE, load_scene
@@ -218,7 +219,7 @@ def main() -> None:
                 }
                 result["runs"][name] = own
                 with replacing(arguments.out) as temporary:
-                    temporary.write_text(json.dumps(result, indent=1) + "\n")
+                    temporary.write_text(result_text(result))
                 print(name, f"albedo {own['albedo_psnr_3ch']:.2f} relit {own['relit_psnr']:.2f}")
 
 

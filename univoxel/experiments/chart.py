@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from univoxel.config import LIGHTS, LightName, StageConfig, TrainConfig
 from univoxel.data.images import replacing
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
-from univoxel.experiments.record import Outcome, Setting
+from univoxel.experiments.record import Outcome, Setting, result_text
 
 BETWEEN = (2, 8)  # minutes, where the curve is looked at between the presets
 PRESETS = ("draft", "fast", "full")
@@ -91,12 +90,12 @@ def chart(
         "changes": list(changes),
         "samples": samples,
         "machine": plots.machine(),
-        "points": [asdict(outcome) for outcome in outcomes],
+        "points": [outcome.summary() for outcome in outcomes],
         "fronts": fronts(outcomes),
         "published": [asdict(point) for point in PUBLISHED],
     }
     with replacing(out / "chart.json") as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(result_text(record), encoding="utf-8")
     if any(not outcome.error for outcome in outcomes):
         draw(outcomes, out / "chart")
     if failed := runner.failures(outcomes):
