@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 
 import torch
+from made import made
 from torch import Tensor
 
 from univoxel import sphere
@@ -142,7 +143,7 @@ def main() -> None:
         "shade_sg": measure(options.rounds),
         "load_average": os.getloadavg()[0],
     }
-    options.out.write_text(result_text(result))
+    options.out.write_text(result_text(made() | result))
     draw(options.out)
 
 

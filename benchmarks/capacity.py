@@ -21,6 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ball import write
+from made import made
 
 from univoxel.config import StageConfig, TrainConfig, preset, with_field
 from univoxel.data.images import replacing
@@ -128,9 +129,9 @@ def main() -> None:
                 "bytes": found["bytes"],
                 "chosen": [c["said"] for c in found["chosen"]],
             }
-            result["runs"][name] = own
+            result["runs"][name] = own | {"commit": made()["commit"]}
             with replacing(arguments.out) as temporary:
-                temporary.write_text(result_text(result))
+                temporary.write_text(result_text(result | made()))
     draw(result["runs"], arguments.out.with_suffix(""))
 
 

@@ -24,6 +24,7 @@ from pathlib import Path
 from statistics import median
 
 import torch
+from made import made
 
 from univoxel.experiments.record import result_text
 from univoxel.fields.base import AbstractField
@@ -219,7 +220,7 @@ def main() -> None:
             for kind in KINDS
         },
     }
-    options.out.write_text(result_text(found))
+    options.out.write_text(result_text(made() | found))
     print(json.dumps(found["exponents"], indent=2))
     try:
         draw(found, options.out)

@@ -19,6 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from made import made
 from train_step import OTHER, STAGES, Clock
 
 from univoxel.config import JointConfig, TrainConfig, chosen
@@ -231,7 +232,7 @@ def main() -> None:
         "torch": torch.__version__,
         "load_average": os.getloadavg()[0],
     }
-    options.out.write_text(result_text(result))
+    options.out.write_text(result_text(made() | result))
     print(table(result))
 
 

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from made import made
 from peers import BARE_EMBREE
 from relight_rays import ray_rates
 from relight_scenes import TESTS, Scene, mesh_scene, sphere_scene, true_mesh
@@ -285,7 +286,7 @@ def main() -> None:
         result["mitsuba"] = against_mitsuba(scene, result["strategies"])
     if data and "pictures" in wanted:
         result["pictures"] = against_pictures(data, arguments.samples, arguments.every)
-    arguments.out.write_text(result_text(result))
+    arguments.out.write_text(result_text(made() | result))
     if "strategies" in result:
         draw(arguments.out)
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from statistics import fmean
 
 import torch
+from made import made
 
 from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos, load_relit, relight_maps
@@ -125,7 +126,7 @@ def main() -> None:
                 for name, path in relight_maps(folder).items()
             }
         print(run.name, json.dumps(own, indent=1), flush=True)
-        arguments.out.write_text(result_text(result))
+        arguments.out.write_text(result_text(result | made()))
 
 
 if __name__ == "__main__":

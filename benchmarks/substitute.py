@@ -18,6 +18,7 @@ from statistics import fmean
 
 import numpy as np
 import torch
+from made import made
 from relight_scenes import true_mesh
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
@@ -219,7 +220,7 @@ def main() -> None:
                 own[term] = {k: measured[k] for k in SHOWN}
             if term == "none" and "relit" not in own:
                 own["relit"] = relit_with_true_pixels(run, folder)
-            path.write_text(result_text(result))
+            path.write_text(result_text(result | made()))
     path.with_suffix(".md").write_text(table(result))
     print(table(result))
 

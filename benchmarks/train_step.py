@@ -20,6 +20,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import torch
+from made import made
 
 from univoxel import losses, ops
 from univoxel.config import preset
@@ -206,7 +207,7 @@ def main() -> None:
         with ops.use_backend(backend):
             result[backend] = profile(scene, views, options.rays, count, backend == "native")
     result["load_average"] = os.getloadavg()[0]
-    options.out.write_text(result_text(result))
+    options.out.write_text(result_text(made() | result))
     print(table(result))
 
 

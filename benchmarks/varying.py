@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from made import made
 from scipy import ndimage, spatial
 from torch.nn.functional import normalize
 
@@ -217,9 +218,9 @@ def main() -> None:
                 own = evaluate(run, samples=32) | {
                     "gain_stops": gain_error(run, arguments.data, kind)
                 }
-                result["runs"][name] = own
+                result["runs"][name] = own | {"commit": made()["commit"]}
                 with replacing(arguments.out) as temporary:
-                    temporary.write_text(result_text(result))
+                    temporary.write_text(result_text(result | made()))
                 print(name, f"albedo {own['albedo_psnr_3ch']:.2f} relit {own['relit_psnr']:.2f}")
 
 
