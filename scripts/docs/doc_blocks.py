@@ -61,9 +61,7 @@ def update(root: Path, write: bool) -> list[str]:
             continue
         for block in reversed(blocks):
             try:
-                wanted = (
-                    f"\n{generated(block['name'], root / 'benchmarks' / 'results').strip()}\n\n"
-                )
+                made = generated(block["name"], root / "benchmarks" / "results")
             except (ValueError, OSError, KeyError) as error:
                 faults.append(f"{name}: block {block['name']}: {error}")
                 continue

@@ -93,9 +93,8 @@ def number(value: object, digits: int | None = None) -> str:
         return "-"
     if isinstance(value, str):
         return value
-    if digits is None:
-        return f"{value:,}" if isinstance(value, int) and value > 9999 else f"{value}"
-    return f"{value:,.{digits}f}"
+    text = f"{value}" if digits is None else f"{value:.{digits}f}"
+    return f"{float(text):,.0f}" if text.isdigit() and len(text) > 4 else text
 
 
 def grouped(rows: Sequence[Sequence[str]]) -> list[list[str]]:
