@@ -12,6 +12,7 @@ their own table, as written by hand or by a script of one day:
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ RELIT = ("relit, dB", "relit_psnr", 1)
 NORMALS = ("normals, degrees", "normal_mae_deg", 1)
 SECONDS = ("training, s", "train_seconds", 0)
 MEMORY = ("peak memory, MB", "peak_rss_mb", 0)
+COLUMNS = 100
 SCENES = {"chrome_bottle": "metals", "tea_table": "tea table"}
 
 
@@ -83,7 +85,7 @@ def caption(record: dict[str, Any]) -> str:
     parts = [f"*{record['title']}* ({when})."]
     if record.get("note"):
         parts.append(record["note"])
-    text = " ".join(parts)
+    text = textwrap.fill(" ".join(parts), COLUMNS, break_on_hyphens=False)
     return f"{text}\n\n    {record['command']}" if record.get("command") else text
 
 
