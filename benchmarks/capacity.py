@@ -23,11 +23,11 @@ from pathlib import Path
 from ball import write
 from made import made
 
+from univoxel.checkpoint import FILE
 from univoxel.config import StageConfig, TrainConfig, preset, with_field
-from univoxel.data.images import replacing
 from univoxel.experiments import plots
 from univoxel.experiments.record import result_text
-from univoxel.scene import FILE
+from univoxel.files import replacing
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.info import info
 from univoxel.tasks.train import train

@@ -30,8 +30,8 @@ from univoxel.experiments.record import result_text
 from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
-from univoxel.fields.hull import GridShape
 from univoxel.fields.sparse import SparseField
+from univoxel.grid import GridShape
 from univoxel.ops import composite
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays

@@ -25,11 +25,12 @@ from made import made
 from torch import Tensor
 from varying import exposed
 
+from univoxel.checkpoint import FILE
 from univoxel.config import LossConfig, TrainConfig, preset, save_config
 from univoxel.data import load_photos
-from univoxel.data.images import read_image, replacing, write_png
+from univoxel.data.images import read_image, write_png
 from univoxel.experiments.record import result_text
-from univoxel.scene import FILE
+from univoxel.files import replacing
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
 

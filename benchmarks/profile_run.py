@@ -26,20 +26,21 @@ from univoxel.config import JointConfig, TrainConfig, chosen
 from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import HashField
+from univoxel.joint import observations, stage
 from univoxel.ops import VisibilityScene
-from univoxel.solve import sightings
-from univoxel.tasks import joint, train
+from univoxel.tasks import train
+from univoxel.training import loop
 
 HERE = Path(__file__).parent
 ONCE = {
-    "joint: pose and trace": [(joint, "pose")],
-    "joint: trials": [(joint, "supposed")],
-    "joint: colors": [(joint, name) for name in ("sunlit", "balance", "matte_albedo")],
-    "joint: Newton": [(joint, "newton_round")],
-    "joint: metal": [(joint, "find_metal")],
-    "held-out rays": [(train, "held_out_psnr")],
+    "joint: pose and trace": [(stage, "pose")],
+    "joint: trials": [(stage, "supposed")],
+    "joint: colors": [(stage, name) for name in ("sunlit", "balance", "matte_albedo")],
+    "joint: Newton": [(stage, "newton_round")],
+    "joint: metal": [(stage, "find_metal")],
+    "held-out rays": [(loop, "held_out_psnr")],
     "previews": [(train, "preview")],
-    "checkpoints": [(train, "save_scene")],
+    "checkpoints": [(train, "save_scene"), (loop, "save_scene")],
     "trust": [(train, "say_trust")],
 }  # seconds of a stage whatever the number of its steps
 EVERY = 16  # backward passes of which one is divided
@@ -47,7 +48,7 @@ START = "before"  # loading, hull; also what lies between the stages
 PARTS = {
     **STAGES,
     "sample": [(f, n) for f in (DenseField, HashField) for n in ("sample", "features_at")],
-    "light": [*STAGES["light"], (sightings, "shade_map")],
+    "light": [*STAGES["light"], (observations, "shade_map")],
     "hull": [(train, name) for name in ("masks_of", "object_box", "visual_hull")],
     "hollows": [(train, "opened")],
     "cameras": [(train, "put_right")],
@@ -150,7 +151,7 @@ def profile(cfg: TrainConfig, now: Callable[[], float] = time.perf_counter) -> d
             patch(owner, attribute, lambda f, name=name: clock.timed(name, f))
     patch(torch.Tensor, "backward", clock.backward_pass)
     patch(train, "run_stage", clock.stage)
-    patch(joint, "solve", clock.stage)
+    patch(stage, "solve", clock.stage)
     begin = now()
     try:
         train.train(cfg)
@@ -217,7 +218,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=HERE / "results" / "profile.json")
     options = parser.parse_args()
-    joint.FOLLOWING //= options.part
+    stage.FOLLOWING //= options.part
     with tempfile.TemporaryDirectory() as folder:
         cfg = chosen(options.preset, options.minutes, options.scene, Path(folder) / "run")
         stages = (replace(s, iterations=s.iterations // options.part) for s in cfg.stages)

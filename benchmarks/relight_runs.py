@@ -19,18 +19,19 @@ from statistics import fmean
 import torch
 from made import made
 
+from univoxel.checkpoint import load_scene
 from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos, load_relit, relight_maps
 from univoxel.data.base import decode
+from univoxel.data.maps import read_map
 from univoxel.envmap import tables
 from univoxel.experiments.record import result_text
 from univoxel.metrics import on_black, psnr
 from univoxel.records import Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, Stage, relight_surface, stage
-from univoxel.scene import load_scene
+from univoxel.run import trained_on
 from univoxel.tasks.evaluate import _albedo_scales
-from univoxel.tasks.frames import read_map, trained_on
 
 BOUNCES = [0, 1, 2, 4]
 EXPONENTS = [1.0, 1.5]

@@ -28,25 +28,26 @@ from trimesh.triangles import closest_point
 from univoxel import lights
 from univoxel.assets.bake import with_materials
 from univoxel.camera import image_rays
+from univoxel.checkpoint import load_scene, save_scene
 from univoxel.color import linear_to_srgb
 from univoxel.config import JointConfig, StageConfig, TrainConfig, preset, save_config
 from univoxel.data import load_photos, load_relit, load_truth, relight_maps
 from univoxel.data.base import decode
+from univoxel.data.maps import read_map, true_map
 from univoxel.envmap import tables
 from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
-from univoxel.fields.hull import GridShape, estimate_bounds, fit_grid, mask_distances, visual_hull
+from univoxel.grid import GridShape, fit_grid
 from univoxel.lights.distant import DistantLight
 from univoxel.metrics import on_black, psnr
 from univoxel.ops import VisibilityScene
+from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
 from univoxel.records import Mesh, Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, relight_surface, stage
-from univoxel.scene import Scene, load_scene, save_scene
+from univoxel.scene import Scene
 from univoxel.sphere import latlong_directions, texel_solid_angles
-from univoxel.tasks.envmap import true_map
 from univoxel.tasks.evaluate import _albedo_scales, evaluate
-from univoxel.tasks.frames import read_map
 from univoxel.tasks.train import train
 
 TERMS = ("none", "geometry", "light", "both")

@@ -28,19 +28,21 @@ from univoxel.data import load_photos
 from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
-from univoxel.fields.hull import estimate_bounds, fit_grid, mask_distances, visual_hull
+from univoxel.grid import fit_grid
 from univoxel.lights import priors
 from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.sg import LocalSG
 from univoxel.optim import RowAdam
+from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
 from univoxel.render import pipeline
 from univoxel.scene import Scene
 from univoxel.tasks import train
+from univoxel.training import loop
 
 HERE = Path(__file__).parent
 DATA = HERE.parent / "univoxel" / "example_data" / "tiny"
 STAGES = {
-    "rays": [(train, "random_batch")],
+    "rays": [(loop, "random_batch")],
     "march": [(DenseField, "march")],
     "sample": [(DenseField, "sample")],
     "composite": [(pipeline, "composite")],
@@ -54,7 +56,7 @@ STAGES = {
         *((priors, name) for name in ("smoothness", "chroma", "total_variation")),
     ],
     "optimiser": [(RowAdam, "step")],
-    "smoothing": [(train, "smooth"), (train, "spread_gradient")],
+    "smoothing": [(loop, "smooth"), (loop, "spread_gradient")],
     "refresh": [(DenseField, "refresh")],
 }
 BACKWARD = "backward"
@@ -126,7 +128,7 @@ def run_steps(scene: Scene, views: tuple, rays: int, count: int, begin: float = 
             yield begin + (1 - begin) * i / count
 
     progress.steps = steps
-    train.run_stage(scene, cfg, stage, *views, progress)
+    loop.run_stage(scene, cfg, stage, *views, progress)
 
 
 def profile(scene: Scene, views: tuple, rays: int, count: int, divide: bool) -> dict:

@@ -30,18 +30,19 @@ from scipy import ndimage, spatial
 from torch.nn.functional import normalize
 
 from univoxel.camera import image_rays
+from univoxel.checkpoint import FILE, load_scene
 from univoxel.color import linear_to_srgb, luminance
 from univoxel.config import preset
 from univoxel.data import Photos, load_photos, load_truth
-from univoxel.data.images import replacing, write_png
+from univoxel.data.images import write_png
+from univoxel.data.maps import read_map
 from univoxel.data.mesh import read_ply
 from univoxel.envmap import tables
 from univoxel.experiments.record import result_text
+from univoxel.files import replacing
 from univoxel.records import Mesh, Surface
 from univoxel.render.relight import Lighting, relight_surface, stage, turned
-from univoxel.scene import FILE, load_scene
 from univoxel.tasks.evaluate import evaluate
-from univoxel.tasks.frames import read_map
 from univoxel.tasks.train import train
 
 # kind: what it is compared with, and the models that are trained on it

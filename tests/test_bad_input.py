@@ -14,10 +14,10 @@ from analytic import write_scene
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from univoxel.checkpoint import FILE
 from univoxel.cli import main
 from univoxel.data.images import read_exr, read_image, write_exr, write_png
-from univoxel.scene import FILE
-from univoxel.tasks import progress
+from univoxel.training import progress
 
 SMALL = [
     f"--set={change}"

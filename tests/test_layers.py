@@ -11,15 +11,19 @@ ROOT = Path(__file__).parent.parent
 # From the bottom up. A module imports only from layers below its own and, inside its folder, the
 # helpers named here.
 LAYERS = [
-    {"records"},
-    {"brdf", "camera", "color", "sphere"},
+    {"errors", "files", "records"},
+    {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
-    {"envmap", "networks", "packing", "poses"},
+    {"envmap", "networks", "poses"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
-    {"assets", "distributed", "losses", "metrics", "render"},
+    {"checkpoint", "run"},
+    {"assets", "losses", "metrics", "render"},
     {"config", "overrides"},
-    {"solve"},
+    {"preparation", "training"},
+    {"joint"},
+    {"confidence"},
+    {"compression", "pictures"},
     {"tasks"},
     {"tasks.demo"},
     {"experiments.plots", "experiments.record"},
@@ -31,33 +35,20 @@ LAYERS = [
 ]
 HELPERS = {
     "ops": {"checks", "dense_grid", "native", "reflectance", "visibility"},
-    "fields": {"base", "dense", "hull", "sparse"},
+    "fields": {"base", "dense", "sparse"},
     "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
+    "preparation": {"hull"},
+    "training": {"divergence", "plateau", "progress", "surface_update"},
+    "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
+    "compression": {"prune", "quality", "search"},
+    "pictures": {"animation"},
     "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
-    "solve": {"equations", "metals", "newton", "sightings"},
-    "tasks": {
-        *("animation", "capacity", "contact_sheet", "descent", "envmap", "frames", "guard"),
-        *(
-            "exposures",
-            "hollows",
-            "joint",
-            "layers",
-            "look",
-            "plateau",
-            "progress",
-            "registration",
-            "shrink",
-            "spare",
-            "timelapse",
-            "trust",
-        ),
-    },
 }
 # Extras: imported inside the function that needs one
-OPTIONAL = {"drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh", "viser"}
+OPTIONAL = {"drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh"}
 # The one file or folder of csrc/ that includes it; no header of ours passes it on to others.
 INCLUDES = {r"embree\d?/": "visibility.cpp", r"pybind11/": "bindings"}
 

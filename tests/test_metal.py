@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from asymmetric_scene import albedo, lopsided
 from integrator_scenes import WHITE, octahedron, sphere_points
-from lopsided import albedo, lopsided
 from PIL import Image
 
 from univoxel import brdf

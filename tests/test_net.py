@@ -10,6 +10,7 @@ round otherwise. On a processor that is not held, the pictures are compared with
 
 import dataclasses
 import hashlib
+import itertools
 import json
 from pathlib import Path
 
@@ -87,8 +88,8 @@ def small(picture: np.ndarray) -> str:
     rgb = np.clip(picture[..., :3], 0, 1) ** (1 / 2.2)
     rows, columns = (np.linspace(0, n, COPY + 1).astype(int) for n in rgb.shape[:2])
     means = [
-        [rgb[a:b, c:d].mean((0, 1)) for c, d in zip(columns, columns[1:], strict=False)]
-        for a, b in zip(rows, rows[1:], strict=False)
+        [rgb[a:b, c:d].mean((0, 1)) for c, d in itertools.pairwise(columns)]
+        for a, b in itertools.pairwise(rows)
     ]
     return np.round(255 * np.array(means)).astype(np.uint8).tobytes().hex()
 

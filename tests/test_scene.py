@@ -9,11 +9,13 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from univoxel.checkpoint import FILE, SHELL, load_checkpoint, load_scene, save_scene
+from univoxel.compression import prune
 from univoxel.fields import hashed
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import HashField, Levels
-from univoxel.fields.hull import fit_grid
 from univoxel.fields.sparse import SparseField
+from univoxel.grid import fit_grid
 from univoxel.lights import (
     EnvmapConfig,
     EnvmapSGConfig,
@@ -24,16 +26,7 @@ from univoxel.lights import (
     read_config,
     scaled,
 )
-from univoxel.scene import (
-    FILE,
-    SHELL,
-    Scene,
-    SceneConfig,
-    load_checkpoint,
-    load_scene,
-    save_scene,
-)
-from univoxel.tasks import shrink
+from univoxel.scene import Scene, SceneConfig
 
 LIGHTS = [
     SGConfig(lobes=3),
@@ -77,7 +70,7 @@ def test_a_checkpoint_gives_the_same_scene(tmp_path, light):
 
 def test_a_file_without_a_table_of_directions_is_one_from_before_there_were_any(tmp_path):
     scene = small_scene()
-    shrink.drop_mirror_levels(scene, 0)
+    prune.drop_mirror_levels(scene, 0)
     path = save_scene(scene, tmp_path, {})
     with safe_open(path, "pt") as file:
         meta = json.loads(file.metadata()["univoxel"])

@@ -59,3 +59,20 @@ def project(cameras: Cameras, view: int, points: Tensor) -> tuple[Tensor, Tensor
     depth = -local[:, 2]
     xy = torch.stack([local[:, 0], -local[:, 1]], -1) / depth[:, None]
     return xy * cameras.focal[view] + cameras.centre[view], depth
+
+
+def looked_at(cameras: Cameras) -> Tensor:
+    """The point [3] nearest to all optical axes."""
+    position, axis = cameras.camera_to_world[:, :, 3], -cameras.camera_to_world[:, :, 2]
+    across = torch.eye(3) - axis[:, :, None] * axis[:, None]
+    system = across.mean(0) + 1e-6 * torch.eye(3)
+    return torch.linalg.solve(system, (across @ position[:, :, None]).mean(0)[:, 0])
+
+
+def resize(cameras: Cameras, width: int) -> Cameras:
+    """The same views in pictures of another width, in pixels."""
+    height = max(1, round(cameras.height * width / cameras.width))
+    scale = torch.tensor([width / cameras.width, height / cameras.height])
+    return Cameras(
+        cameras.camera_to_world, cameras.focal * scale, cameras.centre * scale, width, height
+    )

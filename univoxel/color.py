@@ -26,3 +26,6 @@ def srgb_to_linear(srgb: Tensor) -> Tensor:
 def luminance(linear: Tensor) -> Tensor:
     """Rec. 709 luminance of linear RGB in the last dimension: [..., 3] -> [...]."""
     return linear @ linear.new_tensor([0.2126, 0.7152, 0.0722])
+
+
+CLIPPED = 0.97  # sRGB; brighter pixels are lower bounds

@@ -6,11 +6,15 @@ Tasks are imported by the command that runs them: `univoxel --help` does not wai
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 from tyro.conf import Positional, UseAppendAction, arg
+
+if TYPE_CHECKING:
+    from univoxel.ops import Lamp, Sun
 
 Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
 Scenes: TypeAlias = Annotated[
@@ -226,7 +230,6 @@ def relight(
         resume: keep the frames that are there
     """
     from univoxel.tasks import relight as task
-    from univoxel.tasks.lights import parse_ground, point_light, sun_light
 
     if orbit is not None:
         if cameras != "test":
@@ -500,3 +503,41 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "stress": stress,
     "demo": demo,
 }
+
+
+def sun_light(values: tuple[float, ...]) -> Sun:
+    """A white sun from azimuth and elevation in degrees, irradiance and, perhaps, its angle.
+
+    Raises:
+        ValueError: not 3 or 4 numbers, or one out of range.
+    """
+    from univoxel.ops import Sun
+
+    if len(values) not in (3, 4):
+        raise ValueError(f"--sun: expected AZIMUTH ELEVATION IRRADIANCE [ANGLE], got {values}")
+    azimuth, elevation = (math.radians(x) for x in values[:2])
+    across = math.cos(elevation)
+    direction = (across * math.cos(azimuth), across * math.sin(azimuth), math.sin(elevation))
+    return Sun(direction, (values[2], values[2], values[2]), *values[3:])
+
+
+def point_light(values: tuple[float, float, float, float]) -> Lamp:
+    """A white lamp from x, y, z and its intensity."""
+    from univoxel.ops import Lamp
+
+    x, y, z, intensity = values
+    return Lamp((x, y, z), (intensity, intensity, intensity))
+
+
+def parse_ground(text: str | None) -> float | Literal["lowest"] | None:
+    """A height, the word lowest, or nothing.
+
+    Raises:
+        ValueError: another text.
+    """
+    if text is None or text == "lowest":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"--ground: expected lowest or a height, got {text!r}") from None

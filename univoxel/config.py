@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
-from univoxel.data.images import replacing
 from univoxel.fields.hashed import PER_LEVEL
+from univoxel.files import replacing
 from univoxel.lights import (
     EnvmapConfig,
     EnvmapSGConfig,

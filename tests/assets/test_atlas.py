@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from lopsided import lopsided
+from asymmetric_scene import lopsided
 
 from univoxel.assets.atlas import dilated, rasterise, unwrap, vertex_normals, vertex_tangents
 from univoxel.assets.topology import clean, simplify

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from lopsided import albedo, lopsided, roughness
+from asymmetric_scene import albedo, lopsided, roughness
 
 from univoxel.assets.atlas import rasterise
 from univoxel.assets.bake import bake, in_frame, nearest_surface, with_materials

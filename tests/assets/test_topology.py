@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from lopsided import lopsided
+from asymmetric_scene import lopsided
 
 from univoxel.assets.topology import clean, close, open_edges, simplify
 from univoxel.records import Mesh

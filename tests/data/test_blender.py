@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from univoxel.data import DataError, load_photos
+from univoxel.data import load_photos
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import RIGID_TOLERANCE, find_image
+from univoxel.errors import DataError
 
 WIDTH, HEIGHT, ANGLE = 6, 4, 0.8
 

@@ -11,8 +11,10 @@ import pytest
 import torch
 from PIL import Image
 
-from univoxel.data import DataError, images
-from univoxel.data.images import read_exr, read_image, replacing, write_exr, write_png
+from univoxel.data import images
+from univoxel.data.images import read_exr, read_image, write_exr, write_png
+from univoxel.errors import DataError
+from univoxel.files import replacing
 
 
 def noise(*shape, dtype=np.float32):
@@ -314,7 +316,7 @@ def test_a_failed_replacement_cleans_up(tmp_path, monkeypatch):
     def replace(source, target):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), source)
 
-    monkeypatch.setattr(images.os, "replace", replace)
+    monkeypatch.setattr(os, "replace", replace)
     with pytest.raises(OSError, match=r"Read-only file system: .*a\.png") as caught:
         write(tmp_path / "a.png", 1)
     assert caught.value.errno == errno.EROFS

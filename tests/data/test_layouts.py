@@ -16,7 +16,8 @@ from layouts import (
 from scipy.spatial.transform import Rotation
 
 from univoxel.camera import image_rays, project
-from univoxel.data import DataError, load_photos
+from univoxel.data import load_photos
+from univoxel.errors import DataError
 
 WRITERS = {
     "NeRF layout": write_nerf,

@@ -6,8 +6,9 @@ import torch
 from layouts import Scene, scene, write_colmap, write_nerfstudio
 
 from univoxel.camera import image_rays
-from univoxel.data import DataError, load_photos
+from univoxel.data import load_photos
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
+from univoxel.errors import DataError
 
 WIDTH, HEIGHT, FOCAL, CENTRE = 96, 64, 90.0, (50.0, 30.0)
 BENT = {

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from univoxel.assets.ply import write_ply
-from univoxel.data import DataError
 from univoxel.data.mesh import read_ply
+from univoxel.errors import DataError
 from univoxel.records import Mesh
 
 VERTICES = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from layouts import FOCAL, HEIGHT, WIDTH, angle, scene, write_nerfstudio
 
-from univoxel.data import DataError, load_photos
+from univoxel.data import load_photos
 from univoxel.data.images import write_png
+from univoxel.errors import DataError
 
 
 def edit(folder, change):

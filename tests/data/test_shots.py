@@ -7,8 +7,9 @@ from layouts import FOCAL, HEIGHT, WIDTH, Scene, scene, write_colmap, write_nerf
 
 from univoxel.camera import project
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.data import DataError, load_photos, shots, splits_of
+from univoxel.data import load_photos, shots, splits_of
 from univoxel.data.images import write_exr, write_png
+from univoxel.errors import DataError
 
 
 @pytest.mark.parametrize("writer", [write_nerf, write_nerfstudio, write_colmap])

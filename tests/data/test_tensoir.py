@@ -5,7 +5,8 @@ import json
 import pytest
 from layouts import scene, write_tensoir
 
-from univoxel.data import DataError, load_photos
+from univoxel.data import load_photos
+from univoxel.errors import DataError
 
 
 @pytest.fixture

@@ -6,15 +6,9 @@ import torch
 
 from univoxel.camera import Cameras
 from univoxel.color import srgb_to_linear
-from univoxel.data import (
-    DataError,
-    Photos,
-    load_points,
-    load_relit,
-    load_truth,
-    relight_maps,
-)
+from univoxel.data import Photos, load_points, load_relit, load_truth, relight_maps
 from univoxel.data.images import write_png
+from univoxel.errors import DataError
 
 WIDTH, HEIGHT = 6, 4
 

@@ -8,10 +8,10 @@ import shutil
 import pytest
 from analytic import write_scene
 
-from univoxel.data import DataError
+from univoxel.checkpoint import FILE
+from univoxel.errors import DataError
 from univoxel.experiments import runner, worker
 from univoxel.experiments.record import Setting, load_outcome
-from univoxel.scene import FILE
 from univoxel.tasks.evaluate import MEASURES
 
 TINY = (

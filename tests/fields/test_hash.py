@@ -11,8 +11,8 @@ from torch import nn
 from univoxel.fields import hashed
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import COARSEST, PER_LEVEL, ROWS, HashField, Levels
-from univoxel.fields.hull import GridShape
 from univoxel.fields.sparse import SparseField
+from univoxel.grid import GridShape
 from univoxel.ops import encode_hash
 from univoxel.records import Rays
 

@@ -5,14 +5,14 @@ import copy
 import pytest
 import torch
 from analytic import cameras_around
-from lopsided import lopsided
-from lopsided import sdf as lopsided_sdf
+from asymmetric_scene import lopsided
+from asymmetric_scene import sdf as lopsided_sdf
 from scipy.spatial import KDTree
 
 from univoxel.fields import sparse
 from univoxel.fields.dense import DenseField
-from univoxel.fields.hull import GridShape, fit_grid
 from univoxel.fields.sparse import BAND, SparseField, pack_bricks, unpack_bricks
+from univoxel.grid import GridShape, fit_grid
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import surface_of_view
 

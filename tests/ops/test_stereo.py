@@ -7,8 +7,8 @@ import torch
 from analytic import look_at
 
 from univoxel.camera import Cameras, image_rays, project
-from univoxel.fields.hollows import _projections
 from univoxel.ops import match_cost, native, semi_global, use_backend
+from univoxel.preparation.carving import _projections
 
 SIZE, VIEWS, STEP, STEPS = 24, 5, 0.1, 7
 TRUE = 3  # the step that the surface lies at

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
+from asymmetric_scene import lopsided
 from balls import views
-from lopsided import lopsided
 
 from univoxel.color import srgb_to_linear
 from univoxel.lights import EnvmapConfig

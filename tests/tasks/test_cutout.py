@@ -10,8 +10,9 @@ from PIL import Image
 
 from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb
-from univoxel.data import DataError, Photos, load_photos
+from univoxel.data import Photos, load_photos
 from univoxel.data.shots import read_photo
+from univoxel.errors import DataError
 from univoxel.tasks import cutout as task
 
 VIEWS, SIZE = 16, 40

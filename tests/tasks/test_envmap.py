@@ -8,10 +8,10 @@ import torch
 from analytic import sphere_scene
 from torch.nn.functional import normalize
 
-from univoxel.data import DataError
+from univoxel.checkpoint import save_scene
 from univoxel.data.images import read_image, write_exr
+from univoxel.errors import DataError
 from univoxel.lights import EnvmapConfig, EnvmapSGConfig
-from univoxel.scene import save_scene
 from univoxel.sphere import fibonacci_sphere
 from univoxel.tasks.envmap import GREY, brightest, compare, envmap, grey_ball
 

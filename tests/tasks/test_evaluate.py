@@ -11,12 +11,13 @@ import torch
 from torch import nn
 
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.data import DataError, load_photos
+from univoxel.data import load_photos
 from univoxel.data.images import read_exr, read_image, write_png
+from univoxel.errors import DataError
+from univoxel.pictures import layers as layers_module
+from univoxel.pictures.contact_sheet import TILE, Panel, contact_sheet, heat, shrink
 from univoxel.records import Mesh, Surface
 from univoxel.tasks import evaluate as task
-from univoxel.tasks import layers as layers_module
-from univoxel.tasks.contact_sheet import TILE, Panel, contact_sheet, heat, shrink
 
 SIZE = 16
 SCALE = torch.tensor([2.0, 1.5, 0.5])  # true albedo over the estimate's

@@ -8,7 +8,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch
-from lopsided import BALLS, Identity, albedo, lopsided, roughness, sdf
+from asymmetric_scene import BALLS, Identity, albedo, lopsided, roughness, sdf
 from PIL import Image
 
 from univoxel.tasks import export as task

@@ -7,11 +7,11 @@ import torch
 from analytic import cameras_around, sphere_normals, sphere_scene, write_scene
 
 from univoxel.assets.ply import write_ply
-from univoxel.data import DataError
+from univoxel.checkpoint import save_scene
 from univoxel.data.images import read_exr, read_image, write_exr
+from univoxel.errors import DataError
 from univoxel.lights import EnvmapConfig, EnvmapSGConfig, MLPLightConfig, SHConfig
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import save_scene
 from univoxel.sphere import latlong_directions
 from univoxel.tasks.inspect import inspect, irradiance, parse_pixel
 

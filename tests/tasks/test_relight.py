@@ -9,13 +9,13 @@ import torch
 
 from univoxel.camera import image_rays, project
 from univoxel.color import linear_to_srgb
-from univoxel.data import DataError
 from univoxel.data.images import read_exr, read_image, write_exr
 from univoxel.envmap import EnvMap
+from univoxel.errors import DataError
 from univoxel.ops import Sun, VisibilityScene
+from univoxel.pictures.viewpoints import orbit
 from univoxel.records import Mesh, Surface
 from univoxel.tasks import relight as task
-from univoxel.tasks.frames import orbit
 
 SIZE, RADIUS, ALBEDO = 24, 0.5, 0.6
 

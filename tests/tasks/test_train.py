@@ -10,6 +10,7 @@ from layouts import Scene, write_colmap
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from univoxel.checkpoint import FILE, load_scene
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.config import StageConfig, TrainConfig, preset, with_field
 from univoxel.data import load_photos
@@ -17,11 +18,13 @@ from univoxel.data.images import read_image, write_png
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import SGConfig
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import FILE, SceneConfig, load_scene
+from univoxel.run import photos_of as photos_of_run
+from univoxel.scene import SceneConfig
 from univoxel.tasks import train as task
-from univoxel.tasks.frames import photos_of as photos_of_run
 from univoxel.tasks.info import info
-from univoxel.tasks.train import batch_at, split_pixels, train
+from univoxel.tasks.train import split_pixels, train
+from univoxel.training import loop, surface_update
+from univoxel.training.loop import batch_at
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +68,7 @@ def test_geometry_is_the_sphere(run):
 def test_the_physical_render_learns_the_photographs(run, data):
     photos = load_photos(data, "test")
     pixels = torch.cartesian_prod(torch.arange(2), torch.arange(32), torch.arange(32))
-    psnr = task.held_out_psnr(load_scene(run).eval(), photos, pixels, physical=True)
+    psnr = loop.held_out_psnr(load_scene(run).eval(), photos, pixels, physical=True)
     assert psnr > 20  # black gives 9 dB, the right sphere in one mean colour 16
 
 
@@ -88,7 +91,7 @@ def test_every_light_learns_the_photographs(data, tmp_path, light):
     scene = load_scene(train(cfg))
     photos = load_photos(data, "test")
     pixels = torch.cartesian_prod(torch.arange(2), torch.arange(32), torch.arange(32))
-    psnr = task.held_out_psnr(scene, photos, pixels, physical=True)
+    psnr = loop.held_out_psnr(scene, photos, pixels, physical=True)
     assert psnr > 18  # black gives 9 dB, the right sphere in one mean colour 16
 
 
@@ -164,7 +167,7 @@ def test_a_gradient_spreads_over_the_nodes_that_it_touches():
     values[middle] = 1.0
     grad = torch.sparse_coo_tensor(rows, values, field.sdf.shape, check_invariants=True)
     field.sdf.grad = grad.coalesce()
-    task.spread_gradient(field, 2)
+    surface_update.spread_gradient(field, 2)
     spread = field.sdf.grad.to_dense()
     beside = [spread[3, 4, 4], spread[5, 4, 4], spread[4, 3, 4], spread[4, 4, 5]]
     assert spread[4, 4, 4] > beside[0] > spread[2, 4, 4] > 0
@@ -210,7 +213,7 @@ def test_another_field_is_as_good(data, run, tmp_path, kind):
     assert away.abs().mean() < 0.03
     photos = load_photos(data, "test")
     pixels = torch.cartesian_prod(torch.arange(2), torch.arange(32), torch.arange(32))
-    psnr, of_dense = (task.held_out_psnr(s, photos, pixels, physical=True) for s in (scene, dense))
+    psnr, of_dense = (loop.held_out_psnr(s, photos, pixels, physical=True) for s in (scene, dense))
     assert psnr > of_dense - 1.0  # two runs of 140 steps with other random numbers
     with pytest.raises(ValueError, match="began with other stages"):
         train(config(data, out), resume=True)
@@ -219,7 +222,7 @@ def test_another_field_is_as_good(data, run, tmp_path, kind):
 def test_a_sparse_run_is_resumed(data, tmp_path, monkeypatch):
     """In the middle of its fine stage, from the checkpoint of a sparse field."""
     cfg = with_field(config(data, tmp_path / "run"), "sparse")
-    save, saved = task.save_scene, []
+    save, saved = loop.save_scene, []
 
     def killed(*arguments, **options):
         save(*arguments, **options)
@@ -227,7 +230,8 @@ def test_a_sparse_run_is_resumed(data, tmp_path, monkeypatch):
         if len(saved) == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(task, "save_scene", killed)
+    for module in (task, loop):  # the last of a stage, and those within
+        monkeypatch.setattr(module, "save_scene", killed)
     monkeypatch.setattr(task.Progress, "checkpoint_due", lambda self: self.step == 70)
     with pytest.raises(KeyboardInterrupt):
         train(cfg)

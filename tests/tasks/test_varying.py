@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from analytic import scene_of, sphere_scene, write_scene
-from sightings import (
+from observed_points import (
     BLUE,
     RED,
     Steps,
@@ -19,18 +19,19 @@ from sightings import (
 )
 
 from univoxel import losses
+from univoxel.checkpoint import load_checkpoint, load_scene, save_scene
 from univoxel.cli import main
 from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
+from univoxel.joint import equations, newton, stage
+from univoxel.joint.observations import draw_sightings, widened
 from univoxel.lights import SGConfig
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import Scene, SceneConfig, load_checkpoint, load_scene, save_scene
-from univoxel.solve import equations, newton
-from univoxel.solve.sightings import draw_sightings, widened
-from univoxel.tasks import joint
+from univoxel.scene import Scene, SceneConfig
 from univoxel.tasks import train as task
-from univoxel.tasks.train import held_out_psnr, train
+from univoxel.tasks.train import train
+from univoxel.training.loop import held_out_psnr
 
 NODES = 12
 
@@ -153,7 +154,7 @@ def test_solve_finds_gains_and_the_albedo_under_them():
     with torch.no_grad():
         scene.views.gain_steps.zero_()
     cfg = JointConfig(points=800, newton_points=800, rays=512, tracing=1, rounds=3)
-    joint.solve(scene, photos, cfg, 0, Steps(600))
+    stage.solve(scene, photos, cfg, 0, Steps(600))
     error = scene.views.log_gain.detach() / math.log(2) - wanted
     mesh = extract_mesh(scene)
     x = mesh.vertices[:, 0]

@@ -18,7 +18,7 @@ from univoxel.assets.base import (
     relief_picture,
     roughness_picture,
 )
-from univoxel.data.images import replacing
+from univoxel.files import replacing
 
 # glTF looks along -Z with +Y up, our world has +Z up: (x, y, z) -> (x, z, -y), a quarter turn.
 Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

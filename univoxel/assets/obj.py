@@ -11,7 +11,8 @@ from univoxel.assets.base import (
     relief_picture,
     roughness_picture,
 )
-from univoxel.data.images import replacing, write_png
+from univoxel.data.images import write_png
+from univoxel.files import replacing
 
 
 def write_obj(path: Path, mesh: TexturedMesh) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from univoxel.color import linear_to_srgb
-from univoxel.data.images import replacing
+from univoxel.files import replacing
 from univoxel.records import Mesh
 
 

@@ -2,13 +2,14 @@
 
 from pathlib import Path
 
-from univoxel.data.base import DataError, Photos, Truth
+from univoxel.data.base import Photos, Truth
 from univoxel.data.blender import is_blender, load_blender
 from univoxel.data.colmap import is_colmap, load_colmap
 from univoxel.data.nerfstudio import is_nerfstudio, load_nerfstudio
 from univoxel.data.tensoir import is_tensoir, load_tensoir
 from univoxel.data.transforms import load_cameras
 from univoxel.data.truth import load_points, load_relit, load_truth, relight_maps
+from univoxel.errors import DataError
 
 __all__ = [
     "DataError",

@@ -12,10 +12,6 @@ from univoxel.camera import Cameras
 from univoxel.color import srgb_to_linear
 
 
-class DataError(ValueError):
-    """Input that cannot be used: the message names the file, what was expected and what came."""
-
-
 @dataclass(frozen=True)
 class Photos:
     """Posed photographs of one split, all of one size."""

@@ -12,9 +12,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from univoxel.data.base import DataError, Photos
+from univoxel.data.base import Photos
 from univoxel.data.shots import read_shots
 from univoxel.data.transforms import read_frames
+from univoxel.errors import DataError
 
 
 def is_blender(folder: Path, split: str) -> bool:

@@ -16,10 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from univoxel.data.base import DataError, Photos
+from univoxel.data.base import Photos
 from univoxel.data.images import image_size
 from univoxel.data.lens import Lens
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.errors import DataError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 # By number in binary files; of those that are supported, how many parameters they have.

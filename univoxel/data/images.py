@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import io
-import os
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +13,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from univoxel.data.base import DataError
 from univoxel.data.radiance import read_radiance
+from univoxel.errors import DataError
+from univoxel.files import replacing
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
 
@@ -151,24 +150,6 @@ def write_exr(
     OpenEXR.File(header, pixels).write(encoded)
     with replacing(path) as temporary:
         temporary.write_bytes(encoded.getbuffer())
-
-
-@contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
-    """Give a temporary path beside `path` to write to; it takes the place of `path` at the end.
-
-    If the block raises, the temporary file is removed and `path` is as it was. OSError comes out
-    naming `path`.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        raise OSError(error.errno, f"cannot write: {error.strerror}", str(path)) from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _require_file(path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from univoxel.data.base import DataError
+from univoxel.errors import DataError
 from univoxel.records import Mesh
 
 _TYPES = {

@@ -12,9 +12,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from univoxel.data.base import DataError, Photos
+from univoxel.data.base import Photos
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
 from univoxel.data.transforms import read_frames, short, view_name
+from univoxel.errors import DataError
 
 
 def is_nerfstudio(folder: Path, split: str) -> bool:

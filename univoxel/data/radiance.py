@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from univoxel.data.base import DataError
+from univoxel.errors import DataError
 
 
 def read_radiance(path: Path) -> np.ndarray:

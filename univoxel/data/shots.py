@@ -13,9 +13,10 @@ from torch import Tensor
 
 from univoxel.camera import Cameras
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.data.base import DataError, Photos, decode
+from univoxel.data.base import Photos, decode
 from univoxel.data.images import read_image
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
+from univoxel.errors import DataError
 
 LARGE = 200_000_000  # pixels in all photographs, from where on their size must be chosen
 TRAINING_BYTES = 25  # of memory that training takes for each of them, about

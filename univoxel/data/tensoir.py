@@ -10,10 +10,11 @@ import json
 import math
 from pathlib import Path
 
-from univoxel.data.base import DataError, Photos
+from univoxel.data.base import Photos
 from univoxel.data.images import image_size
 from univoxel.data.shots import Shot, read_shots
 from univoxel.data.transforms import lens_of, number, pose_of, short
+from univoxel.errors import DataError
 
 LIGHT = "sunset"  # of the photographs that the data set is trained on, where there are several
 

@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.camera import Cameras
-from univoxel.data.base import DataError
-from univoxel.data.images import SUFFIXES, image_size, replacing
+from univoxel.data.images import SUFFIXES, image_size
 from univoxel.data.lens import Lens
 from univoxel.data.shots import Shot, cameras_of
+from univoxel.errors import DataError
+from univoxel.files import replacing
 
 # How far the axes of a camera may be from orthonormal. Six printed digits give 1e-6; what is off
 # by more than this was scaled or sheared.

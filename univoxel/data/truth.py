@@ -19,12 +19,13 @@ import torch
 from torch import Tensor
 
 from univoxel.color import srgb_to_linear
-from univoxel.data.base import DataError, Photos, Truth
+from univoxel.data.base import Photos, Truth
 from univoxel.data.images import read_image
 from univoxel.data.lens import shrink
 from univoxel.data.shots import read_photo, resampled, size_of
 from univoxel.data.tensoir import is_tensoir, photographed
 from univoxel.data.transforms import find_image
+from univoxel.errors import DataError
 
 WHOLE = 250 / 255  # coverage above which a pixel is well inside the object
 MAP_ENDINGS = (".hdr", ".exr")

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from univoxel.config import LIGHTS, LightName, StageConfig, TrainConfig
-from univoxel.data.images import replacing
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
 from univoxel.experiments.record import Outcome, Setting, result_text
+from univoxel.files import replacing
 
 BETWEEN = (2, 8)  # minutes, where the curve is looked at between the presets
 PRESETS = ("draft", "fast", "full")

@@ -7,10 +7,10 @@ from pathlib import Path
 from statistics import fmean
 
 from univoxel.config import LIGHTS, LightName
-from univoxel.data.images import replacing
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
 from univoxel.experiments.record import Outcome, Setting, result_text
+from univoxel.files import replacing
 
 COLUMNS = (
     plots.NVS,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from univoxel import __version__
-from univoxel.data.images import replacing
+from univoxel.files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from univoxel.config import LightName, TrainConfig, chosen
-from univoxel.data.images import replacing
+from univoxel.files import replacing
 from univoxel.overrides import changed
 
 RESULT = "result.json"

@@ -16,9 +16,9 @@ from pathlib import Path
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from univoxel.data import load_photos
-from univoxel.data.images import replacing
 from univoxel.experiments import worker
 from univoxel.experiments.record import RESULT, Outcome, Setting, identity, load_outcome
+from univoxel.files import replacing
 
 OUTPUT = "output.txt"  # what the process said
 NAME = re.compile(r"[\w.+=-]*\w[\w.+=-]*")

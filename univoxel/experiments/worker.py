@@ -14,9 +14,9 @@ import shutil
 import sys
 from pathlib import Path
 
+from univoxel.checkpoint import load_checkpoint
 from univoxel.config import TrainConfig, check_same
 from univoxel.experiments.record import Outcome, Setting, identity
-from univoxel.scene import load_checkpoint
 from univoxel.tasks.envmap import Comparison, envmap
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from univoxel.fields.hull import GridShape
+from univoxel.grid import GridShape
 from univoxel.records import FieldSample, Rays, Samples
 
 BAND = 4.0  # voxels from the surface beyond which density is nothing: 8 s at a sharpness of 0.5

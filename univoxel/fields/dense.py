@@ -7,7 +7,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from univoxel.fields.base import AbstractField
-from univoxel.fields.hull import GridShape, resample
+from univoxel.grid import GridShape, resample
 from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_dense, smooth_rows_
 from univoxel.records import FieldSample, Rays, Samples
 

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from univoxel.fields.base import BAND, AbstractField
 from univoxel.fields.dense import DenseField
-from univoxel.fields.hull import GridShape, resample
 from univoxel.fields.sparse import SparseField
+from univoxel.grid import GridShape, resample
 from univoxel.ops import encode_hash
 from univoxel.records import FieldSample, Rays, Samples
 

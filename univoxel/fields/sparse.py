@@ -9,7 +9,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from univoxel.fields.base import BAND, AbstractField
-from univoxel.fields.hull import GridShape
+from univoxel.grid import GridShape
 from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_sparse, smooth_rows_
 from univoxel.records import Bricks, FieldSample, Rays, Samples
 

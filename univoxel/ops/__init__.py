@@ -23,12 +23,7 @@ from univoxel.ops.smooth import (
     smooth_rows_reference_,
 )
 from univoxel.ops.sparse_grid import sample_sparse, sample_sparse_reference
-from univoxel.ops.stereo import (
-    match_cost,
-    match_cost_reference,
-    semi_global,
-    semi_global_reference,
-)
+from univoxel.ops.stereo import match_cost, match_cost_reference, semi_global, semi_global_reference
 from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference, occluded_reference
 
 __all__ = [

@@ -19,21 +19,22 @@ from skimage.measure import label
 from torch import Tensor
 
 from univoxel import losses
-from univoxel.camera import Cameras, pixel_rays
+from univoxel.camera import Cameras, looked_at, pixel_rays
 from univoxel.color import linear_to_srgb
 from univoxel.config import StageConfig
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
+from univoxel.errors import NothingFound
 from univoxel.fields.backdrop import Backdrop
 from univoxel.fields.dense import DenseField
-from univoxel.fields.hull import fit_grid, looked_at
+from univoxel.grid import fit_grid
 from univoxel.lights.sg import SGConfig
 from univoxel.metrics import psnr
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import surface_at, surface_of_view
 from univoxel.scene import Scene, SceneConfig
-from univoxel.tasks.descent import (
+from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
     MOMENTS,
@@ -61,15 +62,6 @@ NEAR = 1.5  # voxels from the surface within which the sdf is left as it is
 EMPTY = 0.02, 0.0005
 LEAST = 0.02  # of the largest part's volume: smaller ones are taken for chaff
 MARGIN = 0.05  # of the found box's diagonal, left free around it
-
-
-class NothingFound(ValueError):
-    """There is no surface in the box."""
-
-    def __init__(self):
-        super().__init__(
-            "no object was found where the cameras look: say where it is with --box, or make masks"
-        )
 
 
 def cutout(

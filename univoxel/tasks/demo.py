@@ -7,9 +7,9 @@ import html
 from dataclasses import replace
 from pathlib import Path
 
+from univoxel.checkpoint import FILE
 from univoxel.config import StageConfig, preset
-from univoxel.data.images import replacing
-from univoxel.scene import FILE
+from univoxel.files import replacing
 from univoxel.tasks.evaluate import MEASURES, evaluate
 from univoxel.tasks.export import export
 from univoxel.tasks.relight import relight

@@ -11,12 +11,13 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from univoxel import metrics
+from univoxel.checkpoint import load_scene
 from univoxel.color import linear_to_srgb, luminance
 from univoxel.data.images import write_exr, write_png
+from univoxel.data.maps import true_map
 from univoxel.envmap import EnvMap, lookup
-from univoxel.scene import load_scene
+from univoxel.run import trained_on
 from univoxel.sphere import fibonacci_sphere, latlong_directions, texel_solid_angles
-from univoxel.tasks.frames import read_map, trained_on
 
 GREY = 0.5  # albedo of the ball
 TEXELS = 64  # rows of the map that light is summed over
@@ -136,12 +137,3 @@ def _tiles(map: Tensor, height: int) -> list[Tensor]:
     grey = grey_ball(map, normal.flatten(0, 1)).view(height, height, 3)
     balls = [torch.where(inside[..., None], b, 0.0) for b in (grey, lookup(light, mirrored))]
     return [lookup(light, latlong_directions(height)), *balls]
-
-
-def true_map(data: Path) -> Tensor | None:
-    """The light of the photographs, where the data set has it."""
-    for suffix in (".hdr", ".exr"):
-        path = data / "envmaps" / f"train{suffix}"
-        if path.is_file():
-            return read_map(path).radiance
-    return None

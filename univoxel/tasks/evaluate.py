@@ -16,27 +16,23 @@ from rich.text import Text
 from torch import Tensor
 
 from univoxel import metrics
+from univoxel.checkpoint import FILE, load_checkpoint
 from univoxel.color import linear_to_srgb
-from univoxel.data import (
-    DataError,
-    Photos,
-    Truth,
-    load_points,
-    load_relit,
-    load_truth,
-    relight_maps,
-)
+from univoxel.confidence import Doubts, Survey, numbers, survey, words
+from univoxel.data import Photos, Truth, load_points, load_relit, load_truth, relight_maps
 from univoxel.data.base import decode
-from univoxel.data.images import replacing, write_exr, write_png
+from univoxel.data.images import write_exr, write_png
+from univoxel.data.maps import read_map
 from univoxel.envmap import tables
+from univoxel.errors import DataError
+from univoxel.files import replacing
+from univoxel.pictures.contact_sheet import Panel, contact_sheet, heat, shrink
+from univoxel.pictures.layers import Layers, Relighting, exr_channels, render_layers
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, stage
-from univoxel.scene import FILE, Scene, load_checkpoint
-from univoxel.tasks.contact_sheet import Panel, contact_sheet, heat, shrink
-from univoxel.tasks.frames import photos_of, read_map
-from univoxel.tasks.layers import Layers, Relighting, exr_channels, render_layers
-from univoxel.tasks.trust import Doubts, Survey, numbers, survey, words
+from univoxel.run import photos_of
+from univoxel.scene import Scene
 
 # key: what the table says of it
 MEASURES = {
@@ -102,7 +98,7 @@ def evaluate(
     - relit_psnr: rendered with the albedo times the scale per channel, clipped to 1, on the surface
       and on what it sees of itself; relit_psnr_raw: with the albedo as it is.
     - chamfer: samples of the mesh against points of the true surface.
-    - trust_spearman: of doubt (see `univoxel.tasks.trust`) and error over the pixels of the mask in
+    - trust_spearman: of doubt (see `univoxel.confidence`) and error over the pixels of the mask in
       all views: of the albedo, with a scale per channel, mean absolute difference in sRGB; of the
       roughness, absolute difference.
 

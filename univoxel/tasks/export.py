@@ -9,8 +9,8 @@ from univoxel.assets.gltf import write_glb
 from univoxel.assets.obj import write_obj
 from univoxel.assets.ply import write_ply
 from univoxel.assets.topology import clean, close, simplify
+from univoxel.checkpoint import load_scene
 from univoxel.records import Mesh
-from univoxel.scene import load_scene
 
 SUFFIXES = (".glb", ".obj", ".ply")
 TEXTURED_FACES = 20_000  # of textured meshes: the texture holds what they are too coarse for

@@ -13,10 +13,12 @@ from rich import print
 from rich.table import Table
 from safetensors import safe_open
 
-from univoxel.data.images import replacing, write_png
+from univoxel.checkpoint import FILE, load_checkpoint
+from univoxel.data.images import write_png
+from univoxel.files import replacing
 from univoxel.lights import LocalSG
-from univoxel.scene import FILE, Scene, load_checkpoint
-from univoxel.tasks.contact_sheet import heat
+from univoxel.pictures.contact_sheet import heat
+from univoxel.scene import Scene
 
 # Beginning of a tensor's name in the file: the part it belongs to. The first that fits counts.
 PARTS = {

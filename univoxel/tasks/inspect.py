@@ -11,19 +11,20 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from univoxel.camera import pixel_rays
+from univoxel.checkpoint import load_scene
 from univoxel.color import linear_to_srgb, luminance
 from univoxel.data import Photos
 from univoxel.data.images import write_exr, write_png
+from univoxel.data.maps import true_map
 from univoxel.data.mesh import read_ply
 from univoxel.envmap import EnvMap, lookup
 from univoxel.ops import VisibilityScene
 from univoxel.records import Rays, Surface
 from univoxel.render.occlusion import look, starts
 from univoxel.render.pipeline import surface_at
-from univoxel.scene import Scene, load_scene
+from univoxel.run import photos_of
+from univoxel.scene import Scene
 from univoxel.sphere import latlong_directions, texel_solid_angles
-from univoxel.tasks.envmap import true_map
-from univoxel.tasks.frames import photos_of
 
 MIN_OPACITY = 0.5  # of a pixel that has a surface
 LABEL = 18  # pixels of height

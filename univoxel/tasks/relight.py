@@ -14,23 +14,17 @@ from torch import Tensor
 
 from univoxel import envmap as env
 from univoxel.camera import Cameras
+from univoxel.checkpoint import load_scene
 from univoxel.data.images import write_exr, write_png
+from univoxel.data.maps import read_map
 from univoxel.ops import Lamp, Sun
+from univoxel.pictures.animation import require, write_animation
+from univoxel.pictures.viewpoints import ELEVATION, Frame, frames_of, views_of
 from univoxel.records import Surface
-from univoxel.render.frame import (
-    Background,
-    Picture,
-    Quality,
-    channels,
-    render_picture,
-    rgba,
-    srgb,
-)
+from univoxel.render.frame import Background, Picture, Quality, channels, render_picture, rgba, srgb
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, Stage, stage, turned
-from univoxel.scene import Scene, load_scene
-from univoxel.tasks.animation import require, write_animation
-from univoxel.tasks.frames import ELEVATION, Frame, frames_of, read_map, views_of
+from univoxel.scene import Scene
 
 NO_MAP = "lights"  # name of light without a map
 Ground = float | Literal["lowest"] | None

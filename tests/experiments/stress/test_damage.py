@@ -10,8 +10,9 @@ from scipy import ndimage
 
 from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb
-from univoxel.data import DataError, load_photos, load_truth
+from univoxel.data import load_photos, load_truth
 from univoxel.data.images import read_image, write_exr
+from univoxel.errors import DataError
 from univoxel.experiments.stress import damage as module
 from univoxel.experiments.stress import render, scenes
 from univoxel.experiments.stress.damage import NO_MASK, Damage, damaged

@@ -6,7 +6,7 @@ import pydoc
 import pytest
 
 from univoxel import cli
-from univoxel.data import DataError
+from univoxel.errors import DataError
 from univoxel.experiments import plots
 from univoxel.experiments.record import Outcome
 from univoxel.experiments.stress import report
@@ -57,7 +57,7 @@ def test_a_failure_breaks_and_an_endless_severity_has_no_number():
     [
         (None, ""),
         ("ValueError: expected masks", "refused"),
-        ("univoxel.data.base.DataError: p.png: broken", "refused"),
+        ("univoxel.errors.DataError: p.png: broken", "refused"),
         ("FileNotFoundError: [Errno 2] no file", "refused"),
         ("FloatingPointError: the loss is nan at step 3", "not finite"),
         ("IndexError: index 3 is out of bounds", "crashed"),
@@ -77,7 +77,7 @@ def test_a_number_that_is_none_counts():
 
 def test_refusals_are_what_the_command_line_takes_for_mistakes():
     assert set(report.REFUSALS) == set(cli.MISTAKES)
-    assert pydoc.locate("univoxel.data.base.DataError") is DataError
+    assert pydoc.locate("univoxel.errors.DataError") is DataError
 
 
 def cells(light, *values, axis=AXIS):

@@ -18,8 +18,9 @@ from univoxel.data import Photos, load_photos
 from univoxel.data.images import read_image, write_exr, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
+from univoxel.errors import NothingFound
 from univoxel.experiments.stress.render import SPEC
-from univoxel.tasks.cutout import NothingFound, find_object, mask, surroundings
+from univoxel.tasks.cutout import find_object, mask, surroundings
 
 NO_MASK = math.inf  # as a dilation: masks are found by `cutout`
 

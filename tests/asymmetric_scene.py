@@ -1,0 +1,46 @@
+"""A scene without any symmetry, whose materials are known functions of position."""
+
+import torch
+
+from univoxel.fields.dense import DenseField
+from univoxel.grid import fit_grid
+from univoxel.lights import SGConfig
+from univoxel.scene import Scene, SceneConfig
+
+# Balls of these centres and radii, united.
+BALLS = torch.tensor([[0.0, 0, 0, 0.4], [0.35, 0.1, 0, 0.2], [0, 0.1, 0.4, 0.15]])
+
+
+def sdf(points: torch.Tensor) -> torch.Tensor:
+    distances = (points[..., None, :] - BALLS[:, :3]).norm(dim=-1) - BALLS[:, 3]
+    return distances.amin(-1)
+
+
+def albedo(points: torch.Tensor) -> torch.Tensor:
+    """Linear in the position: trilinear interpolation of it is exact."""
+    return 0.5 + points * torch.tensor([0.6, -0.5, 0.4])
+
+
+def roughness(points: torch.Tensor) -> torch.Tensor:
+    return 0.5 + 0.5 * points[..., 2]
+
+
+class Identity(torch.nn.Module):
+    """The features are the materials; no metal."""
+
+    def forward(self, features):
+        return features[:, :3], features[:, 3], torch.zeros(len(features))
+
+
+def lopsided(voxels: int = 48**3, change=None, light=None) -> Scene:
+    """The scene; `change(points, sdf)` gives another sdf at the grid's nodes."""
+    grid = fit_grid(torch.tensor([-0.5, -0.5, -0.5]), torch.tensor([0.65, 0.5, 0.65]), voxels)
+    nodes = grid.nodes()
+    distance = sdf(nodes) if change is None else change(nodes, sdf(nodes))
+    field = DenseField(grid, 4, distance)
+    with torch.no_grad():
+        field.features.copy_(torch.cat([albedo(nodes), roughness(nodes)[..., None]], -1))
+    cfg = SceneConfig(channels=4, material_channels=2, hidden=8, light=light or SGConfig())
+    scene = Scene(cfg, field, inv_s=100.0)
+    scene.material = Identity()
+    return scene.eval()

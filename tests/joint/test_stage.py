@@ -1,0 +1,622 @@
+"""The stage that solves for one map: its equations against autograd, its answers against truth."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import photos_of, scene_of, sphere_scene, write_scene
+from observed_points import (
+    BLUE,
+    RED,
+    Steps,
+    facing,
+    in_double,
+    lamps,
+    photographed,
+    photographs_under,
+    problem_on_a_sphere,
+    random_problem,
+)
+from torch.nn.functional import normalize
+
+from univoxel import brdf, losses
+from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.joint import equations, newton, stage
+from univoxel.joint.observations import draw, widened
+from univoxel.lights.sg import SGConfig
+from univoxel.ops import shade_map
+from univoxel.optim import RowAdam
+from univoxel.render.pipeline import extract_mesh
+from univoxel.scene import SceneConfig
+from univoxel.sphere import fibonacci_sphere
+from univoxel.tasks import train as train_task
+
+
+@pytest.fixture(params=["dielectric", "metal"])
+def rows_and_map(request):
+    """Rows in double, a map and albedos that do not explain them, some sightings clipped."""
+    problem, metal = random_problem(), request.param == "metal"
+    map, albedo = 0.7 + 2.5 * torch.rand(12, 3), 0.2 + 0.6 * torch.rand(5, 3)
+    problem = photographed(problem, map, *of_metal(metal, albedo, torch.full((5,), 0.3)))
+    problem = replace(problem, metal=torch.full((5,), metal))
+    target = problem.target + 0.03 * torch.randn_like(problem.target)
+    target = target.clamp_max(1.0)  # as photographs are
+    problem = replace(problem, target=target)
+    sighting = torch.arange(20).view(5, 4)
+    rows = newton.light_rows(problem, torch.arange(5), sighting, torch.full((5,), 0.3))
+    rows = in_double(rows)
+    map = map * torch.linspace(1.6, 0.9, 12)[:, None]
+    return rows, map.double(), albedo.log().double()
+
+
+def of_metal(metal: bool, base: torch.Tensor, roughness: torch.Tensor):
+    """Diffuse albedo, roughness and F0."""
+    diffuse, f0 = brdf.split(base, torch.full((len(base),), float(metal)))
+    return diffuse, roughness, f0
+
+
+@pytest.mark.parametrize("metal", [False, True])
+def test_rows_draw_what_the_shading_draws(metal):
+    problem = replace(random_problem(), metal=torch.full((5,), metal))
+    map, albedo, roughness = torch.rand(12, 3), torch.rand(5, 3), 0.2 + 0.6 * torch.rand(5)
+    problem = photographed(problem, map, *of_metal(metal, albedo, roughness))
+    which = torch.tensor([[3, 1], [9, 8], [18, 18]])
+    rows = newton.light_rows(problem, torch.tensor([0, 2, 4]), which, roughness[[0, 2, 4]])
+    drawn = drawn_by(rows, map, albedo[[0, 2, 4]])
+    assert torch.allclose(drawn, problem.seen.color[which], rtol=1e-4, atol=1e-6)
+    assert torch.equal(rows.target, problem.target[which])
+
+
+def drawn_by(rows: equations.Rows, map: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
+    sky = rows.through[..., None] * (rows.diffuse @ map)
+    return albedo[:, None] * (sky + rows.diffuse_blocked) + rows.shine @ map + rows.shine_blocked
+
+
+def weights(rows: equations.Rows, map: torch.Tensor, log_albedo: torch.Tensor) -> torch.Tensor:
+    residual = rows.target - losses.encode(drawn_by(rows, map, log_albedo.exp()))
+    weight = 1 / (1 + (residual / equations.CAUCHY) ** 2)
+    return torch.where((rows.target > equations.CLIPPED) & (residual < 0), 0.0, weight)
+
+
+def test_equations_are_the_schur_complement_of_the_dense_system(rows_and_map):
+    rows, map, log_albedo = rows_and_map
+    weight = weights(rows, map, log_albedo)
+    assert 0 < int((weight == 0).sum()) < weight.numel() / 2  # clipped sightings are among them
+    eliminated, right, tie = equations.normal_equations(rows, map, log_albedo)
+    cost = 0.0
+    for c in range(3):
+
+        def encoded(x, a, c=c):
+            light, albedo = map.clone(), log_albedo.exp()
+            light[:, c], albedo[:, c] = x.exp(), a.exp()
+            return losses.encode(drawn_by(rows, light, albedo))[..., c].flatten()
+
+        x, a = map[:, c].log(), log_albedo[:, c]
+        j_map, j_albedo = torch.autograd.functional.jacobian(encoded, (x, a))
+        w = weight[..., c].flatten()
+        residual = rows.target[..., c].flatten() - encoded(x, a)
+        cost += (w * residual**2).sum()
+        full = torch.cat([j_map, j_albedo], 1)
+        hessian, gradient = full.T @ (w[:, None] * full), full.T @ (w * residual)
+        own = hessian[12:, 12:] + 1e-6 * torch.eye(5)
+        cross, inverse = hessian[:12, 12:], torch.linalg.inv(own)
+        exact = {"rtol": 1e-6, "atol": 1e-9}  # double, but for float32 constants of the curve
+        assert torch.allclose(eliminated[c], hessian[:12, :12] - cross @ inverse @ cross.T, **exact)
+        assert torch.allclose(right[c], gradient[:12] - cross @ inverse @ gradient[12:], **exact)
+        assert torch.allclose(tie.own[c], gradient[12:], **exact)
+        assert torch.allclose(tie.norm[c], own.diagonal(), **exact)
+        assert torch.allclose(tie.cross[c], cross.T, **exact)
+
+        # One step of the eliminated system and what it says of the albedo: the dense solution
+        damping = 1e-4 * torch.eye(12)
+        dense = hessian.clone()
+        dense[12:, 12:], dense[:12, :12] = own, hessian[:12, :12] + damping
+        solution = torch.linalg.solve(dense, gradient)
+        step = torch.linalg.solve(eliminated[c] + damping, right[c])
+        change = (tie.own[c] - tie.cross[c] @ step) / tie.norm[c]
+        assert torch.allclose(step, solution[:12], rtol=1e-4, atol=1e-7)
+        assert torch.allclose(change, solution[12:], rtol=1e-4, atol=1e-7)
+    assert tie.cost == pytest.approx(float(cost), rel=1e-9)
+
+
+def test_the_gradient_is_that_of_the_cost_at_fixed_weights(rows_and_map):
+    rows, map, log_albedo = rows_and_map
+    weight = weights(rows, map, log_albedo)
+
+    def cost(log_map, log_albedo):
+        residual = rows.target - losses.encode(drawn_by(rows, log_map.exp(), log_albedo.exp()))
+        return (weight * residual**2).sum()
+
+    x, a = map.log(), log_albedo
+    _, right, tie = equations.normal_equations(rows, map, log_albedo)
+    h = 1e-5
+    for node, c in ((0, 0), (5, 1), (11, 2)):
+        step = torch.zeros_like(x)
+        step[node, c] = h
+        slope = (cost(x + step, a) - cost(x - step, a)) / (2 * h)
+        # The elimination's share of the gradient put back
+        g = right[c] + tie.cross[c].T @ (tie.own[c] / tie.norm[c])
+        assert g[node].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
+    step = torch.zeros_like(a)
+    step[3, 1] = h
+    slope = (cost(x, a + step) - cost(x, a - step)) / (2 * h)
+    assert tie.own[1, 3].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
+
+
+def test_free_roughness_is_the_schur_complement_too():
+    """Of the dense system of three channels, which roughness ties to one another; in double."""
+    problem = random_problem()
+    true, albedo = 0.7 + 2.5 * torch.rand(12, 3), 0.2 + 0.6 * torch.rand(5, 3)
+    problem = photographed(problem, true, albedo, torch.full((5,), 0.5))
+    point, sighting, by = torch.arange(5), torch.arange(20).view(5, 4), 0.02
+    rows, more = (
+        in_double(newton.light_rows(problem, point, sighting, torch.full((5,), r)))
+        for r in (0.3, 0.3 + by)
+    )
+    map, log_albedo = (true * 1.2).double(), (0.9 * albedo).log().double()
+    pull, away = 0.3, torch.linspace(-0.1, 0.2, 5).double()
+
+    def encoded(x, a, rough):  # linear in roughness, as the equations take it
+        now, then = (drawn_by(r, x.view(12, 3).exp(), a.view(5, 3).exp()) for r in (rows, more))
+        return losses.encode(now + rough[:, None, None] / by * (then - now)).flatten()
+
+    state = map.log().flatten(), log_albedo.flatten(), torch.zeros(5).double()
+    jacobian = torch.cat(torch.autograd.functional.jacobian(encoded, state), 1)
+    w = weights(rows, map, log_albedo).flatten()
+    residual = rows.target.flatten() - encoded(*state)
+    hessian, gradient = jacobian.T @ (w[:, None] * jacobian), jacobian.T @ (w * residual)
+    hessian[36:51, 36:51] += 1e-6 * torch.eye(15)
+    hessian[51:, 51:] += pull * torch.eye(5)
+    gradient[51:] -= pull * away
+
+    rougher = equations.Rougher(more, by, pull, away)
+    own, right, tie = equations.normal_equations(rows, map, log_albedo, None, rougher)
+    taken, less = equations.free_roughness(tie.roughness)
+    system, right = torch.block_diag(*own) - taken, (right - less).flatten()
+    order = torch.arange(36).view(12, 3).T.flatten()  # channel after channel
+    cross, inverse = hessian[:36, 36:], torch.linalg.inv(hessian[36:, 36:])
+    exact = {"rtol": 1e-5, "atol": 1e-8}  # double, but for float32 constants of the curve
+    complement = (hessian[:36, :36] - cross @ inverse @ cross.T)[order][:, order]
+    assert torch.allclose(system, complement, **exact)
+    assert torch.allclose(right, (gradient[:36] - cross @ inverse @ gradient[36:])[order], **exact)
+    assert (own[0] - system[:12, :12]).abs().max() > 1e-3 * own[0].abs().max()  # it matters
+
+    hessian[:36, :36] += 1e-4 * torch.eye(36)
+    solution = torch.linalg.solve(hessian, gradient)
+    step = torch.linalg.solve(system + 1e-4 * torch.eye(36), right)
+    to_albedo, to_rough = tie.follow(step.view(3, 12))
+    found = {"rtol": 1e-4, "atol": 1e-7}
+    assert torch.allclose(step, solution[:36][order], **found)
+    assert torch.allclose(to_albedo.flatten(), solution[36:51], **found)
+    assert torch.allclose(to_rough, solution[51:], **found)
+
+
+@pytest.mark.parametrize(("count", "size"), [(30, 12), (3, 10), (5, 1), (0, 4)])
+def test_gram_is_the_product_with_the_transpose(count, size):
+    rows = torch.randn(count, size, dtype=torch.float64)
+    torch.testing.assert_close(equations.gram(rows), rows.T @ rows)
+
+
+def test_slope_is_the_derivative_of_the_curve():
+    x = torch.tensor([0.0, 0.001, 0.00313, 0.0032, 0.1, 0.9, 3.0], dtype=torch.float64)
+    x.requires_grad_()
+    (slope,) = torch.autograd.grad(losses.encode(x[1:]).sum(), x)
+    assert torch.allclose(equations.encoded_slope(x.detach())[1:], slope[1:], rtol=1e-6)
+    assert equations.encoded_slope(x.detach())[0] == 12.92
+
+
+def test_widened_lobes_cover_the_gap_between_nodes():
+    roughness = torch.tensor([0.05, 0.3, 1.0])
+    wide = widened(roughness, 64)
+    assert torch.allclose(wide**4 - roughness**4, torch.full((3,), 1 / 64), rtol=1e-4)
+    # The mean over a gap of what point lights of 64 nodes make of a mirror: near the right one
+    direction, normal = fibonacci_sphere(64), normalize(torch.randn(500, 3), dim=1)
+    wo = facing(normal, 0.5)
+    albedo, one = torch.zeros(500, 3), torch.ones(64, 3)
+    seen = shade_map(
+        one, torch.ones(500, 64), torch.zeros(500, 64, 3), torch.arange(500), normal, wo, albedo,
+        wide[:1].expand(500), direction, 4 * math.pi / 64,
+    )[:, 0]  # fmt: skip
+    assert seen.std() < 0.5 * seen.mean()
+
+
+def test_laplacian():
+    direction = fibonacci_sphere(200)
+    matrix = equations.graph_laplacian(direction)
+    assert (matrix.sum(1) == 0).all()
+    assert torch.equal(matrix, matrix.T)
+    assert (matrix.diagonal() >= 6).all()
+    near = (direction[0] @ direction.T).topk(7).indices[1:]
+    assert (matrix[0, near] == -1).all()
+    assert (matrix - torch.diag(matrix.diagonal()) <= 0).all()
+    # A smooth function costs little, an uneven one much: x' L x sums squared differences
+    smooth, rough = direction[:, 2], torch.arange(200) % 2 * 2.0 - 1
+    edges = 0.5 * (matrix.diagonal().sum())
+    assert smooth @ matrix @ smooth < 0.1 * edges
+    assert rough @ matrix @ rough > edges
+
+
+def test_draw_takes_points_that_are_seen_and_their_own_sightings():
+    torch.manual_seed(0)
+    problem = problem_on_a_sphere(6, 1, 8)
+    counts = torch.tensor([3, 0, 1, 0, 0, 5])
+    offsets = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
+    problem = replace(problem, seen=replace(problem.seen, offsets=offsets))
+    point, sighting = draw(problem, 300, 4)
+    assert point.shape == sighting.shape == (1200,)
+    assert (point.view(300, 4) == point.view(300, 4)[:, :1]).all()
+    owner = torch.repeat_interleave(counts)
+    assert torch.equal(owner[sighting], point)
+    assert set(sighting.tolist()) == set(range(9))  # each is drawn at times
+
+
+CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
+
+
+def test_newton_recovers_a_known_map():
+    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
+    scene = scene_of(albedo, roughness, nodes)
+    problem = problem_on_a_sphere(400, 12, nodes)
+    torch.manual_seed(2)
+    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
+    shown = widened(torch.full((400,), roughness), nodes)  # a node is a patch of sky
+    problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
+    costs = newton.newton_round(scene, problem, CFG)
+    costs += newton.newton_round(scene, problem, CFG)
+    assert len(costs) == 2 * CFG.newton_steps
+    error = scene.sky.log_radiance.detach() - true.log()
+    assert costs[-1] < 1e-3 * costs[0]
+    # What is left is the smoothness, which this uneven map has none of
+    assert error.abs().mean() < 0.25 * true.log().abs().mean()
+
+
+def test_newton_finds_the_map_under_a_roughness_that_is_wrong():
+    """Where roughness may change, the map is right; where it stays, the map takes the error on."""
+    errors = []
+    for free in (0.0, CFG.newton_roughness):
+        nodes, albedo = 64, torch.tensor([0.5, 0.4, 0.3])
+        scene, problem = (
+            scene_of(tuple(albedo.tolist()), 0.45, nodes),
+            problem_on_a_sphere(400, 12, nodes),
+        )
+        shown = widened(torch.full((400,), 0.3), nodes)
+        problem = photographed(problem, lamps(nodes), albedo.expand(400, 3), shown)
+        for _ in range(2):
+            newton.newton_round(scene, problem, replace(CFG, newton_roughness=free))
+        errors.append((scene.sky.log_radiance.detach() - lamps(nodes).log()).abs().mean())
+    assert errors[1] < 0.5 * errors[0]  # not all: roughness has a pull to where it was
+
+
+@pytest.mark.parametrize("views", [2, 3])
+def test_newton_learns_from_few_photographs(views):
+    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
+    scene, problem = scene_of(albedo, roughness, nodes), problem_on_a_sphere(400, views, nodes)
+    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
+    shown = widened(torch.full((400,), roughness), nodes)
+    problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
+    costs = newton.newton_round(scene, problem, CFG)
+    assert len(costs) == CFG.newton_steps
+    assert costs[-1] < 0.1 * costs[0]
+
+
+def test_newton_in_no_time_takes_few_points(monkeypatch):
+    scene, counts = scene_of((0.5, 0.4, 0.3), 0.4, 32), []
+    problem = problem_on_a_sphere(100, 12, 32)
+    equations = newton.normal_equations
+
+    def counted(rows, *arguments):
+        counts.append(len(rows.diffuse))
+        return equations(rows, *arguments)
+
+    monkeypatch.setattr(newton, "normal_equations", counted)
+    monkeypatch.setattr(newton, "NEWTON_CHUNK", 20)
+    cfg = replace(CFG, newton_steps=2)
+    newton.newton_round(scene, problem, cfg, seconds=0.0)
+    assert counts == [20] * (1 + cfg.newton_steps * newton.LEAST_CHUNKS)  # one to measure
+    counts.clear()
+    newton.newton_round(scene, problem, cfg, seconds=1e3)
+    assert counts == [20] * (1 + cfg.newton_steps * 5)
+
+
+def test_a_run_that_was_cut_traces_fewer_points(monkeypatch):
+    asked = []
+    monkeypatch.setattr(stage, "pose", lambda scene, photos, cfg, seed: asked.append(cfg.points))
+    for pace in (1.0, 0.5, 0.0):
+        steps = Steps(0)
+        steps.pace = pace
+        stage.solve(sphere_scene(8), photos_of(1, 8), JointConfig(points=10000), 0, steps)
+    assert asked == [10000, 5000, stage.LEAST_POINTS]
+
+
+def test_no_steps_of_newton_leave_the_map():
+    scene, problem = scene_of((0.5, 0.5, 0.5), 0.4, 32), problem_on_a_sphere(20, 8, 32)
+    assert newton.newton_round(scene, problem, replace(CFG, newton_steps=0), seconds=10.0) == []
+    assert (scene.sky.log_radiance == 0).all()
+
+
+def test_newton_without_rich_points_leaves_the_map():
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
+    problem = problem_on_a_sphere(20, 1, 32)  # of one sighting the albedo explains everything
+    assert newton.newton_round(scene, problem, CFG) == []
+    assert (scene.sky.log_radiance == 0).all()
+
+
+def test_parts_are_of_one_material(monkeypatch):
+    monkeypatch.setattr(newton, "NEWTON_CHUNK", 4)
+    point, metal = torch.randperm(30)[:22], torch.arange(30) % 3 == 0
+    order, parts = newton.in_parts(point, metal)
+    assert sorted(order.tolist()) == sorted(point.tolist())
+    assert torch.equal(torch.cat(parts), torch.arange(22))
+    for part in parts:
+        assert 1 <= len(part) <= 4
+        assert len(metal[order[part]].unique()) == 1
+
+
+def test_metals_show_the_map():
+    """Half of a sphere in copper: light is found, whose colour is not that of the metal."""
+    nodes, count = 64, 600
+    base, roughness = torch.tensor([0.9, 0.6, 0.4]), 0.3
+    scene = scene_of(tuple(base.tolist()), roughness, nodes)
+    problem = problem_on_a_sphere(count, 12, nodes)
+    metal = problem.seen.normal[:, 0] > 0
+    torch.manual_seed(2)
+    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
+    shown = widened(torch.full((count,), roughness), nodes)
+    diffuse, f0 = brdf.split(base.expand(count, 3), metal.float())
+    problem = replace(photographed(problem, true, diffuse, shown, f0), metal=metal)
+    costs = newton.newton_round(scene, problem, CFG) + newton.newton_round(scene, problem, CFG)
+    assert costs[-1] < 1e-3 * costs[0]
+    error = scene.sky.log_radiance.detach() - true.log()
+    # What is left is the smoothness, as above
+    assert error.abs().mean() < 0.25 * true.log().abs().mean()
+
+
+@pytest.mark.parametrize("metal", [False, True])
+def test_only_what_is_taken_for_metal_can_be_metal(metal):
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
+    problem = problem_on_a_sphere(20, 8, 32)
+    problem = replace(problem, metal=torch.full((20,), metal))
+    with torch.no_grad():
+        scene.material.net[-1].bias[4] = 0.0
+    stage.objective(scene, problem, CFG)["joint"].backward()
+    slope = scene.material.net[-1].bias.grad
+    assert slope[:4].abs().min() > 0
+    assert (slope[4] != 0) == metal
+
+
+def test_metal_is_learned_where_it_is():
+    """Under a known map with lamps: copper on one side of the sphere, a dielectric on the other."""
+    torch.manual_seed(3)
+    nodes, count = 64, 600
+    problem = problem_on_a_sphere(count, 12, nodes)
+    map = 0.3 + 4 * (torch.rand(nodes, 3) < 0.1)
+    copper = problem.seen.normal[:, 0] > 0
+    base = torch.where(
+        copper[:, None], torch.tensor([0.95, 0.6, 0.4]), torch.tensor([0.4, 0.5, 0.6])
+    )
+    shown = widened(torch.full((count,), 0.3), nodes)
+    albedo, f0 = brdf.split(base, copper.float())
+    problem = replace(photographed(problem, map, albedo, shown, f0), metal=copper)
+    scene = sphere_scene(nodes)
+    with torch.no_grad():
+        scene.sky.log_radiance.copy_(map.log())
+    optimizer = RowAdam(
+        [{"params": [scene.field.features], "lr": 0.03}, {"params": scene.material.parameters()}],
+        lr=3e-3,
+    )
+    for _ in range(400):
+        optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(stage.objective(scene, problem, CFG).values())).sum().backward()
+        optimizer.step()
+    features = scene.field.sample(problem.seen.position).features
+    found, _, metallic = (m.detach() for m in scene.material(features))
+    inside = problem.seen.normal[:, 0].abs() > 0.2
+    assert metallic[inside & copper].mean() > 0.9
+    assert metallic[inside & ~copper].mean() < 0.05
+    assert (found - base)[inside].abs().mean() < 0.05
+
+
+def test_solve_recovers_albedo_and_map():
+    nodes, roughness = 128, 0.29
+    true = lamps(nodes)
+    photos = photographs_under(true, roughness)
+    scene = sphere_scene(nodes)
+    before = {k: v.clone() for k, v in scene.state_dict().items()}
+    cfg = JointConfig(points=1500, newton_points=1000, rays=1024, tracing=1, rounds=3, lr_sdf=0.0)
+    stage.solve(scene, photos, cfg, 0, Steps(700))
+    after = scene.state_dict()
+    changed = {k.split(".")[0] for k in after if not torch.equal(after[k], before[k])}
+    assert changed == {"field", "material", "sky"}
+    assert torch.equal(after["field.sdf"], before["field.sdf"])  # no rate, no step
+
+    mesh = extract_mesh(scene)
+    x = mesh.vertices[:, 0]
+    ratio = torch.stack([mesh.albedo[x > 0.1].mean(0) / RED, mesh.albedo[x < -0.1].mean(0) / BLUE])
+    # Only the highlights tell how bright light and albedo are apart, and roughness blurs them:
+    # one factor, the inverse of the light's, is far less certain than all the rest
+    scale = ratio.mean()
+    assert 0.65 < scale < 1.4
+    assert (ratio / scale - 1).abs().max() < 0.08
+    assert mesh.albedo[x > 0.1].std(0).max() < 0.05
+    error = (scene.sky.radiance.detach() * scale / true).log()
+    assert error.mean().abs() < 0.1
+    assert error.std() < 0.3  # of a map whose logarithm varies by 0.7
+    assert true.log().std() > 0.6
+
+
+def test_bumps_that_shading_contradicts_are_smoothed():
+    """The sphere with dents of half a voxel, 7 degrees of its normals, photographed without."""
+    photos, scene = photographs_under(lamps(128), 0.29), sphere_scene(128)
+    place = torch.arange(scene.field.grid.size[0]) / 1.5
+    bump = place.sin()[:, None, None] * place.sin()[:, None] * place.cos()
+    with torch.no_grad():
+        scene.field.sdf += 0.5 * scene.field.voxel_size * bump
+    at = 0.5 * normalize(torch.randn(2000, 3), dim=1)
+
+    def off() -> float:
+        normal = normalize(scene.field.sample(at).gradient.detach(), dim=1)
+        return float(torch.rad2deg((normal * at * 2).sum(1).clamp(-1, 1).acos()).mean())
+
+    before = off()
+    occluder = scene.occluder()
+    cfg = JointConfig(points=1500, newton_points=500, rays=1024, tracing=1, rounds=2)
+    stage.solve(scene, photos, cfg, 0, Steps(300))
+    assert off() < 0.75 * before  # some is left: pixels are three quarters of a voxel wide
+    moved = scene.field.sample(at).sdf.abs().mean()
+    assert moved < 0.3 * scene.field.voxel_size  # it turns, and stays where it is
+    assert scene.occluder() is not occluder  # what is derived from the surface is made anew
+
+
+def test_no_time_is_no_tracing():
+    steps = Steps(10)
+    steps.over, steps.skip = True, lambda: steps.asked.append("skip")
+    stage.solve(sphere_scene(8), photos_of(1, 8), JointConfig(), 0, steps)
+    assert steps.asked == ["skip"]
+
+
+@pytest.mark.parametrize(
+    ("rooms", "newton", "asked"),
+    [((), [0, 0.25, 0.5, 0.75], [3, 2, 1, 0]), ((1, 0), [0, 0.5], [3, 0]), ((0,), [0], [3])],
+)
+def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, asked):
+    """With less room than rounds there are fewer rounds, each of them longer."""
+    steps, when, rates, made = Steps(400, rooms), [], [], []
+
+    class Optimizer(RowAdam):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            rates.append([])
+
+        def step(self):
+            rates[-1].append(self.param_groups[0]["lr"])
+            made.append(None)
+
+    def objective(scene, *_):
+        return {"joint": scene.sky.log_radiance.square().sum()}
+
+    monkeypatch.setattr(stage, "pose", lambda *_: random_problem())
+    monkeypatch.setattr(stage, "objective", objective)
+    monkeypatch.setattr(stage, "RowAdam", Optimizer)
+    monkeypatch.setattr(stage, "find_metal", lambda *_: torch.zeros(5, dtype=torch.bool))
+    monkeypatch.setattr(stage, "supposed", lambda scene, problem, *_: problem)
+    monkeypatch.setattr(stage, "newton_round", lambda *_: when.append(len(made) / steps.count))
+    cfg = JointConfig(rounds=4, lr_sdf=0.0)  # the objective above says nothing of the surface
+    stage.solve(sphere_scene(8), photos_of(1, 8), cfg, 0, steps)
+    assert when == newton
+    assert steps.asked == asked
+    for rate in rates:  # every round runs through the whole of its schedule
+        assert rate[0] == cfg.lr_features
+        assert rate[-1] == pytest.approx(0.1 * cfg.lr_features, rel=0.03)  # of 100 steps, the last
+
+
+@pytest.mark.parametrize("changed", [True, False])
+def test_paint_is_asked_before_and_after_newton(monkeypatch, changed):
+    """Newton starts from the albedos under a map that the materials do not follow yet."""
+    told, begun = [], []
+
+    def newton_round(scene, problem, *_):
+        told.append("newton")
+        begun.append(problem.albedo)
+        return []
+
+    def balance(scene, problem):
+        told.append("balance")
+        return changed
+
+    monkeypatch.setattr(stage, "pose", lambda *_: random_problem())
+    monkeypatch.setattr(stage, "find_metal", lambda *_: torch.zeros(5, dtype=torch.bool))
+    monkeypatch.setattr(stage, "supposed", lambda scene, problem, *_: problem)
+    monkeypatch.setattr(stage, "sunlit", lambda scene, problem, _: problem)
+    monkeypatch.setattr(stage, "matte_albedo", lambda *_: torch.full((5, 3), 0.3))
+    monkeypatch.setattr(stage, "follow", lambda *_: told.append("follow"))
+    monkeypatch.setattr(stage, "balance", balance)
+    monkeypatch.setattr(stage, "newton_round", newton_round)
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+    stage.solve(scene, photos_of(1, 8), replace(CFG, rounds=2), 0, Steps(4))
+    first = ["balance", "newton", "balance", *["follow"] * changed]
+    assert told == [*first, "newton", "balance"]
+    assert [albedo is not None for albedo in begun] == [changed, False]
+    told.clear()
+    stage.solve(scene, photos_of(1, 8), replace(CFG, rounds=2, colors=False), 0, Steps(4))
+    assert told == ["newton", "newton"]
+
+
+def test_materials_follow_a_map_that_was_changed(monkeypatch):
+    """Albedo goes to what the photographs say; the rest, metals, and what none sees stay."""
+    torch.manual_seed(0)
+    scene, problem = sphere_scene(12), problem_on_a_sphere(600, 4, 12)
+    wanted = torch.where(problem.seen.normal[:, :1] > 0, RED, BLUE)
+    told = wanted.clone()
+    told[:20] = torch.nan
+    metal = problem.seen.normal[:, 2] > 0.5
+    told[metal] = 1.0
+    monkeypatch.setattr(stage, "matte_albedo", lambda *_: told)
+    features = scene.field.features_at(problem.seen.position)
+    before = [m.detach() for m in scene.material(features)]
+    cfg = replace(CFG, rays=512, lr_features=0.2, lr_networks=0.03)  # from features that are 0
+    stage.follow(scene, replace(problem, metal=metal), cfg)
+    after = scene.material(scene.field.features_at(problem.seen.position))
+    # Between red, blue and metal features are mixed
+    matte = (problem.seen.normal[:, 0].abs() > 0.3) & (problem.seen.normal[:, 2] < 0.2)
+    held = problem.seen.normal[:, 2] > 0.8
+    off = (before[0] - wanted).abs().mean(1)
+    error = (after[0].detach() - wanted).abs().mean(1)
+    assert error[matte].mean() < 0.2 * off[matte].mean()
+    assert (after[0] - before[0]).abs()[held].mean() < 0.2 * off[held].mean()
+    for now, was in zip(after[1:], before[1:], strict=True):
+        assert (now - was).abs().mean() < 0.02
+
+
+def test_without_paint_materials_stay(monkeypatch):
+    scene, problem = scene_of((0.5, 0.5, 0.5), 0.4, 12), problem_on_a_sphere(50, 4, 12)
+    before = {k: v.clone() for k, v in scene.state_dict().items()}
+    stage.follow(scene, replace(problem, metal=~problem.metal), CFG)
+    after = scene.state_dict()
+    assert all(torch.equal(after[k], before[k]) for k in after)
+
+
+def test_newton_starts_from_the_albedo_that_it_is_given():
+    scene, problem = scene_of((0.5, 0.5, 0.5), 0.4, 12), random_problem(50)
+    cfg = replace(CFG, newton_points=20, newton_views=2)
+    albedo = torch.rand(50, 3)
+    points = newton.choose(scene, replace(problem, albedo=albedo), cfg)
+    torch.testing.assert_close(points.log_albedo, albedo[points.point].clamp_min(1e-3).log())
+    torch.testing.assert_close(
+        newton.choose(scene, problem, cfg).log_albedo, torch.full((20, 3), 0.5).log()
+    )
+
+
+def test_a_refit_leaves_materials_bit_for_bit(tmp_path, monkeypatch):
+    data = write_scene(tmp_path / "data", views=8, size=24)
+    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
+    stage = StageConfig(voxels=0.01, iterations=30, share=0.4, rays=256, physical_from=0.5)
+    stages = (
+        stage,
+        JointConfig(iterations=20, points=300, newton_points=100, rays=256, tracing=1),
+        replace(stage, iterations=10, refit=True, physical_from=0.0),
+    )
+    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, sky_nodes=32, light=light)
+    run_stage, states = train_task.run_stage, []
+
+    def watched(scene, *rest):
+        states.append({k: v.clone() for k, v in scene.state_dict().items()})
+        run_stage(scene, *rest)
+        states.append({k: v.clone() for k, v in scene.state_dict().items()})
+
+    monkeypatch.setattr(train_task, "run_stage", watched)
+    train_task.train(TrainConfig(data, tmp_path / "run", stages, minutes=2.0, scene=sizes))
+    start, formed, before, after = states
+    kept = {k for k in after if torch.equal(before[k], after[k])}
+    assert "sky.log_radiance" in kept
+    assert "field.sdf" not in kept  # silhouettes are put right
+    assert {k for k in after if k.startswith("material.")} <= kept
+    assert not {k for k in after if k.startswith(("light.", "radiance.")) and "weight" in k} & kept
+    features = before["field.features"], after["field.features"]
+    assert torch.equal(features[0][..., :2], features[1][..., :2])
+    assert not torch.equal(features[0][..., 2:], features[1][..., 2:])
+    # The stages before are what these could have stood still through
+    assert not torch.equal(start["field.sdf"], formed["field.sdf"])
+    assert not torch.equal(formed["field.sdf"], before["field.sdf"])
+    assert not torch.equal(formed["field.features"], before["field.features"])
+    assert not torch.equal(formed["sky.log_radiance"], before["sky.log_radiance"])

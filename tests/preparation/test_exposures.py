@@ -1,0 +1,132 @@
+"""Photographs that were exposed differently are told by the colours of the same points."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import photos_of
+
+from univoxel.color import linear_to_srgb
+from univoxel.grid import fit_grid
+from univoxel.preparation import exposures as task
+from univoxel.preparation.exposures import exposures, log_gains
+from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
+from univoxel.scene import Varying
+
+VIEWS = 16
+
+
+@pytest.fixture(scope="module")
+def photos():
+    """A ball, red on one side and blue on the other, no pixel of it clipped."""
+    photos = photos_of(VIEWS, 32)
+    return replace(photos, color=photos.color / 4)
+
+
+@pytest.fixture(scope="module")
+def hull(photos):
+    distance = mask_distances(photos.coverage())
+    grid = fit_grid(*estimate_bounds(distance, photos.cameras), 20000)
+    return visual_hull(distance, photos.cameras, grid), grid
+
+
+def stops(most: float) -> torch.Tensor:
+    """One for each view, from -most to most, of mean 0, in no order that neighbours share."""
+    return torch.linspace(-most, most, VIEWS)[torch.arange(VIEWS) * 7 % VIEWS]
+
+
+def exposed(photos, gains: torch.Tensor):
+    return replace(photos, color=photos.color * 2 ** gains[:, None, None, None])
+
+
+def rms(values: torch.Tensor) -> float:
+    return float(values.square().mean().sqrt())
+
+
+@pytest.mark.parametrize("most", [0.0, 0.5, 2.0])
+def test_gains_are_found(photos, hull, most):
+    found = log_gains(exposed(photos, stops(most)), *hull) / math.log(2)
+    assert float(found.sum()) == pytest.approx(0, abs=1e-4)
+    # The hull of 16 views is larger than the ball: what is seen of a point is a little beside it
+    assert rms(found - stops(most)) < 0.05
+
+
+def test_what_is_no_surface_colour_counts_little(photos, hull):
+    """Highlights, and clipped and black pixels, on a fifth of the photographs' pixels."""
+    generator = torch.Generator().manual_seed(0)
+    color = exposed(photos, stops(1.0)).color.clone()
+    where = torch.rand(color.shape[:3], generator=generator)
+    color[where < 0.05] = 1.0
+    color[(where > 0.05) & (where < 0.1)] = 0.0
+    color[(where > 0.1) & (where < 0.2)] *= 3.0
+    found = log_gains(replace(photos, color=color), *hull) / math.log(2)
+    assert rms(found - stops(1.0)) < 0.1
+
+
+def test_eight_bits_will_do(photos, hull):
+    color = (255 * linear_to_srgb(exposed(photos, stops(1.0)).color)).round().to(torch.uint8)
+    found = log_gains(replace(photos, color=color), *hull) / math.log(2)
+    assert rms(found - stops(1.0)) < 0.1
+
+
+def test_clipped_pixels_tell_no_gain(photos, hull):
+    """They would make the brightest photographs, seem darker: 0.06 stops in all."""
+    color = (5 * exposed(photos, stops(1.0)).color).clamp(max=1)
+    shown = photos.alpha > 0.99
+    assert ((color == 1).any(-1) & shown).sum() > 0.1 * shown.sum()
+    found = log_gains(replace(photos, color=color), *hull) / math.log(2)
+    assert rms(found - stops(1.0)) < 0.04  # as if nothing were clipped 0.02
+
+
+def test_photographs_that_share_few_points():
+    """Five around a ball: each point is seen in one or two."""
+    photos = photos_of(5, 32)
+    distance = mask_distances(photos.coverage())
+    grid = fit_grid(*estimate_bounds(distance, photos.cameras), 20000)
+    wanted = torch.tensor([1.0, -0.5, 0.8, -1.2, -0.1])
+    color = photos.color / 4 * 2 ** wanted[:, None, None, None]
+    hull = visual_hull(distance, photos.cameras, grid)
+    found = log_gains(replace(photos, color=color), hull, grid) / math.log(2)
+    assert rms(found - wanted) < 0.03  # 0.008 here
+
+
+def test_no_surface_says_nothing(photos, hull):
+    sdf, grid = hull
+    assert not log_gains(photos, sdf.abs() + 1, grid).any()
+
+
+def test_a_black_photograph_says_nothing(photos, hull):
+    dark = photos.color.clone()
+    dark[3] = 0
+    found = log_gains(replace(photos, color=dark), *hull)
+    assert found.isfinite().all()
+    assert rms(found) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("most", "varying", "look", "wanted", "told"),
+    [
+        (1.0, "none", True, "exposure", True),
+        (1.0, "none", False, "none", False),
+        (0.25, "none", True, "none", False),
+        (1.0, "exposure", True, "exposure", True),
+        (0.0, "exposure", False, "exposure", True),
+        (1.0, "light", True, "light", True),
+    ],
+)
+def test_what_differs(
+    photos, hull, capsys, most: float, varying: Varying, look: bool, wanted: Varying, told: bool
+):
+    found, gains = exposures(exposed(photos, stops(most)), *hull, varying, look)
+    assert found == wanted
+    assert (gains is not None) == told
+    if gains is not None:
+        assert rms(gains / math.log(2) - stops(most)) < 0.05
+    said = capsys.readouterr().out
+    assert ("exposures differ by 0.6" in said) == (varying != wanted)  # of +-1 stop, evenly spread
+
+
+def test_nothing_is_looked_for_that_was_not_asked_for(photos, hull, monkeypatch):
+    monkeypatch.setattr(task, "log_gains", None)
+    assert exposures(photos, *hull, "none", look=False) == ("none", None)

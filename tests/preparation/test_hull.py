@@ -1,0 +1,93 @@
+"""Bounds and visual hull from silhouettes of a sphere."""
+
+import pytest
+import torch
+from analytic import RADIUS, cameras_around, sphere_normals
+
+from univoxel.camera import Cameras
+from univoxel.grid import GridShape, fit_grid, resample
+from univoxel.preparation.hull import estimate_bounds, hull_sdf, mask_distances, visual_hull
+
+
+@pytest.fixture(scope="module")
+def silhouettes():
+    cameras = cameras_around(24, size=64)
+    alpha = torch.stack([sphere_normals(cameras, v)[1] for v in range(24)]).float()
+    return mask_distances(alpha), cameras
+
+
+def test_mask_distance_is_signed_and_subpixel():
+    alpha = torch.zeros(1, 9, 9)
+    alpha[:, 2:7, 2:7] = 1
+    alpha[:, 2:7, 7] = 0.25
+    d = mask_distances(alpha)[0]
+    assert d[4, 4] == -2.5  # the middle of a square of side 5
+    assert d[4, 0] == 1.5  # two pixels left of the first covered one, whose edge is half nearer
+    assert d[4, 7] == 0.25  # a quarter covered: the edge lies a quarter pixel inwards of its middle
+
+
+def test_an_empty_mask_is_far_outside_everywhere():
+    assert (mask_distances(torch.zeros(1, 4, 6)) == 6).all()
+
+
+def test_bounds_enclose_the_sphere_with_little_to_spare(silhouettes):
+    lower, upper = estimate_bounds(*silhouettes)
+    assert (lower < -RADIUS).all()
+    assert (upper > RADIUS).all()
+    # margin: 3 % of the diagonal and a voxel, on top of a hull that is somewhat larger
+    assert (upper - lower).max() < 2 * RADIUS * 1.35
+
+
+def test_hull_is_the_sphere_up_to_its_facets(silhouettes):
+    grid = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 40**3)
+    sdf = visual_hull(*silhouettes, grid)
+    true = grid.nodes().norm(dim=-1) - RADIUS
+    near = true.abs() < 0.1
+    # One pixel is 2 / (64 * 2 / 1.8) = 0.028 wide at the sphere; 24 facets bulge by about as much.
+    assert (sdf - true)[near].abs().max() < 0.06
+    assert (sdf - true)[near].mean().abs() < 0.02
+    assert (sdf[true > 0.15] > 0).all()
+    assert (sdf[true < -0.05] < 0).all()
+
+
+def test_points_that_no_view_sees_are_outside(silhouettes):
+    behind_everything = torch.tensor([[0.0, 0.0, 50.0], [0.0, 0.0, 0.0]])
+    sdf = hull_sdf(*silhouettes, behind_everything)
+    assert sdf[0] > 0
+    assert sdf[1] < 0
+
+
+def test_a_silhouette_cut_by_the_border_says_nothing_beyond_it(silhouettes):
+    distance, cameras = silhouettes
+    pose, focal, centre = cameras.camera_to_world, cameras.focal, cameras.centre
+    one = Cameras(pose[:1], focal[:1], centre[:1], 64, 64)
+    beside = -1.5 * pose[:1, :, 0]  # left of the picture
+    assert hull_sdf(distance[:1], one, beside) > 0
+    assert hull_sdf(torch.full((1, 64, 64), -3.0), one, torch.zeros(1, 3)) < 0
+    assert hull_sdf(torch.full((1, 64, 64), -3.0), one, beside) == torch.inf  # nobody sees it
+
+
+def test_no_common_volume_is_an_error(silhouettes):
+    distance, cameras = silhouettes
+    with pytest.raises(ValueError, match="silhouettes of the photographs share no volume"):
+        estimate_bounds(torch.full_like(distance, 5.0), cameras)
+
+
+def test_fit_grid_has_cubic_voxels_and_covers_the_box():
+    grid = fit_grid(torch.tensor([-1.0, 0.0, 0.0]), torch.tensor([1.0, 1.0, 0.5]), 1000)
+    upper = torch.tensor(grid.origin) + grid.voxel_size * (torch.tensor(grid.size) - 1)
+    assert (torch.tensor(grid.origin) <= torch.tensor([-1.0, 0.0, 0.0]) + 1e-6).all()
+    assert (upper >= torch.tensor([1.0, 1.0, 0.5]) - 1e-6).all()
+    assert 1000 <= (torch.tensor(grid.size) - 1).prod() <= 1800
+
+
+def test_resampling_keeps_a_linear_function():
+    source = GridShape((-1.0, 0.0, 0.5), 0.25, (9, 6, 5))
+    target = GridShape((-0.9, 0.1, 0.6), 0.1, (15, 11, 8))
+    weights = torch.tensor([1.0, -2.0, 0.5])
+    values = source.nodes() @ weights
+    torch.testing.assert_close(resample(values, source, target), target.nodes() @ weights)
+    two = torch.stack([values, 3 * values], -1)
+    torch.testing.assert_close(
+        resample(two, source, target)[..., 1], 3 * (target.nodes() @ weights)
+    )

@@ -1,0 +1,82 @@
+"""Pictures in files as one moving picture: GIF, or MP4 by ffmpeg."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from univoxel.files import replacing
+
+FRAMES_PER_SECOND = 25  # GIF counts in hundredths of a second
+KINDS = ("gif", "mp4")
+
+
+def require(kind: str) -> None:
+    """Say before the work starts whether this kind can be written.
+
+    Raises:
+        ValueError: another kind than gif and mp4.
+        ImportError: mp4 without imageio-ffmpeg.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"relight: animation must be gif or mp4, got {kind!r}")
+    if kind == "mp4":
+        _ffmpeg()
+
+
+def write_animation(path: Path, pictures: Sequence[Path], rate: int = FRAMES_PER_SECOND) -> None:
+    """Write pictures of one size, on white where they are transparent, `rate` a second.
+
+    Whole or not at all; a GIF runs in a loop; an MP4 is H.264, cut to even sizes.
+
+    Raises:
+        OSError: a file cannot be read or written.
+        ImportError: an MP4 without imageio-ffmpeg.
+    """
+    frames = (_on_white(picture) for picture in pictures)
+    with replacing(path) as temporary:
+        if path.suffix == ".gif":
+            first, *rest = (frame.convert("P", palette=Image.Palette.ADAPTIVE) for frame in frames)
+            first.save(
+                temporary,
+                format="GIF",
+                save_all=True,
+                append_images=rest,
+                duration=1000 // rate,
+                loop=0,
+            )
+            return
+        first = next(frames)
+        width, height = (size - size % 2 for size in first.size)
+        writer = _ffmpeg().write_frames(
+            str(temporary),
+            (width, height),
+            fps=rate,
+            codec="libx264",
+            macro_block_size=2,
+            output_params=["-f", "mp4", "-movflags", "+faststart"],
+        )
+        writer.send(None)
+        for frame in (first, *frames):
+            writer.send(np.ascontiguousarray(np.asarray(frame)[:height, :width]))
+        writer.close()
+
+
+def _on_white(path: Path) -> Image.Image:
+    with Image.open(path) as image:
+        picture = image.convert("RGBA")
+    white = Image.new("RGBA", picture.size, "white")
+    return Image.alpha_composite(white, picture).convert("RGB")
+
+
+def _ffmpeg():
+    try:
+        import imageio_ffmpeg  # pyright: ignore[reportMissingImports]  the extra `video`
+    except ImportError:
+        raise ImportError(
+            "an MP4 needs imageio-ffmpeg: pip install 'univoxel[video]', or choose gif"
+        ) from None
+    return imageio_ffmpeg

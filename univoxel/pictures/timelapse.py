@@ -1,0 +1,139 @@
+"""One view of a scene while it is trained: render, albedo and normal side by side."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from univoxel.camera import resize
+from univoxel.color import linear_to_srgb
+from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.data import load_photos
+from univoxel.data.images import write_png
+from univoxel.envmap import EnvMap, tables
+from univoxel.errors import DataError
+from univoxel.pictures.animation import KINDS, require, write_animation
+from univoxel.render.pipeline import extract_mesh, shade_hits, surface_of_view
+from univoxel.render.relight import Lighting, relight_surface, stage
+from univoxel.scene import Scene
+from univoxel.training.progress import Progress
+
+FRAMES = 60  # in the whole time of a training
+FRAMES_PER_SECOND = 10
+SIZE = 256  # pixels along a picture, at most
+LABEL = 18  # pixels above the pictures
+MAP_ROWS, SAMPLES, BOUNCES = 64, 16, 1  # of light from the map
+
+
+class Timelapse:
+    """Takes frames by the clock of training, and makes one file of them."""
+
+    def __init__(self, path: str | Path, cfg: TrainConfig):
+        """
+        Args:
+            path: .gif or .mp4, or a folder for PNG files: a name without an ending, or with / at
+                its end.
+
+        Raises:
+            ValueError: another ending.
+            ImportError: an MP4 without imageio-ffmpeg.
+            DataError: the photographs cannot be used.
+        """
+        kind = Path(path).suffix
+        folder = str(path).endswith("/") or not kind
+        if not folder and kind[1:] not in KINDS:
+            raise ValueError(
+                f"--timelapse: expected a name that ends in .gif, .mp4 or / (a folder), got {path}"
+            )
+        if not folder:
+            require(kind[1:])
+        self.file = None if folder else Path(path)
+        self.folder = Path(path) if folder else cfg.out / "timelapse"
+        try:
+            cameras = load_photos(cfg.data, "test", cfg.downscale).cameras
+        except DataError:
+            cameras = load_photos(cfg.data, "train", cfg.downscale).cameras
+        self.cameras = resize(cameras, min(cameras.width, SIZE))
+        self.every = 60 * cfg.minutes / FRAMES  # seconds
+        self._next = 0.0
+
+    def look(self, scene: Scene, progress: Progress, last: bool = False) -> None:
+        """Take a frame if it is time for one. The scene and the random numbers stay as they are."""
+        if progress.seconds < self._next and not last:
+            return
+        self._next = progress.seconds + self.every
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with torch.random.fork_rng(devices=[]):
+            picture = draw(scene, self.cameras, *shown(progress))
+        path = self.folder / f"step_{progress.step:06d}.png"
+        write_png(path, labelled(picture, f"{progress.seconds:.1f} s"))
+
+    def finish(self, scene: Scene, progress: Progress) -> None:
+        """Take the last frame, and make the file of all.
+
+        Raises:
+            OSError: it cannot be written; the frames stay in the run's folder.
+        """
+        self.look(scene, progress, last=True)
+        if self.file is None:
+            return
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        write_animation(self.file, sorted(self.folder.glob("*.png")), FRAMES_PER_SECOND)
+        shutil.rmtree(self.folder)
+
+
+def shown(progress: Progress) -> tuple[bool, bool]:
+    """Whether the render is lit at all, by the radiance head alone before; and by the map."""
+    if progress.stage == len(progress.cfg.stages):
+        return True, False
+    now = progress.cfg.stages[progress.stage]
+    if isinstance(now, StageConfig):
+        return progress.done >= now.physical_from, False
+    return True, isinstance(now, JointConfig)
+
+
+@torch.no_grad()
+def draw(scene: Scene, cameras, lit: bool, by_map: bool) -> Tensor:
+    """Render, albedo and normal of the first view [H, 3 W, 3], sRGB on black.
+
+    Args:
+        lit: by the physically based render, not by the radiance head.
+        by_map: light is the distant map, by tracing paths: while it is solved for, the local light
+            does not follow the materials.
+    """
+    training = scene.training
+    scene.eval()
+    surface, wo = surface_of_view(scene, cameras, 0)
+    opacity = surface.opacity[:, None]
+    if by_map:
+        assert scene.sky is not None
+        lighting = Lighting(tables(EnvMap(scene.sky.latlong(MAP_ROWS))))
+        place = stage(extract_mesh(scene), scene.field.voxel_size)
+        sent = relight_surface(surface, wo, place, lighting, samples=SAMPLES, bounces=BOUNCES)
+        render = linear_to_srgb(sent * opacity)
+    elif lit:
+        render = linear_to_srgb(shade_hits(scene, surface, wo))
+    else:
+        render = scene.radiance(surface.features, surface.normal, wo) * opacity
+    scene.train(training)
+    albedo = linear_to_srgb(surface.albedo * opacity)
+    normal = (0.5 + 0.5 * surface.normal) * opacity
+    shape = (cameras.height, cameras.width, 3)
+    return torch.cat([tile.reshape(shape) for tile in (render, albedo, normal)], 1)
+
+
+def labelled(picture: Tensor, time: str) -> np.ndarray:
+    """[H + LABEL, W, 3] uint8: three tiles [H, W, 3] under their names and the time."""
+    height, width, _ = picture.shape
+    pixels = (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+    image = Image.new("RGB", (width, height + LABEL), (32, 32, 32))
+    image.paste(Image.fromarray(pixels), (0, LABEL))
+    drawing, font = ImageDraw.Draw(image), ImageFont.load_default(12)
+    for k, text in enumerate((time, "albedo", "normal")):
+        drawing.text((4 + k * width // 3, 2), text, "white", font)
+    return np.asarray(image)

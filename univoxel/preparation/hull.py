@@ -1,0 +1,93 @@
+"""Where the object can be: bounds and a first SDF from silhouettes."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from univoxel.camera import Cameras, looked_at, project
+from univoxel.grid import GridShape, fit_coarse, fit_grid, resample
+
+
+def mask_distances(alpha: Tensor) -> Tensor:
+    """Signed distance to the silhouette in pixels, negative inside: [V, H, W] -> the same.
+
+    Sub-pixel: a half-covered pixel lies on the silhouette.
+    """
+    result = np.empty(alpha.shape, np.float32)
+    for v, a in enumerate(alpha.numpy()):
+        inside = a >= 0.5
+        if not inside.any():
+            result[v] = max(a.shape)  # nothing seen: everything is far outside
+            continue
+        padded = np.pad(inside, 1)  # what leaves the picture ends there
+        outside, depth = (ndimage.distance_transform_edt(m) for m in (~padded, padded))
+        d = (np.asarray(outside) - np.asarray(depth))[1:-1, 1:-1]
+        # Next to the edge the distance to pixel centres is 1; coverage says where in between.
+        edge = np.abs(d) <= 1
+        d = d - np.sign(d) * 0.5
+        result[v] = np.where(edge & (a > 0) & (a < 1), 0.5 - a, d)
+    return torch.from_numpy(result)
+
+
+def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
+    """Signed distance to the visual hull, a lower bound of the object's: [P, 3] -> [P].
+
+    The largest over views of the silhouette's distance times depth / focal length. Outside a
+    picture there is nothing where its silhouette stays clear of the border; where the silhouette
+    is cut off by it, the view says nothing. Points that no view sees are outside.
+
+    Args:
+        distance: [V, H, W] from `mask_distances`.
+    """
+    border = [distance[:, 0], distance[:, -1], distance[:, :, 0], distance[:, :, -1]]
+    whole = torch.stack([b.amin(1) > 0 for b in border]).all(0)
+    sdf = torch.full((len(points),), -torch.inf)
+    scale = torch.tensor([2 / cameras.width, 2 / cameras.height])
+    for v in range(len(cameras)):
+        pixel, depth = project(cameras, v, points)
+        uv = pixel * scale - 1
+        d = torch.nn.functional.grid_sample(
+            distance[v][None, None], uv[None, None], align_corners=False, padding_mode="border"
+        )[0, 0, 0]
+        seen = (depth > 0) & (uv.abs() <= 1).all(1)
+        here = d.clamp_min(0.5) if whole[v] else torch.full_like(d, -torch.inf)
+        here = torch.where(seen, d, here) * depth.abs() / cameras.focal[v].mean()
+        sdf = torch.maximum(sdf, here)
+    return torch.where(sdf.isinf(), torch.inf, sdf)
+
+
+def estimate_bounds(distance: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Corners [3], [3] of a box around the visual hull, with a margin of 3 % of its diagonal.
+
+    Raises:
+        ValueError: the silhouettes share no volume.
+    """
+    centre = looked_at(cameras)
+    away = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
+    field_of_view = max(cameras.width, cameras.height) / (2 * cameras.focal.min(1).values)
+    half = float((away * field_of_view).max()) * 1.2
+    lower, upper = centre - half, centre + half
+    for _ in range(2):  # each round sees the hull at a finer grid
+        grid = fit_grid(lower, upper, 64**3)
+        nodes = grid.nodes().reshape(-1, 3)
+        inside = nodes[hull_sdf(distance, cameras, nodes) < grid.voxel_size]
+        if not len(inside):
+            raise ValueError(
+                "the silhouettes of the photographs share no volume: check masks and cameras"
+            )
+        lower, upper = inside.amin(0), inside.amax(0)
+        margin = 0.03 * (upper - lower).norm() + grid.voxel_size
+        lower, upper = lower - margin, upper + margin
+    return lower, upper
+
+
+def visual_hull(distance: Tensor, cameras: Cameras, grid: GridShape) -> Tensor:
+    """SDF of the visual hull on a grid: [X, Y, Z], world units; evaluated at about 1 M nodes."""
+    stride = max(1, round((np.prod(grid.size) / 1e6) ** (1 / 3)))
+    coarse = fit_coarse(grid, stride)
+    sdf = hull_sdf(distance, cameras, coarse.nodes().reshape(-1, 3)).reshape(coarse.size)
+    far = sum(n * n for n in grid.size) ** 0.5 * grid.voxel_size
+    return resample(sdf.clamp(-far, far), coarse, grid)

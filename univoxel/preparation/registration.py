@@ -1,0 +1,184 @@
+"""Cameras against silhouettes: whether they contradict one another, and how to put them right."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from univoxel.camera import Cameras, pixel_rays
+from univoxel.config import CamerasFrom
+from univoxel.poses import PoseSteps
+from univoxel.preparation.hull import estimate_bounds
+from univoxel.records import Rays
+
+EDGE = -1.6, -0.5  # pixels inside a silhouette that count as its edge
+PLACES = 48  # that are looked at along a ray, twice
+LOOKED_AT = 1000  # rays through edges that tell whether cameras contradict one another
+MOST = 0.95  # share of them that may miss by less than what is called the contradiction
+STEPS, RATES = 150, (5e-3, 2.5e-4)  # of Adam, at begin and end: radians, radii of the object
+RAYS, VIEWS = 256, 32  # a step: rays, and silhouettes that they are held against
+
+
+class Edges:
+    """Rays through the edges of V silhouettes, and how near all silhouettes let them come.
+
+    The edge of a silhouette is where rays graze the object: on each of them lies a point that every
+    other silhouette contains too. Where there is none, cameras or masks are wrong.
+
+    Source: Hernandez, Schmitt, Cipolla 2007, "Silhouette Coherence for Camera Calibration under
+    Circular Motion".
+    """
+
+    def __init__(self, distance: Tensor, box: tuple[Tensor, Tensor]) -> None:
+        """
+        Args:
+            distance: [V, H, W] from `hull.mask_distances`, pixels.
+            box: corners [3], [3] around the object.
+        """
+        low, high = EDGE
+        self.distance = distance[:, None]
+        self.pixels = ((distance > low) & (distance < high)).nonzero()  # [K, 3] view, row, column
+        self.middle = (box[0] + box[1]) / 2
+        self.reach = float((box[1] - box[0]).norm()) / 2
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """So many edge pixels [count, 3], drawn with replacement."""
+        return self.pixels[torch.randint(len(self.pixels), (count,), generator=generator)]
+
+    def missed(self, cameras: Cameras, pixels: Tensor, others: Tensor) -> Tensor:
+        """Pixels [N] that rays through edges miss other silhouettes by: below 0 where a point on
+        the ray lies in all of them. Differentiable in the cameras.
+
+        Args:
+            others: [K] views to hold them against.
+        """
+        view, row, column = pixels.unbind(1)
+        centre = torch.stack([column, row], 1) + 0.5
+        rays = pixel_rays(cameras, view, centre)
+        with torch.no_grad():
+            nearest, other = self._nearest(cameras, rays, others)
+        uv, _ = _seen(cameras, rays.origin + nearest[:, None] * rays.direction, other)
+        # Views are the slices of a volume, of which each point takes its own
+        slice_ = (2 * other + 1) / len(self.distance) - 1
+        where = torch.cat([uv, slice_[:, None].to(uv)], 1)[None, None, None]
+        volume = self.distance.movedim(1, 0)[None]
+        return grid_sample(volume, where, align_corners=False, padding_mode="border")[0, 0, 0, 0]
+
+    def _nearest(self, cameras: Cameras, rays: Rays, others: Tensor) -> tuple[Tensor, Tensor]:
+        """Distance [N] along each ray where it is least outside, and the view [N] that says so."""
+        middle = ((self.middle - rays.origin) * rays.direction).sum(1)
+        reach = self.reach
+        for _ in range(2):  # again, closer, around what was found
+            share = torch.linspace(-1, 1, PLACES)
+            t = middle[:, None] + reach * share
+            points = rays.origin[:, None] + t[..., None] * rays.direction[:, None]
+            outside, view = self._outside(cameras, points.reshape(-1, 3), others)
+            best = outside.view(t.shape).argmin(1, keepdim=True)
+            middle, reach = t.gather(1, best)[:, 0], 2 * reach / PLACES
+        return middle, view.view(t.shape).gather(1, best)[:, 0]
+
+    def _outside(self, cameras: Cameras, points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
+        """Most pixels [P] that points lie outside of a silhouette, and of whose [P]."""
+        most = torch.full((len(points),), -torch.inf)
+        worst = torch.full((len(points),), int(others[0]))
+        for v in others.tolist():
+            uv, depth = _seen(cameras, points, torch.tensor(v))
+            d = grid_sample(self.distance[v : v + 1], uv[None, None], align_corners=False)[0, 0, 0]
+            seen = (depth > 0) & (uv.abs() <= 1).all(1)  # beyond its picture a view says nothing
+            further = seen & (d > most)
+            most[further], worst[further] = d[further], v
+        return torch.where(most.isinf(), torch.inf, most), worst  # unseen places are outside
+
+
+def contradiction(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tensor]) -> float:
+    """Pixels that all but a twentieth of rays through silhouettes' edges miss the others by, at
+    most: -0.3 or less where cameras and masks are exact, about their error where they are not.
+
+    Args:
+        distance, box: see `Edges`.
+    """
+    edges, generator = Edges(distance, box), torch.Generator().manual_seed(0)
+    if not len(edges.pixels):
+        return 0.0
+    pixels, views = edges.draw(LOOKED_AT, generator), torch.arange(len(cameras))
+    missed = edges.missed(cameras, pixels, views)
+    return float(missed.quantile(MOST))
+
+
+def align(poses: PoseSteps, distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tensor]) -> None:
+    """Move the cameras, by steps of `poses`, to where their silhouettes agree.
+
+    What silhouettes do not show - how a ball is turned - stays as it is.
+
+    Args:
+        distance, box: see `Edges`.
+    """
+    edges, generator = Edges(distance, box), torch.Generator().manual_seed(0)
+    if not len(edges.pixels):
+        return
+    begin, end = RATES
+    optimizer = torch.optim.Adam(poses.parameters(), betas=(0.9, 0.99))
+    poses.train()
+    for k in range(STEPS):
+        optimizer.param_groups[0]["lr"] = begin * (end / begin) ** (k / STEPS)
+        now = poses.corrected(cameras)
+        others = torch.randperm(len(cameras), generator=generator)[:VIEWS]
+        missed = edges.missed(now, edges.draw(RAYS, generator), others)
+        # An edge pixel's own silhouette contains it by some 1: only more than that contradicts
+        off = (missed - sum(EDGE) / 2).clamp_min(0)
+        optimizer.zero_grad()
+        (off.square() / (1 + off)).mean().backward()  # robust: some masks are wrong, not cameras
+        optimizer.step()
+
+
+def _seen(cameras: Cameras, points: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+    """Where a view, or views [N], see points [N, 3]: from -1 to 1 across the picture [N, 2], and
+    depth [N]."""
+    pose = cameras.camera_to_world[view]
+    x, y, z = ((points - pose[..., 3])[:, None] @ pose[..., :3])[:, 0].unbind(1)
+    pixel = torch.stack([x, -y], 1) / -z[:, None] * cameras.focal[view] + cameras.centre[view]
+    return pixel * torch.tensor([2 / cameras.width, 2 / cameras.height]) - 1, -z
+
+
+AGREEING = 0.25  # pixels that silhouettes may contradict one another by: -0.4 where all is exact
+
+
+def object_box(
+    distance: Tensor, cameras: Cameras, wanted: CamerasFrom
+) -> tuple[tuple[Tensor, Tensor], bool]:
+    """Corners [3], [3] of a box around the object, and whether its cameras are to be refined.
+
+    Args:
+        distance: [V, H, W] from `hull.mask_distances`.
+        wanted: as of the configuration.
+
+    Raises:
+        ValueError: the silhouettes share no volume.
+    """
+    box = estimate_bounds(distance, cameras)
+    off = contradiction(distance, cameras, box)
+    refined = wanted == "refined" or (wanted == "auto" and off > AGREEING)
+    if off > AGREEING:
+        then = "cameras are refined" if refined else "see --cameras refined"
+        print(f"silhouettes contradict one another by {off:.1f} pixels: {then}")
+    if refined and off > 0:  # what the silhouettes share is too small by so much
+        box = estimate_bounds(distance - off, cameras)
+    return box, refined
+
+
+def put_right(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tensor]) -> PoseSteps:
+    """Steps to cameras whose silhouettes agree, as far as these tell; says how far they went.
+
+    Args:
+        distance, box: see `object_box`.
+    """
+    half = (box[1] - box[0]) / 2
+    poses = PoseSteps(len(cameras))
+    poses.about(cameras, box[0] + half, float(half.max()))
+    align(poses, distance, cameras, box)
+    moved = poses.moved(cameras).square().mean().sqrt()
+    left = contradiction(distance, poses.eval().corrected(cameras), box)
+    left = f"still contradict one another by {left:.1f} pixels" if left > AGREEING else "agree"
+    print(f"cameras moved the object by {moved:.1f} pixels on average: silhouettes {left}")
+    return poses

@@ -1,0 +1,137 @@
+"""Holds a training where its numbers fail: drops the step, goes back to a good state, says so."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from univoxel.training.progress import Progress, Rehearsal
+
+FAR = 6.0  # dB below its best at which held-out quality has collapsed: four times the error
+ENOUGH = 40.0  # dB; a best beyond counts as this: falls from there are no collapse
+LIMIT = 3  # failures in a row that are mended; the next one ends the stage
+PROOF = 50  # sound steps after which a failure is over
+COPYING = 0.002  # share of the time that copies of the parameters may take
+
+
+class Guard:
+    """Watches one stage: no step is taken on a loss or gradient that is not finite.
+
+    The first failure drops its step: the parameters are as good as before it. One that follows
+    within PROOF steps, and quality that collapses, goes back to the copy that was last found good,
+    with fresh moments. Each failure halves the step size, `scale`; after LIMIT in a row the stage
+    ends with what is good.
+
+    Args:
+        progress: that is told, and ends the stage.
+        restored: called when parameters have gone back, for what is derived from them.
+    """
+
+    def __init__(self, progress: Progress | Rehearsal, restored: Callable[[], None] = lambda: None):
+        self.scale = 1.0  # on the step size
+        self._progress, self._restored = progress, restored
+        self._best, self._kind = -math.inf, False
+        self._failures, self._sound = 0, 0  # in a row; steps since the last
+        self._optimizer: torch.optim.Optimizer | None = None
+        self._copy: list[Tensor] = []
+        self._next = -math.inf  # when to copy again
+
+    def follow(self, optimizer: torch.optim.Optimizer) -> None:
+        """Watch the parameters of this optimizer, which are good as they are."""
+        self._optimizer, self._next = optimizer, -math.inf
+        self.keep()
+
+    def forget(self) -> None:
+        """Do not go back to the copy: what the parameters stand for has changed since."""
+        self._copy, self._next = [], -math.inf
+
+    @torch.no_grad()
+    def keep(self) -> None:
+        """Copy the parameters as a good state, unless copies would take too long.
+
+        They may have other sizes than before.
+        """
+        begin = time.monotonic()
+        if begin < self._next:
+            return
+        parameters = self._parameters()
+        if not self._fits(parameters):
+            self._copy = [torch.empty_like(p) for p in parameters]
+        for copy, parameter in zip(self._copy, parameters, strict=True):
+            copy.copy_(parameter)
+        end = time.monotonic()
+        self._next = end + (end - begin) / COPYING
+
+    def sound(self, loss: Tensor) -> bool:
+        """Whether the step may be taken, after backward; if not, what is needed has been done.
+
+        Args:
+            loss: [] what was differentiated.
+        """
+        total = loss.detach()
+        for parameter in self._parameters():
+            if (gradient := parameter.grad) is not None:
+                values = gradient._values() if gradient.is_sparse else gradient
+                # The root of the sum of squares: Adam's moments must not overflow either
+                total = total + torch.linalg.vector_norm(values)
+        if bool(torch.isfinite(total)):
+            self._sound += 1
+            if self._sound >= PROOF:
+                self._failures = 0
+            return True
+        value = loss.item()
+        what = "a gradient is not finite" if math.isfinite(value) else f"the loss is {value}"
+        self._fail(what, self._failures > 0, "dropped this step")
+        return False
+
+    def judge(self, psnr: float, kind: bool) -> None:
+        """Note quality on held-out rays, dB; go back if it has collapsed, else keep the state.
+
+        Args:
+            kind: what the quality is of; that of the other kind says nothing of it.
+        """
+        if kind != self._kind:
+            self._best, self._kind = -math.inf, kind
+        if not psnr > self._best - FAR:  # NaN too
+            best = f", {self._best:.1f} dB at best" if math.isfinite(self._best) else ""
+            self._fail(
+                f"held-out quality is {psnr:.1f} dB{best}", True, "there is no state to go back to"
+            )
+            return
+        self._best = min(max(self._best, psnr), ENOUGH)
+        if psnr > self._best - FAR / 2:
+            self.keep()
+
+    def _parameters(self) -> list[Tensor]:
+        assert self._optimizer is not None
+        return [p for group in self._optimizer.param_groups for p in group["params"]]
+
+    def _fits(self, parameters: list[Tensor]) -> bool:
+        return [p.shape for p in parameters] == [c.shape for c in self._copy]
+
+    @torch.no_grad()
+    def _fail(self, what: str, back: bool, otherwise: str) -> None:
+        self._failures, self._sound = self._failures + 1, 0
+        self.scale /= 2
+        parameters = self._parameters()
+        back = back and self._fits(parameters)  # else the copy is of a grid that is no more
+        if back:
+            assert self._optimizer is not None
+            for parameter, copy in zip(parameters, self._copy, strict=True):
+                parameter.copy_(copy)
+            self._optimizer.state.clear()
+            self._restored()
+        where = f"stage {self._progress.stage + 1}, step {self._progress.step}: {what}"
+        if self._failures > LIMIT:
+            self._progress.trouble(
+                f"{where}; {LIMIT} smaller steps did not help: the stage ends with the last state "
+                "that was good"
+            )
+            self._progress.abandon()
+            return
+        done = "went back to the last good state" if back else otherwise
+        self._progress.trouble(f"{where}; {done}, steps are {self.scale:g} times as long from here")
