@@ -5,6 +5,11 @@ extensions = ["myst_parser"]
 html_theme = "furo"
 html_title = "univoxel"
 myst_heading_anchors = 3
-# A folder whose pages are still to come
-suppress_warnings = ["toc.empty_glob"]
-exclude_patterns = []
+myst_enable_extensions = ["deflist"]
+# Pages whose subjects are on their way into guide/ and explanation/
+exclude_patterns = [
+    f"{name}.md"
+    for name in (
+        *("architecture", "capacity", "data", "export", "fields", "lights", "relight", "trust"),
+    )
+]

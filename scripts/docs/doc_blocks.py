@@ -19,8 +19,10 @@ from pathlib import Path
 import doc_reference
 import doc_tables
 
-BLOCK = re.compile(r"<!-- begin (?P<name>\S+) -->\n(?P<text>.*?)<!-- end (?P=name) -->", re.DOTALL)
-MARKER = re.compile(r"<!-- (?:begin|end) (\S+) -->")
+BLOCK = re.compile(
+    r"^<!-- begin (?P<name>\S+) -->\n(?P<text>.*?)^<!-- end (?P=name) -->", re.DOTALL | re.MULTILINE
+)
+MARKER = re.compile(r"^<!-- (?:begin|end) (\S+) -->", re.MULTILINE)
 
 
 def pages(root: Path) -> list[Path]:

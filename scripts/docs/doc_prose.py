@@ -16,8 +16,22 @@ COLUMNS = 100
 README_LINES = 100
 
 # Where numbers with units may stand anywhere: a history, and mathematics
-FREE = ("CHANGELOG.md", "docs/derivations/", "univoxel/example_data/")
-UNITS = r"dB|%|percent|per cent|ms|s|seconds?|stops?|nats?|degrees?|[kMG]B|[KMG]iB|GFLOP/s|x(?! ?\d)|times"
+FREE = (
+    "CHANGELOG.md",
+    "docs/derivations/",
+    "univoxel/example_data/",
+)  # Pages whose subjects are on their way into guide/ and explanation/; not checked, nor built
+LEAVING = {
+    f"docs/{name}.md"
+    for name in (
+        *("architecture", "capacity", "data", "export", "fields", "lights", "relight", "trust"),
+    )
+}
+
+UNITS = (
+    r"dB|%|percent|per cent|ms|s|seconds?|stops?|nats?|degrees?|"
+    r"[kMG]B|[KMG]iB|GFLOP/s|x(?! ?\d)|times"
+)
 MEASURED = re.compile(rf"(?<![\w.^-])\d[\d,.]*(?: to \d[\d,.]*)? ?(?:{UNITS})(?![\w^])")
 CODE_SPAN = re.compile(r"(`+).+?\1", re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)[^)]*\)")
@@ -28,6 +42,8 @@ def faults(root: Path) -> list[str]:
     found = []
     for page in doc_blocks.pages(root):
         name = page.relative_to(root).as_posix()
+        if name in LEAVING:
+            continue
         text = page.read_text(encoding="utf-8")
         found += [f"{name}:{n}: {length} columns" for n, length in long_lines(text)]
         if name == "README.md" and (lines := text.count("\n")) > README_LINES:
