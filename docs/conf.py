@@ -2,10 +2,14 @@
 
 project = "univoxel"
 extensions = ["myst_parser"]
-html_theme = "furo"
-html_title = "univoxel"
 myst_heading_anchors = 3
 myst_enable_extensions = ["deflist"]
+smartquotes = False  # two dashes are an option, not a dash
+html_theme = "furo"
+html_title = "univoxel"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_copyright = False
 # Pages whose subjects are on their way into guide/ and explanation/
 exclude_patterns = [
     f"{name}.md"
