@@ -24,13 +24,15 @@ from ball import write
 from made import made
 
 from univoxel.checkpoint import FILE
-from univoxel.config import StageConfig, TrainConfig, preset, with_field
+from univoxel.config import TrainConfig
 from univoxel.experiments import plots
 from univoxel.experiments.record import result_text
 from univoxel.files import replacing
+from univoxel.presets import preset, with_field
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.info import info
 from univoxel.tasks.train import train
+from univoxel.training.config import StageConfig
 
 SETTINGS = ["dense", "sparse", "hash", "adaptive"]
 PANELS = [plots.NVS, plots.ALBEDO, plots.RELIT]

@@ -22,12 +22,14 @@ import torch
 from made import made
 from train_step import OTHER, STAGES, Clock
 
-from univoxel.config import JointConfig, TrainConfig, chosen
+from univoxel.config import TrainConfig
 from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import HashField
 from univoxel.joint import observations, stage
+from univoxel.joint.config import JointConfig
 from univoxel.ops import VisibilityScene
+from univoxel.presets import chosen
 from univoxel.tasks import train
 from univoxel.training import loop
 

@@ -30,7 +30,7 @@ from univoxel.assets.bake import with_materials
 from univoxel.camera import image_rays
 from univoxel.checkpoint import load_scene, save_scene
 from univoxel.color import linear_to_srgb
-from univoxel.config import JointConfig, StageConfig, TrainConfig, preset, save_config
+from univoxel.config import TrainConfig, save_config
 from univoxel.data import load_photos, load_relit, load_truth, relight_maps
 from univoxel.data.base import decode
 from univoxel.data.maps import read_map, true_map
@@ -38,10 +38,12 @@ from univoxel.envmap import tables
 from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
 from univoxel.grid import GridShape, fit_grid
+from univoxel.joint.config import JointConfig
 from univoxel.lights.distant import DistantLight
 from univoxel.metrics import on_black, psnr
 from univoxel.ops import VisibilityScene
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
+from univoxel.presets import preset
 from univoxel.records import Mesh, Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, relight_surface, stage
@@ -49,6 +51,7 @@ from univoxel.scene import Scene
 from univoxel.sphere import latlong_directions, texel_solid_angles
 from univoxel.tasks.evaluate import _albedo_scales, evaluate
 from univoxel.tasks.train import train
+from univoxel.training.config import StageConfig
 
 TERMS = ("none", "geometry", "light", "both")
 NEIGHBOURS = 4  # samples of the surface whose triangles a node is measured to

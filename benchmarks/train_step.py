@@ -23,7 +23,6 @@ import torch
 from made import made
 
 from univoxel import losses, ops
-from univoxel.config import preset
 from univoxel.data import load_photos
 from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
@@ -34,6 +33,7 @@ from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.sg import LocalSG
 from univoxel.optim import RowAdam
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
+from univoxel.presets import preset
 from univoxel.render import pipeline
 from univoxel.scene import Scene
 from univoxel.tasks import train

@@ -32,7 +32,6 @@ from torch.nn.functional import normalize
 from univoxel.camera import image_rays
 from univoxel.checkpoint import FILE, load_scene
 from univoxel.color import linear_to_srgb, luminance
-from univoxel.config import preset
 from univoxel.data import Photos, load_photos, load_truth
 from univoxel.data.images import write_png
 from univoxel.data.maps import read_map
@@ -40,6 +39,7 @@ from univoxel.data.mesh import read_ply
 from univoxel.envmap import tables
 from univoxel.experiments.record import result_text
 from univoxel.files import replacing
+from univoxel.presets import preset
 from univoxel.records import Mesh, Surface
 from univoxel.render.relight import Lighting, relight_surface, stage, turned
 from univoxel.tasks.evaluate import evaluate

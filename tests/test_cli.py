@@ -75,7 +75,7 @@ def calls(monkeypatch):
     def with_field(config, kind):
         return replace_fields(config, stages=(config.stages[0], StageConfig(field=kind)))
 
-    stand_in("univoxel.config", chosen=chosen, with_field=with_field)
+    stand_in("univoxel.presets", chosen=chosen, with_field=with_field)
     replace("train", Path("run"))
     replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5})

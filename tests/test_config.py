@@ -6,21 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from univoxel.config import (
-    LIGHTS,
-    JointConfig,
-    LossConfig,
-    StageConfig,
-    TrainConfig,
-    budget,
-    chosen,
-    preset,
-    save_config,
-    with_field,
-    work_in,
-)
+from univoxel.config import TrainConfig, save_config
+from univoxel.joint.config import JointConfig
 from univoxel.lights.sg import LocalSG, SGConfig
+from univoxel.names import LIGHTS
+from univoxel.presets import budget, chosen, preset, with_field, work_in
 from univoxel.scene import SceneConfig
+from univoxel.training.config import LossConfig, StageConfig
 
 STAGE = StageConfig(voxels=1.0, iterations=10, share=1.0)
 CONFIG = TrainConfig(Path("photos"), Path("run"), (STAGE,), minutes=1.0)

@@ -126,6 +126,27 @@ def test_commands_of_the_pages_are_understood(page, line):
         pytest.fail(f"{page}: univoxel {line}\n{said.getvalue()}")
 
 
+@pytest.mark.parametrize("page", [p for p in PAGES if "```python" in p.read_text("utf-8")], ids=str)
+def test_names_that_python_code_of_the_pages_imports_are_there(page):
+    for block in re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
+        if not re.match(r"\s*(?:@|def |class )", block):  # signatures of the reference
+            compile(block, str(page), "exec")
+        for line in re.findall(r"^(?:from|import) .*", block, re.MULTILINE):
+            exec(line, {})
+
+
+def test_folders_and_files_of_the_tree_are_there():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    tree = text.partition("## The tree")[2].partition("## Rules")[0]
+    rows = re.findall(r"^\| (`.*?) \|", tree, re.MULTILINE)
+    for name in re.findall(r"`([^`]+)`", " ".join(rows)):
+        assert (ROOT / name).exists() or (ROOT / "univoxel" / name).exists(), name
+    named = set(re.findall(r"`(?:univoxel/)?([a-z]+(?:\.py|/))`", tree))
+    package = {p.name + "/" * p.is_dir() for p in (ROOT / "univoxel").iterdir()}
+    unnamed = {n for n in package - named if not n.startswith(("_", "example_data"))}
+    assert not unnamed, "add to the tree of CONTRIBUTING.md"
+
+
 def targets(text: str) -> set[str]:
     return set(re.findall(r"^    make ([a-z-]+)", text, re.MULTILINE))
 

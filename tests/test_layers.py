@@ -11,15 +11,18 @@ ROOT = Path(__file__).parent.parent
 # From the bottom up. A module imports only from layers below its own and, inside its folder, the
 # helpers named here.
 LAYERS = [
-    {"errors", "files", "records"},
+    {"errors", "files", "names", "records", "validation"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "poses"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
     {"checkpoint", "run"},
-    {"assets", "losses", "metrics", "render"},
+    {"losses"},
+    {"assets", "metrics", "render"},
+    {"joint.config", "preparation.config", "training.config", "compression.config"},
     {"config", "overrides"},
+    {"presets"},
     {"preparation", "training"},
     {"joint"},
     {"confidence"},

@@ -20,8 +20,9 @@ import torch
 from safetensors import safe_open
 
 import univoxel
-from univoxel.config import TrainConfig, preset, with_field
+from univoxel.config import TrainConfig
 from univoxel.ops import native
+from univoxel.presets import preset, with_field
 
 HELD = Path(__file__).parent / "net.json"
 DATA = Path(univoxel.__file__).parent / "example_data" / "tiny"

@@ -89,8 +89,8 @@ def train(
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
             stages.1.voxels=3; config.json in a run's folder holds them all
     """
-    from univoxel.config import chosen, with_field
     from univoxel.overrides import changed
+    from univoxel.presets import chosen, with_field
     from univoxel.tasks import train as task
 
     _check_minutes(minutes)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -26,10 +25,9 @@ from univoxel.lights import (
 from univoxel.lights.distant import DistantLight
 from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.views import ViewLights
+from univoxel.names import Varying
 from univoxel.ops import VisibilityScene
 from univoxel.poses import PoseSteps
-
-Varying: TypeAlias = Literal["none", "exposure", "light"]
 
 
 @dataclass(frozen=True)

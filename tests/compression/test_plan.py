@@ -10,15 +10,17 @@ from analytic import photos_of, sphere_scene, write_scene
 from univoxel.checkpoint import FILE, load_checkpoint, load_scene, save_scene
 from univoxel.compression import plan, prune, search
 from univoxel.compression.quality import smallest
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import FEWEST_ROWS, ROWS, HashField, Levels
+from univoxel.joint.config import JointConfig
 from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.scene import Scene, SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.info import info
 from univoxel.tasks.train import look_at, train
 from univoxel.training import loop
+from univoxel.training.config import StageConfig
 from univoxel.training.progress import Rehearsal
 
 LIGHT = SGConfig(lobes=4, hidden=16, directions=16, directions_eval=16)

@@ -10,7 +10,6 @@ from analytic import scene_of
 from observed_points import lamps, photographed, problem_on_a_sphere
 from torch.nn.functional import normalize
 
-from univoxel.config import JointConfig
 from univoxel.joint import albedo_entropy
 from univoxel.joint.albedo_entropy import (
     CELL,
@@ -20,6 +19,7 @@ from univoxel.joint.albedo_entropy import (
     shown,
     sunlit,
 )
+from univoxel.joint.config import JointConfig
 from univoxel.joint.newton import newton_round
 from univoxel.joint.observations import widened
 from univoxel.lights.views import ViewLights

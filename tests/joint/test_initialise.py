@@ -6,8 +6,8 @@ import pytest
 import torch
 from observed_points import lamps, sphere_of
 
-from univoxel.config import JointConfig
 from univoxel.joint import initialise
+from univoxel.joint.config import JointConfig
 from univoxel.joint.initialise import TRIALS, supposed
 
 CFG = JointConfig(newton_points=500, newton_views=8)

@@ -7,8 +7,8 @@ import torch
 from observed_points import COUNT, NODES, photographed, sphere_of
 
 from univoxel import losses
-from univoxel.config import JointConfig
 from univoxel.joint import metals
+from univoxel.joint.config import JointConfig
 from univoxel.joint.equations import CAUCHY
 from univoxel.joint.metals import ASKED, METAL_BASE, evidence, find_metal, fitted
 

@@ -21,8 +21,9 @@ from observed_points import (
 from torch.nn.functional import normalize
 
 from univoxel import brdf, losses
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.joint import equations, newton, stage
+from univoxel.joint.config import JointConfig
 from univoxel.joint.observations import draw, widened
 from univoxel.lights.sg import SGConfig
 from univoxel.ops import shade_map
@@ -31,6 +32,7 @@ from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig
 from univoxel.sphere import fibonacci_sphere
 from univoxel.tasks import train as train_task
+from univoxel.training.config import StageConfig
 
 
 @pytest.fixture(params=["dielectric", "metal"])

@@ -9,15 +9,17 @@ from analytic import write_scene
 from PIL import Image
 
 from univoxel.checkpoint import load_checkpoint, load_scene
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.data.images import read_image
 from univoxel.errors import DataError
+from univoxel.joint.config import JointConfig
 from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.pictures import timelapse as module
 from univoxel.pictures.timelapse import LABEL, Timelapse
 from univoxel.scene import SceneConfig
 from univoxel.tasks.train import train
 from univoxel.training import progress as progress_module
+from univoxel.training.config import StageConfig
 
 
 @pytest.fixture(scope="module")
@@ -118,3 +120,11 @@ def test_what_is_missing_is_said_before_the_work(data, tmp_path, monkeypatch):
     with pytest.raises(DataError, match="transforms_train"):
         train(config(tmp_path, tmp_path / "run"), timelapse="film.gif")
     assert not (tmp_path / "run").exists()
+
+
+def test_light_that_varies_is_shown(data, tmp_path, often):
+    """The radiance head then reads a code of the view beside the features."""
+    cfg = config(data, tmp_path / "run")
+    cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, varying="light"))
+    train(cfg, timelapse=f"{tmp_path}/frames/")
+    assert len(list((tmp_path / "frames").iterdir())) == 20 + 8 + 4

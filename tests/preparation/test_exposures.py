@@ -9,10 +9,10 @@ from analytic import photos_of
 
 from univoxel.color import linear_to_srgb
 from univoxel.grid import fit_grid
+from univoxel.names import Varying
 from univoxel.preparation import exposures as task
 from univoxel.preparation.exposures import exposures, log_gains
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
-from univoxel.scene import Varying
 
 VIEWS = 16
 

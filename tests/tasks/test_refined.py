@@ -11,7 +11,7 @@ from analytic import LIGHTS, RADIUS, cameras_around, write_scene
 from univoxel import confidence
 from univoxel.camera import project
 from univoxel.checkpoint import load_scene
-from univoxel.config import StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
 from univoxel.experiments.stress.damage import turned
@@ -21,6 +21,7 @@ from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.train import train
+from univoxel.training.config import StageConfig
 
 
 @pytest.fixture(scope="module")

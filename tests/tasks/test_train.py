@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from univoxel.checkpoint import FILE, load_scene
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.config import StageConfig, TrainConfig, preset, with_field
+from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import SGConfig
+from univoxel.presets import preset, with_field
 from univoxel.render.pipeline import extract_mesh
 from univoxel.run import photos_of as photos_of_run
 from univoxel.scene import SceneConfig
@@ -24,6 +25,7 @@ from univoxel.tasks import train as task
 from univoxel.tasks.info import info
 from univoxel.tasks.train import split_pixels, train
 from univoxel.training import loop, surface_update
+from univoxel.training.config import StageConfig
 from univoxel.training.loop import batch_at
 
 

@@ -21,16 +21,18 @@ from observed_points import (
 from univoxel import losses
 from univoxel.checkpoint import load_checkpoint, load_scene, save_scene
 from univoxel.cli import main
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.joint import equations, newton, stage
+from univoxel.joint.config import JointConfig
 from univoxel.joint.observations import draw_sightings, widened
 from univoxel.lights import SGConfig
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import Scene, SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.train import train
+from univoxel.training.config import StageConfig
 from univoxel.training.loop import held_out_psnr
 
 NODES = 12

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from univoxel.config import StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.files import append_line
 from univoxel.training import progress as module
+from univoxel.training.config import StageConfig
 from univoxel.training.progress import RESERVE_SECONDS, REST, Progress
 
 START = {"stage": 0, "progress": 0.0, "step": 0}

@@ -20,13 +20,14 @@ from univoxel.camera import Cameras
 from univoxel.checkpoint import SHELL, stored
 from univoxel.compression import search
 from univoxel.compression.quality import TOLERANCE, Choice, Look, smallest
-from univoxel.config import StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS
 from univoxel.grid import fit_grid
 from univoxel.lights import LocalSG
 from univoxel.networks import DirectionTable
 from univoxel.scene import Scene, SceneConfig
+from univoxel.training.config import StageConfig
 
 REGAINED = 0.1  # dB that channels may cost where training goes on with what is left
 GRID_TOLERANCE = 0.1  # dB that a rehearsal on a coarser grid may fall short of the best so far

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from univoxel.color import linear_to_srgb
 from univoxel.records import Rays, Surface
-from univoxel.render.pipeline import shade, surface_at
+from univoxel.render.pipeline import radiance_of, shade, surface_at
 from univoxel.scene import Scene
 
 Number = TypeVar("Number", int, float)
@@ -46,7 +46,6 @@ class Look:
     rays: Rays
     view: Tensor  # [N] int64
     target: Tensor  # [N, 3] sRGB, on black
-    radiance: Callable[[Scene, Surface], Tensor]  # [N, 3] sRGB-encoded, of the radiance head
 
     @property
     def wo(self) -> Tensor:
@@ -63,7 +62,7 @@ class Look:
         surface = replace(
             surface, features=features, albedo=albedo, roughness=roughness, metallic=metallic
         )
-        head = self.radiance(scene, surface)
+        head = radiance_of(scene, surface, self.wo, self.view)
         rgb = shade(scene, surface, self.wo, view=self.view)
         material = torch.cat([albedo, roughness[:, None], metallic[:, None]], 1)
         return {

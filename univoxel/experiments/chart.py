@@ -7,11 +7,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from univoxel.config import LIGHTS, LightName, StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
 from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.files import replacing
+from univoxel.names import LIGHTS, LightName
+from univoxel.training.config import StageConfig
 
 BETWEEN = (2, 8)  # minutes, where the curve is looked at between the presets
 PRESETS = ("draft", "fast", "full")

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
-from univoxel.config import LIGHTS, LightName
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
 from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.files import replacing
+from univoxel.names import LIGHTS, LightName
 
 COLUMNS = (
     plots.NVS,

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from univoxel.config import LightName, TrainConfig, chosen
+from univoxel.config import TrainConfig
 from univoxel.files import replacing
+from univoxel.names import LightName
 from univoxel.overrides import changed
+from univoxel.presets import chosen
 
 RESULT = "result.json"
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from univoxel.config import JointConfig
+from univoxel.joint.config import JointConfig
 from univoxel.joint.metals import find_metal
 from univoxel.joint.newton import newton_round
 from univoxel.joint.observations import Problem

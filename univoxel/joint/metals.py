@@ -14,7 +14,7 @@ from torch import Tensor
 from univoxel import losses
 from univoxel.brdf import F0
 from univoxel.color import CLIPPED, srgb_to_linear
-from univoxel.config import JointConfig
+from univoxel.joint.config import JointConfig
 from univoxel.joint.equations import CAUCHY, encoded_slope
 from univoxel.joint.observations import LEAST_VIEWS, Problem, draw_sightings, sightings_of, widened
 from univoxel.scene import Scene

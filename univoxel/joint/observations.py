@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from univoxel import losses
-from univoxel.config import JointConfig
 from univoxel.data import Photos
+from univoxel.joint.config import JointConfig
 from univoxel.ops import shade_map
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh

@@ -17,9 +17,9 @@ from torch.nn.functional import binary_cross_entropy, normalize
 
 from univoxel import brdf, losses
 from univoxel.color import CLIPPED
-from univoxel.config import JointConfig
 from univoxel.data import Photos
 from univoxel.joint.albedo_entropy import balance, matte_albedo, sunlit
+from univoxel.joint.config import JointConfig
 from univoxel.joint.initialise import STEPS, TRIALS, TRIED, supposed
 from univoxel.joint.metals import find_metal
 from univoxel.joint.newton import newton_round

@@ -12,15 +12,17 @@ from torch import Tensor
 
 from univoxel.camera import resize
 from univoxel.color import linear_to_srgb
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import write_png
 from univoxel.envmap import EnvMap, tables
 from univoxel.errors import DataError
+from univoxel.joint.config import JointConfig
 from univoxel.pictures.animation import KINDS, require, write_animation
-from univoxel.render.pipeline import extract_mesh, shade_hits, surface_of_view
+from univoxel.render.pipeline import extract_mesh, radiance_of, shade_hits, surface_of_view
 from univoxel.render.relight import Lighting, relight_surface, stage
 from univoxel.scene import Scene
+from univoxel.training.config import StageConfig
 from univoxel.training.progress import Progress
 
 FRAMES = 60  # in the whole time of a training
@@ -119,7 +121,7 @@ def draw(scene: Scene, cameras, lit: bool, by_map: bool) -> Tensor:
     elif lit:
         render = linear_to_srgb(shade_hits(scene, surface, wo))
     else:
-        render = scene.radiance(surface.features, surface.normal, wo) * opacity
+        render = radiance_of(scene, surface, wo) * opacity
     scene.train(training)
     albedo = linear_to_srgb(surface.albedo * opacity)
     normal = (0.5 + 0.5 * surface.normal) * opacity

@@ -12,10 +12,10 @@ from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.data import Photos
 from univoxel.fields.dense import DenseField
 from univoxel.grid import GridShape
+from univoxel.names import Varying
 from univoxel.ops import VisibilityScene
 from univoxel.records import Mesh
 from univoxel.render.transport import observe, surface_points
-from univoxel.scene import Varying
 
 POINTS = 6000  # of the surface
 DARK = 0.1  # sRGB; of what is darker, rounding to 8 bits and reflections are too large a part

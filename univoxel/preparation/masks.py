@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from univoxel.color import linear_to_srgb
-from univoxel.config import MasksFrom
 from univoxel.data import Photos
+from univoxel.names import MasksFrom
 from univoxel.preparation.hull import mask_distances
 
 VIEWS = 32  # photographs at most that are looked at

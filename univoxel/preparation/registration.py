@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from univoxel.camera import Cameras, pixel_rays
-from univoxel.config import CamerasFrom
+from univoxel.names import CamerasFrom
 from univoxel.poses import PoseSteps
 from univoxel.preparation.hull import estimate_bounds
 from univoxel.records import Rays

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
+from univoxel.color import srgb_to_linear
 from univoxel.lights.quadrature import rotations
+from univoxel.losses import encode
 from univoxel.ops import composite
 from univoxel.records import Mesh, Rays, Surface
 from univoxel.render.density import section_alpha
@@ -56,6 +58,21 @@ def surface_at(scene: Scene, rays: Rays, jitter: Tensor | None = None) -> Surfac
 def at_rays(surface: Surface, index: Tensor) -> Surface:
     """The surface at some of its rays: numbers, or a mask."""
     return Surface(**{name: x[index] for name, x in vars(surface).items() if x is not None})
+
+
+def radiance_of(
+    scene: Scene, surface: Surface, wo: Tensor, view: Tensor | int | None = None
+) -> Tensor:
+    """What the radiance head says that the surface sends along wo: [N, 3], sRGB-encoded.
+
+    Args:
+        wo: [N, 3] unit, towards the eye.
+        view: as of `shade`.
+    """
+    encoded = scene.radiance(scene.coded(surface.features, view), surface.normal, wo)
+    if scene.views is None:
+        return encoded
+    return encode(scene.exposed(srgb_to_linear(encoded), view))
 
 
 def shade(

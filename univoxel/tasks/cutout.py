@@ -21,7 +21,6 @@ from torch import Tensor
 from univoxel import losses
 from univoxel.camera import Cameras, looked_at, pixel_rays
 from univoxel.color import linear_to_srgb
-from univoxel.config import StageConfig
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
@@ -34,6 +33,7 @@ from univoxel.metrics import psnr
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import surface_at, surface_of_view
 from univoxel.scene import Scene, SceneConfig
+from univoxel.training.config import StageConfig
 from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,

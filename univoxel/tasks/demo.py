@@ -8,12 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from univoxel.checkpoint import FILE
-from univoxel.config import StageConfig, preset
 from univoxel.files import replacing
+from univoxel.presets import preset
 from univoxel.tasks.evaluate import MEASURES, evaluate
 from univoxel.tasks.export import export
 from univoxel.tasks.relight import relight
 from univoxel.tasks.train import train
+from univoxel.training.config import StageConfig
 
 SCENE = Path(__file__).parent.parent / "example_data" / "tiny"
 MAPS = ("city", "sunset")

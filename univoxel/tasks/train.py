@@ -16,7 +16,7 @@ from univoxel import confidence, lights
 from univoxel.checkpoint import FILE, load_checkpoint, save_scene
 from univoxel.color import linear_to_srgb
 from univoxel.compression import plan
-from univoxel.config import JointConfig, StageConfig, TrainConfig, check_same, save_config
+from univoxel.config import TrainConfig, check_same, save_config
 from univoxel.data import Photos, load_photos
 from univoxel.errors import DataError
 from univoxel.fields.base import AbstractField
@@ -26,6 +26,7 @@ from univoxel.fields.sparse import SparseField
 from univoxel.files import replacing
 from univoxel.grid import GridShape, fit_grid
 from univoxel.joint import stage as joint_stage
+from univoxel.joint.config import JointConfig
 from univoxel.pictures.timelapse import Timelapse
 from univoxel.preparation.carving import opened
 from univoxel.preparation.exposures import exposures
@@ -34,7 +35,8 @@ from univoxel.preparation.masks import masks_of
 from univoxel.preparation.registration import object_box, put_right
 from univoxel.render.picture import preview
 from univoxel.scene import Scene
-from univoxel.training.loop import batch_at, encoded_radiance, rehearsal, run_stage
+from univoxel.training.config import StageConfig
+from univoxel.training.loop import batch_at, rehearsal, run_stage
 from univoxel.training.progress import Progress
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
@@ -185,9 +187,4 @@ def look_at(photos: Photos, pixels: Tensor) -> plan.Look:
     """Pixels as capacity looks at them."""
     batch = batch_at(photos, pixels)
     target = linear_to_srgb(batch.color * batch.alpha[:, None])
-    return plan.Look(
-        batch.rays,
-        batch.view,
-        target,
-        radiance=lambda scene, surface: encoded_radiance(scene, surface, batch),
-    )
+    return plan.Look(batch.rays, batch.view, target)

@@ -11,15 +11,16 @@ from torch import Tensor
 from univoxel import losses
 from univoxel.camera import pixel_rays
 from univoxel.checkpoint import save_scene
-from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.config import LossConfig, StageConfig, TrainConfig
+from univoxel.color import linear_to_srgb
+from univoxel.config import TrainConfig
 from univoxel.data import Photos
 from univoxel.lights import priors
 from univoxel.metrics import psnr
 from univoxel.optim import RowAdam
 from univoxel.records import Rays, Surface
-from univoxel.render.pipeline import at_rays, shade, surface_at
+from univoxel.render.pipeline import at_rays, radiance_of, shade, surface_at
 from univoxel.scene import Scene
+from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
 from univoxel.training.plateau import Plateau
 from univoxel.training.progress import Progress, Rehearsal
@@ -167,7 +168,7 @@ def objective(
     # A random background: otherwise a surface of the background's colour explains empty space.
     behind = torch.rand_like(batch.color)
     target = linear_to_srgb(batch.color * alpha + behind * (1 - alpha))
-    radiance = encoded_radiance(scene, surface, batch)
+    radiance = radiance_of(scene, surface, batch.wo, batch.view)
     drawn = radiance * opacity + linear_to_srgb(behind) * (1 - opacity)
     terms = {
         "radiance": weight.radiance * losses.photometric(drawn, target),
@@ -197,15 +198,6 @@ def objective(
     return terms | {name: getattr(weight, name) * value for name, value in prior.items()}
 
 
-def encoded_radiance(scene: Scene, surface: Surface, batch: Batch) -> Tensor:
-    """What the radiance head says of the photographs' rays: [N, 3], sRGB-encoded."""
-    features = scene.coded(surface.features, batch.view)
-    encoded = scene.radiance(features, surface.normal, batch.wo)
-    if scene.views is None:
-        return encoded
-    return losses.encode(scene.exposed(srgb_to_linear(encoded), batch.view))
-
-
 def random_batch(photos: Photos, pixels: Tensor, count: int) -> Batch:
     """`count` of the pixels, drawn with replacement."""
     return batch_at(photos, pixels[torch.randint(len(pixels), (count,))])
@@ -228,6 +220,6 @@ def held_out_psnr(scene: Scene, photos: Photos, pixels: Tensor, physical: bool) 
         shaded = shade(scene, surface, batch.wo, view=batch.view)
         shaded = linear_to_srgb(shaded * surface.opacity[:, None])
     else:
-        shaded = encoded_radiance(scene, surface, batch) * surface.opacity[:, None]
+        shaded = radiance_of(scene, surface, batch.wo, batch.view) * surface.opacity[:, None]
     target = linear_to_srgb(batch.color * batch.alpha[:, None])
     return psnr(shaded, target)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from univoxel.config import StageConfig
 from univoxel.fields.base import AbstractField
 from univoxel.optim import rows_of
 from univoxel.scene import Scene
+from univoxel.training.config import StageConfig
 
 SMOOTH_EVERY = 4  # steps between smoothings of what the step has touched
 SPREAD = 0.8  # share of the neighbours' mean that a node's gradient takes on in a pass

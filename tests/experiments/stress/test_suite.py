@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 
 from univoxel.cli import main
-from univoxel.config import LIGHTS, JointConfig
 from univoxel.experiments.record import Outcome
 from univoxel.experiments.stress import axes, render, suite
 from univoxel.experiments.stress.axes import AXES, BASE, INTACT
 from univoxel.experiments.stress.scenes import Spec
+from univoxel.joint.config import JointConfig
+from univoxel.names import LIGHTS
 
 TINY = (
     *(f"stages.{i}.{field}" for i in (0, 1, 3) for field in ("voxels=0.004", "rays=64")),

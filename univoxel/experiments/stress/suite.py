@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from univoxel.config import LIGHTS, LightName
 from univoxel.experiments import plots, runner
 from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.experiments.stress import axes as of_axes
@@ -17,6 +16,7 @@ from univoxel.experiments.stress.damage import Damage, clipped, damaged
 from univoxel.experiments.stress.report import Cell
 from univoxel.experiments.stress.scenes import Spec
 from univoxel.files import replacing
+from univoxel.names import LIGHTS, LightName
 
 SHOWN: tuple[LightName, ...] = ("hybrid", "sg", "sh", "envmap")
 SEEDS = 3

@@ -1,0 +1,205 @@
+"""Presets: how much work fits into a time on two cores."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from univoxel.config import TrainConfig
+from univoxel.joint.config import JointConfig
+from univoxel.lights import (
+    EnvmapConfig,
+    EnvmapSGConfig,
+    LightConfig,
+    MLPLightConfig,
+    SGConfig,
+    SHConfig,
+)
+from univoxel.names import Differing, FieldName, LightName
+from univoxel.scene import SceneConfig
+from univoxel.training.config import LossConfig, StageConfig
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a budget of time on two cores goes into."""
+
+    minutes: float
+    voxels: float  # millions, of the finest grid
+    steps: float  # of the fine stage; the others follow
+    rays: float  # per step
+
+
+PRESETS = {
+    "draft": Work(1.0, voxels=1.0, steps=400, rays=1024),
+    "fast": Work(4.0, voxels=2.0, steps=1200, rays=2048),
+    "full": Work(12.0, voxels=4.0, steps=4200, rays=2048),
+}
+
+
+COLORS_MINUTES = 1.5  # up to which materials have no time to follow a map that colours changed
+
+
+HOLLOWS = 0.04  # share of the time: where opening them takes more it costs more than it brings
+
+
+def preset(
+    name: str, data: Path, out: Path, light: LightName = "hybrid", varying: Differing = "auto"
+) -> TrainConfig:
+    """The configuration of a preset: draft (1 minute), fast (4) or full (12) on two cores.
+
+    Its sizes are limits: capacity is adaptive under the hybrid light, and fixed under others, which
+    are there to be compared.
+
+    Args:
+        light, varying: see `budget`.
+
+    Raises:
+        ValueError: an unknown name, or varying light with a map from the beginning.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"preset must be draft, fast or full, got {name!r}")
+    return _configuration(PRESETS[name], data, out, light, varying)
+
+
+def budget(
+    minutes: float, data: Path, out: Path, light: LightName = "hybrid", varying: Differing = "auto"
+) -> TrainConfig:
+    """The configuration for any time, in minutes on two cores: the presets and what lies between.
+
+    Args:
+        minutes: above 0.
+        light: "sg", local lobes as published; "hybrid", local lobes while geometry forms, then one
+            environment map with traced visibility for the materials, then lobes that follow them;
+            "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
+            traced visibility from the beginning. docs/lights.md tells them apart.
+        varying: what differs from photograph to photograph: "none"; "exposure", a gain per channel;
+            "light", the light itself too; "auto", exposure where they are seen to differ.
+
+    Raises:
+        ValueError: minutes out of range, no such light, or varying light with a map from the
+            beginning.
+    """
+    if not 0 < minutes < math.inf:
+        raise ValueError(f"minutes must be above 0, got {minutes:g}")
+    return _configuration(work_in(minutes), data, out, light, varying)
+
+
+def chosen(
+    name: str,
+    minutes: float | None,
+    data: Path,
+    out: Path,
+    light: LightName = "hybrid",
+    varying: Differing = "auto",
+) -> TrainConfig:
+    """A preset within a limit of minutes; or for the name auto, the work that fits into them.
+
+    Without minutes: the preset as it is, fast for auto.
+    """
+    if name == "auto" and minutes is not None:
+        return budget(minutes, data, out, light, varying)
+    config = preset("fast" if name == "auto" else name, data, out, light, varying)
+    return config if minutes is None else replace(config, minutes=minutes)
+
+
+def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
+    """The same with stages on such a field; only the first, a coarse one, is dense where the
+    others are sparse. Capacity is fixed where they are."""
+    stages = [replace(s, field=kind) if isinstance(s, StageConfig) else s for s in cfg.stages]
+    if kind == "sparse" and isinstance(stages[0], StageConfig):
+        stages[0] = replace(stages[0], field="dense")
+    capacity = "fixed" if kind == "sparse" else cfg.capacity
+    return replace(cfg, stages=tuple(stages), capacity=capacity)
+
+
+def work_in(minutes: float) -> Work:
+    """Work on the geometric line between the presets on either side of a time.
+
+    Before draft and beyond full the nearest two lead on, except that the grid stays as fine and the
+    batch as large as in full: more would want more memory.
+    """
+    known = list(PRESETS.values())
+    k = max(i for i, w in enumerate(known[:-1]) if i == 0 or w.minutes <= minutes)
+    low, high = known[k], known[k + 1]
+    x = math.log(minutes / low.minutes) / math.log(high.minutes / low.minutes)
+    voxels, steps, rays = (
+        getattr(low, name) * (getattr(high, name) / getattr(low, name)) ** x
+        for name in ("voxels", "steps", "rays")
+    )
+    return Work(minutes, min(voxels, known[-1].voxels), steps, min(rays, known[-1].rays))
+
+
+def _configuration(
+    work: Work, data: Path, out: Path, light: LightName, varying: Differing
+) -> TrainConfig:
+    minutes, voxels = work.minutes, round(work.voxels, 3)
+    exposures, known = varying == "auto", "none" if varying == "auto" else varying
+    steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
+    coarse = StageConfig(
+        0.9, steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35), field="hash"
+    )
+    fine = StageConfig(
+        voxels=voxels,
+        iterations=steps,
+        share=0.85,
+        rays=rays,
+        sharpness=(0.5, 0.3),
+        lr_sdf=(0.05, 0.005),
+        physical_from=0.3,
+        field="hash",
+    )
+    alone: dict[str, LightConfig] = {
+        c.kind: c
+        for c in (SGConfig(), SHConfig(), MLPLightConfig(), EnvmapSGConfig(), EnvmapConfig())
+    }
+    match light:
+        case "hybrid":
+            # Shares are what the stages cost where none is cut
+            coarse, fine = replace(coarse, share=0.12), replace(fine, share=0.48)
+            # What Newton and tracing cost follows the steps, or little work would be nothing else
+            joint = JointConfig(
+                iterations=steps,
+                share=0.25,
+                points=min(25 * steps, 15000 + 6 * steps),
+                newton_points=min(4000, 3 * steps),
+                colors=minutes > COLORS_MINUTES,
+            )
+            refit = StageConfig(
+                voxels=voxels,
+                iterations=steps // 3,
+                share=0.15,
+                rays=rays,
+                sharpness=(0.3, 0.3),
+                lr_sdf=(0.015, 0.0015),
+                lr_features=(0.01, 0.001),
+                plate=0.0,
+                diffusion=0.0,
+                physical_from=0.0,
+                refit=True,
+                field="hash",
+            )
+            scene, loss = SceneConfig(varying=known), LossConfig()
+            stages, capacity = (coarse, fine, joint, refit), "adaptive"
+        case _ if light in alone:
+            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=known)
+            # Lobes that light the materials to the end: what leaves least shading in the albedo
+            loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
+            stages, capacity = (coarse, fine), "fixed"
+        case _:
+            names = ", ".join(("hybrid", *alone))
+            raise ValueError(f"light must be one of {names}, got {light!r}")
+    return TrainConfig(
+        data,
+        out,
+        stages,
+        minutes,
+        masks="auto",
+        cameras="auto",
+        exposures=exposures,
+        hollows=HOLLOWS,
+        capacity=capacity,
+        scene=scene,
+        loss=loss,
+    )
