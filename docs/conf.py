@@ -3,7 +3,6 @@
 project = "univoxel"
 extensions = ["myst_parser"]
 myst_heading_anchors = 3
-myst_enable_extensions = ["deflist"]
 smartquotes = False  # two dashes are an option, not a dash
 html_theme = "furo"
 html_title = "univoxel"

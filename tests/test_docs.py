@@ -30,6 +30,10 @@ def test_pages_agree_with_results_and_code():
     assert doc_blocks.update(ROOT, write=False) == []
 
 
+def test_every_result_is_shown():
+    assert doc_blocks.unused(ROOT) == []
+
+
 def test_pages_keep_the_rules_of_prose():
     assert doc_prose.faults(ROOT) == []
 
@@ -71,6 +75,11 @@ def test_rows_of_different_commits_are_refused(copy):
     }
     with pytest.raises(ValueError, match="runs mix the commits a, b"):
         doc_tables.check_one_version(mixed)
+
+
+def test_a_result_that_no_page_shows_is_found(copy):
+    assert "benchmarks/results/ops.json: no page shows it" in doc_blocks.unused(copy)
+    assert "benchmarks/results/chart.json: no page shows it" not in doc_blocks.unused(copy)
 
 
 def test_a_block_that_does_not_end_is_found(copy):

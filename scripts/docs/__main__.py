@@ -23,7 +23,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="check the documentation, or bring it up to date")
     parser.add_argument("--write", action="store_true", help="fill the generated blocks anew")
     options = parser.parse_args()
-    faults = doc_blocks.update(ROOT, write=options.write) + doc_prose.faults(ROOT)
+    faults = doc_blocks.update(ROOT, write=options.write)
+    faults += doc_blocks.unused(ROOT) + doc_prose.faults(ROOT)
     for fault in faults:
         print(fault)
     print(f"{len(faults)} faults" if faults else "documentation: pages, results and code agree")

@@ -87,6 +87,15 @@ def update(root: Path, write: bool) -> list[str]:
     return faults
 
 
+def unused(root: Path) -> list[str]:
+    """One line for each result file that no page shows."""
+    names = [n for page in pages(root) for n in MARKER.findall(page.read_text(encoding="utf-8"))]
+    shown = {name.partition(":")[0] for name in names}
+    results = root / "benchmarks" / "results"
+    files = sorted(path.relative_to(results).as_posix() for path in results.rglob("*.json"))
+    return [f"benchmarks/results/{file}: no page shows it" for file in files if file not in shown]
+
+
 def _first_difference(text: str, wanted: str) -> int:
     """Lines from the block's marker to the first that differs."""
     pairs = zip(text.splitlines(), wanted.splitlines(), strict=False)
