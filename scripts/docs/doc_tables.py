@@ -384,9 +384,27 @@ def _approximations(record: dict[str, Any], _: str) -> str:
     return table(heads, rows, [True, False, True, True, True])
 
 
-def _relight(record: dict[str, Any], _: str) -> str:
-    names = {"mis": "map and BRDF (MIS)", "light": "map alone", "brdf": "BRDF alone"}
-    names |= {"map": "map alone", "env": "map alone"}
+def _relight(record: dict[str, Any], part: str) -> str:
+    """Error by strategy; or `mitsuba`, `pictures` of Cycles, and `rays` of bare Embree."""
+    if part == "mitsuba":
+        heads = ["material", "samples", "error", "Mitsuba, ms", "univoxel to the same error, ms"]
+        names = {"same_brdf": "our BRDF, sampled by the cosine", "principled": "`principled`"}
+        rows = []
+        for key, name in names.items():
+            for r in record["mitsuba"][key]:
+                times = [1000 * r[k] for k in ("seconds", "univoxel_seconds")]
+                errors = [str(r["spp"]), f"{r['error']:.3f}"]
+                rows.append([name, *errors, *[f"{ms:.1f}" for ms in times]])
+        return table(heads, grouped(rows), [False] + [True] * 4)
+    if part == "pictures":
+        rows = [[r["map"], str(r["bounces"]), f"{r['psnr']:.2f}"] for r in record["pictures"]]
+        return table(["map", "bounces", "PSNR, dB"], grouped(rows), [False, True, True])
+    if part == "rays":
+        r = record["rays"]
+        against = (r["ratio_to_bare"], r["ratio_to_bare_packets"])
+        heads = ["shadow rays", "rate against `rtcOccluded1`", "against packets of 8"]
+        return table(heads, [[f"{r['rays']:,}", *[f"{x:.2f}" for x in against]]], [True] * 3)
+    names = {"mis": "map and BRDF (MIS)", "map": "map alone", "brdf": "BRDF alone"}
     runs: dict[str, dict[int, dict]] = {}
     for r in record["strategies"]:
         runs.setdefault(r["strategy"], {})[r["spp"]] = r
