@@ -111,6 +111,13 @@ def test_long_lines_are_found_but_for_tables_code_and_links():
         assert doc_prose.long_lines(f"{free}\n") == []
 
 
+def test_a_link_to_markdown_outside_of_docs_is_found():
+    page = ROOT / "docs/guide/page.md"
+    assert doc_prose.leaves_docs(page, "../../CONTRIBUTING.md", ROOT)
+    assert not doc_prose.leaves_docs(page, "../glossary.md", ROOT)
+    assert not doc_prose.leaves_docs(page, "../../LICENSE", ROOT)
+
+
 def commands() -> list[tuple[str, str]]:
     """Every command line of the pages: page and arguments."""
     found = []

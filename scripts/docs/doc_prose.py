@@ -58,6 +58,11 @@ def faults(root: Path) -> list[str]:
             for target in links(text)
             if not (page.parent / target).exists()
         ]
+        found += [
+            f"{name}: {target} is no page of the site: name it in a code span, without a link"
+            for target in links(text)
+            if name.startswith("docs/") and leaves_docs(page, target, root)
+        ]
     return found
 
 
@@ -85,6 +90,12 @@ def links(text: str) -> list[str]:
     prose = CODE_SPAN.sub(_blank, _without_code(text))
     targets = [target.partition("#")[0] for target in LINK.findall(prose)]
     return [t for t in targets if t and not re.match(r"[a-z]+:", t)]
+
+
+def leaves_docs(page: Path, target: str, root: Path) -> bool:
+    """Whether a link of a page below docs/ leads to Markdown outside, which Sphinx does not know."""
+    path = (page.parent / target).resolve()
+    return path.suffix == ".md" and not path.is_relative_to((root / "docs").resolve())
 
 
 def _without_code(text: str) -> str:
