@@ -105,7 +105,7 @@ class RunClock(Clock):
 
         def call(*arguments):
             progress = arguments[-1]
-            number, stage = progress.stage + 1, self.cfg.stages[progress.stage]
+            number, stage = progress.clock.stage + 1, self.cfg.stages[progress.clock.stage]
             joint = isinstance(stage, JointConfig)
             what = "joint" if joint else f"{'refit' if stage.refit else 'grid'} {stage.voxels:g} M"
             self.enter(START)

@@ -71,7 +71,7 @@ def in_double(rows: Rows) -> Rows:
 
 
 class Steps:
-    """A clock that lets a stage run through."""
+    """A progress, and its clock, that let a stage run through."""
 
     over, pace, reserved = False, 1.0, math.inf
     stage = step = 0
@@ -88,10 +88,14 @@ class Steps:
             self.step = i
             yield i / self.count
 
-    def apart(self):
+    @property
+    def clock(self) -> "Steps":
+        return self
+
+    def off_pace(self):
         return nullcontext()
 
-    def room_for(self, blocks):
+    def blocks_that_fit(self, blocks):
         self.asked.append(blocks)
         return self.rooms.pop(0) if self.rooms else blocks
 

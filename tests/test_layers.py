@@ -37,14 +37,14 @@ LAYERS = [
     {"cli"},
 ]
 HELPERS = {
-    "ops": {"checks", "dense_grid", "native", "reflectance", "visibility"},
+    "ops": {"checks", "dense_grid", "grid_sampling", "native", "reflectance", "visibility"},
     "fields": {"base", "dense", "sparse"},
     "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "preparation": {"hull"},
-    "training": {"divergence", "plateau", "progress", "surface_update"},
+    "training": {"clock", "divergence", "plateau", "progress", "surface_update"},
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
     "compression": {"prune", "quality", "search"},
     "pictures": {"animation"},

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from univoxel.fields.hashed import PER_LEVEL
 from univoxel.files import replacing
@@ -117,17 +117,49 @@ def check_same(cfg: TrainConfig) -> None:
         before = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ValueError(f"{path}: cannot be read, so the run cannot go on: {error}") from None
-    now = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
+    if not isinstance(before, dict):
+        raise ValueError(f"{path}: expected an object with the configuration, got {before!r:.80}")
+    began = _completed(before, cfg)
     # of configurations from before there were any
     since = {"downscale": 0, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
     since |= {"masks": "given", "cameras": "given", "exposures": False}
+    began |= {name: value for name, value in since.items() if name not in before}
+    now = _as_json(cfg)
     for name in ("stages", "scene", *since):
-        if not isinstance(before, dict) or before.get(name, since.get(name)) != now[name]:
+        if began.get(name) != now[name]:
             raise ValueError(
                 f"{path}: the run began with other {name}: resume with the same --preset, "
                 "--minutes, --light, --varying, --masks, --cameras, --downscale, --capacity, "
                 "--budget-mb and --set as then"
             )
+
+
+def _completed(before: Any, now: Any) -> Any:
+    """A configuration from JSON with the defaults of fields that were added since.
+
+    Args:
+        now: a configuration of the same classes.
+    """
+    if isinstance(now, tuple) and isinstance(before, list) and len(before) == len(now):
+        return [_completed(b, n) for b, n in zip(before, now, strict=True)]
+    if not dataclasses.is_dataclass(now) or not isinstance(before, dict):
+        return before
+    result = dict(before)
+    for known in dataclasses.fields(now):
+        if known.name in before:
+            result[known.name] = _completed(before[known.name], getattr(now, known.name))
+        elif known.default is not dataclasses.MISSING:
+            result[known.name] = _as_json(known.default)
+        elif known.default_factory is not dataclasses.MISSING:
+            result[known.name] = _as_json(known.default_factory())
+    return result
+
+
+def _as_json(value: Any) -> Any:
+    """A configuration, or a value of one, as config.json holds it."""
+    is_record = dataclasses.is_dataclass(value) and not isinstance(value, type)
+    plain = dataclasses.asdict(value) if is_record else value
+    return json.loads(json.dumps(plain, default=str))
 
 
 def __getattr__(name: str):

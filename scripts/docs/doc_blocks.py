@@ -31,7 +31,9 @@ def pages(root: Path) -> list[Path]:
     listed = subprocess.run(command, capture_output=True, text=True, check=False)
     if listed.returncode:  # no repository, such as a copy that a test made
         return sorted(root.rglob("*.md"))
-    return sorted(path for name in listed.stdout.splitlines() if (path := root / name).exists())
+    return sorted(
+        path for name in set(listed.stdout.splitlines()) if (path := root / name).exists()
+    )
 
 
 def generated(name: str, results: Path) -> str:

@@ -93,7 +93,7 @@ def links(text: str) -> list[str]:
 
 
 def leaves_docs(page: Path, target: str, root: Path) -> bool:
-    """Whether a link of a page below docs/ leads to Markdown outside, which Sphinx does not know."""
+    """Whether a link of a page leads to Markdown outside of docs/, which Sphinx does not know."""
     path = (page.parent / target).resolve()
     return path.suffix == ".md" and not path.is_relative_to((root / "docs").resolve())
 

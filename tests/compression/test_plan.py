@@ -268,7 +268,7 @@ def test_resume_goes_on_with_what_was_chosen(data, tmp_path, monkeypatch):
 
     def killed(scene, cfg, stage, photos, pixels, held_out, progress):
         if not isinstance(progress, Rehearsal):
-            if progress.stage == 1:
+            if progress.clock.stage == 1:
                 raise KeyboardInterrupt
             original(scene, cfg, stage, photos, pixels, held_out, progress)
         # A rehearsal: the third grid serves as well as the first

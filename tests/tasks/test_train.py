@@ -169,7 +169,7 @@ def test_a_gradient_spreads_over_the_nodes_that_it_touches():
     values[middle] = 1.0
     grad = torch.sparse_coo_tensor(rows, values, field.sdf.shape, check_invariants=True)
     field.sdf.grad = grad.coalesce()
-    surface_update.spread_gradient(field, 2)
+    surface_update.smooth_sdf_gradient_(field, 2)
     spread = field.sdf.grad.to_dense()
     beside = [spread[3, 4, 4], spread[5, 4, 4], spread[4, 3, 4], spread[4, 4, 5]]
     assert spread[4, 4, 4] > beside[0] > spread[2, 4, 4] > 0

@@ -29,7 +29,13 @@ from univoxel.optim import RowAdam
 from univoxel.scene import Scene
 from univoxel.training.divergence import Guard
 from univoxel.training.progress import Progress
-from univoxel.training.surface_update import EPS_FEATURES, EPS_SDF, MOMENTS, moved, spread_gradient
+from univoxel.training.surface_update import (
+    EPS_FEATURES,
+    EPS_SDF,
+    MOMENTS,
+    refresh_surface_,
+    smooth_sdf_gradient_,
+)
 
 # Of a sighting in a Newton step over one in a step of Adam, with trials and the search for metals;
 # measured
@@ -47,33 +53,33 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     What a point sees, and is seen by, is traced once: the surface turns, and hardly moves.
     """
     assert scene.sky is not None
-    if progress.over:
-        progress.skip()
+    if progress.clock.over:
+        progress.clock.skip()
         return
     # What does not fit is cut alike: points here, steps of Adam by `steps`, points of Newton below
-    points = min(cfg.points, max(LEAST_POINTS, round(progress.pace * cfg.points)))
+    points = min(cfg.points, max(LEAST_POINTS, round(progress.clock.pace * cfg.points)))
     try:
         scene.occluder()
         problem = pose(scene, photos, replace(cfg, points=points), seed)
     except ValueError as error:  # no surface, or none that is seen
-        progress.trouble(f"stage {progress.stage + 1}: {error}: light and materials stay")
-        progress.skip()
+        progress.trouble(f"stage {progress.clock.stage + 1}: {error}: light and materials stay")
+        progress.clock.skip()
         return
     scene.field.sdf.requires_grad_(cfg.lr_sdf > 0)
     first, turn, more = 0.0, -1.0, cfg.rounds  # begin and end of a round, rounds to come
     guard = Guard(progress)
-    for done in progress.steps(newton_share(cfg)):
+    for done in progress.clock.steps(newton_share(cfg)):
         if done >= turn:
-            seconds = progress.reserved / more
+            seconds = progress.clock.reserved / more
             problem = turned(scene, problem)
             if more == cfg.rounds:
-                with progress.apart():
+                with progress.clock.off_pace():
                     problem = supposed(scene, problem, cfg, seconds, progress.trouble)
                     if cfg.colors:
                         problem = sunlit(scene, problem, progress.say)
                         if balance(scene, problem) or problem.sun is not None:
                             problem = replace(problem, albedo=matte_albedo(scene, problem))
-            with progress.apart():
+            with progress.clock.off_pace():
                 costs = newton_round(scene, problem, cfg, seconds, progress.trouble)
                 if cfg.colors:
                     balance(scene, problem)
@@ -82,7 +88,9 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
                 if problem.albedo is not None:
                     follow(scene, problem, cfg)
                     problem = replace(problem, albedo=None)
-            more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
+            more = 1 + progress.clock.blocks_that_fit(
+                more - 1
+            )  # on a slow machine fewer and longer rounds
             groups = [
                 {"params": [scene.field.features], "eps": EPS_FEATURES},
                 {"params": list(scene.material.parameters())},
@@ -116,12 +124,12 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         if not guard.sound(loss):
             continue
         if cfg.lr_sdf:
-            spread_gradient(scene.field, SPREAD)
+            smooth_sdf_gradient_(scene.field, SPREAD)
         optimizer.step()
         if progress.due():
             progress.report({k: v.item() for k, v in terms.items()}, None)
             guard.keep()
-    moved(scene)
+    refresh_surface_(scene)
 
 
 def follow(scene: Scene, problem: Problem, cfg: JointConfig) -> None:

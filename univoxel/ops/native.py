@@ -26,9 +26,9 @@ def _load() -> tuple[ModuleType | None, str]:
     """The build for this processor, or None and the reason why there is none."""
     folder = Path(__file__).parent.parent / "_core"
     built = {p.parent.name: p for p in folder.glob("*/_core.*") if p.suffix in (".so", ".pyd")}
-    wanted = torch.backends.cpu.get_cpu_capability().lower()
+    capability = torch.backends.cpu.get_cpu_capability().lower()
     rank = ["default", "avx2", "avx512"]
-    usable = rank[: rank.index(wanted) + 1] if wanted in rank else ["default"]
+    usable = rank[: rank.index(capability) + 1] if capability in rank else ["default"]
     for variant in reversed(usable):
         if variant not in built:
             continue

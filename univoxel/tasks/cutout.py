@@ -40,9 +40,9 @@ from univoxel.training.surface_update import (
     MOMENTS,
     REFRESH,
     SMOOTH_EVERY,
-    between,
-    smooth,
-    spread_gradient,
+    geometric,
+    smooth_sdf_gradient_,
+    smooth_touched_,
 )
 
 STAGES = (
@@ -215,14 +215,14 @@ def separate(
     for step in range(stage.iterations):
         done = step / stage.iterations
         rates = (
-            between(stage.lr_sdf, done) * field.voxel_size,
-            between(stage.lr_features, done),
-            between(stage.lr_networks, done),
-            between(LR_BACKDROP, done),
+            geometric(stage.lr_sdf, done) * field.voxel_size,
+            geometric(stage.lr_features, done),
+            geometric(stage.lr_networks, done),
+            geometric(LR_BACKDROP, done),
         )
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
-        scene.inv_s = 1 / (between(stage.sharpness, done) * field.voxel_size)
+        scene.inv_s = 1 / (geometric(stage.sharpness, done) * field.voxel_size)
         if step % REDISTANCE == 0:
             redistance(field)
         if step % REFRESH == 0:
@@ -237,13 +237,13 @@ def separate(
         # The same from all directions: what looks different from each would pass for the backdrop
         front = scene.radiance(surface.features, surface.normal, surface.normal)
         drawn = front * opacity + backdrop(rays) * (1 - opacity)
-        loss = losses.photometric(drawn, target) + between(EMPTY, done) * opacity.mean()
+        loss = losses.photometric(drawn, target) + geometric(EMPTY, done) * opacity.mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        spread_gradient(field, stage.spread)
+        smooth_sdf_gradient_(field, stage.spread)
         optimizer.step()
         if step % SMOOTH_EVERY == 0:
-            smooth(field, stage)
+            smooth_touched_(field, stage)
         quality.append(psnr(drawn.detach(), target))
         watch(quality[-1])
     return sum(quality[-LAST:]) / len(quality[-LAST:])
