@@ -21,6 +21,7 @@ LAYERS = [
     {"losses"},
     {"assets", "metrics", "render"},
     {"joint.config", "preparation.config", "training.config", "compression.config"},
+    {"compression.choices"},
     {"config", "overrides"},
     {"presets"},
     {"preparation", "training"},
@@ -46,7 +47,7 @@ HELPERS = {
     "preparation": {"hull"},
     "training": {"divergence", "plateau", "progress", "surface_update"},
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
-    "compression": {"prune", "quality", "search"},
+    "compression": {"prune", "quality", "search", "sizes", "storage"},
     "pictures": {"animation"},
     "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
 }

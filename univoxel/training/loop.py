@@ -55,6 +55,15 @@ class Batch:
         return -self.rays.direction
 
 
+@dataclass(frozen=True)
+class TrainingPixels:
+    """Photographs, and which of their pixels [P, 3] (view, row, column) serve what."""
+
+    photos: Photos
+    pixels: Tensor  # trained on
+    held_out: Tensor  # only looked at, to follow quality
+
+
 def run_stage(
     scene: Scene,
     cfg: TrainConfig,
@@ -144,19 +153,18 @@ def run_stage(
 
 def rehearsal(
     cfg: TrainConfig,
-    photos: Photos,
-    pixels: Tensor,
-    held_out: Tensor,
+    pixels: TrainingPixels,
     scene: Scene,
     stage: StageConfig,
     steps: int,
 ) -> float:
     """Hurry a scene through a stage, without light; PSNR of its held-out pixels."""
+    photos, held_out = pixels.photos, pixels.held_out
     torch.manual_seed(cfg.seed)  # all rehearsals see the same rays
     # From middling rates on: what has been learned must not be shaken
     rates = {n: (math.sqrt(a * b), b) for n in RATES for a, b in [getattr(stage, n)]}
     stage, cfg = replace(stage, physical_from=1.0, **rates), replace(cfg, patience=0.0)
-    run_stage(scene, cfg, stage, photos, pixels, held_out, Rehearsal(steps))
+    run_stage(scene, cfg, stage, photos, pixels.pixels, held_out, Rehearsal(steps))
     return held_out_psnr(scene, photos, held_out, physical=False)
 
 

@@ -13,6 +13,7 @@ import torch
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
+from univoxel.compression.choices import CapacityChoice
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
 
@@ -44,7 +45,7 @@ class Progress:
         self.stage, self.done, self.step = state["stage"], state["progress"], state["step"]
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
         self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
-        self.chosen: list[dict] = list(state.get("chosen", ()))  # of capacity
+        self.chosen = [CapacityChoice.from_json(entry) for entry in state.get("chosen", ())]
         self.troubles: list[str] = list(state.get("troubles", ()))  # what went wrong and was mended
         self._stage_steps = state.get("stage_steps", 0)  # made in the present stage
         self._planned, self._count = 0, 0  # steps of the stage in this sitting
@@ -72,7 +73,7 @@ class Progress:
         self._bar.stop()
         if kind is not None:
             return
-        for told in (*(c["said"] for c in self.chosen), self.cut()):
+        for told in (*(c.sentence for c in self.chosen), self.cut()):
             if told:
                 self.say(told)
         if self.troubles:
@@ -95,7 +96,7 @@ class Progress:
             "step": self.step,
             "made": self.made,
             "early": self.early,
-            "chosen": self.chosen,
+            "chosen": [choice.as_json() for choice in self.chosen],
             "troubles": self.troubles,
             "stage_steps": self._stage_steps,
             "seconds": self.seconds,
