@@ -25,7 +25,7 @@ def export(
     texture_size: int = 1024,
     watertight: bool = False,
 ) -> None:
-    """Write the zero level of a scene's sdf with its materials; see docs/export.md.
+    """Write the zero level of a scene's sdf with its materials; see docs/guide/export.md.
 
     Args:
         run: folder of the trained scene.
