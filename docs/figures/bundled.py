@@ -1,7 +1,8 @@
 """Draws the pictures of docs/guide and docs/explanation that show the bundled scene.
 
-    univoxel train univoxel/example_data/tiny --out RUN --minutes 20 --set stages.0.voxels=0.27 \\
-        --set stages.1.voxels=0.6 --set stages.3.voxels=0.6 --timelapse RUN/film/
+    univoxel train univoxel/example_data/tiny --out RUN --preset fast --minutes 20 \\
+        --set stages.0.voxels=0.27 --set stages.1.voxels=0.6 --set stages.3.voxels=0.6 \\
+        --timelapse RUN/film/
     python docs/figures/bundled.py RUN docs/images
 
 Commands of univoxel make the pictures. This script puts them side by side.
@@ -9,6 +10,7 @@ Commands of univoxel make the pictures. This script puts them side by side.
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tempfile
@@ -22,6 +24,7 @@ from univoxel.data.images import read_exr
 SCENE = Path(__file__).parents[2] / "univoxel/example_data/tiny"
 VIEW = 2  # of the test views: pepper and avocado side by side
 SIDE = 220  # pixels of a picture
+FRAME = 120  # pixels of one in a timelapse
 GAP = 6  # between pictures
 LABEL = 18  # pixels above a frame of a timelapse, and above a picture of `univoxel inspect`
 
@@ -82,13 +85,22 @@ def masks(out: Path) -> None:
 
 
 def stage_frames(run: Path, out: Path) -> None:
-    """Frames of the timelapse, from early to last."""
-    film = sorted((run / "film").glob("*.png"))
-    chosen = [film[round(share * (len(film) - 1))] for share in (0.12, 0.4, 0.75, 1.0)]
-    frames = [Image.open(p) for p in chosen]
-    frames = [f.crop((0, LABEL, f.width, f.height)) for f in frames]
-    frames = [f.resize((3 * SIDE, SIDE), Image.Resampling.LANCZOS) for f in frames]
-    below(frames).save(out / "stage_frames.png", optimize=True)
+    """Render, albedo and normals as each stage ends."""
+    stages = json.loads((run / "config.json").read_text())["stages"]
+    film = {int(path.stem.removeprefix("step_")): path for path in (run / "film").glob("*.png")}
+    columns, end = [], 0
+    for stage in stages:
+        end += stage["iterations"]
+        frame = Image.open(film[max(step for step in film if step <= end)]).convert("RGB")
+        side = frame.width // 3
+        left, top = side // 8, LABEL + side // 8  # of what is not just black
+        parts = [
+            frame.crop((k * side + left, top, (k + 1) * side - left, LABEL + side - side // 8))
+            for k in range(3)
+        ]
+        size = (FRAME, FRAME)
+        columns.append(below([part.resize(size, Image.Resampling.LANCZOS) for part in parts]))
+    beside(columns).save(out / "stage_frames.png", optimize=True)
 
 
 def doubt(test: Path, out: Path) -> None:
