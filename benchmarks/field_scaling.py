@@ -34,7 +34,7 @@ from univoxel.ops import composite
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays
 from univoxel.render.density import section_alpha
-from univoxel.tasks import train
+from univoxel.training import surface_update
 
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "field_scaling.json"
@@ -87,7 +87,7 @@ def step(field: AbstractField, optimizer: RowAdam) -> None:
     loss = (seen[:, :channels] - wanted).square().mean() + 0.1 * (length - 1).square().mean()
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
-    train.spread_gradient(field, 4)
+    surface_update.smooth_sdf_gradient_(field, 4)
     optimizer.step()
 
 
@@ -108,7 +108,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
     optimizer = RowAdam([field.sdf, field.features], lr=0.01 * field.voxel_size, eps=1e-4)
     seconds, looks = [], []
     for i in range(steps):
-        if i % train.REFRESH == 0:
+        if i % surface_update.REFRESH == 0:
             begin, old = time.perf_counter(), (field.sdf, field.features)
             field.refresh()
             for a, b in zip(old, (field.sdf, field.features), strict=True):
@@ -116,7 +116,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
             looks.append(time.perf_counter() - begin)
         begin = time.perf_counter()
         step(field, optimizer)
-        if i % train.SMOOTH_EVERY == 0:
+        if i % surface_update.SMOOTH_EVERY == 0:
             assert field.sdf.grad is not None
             assert field.features.grad is not None
             field.smooth_rows_(field.sdf.data, rows_of(field.sdf.grad), 0.01, order=2)
@@ -132,7 +132,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
         "memory_mb": peak - before,
         "process_mb": peak,
         "make_seconds": made,
-        "step_ms": 1e3 * (median(seconds) + median(looks) / train.REFRESH),
+        "step_ms": 1e3 * (median(seconds) + median(looks) / surface_update.REFRESH),
         "refresh_ms": 1e3 * median(looks),
         "isosurface_seconds": time.perf_counter() - begin,
         "faces": faces,

@@ -24,12 +24,12 @@ from univoxel.data import load_photos, load_relit, relight_maps
 from univoxel.data.base import decode
 from univoxel.data.maps import read_map
 from univoxel.envmap import tables
+from univoxel.evaluation.measures import albedo_scales
 from univoxel.metrics import on_black, psnr
 from univoxel.records import Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, Stage, relight_surface, stage
 from univoxel.run import trained_on
-from univoxel.tasks.evaluate import _albedo_scales
 
 BOUNCES = [0, 1, 2, 4]
 EXPONENTS = [1.0, 1.5]
@@ -49,7 +49,7 @@ def scores(run: Path, every: int, samples: int = 64) -> list[dict]:
     """relit_psnr of a run by bounces and exponent."""
     scene, folder = load_scene(run), trained_on(run)
     photos = load_photos(folder, "test")
-    scale = _albedo_scales(scene, photos).three
+    scale = albedo_scales(scene, photos).three
     here = stage(_scaled(extract_mesh(scene), scale), scene.field.voxel_size)
     maps = relight_maps(folder)
     lights = {name: Lighting(tables(read_map(path))) for name, path in maps.items()}

@@ -34,6 +34,7 @@ from univoxel.data import load_photos, load_relit, load_truth, relight_maps
 from univoxel.data.base import decode
 from univoxel.data.maps import read_map, true_map
 from univoxel.envmap import tables
+from univoxel.evaluation.measures import albedo_scales
 from univoxel.fields.dense import DenseField
 from univoxel.grid import GridShape, fit_grid
 from univoxel.joint.config import JointConfig
@@ -47,7 +48,7 @@ from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, relight_surface, stage
 from univoxel.scene import Scene
 from univoxel.sphere import latlong_directions, texel_solid_angles
-from univoxel.tasks.evaluate import _albedo_scales, evaluate
+from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
 from univoxel.training.config import StageConfig
 
@@ -155,7 +156,7 @@ def begin(folder: Path, out: Path, name: str, term: str) -> TrainConfig:
 def relit_with_true_pixels(run: Path, folder: Path, samples: int = 64) -> dict[str, float]:
     """relit_psnr of a run, its pixels' terms replaced by the truth one by one, and all at once."""
     scene, photos = load_scene(run), load_photos(folder, "test")
-    scale = _albedo_scales(scene, photos).three
+    scale = albedo_scales(scene, photos).three
     own = extract_mesh(scene)
     assert own.albedo is not None
     own = replace(own, albedo=(own.albedo * scale).clamp_max(1))

@@ -55,7 +55,7 @@ STAGES = {
         *((priors, name) for name in ("smoothness", "chroma", "total_variation")),
     ],
     "optimiser": [(RowAdam, "step")],
-    "smoothing": [(loop, "smooth"), (loop, "spread_gradient")],
+    "smoothing": [(loop, "smooth_touched_"), (loop, "smooth_sdf_gradient_")],
     "refresh": [(DenseField, "refresh")],
 }
 BACKWARD = "backward"
@@ -119,14 +119,15 @@ def run_steps(scene: Scene, views: tuple, rays: int, count: int, begin: float = 
     """`count` steps of the training loop, with every term of the loss; `begin`: of its schedule."""
     cfg = preset("fast", DATA, DATA)
     stage = replace(cfg.stages[1], rays=rays, physical_from=0.0)
-    progress = SimpleNamespace(step=0, due=lambda: False, checkpoint_due=lambda: False)
+    clock = SimpleNamespace(stage=1, step=0)
+    progress = SimpleNamespace(clock=clock, due=lambda: False, checkpoint_due=lambda: False)
 
     def steps():
         for i in range(count):
-            progress.step = i
+            clock.step = i
             yield begin + (1 - begin) * i / count
 
-    progress.steps = steps
+    clock.steps = steps
     loop.run_stage(scene, cfg, stage, *views, progress)
 
 

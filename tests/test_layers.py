@@ -11,7 +11,8 @@ ROOT = Path(__file__).parent.parent
 # From the bottom up. A module imports only from layers below its own and, inside its folder, the
 # helpers named here.
 LAYERS = [
-    {"errors", "files", "names", "records", "validation"},
+    {"errors"},
+    {"bars", "files", "names", "records", "validation"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "poses"},
@@ -27,6 +28,7 @@ LAYERS = [
     {"joint"},
     {"confidence"},
     {"compression", "pictures"},
+    {"evaluation", "segmentation"},
     {"tasks"},
     {"tasks.demo"},
     {"experiments.plots", "experiments.record"},
@@ -37,17 +39,19 @@ LAYERS = [
     {"cli"},
 ]
 HELPERS = {
-    "ops": {"checks", "dense_grid", "native", "reflectance", "visibility"},
+    "ops": {"checks", "dense_grid", "grid_sampling", "native", "reflectance", "visibility"},
     "fields": {"base", "dense", "sparse"},
     "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "preparation": {"hull"},
-    "training": {"divergence", "plateau", "progress", "surface_update"},
+    "training": {"clock", "divergence", "plateau", "progress", "surface_update"},
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
     "compression": {"prune", "quality", "search"},
     "pictures": {"animation"},
+    "evaluation": {"measures", "truth"},
+    "segmentation": {"config", "distances"},
     "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
 }
 # Extras: imported inside the function that needs one

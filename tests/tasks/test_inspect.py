@@ -104,7 +104,7 @@ def test_irradiance_of_an_even_sky():
 def test_pixels_as_they_are_written():
     assert parse_pixel("12,34") == (12, 34)
     for text in ("12", "a,b", "1,2,3", "1.5,2"):
-        with pytest.raises(ValueError, match=f"--pixel: expected COLUMN,ROW, got '{text}'"):
+        with pytest.raises(ValueError, match=f"pixel: expected COLUMN,ROW, got '{text}'"):
             parse_pixel(text)
 
 

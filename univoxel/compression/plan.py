@@ -21,6 +21,7 @@ from univoxel.checkpoint import SHELL, stored
 from univoxel.compression import search
 from univoxel.compression.quality import TOLERANCE, Choice, Look, smallest
 from univoxel.config import TrainConfig
+from univoxel.errors import UserError
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS
 from univoxel.grid import fit_grid
@@ -201,13 +202,14 @@ def check_budget(scene: Scene, megabytes: float) -> None:
     its nodes near the surface, do not fit into.
 
     Raises:
-        ValueError: says how much is needed.
+        UserError: says how much is needed.
     """
     least = _apart_from_grid(scene) + FEWEST_VOXELS // 2 * _node_bytes(scene)
     if 1e6 * megabytes < least:
-        raise ValueError(
-            f"--budget-mb: {megabytes:g} is too small for anything: networks, map and the coarsest "
-            f"grid need {least / 1e6:.2g}"
+        raise UserError(
+            f"budget_mb: {megabytes:g} is too small for anything: networks, map and the coarsest "
+            f"grid need {least / 1e6:.2g}",
+            "budget_mb",
         )
 
 

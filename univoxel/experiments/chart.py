@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from univoxel.config import TrainConfig
+from univoxel.errors import ProcessFailed, UserError
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
 from univoxel.experiments.record import Outcome, Setting
@@ -76,16 +77,16 @@ def chart(
         out/chart.png.
 
     Raises:
-        DataError, ValueError: a scene or an argument cannot be used; nothing was trained.
-        ImportError: matplotlib is missing.
-        RuntimeError: trainings failed; what came through is in the files.
+        UserError: a scene or an argument cannot be used; nothing was trained.
+        MissingExtra: matplotlib is missing.
+        ProcessFailed: trainings failed; what came through is in the files.
         OSError: a file cannot be written.
     """
     plots.require()
     chosen = settings(preset, light, tuple(changes))
     wanted = only or ((*dict.fromkeys(("draft", preset)), *QUICK) if quick else tuple(chosen))
     if unknown := [name for name in wanted if name not in chosen]:
-        raise ValueError(f"--only must be of {', '.join(chosen)}, got {', '.join(unknown)}")
+        raise UserError(f"only must be of {', '.join(chosen)}, got {', '.join(unknown)}", "only")
     outcomes = runner.run(scenes, [chosen[name] for name in wanted], out, samples)
     record = {
         "preset": preset,
@@ -102,7 +103,7 @@ def chart(
     if any(not outcome.error for outcome in outcomes):
         draw(outcomes, out / "chart")
     if failed := runner.failures(outcomes):
-        raise RuntimeError(failed)
+        raise ProcessFailed(failed)
     return out / "chart.png"
 
 

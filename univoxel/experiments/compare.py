@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
 
+from univoxel.errors import ProcessFailed, UserError
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
 from univoxel.experiments.record import Outcome, Setting
@@ -53,9 +54,9 @@ def compare(
         out/compare.md.
 
     Raises:
-        DataError, ValueError: a scene or an argument cannot be used; nothing was trained.
-        ImportError: matplotlib is missing.
-        RuntimeError: trainings failed; what came through is in the files.
+        UserError: a scene or an argument cannot be used; nothing was trained.
+        MissingExtra: matplotlib is missing.
+        ProcessFailed: trainings failed; what came through is in the files.
         OSError: a file cannot be written.
     """
     plots.require()
@@ -76,7 +77,7 @@ def compare(
     if any(not outcome.error for outcome in outcomes):
         draw(outcomes, out / "compare")
     if failed := runner.failures(outcomes):
-        raise RuntimeError(failed)
+        raise ProcessFailed(failed)
     return out / "compare.md"
 
 
@@ -136,7 +137,7 @@ def draw(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
 def _setting(text: str, preset: str, minutes: float | None, changes: tuple[str, ...]) -> Setting:
     name, _, fields = text.partition(":")
     if name not in LIGHTS:
-        raise ValueError(f"--light must be one of {', '.join(LIGHTS)}, got {text!r}")
+        raise UserError(f"light must be one of {', '.join(LIGHTS)}, got {text!r}", "light")
     light: LightName = name
     own = tuple(f"scene.light.{field}" for field in fields.split(",") if field)
     label = "-".join([name, *fields.split(",")]) if fields else name

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from univoxel.config import TrainConfig
+from univoxel.errors import DataError
 from univoxel.files import replacing
 from univoxel.names import LightName
 from univoxel.overrides import changed
@@ -44,8 +45,8 @@ class Outcome:
     scene: str
     setting: str
     identity: dict  # what a later call must agree with to take this for its own; JSON
-    # By the keys of tasks.evaluate.MEASURES, steps_made (share of the planned ones), and map_*, the
-    # fields of tasks.envmap.Comparison
+    # By the keys of evaluation.measures.MEASURES, steps_made (share of the planned ones), and
+    # map_*, the fields of tasks.envmap.Comparison
     measures: Mapping[str, float | int | None] = dataclasses.field(default_factory=dict)
     log: list[dict] = dataclasses.field(default_factory=list)  # seconds, stage, held_out_psnr
     load_average: float | None = None  # of the machine when it began
@@ -74,7 +75,7 @@ def load_outcome(folder: Path) -> Outcome | None:
     try:
         return Outcome(**json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{path}: expected the record of a training: {error}") from None
+        raise DataError(f"{path}: expected the record of a training: {error}") from None
 
 
 def identity(config: TrainConfig, samples: int) -> dict:

@@ -16,6 +16,7 @@ from pathlib import Path
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from univoxel.data import load_photos
+from univoxel.errors import UserError
 from univoxel.experiments import worker
 from univoxel.experiments.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.files import replacing
@@ -46,7 +47,7 @@ def run(
 
     Raises:
         DataError: a scene cannot be read.
-        ValueError: two scenes or settings of one name; as of `run_pairs`.
+        UserError: two scenes or settings of one name; as of `run_pairs`.
         OSError: `out` cannot be written.
     """
     settings = _distinct(settings)
@@ -76,7 +77,7 @@ def run_pairs(
         seconds: what one may take, a guess for the bar; the configuration's time when left out.
 
     Raises:
-        ValueError: a setting that no configuration follows from, a pair that comes twice, or
+        UserError: a setting that no configuration follows from, a pair that comes twice, or
             results of other settings in `out`.
         OSError: `out` cannot be written.
     """
@@ -91,9 +92,10 @@ def _run(jobs: Sequence[Job]) -> list[Outcome]:
     for job in jobs:
         found = before[job.folder]
         if found is not None and found.identity != job.identity:
-            raise ValueError(
+            raise UserError(
                 f"{job.folder / RESULT}: is of another configuration or data set: remove it, or "
-                "choose another --out"
+                "choose another out",
+                "out",
             )
     done = {folder: found for folder, found in before.items() if found and not found.error}
     missing = [job for job in jobs if job.folder not in done]
@@ -120,10 +122,10 @@ def _named(scenes: Iterable[Path]) -> list[Path]:
     """Scenes as absolute folders, whose names tell them apart."""
     folders = [Path(scene).resolve() for scene in scenes]
     if not folders:
-        raise ValueError("expected a scene, a folder of photographs, or more; got none")
+        raise UserError("expected a scene, a folder of photographs, or more; got none")
     if len({folder.name for folder in folders}) < len(folders):
         names = [str(folder) for folder in folders]
-        raise ValueError(f"expected scenes in folders of different names, got {names}")
+        raise UserError(f"expected scenes in folders of different names, got {names}")
     return folders
 
 
@@ -131,13 +133,13 @@ def _distinct(settings: Sequence[Setting]) -> Sequence[Setting]:
     names = [setting.name for setting in settings]
     bad = [name for name in names if not NAME.fullmatch(name) or names.count(name) > 1]
     if bad or not names:
-        raise ValueError(f"expected settings of different names, got {bad or names}")
+        raise UserError(f"expected settings of different names, got {bad or names}")
     return settings
 
 
 def _job(data: Path, setting: Setting, out: Path, samples: int, seconds: float | None) -> Job:
     if samples < 1:
-        raise ValueError(f"--samples must be at least 1, got {samples}")
+        raise UserError(f"samples must be at least 1, got {samples}", "samples")
     folder = out / data.name / setting.name
     config = setting.config(data, folder / worker.RUN)
     seconds = 60 * config.minutes + EVALUATION_SECONDS if seconds is None else seconds

@@ -6,6 +6,7 @@ import torch
 from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
+from univoxel.errors import NoSurface
 from univoxel.fields.base import AbstractField
 from univoxel.grid import GridShape, resample
 from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_dense, smooth_rows_
@@ -73,7 +74,7 @@ class DenseField(AbstractField):
     def isosurface(self) -> tuple[Tensor, Tensor]:
         sdf = self.sdf.detach().numpy()
         if not sdf.min() < 0 < sdf.max():
-            raise ValueError("the field has no surface: its sdf does not change sign")
+            raise NoSurface("the field has no surface: its sdf does not change sign")
         vertices, faces, _, _ = marching_cubes(sdf, 0.0, gradient_direction="descent")
         origin = torch.tensor(self.grid.origin)
         world = origin + self.voxel_size * torch.from_numpy(vertices.copy())

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from univoxel.errors import ConfigError
 from univoxel.networks import MLP, waves
 from univoxel.records import Surface
 
@@ -18,15 +19,15 @@ def check(config: Any, at_least: dict[str, int], *above_zero: str) -> None:
     """Refuse a configuration with a number out of range.
 
     Raises:
-        ValueError: names the number.
+        ConfigError: names the number.
     """
     name = type(config).__name__
     for field, least in at_least.items():
         if getattr(config, field) < least:
-            raise ValueError(f"{name}: {field} must be >= {least}, got {getattr(config, field)}")
+            raise ConfigError(f"{name}: {field} must be >= {least}, got {getattr(config, field)}")
     for field in above_zero:
         if not 0 < getattr(config, field) < math.inf:
-            raise ValueError(f"{name}: {field} must be > 0, got {getattr(config, field)}")
+            raise ConfigError(f"{name}: {field} must be > 0, got {getattr(config, field)}")
 
 
 def build(

@@ -24,7 +24,7 @@ Strategy = Literal["mis", "map", "brdf"]
 class EnvTables:
     """An environment map as the integrator reads it; `univoxel.envmap.tables` makes them."""
 
-    texel: Tensor  # [H, W, 4] float32: linear radiance, >= 0; density of being drawn, 1 / steradian
+    texel: Tensor  # [H, W, 4] float32: linear radiance, >= 0; sampling density, 1 / steradian
     row_cdf: Tensor  # [H + 1] float32 from 0 to 1: which row a sample falls in
     column_cdf: Tensor  # [H, W + 1] float32 from 0 to 1: which column, given the row
     rotation: float  # radians, counter-clockwise about +Z
@@ -102,8 +102,8 @@ def relight(
         L(wo) = integral over the half-sphere of f(wi, wo) L_i(wi) (n.wi) dwi
 
     L_i is the light where nothing stands in the way, else what the mesh sends back, up to `bounces`
-    times. At every vertex of a path each sun and lamp is looked at once; of the map one direction
-    is drawn in proportion to its light and one from the BRDF, weighed by the power heuristic. The
+    times. Every vertex of a path sends a shadow ray to each sun and lamp. It samples one direction
+    of the map in proportion to its light and one of the BRDF, weighed by the power heuristic. The
     points are Sobol's sequence with an Owen scramble of its own per surface point. Paths end at
     random where they carry little.
 

@@ -14,6 +14,7 @@ from univoxel import envmap as env
 from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
+from univoxel.errors import UserError
 from univoxel.records import Surface
 from univoxel.render.relight import Lighting, Stage, ground_shadow, relight_surface, relight_until
 
@@ -25,7 +26,7 @@ class Quality:
     """How a frame is made.
 
     Raises:
-        ValueError: a field is out of range.
+        UserError: a field is out of range.
     """
 
     samples: int = 64  # of the light, per pixel; >= 1
@@ -51,7 +52,7 @@ class Quality:
             ),
         ):
             if not ok:
-                raise ValueError(f"relight: {name}, got {value!r}")
+                raise UserError(f"relight: {name}, got {value!r}", name.split()[0])
 
 
 @dataclass(frozen=True)

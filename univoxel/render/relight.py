@@ -12,6 +12,7 @@ from torch import Tensor
 
 from univoxel.brdf import F0, split
 from univoxel.color import luminance
+from univoxel.errors import UserError
 from univoxel.ops import EnvTables, Lamp, Sun, VisibilityScene, relight
 from univoxel.records import Mesh, Rays, Surface
 
@@ -131,7 +132,7 @@ def relight_until(
         report: called after each pass with the share of the work that is done, as estimated.
     """
     if not noise > 0:
-        raise ValueError(f"relight: noise must be above 0, got {noise}")
+        raise UserError(f"relight: noise must be above 0, got {noise}", "noise")
     weight = surface.opacity[surface.opacity > 0]
     halves = [torch.zeros_like(surface.position) for _ in range(2)]
     done, more = 0, FIRST_PASS

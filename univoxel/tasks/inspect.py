@@ -18,6 +18,8 @@ from univoxel.data.images import write_exr, write_png
 from univoxel.data.maps import true_map
 from univoxel.data.mesh import read_ply
 from univoxel.envmap import EnvMap, lookup
+from univoxel.errors import UserError
+from univoxel.names import MAP_ROWS
 from univoxel.ops import VisibilityScene
 from univoxel.records import Rays, Surface
 from univoxel.render.occlusion import look, starts
@@ -42,11 +44,11 @@ class Incident:
 
 @torch.no_grad()
 def inspect(
-    run: Path,
+    run: str | Path,
     view: str,
     pixel: tuple[int, int],
-    out: Path | None = None,
-    height: int = 128,
+    out: str | Path | None = None,
+    height: int = MAP_ROWS,
     light_of: str | None = None,
 ) -> Path:
     """Draw the light that a scene says falls on the surface under a pixel; returns the picture.
@@ -70,14 +72,15 @@ def inspect(
 
     Raises:
         DataError: the run or its data cannot be read.
-        ValueError: no such view or pixel, or no surface under it; an argument out of range;
+        UserError: no such view or pixel, or no surface under it; an argument out of range;
             light_of is no training view, or light does not vary.
         OSError: a file cannot be written.
     """
+    run, out = Path(run), None if out is None else Path(out)
     if height < 1:
-        raise ValueError(f"inspect: height must be at least 1, got {height}")
+        raise UserError(f"inspect: height must be at least 1, got {height}", "height")
     if out is not None and out.suffix.lower() != ".png":
-        raise ValueError(f"--out: expected a name that ends in .png, got {out}")
+        raise UserError(f"out: expected a name that ends in .png, got {out}", "out")
     scene = load_scene(run)
     scene.show_light_of(light_of)
     photos = photos_of(run)
@@ -85,7 +88,7 @@ def inspect(
     rays = _ray(photos, index, pixel)
     surface = surface_at(scene, rays)
     if not surface.opacity[0] > MIN_OPACITY:
-        raise ValueError(f"--pixel: there is no surface under pixel {pixel[0]},{pixel[1]}")
+        raise UserError(f"pixel: there is no surface under {pixel[0]},{pixel[1]}", "pixel")
     layers = arriving(scene, surface, height)
     truth = true_light(scene, photos.folder, rays, height)
     out = out or run / "inspect" / f"{photos.names[index]}_{pixel[0]}_{pixel[1]}.png"
@@ -155,12 +158,12 @@ def parse_pixel(text: str) -> tuple[int, int]:
     """Column and row as the command line writes them.
 
     Raises:
-        ValueError: not two whole numbers.
+        UserError: not two whole numbers.
     """
     try:
         column, row = (int(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(f"--pixel: expected COLUMN,ROW, got {text!r}") from None
+        raise UserError(f"pixel: expected COLUMN,ROW, got {text!r}", "pixel") from None
     return column, row
 
 
@@ -169,17 +172,19 @@ def _view(photos: Photos, view: str) -> int:
         return photos.names.index(view)
     if view.isdigit() and int(view) < len(photos):
         return int(view)
-    raise ValueError(
-        f"--view: expected a number below {len(photos)} or one of {photos.names[0]} to "
-        f"{photos.names[-1]}, got {view!r}"
+    raise UserError(
+        f"view: expected a number below {len(photos)} or one of {photos.names[0]} to "
+        f"{photos.names[-1]}, got {view!r}",
+        "view",
     )
 
 
 def _ray(photos: Photos, view: int, pixel: tuple[int, int]) -> Rays:
     size = photos.cameras.width, photos.cameras.height
     if not all(0 <= p < n for p, n in zip(pixel, size, strict=True)):
-        raise ValueError(
-            f"--pixel: expected one of the {size[0]}x{size[1]} pixels, got {pixel[0]},{pixel[1]}"
+        raise UserError(
+            f"pixel: expected one of the {size[0]}x{size[1]} pixels, got {pixel[0]},{pixel[1]}",
+            "pixel",
         )
     return pixel_rays(photos.cameras, torch.tensor([view]), torch.tensor([pixel]) + 0.5)
 

@@ -17,6 +17,7 @@ from univoxel.camera import Cameras
 from univoxel.checkpoint import load_scene
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.maps import read_map
+from univoxel.errors import UserError
 from univoxel.ops import Lamp, Sun
 from univoxel.pictures.animation import require, write_animation
 from univoxel.pictures.viewpoints import ELEVATION, Frame, frames_of, views_of
@@ -84,15 +85,15 @@ def relight(
         progress: show a bar.
 
     Raises:
-        DataError, ValueError: the run, a map or the cameras cannot be used, or a number is out of
+        UserError: the run, a map or the cameras cannot be used, or a number is out of
             range.
-        ImportError: an MP4 without imageio-ffmpeg.
+        MissingExtra: an MP4 without imageio-ffmpeg.
         OSError: a file cannot be read or written.
     """
     several = not isinstance(envmap, (str, Path))
     paths = [Path(path) for path in envmap] if several else [Path(envmap)]
     if len({path.stem for path in paths}) != len(paths):
-        raise ValueError(
+        raise UserError(
             "relight: expected environment maps of different names, got "
             f"{[str(path) for path in paths]}"
         )
@@ -170,14 +171,16 @@ def lighting(
 
     Raises:
         DataError: the map cannot be used; the message names its file.
-        ValueError: there is no light, or a number is out of range.
+        UserError: there is no light, or a number is out of range.
     """
     if envmap is None and not suns and not lamps:
-        raise ValueError("relight: expected an environment map, a sun or a lamp, got none")
+        raise UserError("relight: expected an environment map, a sun or a point light, got none")
     if not math.isfinite(rotate):
-        raise ValueError(f"relight: rotate must be finite, got {rotate}")
+        raise UserError(f"relight: rotate must be finite, got {rotate}", "rotate")
     if not 0 <= exposure < math.inf:
-        raise ValueError(f"relight: exposure must be finite and at least 0, got {exposure}")
+        raise UserError(
+            f"relight: exposure must be finite and at least 0, got {exposure}", "exposure"
+        )
     if envmap is None:
         envmap = env.EnvMap(torch.zeros(1, 2, 3))
     elif not isinstance(envmap, env.EnvMap):

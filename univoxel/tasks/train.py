@@ -110,7 +110,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     save_config(asked)
     with Progress(cfg, begin, state) as progress:
         if film:
-            progress.watch = lambda: film.look(scene, progress)
+            progress.clock.watch = lambda: film.look(scene, progress.clock)
         for index in range(state["stage"], len(cfg.stages)):
             stage = cfg.stages[index]
             if isinstance(stage, JointConfig):
@@ -125,19 +125,19 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
                     stage = plan.on_grid(stage, box, grid.voxel_size)
                 run_stage(scene, cfg, stage, photos, pixels, held_out, progress)
             done = index + 1 == len(cfg.stages)
-            if cfg.capacity == "adaptive" and (done or not progress.over):
+            if cfg.capacity == "adaptive" and (done or not progress.clock.over):
                 rehearse = partial(rehearsal, cfg, photos, pixels, held_out)
                 shot = scene.registered(photos)
                 looks = look_at(shot, held_out), partial(random_look, shot, pixels)
-                chosen = plan.adapt(scene, cfg, index, box, *looks, rehearse, progress.pace)
+                chosen = plan.adapt(scene, cfg, index, box, *looks, rehearse, progress.clock.pace)
                 progress.chosen += [choice.noted() for choice in chosen]
                 if not done and plan.rehearsed(scene, chosen):
-                    progress.credit(plan.REHEARSAL)
+                    progress.clock.count_as_done(plan.REHEARSAL)
             reach = plan.reach(progress.chosen)
             save_scene(scene, cfg.out, progress.state(), slim=done, reach=reach)
             preview(scene, scene.registered(photos), cfg.out / "preview.png")
         if film:
-            film.finish(scene, progress)
+            film.finish(scene, progress.clock)
     say_trust(scene, photos, cfg.out, progress.troubles)
     return cfg.out
 

@@ -23,17 +23,17 @@ from univoxel.scene import Scene
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
 from univoxel.training.plateau import Plateau
-from univoxel.training.progress import Progress, Rehearsal
+from univoxel.training.progress import Listener, Rehearsal
 from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
     MOMENTS,
     REFRESH,
     SMOOTH_EVERY,
-    between,
-    moved,
-    smooth,
-    spread_gradient,
+    geometric,
+    refresh_surface_,
+    smooth_sdf_gradient_,
+    smooth_touched_,
 )
 
 RETRACE = 100  # steps after which light is traced through the surface as it has become
@@ -62,55 +62,29 @@ def run_stage(
     photos: Photos,
     pixels: Tensor,
     held_out: Tensor,
-    progress: Progress | Rehearsal,
+    progress: Listener,
 ) -> None:
     """Optimise the scene on its present grid until the stage's steps or its time are over."""
     field = scene.field
     scene.train()
     scene.surface_moved()
-    field.sdf.requires_grad_()
-    scene.material.requires_grad_(not stage.refit)
-    networks = [scene.material, scene.radiance, scene.light]
-    if scene.mirrored:  # only with fixed materials: before, it would take their gloss upon itself
-        scene.mirrored.requires_grad_(stage.refit)
-        networks.append(scene.mirrored)
-    if scene.views:
-        scene.views.gain_steps.requires_grad_(not stage.refit)
-        networks.append(scene.views)
-    table, poses = scene.radiance.directions.table, []
-    if scene.poses is not None:
-        scene.poses.requires_grad_(not stage.refit)
-        poses = [scene.poses.steps]
-    optimizer = RowAdam(
-        [
-            {"params": [field.sdf], "eps": EPS_SDF},
-            {"params": [field.features, table], "eps": EPS_FEATURES},
-            {"params": [p for net in networks for p in net.parameters() if p is not table]},
-            {"params": poses},
-        ],
-        betas=MOMENTS,
-    )
+    optimizer = build_optimizer(scene, stage.refit)
     plateau = Plateau(cfg.patience)
-    guard = Guard(progress, restored=lambda: moved(scene))
+    guard = Guard(progress, restored=lambda: refresh_surface_(scene))
     guard.follow(optimizer)
-    for done in progress.steps():
+    for done in progress.clock.steps():
         physical = done >= stage.physical_from
-        rates = (
-            between(stage.lr_sdf, done) * field.voxel_size,
-            between(stage.lr_features, done),
-            between(stage.lr_networks, done),
-            between(stage.lr_poses, done),
-        )
+        rates = learning_rates(stage, done, field.voxel_size)
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate * guard.scale
-        scene.inv_s = 1 / (between(stage.sharpness, done) * field.voxel_size)
-        if progress.step % REFRESH == 0:
+        scene.inv_s = 1 / (geometric(stage.sharpness, done) * field.voxel_size)
+        if progress.clock.step % REFRESH == 0:
             before = field.sdf, field.features
             if field.refresh():
                 guard.forget()
             optimizer.follow(before[0], field.sdf)
             optimizer.follow(before[1], field.features)
-        if progress.step % RETRACE == 0 and not stage.refit:
+        if progress.clock.step % RETRACE == 0 and not stage.refit:
             scene.surface_moved()
 
         batch = random_batch(scene.registered(photos), pixels, stage.rays)
@@ -124,22 +98,64 @@ def run_stage(
         if stage.refit:
             field.hold_channels_(scene.material.channels)
         if stage.spread:
-            spread_gradient(field, stage.spread)
+            smooth_sdf_gradient_(field, stage.spread)
         optimizer.step()
-        if progress.step % SMOOTH_EVERY == 0 and not stage.refit:
-            smooth(field, stage)
+        if progress.clock.step % SMOOTH_EVERY == 0 and not stage.refit:
+            smooth_touched_(field, stage)
         if plateau.due(done):
             quality = held_out_psnr(scene, photos, held_out, physical)
             if plateau.flat(done, quality, physical):
-                progress.shorten()
+                progress.clock.shorten()
         if progress.due():
             quality = held_out_psnr(scene, photos, held_out, physical)
             progress.report({k: v.item() for k, v in terms.items()}, quality)
             guard.judge(quality, physical)
         if progress.checkpoint_due():
             save_scene(scene, cfg.out, progress.state())
-    moved(scene)
+    refresh_surface_(scene)
     scene.eval()
+
+
+def build_optimizer(scene: Scene, refit: bool) -> RowAdam:
+    """Adam over what a stage trains, in the groups of `learning_rates`; the rest is frozen.
+
+    Args:
+        refit: materials stay. Only then there is a network for what is mirrored sharply: before,
+            it would take the materials' gloss upon itself.
+    """
+    field = scene.field
+    field.sdf.requires_grad_()
+    scene.material.requires_grad_(not refit)
+    networks = [scene.material, scene.radiance, scene.light]
+    if scene.mirrored:
+        scene.mirrored.requires_grad_(refit)
+        networks.append(scene.mirrored)
+    if scene.views:
+        scene.views.gain_steps.requires_grad_(not refit)
+        networks.append(scene.views)
+    table, poses = scene.radiance.directions.table, []
+    if scene.poses is not None:
+        scene.poses.requires_grad_(not refit)
+        poses = [scene.poses.steps]
+    return RowAdam(
+        [
+            {"params": [field.sdf], "eps": EPS_SDF},
+            {"params": [field.features, table], "eps": EPS_FEATURES},
+            {"params": [p for net in networks for p in net.parameters() if p is not table]},
+            {"params": poses},
+        ],
+        betas=MOMENTS,
+    )
+
+
+def learning_rates(stage: StageConfig, done: float, voxel_size: float) -> tuple[float, ...]:
+    """Of distances (world units), features, networks and poses, at progress in [0, 1)."""
+    return (
+        geometric(stage.lr_sdf, done) * voxel_size,
+        geometric(stage.lr_features, done),
+        geometric(stage.lr_networks, done),
+        geometric(stage.lr_poses, done),
+    )
 
 
 def rehearsal(

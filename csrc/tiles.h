@@ -1,23 +1,27 @@
-// Points grouped by bricks of 8^3 cells, and the grid rows that they touch.
+// Points grouped by tiles of 8^3 cells, and the grid rows that they touch.
 #pragma once
 
 #include <cstdint>
 #include <vector>
 
+#include "dcheck.h"
 #include "parallel.h"
 #include "trilinear.h"
 
 namespace univoxel {
+
+constexpr int kTileShift = 3;
+constexpr int64_t kTile = int64_t(1) << kTileShift;  // cells along the side of a tile
 
 /// Threads for work on n points: few are done before a team stands.
 inline int team_for(int64_t n_points, int threads) {
     return n_points < 2048 ? 1 : threads;
 }
 
-/// Write to order [M] the points sorted by brick, x slowest; equal bricks keep their order.
+/// Write to order [M] the points sorted by tile, x slowest; points of one tile keep their order.
 template <class T>
-void sort_by_brick(const Lattice& grid, const T* points, int64_t n_points, int32_t* order,
-                   int threads);
+void sort_by_tile(const Lattice& grid, const T* points, int64_t n_points, int32_t* order,
+                  int threads);
 
 /// Bounds [n_slabs + 1] of the slabs in a sorted order. A slab is 8 cells thick along x.
 template <class T>
@@ -44,11 +48,12 @@ struct Planes {
 };
 Planes planes_to_clear(const Lattice& grid, int64_t slab, int64_t n_slabs);
 
-/// Cells x, y, z + i for every set bit i < 8 hold points.
+/// Cells x, y, z + i for every set bit i < kTile hold points.
 struct CellColumn {
     int32_t x, y, z;
     uint32_t cells;
 };
+static_assert(kTile <= 8, "a column of a tile is a byte of cells");
 
 /// Call f(x, y, inner) for the lines of nodes that a column of cells touches: the four at its
 /// corners (inner), and if wide the eight beside these.
@@ -75,6 +80,7 @@ struct NodesAlongZ {
 
 inline NodesAlongZ nodes_along_z(const Lattice& grid, const CellColumn& column, bool wide) {
     // Bit i stands for node z - 1 + i.
+    DCHECK(column.cells != 0 && column.z >= 0 && column.z < grid.size[2]);
     const uint64_t m = column.cells;
     uint64_t ends = m << 1 | m << 2, beyond = wide ? ends | m | m << 3 : ends;
     int64_t z = column.z - 1;
@@ -107,12 +113,17 @@ class TouchedRows {
     int64_t count() const { return count_; }
     /// Slot of a touched node.
     int64_t slot(int64_t x, int64_t y, int64_t z) const {
+        DCHECK(x < size_x_ && y < size_y_ && z < size_z_ && line_[x * size_y_ + y] >= 0);
         const Word& w = words_[line_[x * size_y_ + y] + (z >> 6)];
+        DCHECK(w.bits >> (z & 63) & 1);
         const uint64_t below = w.bits & ((uint64_t(1) << (z & 63)) - 1);
         return w.first + __builtin_popcountll(below);
     }
     /// How many slots lie in planes below x; x in [0, X].
-    int64_t slots_below(int64_t x) const { return plane_[x]; }
+    int64_t slots_below(int64_t x) const {
+        DCHECK(x >= 0 && x <= size_x_);
+        return plane_[x];
+    }
     /// Write the node of every slot to indices [3, count].
     void write_indices(int64_t* indices, int threads) const;
 

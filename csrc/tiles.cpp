@@ -1,38 +1,37 @@
-#include "bricks.h"
+#include "tiles.h"
 
 #include <algorithm>
 #include <numeric>
 #include <utility>
 
+#include "dcheck.h"
 #include "huge_pages.h"
 
 namespace univoxel {
 namespace {
 
-constexpr int kShift = 3;  // bricks of 8^3 cells
-constexpr int64_t kSide = 1 << kShift;
 constexpr int64_t kPointsPerChunk = 8192;
 
-int64_t bricks_along(const Lattice& grid, int axis) {
-    return (std::max<int64_t>(grid.size[axis] - 2, 0) >> kShift) + 1;
+int64_t tiles_along(const Lattice& grid, int axis) {
+    return (std::max<int64_t>(grid.size[axis] - 2, 0) >> kTileShift) + 1;
 }
 
 template <class T>
 int64_t slab_of(const Lattice& grid, const T* points, int64_t i) {
-    return place(grid, 0, static_cast<double>(points[3 * i])).cell >> kShift;
+    return place(grid, 0, static_cast<double>(points[3 * i])).cell >> kTileShift;
 }
 
 }  // namespace
 
 template <class T>
-void sort_by_brick(const Lattice& grid, const T* points, int64_t n_points, int32_t* order,
-                   int threads) {
+void sort_by_tile(const Lattice& grid, const T* points, int64_t n_points, int32_t* order,
+                  int threads) {
     threads = team_for(n_points, threads);
-    const int64_t slabs = bricks_along(grid, 0);
-    const int64_t ny = bricks_along(grid, 1), nz = bricks_along(grid, 2);
+    const int64_t slabs = tiles_along(grid, 0);
+    const int64_t ny = tiles_along(grid, 1), nz = tiles_along(grid, 2);
     const int64_t chunks = (n_points + kPointsPerChunk - 1) / kPointsPerChunk;
     struct Keyed {
-        int32_t point, column;  // column: brick within the slab
+        int32_t point, column;  // column: tile within the slab
     };
     std::vector<int32_t> slab(n_points), column(n_points);
     std::vector<Keyed> keyed(n_points);
@@ -44,8 +43,8 @@ void sort_by_brick(const Lattice& grid, const T* points, int64_t n_points, int32
         for (int64_t i = begin; i < end; ++i) {
             const T* p = points + 3 * i;
             slab[i] = static_cast<int32_t>(slab_of(grid, points, i));
-            const int64_t y = place(grid, 1, static_cast<double>(p[1])).cell >> kShift;
-            const int64_t z = place(grid, 2, static_cast<double>(p[2])).cell >> kShift;
+            const int64_t y = place(grid, 1, static_cast<double>(p[1])).cell >> kTileShift;
+            const int64_t z = place(grid, 2, static_cast<double>(p[2])).cell >> kTileShift;
             column[i] = static_cast<int32_t>(y * nz + z);
             ++count[slab[i]];
         }
@@ -65,7 +64,7 @@ void sort_by_brick(const Lattice& grid, const T* points, int64_t n_points, int32
             keyed[next[slab[i]]++] = {static_cast<int32_t>(i), column[i]};
         }
     });
-    // Sort each slab by brick.
+    // Sort each slab by tile.
     parallel_for(slabs, 1, threads, [&](int64_t first, int64_t) {
         const int64_t begin = bounds[first], end = bounds[first + 1];
         if (begin == end) return;
@@ -81,20 +80,21 @@ void sort_by_brick(const Lattice& grid, const T* points, int64_t n_points, int32
 template <class T>
 std::vector<int64_t> slab_bounds(const Lattice& grid, const T* points, int64_t n_points,
                                  const int32_t* order) {
-    std::vector<int64_t> bounds(bricks_along(grid, 0) + 1, n_points);
+    std::vector<int64_t> bounds(tiles_along(grid, 0) + 1, n_points);
     for (size_t s = 0; s + 1 < bounds.size(); ++s) {
         const int32_t* at = std::partition_point(order, order + n_points, [&](int32_t i) {
             return slab_of(grid, points, i) < static_cast<int64_t>(s);
         });
         bounds[s] = at - order;
     }
+    DCHECK(std::is_sorted(bounds.begin(), bounds.end()));
     return bounds;
 }
 
 Planes planes_to_clear(const Lattice& grid, int64_t slab, int64_t n_slabs) {
-    const int64_t x = slab * kSide, size = grid.size[0];
-    if (slab % 2 == 0) return {std::max<int64_t>(x - 1, 0), std::min(x + kSide + 2, size)};
-    return {std::min(x + 2, size), slab + 1 == n_slabs ? size : x + kSide - 1};
+    const int64_t x = slab * kTile, size = grid.size[0];
+    if (slab % 2 == 0) return {std::max<int64_t>(x - 1, 0), std::min(x + kTile + 2, size)};
+    return {std::min(x + 2, size), slab + 1 == n_slabs ? size : x + kTile - 1};
 }
 
 template <class T>
@@ -106,11 +106,11 @@ std::vector<std::vector<CellColumn>> occupied_columns(const Lattice& grid, const
     std::vector<std::vector<CellColumn>> columns(slabs);
     threads = team_for(bounds.back(), threads);
     parallel_for(slabs, 1, threads, [&](int64_t s, int64_t) {
-        uint8_t cells[kSide][kSide] = {};  // of one brick: a bit per cell along z
+        uint8_t cells[kTile][kTile] = {};  // of one tile: a bit per cell along z
         int64_t corner[3] = {-1, -1, -1};  // its first cell
         const auto flush = [&] {
-            for (int64_t a = 0; a < kSide; ++a) {
-                for (int64_t b = 0; b < kSide; ++b) {
+            for (int64_t a = 0; a < kTile; ++a) {
+                for (int64_t b = 0; b < kTile; ++b) {
                     const uint8_t mask = std::exchange(cells[a][b], uint8_t(0));
                     if (!mask) continue;
                     columns[s].push_back({static_cast<int32_t>(corner[0] + a),
@@ -124,13 +124,14 @@ std::vector<std::vector<CellColumn>> occupied_columns(const Lattice& grid, const
             if (has_nan(p)) continue;
             int64_t cell[3];
             for (int d = 0; d < 3; ++d) cell[d] = place(grid, d, static_cast<double>(p[d])).cell;
-            const bool same = (cell[0] & ~(kSide - 1)) == corner[0] &&
-                              (cell[1] & ~(kSide - 1)) == corner[1] &&
-                              (cell[2] & ~(kSide - 1)) == corner[2];
+            const bool same = (cell[0] & ~(kTile - 1)) == corner[0] &&
+                              (cell[1] & ~(kTile - 1)) == corner[1] &&
+                              (cell[2] & ~(kTile - 1)) == corner[2];
             if (!same) {
                 flush();
-                for (int d = 0; d < 3; ++d) corner[d] = cell[d] & ~(kSide - 1);
+                for (int d = 0; d < 3; ++d) corner[d] = cell[d] & ~(kTile - 1);
             }
+            DCHECK(cell[0] >> kTileShift == s);  // the points are sorted by slab
             cells[cell[0] - corner[0]][cell[1] - corner[1]] |=
                 static_cast<uint8_t>(1 << (cell[2] - corner[2]));
         }
@@ -194,7 +195,7 @@ TouchedRows::TouchedRows(const Lattice& grid, const std::vector<std::vector<Cell
 void TouchedRows::write_indices(int64_t* indices, int threads) const {
     threads = team_for(count_, threads);
     want_huge_pages(indices, 3 * count_ * static_cast<int64_t>(sizeof(int64_t)));
-    parallel_for(size_x_, kSide, threads, [&](int64_t begin, int64_t end) {
+    parallel_for(size_x_, kTile, threads, [&](int64_t begin, int64_t end) {
         for (int64_t x = begin; x < end; ++x) {
             std::fill(indices + plane_[x], indices + plane_[x + 1], x);
             int64_t slot = plane_[x];
@@ -214,8 +215,8 @@ void TouchedRows::write_indices(int64_t* indices, int threads) const {
     });
 }
 
-template void sort_by_brick(const Lattice&, const float*, int64_t, int32_t*, int);
-template void sort_by_brick(const Lattice&, const double*, int64_t, int32_t*, int);
+template void sort_by_tile(const Lattice&, const float*, int64_t, int32_t*, int);
+template void sort_by_tile(const Lattice&, const double*, int64_t, int32_t*, int);
 template std::vector<int64_t> slab_bounds(const Lattice&, const float*, int64_t, const int32_t*);
 template std::vector<int64_t> slab_bounds(const Lattice&, const double*, int64_t, const int32_t*);
 template std::vector<std::vector<CellColumn>> occupied_columns(const Lattice&, const float*,
