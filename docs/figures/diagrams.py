@@ -285,7 +285,8 @@ def layers() -> Figure:
     rows = [
         ("cli, commands", SOFT),
         ("experiments", SOFT),
-        ("tasks: a file for each command", RED),
+        ("tasks: a file for each command", SOFT),
+        ("evaluation, segmentation", RED),
         ("confidence, compression, pictures", RED),
         ("joint", ORANGE),
         ("preparation, training", ORANGE),
@@ -296,7 +297,7 @@ def layers() -> Figure:
         ("envmap, networks, poses", BLUE),
         ("ops", BLUE),
         ("brdf, camera, color, grid, sphere", BLUE),
-        ("records, names, errors, files, validation", BLUE),
+        ("records, names, errors, files, bars, validation", BLUE),
     ]
     height = 0.3
     figure, axes = blank(7.9, height * len(rows) + 0.75)
@@ -309,7 +310,7 @@ def layers() -> Figure:
     arrow(axes, (0.4, 0.5 + height * len(rows)), (0.4, 0.5), color=INK)
     axes.text(0.22, 2.6, "imports", rotation=90, va="center", ha="center", color=INK)
     for name, begin, end, color in (
-        ("what a person runs", 12, 14, SOFT),
+        ("what a person runs", 12, 15, SOFT),
         ("after training", 10, 12, RED),
         ("training", 8, 10, ORANGE),
         ("one scene", 4, 7, GREEN),
