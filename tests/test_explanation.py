@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -9,15 +10,26 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*(ROOT / "docs/guide").glob("*.md"), *(ROOT / "docs/explanation").glob("*.md")])
 SOURCES = list((ROOT / "univoxel").rglob("*.py"))
-CODE = re.compile(r"```.*?```|`[^`\n]+`|^    .*$", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"```[\s\S]*?```|`[^`\n]+`|^    .*$", re.MULTILINE)
 FIELD = re.compile(r"\b([A-Z]\w*Config)\.(\w+)")
 CONSTANT = re.compile(r"(?<![\w/.-])[A-Z][A-Z_]{3,}(?![\w/.-])")
 FILE = re.compile(r"(?<![\w./])(?:univoxel/)?((?:\w+/)*\w+\.(?:py|cpp))\b")
 # Placeholders of commands, and names that are not ours
 WORDS = {"ANGLE", "AZIMUTH", "DATA", "ELEVATION", "FILE", "HEIGHT", "INTENSITY", "IRRADIANCE"}
-WORDS |= {"NAME", "PIXELS", "SHARE", "DEGREES", "FACTOR", "TEXELS", "OPENCV", "QT_QPA_PLATFORM"}
+WORDS |= {
+    "COLMAP",
+    "NAME",
+    "PIXELS",
+    "SHARE",
+    "DEGREES",
+    "FACTOR",
+    "TEXELS",
+    "OPENCV",
+    "QT_QPA_PLATFORM",
+}
 
 
+@cache
 def classes() -> dict[str, set[str]]:
     """Fields by the names of configurations."""
     found = {}
@@ -29,6 +41,7 @@ def classes() -> dict[str, set[str]]:
     return found
 
 
+@cache
 def constants() -> set[str]:
     """Names that are assigned at the top of a module or a class."""
     found = set()
