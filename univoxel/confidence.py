@@ -1,7 +1,7 @@
 """What the photographs fix of a scene's materials, and what they leave open: maps and words.
 
-No truth is read: only the photographs that were trained on, and the scene. docs/trust.md explains
-the terms and says how well they foretell the true error.
+No truth is read: only the photographs that were trained on, and the scene.
+docs/explanation/trust.md explains the terms.
 """
 
 from __future__ import annotations
