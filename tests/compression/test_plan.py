@@ -141,7 +141,7 @@ def test_a_grid_is_as_coarse_as_its_rehearsal_allows(quality, chosen, tmp_path, 
 def test_a_rehearsal_is_off_the_record():
     rehearsal = Rehearsal(4)
     assert list(rehearsal.clock.steps()) == [0, 0.25, 0.5, 0.75]
-    assert rehearsal.step == 4
+    assert rehearsal.clock.step == 4
     assert not rehearsal.due()
     assert not rehearsal.checkpoint_due()
 
