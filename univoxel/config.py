@@ -167,9 +167,9 @@ def _completed(before: Any, now: Any) -> Any:
 
 def _as_json(value: Any) -> Any:
     """A configuration, or a value of one, as config.json holds it."""
-    is_record = dataclasses.is_dataclass(value) and not isinstance(value, type)
-    plain = dataclasses.asdict(value) if is_record else value
-    return json.loads(json.dumps(plain, default=str))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = dataclasses.asdict(value)
+    return json.loads(json.dumps(value, default=str))
 
 
 def __getattr__(name: str):
