@@ -186,6 +186,7 @@ def test_test_views_come_from_the_data_of_the_run(run):
     ("options", "error", "message"),
     [
         ({"samples": 0}, ValueError, "samples must be at least 1, got 0"),
+        ({"samples": 2**31 + 1}, ValueError, r"samples must be at most 2\^31, got 2147483649"),
         ({"resolution": 0}, ValueError, "resolution must be at least 1, got 0"),
         ({"bounces": -1}, ValueError, "bounces must be at least 0, got -1"),
         ({"exposure": -1.0}, ValueError, "exposure must be finite and at least 0, got -1.0"),

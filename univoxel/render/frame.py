@@ -43,6 +43,7 @@ class Quality:
     def __post_init__(self) -> None:
         for name, value, ok in (
             ("samples must be at least 1", self.samples, self.samples >= 1),
+            ("samples must be at most 2^31", self.samples, self.samples <= 2**31),
             ("noise must be above 0", self.noise, self.noise is None or self.noise > 0),
             ("bounces must be at least 0", self.bounces, self.bounces >= 0),
             (
