@@ -24,7 +24,9 @@ from pathlib import Path
 from statistics import median
 
 import torch
+from made import made
 
+from univoxel.experiments.record import result_text
 from univoxel.fields.base import AbstractField
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
@@ -218,7 +220,7 @@ def main() -> None:
             for kind in KINDS
         },
     }
-    options.out.write_text(json.dumps(found, indent=2) + "\n")
+    options.out.write_text(result_text(made() | found))
     print(json.dumps(found["exponents"], indent=2))
     try:
         draw(found, options.out)

@@ -10,7 +10,6 @@ of them is divided in these proportions.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import tempfile
 import time
@@ -20,9 +19,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from made import made
 from train_step import OTHER, STAGES, Clock
 
 from univoxel.config import TrainConfig
+from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import HashField
 from univoxel.joint import observations, stage
@@ -245,7 +246,7 @@ def main() -> None:
         "torch": torch.__version__,
         "load_average": os.getloadavg()[0],
     }
-    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    options.out.write_text(result_text(made() | result))
     print(table(result))
 
 

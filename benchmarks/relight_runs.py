@@ -17,6 +17,7 @@ from pathlib import Path
 from statistics import fmean
 
 import torch
+from made import made
 
 from univoxel.checkpoint import load_scene
 from univoxel.color import linear_to_srgb
@@ -25,6 +26,7 @@ from univoxel.data.base import decode
 from univoxel.data.maps import read_map
 from univoxel.envmap import tables
 from univoxel.evaluation.measures import albedo_scales
+from univoxel.experiments.record import result_text
 from univoxel.metrics import on_black, psnr
 from univoxel.records import Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view
@@ -125,7 +127,7 @@ def main() -> None:
                 for name, path in relight_maps(folder).items()
             }
         print(run.name, json.dumps(own, indent=1), flush=True)
-        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+        arguments.out.write_text(result_text(result | made()))
 
 
 if __name__ == "__main__":

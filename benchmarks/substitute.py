@@ -18,6 +18,7 @@ from statistics import fmean
 
 import numpy as np
 import torch
+from made import made
 from relight_scenes import true_mesh
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
@@ -35,6 +36,7 @@ from univoxel.data.base import decode
 from univoxel.data.maps import read_map, true_map
 from univoxel.envmap import tables
 from univoxel.evaluation.measures import albedo_scales
+from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
 from univoxel.grid import GridShape, fit_grid
 from univoxel.joint.config import JointConfig
@@ -223,7 +225,7 @@ def main() -> None:
                 own[term] = {k: measured[k] for k in SHOWN}
             if term == "none" and "relit" not in own:
                 own["relit"] = relit_with_true_pixels(run, folder)
-            path.write_text(json.dumps(result, indent=1) + "\n")
+            path.write_text(result_text(result | made()))
     path.with_suffix(".md").write_text(table(result))
     print(table(result))
 

@@ -11,7 +11,6 @@ references' is not: under the profiler that this takes their memory grew past 20
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 from collections import defaultdict
@@ -21,9 +20,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import torch
+from made import made
 
 from univoxel import losses, ops
 from univoxel.data import load_photos
+from univoxel.experiments.record import result_text
 from univoxel.fields.dense import DenseField
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.grid import fit_grid
@@ -209,7 +210,7 @@ def main() -> None:
         with ops.use_backend(backend):
             result[backend] = profile(scene, views, options.rays, count, backend == "native")
     result["load_average"] = os.getloadavg()[0]
-    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    options.out.write_text(result_text(made() | result))
     print(table(result))
 
 

@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from made import made
 from scipy import ndimage, spatial
 from torch.nn.functional import normalize
 
@@ -36,6 +37,7 @@ from univoxel.data.images import write_png
 from univoxel.data.maps import read_map
 from univoxel.data.mesh import read_ply
 from univoxel.envmap import tables
+from univoxel.experiments.record import result_text
 from univoxel.files import replacing
 from univoxel.presets import preset
 from univoxel.records import Mesh, Surface
@@ -217,9 +219,9 @@ def main() -> None:
                 own = evaluate(run, samples=32) | {
                     "gain_stops": gain_error(run, arguments.data, kind)
                 }
-                result["runs"][name] = own
+                result["runs"][name] = own | {"commit": made()["commit"]}
                 with replacing(arguments.out) as temporary:
-                    temporary.write_text(json.dumps(result, indent=1) + "\n")
+                    temporary.write_text(result_text(result | made()))
                 print(name, f"albedo {own['albedo_psnr_3ch']:.2f} relit {own['relit_psnr']:.2f}")
 
 

@@ -1,4 +1,4 @@
-"""Imports go down the street of docs/architecture.md, never up and never sideways."""
+"""Imports go down the list of CONTRIBUTING.md, never up and never sideways."""
 
 import ast
 import re

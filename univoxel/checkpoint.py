@@ -101,7 +101,7 @@ def save_scene(
     return path
 
 
-def load_checkpoint(run: Path) -> tuple[Scene, dict]:
+def load_checkpoint(run: str | Path) -> tuple[Scene, dict]:
     """The scene of a run, in evaluation mode, and the state it was saved with.
 
     Raises:
@@ -163,6 +163,6 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
         raise DataError(f"{path}: does not fit its own description: {error}") from error
 
 
-def load_scene(run: Path) -> Scene:
+def load_scene(run: str | Path) -> Scene:
     """The scene of a run, see `load_checkpoint`."""
     return load_checkpoint(run)[0]

@@ -8,10 +8,12 @@
 #include <pybind11/stl.h>
 
 #include <algorithm>
+#include <iterator>
 #include <optional>
 #include <sstream>
 #include <stdexcept>
 #include <string>
+#include <tuple>
 #include <type_traits>
 #include <utility>
 #include <variant>
@@ -46,29 +48,32 @@ struct HoldsArrays<std::vector<A>> : HoldsArrays<A> {};
 template <class... A>
 struct HoldsArrays<std::variant<A...>> : std::disjunction<HoldsArrays<A>...> {};
 
-/// Pointer to the numbers of an optional array; null where there is none.
+/// An array as the pointer to its numbers, null where there is none; all else as it is.
+template <class A>
+A raw(const A& other) {
+    return other;
+}
 template <class T>
-const T* data_of(OptionalIn<T> a) {
+const T* raw(In<T> a) {
+    return a.data();
+}
+template <class T>
+T* raw(Out<T> a) {
+    return a.mutable_data();
+}
+template <class T>
+const T* raw(OptionalIn<T> a) {
     return a ? a->data() : nullptr;
 }
 template <class T>
-T* mutable_data_of(OptionalOut<T> a) {
+T* raw(OptionalOut<T> a) {
     return a ? a->mutable_data() : nullptr;
 }
 
-/// A structure of pointers and numbers: from arrays their pointers, all else as it is.
+/// A structure of pointers and numbers.
 template <class S, class... A>
-S make(A&&... a) {
-    const auto member = [](auto& from) {
-        using From = std::remove_reference_t<decltype(from)>;
-        if constexpr (!HoldsArrays<std::remove_const_t<From>>::value)
-            return from;
-        else if constexpr (std::is_const_v<From>)
-            return from.data();
-        else
-            return from.mutable_data();
-    };
-    return S{member(a)...};
+S make(A&&... members) {
+    return S{raw(members)...};
 }
 
 inline void require(bool ok, const std::string& message) {

@@ -41,8 +41,8 @@ void bind_hash_grid(py::module_& m) {
            const HashRows* touched, OptionalOut<T> grad_points, Sizes sizes, const Vec3& origin,
            Numbers voxel_sizes, int threads) {
             const auto in = hash_grid_of(table, points, sizes, origin, voxel_sizes);
-            encode_hash_backward(in, grad_out.data(), mutable_data_of<T>(grad_table), touched,
-                                 mutable_data_of<T>(grad_points), threads);
+            encode_hash_backward(in, grad_out.data(), raw(grad_table), touched, raw(grad_points),
+                                 threads);
         });
 }
 

@@ -40,7 +40,7 @@ void bind_mlp(py::module_& m) {
             require(grad_weights.size() == grad_biases.size() &&
                         (grad_weights.empty() || grad_weights.size() == weights.size()),
                     "mlp: layers do not fit");
-            MlpGrad<T> grad{mutable_data_of<T>(grad_x), {}, {}};
+            MlpGrad<T> grad{raw(grad_x), {}, {}};
             for (size_t l = 0; l < grad_weights.size(); ++l) {
                 require(grad_weights[l].size() == weights[l].size() &&
                             grad_biases[l].size() == biases[l].size(),

@@ -63,10 +63,9 @@ void bind_sampling(py::module_& m) {
            OptionalOut<T> grad_features, OptionalOut<T> grad_points, const Rows* sdf_rows,
            const Rows* feature_rows, int threads) {
             const auto in = sampling_of(grid, sdf, features, points, order);
-            const auto grads = make<SamplingGrads<T, Rows>>(
-                grad_value, grad_gradient, grad_feature, mutable_data_of<T>(grad_sdf),
-                mutable_data_of<T>(grad_features), mutable_data_of<T>(grad_points), sdf_rows,
-                feature_rows);
+            const auto grads =
+                make<SamplingGrads<T, Rows>>(grad_value, grad_gradient, grad_feature, grad_sdf,
+                                             grad_features, grad_points, sdf_rows, feature_rows);
             sample_grid_backward(in, grads, threads);
         });
     def(m, "touched_rows", "grid points order n_rows sdf features threads",

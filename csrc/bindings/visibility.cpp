@@ -71,10 +71,9 @@ void bind_integrator(py::module_& m) {
             const EnvMapTables map{texel.data(), row_cdf.data(), column_cdf.data(), h, w, rotation};
             const Lights lights{sun.data(), lamp.data(), sun.size() / 7, lamp.size() / 6};
             const auto in =
-                make<Relight>(&scene, data_of<float>(vertex_normal), data_of<float>(vertex_albedo),
-                              data_of<float>(vertex_roughness), data_of<float>(vertex_f0), map,
-                              lights, position, normal, wo, albedo, roughness, f0, n, offset, first,
-                              samples, bounces, seed, strategy);
+                make<Relight>(&scene, vertex_normal, vertex_albedo, vertex_roughness, vertex_f0,
+                              map, lights, position, normal, wo, albedo, roughness, f0, n, offset,
+                              first, samples, bounces, seed, strategy);
             relight(in, rgb.mutable_data(), threads);
         });
 }

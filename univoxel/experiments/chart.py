@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from univoxel.config import TrainConfig
 from univoxel.errors import ProcessFailed, UserError
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
-from univoxel.experiments.record import Outcome, Setting
+from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
 from univoxel.training.config import StageConfig
@@ -94,12 +93,12 @@ def chart(
         "changes": list(changes),
         "samples": samples,
         "machine": plots.machine(),
-        "points": [asdict(outcome) for outcome in outcomes],
+        "points": [outcome.summary() for outcome in outcomes],
         "fronts": fronts(outcomes),
         "published": [asdict(point) for point in PUBLISHED],
     }
     with replacing(out / "chart.json") as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(result_text(record), encoding="utf-8")
     if any(not outcome.error for outcome in outcomes):
         draw(outcomes, out / "chart")
     if failed := runner.failures(outcomes):

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
 
 from univoxel.errors import ProcessFailed, UserError
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
-from univoxel.experiments.record import Outcome, Setting
+from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
 
@@ -68,10 +66,10 @@ def compare(
         "changes": list(changes),
         "samples": samples,
         "machine": plots.machine(),
-        "rows": [asdict(outcome) for outcome in outcomes],
+        "rows": [outcome.summary() for outcome in outcomes],
     }
     with replacing(out / "compare.json") as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(result_text(record), encoding="utf-8")
     with replacing(out / "compare.md") as temporary:
         temporary.write_text(markdown(outcomes), encoding="utf-8")
     if any(not outcome.error for outcome in outcomes):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from univoxel.errors import UserError
 from univoxel.experiments import plots, runner
-from univoxel.experiments.record import Outcome, Setting
+from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.experiments.stress import axes as of_axes
 from univoxel.experiments.stress import render, report
 from univoxel.experiments.stress.axes import BASE, INTACT, SECOND, Axis, Level
@@ -82,8 +81,7 @@ def stress(
     cells = _train(found, lights, seeds, prepared, out / "runs", tuple(changes))
     clipping = {path.name: clipped(path) for path in dict.fromkeys(prepared.values())}
     with replacing(out / "stress.json") as temporary:
-        text = json.dumps(_record(cells, clipping, changes), indent=1, allow_nan=False)
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(result_text(_record(cells, clipping, changes)), encoding="utf-8")
     with replacing(out / "stress.md") as temporary:
         temporary.write_text(report.markdown(cells), encoding="utf-8")
     plots.save_figure(report.draw(cells), out / "stress")
@@ -195,9 +193,9 @@ def _name(error: UserError) -> str:
     return f"{type(error).__module__}.{type(error).__qualname__}"
 
 
-def _plain(measures: Mapping[str, float | int | None]) -> dict[str, float | int | str | None]:
-    """JSON knows no NaN: it becomes text."""
-    return {k: v if v is None or math.isfinite(v) else str(v) for k, v in measures.items()}
+def _relit(measures: Mapping[str, float | int | None]) -> dict[str, float | int | None]:
+    """The measure that breaking points are judged by; runs/ keeps all of them."""
+    return {key: measures[key] for key in (plots.RELIT.key,) if key in measures}
 
 
 def _record(cells: Sequence[Cell], clipping: dict[str, float], changes: Sequence[str]) -> dict:
@@ -216,7 +214,7 @@ def _record(cells: Sequence[Cell], clipping: dict[str, float], changes: Sequence
                 "mean": {key: cell.mean(key) for key in keys},
                 "spread": {key: cell.spread(key) for key in keys},
                 "outcomes": [
-                    {"scene": o.scene, "setting": o.setting, "error": o.error, **_plain(o.measures)}
+                    {"scene": o.scene, "setting": o.setting, "error": o.error, **_relit(o.measures)}
                     for o in cell.outcomes
                 ],
             }
