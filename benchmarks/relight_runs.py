@@ -30,7 +30,7 @@ from univoxel.experiments.record import result_text
 from univoxel.metrics import on_black, psnr
 from univoxel.records import Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view
-from univoxel.render.relight import Lighting, Stage, relight_surface, stage
+from univoxel.render.relight import Lighting, TracedMesh, relight_surface, traced_mesh
 from univoxel.run import trained_on
 
 BOUNCES = [0, 1, 2, 4]
@@ -52,7 +52,7 @@ def scores(run: Path, every: int, samples: int = 64) -> list[dict]:
     scene, folder = load_scene(run), trained_on(run)
     photos = load_photos(folder, "test")
     scale = albedo_scales(scene, photos).three
-    here = stage(_scaled(extract_mesh(scene), scale), scene.field.voxel_size)
+    here = traced_mesh(_scaled(extract_mesh(scene), scale), scene.field.voxel_size)
     maps = relight_maps(folder)
     lights = {name: Lighting(tables(read_map(path))) for name, path in maps.items()}
     wanted = {name: load_relit(photos, name) for name in lights}
@@ -79,7 +79,7 @@ def scores(run: Path, every: int, samples: int = 64) -> list[dict]:
     ]
 
 
-def noise(surface: Surface, wo: torch.Tensor, here: Stage, light: Lighting) -> list[dict]:
+def noise(surface: Surface, wo: torch.Tensor, here: TracedMesh, light: Lighting) -> list[dict]:
     """Seconds and error of one frame by samples per pixel, with two bounces."""
 
     def picture(samples: int, seed: int) -> torch.Tensor:
@@ -120,7 +120,7 @@ def main() -> None:
             own["surface_seconds"] = time.perf_counter() - start
             own["size"] = [cameras.width, cameras.height]
             own["pixels"] = int((surface.opacity > 0).sum())
-            here = stage(extract_mesh(scene), scene.field.voxel_size)
+            here = traced_mesh(extract_mesh(scene), scene.field.voxel_size)
             own["triangles"] = len(here.mesh.faces)
             own["noise"] = {
                 name: noise(surface, wo, here, Lighting(tables(read_map(path))))

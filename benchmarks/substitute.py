@@ -47,7 +47,7 @@ from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hu
 from univoxel.presets import preset
 from univoxel.records import Mesh, Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view
-from univoxel.render.relight import Lighting, relight_surface, stage
+from univoxel.render.relight import Lighting, relight_surface, traced_mesh
 from univoxel.scene import Scene
 from univoxel.sphere import latlong_directions, texel_solid_angles
 from univoxel.tasks.evaluate import evaluate
@@ -166,7 +166,7 @@ def relit_with_true_pixels(run: Path, folder: Path, samples: int = 64) -> dict[s
     other = with_materials(scene, Mesh(vertices, faces))
     assert other.albedo is not None
     other = replace(other, normals=normals, albedo=(other.albedo * scale).clamp_max(1))
-    stages = {m: stage(mesh, scene.field.voxel_size) for m, mesh in ((0, own), (1, other))}
+    stages = {m: traced_mesh(mesh, scene.field.voxel_size) for m, mesh in ((0, own), (1, other))}
     maps = {name: Lighting(tables(read_map(path))) for name, path in relight_maps(folder).items()}
     wanted = {name: load_relit(photos, name) for name in maps}
     found: dict[str, list[float]] = {}

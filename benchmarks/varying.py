@@ -41,7 +41,7 @@ from univoxel.experiments.record import result_text
 from univoxel.files import replacing
 from univoxel.presets import preset
 from univoxel.records import Mesh, Surface
-from univoxel.render.relight import Lighting, relight_surface, stage, turned
+from univoxel.render.relight import Lighting, relight_surface, rotated, traced_mesh
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
 
@@ -121,7 +121,7 @@ def rendered(folder: Path, photos: Photos, degrees: torch.Tensor) -> torch.Tenso
         normals.index_add_(0, corner[:, k], area)
     normals = normalize(normals, dim=1)
     albedo, roughness = at(mesh.vertices)
-    here = stage(Mesh(mesh.vertices, mesh.faces, normals, albedo, roughness), 1e-3)
+    here = traced_mesh(Mesh(mesh.vertices, mesh.faces, normals, albedo, roughness), 1e-3)
     light = Lighting(tables(read_map(folder / "envmaps" / "train.hdr")))
     out = torch.zeros_like(photos.color)
     for v in range(len(photos)):
@@ -139,7 +139,7 @@ def rendered(folder: Path, photos: Photos, degrees: torch.Tensor) -> torch.Tenso
         one = torch.ones(len(place))
         surface = Surface(place, normal, near, albedo, roughness, one, one)
         options = {"samples": SAMPLES, "bounces": 2, "seed": v}
-        rgb = relight_surface(surface, wo, here, turned(light, float(degrees[v])), **options)
+        rgb = relight_surface(surface, wo, here, rotated(light, float(degrees[v])), **options)
         picture, there = torch.zeros(len(met), 3), met.view(photos.alpha.shape[1:]).numpy()
         picture[met] = linear_to_srgb(rgb)
         # Where a pixel's middle misses the mesh, the nearest one that does not stands in

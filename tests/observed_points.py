@@ -11,8 +11,8 @@ import torch
 from analytic import RADIUS, cameras_around, scene_of, sphere_normals
 from torch.nn.functional import normalize
 
-from univoxel import brdf, losses
-from univoxel.color import linear_to_srgb
+from univoxel import brdf
+from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.data import Photos
 from univoxel.joint.equations import LinearTransport
 from univoxel.joint.observations import Decisions, JointProblem, prefiltered_roughness
@@ -65,7 +65,7 @@ def photographed(problem: JointProblem, map, albedo, roughness, f0=None) -> Join
         roughness[point], t.direction, problem.solid_angle, brdf.F0 if f0 is None else f0[point],
     )  # fmt: skip
     seen = replace(seen, color=color)
-    return replace(problem, observations=seen, target=losses.encode(color))
+    return replace(problem, observations=seen, target=linear_to_srgb_unclipped(color))
 
 
 def random_problem(

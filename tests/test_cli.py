@@ -97,7 +97,7 @@ def calls(monkeypatch):
     replace("train", Path("run"))
     replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)
-    replace("relight", None)
+    stand_in("univoxel.tasks.relight", relight_to_files=task("relight", None))
     replace("export", None)
     replace("envmap", None)
     found = {"chosen": [{"said": "lobes 24 -> 12"}]}

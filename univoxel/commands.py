@@ -37,7 +37,7 @@ from univoxel.names import (
 )
 
 if TYPE_CHECKING:
-    from univoxel.ops import Lamp, Sun
+    from univoxel.ops import PointLight, Sun
 
 Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
 Scenes: TypeAlias = Annotated[
@@ -47,6 +47,14 @@ Scenes: TypeAlias = Annotated[
 Changes: TypeAlias = Annotated[
     UseAppendAction[tuple[str, ...]],
     arg(metavar="FIELD=VALUE", help_behavior_hint="(repeatable)"),
+]
+Suns: TypeAlias = Annotated[
+    UseAppendAction[tuple[tuple[float, ...], ...]],
+    arg(metavar="AZIMUTH ELEVATION IRRADIANCE [ANGLE]"),
+]
+Points: TypeAlias = Annotated[
+    UseAppendAction[tuple[tuple[float, float, float, float], ...]],
+    arg(metavar="X Y Z INTENSITY"),
 ]
 LightOf: TypeAlias = Annotated[
     str | None, arg(metavar="VIEW", help_behavior_hint="(default: the mean of all)")
@@ -93,17 +101,17 @@ def sun_light(values: tuple[float, ...]) -> Sun:
         raise UserError(f"--{error}") from None
 
 
-def point_light(values: tuple[float, float, float, float]) -> Lamp:
+def point_light(values: tuple[float, float, float, float]) -> PointLight:
     """A white point light from x, y, z and its intensity.
 
     Raises:
         UserError: a number is out of range.
     """
-    from univoxel.ops import Lamp
+    from univoxel.ops import PointLight
 
     x, y, z, intensity = values
     try:
-        return Lamp((x, y, z), (intensity, intensity, intensity))
+        return PointLight((x, y, z), (intensity, intensity, intensity))
     except ValueError as error:
         raise UserError(f"--point: {error}") from None
 
@@ -267,14 +275,8 @@ def relight(
     run: Run,
     /,
     envmap: Annotated[tuple[Path, ...], arg(metavar="MAP [MAP ...]")] = (),
-    sun: Annotated[
-        UseAppendAction[tuple[tuple[float, ...], ...]],
-        arg(metavar="AZIMUTH ELEVATION IRRADIANCE [ANGLE]"),
-    ] = (),
-    point: Annotated[
-        UseAppendAction[tuple[tuple[float, float, float, float], ...]],
-        arg(metavar="X Y Z INTENSITY"),
-    ] = (),
+    sun: Suns = (),
+    point: Points = (),
     out: Annotated[
         Path | None, arg(metavar="DIR", help_behavior_hint="(default: in RUN/relight)")
     ] = None,
@@ -321,19 +323,19 @@ def relight(
     """
     from univoxel.tasks import relight as task
 
-    if orbit is not None:
-        if cameras != "test":
-            raise UserError(f"expected --orbit or --cameras, got {orbit} and {cameras}")
-        cameras = f"orbit {orbit}"
+    if orbit is not None and cameras != "test":
+        raise UserError(f"expected --orbit or --cameras, got {orbit} and {cameras}")
     if out is None:
         out = run / "relight" / envmap[0].stem if len(envmap) == 1 else run / "relight"
-    task.relight(
+    task.relight_to_files(
         run,
         envmap[0] if len(envmap) == 1 else envmap,
         out,
+        animation=animation,
+        resume=resume,
         suns=[sun_light(values) for values in sun],
-        lamps=[point_light(values) for values in point],
-        cameras=cameras,
+        point_lights=[point_light(values) for values in point],
+        cameras=cameras if orbit is None else f"orbit {orbit}",
         elevation=elevation,
         turn=turn,
         resolution=resolution,
@@ -344,8 +346,6 @@ def relight(
         bounces=bounces,
         background=background,
         ground=parse_ground(ground),
-        animation=animation,
-        resume=resume,
     )
     print(out)
 

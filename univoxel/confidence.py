@@ -13,8 +13,8 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from univoxel import brdf, losses
-from univoxel.color import CLIPPED
+from univoxel import brdf
+from univoxel.color import CLIPPED, linear_to_srgb_unclipped
 from univoxel.data import Photos
 from univoxel.joint.observations import (
     JointProblem,
@@ -110,7 +110,7 @@ def survey(scene: Scene, photos: Photos, points: int = POINTS) -> Survey:
     visibility = (cosine * transport.visibility / 255).sum(1) / cosine.sum(1).clamp_min(1e-6)
     counts = observations.offsets.diff()
     point = torch.repeat_interleave(counts)
-    encoded = losses.encode(observations.color)
+    encoded = linear_to_srgb_unclipped(observations.color)
     clipped, black = (encoded > CLIPPED).any(1), (encoded < BLACK).all(1)
     usable = ~(clipped | black)
     straight = (observations.wo * normal[point]).sum(1).square()
@@ -173,10 +173,10 @@ def compare(
     )
     changed = replace(surface, roughness=roughness + step)
     present, other = (
-        losses.encode(render(scene, s, observations, transport, point, observation))
+        linear_to_srgb_unclipped(render(scene, s, observations, transport, point, observation))
         for s in (surface, changed)
     )
-    target = losses.encode(observations.color[observation])
+    target = linear_to_srgb_unclipped(observations.color[observation])
     difference = (target - present).abs()
     at_least = (target > CLIPPED) & (present > target)
     difference = torch.where(at_least, 0.0, difference).mean(1)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from observed_points import COUNT, NODES, photographed, sphere_of
 
-from univoxel import losses
+from univoxel.color import linear_to_srgb_unclipped
 from univoxel.joint import metals
 from univoxel.joint.config import JointConfig
 from univoxel.joint.metals import evidence, find_metal, fitted
@@ -72,7 +72,7 @@ def test_fitted_finds_the_best_base_within_its_bounds():
         best = 0.0
         for c in range(3):
             shown = constant[p, :, c] + grey[:, None] * slope[p, :, c]
-            r = (target[p, :, c] - losses.encode(shown)) / cauchy
+            r = (target[p, :, c] - linear_to_srgb_unclipped(shown)) / cauchy
             best += cauchy**2 * torch.log1p(r.square()).mean(1).min() / 3
         # Gauss-Newton on Cauchy costs may end in a neighbouring valley, never below the best
         assert cost[p] >= best - 1e-5

@@ -104,9 +104,11 @@ def relit_calls(monkeypatch):
         wo = torch.tensor([0.6, 0.0, 0.8]).expand(n, 3)
         return surface, wo
 
-    def relight_surface(surface, wo, stage, lighting, *, samples, bounces):
+    def relight_surface(surface, wo, traced, lighting, *, samples, bounces):
         calls.append(
-            SimpleNamespace(mesh=stage.mesh, samples=samples, bounces=bounces, offset=stage.offset)
+            SimpleNamespace(
+                mesh=traced.mesh, samples=samples, bounces=bounces, offset=traced.offset
+            )
         )
         assert len(surface.opacity) == int(inside().sum())  # nothing outside is shaded
         return surface.albedo * lighting.tables.radiance.mean()

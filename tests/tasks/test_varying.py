@@ -19,9 +19,9 @@ from observed_points import (
     random_problem,
 )
 
-from univoxel import losses
 from univoxel.checkpoint import load_checkpoint, load_scene, save_scene
 from univoxel.cli import main
+from univoxel.color import linear_to_srgb_unclipped
 from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
@@ -94,7 +94,7 @@ def test_equations_know_what_differs():
     diffuse = diffuse * transport.diffuse_factor[..., None] + transport.diffuse_indirect
     specular = torch.einsum("pvd,pvdc->pvc", transport.specular, light)
     shaded = a.exp()[:, None] * diffuse + specular + transport.specular_indirect
-    residual = transport.target - losses.encode(g.exp()[transport.view] * shaded)
+    residual = transport.target - linear_to_srgb_unclipped(g.exp()[transport.view] * shaded)
     cauchy = JointConfig().newton.cauchy
     weight = 1 / (1 + (residual.detach() / cauchy) ** 2)
     weight = weight.masked_fill((transport.target > equations.CLIPPED) & (residual < 0), 0.0)
@@ -139,7 +139,7 @@ def test_newton_finds_gains_and_what_each_map_has_of_its_own():
         for v in range(views)
     ]
     color = torch.stack(colors, 1).flatten(0, 1)
-    problem = replace(problem, target=losses.encode(color))
+    problem = replace(problem, target=linear_to_srgb_unclipped(color))
     with torch.no_grad():
         scene.views.gain_steps.zero_()
         scene.views.sky_weights.zero_()

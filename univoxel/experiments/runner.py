@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import re
 import signal
 import subprocess
@@ -13,13 +14,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
+from univoxel.bars import bar
 from univoxel.data import load_photos
 from univoxel.errors import UserError
 from univoxel.experiments import worker
 from univoxel.experiments.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.files import replacing
+
+log = logging.getLogger("univoxel")
 
 OUTPUT = "output.txt"  # what the process said
 NAME = re.compile(r"[\w.+=-]*\w[\w.+=-]*")
@@ -99,10 +103,10 @@ def _run(jobs: Sequence[Job]) -> list[Outcome]:
             )
     done = {folder: found for folder, found in before.items() if found and not found.error}
     missing = [job for job in jobs if job.folder not in done]
-    with _Bar(missing, len(jobs)) as bar:
+    with _Bar(missing, len(jobs)) as shown:
         for job in missing:
-            done[job.folder] = _train(job, bar)
-            bar.finished(job, done[job.folder])
+            done[job.folder] = _train(job, shown)
+            shown.finished(job, done[job.folder])
     return [done[job.folder] for job in jobs]
 
 
@@ -146,7 +150,7 @@ def _job(data: Path, setting: Setting, out: Path, samples: int, seconds: float |
     return Job(folder, data.name, data, setting, samples, identity(config, samples), seconds)
 
 
-def _train(job: Job, bar: _Bar) -> Outcome:
+def _train(job: Job, shown: _Bar) -> Outcome:
     """The outcome of a job, which is recorded in its folder."""
     job.folder.mkdir(parents=True, exist_ok=True)
     (job.folder / RESULT).unlink(missing_ok=True)  # of a failure before
@@ -161,7 +165,7 @@ def _train(job: Job, bar: _Bar) -> Outcome:
         begin = time.monotonic()
         try:
             while process.poll() is None:
-                bar.now(job, time.monotonic() - begin)
+                shown.now(job, time.monotonic() - begin)
                 time.sleep(POLL_SECONDS)
         finally:
             process.kill()  # only when this was interrupted is it still there
@@ -189,7 +193,7 @@ class _Bar:
         self._left = sum(job.seconds for job in jobs)
         self._spent, self._expected = 0.0, 0.0  # seconds of what was done in this sitting
         self._now = 0.0
-        self._progress = Progress(
+        self._progress = bar(
             TextColumn("{task.completed}/{task.total}"),
             BarColumn(),
             TextColumn("{task.description}  {task.fields[left]}"),
@@ -221,5 +225,4 @@ class _Bar:
         self._left -= job.seconds
         self._progress.advance(self._task)
         if outcome.error:
-            text = f"{job.scene}/{job.setting.name} failed: {outcome.error}"
-            self._progress.console.print(text, markup=False)
+            log.info("%s/%s failed: %s", job.scene, job.setting.name, outcome.error)

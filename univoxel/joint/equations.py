@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from univoxel import losses
-from univoxel.color import CLIPPED
+from univoxel.color import CLIPPED, linear_to_srgb_unclipped, srgb_slope
 from univoxel.scene import Scene
 
 
@@ -121,11 +120,11 @@ def linearise(
     diffuse_radiance, radiance = channel_radiance(transport, sky, log_albedo, c, differences)
     diffuse, specular, gain = transport_in_views(transport, c, differences)
     target = transport.target[..., c]
-    residual = target - losses.encode(radiance)
+    residual = target - linear_to_srgb_unclipped(radiance)
     weight = 1 / (1 + (residual / cauchy).square())
     weight = weight.masked_fill((target > CLIPPED) & (residual < 0), 0.0)
     root = weight.sqrt()
-    slope = root * encoded_slope(radiance)
+    slope = root * srgb_slope(radiance)
     by_map = (albedo * transport.diffuse_factor)[..., None] * diffuse + specular
     by_map = by_map * (slope * gain)[..., None] * sky[:, c]
     by_albedo, by_gain = slope * diffuse_radiance, slope * radiance
@@ -286,12 +285,6 @@ def solve_damped(system: Tensor, right: Tensor) -> Tensor | None:
             if x.isfinite().all():
                 return x
     return None
-
-
-def encoded_slope(linear: Tensor) -> Tensor:
-    """Derivative of the sRGB curve."""
-    power = 1.055 / 2.4 * linear.clamp_min(0.0031308) ** (1 / 2.4 - 1)
-    return torch.where(linear <= 0.0031308, 12.92, power)
 
 
 def graph_laplacian(direction: Tensor, neighbours: int) -> Tensor:

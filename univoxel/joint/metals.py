@@ -11,11 +11,9 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from univoxel import losses
 from univoxel.brdf import F0
-from univoxel.color import CLIPPED, srgb_to_linear
+from univoxel.color import CLIPPED, linear_to_srgb_unclipped, srgb_slope, srgb_to_linear
 from univoxel.joint.config import JointConfig
-from univoxel.joint.equations import encoded_slope
 from univoxel.joint.observations import (
     JointProblem,
     observations_of,
@@ -112,9 +110,9 @@ def fitted(
 
     def compared() -> tuple[Tensor, Tensor, Tensor]:  # residual, its square by the scale, slope
         radiance = constant + base[:, None] * slope
-        residual = target - losses.encode(radiance)
+        residual = target - linear_to_srgb_unclipped(radiance)
         free = (target <= CLIPPED) | (residual > 0)  # clipped pixels are lower bounds
-        return free * residual, (free * residual / cauchy).square(), encoded_slope(radiance) * slope
+        return free * residual, (free * residual / cauchy).square(), srgb_slope(radiance) * slope
 
     base = (srgb_to_linear(target) - constant).sum(1) / slope.sum(1).clamp_min(1e-6)
     base = possible(base)

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from univoxel import losses
+from univoxel.color import linear_to_srgb_unclipped
 from univoxel.data import Photos
 from univoxel.errors import NoSurface
 from univoxel.joint.config import JointConfig
@@ -81,7 +81,7 @@ def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> 
     transport = trace(
         observations, tracer, mesh, vertex_color, direction, cfg.tracing, offset, generator
     )
-    target = losses.encode(observations.color)
+    target = linear_to_srgb_unclipped(observations.color)
     return JointProblem(observations, transport, target, offset, scene.sky)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, normalize
 
 from univoxel import brdf, losses
-from univoxel.color import CLIPPED
+from univoxel.color import CLIPPED, linear_to_srgb_unclipped
 from univoxel.data import Photos
 from univoxel.errors import NoSurface
 from univoxel.joint.albedo_entropy import diffuse_albedo, fit_sun_, minimise_entropy_
@@ -277,7 +277,7 @@ def objective(
     normal = normalize(sample.gradient[: len(point)], dim=1, eps=1e-6)
     surface = normal[repeat], diffuse[repeat], wide[repeat], f0[repeat]
     rgb = shade_observations(scene, problem, index, observation, *surface)
-    encoded, target = losses.encode(rgb), problem.target[observation]
+    encoded, target = linear_to_srgb_unclipped(rgb), problem.target[observation]
     away = (sample.sdf[: len(point)] / problem.voxel_size).square().mean()
     return {
         "joint": losses.photometric(encoded, target, clipped=CLIPPED),

@@ -10,9 +10,9 @@ from PIL import Image
 
 from univoxel.errors import MissingExtra, UserError
 from univoxel.files import replacing
+from univoxel.names import ANIMATIONS
 
 FRAMES_PER_SECOND = 25  # GIF counts in hundredths of a second
-KINDS = ("gif", "mp4")
 
 
 def require(kind: str) -> None:
@@ -22,7 +22,7 @@ def require(kind: str) -> None:
         UserError: another kind than gif and mp4.
         MissingExtra: mp4 without imageio-ffmpeg.
     """
-    if kind not in KINDS:
+    if kind not in ANIMATIONS:
         raise UserError(f"relight: animation must be gif or mp4, got {kind!r}", "animation")
     if kind == "mp4":
         _ffmpeg()

@@ -18,9 +18,10 @@ from univoxel.data.images import write_png
 from univoxel.envmap import EnvMap, tables
 from univoxel.errors import DataError, UserError
 from univoxel.joint.config import JointConfig
-from univoxel.pictures.animation import KINDS, require, write_animation
+from univoxel.names import ANIMATIONS
+from univoxel.pictures.animation import require, write_animation
 from univoxel.render.pipeline import extract_mesh, radiance_of, shade_hits, surface_of_view
-from univoxel.render.relight import Lighting, relight_surface, stage
+from univoxel.render.relight import Lighting, relight_surface, traced_mesh
 from univoxel.scene import Scene
 from univoxel.training.clock import Clock
 from univoxel.training.config import StageConfig
@@ -48,7 +49,7 @@ class Timelapse:
         """
         kind = Path(path).suffix
         folder = str(path).endswith("/") or not kind
-        if not folder and kind[1:] not in KINDS:
+        if not folder and kind[1:] not in ANIMATIONS:
             raise UserError(
                 f"timelapse: expected a name that ends in .gif, .mp4 or / (a folder), got {path}",
                 "timelapse",
@@ -116,8 +117,8 @@ def draw(scene: Scene, cameras, lit: bool, by_map: bool) -> Tensor:
     if by_map:
         assert scene.sky is not None
         lighting = Lighting(tables(EnvMap(scene.sky.latlong(MAP_ROWS))))
-        place = stage(extract_mesh(scene), scene.field.voxel_size)
-        sent = relight_surface(surface, wo, place, lighting, samples=SAMPLES, bounces=BOUNCES)
+        traced = traced_mesh(extract_mesh(scene), scene.field.voxel_size)
+        sent = relight_surface(surface, wo, traced, lighting, samples=SAMPLES, bounces=BOUNCES)
         render = linear_to_srgb(sent * opacity)
     elif lit:
         render = linear_to_srgb(shade_hits(scene, surface, wo))

@@ -12,11 +12,11 @@ import torch
 from univoxel.camera import Cameras, resize
 from univoxel.data import load_cameras
 from univoxel.errors import UserError
+from univoxel.names import ELEVATION
 from univoxel.records import Mesh
 from univoxel.run import photos_of
 
 ORBIT_FRAMES = 60
-ELEVATION = 25.0  # degrees, of an orbit's cameras above the object's middle
 VIEW_ANGLE = 40.0  # degrees, of an orbit's cameras
 ORBIT_SIZE = 512  # pixels along an orbit's pictures
 MARGIN = 1.05  # room that an orbit leaves around the object
@@ -71,7 +71,7 @@ def views_of(
     elevation: float,
     mesh: Mesh,
 ) -> tuple[list[str], Cameras]:
-    """Names of the views, and their cameras; arguments as of `univoxel.tasks.relight.relight`.
+    """Names of the views, and their cameras; arguments as of `tasks.relight.RelightOptions`.
 
     Raises:
         UserError: the cameras cannot be used.

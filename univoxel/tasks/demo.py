@@ -13,7 +13,7 @@ from univoxel.files import replacing
 from univoxel.presets import preset
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.export import export
-from univoxel.tasks.relight import relight
+from univoxel.tasks.relight import relight_to_files
 from univoxel.tasks.train import train
 from univoxel.training.config import StageConfig
 
@@ -80,7 +80,7 @@ def demo(out: str | Path) -> Path:
     config = replace(config, stages=stages, minutes=MINUTES)
     train(config, resume=(run / FILE).exists())
     measures = evaluate(run, save=out / "test")
-    relight(run, [SCENE / "envmaps" / f"{name}.hdr" for name in MAPS], out / "relight")
+    relight_to_files(run, [SCENE / "envmaps" / f"{name}.hdr" for name in MAPS], out / "relight")
     export(run, out / "mesh.ply")
 
     page = out / "index.html"

@@ -36,7 +36,7 @@ from univoxel.pictures.contact_sheet import contact_sheet
 from univoxel.pictures.layers import Relighting, exr_channels, render_layers
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh
-from univoxel.render.relight import Lighting, stage
+from univoxel.render.relight import Lighting, traced_mesh
 from univoxel.run import photos_of
 from univoxel.scene import Scene
 
@@ -67,8 +67,8 @@ def evaluate(
     """Measures of a trained scene on its test views, by the keys of `MEASURES`.
 
     Pictures are compared as sRGB in [0, 1] composited on black, whole image; numbers are means over
-    the views (and maps) of numbers per view. `univoxel.metrics` defines each. What
-    is weakly determined is said in words through the log. In particular:
+    the views (and maps) of numbers per view. `univoxel.metrics` defines each. What is weakly
+    determined is said in words through the log. In particular:
 
     - albedo_psnr_raw, _1ch, _3ch: albedo as it is; with one scale; with a scale per channel.
     - albedo_psnr_fg: as _3ch, over the pixels of the mask only.
@@ -127,11 +127,7 @@ def evaluate(
         "chamfer": mesh_chamfer(mesh, truth.points),
         "trust_spearman": doubt_correlation(views.albedo_doubts),
         "trust_spearman_roughness": doubt_correlation(views.roughness_doubts),
-        "train_seconds": report.get("seconds"),
-        "threads": report.get("threads"),
-        "peak_rss_mb": report.get("peak_rss_mb"),
-        "parameters": sum(p.numel() for p in scene.parameters()),
-        "model_bytes": (run / FILE).stat().st_size,
+        **_costs(run, scene, report),
     }
     figures = _say_trust(surveyed, report.get("troubles", []), save)
     if json:
@@ -152,6 +148,17 @@ def table(result: dict[str, float | int | None]) -> Table:
     return rows
 
 
+def _costs(run: Path, scene: Scene, report: dict) -> dict[str, float | int | None]:
+    """What training took, and the size of the model."""
+    return {
+        "train_seconds": report.get("seconds"),
+        "threads": report.get("threads"),
+        "peak_rss_mb": report.get("peak_rss_mb"),
+        "parameters": sum(p.numel() for p in scene.parameters()),
+        "model_bytes": (run / FILE).stat().st_size,
+    }
+
+
 def _relighting(
     scene: Scene,
     mesh: Mesh | None,
@@ -164,7 +171,7 @@ def _relighting(
     if not truth.maps or mesh is None:
         return None
     lights = {name: Lighting(tables(envmap)) for name, envmap in truth.maps.items()}
-    traced = stage(mesh, scene.field.voxel_size)
+    traced = traced_mesh(mesh, scene.field.voxel_size)
     return Relighting(lights, traced, scales.three, samples, bounces)
 
 

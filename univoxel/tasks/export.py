@@ -56,7 +56,7 @@ def export(
             f"export: texture_size must be a power of 2 from {low} to {high}, got {texture_size}",
             "texture_size",
         )
-    scene = load_scene(run)
+    scene = load_scene(Path(run))
     surface = clean(Mesh(*scene.field.isosurface()))
     if watertight:
         surface = close(surface)

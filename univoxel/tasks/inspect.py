@@ -22,7 +22,7 @@ from univoxel.errors import UserError
 from univoxel.names import MAP_ROWS
 from univoxel.ops import VisibilityScene
 from univoxel.records import Rays, Surface
-from univoxel.render.occlusion import look, starts
+from univoxel.render.occlusion import occlusion_rays, trace_and_shade
 from univoxel.render.pipeline import surface_at
 from univoxel.run import photos_of
 from univoxel.scene import Scene
@@ -39,7 +39,7 @@ class Incident:
 
     title: str
     radiance: Tensor  # [H, 2 H, 3] linear
-    open: Tensor | None = None  # [H, 2 H] bool: from the distant map, not from the object itself
+    visible: Tensor | None = None  # [H, 2 H] bool: from the distant map, not from the object itself
 
 
 @torch.no_grad()
@@ -97,8 +97,8 @@ def inspect(
     for layer in [*layers, *([truth] if truth else [])]:
         key = layer.title.replace(" ", "_")
         channels |= {f"{key}.{c}": x for c, x in zip("RGB", layer.radiance.unbind(2), strict=True)}
-        if layer.open is not None:
-            channels[f"{key}.open"] = layer.open.float()
+        if layer.visible is not None:
+            channels[f"{key}.open"] = layer.visible.float()
     write_exr(out.with_suffix(".exr"), channels, half=False)
     write_png(out, _sheet(photos, index, pixel, surface, layers, truth))
     return out
@@ -115,10 +115,10 @@ def arriving(scene: Scene, surface: Surface, height: int) -> list[Incident]:
         layers.append(Incident(f"local {scene.cfg.light.kind}", radiance.view(*shape, 3)))
     sky = scene.environment()
     if sky is not None:
-        clear, indirect = look(scene, *starts(scene, surface, wi))
-        radiance = torch.where(clear[:, None], sky.latlong(height).flatten(0, 1), indirect)
+        visible, indirect = trace_and_shade(scene, *occlusion_rays(scene, surface, wi))
+        radiance = torch.where(visible[:, None], sky.latlong(height).flatten(0, 1), indirect)
         radiance = scene.exposed(radiance)
-        layers.append(Incident("map", radiance.view(*shape, 3), clear.view(shape)))
+        layers.append(Incident("map", radiance.view(*shape, 3), visible.view(shape)))
     return layers
 
 
@@ -142,9 +142,9 @@ def true_light(scene: Scene, data: Path, rays: Rays, height: int) -> Incident | 
         normal = -normal
     wi = latlong_directions(height).flatten(0, 1)
     start = place + 1e-4 * hit.t[0] * normal  # off its own triangle
-    clear, indirect = look(scene, start.expand_as(wi).contiguous(), wi, tracer)
-    radiance = torch.where(clear[:, None], lookup(EnvMap(map), wi), indirect)
-    return Incident("truth", radiance.view(height, -1, 3), clear.view(height, -1))
+    visible, indirect = trace_and_shade(scene, start.expand_as(wi).contiguous(), wi, tracer)
+    radiance = torch.where(visible[:, None], lookup(EnvMap(map), wi), indirect)
+    return Incident("truth", radiance.view(height, -1, 3), visible.view(height, -1))
 
 
 def irradiance(radiance: Tensor, normal: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from univoxel import losses
 from univoxel.camera import pixel_rays
 from univoxel.checkpoint import save_scene
-from univoxel.color import linear_to_srgb
+from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.config import TrainConfig
 from univoxel.data import Photos
 from univoxel.lights import priors
@@ -202,7 +202,7 @@ def objective(
     met, view = at_rays(surface, hit), batch.view[hit]
     opacity, behind, target = opacity[hit], behind[hit], target[hit]
     shaded = shade(scene, met, batch.wo[hit], torch.default_generator, view)
-    encoded = losses.encode(shaded * opacity + behind * (1 - opacity))
+    encoded = linear_to_srgb_unclipped(shaded * opacity + behind * (1 - opacity))
     beside = met.position.detach() + scene.field.voxel_size * torch.randn_like(met.position)
     near = scene.field.features_at(beside)
     albedo, roughness, _ = scene.material(near)
