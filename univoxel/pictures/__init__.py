@@ -1,0 +1,1 @@
+"""Pictures of scenes: layers of a view, contact sheets, animations, timelapses."""

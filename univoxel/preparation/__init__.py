@@ -1,0 +1,1 @@
+"""What happens before the first gradient: masks, cameras, exposures and the carved visual hull."""

@@ -1,0 +1,1 @@
+"""Rays to surfaces to colours, and light traced through the scene."""

@@ -1,0 +1,1 @@
+"""The training loop: its clock, its optimiser, and what guards it."""
