@@ -37,7 +37,7 @@ from univoxel.envmap import tables
 from univoxel.fields.dense import DenseField
 from univoxel.grid import GridShape, fit_grid
 from univoxel.joint.config import JointConfig
-from univoxel.lights.distant import DistantLight
+from univoxel.lights.nodes import DistantLight
 from univoxel.metrics import on_black, psnr
 from univoxel.ops import VisibilityScene
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull

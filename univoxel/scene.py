@@ -1,4 +1,4 @@
-"""A scene: field, heads and light; and its checkpoint."""
+"""A scene: field, heads and light."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from univoxel.lights import (
     SHConfig,
     build,
 )
-from univoxel.lights.distant import DistantLight
 from univoxel.lights.mirrored import MirroredLight
+from univoxel.lights.nodes import DistantLight
 from univoxel.lights.views import ViewLights
 from univoxel.names import Varying
 from univoxel.ops import VisibilityScene

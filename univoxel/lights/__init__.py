@@ -8,11 +8,11 @@ from typing import Any, TypeAlias
 import torch
 
 from univoxel.lights.base import AbstractLight
-from univoxel.lights.envmap import EnvmapConfig, EnvmapLight
-from univoxel.lights.envmap_sg import EnvmapSGConfig, EnvmapSGLight
+from univoxel.lights.lobes_map import EnvmapSGConfig, EnvmapSGLight
 from univoxel.lights.mlp import LocalMLP, MLPLightConfig
 from univoxel.lights.sg import LocalSG, SGConfig
 from univoxel.lights.sh import LocalSH, SHConfig
+from univoxel.lights.texels import EnvmapConfig, EnvmapLight
 
 LightConfig: TypeAlias = SGConfig | SHConfig | MLPLightConfig | EnvmapSGConfig | EnvmapConfig
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from univoxel import envmap
-from univoxel.lights import distant_map, head, lobes, priors
+from univoxel.lights import head, latlong, lobes, priors
 from univoxel.lights.base import AbstractLight
 from univoxel.records import Occlusion, Surface
 from univoxel.sphere import latlong_directions
@@ -84,7 +84,7 @@ class EnvmapSGLight(AbstractLight):
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Radiance [N, 3] towards wo; no gradient to normals."""
-        return distant_map.reflected(self, surface, wo, occlusion, generator)
+        return latlong.reflected(self, surface, wo, occlusion, generator)
 
     def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
         _, sharpness, amplitude = self.lobes()

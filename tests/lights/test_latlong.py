@@ -14,7 +14,7 @@ from univoxel.lights import (
     EnvmapLight,
     EnvmapSGConfig,
     EnvmapSGLight,
-    distant_map,
+    latlong,
     quadrature,
 )
 from univoxel.records import Occlusion
@@ -179,7 +179,7 @@ def test_regularisation_sees_noise_and_colour():
     red = of_lobes()
     before = red.regularisation(s, s)["white_light"]
     # in closed form, what the map sums up to
-    torch.testing.assert_close(before, distant_map.chroma(red.latlong(64)), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(before, latlong.chroma(red.latlong(64)), rtol=1e-3, atol=1e-4)
     red.raw[:, 4] += 0.1
     assert red.regularisation(s, s)["white_light"] > before
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from univoxel import envmap
-from univoxel.lights import distant_map, head, priors
+from univoxel.lights import head, latlong, priors
 from univoxel.lights.base import AbstractLight
 from univoxel.records import Occlusion, Surface
 
@@ -83,18 +83,18 @@ class EnvmapLight(AbstractLight):
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Radiance [N, 3] towards wo; no gradient to normals."""
-        return distant_map.reflected(self, surface, wo, occlusion, generator)
+        return latlong.reflected(self, surface, wo, occlusion, generator)
 
     def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
         log_map = self.log_radiance
         return {
             "map_smoothness": priors.total_variation(log_map),
-            "white_light": distant_map.chroma(log_map.exp()),
+            "white_light": latlong.chroma(log_map.exp()),
         }
 
     def latlong(self, height: int) -> Tensor:
         """The map [height, 2 height, 3], linear, in the axes of docs/conventions.md."""
-        return distant_map.resampled(self.log_radiance.exp(), height)
+        return latlong.resampled(self.log_radiance.exp(), height)
 
 
 def _finer(level: Tensor, factor: int) -> Tensor:
