@@ -39,7 +39,7 @@ LAYERS = [
 HELPERS = {
     "ops": {"checks", "dense_grid", "native", "reflectance", "visibility"},
     "fields": {"base", "dense", "sparse"},
-    "lights": {"base", "latlong", "head", "lobes", "priors", "quadrature"},
+    "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},

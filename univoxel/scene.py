@@ -11,15 +11,12 @@ from univoxel.data import Photos
 from univoxel.fields.base import AbstractField
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.lights import (
+    AbstractLocalLight,
     EnvmapLight,
     EnvmapSGLight,
     LightConfig,
-    LocalMLP,
-    LocalSG,
-    LocalSH,
-    MLPLightConfig,
+    LocalLightConfig,
     SGConfig,
-    SHConfig,
     build,
 )
 from univoxel.lights.mirrored import MirroredLight
@@ -67,9 +64,7 @@ class SceneConfig:
             raise ValueError(
                 f"SceneConfig: varying must be none, exposure or light, got {self.varying!r}"
             )
-        if self.varying == "light" and not isinstance(
-            self.light, SGConfig | SHConfig | MLPLightConfig
-        ):
+        if self.varying == "light" and not isinstance(self.light, LocalLightConfig):
             raise ValueError(
                 "SceneConfig: varying light needs hybrid or a local light, sg, sh or mlp, got "
                 f"{self.light.kind}; varying exposure goes with every light"
@@ -91,7 +86,7 @@ class Scene(nn.Module):
         self.light = build(inputs, cfg.light)
         self.sky = DistantLight(cfg.sky_nodes) if cfg.sky_nodes else None
         self.mirrored = None
-        if cfg.mirrored and isinstance(cfg.light, SGConfig | SHConfig | MLPLightConfig):
+        if cfg.mirrored and isinstance(cfg.light, LocalLightConfig):
             known = self.radiance.directions.channels
             self.mirrored = MirroredLight(inputs, cfg.hidden, cfg.light.scale, known)
         self.views = None
@@ -100,7 +95,7 @@ class Scene(nn.Module):
             self.views = ViewLights(cfg.views, codes, directions)
         self.poses = PoseSteps(len(cfg.views)) if cfg.refined else None
         if codes:  # at first they change nothing
-            assert isinstance(self.light, LocalSG | LocalSH | LocalMLP)
+            assert isinstance(self.light, AbstractLocalLight)
             nets = [self.radiance.net, self.light.head]
             nets += [self.mirrored.net] if self.mirrored else []
             for net in nets:

@@ -17,7 +17,7 @@ import torch
 from scipy.linalg import qr
 from torch import Tensor, nn
 
-from univoxel.lights import LocalMLP, LocalSG, LocalSH
+from univoxel.lights import AbstractLocalLight, LocalSG
 from univoxel.networks import MLP
 from univoxel.scene import Scene
 
@@ -40,7 +40,7 @@ def parts_of(scene: Scene) -> Parts:
         (scene.radiance, ("net",)),
         (scene.radiance.directions, ("table",)),
     ]
-    if isinstance(scene.light, LocalSG | LocalSH | LocalMLP):
+    if isinstance(scene.light, AbstractLocalLight):
         names.append((scene.light, ("head", "base", "config")))
     if scene.mirrored:
         names.append((scene.mirrored, ("net",)))
@@ -56,7 +56,7 @@ def put_back(parts: Parts) -> None:
 def heads(scene: Scene) -> list[tuple[Any, str]]:
     """Owner and attribute of every network that reads features."""
     found: list[tuple[Any, str]] = [(scene.material, "net"), (scene.radiance, "net")]
-    if isinstance(scene.light, LocalSG | LocalSH | LocalMLP):
+    if isinstance(scene.light, AbstractLocalLight):
         found.append((scene.light, "head"))
     if scene.mirrored:
         found.append((scene.mirrored, "net"))
@@ -190,16 +190,14 @@ def drop_units(scene: Scene, width: int, read: dict[str, Tensor]) -> None:
     Args:
         read: what each head reads, [N, inputs], by the name of its owner's class; see `reads`.
     """
-    for owner, name in heads(scene):
-        if not isinstance(owner, LocalMLP):  # its two networks share their width
-            setattr(owner, name, narrow(getattr(owner, name), read[type(owner).__name__], width))
     cfg, light = scene.cfg, scene.light
-    if isinstance(light, LocalSG):
-        light.config = replace(light.config, hidden=min(width, light.config.hidden))
-    elif isinstance(light, LocalSH):
-        light.config = replace(light.config, hidden=min(width, light.config.hidden))
-    if isinstance(light, LocalSG | LocalSH):
-        cfg = replace(cfg, light=light.config)
+    narrowed = light.narrowed(width) if isinstance(light, AbstractLocalLight) else None
+    for owner, name in heads(scene):
+        if owner is not light or narrowed is not None:
+            setattr(owner, name, narrow(getattr(owner, name), read[type(owner).__name__], width))
+    if isinstance(light, AbstractLocalLight) and narrowed is not None:
+        light.config = narrowed
+        cfg = replace(cfg, light=narrowed)
     scene.cfg = replace(cfg, hidden=min(width, cfg.hidden))
 
 
