@@ -38,7 +38,7 @@ LAYERS = [
 ]
 HELPERS = {
     "ops": {"checks", "dense_grid", "native", "reflectance", "visibility"},
-    "fields": {"base", "dense", "sparse"},
+    "fields": {"bricks", "dense", "distances", "features"},
     "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import get_args
 
-from univoxel.fields.hashed import PER_LEVEL
+from univoxel.fields.features import PER_LEVEL
 from univoxel.files import replacing
 from univoxel.joint.config import JointConfig
 from univoxel.names import CamerasFrom, Capacity, MasksFrom

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from univoxel.data import Photos
-from univoxel.fields.base import AbstractField
+from univoxel.fields.field import Field
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.lights import (
     AbstractLocalLight,
@@ -74,7 +74,7 @@ class SceneConfig:
 class Scene(nn.Module):
     """Everything that is learned of an object and of the light it stood in."""
 
-    def __init__(self, cfg: SceneConfig, field: AbstractField, inv_s: float = 1.0):
+    def __init__(self, cfg: SceneConfig, field: Field, inv_s: float = 1.0):
         super().__init__()
         self.cfg = cfg
         self.inv_s = inv_s  # sharpness of the NeuS density, 1 / world units

@@ -129,7 +129,7 @@ def test_what_cannot_be_written_leaves_nothing_behind_that_looks_whole(tmp_path,
 def test_a_field_without_an_inside_is_nothing():
     grid = task.fit_grid(-torch.ones(3), torch.ones(3), 10**3)
     with pytest.raises(task.NothingFound, match="no object was found"):
-        task.redistance(task.DenseField(grid, 1, torch.ones(grid.size)))
+        task.redistance(task.dense_field(grid, 1, torch.ones(grid.size)))
 
 
 def test_what_cameras_look_at_is_the_box():
@@ -144,7 +144,7 @@ def test_small_parts_are_chaff():
     node = grid.nodes()
     ball = (node - torch.tensor([0.3, 0.0, 0.0])).norm(dim=-1) - 0.4
     speck = (node + torch.tensor([0.8, 0.0, 0.0])).norm(dim=-1) - 0.08
-    field = task.DenseField(grid, 1, torch.minimum(ball, speck))
+    field = task.dense_field(grid, 1, torch.minimum(ball, speck))
     near = ball.abs() < 0.1
     task.redistance(field)
     assert (field.sdf[speck < 0] < 0).all()

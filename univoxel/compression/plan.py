@@ -21,8 +21,8 @@ from univoxel.checkpoint import SHELL, stored
 from univoxel.compression import search
 from univoxel.compression.quality import TOLERANCE, Choice, Look, smallest
 from univoxel.config import TrainConfig
-from univoxel.fields.dense import DenseField
-from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS
+from univoxel.fields.dense import DenseDistances
+from univoxel.fields.features import FEWEST_ROWS, PER_LEVEL, ROWS, NodeFeatures
 from univoxel.grid import fit_grid
 from univoxel.lights import LocalSG
 from univoxel.networks import DirectionTable
@@ -165,7 +165,7 @@ def adapt(
             return rehearse(tried, on_grid(follows, box, tried.field.voxel_size), steps)
 
         room = f"the budget leaves room for {most:,}"
-        if scene.field.by_node:
+        if isinstance(scene.field.encoding, NodeFeatures):
             choice = coarser_grid(scene, most, box, rehearsed)
             if most < limit:
                 choice = replace(choice, before=limit, why=f"{room}; {choice.why}")
@@ -175,7 +175,7 @@ def adapt(
             found.append(Choice("voxels", limit, most, 0.0, room))
     if isinstance(stage, StageConfig) and not stage.refit and stage.physical_from < 1:
         tolerance, taught = REGAINED if after else TOLERANCE, lesson(LESSON)
-        if scene.field.by_node:
+        if isinstance(scene.field.encoding, NodeFeatures):
             found.append(search.fewer_channels(scene, look, taught, tolerance))
         if scene.cfg.mirror_levels:
             found.append(search.fewer_mirror_levels(scene, look, taught))
@@ -184,9 +184,9 @@ def adapt(
                 found.append(search.fewer_lobes(scene, look, taught))
             found.append(search.fewer_units(scene, look, taught))
     if not after:
-        if isinstance(scene.field.distances, DenseField):
+        if isinstance(scene.field.distances, DenseDistances):
             found.append(shorter_reach(scene, look))
-        if not scene.field.by_node:
+        if not isinstance(scene.field.encoding, NodeFeatures):
             far = (reach([c.noted() for c in found]) or SHELL) * scene.field.voxel_size
             found.append(
                 search.fewer_rows(scene, look, (lesson(PROBE) for _ in range(PROBES)), far)
@@ -278,14 +278,14 @@ def _direction_bytes(levels: int) -> int:
 def _node_bytes(scene: Scene) -> int:
     """Of a node near the surface: number of its row and distance, in halves; and, where features
     are of nodes, its number again and features."""
-    features = 4 + 2 * scene.cfg.channels if scene.field.by_node else 0
+    features = 4 + 2 * scene.cfg.channels if isinstance(scene.field.encoding, NodeFeatures) else 0
     return 4 + 2 + features
 
 
 def _apart_from_grid(scene: Scene) -> int:
     rest = (x for name, x in scene.state_dict().items() if not name.startswith(search.TABLES))
     names = NAME * len(scene.cfg.views)
-    rows = 0 if scene.field.by_node else len(scene.field.features)
+    rows = 0 if isinstance(scene.field.encoding, NodeFeatures) else len(scene.field.features)
     rows_bytes = ROW_BYTES * rows + _direction_bytes(scene.cfg.mirror_levels)
     return HEADER + names + rows_bytes + sum(x.numel() * x.element_size() for x in rest)
 
@@ -326,7 +326,8 @@ def voxels(stage: StageConfig, chosen: list[dict]) -> int:
 
 def rehearsed(scene: Scene, choices: list[Choice]) -> bool:
     """Whether the coming stage has made its first steps in a rehearsal."""
-    return scene.field.by_node and any(c.what == "voxels" for c in choices)
+    by_node = isinstance(scene.field.encoding, NodeFeatures)
+    return by_node and any(c.what == "voxels" for c in choices)
 
 
 def reach(chosen: list[dict]) -> float | None:

@@ -17,6 +17,7 @@ import torch
 from scipy.linalg import qr
 from torch import Tensor, nn
 
+from univoxel.fields.features import NodeFeatures
 from univoxel.lights import AbstractLocalLight, LocalSG
 from univoxel.networks import MLP
 from univoxel.scene import Scene
@@ -35,7 +36,7 @@ def parts_of(scene: Scene) -> Parts:
     """The present networks, features and sizes of a scene."""
     names = [
         (scene, ("cfg",)),
-        (scene.field, ("features", "channels")),
+        (scene.field, ("features",)),
         (scene.material, ("net", "channels")),
         (scene.radiance, ("net",)),
         (scene.radiance.directions, ("table",)),
@@ -89,6 +90,8 @@ def drop_channels(scene: Scene, keep: Tensor, mean: Tensor) -> None:
         keep: [K] increasing numbers, at least one of them a material channel.
         mean: [C] of the channels over the surface.
     """
+    encoding = scene.field.encoding
+    assert isinstance(encoding, NodeFeatures)
     channels, of_material = scene.cfg.channels, scene.material.channels
     gone = torch.ones(channels, dtype=torch.bool)
     gone[keep] = False
@@ -101,7 +104,7 @@ def drop_channels(scene: Scene, keep: Tensor, mean: Tensor) -> None:
         setattr(owner, name, _network(weights, biases))
     scene.material.channels = int((keep < of_material).sum())
     scene.cfg = replace(scene.cfg, channels=len(keep), material_channels=scene.material.channels)
-    scene.field.keep_channels(keep)
+    encoding.keep_channels(keep)
 
 
 def drop_lobes(scene: Scene, keep: Tensor) -> None:

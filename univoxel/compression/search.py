@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from univoxel.checkpoint import SHELL
 from univoxel.compression import prune
 from univoxel.compression.quality import TOLERANCE, Choice, Look, smallest
+from univoxel.fields.features import NodeFeatures
 from univoxel.lights import LocalSG
 from univoxel.records import Surface
 from univoxel.render.pipeline import surface_at
@@ -260,7 +261,7 @@ def share_of_heads(scene: Scene) -> float:
     rest = sum(x.numel() for name, x in scene.named_parameters() if not name.startswith(TABLES))
     near = nodes_near(scene)
     features = near * scene.cfg.channels
-    if not scene.field.by_node:
+    if not isinstance(scene.field.encoding, NodeFeatures):
         features = scene.field.features.shape[1] * int(scene.field.features.detach().any(1).sum())
     return rest / (rest + near + features)
 

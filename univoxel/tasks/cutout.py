@@ -26,7 +26,7 @@ from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.errors import NothingFound
 from univoxel.fields.backdrop import Backdrop
-from univoxel.fields.dense import DenseField
+from univoxel.fields.field import Field, dense_field
 from univoxel.grid import fit_grid
 from univoxel.lights.sg import SGConfig
 from univoxel.metrics import psnr
@@ -171,7 +171,7 @@ def started(
     upper: Tensor,
     stage: StageConfig,
     watch: Callable[[float], None],
-) -> tuple[Scene, DenseField, Backdrop, float]:
+) -> tuple[Scene, Field, Backdrop, float]:
     """Scene, its field and backdrop after a stage that begins with a ball, and the PSNR, dB."""
     centre, half = (lower + upper) / 2, (upper - lower) / 2
     backdrop = Backdrop(centre, float(half.norm()))
@@ -185,14 +185,14 @@ def started(
         mirrored=False,
         light=SGConfig(lobes=1),
     )
-    field = DenseField(grid, sizes.channels, ball)
+    field = dense_field(grid, sizes.channels, ball)
     scene = Scene(sizes, field)
     return scene, field, backdrop, separate(scene, field, backdrop, stage, photos, watch)
 
 
 def separate(
     scene: Scene,
-    field: DenseField,
+    field: Field,
     backdrop: Backdrop,
     stage: StageConfig,
     photos: Photos,
@@ -250,7 +250,7 @@ def separate(
 
 
 @torch.no_grad()
-def redistance(field: DenseField, whole: bool = False) -> None:
+def redistance(field: Field, whole: bool = False) -> None:
     """Make the sdf a distance again, but for what is near the surface.
 
     Args:
@@ -273,7 +273,7 @@ def redistance(field: DenseField, whole: bool = False) -> None:
     field.refresh()
 
 
-def bounds(field: DenseField, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+def bounds(field: Field, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
     """A box around the surface, within that of lower and upper."""
     vertices, _ = field.isosurface()
     low, high = vertices.amin(0), vertices.amax(0)

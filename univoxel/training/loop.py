@@ -123,7 +123,7 @@ def run_stage(
         if not guard.sound(loss):
             continue
         if stage.refit:
-            field.hold_channels_(scene.material.channels)
+            field.encoding.hold_channels_(scene.material.channels)
         if stage.spread:
             spread_gradient(field, stage.spread)
         optimizer.step()
