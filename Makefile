@@ -12,7 +12,7 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test lint format bench asan clean
+.PHONY: help dev demo test lint format bench docs docs-check docs-write asan clean
 .DELETE_ON_ERROR:
 
 help:
@@ -20,6 +20,8 @@ help:
 	@echo "make test    all tests"
 	@echo "make lint    formatting, lint and types, as CI checks them"
 	@echo "make format  put formatting right"
+	@echo "make docs    build the documentation into build/docs; warnings are errors"
+	@echo "make docs-check  compare pages with results and code; docs-write brings them up to date"
 	@echo "make bench   time every op against its peers and draw the charts"
 	@echo "make asan    the ops' tests under address and undefined-behaviour sanitizers"
 	@echo "make dev     set up only"
@@ -63,6 +65,20 @@ build/.bench: build/.installed benchmarks/bare_embree.cpp
 bench: dev .venv/.bench build/.bench
 	$(BIN)/python benchmarks/ops.py
 	$(BIN)/python benchmarks/charts.py
+
+.venv/.docs: $(SETUP)
+	scripts/venv.sh $(PYTHON) docs
+	@touch $@
+
+docs: .venv/.docs
+	$(BIN)/python -m sphinx -q -W --keep-going -d build/doctrees docs build/docs
+	@echo build/docs/index.html
+
+docs-check: dev
+	$(BIN)/python scripts/docs
+
+docs-write: dev
+	$(BIN)/python scripts/docs --write
 
 # The instrumented build stands in a package of its own, of links to the Python sources. Inductor's
 # own compiler runs are no business of the sanitizers; Python itself leaks by design.

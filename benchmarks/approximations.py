@@ -18,9 +18,11 @@ import time
 from pathlib import Path
 
 import torch
+from made import made
 from torch import Tensor
 
 from univoxel import sphere
+from univoxel.experiments.record import result_text
 from univoxel.ops import shade_sg
 
 HERE = Path(__file__).parent
@@ -141,7 +143,7 @@ def main() -> None:
         "shade_sg": measure(options.rounds),
         "load_average": os.getloadavg()[0],
     }
-    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    options.out.write_text(result_text(made() | result))
     draw(options.out)
 
 

@@ -21,10 +21,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from ball import write
+from made import made
 
 from univoxel.checkpoint import FILE
 from univoxel.config import TrainConfig
 from univoxel.experiments import plots
+from univoxel.experiments.record import result_text
 from univoxel.files import replacing
 from univoxel.presets import preset, with_field
 from univoxel.tasks.evaluate import evaluate
@@ -129,9 +131,9 @@ def main() -> None:
                 "bytes": found["bytes"],
                 "chosen": [c["said"] for c in found["chosen"]],
             }
-            result["runs"][name] = own
+            result["runs"][name] = own | {"commit": made()["commit"]}
             with replacing(arguments.out) as temporary:
-                temporary.write_text(json.dumps(result, indent=1) + "\n")
+                temporary.write_text(result_text(result | made()))
     draw(result["runs"], arguments.out.with_suffix(""))
 
 

@@ -24,7 +24,9 @@ from pathlib import Path
 from statistics import median
 
 import torch
+from made import made
 
+from univoxel.experiments.record import result_text
 from univoxel.fields.features import PER_LEVEL, Levels
 from univoxel.fields.field import Field, dense_field, hash_field
 from univoxel.grid import GridShape
@@ -32,7 +34,7 @@ from univoxel.ops import composite
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays
 from univoxel.render.density import section_alpha
-from univoxel.tasks import train
+from univoxel.training import surface_update
 
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "field_scaling.json"
@@ -84,7 +86,7 @@ def step(field: Field, optimizer: RowAdam) -> None:
     loss = (seen[:, :channels] - wanted).square().mean() + 0.1 * (length - 1).square().mean()
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
-    train.spread_gradient(field, 4)
+    surface_update.smooth_sdf_gradient_(field, 4)
     optimizer.step()
 
 
@@ -105,7 +107,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
     optimizer = RowAdam([field.sdf, field.features], lr=0.01 * field.voxel_size, eps=1e-4)
     seconds, looks = [], []
     for i in range(steps):
-        if i % train.REFRESH == 0:
+        if i % surface_update.REFRESH == 0:
             begin, old = time.perf_counter(), (field.sdf, field.features)
             field.refresh()
             for a, b in zip(old, (field.sdf, field.features), strict=True):
@@ -113,7 +115,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
             looks.append(time.perf_counter() - begin)
         begin = time.perf_counter()
         step(field, optimizer)
-        if i % train.SMOOTH_EVERY == 0:
+        if i % surface_update.SMOOTH_EVERY == 0:
             assert field.sdf.grad is not None
             assert field.features.grad is not None
             touched, read = rows_of(field.sdf.grad), rows_of(field.features.grad)
@@ -130,7 +132,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
         "memory_mb": peak - before,
         "process_mb": peak,
         "make_seconds": made,
-        "step_ms": 1e3 * (median(seconds) + median(looks) / train.REFRESH),
+        "step_ms": 1e3 * (median(seconds) + median(looks) / surface_update.REFRESH),
         "refresh_ms": 1e3 * median(looks),
         "isosurface_seconds": time.perf_counter() - begin,
         "faces": faces,
@@ -216,7 +218,7 @@ def main() -> None:
             for kind in KINDS
         },
     }
-    options.out.write_text(json.dumps(found, indent=2) + "\n")
+    options.out.write_text(result_text(made() | found))
     print(json.dumps(found["exponents"], indent=2))
     try:
         draw(found, options.out)

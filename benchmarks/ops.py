@@ -24,7 +24,10 @@ from pathlib import Path
 
 import torch
 import workers
+from made import made
 from torch import Tensor
+
+from univoxel.experiments.record import result_text
 
 HERE = Path(__file__).parent
 SLOW_MS = 3000.0
@@ -202,14 +205,12 @@ def main() -> None:
         merged["limits"] |= result["limits"]
         merged["results"] += result["results"]
         merged["peers"] = result["peers"]
-    git = ["git", "-C", str(HERE), "describe", "--always", "--dirty"]
-    merged["commit"] = subprocess.run(git, capture_output=True, text=True).stdout.strip()
     merged["versions"] = {"python": platform.python_version(), "torch": torch.__version__}
     merged["versions"] |= merged.pop("peers")
     merged["cpu"] = torch.backends.cpu.get_cpu_capability()
     merged["load_average"] = os.getloadavg()[0]  # 1 minute; above the cores: others ran too
     merged["cores"] = len(os.sched_getaffinity(0))
-    options.out.write_text(json.dumps(merged, indent=1) + "\n")
+    options.out.write_text(result_text(made() | merged))
     print(options.out)
 
 

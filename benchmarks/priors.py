@@ -21,6 +21,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import torch
+from made import made
 from torch import Tensor
 from varying import exposed
 
@@ -28,6 +29,7 @@ from univoxel.checkpoint import FILE
 from univoxel.config import TrainConfig, save_config
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
+from univoxel.experiments.record import result_text
 from univoxel.files import replacing
 from univoxel.presets import preset
 from univoxel.tasks.evaluate import evaluate
@@ -193,10 +195,10 @@ def main() -> None:
         cfg = replace(cfg, minutes=arguments.minutes, loss=loss)
         first = f"{arguments.preset}_{scene}_{light}_first".replace(" ", "_")
         trained(cfg, arguments.work / first)
-        row = {"scene": scene, "light": light, "loss": asdict(loss)}
+        row = {"scene": scene, "light": light, "loss": asdict(loss), "commit": made()["commit"]}
         result["runs"][key] = row | evaluate(cfg.out, samples=16)
         with replacing(arguments.out) as temporary:
-            temporary.write_text(json.dumps(result, indent=1) + "\n")
+            temporary.write_text(result_text(result | made()))
         print(key, {m: round(result["runs"][key][m], 2) for m in MEASURES})
     chart(result, arguments.out)
 

@@ -10,7 +10,6 @@ of them is divided in these proportions.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import tempfile
 import time
@@ -20,9 +19,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from made import made
 from train_step import OTHER, STAGES, Clock
 
 from univoxel.config import TrainConfig
+from univoxel.experiments.record import result_text
 from univoxel.fields.field import Field
 from univoxel.joint import observations, stage
 from univoxel.joint.config import JointConfig
@@ -30,13 +31,16 @@ from univoxel.ops import VisibilityScene
 from univoxel.presets import chosen
 from univoxel.tasks import train
 from univoxel.training import loop
+from univoxel.training.config import StageConfig
 
 HERE = Path(__file__).parent
 ONCE = {
-    "joint: pose and trace": [(stage, "pose")],
-    "joint: trials": [(stage, "supposed")],
-    "joint: colors": [(stage, name) for name in ("sunlit", "balance", "matte_albedo")],
-    "joint: Newton": [(stage, "newton_round")],
+    "joint: pose and trace": [(stage, "build_problem")],
+    "joint: trials": [(stage, "initialise_")],
+    "joint: colors": [
+        (stage, name) for name in ("fit_sun_", "minimise_entropy_", "diffuse_albedo")
+    ],
+    "joint: Newton": [(stage, "newton_round_")],
     "joint: metal": [(stage, "find_metal")],
     "held-out rays": [(loop, "held_out_psnr")],
     "previews": [(train, "preview")],
@@ -103,7 +107,7 @@ class RunClock(Clock):
 
         def call(*arguments):
             progress = arguments[-1]
-            number, stage = progress.stage + 1, self.cfg.stages[progress.stage]
+            number, stage = progress.clock.stage + 1, self.cfg.stages[progress.clock.stage]
             joint = isinstance(stage, JointConfig)
             what = "joint" if joint else f"{'refit' if stage.refit else 'grid'} {stage.voxels:g} M"
             self.enter(START)
@@ -162,6 +166,15 @@ def profile(cfg: TrainConfig, now: Callable[[], float] = time.perf_counter) -> d
     return {"seconds": now() - begin, "stages": clock.columns}
 
 
+def part_of(stage: StageConfig | JointConfig, part: int) -> StageConfig | JointConfig:
+    """A stage with an n-th of its steps."""
+    stage = replace(stage, iterations=stage.iterations // part)
+    if not isinstance(stage, JointConfig):
+        return stage
+    steps = max(1, stage.entropy.teaching_steps // part)
+    return replace(stage, entropy=replace(stage.entropy, teaching_steps=steps))
+
+
 def extrapolated(columns: dict, part: int) -> dict:
     """Columns of a run with an n-th of its steps as if it had made all of them."""
     found = {}
@@ -218,10 +231,9 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=HERE / "results" / "profile.json")
     options = parser.parse_args()
-    stage.FOLLOWING //= options.part
     with tempfile.TemporaryDirectory() as folder:
         cfg = chosen(options.preset, options.minutes, options.scene, Path(folder) / "run")
-        stages = (replace(s, iterations=s.iterations // options.part) for s in cfg.stages)
+        stages = (part_of(s, options.part) for s in cfg.stages)
         cfg = replace(cfg, stages=tuple(stages), capacity="fixed")  # rehearsals are no stages
         result = profile(cfg, time.process_time if options.cpu else time.perf_counter)
     result |= {
@@ -233,7 +245,7 @@ def main() -> None:
         "torch": torch.__version__,
         "load_average": os.getloadavg()[0],
     }
-    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    options.out.write_text(result_text(made() | result))
     print(table(result))
 
 

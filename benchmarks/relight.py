@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from made import made
 from peers import BARE_EMBREE
 from relight_rays import ray_rates
 from relight_scenes import TESTS, Scene, mesh_scene, sphere_scene, true_mesh
@@ -32,6 +33,7 @@ from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.envmap import EnvMap, tables
+from univoxel.experiments.record import result_text
 from univoxel.ops import VisibilityScene, relight
 from univoxel.records import Mesh
 
@@ -284,7 +286,7 @@ def main() -> None:
         result["mitsuba"] = against_mitsuba(scene, result["strategies"])
     if data and "pictures" in wanted:
         result["pictures"] = against_pictures(data, arguments.samples, arguments.every)
-    arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+    arguments.out.write_text(result_text(made() | result))
     if "strategies" in result:
         draw(arguments.out)
 

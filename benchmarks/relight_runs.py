@@ -17,6 +17,7 @@ from pathlib import Path
 from statistics import fmean
 
 import torch
+from made import made
 
 from univoxel.checkpoint import load_scene
 from univoxel.color import linear_to_srgb
@@ -24,12 +25,13 @@ from univoxel.data import load_photos, load_relit, relight_maps
 from univoxel.data.base import decode
 from univoxel.data.maps import read_map
 from univoxel.envmap import tables
+from univoxel.evaluation.measures import albedo_scales
+from univoxel.experiments.record import result_text
 from univoxel.metrics import on_black, psnr
 from univoxel.records import Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view
-from univoxel.render.relight import Lighting, Stage, relight_surface, stage
+from univoxel.render.relight import Lighting, TracedMesh, relight_surface, traced_mesh
 from univoxel.run import trained_on
-from univoxel.tasks.evaluate import _albedo_scales
 
 BOUNCES = [0, 1, 2, 4]
 EXPONENTS = [1.0, 1.5]
@@ -49,8 +51,8 @@ def scores(run: Path, every: int, samples: int = 64) -> list[dict]:
     """relit_psnr of a run by bounces and exponent."""
     scene, folder = load_scene(run), trained_on(run)
     photos = load_photos(folder, "test")
-    scale = _albedo_scales(scene, photos).three
-    here = stage(_scaled(extract_mesh(scene), scale), scene.field.voxel_size)
+    scale = albedo_scales(scene, photos).three
+    here = traced_mesh(_scaled(extract_mesh(scene), scale), scene.field.voxel_size)
     maps = relight_maps(folder)
     lights = {name: Lighting(tables(read_map(path))) for name, path in maps.items()}
     wanted = {name: load_relit(photos, name) for name in lights}
@@ -77,7 +79,7 @@ def scores(run: Path, every: int, samples: int = 64) -> list[dict]:
     ]
 
 
-def noise(surface: Surface, wo: torch.Tensor, here: Stage, light: Lighting) -> list[dict]:
+def noise(surface: Surface, wo: torch.Tensor, here: TracedMesh, light: Lighting) -> list[dict]:
     """Seconds and error of one frame by samples per pixel, with two bounces."""
 
     def picture(samples: int, seed: int) -> torch.Tensor:
@@ -118,14 +120,14 @@ def main() -> None:
             own["surface_seconds"] = time.perf_counter() - start
             own["size"] = [cameras.width, cameras.height]
             own["pixels"] = int((surface.opacity > 0).sum())
-            here = stage(extract_mesh(scene), scene.field.voxel_size)
+            here = traced_mesh(extract_mesh(scene), scene.field.voxel_size)
             own["triangles"] = len(here.mesh.faces)
             own["noise"] = {
                 name: noise(surface, wo, here, Lighting(tables(read_map(path))))
                 for name, path in relight_maps(folder).items()
             }
         print(run.name, json.dumps(own, indent=1), flush=True)
-        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+        arguments.out.write_text(result_text(result | made()))
 
 
 if __name__ == "__main__":

@@ -11,11 +11,9 @@ the slope of log time over log size, 1 for a cost that is linear.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import multiprocessing
 import os
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +22,10 @@ from statistics import median
 import cases
 import torch
 import workers
+from made import made
 from ops import arguments_as, forward_backward
+
+from univoxel.experiments.record import result_text
 
 OPS: dict[str, Callable[[], cases.Case]] = {
     "composite": cases.composite,
@@ -129,7 +130,7 @@ def main() -> None:
     default = Path(__file__).parent / "results" / "scaling.json"
     parser.add_argument("--out", type=Path, default=default)
     options = parser.parse_args()
-    result: dict = {"date": time.strftime("%Y-%m-%d"), "threads": {}, "growth": {}}
+    result: dict = {"threads": {}, "growth": {}}
     print("| op | 1 thread, ms | 2 threads, ms | gain | one of two copies, ms | gain of a core |")
     print("|---|---|---|---|---|---|")
     for name, make in OPS.items():
@@ -148,7 +149,7 @@ def main() -> None:
         result["growth"][name] = {"ms": times, "exponent": exponent(times)}
         row = " | ".join(f"{t:.1f}" for t in times.values())
         print(f"| `{name}` | {row} | {exponent(times):.2f} |", flush=True)
-    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    options.out.write_text(result_text(made() | result))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from statistics import fmean
 
 import numpy as np
 import torch
+from made import made
 from relight_scenes import true_mesh
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
@@ -34,6 +35,8 @@ from univoxel.data import load_photos, load_relit, load_truth, relight_maps
 from univoxel.data.base import decode
 from univoxel.data.maps import read_map, true_map
 from univoxel.envmap import tables
+from univoxel.evaluation.measures import albedo_scales
+from univoxel.experiments.record import result_text
 from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape, fit_grid
 from univoxel.joint.config import JointConfig
@@ -44,10 +47,10 @@ from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hu
 from univoxel.presets import preset
 from univoxel.records import Mesh, Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view
-from univoxel.render.relight import Lighting, relight_surface, stage
+from univoxel.render.relight import Lighting, relight_surface, traced_mesh
 from univoxel.scene import Scene
 from univoxel.sphere import latlong_directions, texel_solid_angles
-from univoxel.tasks.evaluate import _albedo_scales, evaluate
+from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
 from univoxel.training.config import StageConfig
 
@@ -155,7 +158,7 @@ def begin(folder: Path, out: Path, name: str, term: str) -> TrainConfig:
 def relit_with_true_pixels(run: Path, folder: Path, samples: int = 64) -> dict[str, float]:
     """relit_psnr of a run, its pixels' terms replaced by the truth one by one, and all at once."""
     scene, photos = load_scene(run), load_photos(folder, "test")
-    scale = _albedo_scales(scene, photos).three
+    scale = albedo_scales(scene, photos).three
     own = extract_mesh(scene)
     assert own.albedo is not None
     own = replace(own, albedo=(own.albedo * scale).clamp_max(1))
@@ -163,7 +166,7 @@ def relit_with_true_pixels(run: Path, folder: Path, samples: int = 64) -> dict[s
     other = with_materials(scene, Mesh(vertices, faces))
     assert other.albedo is not None
     other = replace(other, normals=normals, albedo=(other.albedo * scale).clamp_max(1))
-    stages = {m: stage(mesh, scene.field.voxel_size) for m, mesh in ((0, own), (1, other))}
+    stages = {m: traced_mesh(mesh, scene.field.voxel_size) for m, mesh in ((0, own), (1, other))}
     maps = {name: Lighting(tables(read_map(path))) for name, path in relight_maps(folder).items()}
     wanted = {name: load_relit(photos, name) for name in maps}
     found: dict[str, list[float]] = {}
@@ -222,7 +225,7 @@ def main() -> None:
                 own[term] = {k: measured[k] for k in SHOWN}
             if term == "none" and "relit" not in own:
                 own["relit"] = relit_with_true_pixels(run, folder)
-            path.write_text(json.dumps(result, indent=1) + "\n")
+            path.write_text(result_text(result | made()))
     path.with_suffix(".md").write_text(table(result))
     print(table(result))
 

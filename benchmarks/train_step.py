@@ -11,7 +11,6 @@ references' is not: under the profiler that this takes their memory grew past 20
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import time
 from collections import defaultdict
@@ -21,9 +20,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import torch
+from made import made
 
 from univoxel import losses, ops
 from univoxel.data import load_photos
+from univoxel.experiments.record import result_text
 from univoxel.fields.field import Field, dense_field
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.grid import fit_grid
@@ -55,7 +56,7 @@ STAGES = {
         *((priors, name) for name in ("smoothness", "chroma", "total_variation")),
     ],
     "optimiser": [(RowAdam, "step")],
-    "smoothing": [(loop, "smooth"), (loop, "spread_gradient")],
+    "smoothing": [(loop, "smooth_touched_"), (loop, "smooth_sdf_gradient_")],
     "refresh": [(Field, "refresh")],
 }
 BACKWARD = "backward"
@@ -119,15 +120,16 @@ def run_steps(scene: Scene, views: tuple, rays: int, count: int, begin: float = 
     """`count` steps of the training loop, with every term of the loss; `begin`: of its schedule."""
     cfg = preset("fast", DATA, DATA)
     stage = replace(cfg.stages[1], rays=rays, physical_from=0.0)
-    progress = SimpleNamespace(step=0, due=lambda: False, checkpoint_due=lambda: False)
+    clock = SimpleNamespace(stage=1, step=0)
+    progress = SimpleNamespace(clock=clock, due=lambda: False, checkpoint_due=lambda: False)
 
     def steps():
         for i in range(count):
-            progress.step = i
+            clock.step = i
             yield begin + (1 - begin) * i / count
 
-    progress.steps = steps
-    loop.run_stage(scene, cfg, stage, *views, progress)
+    clock.steps = steps
+    loop.run_stage(scene, cfg, stage, loop.TrainingPixels(*views), progress)
 
 
 def profile(scene: Scene, views: tuple, rays: int, count: int, divide: bool) -> dict:
@@ -208,7 +210,7 @@ def main() -> None:
         with ops.use_backend(backend):
             result[backend] = profile(scene, views, options.rays, count, backend == "native")
     result["load_average"] = os.getloadavg()[0]
-    options.out.write_text(json.dumps(result, indent=1) + "\n")
+    options.out.write_text(result_text(made() | result))
     print(table(result))
 
 

@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from made import made
 from scipy import ndimage, spatial
 from torch.nn.functional import normalize
 
@@ -36,10 +37,11 @@ from univoxel.data.images import write_png
 from univoxel.data.maps import read_map
 from univoxel.data.mesh import read_ply
 from univoxel.envmap import tables
+from univoxel.experiments.record import result_text
 from univoxel.files import replacing
 from univoxel.presets import preset
 from univoxel.records import Mesh, Surface
-from univoxel.render.relight import Lighting, relight_surface, stage, turned
+from univoxel.render.relight import Lighting, relight_surface, rotated, traced_mesh
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
 
@@ -119,7 +121,7 @@ def rendered(folder: Path, photos: Photos, degrees: torch.Tensor) -> torch.Tenso
         normals.index_add_(0, corner[:, k], area)
     normals = normalize(normals, dim=1)
     albedo, roughness = at(mesh.vertices)
-    here = stage(Mesh(mesh.vertices, mesh.faces, normals, albedo, roughness), 1e-3)
+    here = traced_mesh(Mesh(mesh.vertices, mesh.faces, normals, albedo, roughness), 1e-3)
     light = Lighting(tables(read_map(folder / "envmaps" / "train.hdr")))
     out = torch.zeros_like(photos.color)
     for v in range(len(photos)):
@@ -137,7 +139,7 @@ def rendered(folder: Path, photos: Photos, degrees: torch.Tensor) -> torch.Tenso
         one = torch.ones(len(place))
         surface = Surface(place, normal, near, albedo, roughness, one, one)
         options = {"samples": SAMPLES, "bounces": 2, "seed": v}
-        rgb = relight_surface(surface, wo, here, turned(light, float(degrees[v])), **options)
+        rgb = relight_surface(surface, wo, here, rotated(light, float(degrees[v])), **options)
         picture, there = torch.zeros(len(met), 3), met.view(photos.alpha.shape[1:]).numpy()
         picture[met] = linear_to_srgb(rgb)
         # Where a pixel's middle misses the mesh, the nearest one that does not stands in
@@ -217,9 +219,9 @@ def main() -> None:
                 own = evaluate(run, samples=32) | {
                     "gain_stops": gain_error(run, arguments.data, kind)
                 }
-                result["runs"][name] = own
+                result["runs"][name] = own | {"commit": made()["commit"]}
                 with replacing(arguments.out) as temporary:
-                    temporary.write_text(json.dumps(result, indent=1) + "\n")
+                    temporary.write_text(result_text(result | made()))
                 print(name, f"albedo {own['albedo_psnr_3ch']:.2f} relit {own['relit_psnr']:.2f}")
 
 

@@ -16,7 +16,7 @@ struct CosSin {
 inline CosSin cos_sin(float turns) {
     // The nearest quarter, and the rest in radians, at most pi / 4.
     const float quarter = std::floor(4 * turns + 0.5f);
-    const float x = 6.28318530718f * (turns - 0.25f * quarter), x2 = x * x;
+    const float x = float(2 * kPi) * (turns - 0.25f * quarter), x2 = x * x;
     const float c = 1 + x2 * (-1 / 2.f + x2 * (1 / 24.f + x2 * (-1 / 720.f + x2 / 40320)));
     const float s = x * (1 + x2 * (-1 / 6.f + x2 * (1 / 120.f + x2 * (-1 / 5040.f))));
     const int q = static_cast<int>(quarter) & 3;

@@ -10,7 +10,6 @@
 
 namespace univoxel {
 
-constexpr double kPi = 3.14159265358979323846;
 constexpr double kAlphaMin = 1e-3;     // smallest GGX alpha
 constexpr double kCosMin = 1e-4;       // cosines in denominators are held above this
 constexpr double kHalfEpsilon = 1e-7;  // added to |wi + wo|^2, which may be 0
@@ -127,20 +126,20 @@ inline SpecularAlbedo<T> specular_albedo(T n_dot_v, T roughness, T f0) {
 
 /// E of an F0 per channel, and its derivatives.
 template <class T>
-struct ColouredAlbedo {
+struct ColoredAlbedo {
     vec3<T> value, d_cosine, d_roughness;
     vec3<T> d_f0;  // dE_c / d F0_c
 };
 
 template <class T>
-inline ColouredAlbedo<T> specular_albedo(T n_dot_v, T roughness, const vec3<T>& f0) {
+inline ColoredAlbedo<T> specular_albedo(T n_dot_v, T roughness, const vec3<T>& f0) {
     using Pair = glm::vec<2, T, glm::defaultp>;
     const auto e = albedo_polynomial<Pair>(n_dot_v, roughness, [](int term) {
         return Pair(T(kAlbedoBlack[term]), T(kAlbedoWhite[term]) - T(kAlbedoBlack[term]));
     });
     const vec3<T> value = e.value.x + f0 * e.value.y;
-    ColouredAlbedo<T> out{value, e.d_cosine.x + f0 * e.d_cosine.y,
-                          e.d_roughness.x + f0 * e.d_roughness.y, vec3<T>(e.value.y)};
+    ColoredAlbedo<T> out{value, e.d_cosine.x + f0 * e.d_cosine.y,
+                         e.d_roughness.x + f0 * e.d_roughness.y, vec3<T>(e.value.y)};
     for (int c = 0; c < 3; ++c) {
         if (!(value[c] < 0 || value[c] > 1)) continue;
         out.value[c] = std::min(std::max(value[c], T(0)), T(1));

@@ -4,9 +4,9 @@
 #include <cstdint>
 #include <vector>
 
-#include "bricks.h"
 #include "nodes.h"
 #include "row_set.h"
+#include "tiles.h"
 
 namespace univoxel {
 

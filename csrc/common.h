@@ -1,13 +1,13 @@
-// Shared by every kernel: 3-vectors over GLM, row-major access, debug checks.
+// Shared by kernels over vectors: 3-vectors over GLM and row-major access.
 #pragma once
 
 #include <cstdint>
-#include <cstdio>
-#include <cstdlib>
 #include <glm/geometric.hpp>
 #include <glm/vec3.hpp>
 
 namespace univoxel {
+
+constexpr double kPi = 3.14159265358979323846;
 
 template <class T>
 using vec3 = glm::vec<3, T, glm::defaultp>;
@@ -26,16 +26,3 @@ inline void store3(T* p, int64_t i, const vec3<T>& v) {
 }
 
 }  // namespace univoxel
-
-// A broken invariant is a bug of ours: it stops a debug build. User errors are raised in Python.
-#ifdef UNIVOXEL_DEBUG
-#define DCHECK(condition)                                                                \
-    do {                                                                                 \
-        if (!(condition)) {                                                              \
-            std::fprintf(stderr, "%s:%d: DCHECK(%s)\n", __FILE__, __LINE__, #condition); \
-            std::abort();                                                                \
-        }                                                                                \
-    } while (false)
-#else
-#define DCHECK(condition) ((void)0)
-#endif

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "channels.h"
+#include "dcheck.h"
 #include "huge_pages.h"
 #include "parallel.h"
 
@@ -28,13 +29,14 @@ template <int64_t kC, class T>
 void forward_ray(const Composite<T>& in, int64_t ray, T* out, T* weight) {
     const int64_t C = kC ? kC : in.n_channels;
     const int64_t first = in.offsets[ray], n = in.offsets[ray + 1] - first;
+    DCHECK(first >= 0 && n >= 0);  // offsets rise
     const T* alpha = in.alpha + first;
     const T* value = in.value + first * C;
     T *sum = out + ray * C, *w = weight + first;
     const int64_t used = transmittance(alpha, n, in.early_stop, w);
     // Sums of a known width stay in registers: the compiler cannot know that `out` is not `value`.
-    T held[kC ? kC : 1] = {};
-    T* s = kC ? held : sum;
+    T registers[kC ? kC : 1] = {};
+    T* s = kC ? registers : sum;
     if (!kC) std::fill(sum, sum + C, T(0));
     for (int64_t i = 0; i < used; ++i) {
         const T wi = w[i] * alpha[i];
@@ -42,7 +44,7 @@ void forward_ray(const Composite<T>& in, int64_t ray, T* out, T* weight) {
 #pragma omp simd
         for (int64_t c = 0; c < C; ++c) s[c] += wi * value[i * C + c];
     }
-    if (kC) std::copy(held, held + kC, sum);
+    if (kC) std::copy(registers, registers + kC, sum);
     std::fill(w + used, w + n, T(0));
 }
 
@@ -52,6 +54,7 @@ void backward_ray(const Composite<T>& in, int64_t ray, const T* grad_out, const 
                   T* grad_alpha, T* grad_value, T* trans, T* own) {
     const int64_t C = kC ? kC : in.n_channels;
     const int64_t first = in.offsets[ray], n = in.offsets[ray + 1] - first;
+    DCHECK(first >= 0 && n >= 0);  // offsets rise
     const T *alpha = in.alpha + first, *value = in.value + first * C, *g = grad_out + ray * C;
     T *ga = grad_alpha + first, *gv = grad_value + first * C;
     const int64_t used = transmittance(alpha, n, in.early_stop, trans);

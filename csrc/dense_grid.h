@@ -12,9 +12,9 @@ template <class T>
 using DenseGridGrads = SamplingGrads<T, TouchedRows>;
 
 template <class T>
-void sample_dense_forward(const DenseGrid<T>& in, T* value, T* gradient, T* feature, int threads);
+void sample_grid_forward(const DenseGrid<T>& in, T* value, T* gradient, T* feature, int threads);
 
 template <class T>
-void sample_dense_backward(const DenseGrid<T>& in, const DenseGridGrads<T>& grads, int threads);
+void sample_grid_backward(const DenseGrid<T>& in, const DenseGridGrads<T>& grads, int threads);
 
 }  // namespace univoxel

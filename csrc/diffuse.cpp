@@ -4,17 +4,14 @@
 #include <memory>
 #include <vector>
 
-#include "bricks.h"
+#include "dcheck.h"
 #include "row_set.h"
+#include "tiles.h"
 
 namespace univoxel {
 namespace {
 
 constexpr int64_t kRowsPerChunk = 4096;
-
-struct Node {
-    int64_t x, y, z;
-};
 
 /// node_of(row) -> Node, which nodes.row undoes.
 template <class T, class Nodes, class NodeOf>
@@ -24,6 +21,7 @@ void diffuse(T* values, const int64_t size[3], const Nodes& nodes, int64_t n_row
     RowSet chosen(n_rows);
     for (int64_t k = 0; k < n; ++k) chosen.mark(rows[k]);
     chosen.number();
+    DCHECK(chosen.count() == n && std::is_sorted(rows, rows + n));  // slot k is that of row k
     // Neighbours by slot, looked up once for all passes; slot n holds the 0 of all other nodes.
     const std::unique_ptr<int32_t[]> near(new int32_t[6 * n]);
     const auto slot = [&](int64_t row) {
@@ -80,10 +78,9 @@ void diffuse_brick_rows(T* values, const int64_t size[3], const BrickNodes& node
                         const int32_t* place, int64_t n_rows, const int64_t* rows, int64_t n,
                         T amount, int passes, int threads) {
     const auto node_of = [&](int64_t row) {
-        const int64_t stands = place[row / kBrickNodes], inside = row % kBrickNodes;
-        const int64_t ab = stands / nodes.bricks_z, c = stands % nodes.bricks_z;
-        return Node{ab / nodes.bricks_y * kBrick + (inside >> 4),
-                    ab % nodes.bricks_y * kBrick + (inside >> 2 & 3), c * kBrick + (inside & 3)};
+        const Node first = nodes.first_node(place[row / kBrickNodes]);
+        const Node offset = BrickNodes::offset(row % kBrickNodes);
+        return Node{first.x + offset.x, first.y + offset.y, first.z + offset.z};
     };
     diffuse(values, size, nodes, n_rows, rows, n, amount, passes, threads, node_of);
 }

@@ -9,20 +9,21 @@
 #include <vector>
 
 #include "angles.h"
+#include "dcheck.h"
 
 namespace univoxel {
 
 /// Buffers of a map; row-major, contiguous.
 struct EnvMapTables {
-    const float* texel;       // [H, W, 4] linear radiance, density per steradian of being drawn
+    const float* texel;       // [H, W, 4] linear radiance, density per steradian of being sampled
     const float* row_cdf;     // [H + 1]     0 .. 1: which row
     const float* column_cdf;  // [H, W + 1]  0 .. 1: which column, given the row
     int64_t height, width;
     float rotation;  // radians, counter-clockwise about +Z
 };
 
-/// Columns of n draws.
-struct MapDraws {
+/// Columns of n samples of a map.
+struct MapSamples {
     float *u, *v;           // in: two numbers in [0, 1)
     int32_t *row, *column;  // out: the texel
     float *x, *z;           // out: across the map in texels, the height of the direction
@@ -42,24 +43,24 @@ class EnvMap {
         : t_(tables),
           width_(static_cast<int32_t>(tables.width)),
           height_(static_cast<int32_t>(tables.height)),
-          turn_(static_cast<float>(tables.rotation / (2 * kPi64))),
+          turn_(static_cast<float>(tables.rotation / (2 * kPi))),
           edge_(tables.height + 1),
           per_solid_(tables.height) {
-        const auto edge = [&](int64_t r) { return std::cos(kPi64 * r / t_.height); };
+        const auto edge = [&](int64_t r) { return std::cos(kPi * r / t_.height); };
         for (int64_t r = 0; r <= t_.height; ++r) edge_[r] = static_cast<float>(edge(r));
         for (int64_t r = 0; r < t_.height; ++r)
-            per_solid_[r] = static_cast<float>(t_.width / (2 * kPi64 * (edge(r) - edge(r + 1))));
+            per_solid_[r] = static_cast<float>(t_.width / (2 * kPi * (edge(r) - edge(r + 1))));
         guide_.resize(kGuide);
         for (int32_t k = 0, row = 0; k < kGuide; ++k) {
             const float v = static_cast<float>(k) / kGuide;
             while (row + 1 < height_ && t_.row_cdf[row + 1] <= v) ++row;
             guide_[k] = row;
         }
-        while (blocks_ * kBlock < width_) blocks_ *= 2;
+        while (blocks_ * kColumnsPerBlock < width_) blocks_ *= 2;
         block_.resize(t_.height * blocks_, 2.f);
         for (int32_t r = 0; r < height_; ++r)
-            for (int32_t c = 0; c < width_; c += kBlock)
-                block_[r * blocks_ + c / kBlock] = t_.column_cdf[r * (t_.width + 1) + c];
+            for (int32_t c = 0; c < width_; c += kColumnsPerBlock)
+                block_[r * blocks_ + c / kColumnsPerBlock] = t_.column_cdf[r * (t_.width + 1) + c];
         // A black map has the density of its solid angle, or 0, but never light.
         const int64_t n = t_.height * t_.width;
         for (int64_t i = 0; i < n && black_; ++i)
@@ -68,14 +69,15 @@ class EnvMap {
 
     bool black() const { return black_; }
 
-    /// Draw places: the texel by inverting both tables, then uniform in solid angle within it.
-    void draw(const MapDraws& d) const {
+    /// Sample places: the texel by inverting both tables, then uniform in solid angle within it.
+    void sample(const MapSamples& d) const {
         find_rows(d);
         find_columns(d);
         const int32_t pitch = width_ + 1;
 #pragma GCC ivdep
         for (int i = 0; i < d.n; ++i) {
             const int32_t row = d.row[i], column = d.column[i];
+            DCHECK(row >= 0 && row < height_ && column >= 0 && column < width_);
             const float* at = t_.column_cdf + row * pitch + column;
             const float share = at[1] - at[0];
             const float low = t_.row_cdf[row], share_of_row = t_.row_cdf[row + 1] - low;
@@ -104,6 +106,7 @@ class EnvMap {
     }
 
     float pdf(const MapPlace& at) const {
+        DCHECK(at.x >= 0 && at.x <= width_ && at.y >= 0 && at.y <= height_);
         const int32_t row = static_cast<int32_t>(std::min(at.y, height_ - 1.f));
         const int32_t column = static_cast<int32_t>(std::min(at.x, width_ - 1.f));
         return t_.texel[4 * (row * width_ + column) + 3];
@@ -136,12 +139,12 @@ class EnvMap {
     }
 
   private:
-    static constexpr double kPi64 = 3.14159265358979323846;
-    static constexpr int kGuide = 4096, kBlock = 16;
+    static constexpr int kGuide = 4096, kColumnsPerBlock = 16;
     using float4 = float __attribute__((vector_size(16)));
 
     /// Texel i of the radiance and its density.
     float4 texel(int32_t i) const {
+        DCHECK(i >= 0 && i < width_ * height_);
         float4 out;
         std::memcpy(&out, t_.texel + 4 * i, sizeof out);
         return out;
@@ -153,7 +156,7 @@ class EnvMap {
     }
 
     /// Rows are found from where `guide_` says; few have a step or more to go.
-    void find_rows(const MapDraws& d) const {
+    void find_rows(const MapSamples& d) const {
         const float* cdf = t_.row_cdf;
 #pragma GCC ivdep
         for (int i = 0; i < d.n; ++i) d.row[i] = guide_[static_cast<int32_t>(d.v[i] * kGuide)];
@@ -163,11 +166,11 @@ class EnvMap {
 
     /// The columns that hold u, by blocks first: their table stays in cache. An empty column is
     /// never found.
-    void find_columns(const MapDraws& d) const {
+    void find_columns(const MapSamples& d) const {
         std::fill_n(d.column, d.n, 0);
         find(blocks_, d, [this](int32_t r, int32_t c) { return block_[r * blocks_ + c]; });
-        for (int i = 0; i < d.n; ++i) d.column[i] *= kBlock;
-        find(kBlock, d, [this](int32_t r, int32_t c) {
+        for (int i = 0; i < d.n; ++i) d.column[i] *= kColumnsPerBlock;
+        find(kColumnsPerBlock, d, [this](int32_t r, int32_t c) {
             return t_.column_cdf[r * (width_ + 1) + (c < width_ ? c : width_)];
         });
     }
@@ -175,7 +178,8 @@ class EnvMap {
     /// Move columns on by less than `reach`, a power of 2, as far as `table` is at most u. All
     /// search in step: there is no branch to mispredict.
     template <class F>
-    static void find(int32_t reach, const MapDraws& d, F&& table) {
+    static void find(int32_t reach, const MapSamples& d, F&& table) {
+        DCHECK((reach & (reach - 1)) == 0);
         for (int32_t step = reach / 2; step > 0; step /= 2) {
 #pragma GCC ivdep
             for (int i = 0; i < d.n; ++i) {

@@ -3,28 +3,35 @@
 #include <algorithm>
 #include <limits>
 
+#include "dcheck.h"
 #include "parallel.h"
 
 namespace univoxel {
 namespace {
 
 constexpr int64_t kPointsPerChunk = 1024;
-constexpr int64_t kBlock = 8;  // points whose rows are fetched before the first is read
+// Points whose eight rows a level are fetched before the first is read: the fetches overlap.
+constexpr int64_t kPointsPerBlock = 8;
 
 /// Which row of its level a node has: its own while there are enough, otherwise by hash
 /// (Teschner et al. 2003; the factors of Mueller et al. 2022).
-struct Rows {
+struct RowLookup {
     int64_t y, z;  // strides; y = 0: hashed
     uint32_t mask;
 
-    Rows(const Lattice& level, int64_t rows) : y(0), z(0), mask(static_cast<uint32_t>(rows - 1)) {
+    RowLookup(const Lattice& level, int64_t rows)
+        : y(0), z(0), mask(static_cast<uint32_t>(rows - 1)) {
+        DCHECK(rows > 0 && (rows & (rows - 1)) == 0);  // the mask is all ones
         const double nodes = static_cast<double>(level.size[0]) *
                              static_cast<double>(level.size[1]) *
                              static_cast<double>(level.size[2]);
         if (nodes <= static_cast<double>(rows)) y = level.size[1], z = level.size[2];
     }
     int64_t at(int64_t i, int64_t j, int64_t k) const {
-        if (y) return (i * y + j) * z + k;
+        if (y) {
+            DCHECK(i >= 0 && j >= 0 && j < y && k >= 0 && k < z);
+            return (i * y + j) * z + k;
+        }
         return (static_cast<uint32_t>(i) ^ (static_cast<uint32_t>(j) * 2654435761u) ^
                 (static_cast<uint32_t>(k) * 805459861u)) &
                mask;
@@ -39,7 +46,7 @@ struct Corners {
 };
 
 template <class T>
-inline Corners<T> corners(const Lattice& level, const Rows& rows, const T* p) {
+inline Corners<T> corners(const Lattice& level, const RowLookup& rows, const T* p) {
     int64_t node[3][2];
     T weight[3][2];
     for (int d = 0; d < 3; ++d) {
@@ -72,7 +79,7 @@ void with_features(int64_t n, F&& f) {
 
 /// Derivative of a level's output, weighted by grad, to the point: added to out [3].
 template <class T>
-void add_point_gradient(const HashGrid<T>& in, int64_t l, const Rows& rows, const T* p,
+void add_point_gradient(const HashGrid<T>& in, int64_t l, const RowLookup& rows, const T* p,
                         const T* grad, T* out) {
     const Lattice& level = in.levels[l];
     const Corners<T> c = corners(level, rows, p);
@@ -105,7 +112,7 @@ HashRows HashRows::touched(const HashGrid<T>& in, int threads) {
     found.words_.assign(levels * words, Word{0, 0});
     found.first_.assign(levels + 1, 0);
     parallel_for(levels, 1, threads, [&](int64_t l, int64_t) {
-        const Rows rows(in.levels[l], in.rows);
+        const RowLookup rows(in.levels[l], in.rows);
         Word* level = found.words_.data() + l * words;
         for (int64_t i = 0; i < in.n_points; ++i) {
             const T* p = in.points + 3 * i;
@@ -149,11 +156,11 @@ void encode_hash_forward(const HashGrid<T>& in, T* out, int threads) {
         parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
             // Level by level: the rows that a chunk shares stay in the cache.
             for (int64_t l = 0; l < in.n_levels(); ++l) {
-                const Rows rows(in.levels[l], in.rows);
+                const RowLookup rows(in.levels[l], in.rows);
                 const T* table = in.table + l * in.rows * F;
-                Corners<T> block[kBlock];
-                for (int64_t j = begin; j < end; j += kBlock) {
-                    const int64_t n = std::min(kBlock, end - j);
+                Corners<T> block[kPointsPerBlock];
+                for (int64_t j = begin; j < end; j += kPointsPerBlock) {
+                    const int64_t n = std::min(kPointsPerBlock, end - j);
                     for (int64_t i = 0; i < n; ++i) {
                         block[i] = corners(in.levels[l], rows, in.points + 3 * (j + i));
                         for (const int64_t row : block[i].row) __builtin_prefetch(table + row * F);
@@ -182,7 +189,7 @@ void encode_hash_backward(const HashGrid<T>& in, const T* grad_out, T* grad_tabl
             constexpr int64_t kF = decltype(constant)::value;
             const int64_t F = kF ? kF : in.n_features;
             parallel_for(in.n_levels(), 1, threads, [&](int64_t l, int64_t) {
-                const Rows rows(in.levels[l], in.rows);
+                const RowLookup rows(in.levels[l], in.rows);
                 const int64_t first = touched ? touched->first(l) : l * in.rows;
                 const int64_t last = touched ? touched->first(l + 1) : (l + 1) * in.rows;
                 std::fill(grad_table + first * F, grad_table + last * F, T(0));
@@ -204,7 +211,7 @@ void encode_hash_backward(const HashGrid<T>& in, const T* grad_out, T* grad_tabl
     parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
         std::fill(grad_points + 3 * begin, grad_points + 3 * end, T(0));
         for (int64_t l = 0; l < in.n_levels(); ++l) {
-            const Rows rows(in.levels[l], in.rows);
+            const RowLookup rows(in.levels[l], in.rows);
             for (int64_t i = begin; i < end; ++i) {
                 const T* p = in.points + 3 * i;
                 if (has_nan(p)) continue;

@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "dcheck.h"
 #include "trilinear.h"
 
 namespace univoxel {
@@ -32,6 +33,7 @@ class HashRows {
     /// Slot of a touched row of a level.
     int64_t slot(int64_t level, int64_t row) const {
         const Word& w = words_[level * words_per_level_ + (row >> 6)];
+        DCHECK(w.bits >> (row & 63) & 1);
         const uint64_t below = w.bits & ((uint64_t(1) << (row & 63)) - 1);
         return w.first + __builtin_popcountll(below);
     }

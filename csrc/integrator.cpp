@@ -5,6 +5,7 @@
 #include <limits>
 #include <memory>
 
+#include "dcheck.h"
 #include "parallel.h"
 #include "sobol.h"
 #include "wave.h"
@@ -38,6 +39,7 @@ vec row(const float* p, int64_t i = 0) {
 
 /// Interpolate the mesh at a hit.
 Vertex vertex_at(const Relight& in, vec origin, vec direction, const Hit& hit) {
+    DCHECK(hit.face >= 0);
     const int32_t* face = in.scene->faces() + 3 * hit.face;
     const float w[3] = {1 - hit.u - hit.v, hit.u, hit.v};
     vec normal{}, albedo{}, f0{};
@@ -65,43 +67,43 @@ Vertex vertex_at(const Relight& in, vec origin, vec direction, const Hit& hit) {
             roughness};
 }
 
-/// Look along those of the ways drawn that carry light, and add it where nothing is in between. The
-/// light of the map, where one is given, is theirs times what is drawn.
-void look(const Relight& in, Wave& w, float t_min, const EnvMap* map = nullptr) {
+/// Test shadow rays along the sampled directions that carry light, and add it where nothing is in
+/// between. With a map, the light is the map's in that direction times that of the sample.
+void trace_shadow_rays(const Relight& in, Wave& w, float t_min, const EnvMap* map = nullptr) {
     Rays& rays = w.rays;
     int n = 0;
     for (int i = 0; i < w.paths->n; ++i) {
         rays.lane[n] = i;
-        n += largest(w.drawn.light[i]) > 0;
+        n += largest(w.sampled.light[i]) > 0;
     }
     if (map)
         for (int k = 0; k < n; ++k) map->prefetch({w.x[rays.lane[k]], w.y[rays.lane[k]]});
     rays.n = 0;
     for (int k = 0; k < n; ++k) {
         const int i = rays.lane[k];
-        const vec light = w.drawn.light[i];
-        const vec seen = map ? light * map->radiance({w.x[i], w.y[i]}) : light;
-        rays.light.set(rays.n, seen);
-        rays.set(rays.n, i, w.paths->origin[i], w.drawn.direction[i], w.drawn.distance[i]);
-        rays.n += largest(seen) > 0;
+        const vec light = w.sampled.light[i];
+        const vec arriving = map ? light * map->radiance({w.x[i], w.y[i]}) : light;
+        rays.light.set(rays.n, arriving);
+        rays.set(rays.n, i, w.paths->origin[i], w.sampled.direction[i], w.sampled.distance[i]);
+        rays.n += largest(arriving) > 0;
     }
-    in.scene->occluded(rays.stream(t_min), rays.distance, rays.blocked);
+    in.scene->occluded(rays.stream(t_min), rays.distance, rays.occluded);
     for (int k = 0; k < rays.n; ++k) {
-        if (rays.blocked[k]) continue;
+        if (rays.occluded[k]) continue;
         const int path = w.paths->path[rays.lane[k]];
         w.light.set(path, w.light[path] + rays.light[k]);
     }
 }
 
 /// Light of the suns and lamps that arrives at the vertices and leaves them along the paths.
-void draw_suns_and_lamps(const Relight& in, Wave& w, uint32_t depth, float t_min) {
+void sample_suns_and_lamps(const Relight& in, Wave& w, uint32_t depth, float t_min) {
     const Paths& p = *w.paths;
     const auto add = [&](int i, vec direction, vec irradiance, float distance) {
         const vec local = PathFrame(p.normal[i]).to_local(direction);
         const vec light = p.throughput[i] * p.brdf(i).evaluate(local).f_cos * irradiance;
-        w.drawn.direction.set(i, direction);
-        w.drawn.light.set(i, where(above(p, i, direction), light));
-        w.drawn.distance[i] = distance;
+        w.sampled.direction.set(i, direction);
+        w.sampled.light.set(i, where(above(p, i, direction), light));
+        w.sampled.distance[i] = distance;
     };
     for (int64_t k = 0; k < in.lights.n_suns; ++k) {
         const float* sun = in.lights.sun + 7 * k;
@@ -115,23 +117,23 @@ void draw_suns_and_lamps(const Relight& in, Wave& w, uint32_t depth, float t_min
             const float radius = std::sqrt(down * (2 - down));
             add(i, disc.to_world(on_circle(u.y, radius, 1 - down)), irradiance, kFar);
         }
-        look(in, w, t_min);
+        trace_shadow_rays(in, w, t_min);
     }
     for (int64_t k = 0; k < in.lights.n_lamps; ++k) {
         const vec position = row(in.lights.lamp + 6 * k);
         const vec intensity = row(in.lights.lamp + 6 * k + 3);
         for (int i = 0; i < p.n; ++i) {
-            const vec way = position - p.origin[i];
-            const float squared = std::max(dot(way, way), 1e-30f);
+            const vec to_lamp = position - p.origin[i];
+            const float squared = std::max(dot(to_lamp, to_lamp), 1e-30f);
             const float distance = std::sqrt(squared);
-            add(i, (1 / distance) * way, (1 / squared) * intensity, distance);
+            add(i, (1 / distance) * to_lamp, (1 / squared) * intensity, distance);
         }
-        look(in, w, t_min);
+        trace_shadow_rays(in, w, t_min);
     }
 }
 
-/// Draw a direction of the map for each path: `drawn` gets what arrives for each unit of light.
-void draw_map(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth) {
+/// Sample a direction of the map for each path: `sampled` gets what arrives for each unit of light.
+void sample_map(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth) {
     const Paths& p = *w.paths;
     const int n = p.n;
 #pragma GCC ivdep
@@ -139,7 +141,7 @@ void draw_map(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth) {
         const Point2 u = sobol2(p.index[i], hash(hash(p.seed[i], depth), 0));
         w.u[i] = u.x, w.v[i] = u.y;
     }
-    map.draw({w.u, w.v, w.row, w.column, w.x, w.z, w.pdf, n});
+    map.sample({w.u, w.v, w.row, w.column, w.x, w.z, w.pdf, n});
     const float both = in.strategy == Strategy::mis ? 1 : 0;
 #pragma GCC ivdep
     for (int i = 0; i < n; ++i) {
@@ -150,15 +152,15 @@ void draw_map(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth) {
         const bool ok = (pdf > 0) & above(p, i, direction);
         const float weight = ok ? mis_weight(pdf, value.pdf, both) / pdf : 0.f;
         w.y[i] = map.down(w.z[i]);
-        w.drawn.direction.set(i, direction);
-        w.drawn.light.set(i, weight * (p.throughput[i] * value.f_cos));
-        w.drawn.distance[i] = kFar;
+        w.sampled.direction.set(i, direction);
+        w.sampled.light.set(i, weight * (p.throughput[i] * value.f_cos));
+        w.sampled.distance[i] = kFar;
     }
 }
 
-/// Draw a direction of the BRDF for each path: what arrives for each unit of the map's light, and
+/// Sample a direction of the BRDF for each path: what arrives for each unit of the map's light, and
 /// of light from a next vertex; a density of 0 where the path ends.
-void draw_brdf(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth) {
+void sample_brdf(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth) {
     const Paths& p = *w.paths;
     const int n = p.n;
     const float both = in.strategy == Strategy::mis ? 1 : 0;
@@ -172,25 +174,25 @@ void draw_brdf(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth) {
         const float pdf = above(p, i, direction) ? value.pdf : 0.f;
         w.pdf[i] = pdf;
         w.throughput.set(i, (1 / std::max(pdf, 1e-30f)) * (p.throughput[i] * value.f_cos));
-        w.drawn.direction.set(i, direction);
-        w.drawn.distance[i] = kFar;
+        w.sampled.direction.set(i, direction);
+        w.sampled.distance[i] = kFar;
     }
 #pragma GCC ivdep
     for (int i = 0; i < n; ++i) {
-        const MapPlace at = map.place(w.drawn.direction[i]);
+        const MapPlace at = map.place(w.sampled.direction[i]);
         const float balance = lit * mis_weight(w.pdf[i], map.pdf(at), both);
         const float weight = w.pdf[i] > 0 ? balance : 0.f;
         w.x[i] = at.x, w.y[i] = at.y;
-        w.drawn.light.set(i, weight * w.throughput[i]);
+        w.sampled.light.set(i, weight * w.throughput[i]);
     }
 }
 
-/// Follow the directions drawn: to the map, whose light is added, or to the next vertices.
+/// Follow the sampled directions: to the map, whose light is added, or to the next vertices.
 void advance(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth, float t_min) {
     Rays& rays = w.rays;
     rays.n = 0;
     for (int i = 0; i < w.paths->n; ++i) {
-        rays.set(rays.n, i, w.paths->origin[i], w.drawn.direction[i], kFar);
+        rays.set(rays.n, i, w.paths->origin[i], w.sampled.direction[i], kFar);
         rays.n += w.pdf[i] > 0;
     }
     in.scene->closest_hit(rays.stream(t_min), w.hit);
@@ -199,7 +201,7 @@ void advance(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth, floa
         const int i = rays.lane[k], path = w.paths->path[i];
         const Hit& hit = w.hit[k];
         if (hit.face < 0) {
-            const vec light = w.drawn.light[i] * map.radiance({w.x[i], w.y[i]});
+            const vec light = w.sampled.light[i] * map.radiance({w.x[i], w.y[i]});
             w.light.set(path, w.light[path] + light);
             continue;
         }
@@ -211,8 +213,8 @@ void advance(const Relight& in, const EnvMap& map, Wave& w, uint32_t depth, floa
             if (!(unit_float(hash(hash(hash(seed, depth), 2), index)) < survival)) continue;
             throughput = (1 / survival) * throughput;
         }
-        w.next->push(vertex_at(in, w.paths->origin[i], w.drawn.direction[i], hit), throughput, seed,
-                     index, path);
+        w.next->push(vertex_at(in, w.paths->origin[i], w.sampled.direction[i], hit), throughput,
+                     seed, index, path);
     }
     w.next->settle();
     std::swap(w.paths, w.next);
@@ -223,14 +225,14 @@ void trace(const Relight& in, const EnvMap& map, Wave& w) {
     float t_min = in.offset;
     for (int depth = 0; w.paths->n > 0; ++depth, t_min = 0) {
         const bool last = depth == in.bounces;
-        draw_suns_and_lamps(in, w, depth, t_min);
+        sample_suns_and_lamps(in, w, depth, t_min);
         if (in.strategy != Strategy::brdf && !map.black()) {
-            draw_map(in, map, w, depth);
-            look(in, w, t_min, &map);
+            sample_map(in, map, w, depth);
+            trace_shadow_rays(in, w, t_min, &map);
         }
         if (!last || (in.strategy != Strategy::map && !map.black())) {
-            draw_brdf(in, map, w, depth);
-            if (last) look(in, w, t_min, &map);
+            sample_brdf(in, map, w, depth);
+            if (last) trace_shadow_rays(in, w, t_min, &map);
         }
         if (last) return;
         advance(in, map, w, depth, t_min);
@@ -247,6 +249,7 @@ void relight(const Relight& in, float* rgb, int threads) {
         Wave& w = *wave;
         vec3<double> sum[kLanes];  // in float, equal addends of many samples drift
         const int points = static_cast<int>(end - begin), together = kLanes / points;
+        DCHECK(points <= kLanes && together >= 1);
         std::fill_n(sum, points, vec3<double>(0));
         w.first.n = 0;
         for (int64_t i = begin; i < end; ++i) {

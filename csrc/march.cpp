@@ -4,6 +4,7 @@
 #include <cmath>
 #include <limits>
 
+#include "dcheck.h"
 #include "parallel.h"
 
 namespace univoxel {
@@ -27,9 +28,10 @@ void corners(const March<T>& in, const DenseNodes& nodes, const int64_t i[3], co
 template <class T>
 void corners(const March<T>& in, const BrickNodes& nodes, const int64_t i[3], const int64_t step[3],
              T* f) {
-    if ((i[0] & 3) < 3 && (i[1] & 3) < 3 && (i[2] & 3) < 3) {  // all in one brick
+    const auto next_inside = [&](int axis) { return (i[axis] & kBrickMask) < kBrickMask; };
+    if (next_inside(0) && next_inside(1) && next_inside(2)) {  // all in one brick
         const T* p = in.sdf + nodes.row(i[0], i[1], i[2]);
-        const int64_t x = step[0] << 4, y = step[1] << 2;
+        const int64_t x = step[0] << 2 * kBrickShift, y = step[1] << kBrickShift;
         for (int k = 0; k < 8; ++k) f[k] = p[(k >> 2) * x + (k >> 1 & 1) * y + (k & 1) * step[2]];
         return;
     }
@@ -51,6 +53,7 @@ T sdf_at(const March<T>& in, const Nodes& nodes, vec3<T> g) {
         step[a] = in.size[a] > 1;
     }
     corners(in, nodes, i, step, f);
+    for (int a = 0; a < 3; ++a) DCHECK(i[a] >= 0 && i[a] + step[a] < in.size[a]);
     const auto lerp = [](T a, T b, T t) { return a + t * (b - a); };
     const auto along_z = [&](int k) { return lerp(f[k], f[k + 1], w[2]); };
     const auto along_y = [&](int k) { return lerp(along_z(k), along_z(k + 2), w[1]); };
@@ -95,7 +98,7 @@ bool clip(vec3<T> o, vec3<T> d, vec3<T> upper, T& near, T& far) {
 
 /// Walk one ray; append its samples.
 template <class T, class Nodes>
-void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, Marched<T>& out) {
+void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, PackedSamples<T>& out) {
     // Change to grid coordinates; t stays in world units.
     const vec3<T> o = (load3(in.origin, ray) - in.grid_origin) / in.voxel_size;
     const vec3<T> d = load3(in.direction, ray) / in.voxel_size;
@@ -121,6 +124,7 @@ void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, Marched<T>& 
             b[a] = std::min(std::max<int64_t>(static_cast<int64_t>(g[a]) / kBrick, 0), n - 1);
             corner[a] = T(kBrick * (b[a] + (d[a] > 0 ? 1 : 0)));
         }
+        DCHECK(k > before);  // a ray goes on
         if (least(in, nodes, b) > band) {
             T exit = far;
             for (int a = 0; a < 3; ++a)
@@ -144,6 +148,7 @@ void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, Marched<T>& 
             out.t.push_back(start + T(k) * in.step);
             out.connected.push_back(0);
             emitted = k;
+            DCHECK(out.t.size() == out.connected.size());
         }
         trans *= 1 - alpha;
         log_before = log_here;
@@ -184,14 +189,13 @@ void sparse_brick_minimum(const T* sdf, const int64_t size[3], const BrickNodes&
     out[0] = std::numeric_limits<T>::infinity();
     out[1] = -out[0];
     parallel_for(n, kBricksPerChunk, threads, [&](int64_t begin, int64_t end) {
-        for (int64_t brick = std::max<int64_t>(begin, 2); brick < end; ++brick) {
+        for (int64_t brick = std::max(begin, kMissingBricks); brick < end; ++brick) {
             if (place[brick] < 0) {
                 out[brick] = out[0];
                 continue;
             }
-            const int64_t c = place[brick] % nodes.bricks_z, ab = place[brick] / nodes.bricks_z;
-            const int64_t first[3] = {ab / nodes.bricks_y * kBrick, ab % nodes.bricks_y * kBrick,
-                                      c * kBrick};
+            const Node node = nodes.first_node(place[brick]);
+            const int64_t first[3] = {node.x, node.y, node.z};
             int64_t last[3];
             for (int a = 0; a < 3; ++a) last[a] = std::min(first[a] + kBrick, size[a] - 1);
             T lowest = std::numeric_limits<T>::infinity();
@@ -209,11 +213,11 @@ void sparse_brick_minimum(const T* sdf, const int64_t size[3], const BrickNodes&
 }
 
 template <class T>
-Marched<T> march(const March<T>& in, int threads) {
+PackedSamples<T> march(const March<T>& in, int threads) {
     const int64_t chunks = (in.n_rays + kRaysPerChunk - 1) / kRaysPerChunk;
-    std::vector<Marched<T>> parts(chunks);
+    std::vector<PackedSamples<T>> parts(chunks);
     parallel_for(in.n_rays, kRaysPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Marched<T>& part = parts[begin / kRaysPerChunk];
+        PackedSamples<T>& part = parts[begin / kRaysPerChunk];
         for (int64_t ray = begin; ray < end; ++ray) {
             if (in.table) {
                 march_ray(in, in.sparse(), ray, part);
@@ -223,9 +227,9 @@ Marched<T> march(const March<T>& in, int threads) {
             part.offsets.push_back(static_cast<int64_t>(part.t.size()));
         }
     });
-    Marched<T> all;
+    PackedSamples<T> all;
     all.offsets.push_back(0);
-    for (const Marched<T>& part : parts) {
+    for (const PackedSamples<T>& part : parts) {
         const int64_t base = all.offsets.back();
         all.t.insert(all.t.end(), part.t.begin(), part.t.end());
         all.connected.insert(all.connected.end(), part.connected.begin(), part.connected.end());
@@ -240,7 +244,7 @@ template void sparse_brick_minimum(const float*, const int64_t[3], const BrickNo
                                    const int32_t*, int64_t, float*, int);
 template void sparse_brick_minimum(const double*, const int64_t[3], const BrickNodes&,
                                    const int32_t*, int64_t, double*, int);
-template Marched<float> march(const March<float>&, int);
-template Marched<double> march(const March<double>&, int);
+template PackedSamples<float> march(const March<float>&, int);
+template PackedSamples<double> march(const March<double>&, int);
 
 }  // namespace univoxel

@@ -37,7 +37,7 @@ struct March {
 
 /// Packed samples; see records.py. Sample i starts a section when connected[i] is 1.
 template <class T>
-struct Marched {
+struct PackedSamples {
     std::vector<T> t;
     std::vector<uint8_t> connected;
     std::vector<int64_t> offsets;
@@ -53,6 +53,6 @@ void sparse_brick_minimum(const T* sdf, const int64_t size[3], const BrickNodes&
                           const int32_t* place, int64_t n, T* out, int threads);
 
 template <class T>
-Marched<T> march(const March<T>& in, int threads);
+PackedSamples<T> march(const March<T>& in, int threads);
 
 }  // namespace univoxel

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <new>
 
+#include "dcheck.h"
 #include "parallel.h"
 
 namespace univoxel {
@@ -20,9 +21,14 @@ constexpr int64_t kVectorBytes = 32, kBlockRows = 4;
 constexpr int64_t kVectorBytes = 16, kBlockRows = 4;
 #endif
 
-constexpr int64_t kTileRows = 128;  // a tile's layers and gradients stay in the second-level cache
-constexpr int64_t kChunks = 32;  // each sums gradients of the weights of its own: at most so many
-constexpr int64_t kLeastRows = 256;  // of a chunk
+// Rows of a tile: its layers and gradients, some 1 kB a row, stay in the second-level cache.
+constexpr int64_t kTileRows = 128;
+// Chunks sum gradients of the weights apart: their number bounds that memory and the sums at the
+// end.
+constexpr int64_t kMaxChunks = 32;
+constexpr int64_t kMinRowsPerChunk = 256;
+// Numbers of the sums at the end that a thread takes at a time: a part of every chunk's in turn,
+// which its first-level cache holds.
 constexpr int64_t kNumbersPerChunk = 4096;
 
 template <class T>
@@ -98,26 +104,38 @@ void unpack(const T* from, int64_t height, int64_t rows, int64_t columns, T* to)
 /// What a block does with its sums.
 enum class Finish { kStore, kRelu, kMask };
 
-/// c (+)= a b for a block of kBlockRows rows and kVectors vectors.
-///
-/// Element (i, k) of a is a[i * kRowStep + k * kStep], with k restarting `a_skip` numbers further
-/// on after every `a_block` of them; row k of b is b + k * kWidth. Sums start from `start`, whose
-/// rows lie start_step apart; from 0 where it is null.
+/// c (+)= a b for a block of kBlockRows rows and one or two vectors of columns.
+template <class T>
+struct Block {
+    const T* a;          // element (i, k) is a[i * kRowStep + k * kStep]
+    int64_t run;         // so many of a's columns lie kStep apart
+    int64_t skip;        // then the next run begins so many numbers after this one
+    const T* b;          // row k is b + k * kWidth
+    int64_t depth;       // columns of a, rows of b
+    const T* start;      // what the sums start from; null: 0
+    int64_t start_step;  // between its rows
+    const T* mask;       // for kMask: c is 0 where this is at most 0
+    T* c;
+};
+
 template <int64_t kRowStep, int64_t kStep, int64_t kVectors, Finish kFinish, class T>
-inline void block(const T* a, int64_t a_block, int64_t a_skip, const T* b, int64_t depth,
-                  const T* start, int64_t start_step, const T* mask, T* c) {
+inline void multiply_block(const Block<T> block) {
     using Vector = typename Simd<T>::Vector;
     constexpr int64_t W = kWidth<T>, L = Simd<T>::kCount;
+    const T *a = block.a, *b = block.b, *start = block.start;
+    DCHECK(reinterpret_cast<uintptr_t>(b) % kVectorBytes == 0);
+    DCHECK(reinterpret_cast<uintptr_t>(block.c) % kVectorBytes == 0);
     Vector sum[kBlockRows][kVectors];
 #pragma GCC unroll 8
     for (int64_t i = 0; i < kBlockRows; ++i) {
 #pragma GCC unroll 2
         for (int64_t v = 0; v < kVectors; ++v)
-            sum[i][v] =
-                start ? *reinterpret_cast<const Vector*>(start + i * start_step + v * L) : Vector{};
+            sum[i][v] = start
+                            ? *reinterpret_cast<const Vector*>(start + i * block.start_step + v * L)
+                            : Vector{};
     }
-    for (int64_t first = 0; first < depth; first += a_block) {
-        const int64_t end = std::min(a_block, depth - first);
+    for (int64_t first = 0; first < block.depth; first += block.run) {
+        const int64_t end = std::min(block.run, block.depth - first);
         for (int64_t k = 0; k < end; ++k) {
             Vector row[kVectors];
 #pragma GCC unroll 2
@@ -130,7 +148,7 @@ inline void block(const T* a, int64_t a_block, int64_t a_skip, const T* b, int64
                 for (int64_t v = 0; v < kVectors; ++v) sum[i][v] += weight * row[v];
             }
         }
-        a += a_skip;
+        a += block.skip;
         b += end * W;
     }
 #pragma GCC unroll 8
@@ -141,33 +159,46 @@ inline void block(const T* a, int64_t a_block, int64_t a_skip, const T* b, int64
             Vector s = sum[i][v];
             if constexpr (kFinish == Finish::kRelu) s = s < 0 ? Vector{} : s;  // NaN stays
             if constexpr (kFinish == Finish::kMask) {
-                s = *reinterpret_cast<const Vector*>(mask + at) <= 0 ? Vector{} : s;
+                s = *reinterpret_cast<const Vector*>(block.mask + at) <= 0 ? Vector{} : s;
             }
-            *reinterpret_cast<Vector*>(c + at) = s;
+            *reinterpret_cast<Vector*>(block.c + at) = s;
         }
     }
 }
 
 /// A block of the last panel may need its first half alone.
-template <int64_t kRowStep, int64_t kStep, Finish kFinish, class T, class... Rest>
-inline void block_of(int64_t columns, const T* a, Rest... rest) {
+template <int64_t kRowStep, int64_t kStep, Finish kFinish, class T>
+inline void multiply_block(int64_t columns, const Block<T>& block) {
     if (columns <= Simd<T>::kCount) {
-        block<kRowStep, kStep, 1, kFinish>(a, rest...);
+        multiply_block<kRowStep, kStep, 1, kFinish>(block);
     } else {
-        block<kRowStep, kStep, 2, kFinish>(a, rest...);
+        multiply_block<kRowStep, kStep, 2, kFinish>(block);
     }
 }
 
-/// A tile times a packed matrix: c = finish(start + a b), all in panels; start [columns, padded].
+/// A tile times a packed matrix, all in panels.
+template <class T>
+struct Product {
+    const T* a;  // [rows, depth]
+    const T* b;  // [depth, columns]
+    int64_t rows, depth, columns;
+    T* c;                      // [rows, columns]
+    const T* start = nullptr;  // [columns, padded] added to each row; null: nothing
+    const T* mask = nullptr;   // [rows, columns] of Finish::kMask
+};
+
+/// c = finish(start + a b).
 template <Finish kFinish, class T>
-void multiply(const T* a, const T* b, int64_t rows, int64_t depth, int64_t columns, const T* start,
-              const T* mask, T* c) {
+void multiply(const Product<T>& p) {
     constexpr int64_t W = kWidth<T>, panel = kTileRows * W;
-    for (int64_t p = 0; p < columns; p += W) {
-        for (int64_t i = 0; i < rows; i += kBlockRows) {
-            const int64_t at = p * kTileRows + i * W;
-            block_of<W, 1, kFinish>(columns - p, a + i * W, W, panel, b + p * depth, depth,
-                                    start ? start + p : start, int64_t(0), mask + at, c + at);
+    DCHECK(p.rows <= kTileRows && (kFinish != Finish::kMask || p.mask));
+    for (int64_t j = 0; j < p.columns; j += W) {
+        for (int64_t i = 0; i < p.rows; i += kBlockRows) {
+            const int64_t at = j * kTileRows + i * W;
+            multiply_block<W, 1, kFinish>(
+                p.columns - j, Block<T>{p.a + i * W, W, panel, p.b + j * p.depth, p.depth,
+                                        p.start ? p.start + j : nullptr, 0,
+                                        p.mask ? p.mask + at : nullptr, p.c + at});
         }
     }
 }
@@ -177,12 +208,12 @@ template <class T>
 void add_outer(const T* a, int64_t a_columns, const T* b, int64_t b_columns, int64_t rows, T* sum) {
     constexpr int64_t W = kWidth<T>;
     const int64_t height = panels(a_columns, W) * W;
-    for (int64_t p = 0; p < b_columns; p += W) {
+    for (int64_t j = 0; j < b_columns; j += W) {
         for (int64_t i = 0; i < a_columns; i += kBlockRows) {
-            T* c = sum + p * height + i * W;
+            T* c = sum + j * height + i * W;
             const T* from = a + i / W * W * kTileRows + i % W;
-            block_of<1, W, Finish::kStore>(b_columns - p, from, rows, int64_t(0), b + p * kTileRows,
-                                           rows, c, W, c, c);
+            multiply_block<1, W, Finish::kStore>(
+                b_columns - j, Block<T>{from, rows, 0, b + j * kTileRows, rows, c, W, nullptr, c});
         }
     }
 }
@@ -193,18 +224,18 @@ void add_rows(const T* a, int64_t columns, int64_t rows, T* sum) {
     constexpr int64_t W = kWidth<T>;
     for (int64_t p = 0; p < columns; p += W) {
         const T* from = a + p * kTileRows;
-        T held[W] = {};
+        T sums[W] = {};
         for (int64_t r = 0; r < rows; ++r) {
 #pragma omp simd
-            for (int64_t j = 0; j < W; ++j) held[j] += from[r * W + j];
+            for (int64_t j = 0; j < W; ++j) sums[j] += from[r * W + j];
         }
-        for (int64_t j = 0; j < std::min(W, columns - p); ++j) sum[p + j] += held[j];
+        for (int64_t j = 0; j < std::min(W, columns - p); ++j) sum[p + j] += sums[j];
     }
 }
 
 /// Rows of a chunk, whatever the number of threads.
 int64_t grain_of(int64_t n_rows) {
-    return std::max(kLeastRows, panels(panels(n_rows, kChunks), kTileRows) * kTileRows);
+    return std::max(kMinRowsPerChunk, panels(panels(n_rows, kMaxChunks), kTileRows) * kTileRows);
 }
 
 /// The network in panels, and its padded biases.
@@ -242,9 +273,8 @@ void run_layers(const Mlp<T>& in, const Packed<T>& net, int64_t first, int64_t r
     for (int64_t l = 0; l < count; ++l) {
         const auto multiply_ =
             l + 1 < in.layers() ? multiply<Finish::kRelu, T> : multiply<Finish::kStore, T>;
-        T* out = tile[l + 1].data();
-        multiply_(tile[l].data(), net.forward[l].data(), rows, in.sizes[l], in.sizes[l + 1],
-                  net.bias[l].data(), out, out);
+        multiply_({tile[l].data(), net.forward[l].data(), rows, in.sizes[l], in.sizes[l + 1],
+                   tile[l + 1].data(), net.bias[l].data()});
     }
 }
 
@@ -297,11 +327,12 @@ void mlp_backward(const Mlp<T>& in, const T* grad_out, const MlpGrad<T>& grad, i
                     add_outer(from, o, h, i, rows, sum + at[l]);
                     add_rows(from, o, rows, sum + at[l + 1] - panels(o, W) * W);
                 }
-                const T *back = net.backward[l].data(), *none = nullptr;
+                Product<T> to_layer{from, net.backward[l].data(), rows, o, i, g[l].data()};
                 if (l > 0) {
-                    multiply<Finish::kMask>(from, back, rows, o, i, none, h, g[l].data());
+                    to_layer.mask = h;
+                    multiply<Finish::kMask>(to_layer);
                 } else if (grad.x) {
-                    multiply<Finish::kStore>(from, back, rows, o, i, none, h, g[l].data());
+                    multiply<Finish::kStore>(to_layer);
                     unpack(g[0].data(), kTileRows, rows, i, grad.x + first * i);
                 }
             }

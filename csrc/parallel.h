@@ -6,6 +6,8 @@
 #include <cstdint>
 #include <exception>
 
+#include "dcheck.h"
+
 namespace univoxel {
 
 /// Call f(begin, end) over [0, n) in chunks of `grain`, on up to `threads` threads.
@@ -16,6 +18,7 @@ namespace univoxel {
 /// leaves the parallel region and is thrown in the caller.
 template <class F>
 void parallel_for(int64_t n, int64_t grain, int threads, F&& f) {
+    DCHECK(n >= 0 && grain > 0);
     const int64_t chunks = (n + grain - 1) / grain;
     const int team = static_cast<int>(std::min<int64_t>(chunks, threads));
     if (team <= 1) {

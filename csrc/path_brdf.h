@@ -1,4 +1,4 @@
-// The BRDF as a path tracer needs it: its value, its density, and directions drawn from it. No
+// The BRDF as a path tracer needs it: its value, its density, and directions sampled from it. No
 // branches, so that loops over many points vectorise.
 #pragma once
 
@@ -40,7 +40,7 @@ inline float albedo_terms(const double (&c)[35], float cosine, float roughness, 
 /// At one point towards one eye, in the frame of the normal.
 struct PathBrdf {
     float3 wo, diffuse, f0;       // diffuse: (1 - E) albedo / pi
-    float alpha, specular_share;  // how often `sample` draws from the specular layer
+    float alpha, specular_share;  // how often `sample` chooses the specular layer
 
     static PathBrdf of(float3 wo, const float3& albedo, float roughness, const float3& f0) {
         // An eye behind the shading normal looks on at grazing angle.

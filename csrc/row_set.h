@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "dcheck.h"
 #include "parallel.h"
 
 namespace univoxel {
@@ -14,11 +15,15 @@ class RowSet {
   public:
     explicit RowSet(int64_t n_rows) : words_((n_rows + 63) / 64, Word{0, 0}) {}
 
-    void mark(int64_t row) { words_[row >> 6].bits |= uint64_t(1) << (row & 63); }
+    void mark(int64_t row) { mark(row >> 6, uint64_t(1) << (row & 63)); }
     /// Mark those of rows 64 word .. 64 word + 63 whose bit is set.
-    void mark(int64_t word, uint64_t bits) { words_[word].bits |= bits; }
+    void mark(int64_t word, uint64_t bits) {
+        DCHECK(word >= 0 && word < static_cast<int64_t>(words_.size()));
+        words_[word].bits |= bits;
+    }
     /// After the last mark.
     void number() {
+        DCHECK(count_ == 0);
         for (Word& w : words_) {
             w.first = count_;
             count_ += __builtin_popcountll(w.bits);
@@ -29,6 +34,7 @@ class RowSet {
     bool has(int64_t row) const { return words_[row >> 6].bits >> (row & 63) & 1; }
     /// Slot of a marked row.
     int64_t slot(int64_t row) const {
+        DCHECK(has(row));
         const Word& w = words_[row >> 6];
         return w.first + __builtin_popcountll(w.bits & ((uint64_t(1) << (row & 63)) - 1));
     }

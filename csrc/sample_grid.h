@@ -9,10 +9,11 @@
 #include <vector>
 
 #include "brick_rows.h"
-#include "bricks.h"
 #include "channels.h"
+#include "dcheck.h"
 #include "huge_pages.h"
 #include "nodes.h"
+#include "tiles.h"
 #include "trilinear.h"
 
 namespace univoxel {
@@ -23,7 +24,7 @@ struct Sampling {
     const T* sdf;          // [R]
     const T* features;     // [R, C]
     const T* points;       // [M, 3]  world; outside the lattice they are clamped to its border
-    const int32_t* order;  // [M]     from sort_by_brick
+    const int32_t* order;  // [M]     from sort_by_tile
     Lattice lattice;
     Nodes nodes;
     int64_t n_rows, n_points, n_channels;
@@ -45,10 +46,16 @@ struct SamplingGrads {
 namespace sampling {
 
 constexpr int64_t kPointsPerChunk = 2048;
+// Numbers of a gradient that a thread clears at a time: many, so that handing them out costs
+// little, and few enough to share evenly.
 constexpr int64_t kNumbersPerChunk = 1 << 16;
-
-constexpr int64_t kBlock = 8;
-constexpr int64_t kAhead = 12;  // samples: sorted ones lie anywhere in the buffers of the caller
+// Samples whose nodes are fetched before the first of them is read: the fetches overlap, and their
+// cache lines, 24 a sample of 16 channels, fit the first-level cache together.
+constexpr int64_t kPointsPerBlock = 8;
+// How many samples ahead the caller's buffers are fetched, where sorted samples lie anywhere. More
+// than a block: what is fetched arrives while the block before is worked on.
+constexpr int64_t kAhead = 12;
+static_assert(kAhead > kPointsPerBlock);
 
 /// Fetch the cache lines of n numbers before they are read or written.
 template <class T>
@@ -71,7 +78,9 @@ struct Located {
 template <class T, class Nodes>
 inline Located<T, Nodes> locate(const Sampling<T, Nodes>& in, const T* point) {
     const Stencil3<T> s = stencil3(in.lattice, point);
-    return {s, in.nodes.near(s)};
+    const Located<T, Nodes> at{s, in.nodes.near(s)};
+    DCHECK(at.row(0, 0, 0) >= 0 && at.row(3, 3, 3) < in.n_rows);
+    return at;
 }
 
 /// The four nodes of the line (a, b); one load where they follow each other.
@@ -212,6 +221,7 @@ inline void scatter_sdf(const Rows& rows, const Located<T, Nodes>& at, const Pul
     const bool whole = at.run(0, 3), pair = at.run(1, 2);
     const auto add = [&](int a, int b, int c, T x) {
         const int64_t to = slot(rows, at, a, b, c);
+        DCHECK(!kComplete<Nodes> || to >= 0);
         if (kComplete<Nodes> || to >= 0) grad_sdf[to] += x;
     };
     for (int k = 0; k < 4; ++k) {
@@ -345,6 +355,7 @@ void scatter(const Sampling<T, Nodes>& in, const SamplingGrads<T, Touched>& grad
         }
         for (int64_t j = bounds[slab]; j < bounds[slab + 1]; ++j) {
             const int64_t i = in.order[j];
+            DCHECK(i >= 0 && i < in.n_points);
             const int64_t next = in.order[std::min(j + kAhead, bounds[slab + 1] - 1)];
             prefetch(in.points + 3 * next, 3);
             prefetch(grads.grad_value + next, 1);
@@ -373,9 +384,9 @@ void sample_forward(const Sampling<T, Nodes>& in, T* value, T* gradient, T* feat
     with_channels(C, [&](auto constant) {
         constexpr int64_t kC = decltype(constant)::value;
         parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
-            Located<T, Nodes> located[kBlock];
-            for (int64_t j = begin; j < end; j += kBlock) {
-                const int64_t n = std::min(kBlock, end - j);
+            Located<T, Nodes> located[kPointsPerBlock];
+            for (int64_t j = begin; j < end; j += kPointsPerBlock) {
+                const int64_t n = std::min(kPointsPerBlock, end - j);
                 // Locate a few samples and fetch what they need, then sample.
                 for (int64_t k = 0; k < n; ++k) {
                     const int64_t i = in.order[j + k];

@@ -83,7 +83,7 @@ Directions<T> canonical(const ShadeSG<T>& in) {
         dir.y[d] = in.directions[3 * d + 1];
         dir.z[d] = in.directions[3 * d + 2];
         dir.cosine[d] = std::max(dir.z[d], T(0));
-        dir.held[d] = std::max(dir.z[d], T(kCosMin));
+        dir.clamped_cosine[d] = std::max(dir.z[d], T(kCosMin));
     }
     return dir;
 }
@@ -92,7 +92,7 @@ Directions<T> canonical(const ShadeSG<T>& in) {
 /// the directions are constants and the normal is +Z.
 template <class T, class F0>
 struct Point {
-    Frame<T> frame;
+    Frame<vec3<T>> frame;
     T cos_r, sin_r;
     LocalBrdf<T, F0> brdf;
 
@@ -103,24 +103,20 @@ struct Point {
           brdf(local(load3(in.wo, i)), load3(in.albedo, i), in.roughness[i], f0) {}
 
     vec3<T> local(const vec3<T>& w) const {
-        const T t = glm::dot(frame.tangent, w), b = glm::dot(frame.bitangent, w);
-        return {cos_r * t + sin_r * b, cos_r * b - sin_r * t, glm::dot(frame.normal, w)};
+        const vec3<T> u = frame.to_local(w);
+        return {cos_r * u.x + sin_r * u.y, cos_r * u.y - sin_r * u.x, u.z};
     }
 
     /// Undo the turn about +Z: components along tangent, bitangent and normal.
     vec3<T> unturn(const vec3<T>& w) const {
         return {cos_r * w.x - sin_r * w.y, sin_r * w.x + cos_r * w.y, w.z};
     }
-
-    vec3<T> world(const vec3<T>& u) const {
-        return u.x * frame.tangent + u.y * frame.bitangent + u.z * frame.normal;
-    }
 };
 
 /// Integrals of one lobe of unit amplitude over the directions, or gradients to them.
 template <class T>
 struct LobeSums {
-    T cosine, layer, gain;  // against max(n.w, 0) and the specular layer; gain is 0 unless coloured
+    T cosine, layer, gain;  // against max(n.w, 0) and the specular layer; gain is 0 unless colored
 };
 
 /// A lobe's exponent over log2 e as a plane: x . w + offset.
@@ -195,8 +191,8 @@ void shade_sg_forward(const ShadeSG<T>& in, T* rgb, int threads) {
     const int64_t K = in.n_lobes;
     const T weight = T(2 * kPi) / T(in.n_directions);
     const Clamp<T> clamp = clamp_of<T>();
-    with_f0(in.f0, in.coloured, [&](auto f0_of) {
-        constexpr bool kGain = kColoured<decltype(f0_of(0))>;
+    with_f0(in.f0, in.colored, [&](auto f0_of) {
+        constexpr bool kGain = kColored<decltype(f0_of(0))>;
         parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
             Directions<T> dir = canonical(in);
             for (int64_t i = begin; i < end; ++i) {
@@ -206,7 +202,7 @@ void shade_sg_forward(const ShadeSG<T>& in, T* rgb, int threads) {
                 for (int64_t k = i * K; k < (i + 1) * K; ++k) {
                     const Exponent<T> exponent(p.local(load3(in.axis, k)), in.sharpness[k]);
                     const auto s = lobe_forward<kGain>(dir, exponent, clamp);
-                    const vec3<T> layer = p.brdf.colour_of(s.layer, s.gain);
+                    const vec3<T> layer = p.brdf.color_of(s.layer, s.gain);
                     sum += load3(in.amplitude, k) * (p.brdf.diffuse * s.cosine + layer);
                 }
                 store3(rgb, i, weight * sum);
@@ -221,7 +217,7 @@ namespace {
 template <class T, class F0>
 void point_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGrad<T>& grad, int64_t i,
                     const F0& f0, Clamp<T> clamp, Directions<T>& dir) {
-    constexpr bool kGain = kColoured<F0>;
+    constexpr bool kGain = kColored<F0>;
     const int64_t K = in.n_lobes;
     const T weight = T(2 * kPi) / T(in.n_directions);
     const Point p(in, i, f0);
@@ -236,7 +232,7 @@ void point_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGrad<T
         grad_t += u.x * world;
         grad_b += u.y * world;
         grad_n += u.z * world;
-        return p.world(u);
+        return p.frame.to_world(u);
     };
     for (int64_t k = i * K; k < (i + 1) * K; ++k) {
         const vec3<T> world = load3(in.axis, k), axis = p.local(world);
@@ -246,7 +242,7 @@ void point_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGrad<T
         if constexpr (kGain) to.gain = glm::dot(ga, f0);
         vec3<T> moment;
         const auto s = lobe_backward<kGain>(dir, Exponent<T>(axis, sharpness), clamp, to, moment);
-        const vec3<T> layer = p.brdf.colour_of(s.layer, s.gain);
+        const vec3<T> layer = p.brdf.color_of(s.layer, s.gain);
         store3(grad.amplitude, k, g * (p.brdf.diffuse * s.cosine + layer));
         grad_diffuse += ga * s.cosine;
         grad_f0 += ga * s.gain;
@@ -274,7 +270,7 @@ template <class T>
 void shade_sg_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGrad<T>& grad,
                        int threads) {
     const Clamp<T> clamp = clamp_of<T>();
-    with_f0(in.f0, in.coloured, [&](auto f0_of) {
+    with_f0(in.f0, in.colored, [&](auto f0_of) {
         parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
             Directions<T> dir = canonical(in);
             for (int64_t i = begin; i < end; ++i)

@@ -17,12 +17,12 @@ struct ShadeSG {
     const T* roughness;   // [N]       in [0, 1]
     const T* directions;  // [D, 3]    unit, around +Z
     const T* rotation;    // [N]       radians about +Z
-    const T* f0;          // [N, 3]    reflectance at normal incidence, if coloured; else [1]
+    const T* f0;          // [N, 3]    reflectance at normal incidence, if colored; else [1]
     int64_t n_points, n_lobes, n_directions;
-    bool coloured;
+    bool colored;
 };
 
-/// Where the gradients go: the shapes of ShadeSG; that to f0 is written if it is coloured.
+/// Where the gradients go: the shapes of ShadeSG; that to f0 is written if it is colored.
 template <class T>
 struct ShadeSGGrad {
     T *axis, *sharpness, *amplitude, *normal, *wo, *albedo, *roughness, *f0;

@@ -4,6 +4,7 @@
 #include <cstring>
 #include <vector>
 
+#include "dcheck.h"
 #include "parallel.h"
 #include "shading.h"
 
@@ -45,13 +46,13 @@ inline T fraction_of(uint8_t x) {
     return T(x) * (T(1) / 255);
 }
 
-/// Three rows of n numbers.
+/// Three columns of n numbers.
 template <class T>
-struct Rows3 {
+struct Columns3 {
     int64_t count;
     std::vector<T> buffer;
 
-    explicit Rows3(int64_t n) : count(n), buffer(3 * n) {}
+    explicit Columns3(int64_t n) : count(n), buffer(3 * n) {}
     T* operator[](int c) { return buffer.data() + c * count; }
     const T* operator[](int c) const { return buffer.data() + c * count; }
 
@@ -67,10 +68,10 @@ struct Rows3 {
     }
 };
 
-/// What all samples share: the directions, world, in rows.
+/// What all samples share: the directions, world, in columns.
 template <class T>
-Rows3<T> world_directions(const Shade<T>& in) {
-    Rows3<T> world(in.n_directions);
+Columns3<T> world_directions(const Shade<T>& in) {
+    Columns3<T> world(in.n_directions);
     world.split(in.directions);
     return world;
 }
@@ -78,30 +79,23 @@ Rows3<T> world_directions(const Shade<T>& in) {
 /// A sample: the frame of its normal, and what it reflects there.
 template <class T, class F0>
 struct Sample {
-    Frame<T> frame;
+    Frame<vec3<T>> frame;
     LocalBrdf<T, F0> brdf;
 
-    Sample(const Shade<T>& in, int64_t i, const F0& f0) : Sample(in, i, f0, load3(in.albedo, i)) {}
     Sample(const Shade<T>& in, int64_t i, const F0& f0, const vec3<T>& albedo)
-        : frame(load3(in.normal, i)), brdf(local(load3(in.wo, i)), albedo, in.roughness[i], f0) {}
-
-    vec3<T> local(const vec3<T>& w) const {
-        return {glm::dot(frame.tangent, w), glm::dot(frame.bitangent, w),
-                glm::dot(frame.normal, w)};
-    }
-    vec3<T> world(const vec3<T>& u) const {
-        return u.x * frame.tangent + u.y * frame.bitangent + u.z * frame.normal;
-    }
+        : frame(load3(in.normal, i)),
+          brdf(frame.to_local(load3(in.wo, i)), albedo, in.roughness[i], f0) {}
 };
 
 /// Take the directions into the frame of a sample, and fill the specular layer. Below the horizon
 /// the cosine is 0, which masks all that follows: cheaper than packing the rest.
 template <class T, class F0>
-void look(const Sample<T, F0>& sample, const Rows3<T>& world, Directions<T>& dir) {
-    const Frame<T>& frame = sample.frame;
+void fill_specular_layer(const Sample<T, F0>& sample, const Columns3<T>& world,
+                         Directions<T>& dir) {
+    const auto& frame = sample.frame;
     const vec3<T> t = frame.tangent, b = frame.bitangent, n = frame.normal;
     const T *wx = world[0], *wy = world[1], *wz = world[2];
-    T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *held = dir.held;
+    T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *clamped = dir.clamped_cosine;
     const T lowest = T(kCosMin), zero = 0;
     const int64_t count = dir.count;
 #pragma omp simd
@@ -112,7 +106,7 @@ void look(const Sample<T, F0>& sample, const Rows3<T>& world, Directions<T>& dir
         y[d] = b.x * u + b.y * v + b.z * w;
         z[d] = c;
         cosine[d] = std::max(c, zero);
-        held[d] = std::max(c, lowest);
+        clamped[d] = std::max(c, lowest);
     }
     specular_layer(sample.brdf, dir);
 }
@@ -137,7 +131,7 @@ struct Response {
   private:
     T of(int64_t d, T diffuse_c, [[maybe_unused]] T f0_c) const {
         const T value = diffuse_c * cosine[d] + layer[d];
-        if constexpr (kColoured<F0>)
+        if constexpr (kColored<F0>)
             return value + f0_c * gain[d];
         else
             return value;
@@ -146,7 +140,8 @@ struct Response {
 
 /// rgb / solid_angle of one sample.
 template <class T, class F0>
-vec3<T> reflect(const LocalBrdf<T, F0>& brdf, const Directions<T>& dir, const Rows3<T>& radiance) {
+vec3<T> reflect(const LocalBrdf<T, F0>& brdf, const Directions<T>& dir,
+                const Columns3<T>& radiance) {
     const T *r = radiance[0], *g = radiance[1], *b = radiance[2];
     const Response<T, F0> response(brdf, dir);
     const int64_t count = dir.count;
@@ -163,7 +158,7 @@ vec3<T> reflect(const LocalBrdf<T, F0>& brdf, const Directions<T>& dir, const Ro
 /// Sum over the directions above the horizon of (c . radiance) w, local: the gradient to the normal
 /// from the cosine that weighs the radiance.
 template <class T>
-vec3<T> cosine_moment(const vec3<T>& c, const Rows3<T>& radiance, const Directions<T>& dir) {
+vec3<T> cosine_moment(const vec3<T>& c, const Columns3<T>& radiance, const Directions<T>& dir) {
     const T *r = radiance[0], *g = radiance[1], *b = radiance[2];
     const T *x = dir.x, *y = dir.y, *z = dir.z;
     const int64_t count = dir.count;
@@ -180,9 +175,9 @@ vec3<T> cosine_moment(const vec3<T>& c, const Rows3<T>& radiance, const Directio
 
 /// Write the gradients of one sample but that to the light; g is solid_angle times that to rgb.
 template <class T, class F0>
-void sample_backward(const Shade<T>& in, const Sample<T, F0>& sample, const Rows3<T>& radiance,
+void sample_backward(const Shade<T>& in, const Sample<T, F0>& sample, const Columns3<T>& radiance,
                      const vec3<T>& g, int64_t i, Directions<T>& dir, const ShadeGrad<T>& grad) {
-    constexpr bool kGain = kColoured<F0>;
+    constexpr bool kGain = kColored<F0>;
     const auto& brdf = sample.brdf;
     const T *r = radiance[0], *gr = radiance[1], *b = radiance[2], *cosine = dir.cosine;
     T* grad_layer = dir.grad_layer;
@@ -215,15 +210,27 @@ void sample_backward(const Shade<T>& in, const Sample<T, F0>& sample, const Rows
     if (!grad.normal) return;
     const vec3<T> normal = from_layer.normal + from_brdf.cosine * brdf.wo +
                            cosine_moment(g * brdf.diffuse, radiance, dir);
-    store3(grad.normal, i, sample.world(normal));
+    store3(grad.normal, i, sample.frame.to_world(normal));
 }
 
-/// Fetches the radiance that one sample sees.
+// What the kernels below read light from: load(i) fetches the radiance that sample i sees.
+
+/// Light [N, D, 3] of each sample's own.
+template <class T>
+struct OwnLight {
+    const T* from;
+    Columns3<T> radiance;
+
+    OwnLight(const T* light, int64_t count) : from(light), radiance(count) {}
+    void load(int64_t i) { radiance.split(from + 3 * i * radiance.count); }
+};
+
+/// One map, partly hidden from each point.
 template <class T>
 struct MapReader {
     const MapLight<T>& light;
-    Rows3<T> map;
-    Rows3<T> radiance;
+    Columns3<T> map;
+    Columns3<T> radiance;
     std::vector<T> visibility, interleaved;
     int64_t loaded = -1;  // views of one point often follow each other
 
@@ -234,6 +241,7 @@ struct MapReader {
 
     void load(int64_t i) {
         const int64_t count = map.count, p = light.index[i];
+        DCHECK(p >= 0);
         if (p == loaded) return;
         loaded = p;
         std::visit(
@@ -253,47 +261,59 @@ struct MapReader {
             },
             light.indirect);
         radiance.split(interleaved.data());
-        const T* open = visibility.data();
+        const T* visible = visibility.data();
         for (int c = 0; c < 3; ++c) {
             T* to = radiance[c];
             const T* from = map[c];
 #pragma omp simd
-            for (int64_t d = 0; d < count; ++d) to[d] += open[d] * from[d];
+            for (int64_t d = 0; d < count; ++d) to[d] += visible[d] * from[d];
         }
     }
 };
+
+/// Call f(i, sample, dir, reader) for each sample, with the directions in its frame and their
+/// specular layer in dir. A chunk of samples shares dir and a reader, of make_reader().
+template <class T, class MakeReader, class F>
+void for_samples(const Shade<T>& in, int64_t grain, int threads, MakeReader&& make_reader, F&& f) {
+    const Columns3<T> world = world_directions(in);
+    with_f0(in.f0, in.colored, [&](auto f0_of) {
+        parallel_for(in.n_samples, grain, threads, [&](int64_t begin, int64_t end) {
+            Directions<T> dir(in.n_directions);
+            auto reader = make_reader();
+            for (int64_t i = begin; i < end; ++i) {
+                const Sample sample(in, i, f0_of(i), in.albedo ? load3(in.albedo, i) : vec3<T>(0));
+                fill_specular_layer(sample, world, dir);
+                f(i, sample, dir, reader);
+            }
+        });
+    });
+}
+
+template <class T, class MakeReader>
+void forward(const Shade<T>& in, T* rgb, int threads, MakeReader&& make_reader) {
+    for_samples(in, kSamplesPerChunk, threads, make_reader,
+                [&](int64_t i, const auto& sample, const auto& dir, auto& reader) {
+                    reader.load(i);
+                    store3(rgb, i, in.solid_angle * reflect(sample.brdf, dir, reader.radiance));
+                });
+}
 
 }  // namespace
 
 template <class T>
 void specular_response(const Shade<T>& in, T* response, int threads) {
-    const Rows3<T> world = world_directions(in);
-    parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
-        Directions<T> dir(in.n_directions);
-        for (int64_t i = begin; i < end; ++i) {
-            look(Sample<T, T>(in, i, *in.f0, vec3<T>(0)), world, dir);
-            T* out = response + i * in.n_directions;
-            for (int64_t d = 0; d < in.n_directions; ++d) out[d] = in.solid_angle * dir.layer[d];
-        }
-    });
+    const int64_t D = in.n_directions;
+    for_samples(
+        in, kSamplesPerChunk, threads, [] { return nullptr; },
+        [&](int64_t i, const auto&, const auto& dir, auto) {
+            T* out = response + i * D;
+            for (int64_t d = 0; d < D; ++d) out[d] = in.solid_angle * dir.layer[d];
+        });
 }
 
 template <class T>
 void shade_radiance_forward(const Shade<T>& in, const T* radiance, T* rgb, int threads) {
-    const Rows3<T> world = world_directions(in);
-    const int64_t D = in.n_directions;
-    with_f0(in.f0, in.coloured, [&](auto f0_of) {
-        parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
-            Directions<T> dir(D);
-            Rows3<T> light(D);
-            for (int64_t i = begin; i < end; ++i) {
-                const Sample sample(in, i, f0_of(i));
-                look(sample, world, dir);
-                light.split(radiance + 3 * i * D);
-                store3(rgb, i, in.solid_angle * reflect(sample.brdf, dir, light));
-            }
-        });
-    });
+    forward(in, rgb, threads, [&] { return OwnLight<T>(radiance, in.n_directions); });
 }
 
 // grad radiance_dc = g_c (diffuse_c max(n.w, 0) + layer_dc) with g = solid_angle grad_rgb, and the
@@ -301,48 +321,28 @@ void shade_radiance_forward(const Shade<T>& in, const T* radiance, T* rgb, int t
 template <class T>
 void shade_radiance_backward(const Shade<T>& in, const T* radiance, const T* grad_rgb,
                              const ShadeGrad<T>& grad, int threads) {
-    const Rows3<T> world = world_directions(in);
     const int64_t D = in.n_directions;
-    with_f0(in.f0, in.coloured, [&](auto f0_of) {
-        parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
-            Directions<T> dir(D);
-            Rows3<T> light(D);
-            for (int64_t i = begin; i < end; ++i) {
-                const Sample sample(in, i, f0_of(i));
-                look(sample, world, dir);
-                const vec3<T> g = in.solid_angle * load3(grad_rgb, i);
-                light.split(radiance + 3 * i * D);
-                sample_backward(in, sample, light, g, i, dir, grad);
-                if (!grad.light) continue;
-                T* to = grad.light + 3 * i * D;
-                const Response response(sample.brdf, dir);
+    for_samples(
+        in, kSamplesPerChunk, threads, [&] { return OwnLight<T>(radiance, D); },
+        [&](int64_t i, const auto& sample, auto& dir, auto& reader) {
+            const vec3<T> g = in.solid_angle * load3(grad_rgb, i);
+            reader.load(i);
+            sample_backward(in, sample, reader.radiance, g, i, dir, grad);
+            if (!grad.light) return;
+            T* to = grad.light + 3 * i * D;
+            const Response response(sample.brdf, dir);
 #pragma omp simd
-                for (int64_t d = 0; d < D; ++d) {
-                    to[3 * d] = g.x * response.r(d);
-                    to[3 * d + 1] = g.y * response.g(d);
-                    to[3 * d + 2] = g.z * response.b(d);
-                }
+            for (int64_t d = 0; d < D; ++d) {
+                to[3 * d] = g.x * response.r(d);
+                to[3 * d + 1] = g.y * response.g(d);
+                to[3 * d + 2] = g.z * response.b(d);
             }
         });
-    });
 }
 
 template <class T>
 void shade_map_forward(const Shade<T>& in, const MapLight<T>& light, T* rgb, int threads) {
-    const Rows3<T> world = world_directions(in);
-    const int64_t D = in.n_directions;
-    with_f0(in.f0, in.coloured, [&](auto f0_of) {
-        parallel_for(in.n_samples, kSamplesPerChunk, threads, [&](int64_t begin, int64_t end) {
-            Directions<T> dir(D);
-            MapReader<T> reader(light, D);
-            for (int64_t i = begin; i < end; ++i) {
-                const Sample sample(in, i, f0_of(i));
-                look(sample, world, dir);
-                reader.load(i);
-                store3(rgb, i, in.solid_angle * reflect(sample.brdf, dir, reader.radiance));
-            }
-        });
-    });
+    forward(in, rgb, threads, [&] { return MapReader<T>(light, in.n_directions); });
 }
 
 // As above; the map receives sum_n visibility_nd grad radiance_nd. Chunks sum apart, and their sums
@@ -350,38 +350,31 @@ void shade_map_forward(const Shade<T>& in, const MapLight<T>& light, T* rgb, int
 template <class T>
 void shade_map_backward(const Shade<T>& in, const MapLight<T>& light, const T* grad_rgb,
                         const ShadeGrad<T>& grad, int threads) {
-    const Rows3<T> world = world_directions(in);
     const int64_t D = in.n_directions;
     const int64_t grain = std::max(kSamplesPerChunk, (in.n_samples + kMapChunks - 1) / kMapChunks);
     const int64_t chunks = (in.n_samples + grain - 1) / grain;
-    std::vector<Rows3<T>> sums(grad.light ? chunks : 0, Rows3<T>(D));
-    with_f0(in.f0, in.coloured, [&](auto f0_of) {
-        parallel_for(in.n_samples, grain, threads, [&](int64_t begin, int64_t end) {
-            Directions<T> dir(D);
-            MapReader<T> reader(light, D);
-            for (int64_t i = begin; i < end; ++i) {
-                const Sample sample(in, i, f0_of(i));
-                look(sample, world, dir);
-                const vec3<T> g = in.solid_angle * load3(grad_rgb, i);
-                reader.load(i);
-                sample_backward(in, sample, reader.radiance, g, i, dir, grad);
-                if (!grad.light) continue;
-                Rows3<T>& sum = sums[begin / grain];
-                T *x = sum[0], *y = sum[1], *z = sum[2];
-                const T* open = reader.visibility.data();
-                const Response response(sample.brdf, dir);
+    std::vector<Columns3<T>> sums(grad.light ? chunks : 0, Columns3<T>(D));
+    for_samples(
+        in, grain, threads, [&] { return MapReader<T>(light, D); },
+        [&](int64_t i, const auto& sample, auto& dir, auto& reader) {
+            const vec3<T> g = in.solid_angle * load3(grad_rgb, i);
+            reader.load(i);
+            sample_backward(in, sample, reader.radiance, g, i, dir, grad);
+            if (!grad.light) return;
+            Columns3<T>& sum = sums[i / grain];
+            T *x = sum[0], *y = sum[1], *z = sum[2];
+            const T* visible = reader.visibility.data();
+            const Response response(sample.brdf, dir);
 #pragma omp simd
-                for (int64_t d = 0; d < D; ++d) {
-                    x[d] += open[d] * (g.x * response.r(d));
-                    y[d] += open[d] * (g.y * response.g(d));
-                    z[d] += open[d] * (g.z * response.b(d));
-                }
+            for (int64_t d = 0; d < D; ++d) {
+                x[d] += visible[d] * (g.x * response.r(d));
+                y[d] += visible[d] * (g.y * response.g(d));
+                z[d] += visible[d] * (g.z * response.b(d));
             }
         });
-    });
     if (!grad.light) return;
     std::fill(grad.light, grad.light + 3 * D, T(0));
-    for (const Rows3<T>& sum : sums) {
+    for (const Columns3<T>& sum : sums) {
         for (int c = 0; c < 3; ++c) {
             for (int64_t d = 0; d < D; ++d) grad.light[3 * d + c] += sum[c][d];
         }

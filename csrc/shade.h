@@ -14,10 +14,10 @@ struct Shade {
     const T* albedo;      // [N, 3] linear
     const T* roughness;   // [N]    in [0, 1]
     const T* directions;  // [D, 3] unit, world
-    const T* f0;          // [N, 3] reflectance at normal incidence, if coloured; else [1]
+    const T* f0;          // [N, 3] reflectance at normal incidence, if colored; else [1]
     int64_t n_samples, n_directions;
     T solid_angle;  // of each direction, steradians
-    bool coloured;
+    bool colored;
 };
 
 /// One map of radiance seen by P points: radiance_nd = visibility map_d + indirect, row index_n.
@@ -30,7 +30,7 @@ struct MapLight {
 };
 
 /// Where the gradients go. Light ([N, D, 3] or [D, 3]) and normal may be null: nobody asks. That to
-/// f0 is written if it is coloured.
+/// f0 is written if it is colored.
 template <class T>
 struct ShadeGrad {
     T *light, *normal, *albedo, *roughness, *f0;

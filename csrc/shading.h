@@ -5,76 +5,54 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <iterator>
 #include <type_traits>
 #include <utility>
 #include <vector>
 
 #include "brdf.h"
 #include "common.h"
+#include "frame.h"
 
 namespace univoxel {
 
-/// Directions in the frame of a normal, each coordinate in a row of its own, and scratch rows of
-/// the same length. Rows begin at cache lines: a vector that straddles two takes two loads.
+/// Directions in the frame of a normal, each coordinate in a column of its own, and scratch columns
+/// of the same length. Columns begin at cache lines: a vector that straddles two takes two loads.
 template <class T>
 struct Directions {
     int64_t count;
     std::vector<T> buffer;
-    T *x, *y, *z, *cosine, *held, *layer, *grad_layer, *lobe, *gain, *grad_gain;
+    T *x, *y, *z;
+    T* cosine;          // max(n.w, 0)
+    T* clamped_cosine;  // max(n.w, kCosMin); std::max of z[d] in a loop would keep it scalar
+    T* layer;           // D F V max(n.w, 0); with F0 per channel, of F0 = 0
+    T* grad_layer;
+    T* lobe;  // of a spherical Gaussian
+    T* gain;  // with F0 per channel: how much more F0 = 1 gives
+    T* grad_gain;
 
     explicit Directions(int64_t n) : count(n) {
+        T** const columns[] = {&x,     &y,          &z,    &cosine, &clamped_cosine,
+                               &layer, &grad_layer, &lobe, &gain,   &grad_gain};
         constexpr int64_t kLine = 64 / sizeof(T);
         const int64_t step = (n + kLine - 1) / kLine * kLine;
-        buffer.resize(10 * step + kLine);
+        buffer.resize(std::size(columns) * step + kLine);
         const auto past = reinterpret_cast<uintptr_t>(buffer.data()) / sizeof(T) % kLine;
-        T* first = buffer.data() + (kLine - past) % kLine;
-        T* rows[10];
-        for (int i = 0; i < 10; ++i) rows[i] = first + i * step;
-        x = rows[0], y = rows[1], z = rows[2];
-        cosine = rows[3];  // max(n.w, 0)
-        held = rows[4];   // n.w held above kCosMin; std::max of z[d] in a loop would keep it scalar
-        layer = rows[5];  // D F V max(n.w, 0); with F0 per channel, of F0 = 0
-        grad_layer = rows[6];  // its gradient
-        lobe = rows[7];        // of a spherical Gaussian
-        gain = rows[8];        // with F0 per channel: how much more F0 = 1 gives
-        grad_gain = rows[9];   // its gradient
+        T* next = buffer.data() + (kLine - past) % kLine;
+        for (T** column : columns) *column = std::exchange(next, next + step);
     }
-    Directions(Directions&&) = default;  // a copy's rows would point into the original
+    Directions(Directions&&) = default;  // a copy's columns would point into the original
 };
 
-/// The frame of Duff et al. 2017 around a normal. Its rows take a world vector to local
-/// coordinates.
-template <class T>
-struct Frame {
-    vec3<T> tangent, bitangent, normal;
-    T sign, a;
-
-    explicit Frame(const vec3<T>& n) : normal(n), sign(std::copysign(T(1), n.z)) {
-        a = -1 / (sign + n.z);
-        const T b = n.x * n.y * a;
-        tangent = {1 + sign * n.x * n.x * a, sign * b, -sign * n.x};
-        bitangent = {b, sign + n.y * n.y * a, -n.y};
-    }
-
-    /// Gradient to the normal from those to the three rows.
-    vec3<T> backward(const vec3<T>& gt, const vec3<T>& gb, const vec3<T>& gn) const {
-        const T x = normal.x, y = normal.y;
-        const T grad_b = sign * gt.y + gb.x;
-        const T grad_a = gt.x * sign * x * x + gb.y * y * y + grad_b * x * y;
-        return gn + vec3<T>(2 * gt.x * sign * x * a - sign * gt.z + grad_b * y * a,
-                            2 * gb.y * y * a - gb.z + grad_b * x * a, grad_a * a * a);
-    }
-};
-
-// F0 is a number, the same for all channels, or a colour: code below takes its type. Schlick's F is
-// linear in it, so a coloured layer is two numbers a direction: layer + F0 gain.
+// F0 is a number, the same for all channels, or a color: code below takes its type. Schlick's F is
+// linear in it, so a colored layer is two numbers a direction: layer + F0 gain.
 template <class F0>
-constexpr bool kColoured = !std::is_floating_point_v<F0>;
+constexpr bool kColored = !std::is_floating_point_v<F0>;
 
 /// Call f with the function that gives F0 of point i, from a buffer of [N, 3] or of one number.
 template <class T, class F>
-void with_f0(const T* f0, bool coloured, F&& f) {
-    if (coloured)
+void with_f0(const T* f0, bool colored, F&& f) {
+    if (colored)
         f([f0](int64_t i) { return load3(f0, i); });
     else
         f([f0](int64_t) { return *f0; });
@@ -93,7 +71,7 @@ inline std::enable_if_t<std::is_floating_point_v<T>, T> sum_of(T x) {
 template <class T, class F0>
 struct LocalBrdf {
     vec3<T> wo;  // local
-    T v, a2;     // n.wo held above kCosMin, alpha squared
+    T v, a2;     // n.wo, at least kCosMin, alpha squared
     F0 f0;
     decltype(specular_albedo(T(), T(), std::declval<F0>())) layer;
     vec3<T> diffuse;  // (1 - E) albedo / pi
@@ -106,9 +84,9 @@ struct LocalBrdf {
         diffuse = albedo * ((T(1) - layer.value) / T(kPi));
     }
 
-    /// Colour of what the rows `layer` and `gain` sum to.
-    vec3<T> colour_of(T layer_sum, [[maybe_unused]] T gain) const {
-        if constexpr (kColoured<F0>)
+    /// Color of what the columns `layer` and `gain` sum to.
+    vec3<T> color_of(T layer_sum, [[maybe_unused]] T gain) const {
+        if constexpr (kColored<F0>)
             return layer_sum + f0 * gain;
         else
             return vec3<T>(layer_sum);
@@ -124,7 +102,7 @@ struct LocalBrdf {
                        T roughness) const {
         const vec3<T> to_e = -grad_diffuse * albedo / T(kPi);
         F0 grad_e;
-        if constexpr (kColoured<F0>)
+        if constexpr (kColored<F0>)
             grad_e = to_e;
         else
             grad_e = sum_of(to_e);
@@ -138,10 +116,10 @@ struct LocalBrdf {
 // In the two loops over directions below q = |wi + wo|^2, and D's denominator is taken times q:
 // `raw`, and `den` with the floor of ggx_denominator.
 
-/// Fill `layer`, and `gain` for a coloured F0. D V is one quotient: divisions are dear.
+/// Fill `layer`, and `gain` for a colored F0. D V is one quotient: divisions are dear.
 template <class T, class F0>
 void specular_layer(const LocalBrdf<T, F0>& p, Directions<T>& dir) {
-    const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *held = dir.held;
+    const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *clamped = dir.clamped_cosine;
     T* out = dir.layer;
     [[maybe_unused]] T* out_gain = dir.gain;
     const T ox = p.wo.x, oy = p.wo.y, oz = p.wo.z;
@@ -153,9 +131,9 @@ void specular_layer(const LocalBrdf<T, F0>& p, Directions<T>& dir) {
         const T hx = x[d] + ox, hy = y[d] + oy, hz = z[d] + oz;
         const T xy = hx * hx + hy * hy, q = xy + hz * hz + T(kHalfEpsilon);
         const T raw = xy + a2 * hz * hz, den = std::max(raw, T(0.5) * a2 * q);
-        const T l = held[d], smith = l * root_v + v * smith_root(l, a2);
+        const T l = clamped[d], smith = l * root_v + v * smith_root(l, a2);
         const T top = scale * q * q * cosine[d], cosine_h = T(0.5) * std::sqrt(q);
-        if constexpr (kColoured<F0>) {
+        if constexpr (kColored<F0>) {
             const T white = top / (den * den * smith), black = white * schlick_weight(cosine_h);
             out[d] = black;
             out_gain[d] = white - black;
@@ -175,7 +153,7 @@ struct SpecularLayerGrad {
 /// 0 unless asked for. The normal is a vector of its own, of any length.
 template <bool kToWo, bool kToNormal, class T, class F0>
 SpecularLayerGrad<T> specular_layer_backward(const LocalBrdf<T, F0>& p, const Directions<T>& dir) {
-    const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *held = dir.held,
+    const T *x = dir.x, *y = dir.y, *z = dir.z, *cosine = dir.cosine, *clamped = dir.clamped_cosine,
             *grad = dir.grad_layer;
     [[maybe_unused]] const T* grad_gain = dir.grad_gain;
     const T ox = p.wo.x, oy = p.wo.y, oz = p.wo.z;
@@ -189,7 +167,7 @@ SpecularLayerGrad<T> specular_layer_backward(const LocalBrdf<T, F0>& p, const Di
         const T hx = x[d] + ox, hy = y[d] + oy, hz = z[d] + oz;
         const T xy = hx * hx + hy * hy, q = xy + hz * hz + T(kHalfEpsilon);
         const T raw = xy + a2 * hz * hz, den = std::max(raw, T(0.5) * a2 * q);
-        const T l = held[d];
+        const T l = clamped[d];
         const T root_l2 = l * l * (1 - a2) + a2, inv_root_l = 1 / std::sqrt(root_l2);
         const T root_l = root_l2 * inv_root_l, smith = l * root_v + v * root_l;
         const T inv_length = 1 / std::sqrt(q), inv_q = inv_length * inv_length;
@@ -200,7 +178,7 @@ SpecularLayerGrad<T> specular_layer_backward(const LocalBrdf<T, F0>& p, const Di
         const T dv = scale * q * q * quotient;
         // F's share at normal incidence, and what comes on top of it with (1 - wo.h)^5.
         T steady;
-        if constexpr (kColoured<F0>)
+        if constexpr (kColored<F0>)
             steady = grad_gain[d];
         else
             steady = f0 * grad[d];

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <memory>
 
+#include "dcheck.h"
 #include "parallel.h"
 
 namespace univoxel {
@@ -11,15 +12,15 @@ namespace {
 constexpr int64_t kRowsPerChunk = 2048;
 
 /// A node by its coordinates; neighbours stop at the border.
-struct Node {
+struct GridNode {
     int64_t i[3];
 
     template <class Nodes>
     int64_t row(const Nodes& nodes) const {
         return nodes.row(i[0], i[1], i[2]);
     }
-    Node step(int axis, int64_t by, const int64_t size[3]) const {
-        Node n = *this;
+    GridNode step(int axis, int64_t by, const int64_t size[3]) const {
+        GridNode n = *this;
         n.i[axis] = std::min(std::max<int64_t>(i[axis] + by, 0), size[axis] - 1);
         return n;
     }
@@ -28,7 +29,7 @@ struct Node {
 /// out[c] += scale (L f)[c] at a node.
 template <class T, class Nodes>
 void add_laplacian(const T* grid, const int64_t size[3], const Nodes& nodes, int64_t C,
-                   const Node& node, T scale, T* out) {
+                   const GridNode& node, T scale, T* out) {
     const T* centre = grid + node.row(nodes) * C;
     for (int64_t c = 0; c < C; ++c) out[c] -= scale * centre[c];
     for (int axis = 0; axis < 3; ++axis)
@@ -92,7 +93,7 @@ bool away_from_border(int64_t i, int64_t size, int64_t margin) {
 /// The change of a node near the border, where neighbours repeat.
 template <class T, class Nodes>
 void border_change(const T* grid, const int64_t size[3], const Nodes& nodes, int64_t C,
-                   const Node& node, T amount, int order, T* out) {
+                   const GridNode& node, T amount, int order, T* out) {
     std::fill(out, out + C, T(0));
     add_laplacian(grid, size, nodes, C, node, amount, out);
     if (order == 1) return;
@@ -104,7 +105,7 @@ void border_change(const T* grid, const int64_t size[3], const Nodes& nodes, int
 
 /// Copy the nodes of a brick and `margin` around it, all inside the grid, z fastest.
 template <class T>
-void gather_brick(const T* grid, const BrickNodes& nodes, int64_t C, const Node& first,
+void gather_brick(const T* grid, const BrickNodes& nodes, int64_t C, const GridNode& first,
                   int64_t margin, T* out) {
     const int64_t width = kBrick + 2 * margin;
     for (int64_t x = 0; x < width; ++x)
@@ -155,6 +156,8 @@ void smooth_rows(T* grid, const int64_t size[3], int64_t C, const int64_t* rows,
             const int64_t longest = std::min(end - k, size[2] - order - z);
             int64_t run = 1;
             while (run < longest && rows[k + run] == rows[k] + run) ++run;
+            DCHECK(rows[k] * C >= weights.reach);
+            DCHECK((rows[k] + run) * C + weights.reach <= grid_end - grid);
             weights.apply(grid + rows[k] * C, run * C, grid_end, out);
             k += run;
         }
@@ -174,18 +177,17 @@ void smooth_brick_rows(T* grid, const int64_t size[3], const BrickNodes& nodes,
         const std::unique_ptr<T[]> around(new T[numbers]);
         int64_t gathered = -1;
         for (int64_t k = begin; k < end;) {
-            const int64_t brick = rows[k] / kBrickNodes, inside = rows[k] % kBrickNodes;
-            const int64_t c = place[brick] % nodes.bricks_z, ab = place[brick] / nodes.bricks_z;
-            const Node first{
-                {ab / nodes.bricks_y * kBrick, ab % nodes.bricks_y * kBrick, c * kBrick}};
+            const int64_t brick = rows[k] / kBrickNodes;
+            const Node corner = nodes.first_node(place[brick]);
+            const GridNode first{{corner.x, corner.y, corner.z}};
             bool whole = true;  // the brick and what the stencil needs of its neighbours
             for (int a = 0; a < 3; ++a) {
                 whole = whole && first.i[a] >= order && first.i[a] + kBrick + order <= size[a];
             }
-            const int64_t x = inside >> 4, y = inside >> 2 & 3, z = inside & 3;
+            const auto [x, y, z] = BrickNodes::offset(rows[k] % kBrickNodes);
             T* out = change.get() + k * C;
             if (!whole) {
-                const Node node{{first.i[0] + x, first.i[1] + y, first.i[2] + z}};
+                const GridNode node{{first.i[0] + x, first.i[1] + y, first.i[2] + z}};
                 border_change(grid, size, nodes, C, node, amount, order, out);
                 ++k;
                 continue;
@@ -195,6 +197,7 @@ void smooth_brick_rows(T* grid, const int64_t size[3], const BrickNodes& nodes,
             int64_t run = 1;
             while (k + run < end && run < kBrick - z && rows[k + run] == rows[k] + run) ++run;
             const int64_t at = ((x + order) * width + y + order) * width + z + order;
+            DCHECK(at * C >= weights.reach && (at + run) * C + weights.reach <= numbers);
             weights.apply(around.get() + at * C, run * C, around.get() + numbers, out);
             k += run;
         }

@@ -12,9 +12,9 @@ template <class T>
 using SparseGridGrads = SamplingGrads<T, RowSet>;
 
 template <class T>
-void sample_sparse_forward(const SparseGrid<T>& in, T* value, T* gradient, T* feature, int threads);
+void sample_grid_forward(const SparseGrid<T>& in, T* value, T* gradient, T* feature, int threads);
 
 template <class T>
-void sample_sparse_backward(const SparseGrid<T>& in, const SparseGridGrads<T>& grads, int threads);
+void sample_grid_backward(const SparseGrid<T>& in, const SparseGridGrads<T>& grads, int threads);
 
 }  // namespace univoxel

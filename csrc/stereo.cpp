@@ -4,6 +4,7 @@
 #include <cmath>
 #include <vector>
 
+#include "dcheck.h"
 #include "parallel.h"
 
 namespace univoxel {
@@ -87,6 +88,7 @@ class LastRows {
 
   private:
     float* at(int64_t y, int64_t m, int64_t x) {
+        DCHECK(y >= 0 && m >= 0 && m < in_.M && x >= 0 && x < in_.W);
         return buffer_.data() + ((y % kept_ * in_.M + m) * in_.W + x) * in_.steps;
     }
 
@@ -158,6 +160,7 @@ void match_cost(const Match& in, float* cost, int threads) {
             for (int64_t x = 0; x < in.W; ++x) {
                 const int64_t ray = in.rows[y * in.W + x];
                 if (ray < 0) continue;
+                DCHECK(ray < in.N);
                 const int64_t count = window.sum_around(y, x, sum.data());
                 mean_of_best(in, sum.data(), 1.f / count, least.data(), cost + ray * in.steps);
             }

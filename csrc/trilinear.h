@@ -5,6 +5,8 @@
 #include <cmath>
 #include <cstdint>
 
+#include "dcheck.h"
+
 namespace univoxel {
 
 /// Node (i, j, k) lies at origin + voxel_size * (i, j, k). Outside, the nearest border value holds.
@@ -28,7 +30,9 @@ inline Place place(const Lattice& grid, int axis, double x) {
     const double u = std::min(std::max(0.0, p), last);  // max(0, NaN) is 0
     const int64_t cell =
         std::min<int64_t>(static_cast<int64_t>(u), std::max<int64_t>(grid.size[axis] - 2, 0));
-    return {cell, u - static_cast<double>(cell), p >= 0 && p <= last && last > 0};
+    const double t = u - static_cast<double>(cell);
+    DCHECK(cell >= 0 && cell < grid.size[axis] && t >= 0 && t <= 1);
+    return {cell, t, p >= 0 && p <= last && last > 0};
 }
 
 template <class T>
@@ -58,6 +62,8 @@ inline Stencil<T> stencil(const Lattice& grid, int axis, const Place& at) {
     const T half = static_cast<T>(0.5 * grid.per_voxel);
     s.value[0] = 0, s.value[1] = u, s.value[2] = t, s.value[3] = 0;
     s.slope[0] = -half * u, s.slope[1] = -half * t, s.slope[2] = half * u, s.slope[3] = half * t;
+    DCHECK(std::abs(s.value[1] + s.value[2] - 1) < T(1e-6));
+    DCHECK(s.node[0] >= 0 && s.node[0] <= s.node[1] && s.node[1] <= s.node[2]);
     return s;
 }
 

@@ -21,7 +21,7 @@ namespace univoxel {
 namespace {
 
 constexpr int64_t kRaysPerChunk = 1024;
-[[maybe_unused]] const Hit kNothing{std::numeric_limits<float>::infinity(), 0, 0, -1, {0, 0, 0}};
+[[maybe_unused]] const Hit kNoHit{std::numeric_limits<float>::infinity(), 0, 0, -1, {0, 0, 0}};
 
 }  // namespace
 
@@ -157,7 +157,7 @@ bool VisibilityScene::occluded(const vec3<float>& origin, const vec3<float>& dir
 
 Hit VisibilityScene::closest_hit(const vec3<float>& origin, const vec3<float>& direction,
                                  float t_min, float t_max) const {
-    if (!usable(origin, direction)) return kNothing;
+    if (!usable(origin, direction)) return kNoHit;
     RTCRayHit query;
     query.ray = make_ray(origin, direction, t_min, t_max);
     query.hit.geomID = query.hit.instID[0] = RTC_INVALID_GEOMETRY_ID;
@@ -168,7 +168,7 @@ Hit VisibilityScene::closest_hit(const vec3<float>& origin, const vec3<float>& d
     rtcInitIntersectContext(&context);
     rtcIntersect1(impl_->scene, &context, &query);
 #endif
-    if (query.hit.geomID == RTC_INVALID_GEOMETRY_ID) return kNothing;
+    if (query.hit.geomID == RTC_INVALID_GEOMETRY_ID) return kNoHit;
     return {query.ray.tfar,
             query.hit.u,
             query.hit.v,
@@ -219,7 +219,7 @@ void VisibilityScene::closest_hit(const RayStream& rays, Hit* out) const {
                                        packet.hit.v[k],
                                        static_cast<int64_t>(packet.hit.primID[k]),
                                        {packet.hit.Ng_x[k], packet.hit.Ng_y[k], packet.hit.Ng_z[k]}}
-                                 : kNothing;
+                                 : kNoHit;
         }
     }
 }

@@ -8,7 +8,9 @@
 #include <numeric>
 #include <utility>
 
+#include "dcheck.h"
 #include "float3.h"
+#include "frame.h"
 #include "path_brdf.h"
 #include "visibility.h"
 
@@ -31,18 +33,7 @@ struct Columns {
     }
 };
 
-/// Orthonormal frame around a unit normal (Duff et al. 2017).
-struct PathFrame {
-    float3 s, t, n;
-
-    explicit PathFrame(float3 normal) : n(normal) {
-        const float sign = std::copysign(1.f, n.z), a = -1 / (sign + n.z), b = n.x * n.y * a;
-        s = {1 + sign * n.x * n.x * a, sign * b, -sign * n.x};
-        t = {b, sign + n.y * n.y * a, -n.y};
-    }
-    float3 to_local(float3 v) const { return {dot(v, s), dot(v, t), dot(v, n)}; }
-    float3 to_world(float3 v) const { return v.x * s + v.y * t + v.z * n; }
-};
+using PathFrame = Frame<float3>;
 
 /// A place where a path meets a surface.
 struct Vertex {
@@ -67,6 +58,7 @@ struct Paths {
 
     /// Add a path; `settle` has to follow.
     void push(const Vertex& v, float3 carries, uint32_t own, uint32_t number, int32_t place) {
+        DCHECK(n < kLanes && place >= 0 && place < kLanes);
         origin.set(n, v.origin), geometric.set(n, v.geometric), normal.set(n, v.normal);
         throughput.set(n, carries);
         wo.set(n, v.wo), diffuse.set(n, v.albedo), f0.set(n, v.f0), alpha[n] = v.roughness;
@@ -87,6 +79,7 @@ struct Paths {
 
     /// Add `count` times a path of others, settled; numbers and places count up.
     void repeat(const Paths& from, int lane, uint32_t number, int32_t place, int count) {
+        DCHECK(lane < from.n && n + count <= kLanes && place + count <= kLanes);
         const std::pair<Columns*, const Columns*> columns[] = {
             {&origin, &from.origin}, {&geometric, &from.geometric},
             {&normal, &from.normal}, {&throughput, &from.throughput},
@@ -102,8 +95,8 @@ struct Paths {
     }
 };
 
-/// Directions drawn, one a lane, and what arrives along each if nothing stands in its way.
-struct Ways {
+/// Directions sampled, one a lane, and what arrives along each if nothing stands in its way.
+struct LightSamples {
     Columns direction, light;
     float distance[kColumn];
 };
@@ -114,7 +107,7 @@ struct Rays {
     int32_t lane[kColumn];  // of `Paths`
     Columns origin, direction, light;
     float distance[kColumn];
-    uint8_t blocked[kColumn];
+    uint8_t occluded[kColumn];
 
     void set(int k, int32_t from, float3 start, float3 towards, float farthest) {
         lane[k] = from, distance[k] = farthest;
@@ -130,12 +123,12 @@ struct Wave {
     Paths first, both[2];
     Paths *paths = &both[0], *next = &both[1];
     Columns light;  // by path: its radiance so far
-    Ways drawn;
-    Columns throughput;  // of the paths that go on along `drawn`
-    float pdf[kColumn];  // of the draws; 0: the path ends
+    LightSamples sampled;
+    Columns throughput;  // of the paths that go on along `sampled`
+    float pdf[kColumn];  // of the samples; 0: the path ends
     Rays rays;
     Hit hit[kColumn];
-    // Draws of the map
+    // Samples of the map
     float u[kColumn], v[kColumn];
     int32_t row[kColumn], column[kColumn];
     float x[kColumn], y[kColumn], z[kColumn];

@@ -3,9 +3,9 @@
     pip install bpy==4.2.0    # for Python 3.11
     python render_in_blender.py sneaker.glb studio.hdr transforms_test.json out/
 
-Blender turns glTF back to +Z up, and its world textures have the axes of docs/conventions.md: map
-and cameras need no turning. Each frame becomes an EXR file of linear colour with alpha. The file of
-cameras gives the size of the pictures as w and h.
+Blender turns glTF back to +Z up, and its world textures have the axes of
+docs/reference/conventions.md: map and cameras need no turning. Each frame becomes an EXR file of
+linear colour with alpha. The file of cameras gives the size of the pictures as w and h.
 """
 
 import json

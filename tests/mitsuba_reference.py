@@ -26,7 +26,7 @@ PASSES = 8  # bounds memory
 
 
 class Layered(mi.BSDF):
-    """docs/conventions.md as a BSDF, sampled by the cosine; written in drjit."""
+    """docs/reference/conventions.md as a BSDF, sampled by the cosine; written in drjit."""
 
     def __init__(self, props):
         mi.BSDF.__init__(self, props)

@@ -1,4 +1,4 @@
-"""Sightings of the sphere for tests of the joint solve, drawn by the shading op."""
+"""Observations of the sphere for tests of the joint solve, rendered by the shading op."""
 
 import dataclasses
 import math
@@ -11,13 +11,15 @@ import torch
 from analytic import RADIUS, cameras_around, scene_of, sphere_normals
 from torch.nn.functional import normalize
 
-from univoxel import brdf, losses
-from univoxel.color import linear_to_srgb
+from univoxel import brdf
+from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.data import Photos
-from univoxel.joint.equations import Rows
-from univoxel.joint.observations import Problem, widened
+from univoxel.joint.equations import LinearTransport
+from univoxel.joint.observations import Decisions, JointProblem, prefiltered_roughness
+from univoxel.lights.nodes import DistantLight
 from univoxel.ops import shade_map
 from univoxel.render.transport import Observations, Transport
+from univoxel.scene import Scene
 from univoxel.sphere import fibonacci_sphere
 
 
@@ -28,50 +30,63 @@ def facing(normal: torch.Tensor, least: float) -> torch.Tensor:
     return normalize(wo + least * normal, dim=1)
 
 
-def problem_on_a_sphere(points: int, views: int, nodes: int) -> Problem:
-    """Points that see everything above their horizon, and black photographs of them."""
+def problem_on_a_sphere(
+    points: int, views: int, nodes: int, scene: Scene | None = None
+) -> JointProblem:
+    """Points that see everything above their horizon, and black photographs of them.
+
+    Args:
+        scene: whose map is solved for; None: one of its own.
+    """
     normal = normalize(torch.randn(points, 3), dim=1)
     wo = facing(normal.repeat_interleave(views, 0), 0.3)
     offsets = torch.arange(points + 1) * views
     black = torch.zeros(points * views, 3)
     view = torch.arange(points * views) % views
-    seen = Observations(RADIUS * normal, normal, offsets, wo, black, view)
-    open_share = torch.full((points, nodes), 255, dtype=torch.uint8)
+    observations = Observations(RADIUS * normal, normal, offsets, wo, black, view)
+    visibility = torch.full((points, nodes), 255, dtype=torch.uint8)
     indirect = torch.zeros(points, nodes, 3, dtype=torch.float16)
-    transport = Transport(fibonacci_sphere(nodes), open_share, indirect)
-    no_metal = torch.zeros(points, dtype=torch.bool)
-    return Problem(seen, transport, black, no_metal, 0.05)
+    transport = Transport(fibonacci_sphere(nodes), visibility, indirect)
+    sky = DistantLight(nodes) if scene is None else scene.sky
+    return JointProblem(observations, transport, black, 0.05, sky)
 
 
-def photographed(problem: Problem, map, albedo, roughness, f0=None) -> Problem:
-    """The same with the sightings that a map [D, 3] and materials [P, 3], [P] make."""
-    point = torch.repeat_interleave(problem.seen.offsets.diff())
-    t, seen = problem.transport, problem.seen
+def no_metal(problem: JointProblem) -> Decisions:
+    """Nothing is decided yet, and nothing is metal."""
+    return Decisions(torch.zeros(len(problem.observations.position), dtype=torch.bool))
+
+
+def photographed(problem: JointProblem, map, albedo, roughness, f0=None) -> JointProblem:
+    """The same with the observations that a map [D, 3] and materials [P, 3], [P] make."""
+    point = torch.repeat_interleave(problem.observations.offsets.diff())
+    t, seen = problem.transport, problem.observations
     color = shade_map(
-        map, t.open, t.indirect, point, seen.normal[point], seen.wo, albedo[point],
+        map, t.visibility, t.indirect, point, seen.normal[point], seen.wo, albedo[point],
         roughness[point], t.direction, problem.solid_angle, brdf.F0 if f0 is None else f0[point],
     )  # fmt: skip
     seen = replace(seen, color=color)
-    return replace(problem, seen=seen, target=losses.encode(color))
+    return replace(problem, observations=seen, target=linear_to_srgb_unclipped(color))
 
 
-def random_problem(points: int = 5, views: int = 4, nodes: int = 12) -> Problem:
+def random_problem(
+    points: int = 5, views: int = 4, nodes: int = 12, scene: Scene | None = None
+) -> JointProblem:
     """With half-open directions and light from what blocks them."""
     torch.manual_seed(1)
-    problem = problem_on_a_sphere(points, views, nodes)
-    open_share = torch.randint(0, 256, (points, nodes), dtype=torch.uint8)
+    problem = problem_on_a_sphere(points, views, nodes, scene)
+    visibility = torch.randint(0, 256, (points, nodes), dtype=torch.uint8)
     indirect = torch.rand(points, nodes, 3).half()
-    transport = Transport(problem.transport.direction, open_share, indirect)
+    transport = Transport(problem.transport.direction, visibility, indirect)
     return replace(problem, transport=transport)
 
 
-def in_double(rows: Rows) -> Rows:
-    values = {f.name: getattr(rows, f.name) for f in dataclasses.fields(rows)}
-    return Rows(**{k: v.double() if k != "view" else v for k, v in values.items()})
+def in_double(transport: LinearTransport) -> LinearTransport:
+    values = {f.name: getattr(transport, f.name) for f in dataclasses.fields(transport)}
+    return LinearTransport(**{k: v.double() if k != "view" else v for k, v in values.items()})
 
 
 class Steps:
-    """A clock that lets a stage run through."""
+    """A progress, and its clock, that let a stage run through."""
 
     over, pace, reserved = False, 1.0, math.inf
     stage = step = 0
@@ -88,10 +103,14 @@ class Steps:
             self.step = i
             yield i / self.count
 
-    def apart(self):
+    @property
+    def clock(self) -> "Steps":
+        return self
+
+    def off_pace(self):
         return nullcontext()
 
-    def room_for(self, blocks):
+    def blocks_that_fit(self, blocks):
         self.asked.append(blocks)
         return self.rooms.pop(0) if self.rooms else blocks
 
@@ -131,12 +150,14 @@ def sphere_of(base, metallic, roughness, views=12, noise=0.0):
     scene = scene_of((0.5, 0.5, 0.5), 0.5, NODES)
     with torch.no_grad():
         scene.sky.log_radiance.copy_(map.log())
-    problem = problem_on_a_sphere(COUNT, views, NODES)
+    problem = problem_on_a_sphere(COUNT, views, NODES, scene)
     metallic = (
-        metallic(problem.seen.normal) if callable(metallic) else torch.full((COUNT,), metallic)
+        metallic(problem.observations.normal)
+        if callable(metallic)
+        else torch.full((COUNT,), metallic)
     )
     diffuse, f0 = brdf.split(torch.tensor(base).expand(COUNT, 3), metallic)
-    shown = widened(torch.full((COUNT,), roughness), NODES)
+    shown = prefiltered_roughness(torch.full((COUNT,), roughness), NODES)
     problem = photographed(problem, map, diffuse, shown, f0)
     target = problem.target + noise * torch.randn_like(problem.target)
     return scene, replace(problem, target=target.clamp(0, 1))
@@ -155,7 +176,7 @@ def photographs_under(
         wo = normalize(cameras.camera_to_world[v, :, 3] - RADIUS * n, dim=1)
         count = len(n)
         albedo = torch.where(n[:, :1] > 0, RED, BLUE)
-        shown = widened(torch.full((count,), roughness), len(map))
+        shown = prefiltered_roughness(torch.full((count,), roughness), len(map))
         rgb = shade_map(
             map, torch.full((count, len(map)), 255, dtype=torch.uint8),
             torch.zeros(count, len(map), 3).half(), torch.arange(count), n, wo, albedo,

@@ -49,7 +49,7 @@ def visible_normals_albedo(cosine, roughness, f0, n=96):
 
 
 def numpy_brdf(n, wo, wi, albedo, roughness, f0):
-    """f without the (1 - E) of the base: written from docs/conventions.md, textbook forms."""
+    """f without the (1 - E) of the base: docs/reference/conventions.md, in textbook forms."""
     h = (wi + wo) / np.linalg.norm(wi + wo)
     a2 = roughness**4
     nh, nl, nv, vh = n @ h, n @ wi, n @ wo, wo @ h

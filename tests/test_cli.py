@@ -1,6 +1,8 @@
 """The command line over stand-ins for the tasks: what is passed on, what a mistake prints."""
 
+import errno
 import importlib
+import logging
 import os
 import subprocess
 import sys
@@ -11,7 +13,19 @@ from pathlib import Path
 
 import pytest
 
+import univoxel
+from univoxel import errors
 from univoxel.cli import SPINS, main
+from univoxel.errors import (
+    ExistingFile,
+    MissingExtra,
+    MissingFile,
+    NothingFound,
+    ProcessFailed,
+    UserError,
+)
+
+KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, Exception)]
 
 
 @dataclass(frozen=True)
@@ -76,13 +90,18 @@ def calls(monkeypatch):
         return replace_fields(config, stages=(config.stages[0], StageConfig(field=kind)))
 
     stand_in("univoxel.presets", chosen=chosen, with_field=with_field)
+
+    def as_table(found):
+        return f"table of {found}"
+
     replace("train", Path("run"))
     replace("cutout", Path("cut"))
-    replace("evaluate", {"psnr": 31.25, "views": 5})
-    replace("relight", None)
+    replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)
+    stand_in("univoxel.tasks.relight", relight_to_files=task("relight", None))
     replace("export", None)
     replace("envmap", None)
-    replace("info", {})
+    found = {"chosen": [{"said": "lobes 24 -> 12"}]}
+    replace("info", found, tables=lambda found: ["parts", "sizes"])
     replace("demo", Path("demo/index.html"))
     return types.SimpleNamespace(noted=noted, replace=replace, stand_in=stand_in, task=task)
 
@@ -154,10 +173,11 @@ def test_train_fits_the_model_to_the_scene(calls, tmp_path, options, expected):
     assert (config.capacity, config.budget_mb) == expected
 
 
-def test_info(calls):
+def test_info(calls, capsys):
     assert main(["info", "run", "--json", "a.json", "--picture", "b.png"]) == 0
     expected = {"json": Path("a.json"), "picture": Path("b.png")}
     assert calls.noted == [("info", (Path("run"),), expected)]
+    assert capsys.readouterr().out == "parts\nsizes\nlobes 24 -> 12\n"
 
 
 def test_train_takes_a_sparse_field_before_changes(calls, tmp_path):
@@ -177,7 +197,7 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
     assert calls.noted[1][2] == {"resume": True, "timelapse": "frames/"}
 
 
-def test_eval(calls):
+def test_eval(calls, capsys):
     options = ["--samples", "8", "--bounces", "0", "--light-of", "r_7"]
     paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
     named = [str(part) for name, path in paths.items() for part in (f"--{name}", path)]
@@ -185,6 +205,7 @@ def test_eval(calls):
     assert main(["eval", "run"]) == 0
     default = {"data": None, "save": None, "json": None, "samples": 64, "bounces": 2}
     default["light_of"] = None
+    assert "table of {'psnr': 31.25, 'views': 5}" in capsys.readouterr().out
     assert calls.noted == [
         ("evaluate", (Path("run"),), {**paths, "samples": 8, "bounces": 0, "light_of": "r_7"}),
         ("evaluate", (Path("run"),), default),
@@ -263,27 +284,89 @@ def test_experiments(calls, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "error",
+    ("error", "message"),
     [
-        ValueError("bad\n  input"),
-        FileNotFoundError("bad input"),
-        RuntimeError("bad input"),
-        ImportError("bad input"),
-        FloatingPointError("bad input"),
+        *((kind("bad\n  input"), "bad input") for kind in KINDS if kind is not NothingFound),
+        (NothingFound(), "no object was found where the cameras look: say where it is with --box"),
+        (UserError("eval: samples must be above 0", "samples"), "--samples must be above 0"),
+        (UserError("light_of: none; see light_of", "light_of"), "--light-of: none; see light_of"),
+        (UserError("changes=seed=x: bad", "changes"), "--set seed=x: bad"),
+        (UserError("try out=b or box=a", "box", "out"), "try --out b or --box a"),
+        (FileNotFoundError(2, "No such file", "a.png"), "[Errno 2] No such file: 'a.png'"),
+        (OSError(errno.ENOSPC, "No space left"), "[Errno 28] No space left"),
+        (MemoryError(), "MemoryError"),
+        (RuntimeError("CPU: you tried to allocate 9 bytes: can't allocate memory"), "CPU: you"),
     ],
+    ids=lambda x: type(x).__name__,
 )
-def test_a_mistake_is_one_line(calls, capsys, error):
+def test_a_mistake_is_one_line(calls, capsys, error, message):
     calls.replace("evaluate", error)
     assert main(["eval", "run"]) == 2
-    assert capsys.readouterr().err == "univoxel eval: bad input\n"
+    said = capsys.readouterr().err
+    assert said.startswith(f"univoxel eval: {message}")
+    assert said.count("\n") == 1
     with pytest.raises(type(error)):
         main(["eval", "run", "--traceback"])
 
 
-def test_a_bug_is_no_mistake_of_the_user(calls):
-    calls.replace("evaluate", ZeroDivisionError())
-    with pytest.raises(ZeroDivisionError):
+def test_a_mistake_is_what_it_was_in_the_library():
+    """Handlers of the built-in kinds catch ours too."""
+    assert {UserError} <= set(KINDS)
+    for kind in KINDS:
+        assert issubclass(kind, ValueError)
+    assert issubclass(MissingExtra, ImportError)
+    assert issubclass(MissingFile, FileNotFoundError)
+    assert issubclass(ExistingFile, FileExistsError)
+    assert issubclass(ProcessFailed, RuntimeError)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ZeroDivisionError(),
+        ValueError("from the depths"),
+        RuntimeError("mat1 and mat2 shapes cannot be multiplied"),
+        ImportError("cannot import name"),
+        FloatingPointError(),
+        OSError("no file of the user"),
+        FileNotFoundError(2, "No such file", str(Path(univoxel.__file__).parent / "page.html")),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_a_bug_is_no_mistake_of_the_user(calls, error):
+    calls.replace("evaluate", error)
+    with pytest.raises(type(error)) as caught:
         main(["eval", "run"])
+    assert caught.value is error
+    assert any(entry.name == "call" for entry in caught.traceback)  # where it was raised
+
+
+def test_the_package_speaks_through_its_logger(calls, capsys):
+    logger = logging.getLogger("univoxel")
+    before = logger.level, list(logger.handlers)
+
+    def info(*_, **__):
+        logging.getLogger("univoxel.somewhere").info(
+            "%d pixels: see masks=auto", 3, extra={"arguments": ("masks",)}
+        )
+        logger.debug("nothing")
+        return {"chosen": []}
+
+    calls.stand_in("univoxel.tasks.info", info=info, tables=lambda found: [])
+    assert main(["info", "run"]) == 0
+    assert capsys.readouterr().out == "3 pixels: see --masks auto\n"
+    assert before == (logger.level, logger.handlers)
+
+
+@pytest.mark.parametrize("arguments", [["train", "--help"], ["--help"], ["--version"]])
+def test_output_that_nobody_reads_to_its_end(arguments):
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "univoxel.cli", *arguments]
+    run = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert run.stderr == ""
+    assert run.returncode == 1
 
 
 @pytest.mark.parametrize(
@@ -351,7 +434,7 @@ def test_waiting_threads_soon_sleep_unless_asked_otherwise(calls, monkeypatch, a
         monkeypatch.delenv(name)
     for name, value in asked.items():
         monkeypatch.setenv(name, value)
-    assert main(["eval", "run"]) == 0
+    assert main(["info", "run"]) == 0
     assert os.environ.get("GOMP_SPINCOUNT") == spins
 
 

@@ -3,7 +3,13 @@
 import pytest
 import torch
 
-from univoxel.color import linear_to_srgb, luminance, srgb_to_linear
+from univoxel.color import (
+    linear_to_srgb,
+    linear_to_srgb_unclipped,
+    luminance,
+    srgb_slope,
+    srgb_to_linear,
+)
 
 
 def test_all_bytes_survive_a_round_trip():
@@ -41,3 +47,20 @@ def test_gradient_is_finite_everywhere_and_right_inside():
 def test_luminance_of_white_is_one():
     assert float(luminance(torch.ones(3))) == pytest.approx(1.0)
     assert luminance(torch.tensor([[1.0, 0.0, 0.0]])).tolist() == pytest.approx([0.2126])
+
+
+def test_the_unclipped_curve_goes_on_above_one():
+    x = torch.tensor([0.0, 0.001, 0.2, 1.0])
+    torch.testing.assert_close(linear_to_srgb_unclipped(x), linear_to_srgb(x))
+    bright = torch.tensor([3.0], requires_grad=True)
+    linear_to_srgb_unclipped(bright).sum().backward()
+    assert linear_to_srgb_unclipped(bright).item() > 1
+    assert bright.grad.item() > 0
+
+
+def test_slope_is_the_derivative_of_the_curve():
+    x = torch.tensor([0.0, 0.001, 0.00313, 0.0032, 0.1, 0.9, 3.0], dtype=torch.float64)
+    x.requires_grad_()
+    (slope,) = torch.autograd.grad(linear_to_srgb_unclipped(x[1:]).sum(), x)
+    assert torch.allclose(srgb_slope(x.detach())[1:], slope[1:], rtol=1e-6)
+    assert srgb_slope(x.detach())[0] == 12.92

@@ -14,8 +14,8 @@ def test_suns_and_points():
     assert sun.direction == pytest.approx((0.0, 0.75**0.5, 0.5), abs=1e-12)
     assert (sun.irradiance, sun.angle) == ((3.0, 3.0, 3.0), 0.53)
     assert sun_light((0.0, 90.0, 1.0, 5.0)).angle == 5.0
-    lamp = point_light((1.0, 2.0, 3.0, 4.0))
-    assert (lamp.position, lamp.intensity) == ((1.0, 2.0, 3.0), (4.0, 4.0, 4.0))
+    light = point_light((1.0, 2.0, 3.0, 4.0))
+    assert (light.position, light.intensity) == ((1.0, 2.0, 3.0), (4.0, 4.0, 4.0))
     with pytest.raises(ValueError, match="--sun: expected AZIMUTH"):
         sun_light((1.0, 2.0))
 
@@ -38,7 +38,7 @@ def test_the_package_has_the_tasks_and_stays_cheap():
     assert univoxel.train is train.train
     assert univoxel.evaluate is evaluate.evaluate
     assert univoxel.export is export.export
-    assert univoxel.relight is relight.images
+    assert univoxel.relight is relight.relight_images
     assert "relight" in dir(univoxel)
     with pytest.raises(AttributeError, match="no attribute 'relit'"):
         univoxel.relit  # noqa: B018

@@ -50,7 +50,7 @@ def some_views(photos: Photos, keep) -> Photos:
     )
 
 
-def test_views_and_openness_of_a_convex_body(found, photos):
+def test_views_and_visibility_of_a_convex_body(found, photos):
     eye = photos.cameras.camera_to_world[:, :, 3]
     towards = torch.nn.functional.normalize(eye - found.position[:, None], dim=2)
     cosine = (towards * found.normal[:, None]).sum(2)
@@ -60,7 +60,7 @@ def test_views_and_openness_of_a_convex_body(found, photos):
         straight = (seen * cosine.square()).sum(1)
         assert (sign * (seen.sum(1) - found.views) >= 0).all()
         assert (sign * (straight - found.straight) >= -0.05).all()  # normals are the grid's
-    assert found.open.min() > 0.97
+    assert found.visibility.min() > 0.97
     assert found.spread.min() > 20
     assert not found.black.any()
 
@@ -109,13 +109,13 @@ def test_the_formula(found):
         found,
         views=9 * one,
         straight=confidence.ENOUGH * one,
-        open=one,
+        visibility=one,
         disagreement=0 * one,
         gloss=12**0.5 * confidence.NOISE * one,
     )
     assert point.albedo.item() == pytest.approx(0.5)
     assert point.roughness.item() == pytest.approx(1 - 0.5 * 0.5**0.5)
-    shut = dataclasses.replace(point, open=0.4 * one)
+    shut = dataclasses.replace(point, visibility=0.4 * one)
     assert shut.albedo.item() == pytest.approx(0.8)
     wrong = dataclasses.replace(point, disagreement=confidence.NOISE * one)
     assert wrong.albedo.item() == pytest.approx(0.75)
@@ -123,14 +123,14 @@ def test_the_formula(found):
     assert dull.roughness.item() == 1
 
 
-def test_some_sightings_are_spread_over_all():
+def test_some_observations_are_spread_over_all():
     counts = torch.tensor([0, 3, 17])
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
     nothing = torch.zeros(20, 3)
     seen = Observations(nothing[:3], nothing[:3], offsets, nothing, nothing, offsets)
-    point, sighting = confidence.some(seen, 4)
+    point, observation = confidence.spread_observations(seen, 4)
     assert point.tolist() == [1, 1, 1, 2, 2, 2, 2]
-    assert sighting.tolist() == [0, 1, 2, 3, 7, 11, 15]
+    assert observation.tolist() == [0, 1, 2, 3, 7, 11, 15]
 
 
 def test_doubts_are_those_of_the_nearest_on_the_same_side(found):
@@ -150,7 +150,7 @@ def test_doubts_are_those_of_the_nearest_on_the_same_side(found):
         **{
             name: torch.cat([above * torch.ones(200), below * torch.ones(200)])
             for name, above, below in (
-                ("views", 9, 0), ("straight", 1e6, 0.0), ("open", 1.0, 1.0),
+                ("views", 9, 0), ("straight", 1e6, 0.0), ("visibility", 1.0, 1.0),
                 ("disagreement", 0.0, 0.0), ("gloss", 1e3, 0.0),
             )
         },

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from univoxel.config import TrainConfig, save_config
+from univoxel.config import TrainConfig, check_same, save_config
 from univoxel.joint.config import JointConfig
 from univoxel.lights.sg import SGConfig
 from univoxel.names import LIGHTS
@@ -33,7 +33,7 @@ def test_fine_stages_may_be_sparse():
     config = with_field(preset("fast", Path("photos"), Path("run")), "sparse")
     assert [getattr(s, "field", None) for s in config.stages] == ["dense", "sparse", None, "sparse"]
     assert config.capacity == "fixed"
-    with pytest.raises(ValueError, match="adaptive capacity, and so --budget-mb, is for dense"):
+    with pytest.raises(ValueError, match="adaptive capacity, and so budget_mb, is for dense"):
         replace(config, capacity="adaptive")
     dense = with_field(preset("fast", Path("photos"), Path("run")), "dense")
     assert with_field(config, "dense") == replace(dense, capacity="fixed")
@@ -125,7 +125,8 @@ def test_a_light_alone(light):
     config = preset("draft", Path("photos"), Path("run"), light)
     assert config.scene.light.kind == light
     assert config.scene.sky_nodes == 0
-    assert config.loss.light_smoothness == (1.0 if light == "sg" else 0.1)  # docs/lights.md
+    # docs/research/lights.md
+    assert config.loss.light_smoothness == (1.0 if light == "sg" else 0.1)
     assert all(isinstance(stage, StageConfig) for stage in config.stages)
     assert sum(stage.share for stage in config.stages) == pytest.approx(1)
 
@@ -210,3 +211,40 @@ def test_values_out_of_range(config, change, message):
 def test_a_light_is_checked_as_soon_as_it_is_described():
     with pytest.raises(ValueError, match="SGConfig: lobes must be at least 1, got 0"):
         SGConfig(lobes=0)
+
+
+def saved(tmp_path, cut) -> TrainConfig:
+    """The configuration of a run, whose config.json `cut` changes."""
+    cfg = preset("draft", tmp_path / "photos", tmp_path)
+    save_config(cfg)
+    path = tmp_path / "config.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(cut(content) or content))
+    return cfg
+
+
+def test_a_run_goes_on_whose_file_lacks_fields_that_came_since(tmp_path):
+    def cut(content):
+        for stage in content["stages"]:
+            stage.pop("spread", None)
+            stage.pop("tracing", None)
+        del content["scene"]["light"]["lobes"]
+
+    check_same(saved(tmp_path, cut))
+
+
+def test_a_run_does_not_go_on_under_other_stages(tmp_path):
+    cfg = saved(tmp_path, lambda content: content["stages"][2].update(tracing=7))
+    with pytest.raises(ValueError, match="the run began with other stages"):
+        check_same(cfg)
+
+
+def test_a_run_does_not_go_on_with_more_stages(tmp_path):
+    cfg = saved(tmp_path, lambda content: content.update(stages=content["stages"][:3]))
+    with pytest.raises(ValueError, match="the run began with other stages"):
+        check_same(cfg)
+
+
+def test_a_file_that_holds_no_configuration(tmp_path):
+    with pytest.raises(ValueError, match=r"config\.json: expected an object"):
+        check_same(saved(tmp_path, lambda content: [content]))

@@ -19,7 +19,7 @@ def spotted(height=8, seed=0, **kwargs):
 
 
 def centres(height):
-    """Directions of the pixel centres, by the formula of docs/conventions.md: [H, W, 3]."""
+    """Directions of the pixel centres, as of docs/reference/conventions.md: [H, W, 3]."""
     phi = math.pi - 2 * math.pi * (torch.arange(2 * height) + 0.5) / (2 * height)
     theta = math.pi / 2 - math.pi * (torch.arange(height) + 0.5) / height
     theta, phi = torch.meshgrid(theta, phi, indexing="ij")

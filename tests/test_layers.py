@@ -1,4 +1,4 @@
-"""Imports go down the street of docs/architecture.md, never up and never sideways."""
+"""Imports go down the list of CONTRIBUTING.md, never up and never sideways."""
 
 import ast
 import re
@@ -11,7 +11,8 @@ ROOT = Path(__file__).parent.parent
 # From the bottom up. A module imports only from layers below its own and, inside its folder, the
 # helpers named here.
 LAYERS = [
-    {"errors", "files", "names", "records", "validation"},
+    {"errors"},
+    {"bars", "files", "names", "records", "validation"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "poses"},
@@ -21,12 +22,14 @@ LAYERS = [
     {"losses"},
     {"assets", "metrics", "render"},
     {"joint.config", "preparation.config", "training.config", "compression.config"},
+    {"compression.choices"},
     {"config", "overrides"},
     {"presets"},
     {"preparation", "training"},
     {"joint"},
     {"confidence"},
     {"compression", "pictures"},
+    {"evaluation", "segmentation"},
     {"tasks"},
     {"tasks.demo"},
     {"experiments.plots", "experiments.record"},
@@ -37,17 +40,19 @@ LAYERS = [
     {"cli"},
 ]
 HELPERS = {
-    "ops": {"checks", "dense_grid", "native", "reflectance", "visibility"},
+    "ops": {"checks", "dense_grid", "grid_sampling", "native", "reflectance", "visibility"},
     "fields": {"bricks", "dense", "distances", "features"},
     "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "preparation": {"hull"},
-    "training": {"divergence", "plateau", "progress", "surface_update"},
+    "training": {"clock", "divergence", "plateau", "progress", "surface_update"},
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
-    "compression": {"prune", "quality", "search"},
+    "compression": {"prune", "quality", "search", "sizes", "storage"},
     "pictures": {"animation"},
+    "evaluation": {"measures", "truth"},
+    "segmentation": {"config", "distances"},
     "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
 }
 # Extras: imported inside the function that needs one

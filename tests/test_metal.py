@@ -18,7 +18,7 @@ from univoxel.ops import VisibilityScene
 from univoxel.records import Mesh, Surface
 from univoxel.render.frame import Quality, channels, render_picture
 from univoxel.render.pipeline import at_rays, extract_mesh, surface_of_view
-from univoxel.render.relight import Lighting, Stage, relight_surface
+from univoxel.render.relight import Lighting, TracedMesh, relight_surface
 from univoxel.sphere import fibonacci_sphere
 from univoxel.tasks import export as task
 
@@ -84,8 +84,8 @@ def test_what_no_picture_would_show_is_no_metal():
 def test_a_metal_sphere_equals_quadrature(metallic, roughness):
     surface, wo = a_sphere(8, torch.full((8,), metallic), roughness)
     lights, directions = smooth_map(), fibonacci_sphere(100_000)
-    stage = Stage(*octahedron(), 0.01)
-    got = relight_surface(surface, wo, stage, Lighting(tables(lights)), samples=16384, bounces=0)
+    traced = TracedMesh(*octahedron(), 0.01)
+    got = relight_surface(surface, wo, traced, Lighting(tables(lights)), samples=16384, bounces=0)
     diffuse, f0 = brdf.split(surface.albedo, surface.metallic)
     assert isinstance(f0, torch.Tensor)
     light = lookup(lights, directions) * (4 * math.pi / len(directions))
@@ -109,11 +109,11 @@ def test_metal_that_light_bounces_off():
     surface, _ = a_sphere(1, None, 1.0)
     up = torch.tensor([[0.0, 0.0, 1.0]])
     surface = replace(surface, position=0 * up, normal=up, albedo=torch.ones(1, 3))
-    stage = Stage(mesh, VisibilityScene(corner, faces), 0.0)
+    traced = TracedMesh(mesh, VisibilityScene(corner, faces), 0.0)
     light = Lighting(tables(WHITE))
 
     def lit(mesh):
-        here = replace(stage, mesh=mesh)
+        here = replace(traced, mesh=mesh)
         return relight_surface(surface, up, here, light, samples=4096, bounces=1)[0]
 
     metal = lit(mesh)
@@ -139,11 +139,13 @@ def test_views_and_pictures_carry_it(scene):
     assert torch.equal(surface.metallic[there], expected[there])
     assert torch.equal(at_rays(surface, there).metallic, surface.metallic[there])
     mesh = extract_mesh(scene)
-    stage = Stage(mesh, VisibilityScene(mesh.vertices, mesh.faces), 0.02)
+    traced = TracedMesh(mesh, VisibilityScene(mesh.vertices, mesh.faces), 0.02)
     light = Lighting(tables(smooth_map()))
     quality = Quality(samples=16, bounces=1)
-    with_metal = render_picture(surface, wo, cameras, 0, stage, light, quality)
-    without = render_picture(replace(surface, metallic=None), wo, cameras, 0, stage, light, quality)
+    with_metal = render_picture(surface, wo, cameras, 0, traced, light, quality)
+    without = render_picture(
+        replace(surface, metallic=None), wo, cameras, 0, traced, light, quality
+    )
     shown = channels(with_metal)["metallic"].flatten()
     torch.testing.assert_close(shown[there], expected[there] * surface.opacity[there])
     assert "metallic" not in channels(without)

@@ -14,7 +14,7 @@ _TASKS = {
     "cutout": ("univoxel.tasks.cutout", "cutout"),
     "train": ("univoxel.tasks.train", "train"),
     "evaluate": ("univoxel.tasks.evaluate", "evaluate"),
-    "relight": ("univoxel.tasks.relight", "images"),
+    "relight": ("univoxel.tasks.relight", "relight_images"),
     "export": ("univoxel.tasks.export", "export"),
 }
 

@@ -12,6 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from univoxel.errors import DataError, FileError, MissingFile
 from univoxel.fields.bricks import BrickDistances, pack_bricks, unpack_bricks
 from univoxel.fields.dense import DenseDistances
 from univoxel.fields.features import HashFeatures, Levels, NodeFeatures
@@ -77,7 +78,7 @@ def save_scene(
             side it lies; SHELL for features and no limit for distances when left out.
 
     Raises:
-        OSError: names the file when it cannot be written; the one before stays.
+        FileError: names the file when it cannot be written; the one before stays.
     """
     tensors = stored(scene, slim, reach)
     meta = {
@@ -97,30 +98,28 @@ def save_scene(
         os.replace(temporary, path)
     except (OSError, SafetensorError) as error:
         temporary.unlink(missing_ok=True)
-        raise OSError(f"{path}: cannot write the checkpoint: {error}") from error
+        raise FileError(f"{path}: cannot write the checkpoint: {error}") from error
     return path
 
 
-def load_checkpoint(run: Path) -> tuple[Scene, dict]:
+def load_checkpoint(run: str | Path) -> tuple[Scene, dict]:
     """The scene of a run, in evaluation mode, and the state it was saved with.
 
     Raises:
-        FileNotFoundError: no checkpoint there.
-        ValueError: one that is cut short, damaged, or of another version.
+        MissingFile: no checkpoint there.
+        DataError: one that is cut short, damaged, or of another version.
     """
     path = Path(run) / FILE
     if not path.is_file():
-        raise FileNotFoundError(
-            f"no checkpoint in {run} (looked for {FILE}); run `univoxel train` first"
-        )
+        raise MissingFile(f"no checkpoint in {run} (looked for {FILE}); run `univoxel train` first")
     try:
         with safe_open(path, "pt") as file:
             meta = json.loads((file.metadata() or {}).get("univoxel", "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError, ValueError) as error:
-        raise ValueError(f"{path}: damaged or cut short: {error}") from error
+        raise DataError(f"{path}: damaged or cut short: {error}") from error
     if meta.get("format") != FORMAT:
-        raise ValueError(
+        raise DataError(
             f"{path}: expected checkpoint format {FORMAT}, got {meta.get('format')}; "
             "it was written by another version of univoxel"
         )
@@ -163,9 +162,9 @@ def load_checkpoint(run: Path) -> tuple[Scene, dict]:
         scene.load_state_dict(tensors)
         return scene.eval(), meta["state"]
     except (RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise ValueError(f"{path}: does not fit its own description: {error}") from error
+        raise DataError(f"{path}: does not fit its own description: {error}") from error
 
 
-def load_scene(run: Path) -> Scene:
+def load_scene(run: str | Path) -> Scene:
     """The scene of a run, see `load_checkpoint`."""
     return load_checkpoint(run)[0]

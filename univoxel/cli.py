@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import io
+import logging
 import os
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import tyro
@@ -15,9 +18,16 @@ from tyro.conf import FlagCreatePairsOff
 
 from univoxel import __version__
 from univoxel.commands import COMMANDS, chart, compare, stress, train
+from univoxel.errors import UserError
 
-# What a command raises for a mistake of its user; all else is a bug and keeps its traceback.
-MISTAKES = (ValueError, OSError, RuntimeError, ImportError, FloatingPointError, MemoryError)
+# What a command may raise for a mistake of its user, see `is_mistake`; all else is a bug and keeps
+# its traceback
+MISTAKES = (UserError, OSError, MemoryError)
+# Of files and disks of the user, whether or not the error names the file
+DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
+PACKAGE = Path(__file__).resolve().parent
+# Options whose names differ from the arguments of the package's functions
+OPTIONS = {"changes": "--set"}
 
 # Turns that a thread waits before it leaves its core to other programs. By default it waits for
 # so long that a training beside one other program took six times as long (docs/speed.md)
@@ -25,13 +35,29 @@ SPINS = "3000"
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0, 2 for a user's mistake, 130 when interrupted.
+    """Run one command; returns the exit code.
+
+    0; 1 where nobody reads the output to its end; 2 for a user's mistake; 130 when interrupted.
 
     The hidden flag --traceback shows where an error came from.
     """
     if "OMP_WAIT_POLICY" not in os.environ:  # read when a command imports torch
         os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
     arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        with spoken():
+            code = _run(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:  # such as `univoxel --help | head`
+        # Python flushes once more at its end: into nothing
+        with contextlib.suppress(OSError, ValueError):  # a stand-in for stdout has no descriptor
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return code
+
+
+def _run(arguments: list[str]) -> int:
+    """`main` with its surroundings prepared."""
     if arguments == ["--version"]:
         print(f"univoxel {__version__}")
         return 0
@@ -58,13 +84,68 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"univoxel {arguments[0]}: interrupted{_kept(call)}", file=sys.stderr)
         return 130
-    except MISTAKES as error:
-        if traceback:
+    except (*MISTAKES, RuntimeError) as error:
+        if traceback or not is_mistake(error):
             raise
         message = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, UserError):
+            message = with_options(message, error.arguments)
+        message = message.removeprefix(f"{arguments[0]}: ")
         print(f"univoxel {arguments[0]}: {message}", file=sys.stderr)
         return 2
     return 0
+
+
+def is_mistake(error: Exception) -> bool:
+    """Whether an exception is a mistake of the user, or something that the machine lacks."""
+    match error:
+        case BrokenPipeError():
+            return False
+        case UserError() | MemoryError():
+            return True
+        case OSError(filename=str() | bytes() | os.PathLike()):  # of the user, not one of ours
+            return PACKAGE not in Path(os.fsdecode(error.filename)).absolute().parents
+        case OSError():
+            return error.errno in DISK
+        case RuntimeError():
+            return "can't allocate memory" in str(error)  # as torch says it
+    return False
+
+
+def with_options(message: str, arguments: Sequence[str]) -> str:
+    """A message of the package in which options of the command line stand for arguments.
+
+    `name=value` becomes `--name value`; otherwise the first mention of the name becomes `--name`.
+    """
+    for name in arguments:
+        option = OPTIONS.get(name, "--" + name.replace("_", "-"))
+        word = rf"(?<![\w-]){name}"
+        if re.search(rf"{word}=", message):
+            message = re.sub(rf"{word}=", f"{option} ", message)
+        else:
+            message = re.sub(rf"{word}(?![\w-])", option, message, count=1)
+    return message
+
+
+class _Plain(logging.Handler):
+    """Prints what the package says, as it is."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(with_options(record.getMessage(), getattr(record, "arguments", ())), flush=True)
+
+
+@contextlib.contextmanager
+def spoken() -> Iterator[None]:
+    """Print what the package logs, from INFO on, while a command runs."""
+    logger, handler = logging.getLogger("univoxel"), _Plain()
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
 
 
 def _deferred(command: Callable[..., None]) -> Callable[..., functools.partial[None]]:

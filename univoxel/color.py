@@ -1,9 +1,11 @@
-"""The sRGB transfer function: linear radiance inside, sRGB in pictures."""
+"""The sRGB transfer function and its slope: linear radiance inside, sRGB in pictures."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+LINEAR_END = 0.0031308  # linear value up to which the curve is a line
 
 
 def linear_to_srgb(linear: Tensor) -> Tensor:
@@ -11,11 +13,24 @@ def linear_to_srgb(linear: Tensor) -> Tensor:
 
     Differentiable where 0 < linear < 1.
     """
-    x = linear.clamp(0.0, 1.0)
+    return _srgb_curve(linear.clamp(0.0, 1.0))
+
+
+def linear_to_srgb_unclipped(linear: Tensor) -> Tensor:
+    """`linear_to_srgb` that goes on above 1: a value that is too bright still has a gradient."""
+    return _srgb_curve(linear.clamp_min(0.0))
+
+
+def srgb_slope(linear: Tensor) -> Tensor:
+    """Derivative of `linear_to_srgb_unclipped` at linear values >= 0."""
+    power = 1.055 / 2.4 * linear.clamp_min(LINEAR_END) ** (1 / 2.4 - 1)
+    return torch.where(linear <= LINEAR_END, 12.92, power)
+
+
+def _srgb_curve(x: Tensor) -> Tensor:
     # The power's slope is infinite at 0; the clamp keeps its unused branch finite in the backward.
-    return torch.where(
-        x <= 0.0031308, 12.92 * x, 1.055 * x.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
-    )
+    power = 1.055 * x.clamp_min(LINEAR_END) ** (1 / 2.4) - 0.055
+    return torch.where(x <= LINEAR_END, 12.92 * x, power)
 
 
 def srgb_to_linear(srgb: Tensor) -> Tensor:

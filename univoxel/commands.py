@@ -9,12 +9,35 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
+import rich
+from rich.text import Text
 from tyro.conf import Positional, UseAppendAction, arg
 
+from univoxel.errors import ExistingFile, UserError
+from univoxel.names import (
+    BOUNCES,
+    ELEVATION,
+    LIGHTS,
+    MAP_ROWS,
+    SAMPLES,
+    TEXTURE_SIZE,
+    Animation,
+    Background,
+    CamerasFrom,
+    CapacityOrAuto,
+    Differing,
+    FieldName,
+    Ground,
+    LightName,
+    MasksFrom,
+    PresetName,
+    PresetOrAuto,
+)
+
 if TYPE_CHECKING:
-    from univoxel.ops import Lamp, Sun
+    from univoxel.ops import PointLight, Sun
 
 Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
 Scenes: TypeAlias = Annotated[
@@ -25,28 +48,105 @@ Changes: TypeAlias = Annotated[
     UseAppendAction[tuple[str, ...]],
     arg(metavar="FIELD=VALUE", help_behavior_hint="(repeatable)"),
 ]
+Suns: TypeAlias = Annotated[
+    UseAppendAction[tuple[tuple[float, ...], ...]],
+    arg(metavar="AZIMUTH ELEVATION IRRADIANCE [ANGLE]"),
+]
+Points: TypeAlias = Annotated[
+    UseAppendAction[tuple[tuple[float, float, float, float], ...]],
+    arg(metavar="X Y Z INTENSITY"),
+]
 LightOf: TypeAlias = Annotated[
     str | None, arg(metavar="VIEW", help_behavior_hint="(default: the mean of all)")
 ]
+
+
+def check_minutes(minutes: float | None) -> None:
+    """Refuse a limit that is not above 0.
+
+    Raises:
+        UserError: it is not.
+    """
+    if minutes is not None and not minutes > 0:
+        raise UserError(f"--minutes must be above 0, got {minutes:g}")
+
+
+def check_downscale(downscale: int | None) -> int:
+    """The side of the squares of pixels that become one; 0 where none is given.
+
+    Raises:
+        UserError: it is below 1.
+    """
+    if downscale is not None and downscale < 1:
+        raise UserError(f"--downscale must be at least 1, got {downscale}")
+    return downscale or 0
+
+
+def sun_light(values: tuple[float, ...]) -> Sun:
+    """A white sun from azimuth and elevation in degrees, irradiance and, perhaps, its angle.
+
+    Raises:
+        UserError: not 3 or 4 numbers, or one out of range.
+    """
+    from univoxel.ops import Sun
+
+    if len(values) not in (3, 4):
+        raise UserError(f"--sun: expected AZIMUTH ELEVATION IRRADIANCE [ANGLE], got {values}")
+    azimuth, elevation = (math.radians(x) for x in values[:2])
+    across = math.cos(elevation)
+    direction = (across * math.cos(azimuth), across * math.sin(azimuth), math.sin(elevation))
+    try:
+        return Sun(direction, (values[2], values[2], values[2]), *values[3:])
+    except ValueError as error:
+        raise UserError(f"--{error}") from None
+
+
+def point_light(values: tuple[float, float, float, float]) -> PointLight:
+    """A white point light from x, y, z and its intensity.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+    from univoxel.ops import PointLight
+
+    x, y, z, intensity = values
+    try:
+        return PointLight((x, y, z), (intensity, intensity, intensity))
+    except ValueError as error:
+        raise UserError(f"--point: {error}") from None
+
+
+def parse_ground(text: str | None) -> Ground:
+    """A height, the word lowest, or nothing.
+
+    Raises:
+        UserError: another text.
+    """
+    if text is None or text == "lowest":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise UserError(f"--ground: expected lowest or a height, got {text!r}") from None
 
 
 def train(
     data: Annotated[Positional[Path], arg(metavar="DATA")],
     /,
     out: Annotated[Path, arg(metavar="RUN")],
-    preset: Literal["auto", "draft", "fast", "full"] = "auto",
-    light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
-    varying: Literal["auto", "none", "exposure", "light"] = "auto",
-    masks: Literal["auto", "given"] = "auto",
-    cameras: Literal["auto", "given", "refined"] = "auto",
+    preset: PresetOrAuto = "auto",
+    light: LightName = "hybrid",
+    varying: Differing = "auto",
+    masks: MasksFrom = "auto",
+    cameras: CamerasFrom = "auto",
     downscale: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
     ] = None,
-    field: Literal["hash", "dense", "sparse"] = "hash",
+    field: FieldName = "hash",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
-    capacity: Literal["auto", "adaptive", "fixed"] = "auto",
+    capacity: CapacityOrAuto = "auto",
     budget_mb: Annotated[
         float | None, arg(metavar="MB", help_behavior_hint="(default: no limit)")
     ] = None,
@@ -93,13 +193,12 @@ def train(
     from univoxel.presets import chosen, with_field
     from univoxel.tasks import train as task
 
-    _check_minutes(minutes)
+    check_minutes(minutes)
     if not resume and (out / "scene.safetensors").exists():
-        raise FileExistsError(f"{out} holds a run already: add --resume, or choose another --out")
-    if downscale is not None and downscale < 1:
-        raise ValueError(f"--downscale must be at least 1, got {downscale}")
+        raise ExistingFile(f"{out} holds a run already: add --resume, or choose another --out")
+    downscale = check_downscale(downscale)
     config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
-    config = dataclasses.replace(config, masks=masks, cameras=cameras, downscale=downscale or 0)
+    config = dataclasses.replace(config, masks=masks, cameras=cameras, downscale=downscale)
     config = with_field(config, field)
     if budget_mb is not None and capacity == "auto":
         capacity = "adaptive"
@@ -134,9 +233,7 @@ def cutout(
     """
     from univoxel.tasks import cutout as task
 
-    if downscale is not None and downscale < 1:
-        raise ValueError(f"--downscale must be at least 1, got {downscale}")
-    print(task.cutout(data, out, box=box, downscale=downscale or 0))
+    print(task.cutout(data, out, box=box, downscale=check_downscale(downscale)))
 
 
 def evaluate(
@@ -151,8 +248,8 @@ def evaluate(
     json: Annotated[
         Path | None, arg(metavar="FILE", help_behavior_hint="(default: only printed)")
     ] = None,
-    samples: int = 64,
-    bounces: int = 2,
+    samples: int = SAMPLES,
+    bounces: int = BOUNCES,
     light_of: LightOf = None,
 ) -> None:
     """Measure a run on the test views and print the table.
@@ -170,39 +267,34 @@ def evaluate(
     from univoxel.tasks import evaluate as task
 
     options = {"samples": samples, "bounces": bounces, "light_of": light_of}
-    task.evaluate(run, data=data, save=save, json=json, **options)
+    measures = task.evaluate(run, data=data, save=save, json=json, **options)
+    rich.print(task.table(measures))
 
 
 def relight(
     run: Run,
     /,
     envmap: Annotated[tuple[Path, ...], arg(metavar="MAP [MAP ...]")] = (),
-    sun: Annotated[
-        UseAppendAction[tuple[tuple[float, ...], ...]],
-        arg(metavar="AZIMUTH ELEVATION IRRADIANCE [ANGLE]"),
-    ] = (),
-    point: Annotated[
-        UseAppendAction[tuple[tuple[float, float, float, float], ...]],
-        arg(metavar="X Y Z INTENSITY"),
-    ] = (),
+    sun: Suns = (),
+    point: Points = (),
     out: Annotated[
         Path | None, arg(metavar="DIR", help_behavior_hint="(default: in RUN/relight)")
     ] = None,
     cameras: Annotated[str, arg(metavar="test|orbit|FILE")] = "test",
     orbit: Annotated[int | None, arg(metavar="FRAMES")] = None,
-    elevation: Annotated[float, arg(metavar="DEGREES")] = 25.0,
+    elevation: Annotated[float, arg(metavar="DEGREES")] = ELEVATION,
     turn: Annotated[int | None, arg(metavar="FRAMES")] = None,
     resolution: Annotated[
         int | None, arg(metavar="PIXELS", help_behavior_hint="(default: the data's; orbits: 512)")
     ] = None,
     rotate: Annotated[float, arg(metavar="DEGREES")] = 0.0,
     exposure: Annotated[float, arg(metavar="FACTOR")] = 1.0,
-    samples: int = 64,
+    samples: int = SAMPLES,
     noise: Annotated[float | None, arg(metavar="SHARE")] = None,
-    bounces: int = 2,
-    background: Literal["transparent", "map", "black"] = "transparent",
+    bounces: int = BOUNCES,
+    background: Background = "transparent",
     ground: Annotated[str | None, arg(metavar="lowest|HEIGHT")] = None,
-    animation: tuple[Literal["gif", "mp4"], ...] = (),
+    animation: tuple[Animation, ...] = (),
     resume: bool = False,
 ) -> None:
     """Render a run under other light: environment maps, suns, points.
@@ -231,19 +323,19 @@ def relight(
     """
     from univoxel.tasks import relight as task
 
-    if orbit is not None:
-        if cameras != "test":
-            raise ValueError(f"expected --orbit or --cameras, got {orbit} and {cameras}")
-        cameras = f"orbit {orbit}"
+    if orbit is not None and cameras != "test":
+        raise UserError(f"expected --orbit or --cameras, got {orbit} and {cameras}")
     if out is None:
         out = run / "relight" / envmap[0].stem if len(envmap) == 1 else run / "relight"
-    task.relight(
+    task.relight_to_files(
         run,
         envmap[0] if len(envmap) == 1 else envmap,
         out,
+        animation=animation,
+        resume=resume,
         suns=[sun_light(values) for values in sun],
-        lamps=[point_light(values) for values in point],
-        cameras=cameras,
+        point_lights=[point_light(values) for values in point],
+        cameras=cameras if orbit is None else f"orbit {orbit}",
         elevation=elevation,
         turn=turn,
         resolution=resolution,
@@ -254,8 +346,6 @@ def relight(
         bounces=bounces,
         background=background,
         ground=parse_ground(ground),
-        animation=animation,
-        resume=resume,
     )
     print(out)
 
@@ -268,7 +358,7 @@ def export(
         int | None,
         arg(metavar="N", help_behavior_hint="(default: 20000 with textures, all without)"),
     ] = None,
-    texture_size: Annotated[int, arg(metavar="TEXELS")] = 1024,
+    texture_size: Annotated[int, arg(metavar="TEXELS")] = TEXTURE_SIZE,
     watertight: bool = False,
 ) -> None:
     """Write the surface as a mesh with its materials, for any renderer.
@@ -290,7 +380,7 @@ def envmap(
     run: Run,
     /,
     out: Annotated[Path, arg(metavar="FILE.exr")],
-    height: Annotated[int, arg(metavar="ROWS")] = 128,
+    height: Annotated[int, arg(metavar="ROWS")] = MAP_ROWS,
     light_of: LightOf = None,
 ) -> None:
     """Write the light that the photographs were taken in, as an environment map.
@@ -357,21 +447,23 @@ def info(
     """
     from univoxel.tasks import info as task
 
-    task.info(run, json=json, picture=picture)
+    found = task.info(run, json=json, picture=picture)
+    for table in task.tables(found):
+        rich.print(table)
+    for choice in found["chosen"]:
+        rich.print(Text(choice["said"]))
 
 
 def compare(
     scenes: Scenes,
     /,
     out: Annotated[Path, arg(metavar="DIR")],
-    preset: Literal["auto", "draft", "fast", "full"] = "auto",
-    light: Annotated[tuple[str, ...], arg(metavar="LIGHT [LIGHT ...]")] = (
-        *("hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"),
-    ),
+    preset: PresetOrAuto = "auto",
+    light: Annotated[tuple[str, ...], arg(metavar="LIGHT [LIGHT ...]")] = LIGHTS,
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
-    samples: int = 64,
+    samples: int = SAMPLES,
     set: Changes = (),
 ) -> None:
     """Train scenes with every model of light and put their measures side by side.
@@ -393,7 +485,7 @@ def compare(
     """
     from univoxel.experiments import compare as experiment
 
-    _check_minutes(minutes)
+    check_minutes(minutes)
     print(experiment.compare(scenes, out, preset, light, minutes, set, samples))
 
 
@@ -401,13 +493,13 @@ def chart(
     scenes: Scenes,
     /,
     out: Annotated[Path, arg(metavar="DIR")],
-    preset: Literal["draft", "fast", "full"] = "fast",
-    light: Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"] = "hybrid",
+    preset: PresetName = "fast",
+    light: LightName = "hybrid",
     quick: bool = False,
     only: Annotated[
         tuple[str, ...], arg(metavar="SETTING [SETTING ...]", help_behavior_hint="(default: all)")
     ] = (),
-    samples: int = 64,
+    samples: int = SAMPLES,
     set: Changes = (),
 ) -> None:
     """Draw quality against training time: presets, and single knobs around one of them.
@@ -484,11 +576,6 @@ def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> No
     print(task.demo(out))
 
 
-def _check_minutes(minutes: float | None) -> None:
-    if minutes is not None and not minutes > 0:
-        raise ValueError(f"--minutes must be above 0, got {minutes:g}")
-
-
 COMMANDS: dict[str, Callable[..., None]] = {
     "cutout": cutout,
     "train": train,
@@ -503,41 +590,3 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "stress": stress,
     "demo": demo,
 }
-
-
-def sun_light(values: tuple[float, ...]) -> Sun:
-    """A white sun from azimuth and elevation in degrees, irradiance and, perhaps, its angle.
-
-    Raises:
-        ValueError: not 3 or 4 numbers, or one out of range.
-    """
-    from univoxel.ops import Sun
-
-    if len(values) not in (3, 4):
-        raise ValueError(f"--sun: expected AZIMUTH ELEVATION IRRADIANCE [ANGLE], got {values}")
-    azimuth, elevation = (math.radians(x) for x in values[:2])
-    across = math.cos(elevation)
-    direction = (across * math.cos(azimuth), across * math.sin(azimuth), math.sin(elevation))
-    return Sun(direction, (values[2], values[2], values[2]), *values[3:])
-
-
-def point_light(values: tuple[float, float, float, float]) -> Lamp:
-    """A white lamp from x, y, z and its intensity."""
-    from univoxel.ops import Lamp
-
-    x, y, z, intensity = values
-    return Lamp((x, y, z), (intensity, intensity, intensity))
-
-
-def parse_ground(text: str | None) -> float | Literal["lowest"] | None:
-    """A height, the word lowest, or nothing.
-
-    Raises:
-        ValueError: another text.
-    """
-    if text is None or text == "lowest":
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"--ground: expected lowest or a height, got {text!r}") from None

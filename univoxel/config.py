@@ -8,8 +8,10 @@ import math
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
+from univoxel.compression.config import CompressionConfig
+from univoxel.errors import ConfigError, UserError
 from univoxel.fields.features import PER_LEVEL
 from univoxel.files import replacing
 from univoxel.joint.config import JointConfig
@@ -17,6 +19,12 @@ from univoxel.names import CamerasFrom, Capacity, MasksFrom
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.validation import check_fields
+
+# Arguments that a configuration is made of
+CHOICES = (
+    *("preset", "minutes", "light", "varying", "masks", "cameras", "downscale", "capacity"),
+    *("budget_mb", "changes"),
+)
 
 
 @dataclass(frozen=True)
@@ -46,10 +54,11 @@ class TrainConfig:
     hollows: float = 0.0
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
-    capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see tasks/capacity.py
+    capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see compression/plan.py
     budget_mb: float | None = None  # 1e6 bytes that the model's file may have, > 0; adaptive only
     scene: SceneConfig = field(default_factory=SceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
+    compression: CompressionConfig = field(default_factory=CompressionConfig)
 
     def __post_init__(self):
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")
@@ -61,23 +70,26 @@ class TrainConfig:
         )
         kinds = [s.field for s in self.stages if isinstance(s, StageConfig)]
         if "hash" in kinds and set(kinds) != {"hash"}:
-            raise ValueError(f"TrainConfig: hash is for all stages or none, got {', '.join(kinds)}")
+            raise ConfigError(
+                f"TrainConfig: hash is for all stages or none, got {', '.join(kinds)}"
+            )
         if kinds != sorted(kinds):
-            raise ValueError(
+            raise ConfigError(
                 f"TrainConfig: no dense stage can follow a sparse one, got {', '.join(kinds)}"
             )
         if "hash" in kinds and self.scene.channels % PER_LEVEL:
-            raise ValueError(
+            raise ConfigError(
                 f"TrainConfig: the hash field has {PER_LEVEL} channels a level: scene.channels "
                 f"must be a multiple of that, got {self.scene.channels}"
             )
         if self.capacity == "adaptive" and "sparse" in kinds:
-            raise ValueError(
-                "TrainConfig: adaptive capacity, and so --budget-mb, is for dense and hash fields: "
-                "leave it out, or the sparse field"
+            raise ConfigError(
+                "TrainConfig: adaptive capacity, and so budget_mb, is for dense and hash fields: "
+                "leave it out, or the sparse field",
+                "budget_mb",
             )
         if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
-            raise ValueError(
+            raise ConfigError(
                 "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
             )
         check_fields(self, "above 0", lambda x: x > 0, "minutes")
@@ -90,7 +102,7 @@ class TrainConfig:
         )
         check_fields(self, "above 0 or None", lambda x: x is None or 0 < x < math.inf, "budget_mb")
         if self.budget_mb is not None and self.capacity == "fixed":
-            raise ValueError(
+            raise ConfigError(
                 f"TrainConfig: budget_mb {self.budget_mb:g} needs adaptive capacity, got fixed"
             )
 
@@ -110,24 +122,56 @@ def check_same(cfg: TrainConfig) -> None:
     """Refuse to go on with the run in cfg.out under stages or a model that it did not begin with.
 
     Raises:
-        ValueError: they differ, or config.json cannot be read.
+        UserError: they differ, or config.json cannot be read.
     """
     path = cfg.out / "config.json"
     try:
         before = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: cannot be read, so the run cannot go on: {error}") from None
-    now = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
+        raise UserError(f"{path}: cannot be read, so the run cannot go on: {error}") from None
+    if not isinstance(before, dict):
+        raise UserError(f"{path}: expected an object with the configuration, got {before!r:.80}")
+    began = _completed(before, cfg)
     # of configurations from before there were any
     since = {"downscale": 0, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
     since |= {"masks": "given", "cameras": "given", "exposures": False}
+    began |= {name: value for name, value in since.items() if name not in before}
+    now = _as_json(cfg)
     for name in ("stages", "scene", *since):
-        if not isinstance(before, dict) or before.get(name, since.get(name)) != now[name]:
-            raise ValueError(
-                f"{path}: the run began with other {name}: resume with the same --preset, "
-                "--minutes, --light, --varying, --masks, --cameras, --downscale, --capacity, "
-                "--budget-mb and --set as then"
+        if began.get(name) != now[name]:
+            raise UserError(
+                f"{path}: the run began with other {name}: resume with the same "
+                f"{', '.join(CHOICES[:-1])} and {CHOICES[-1]} as then",
+                *CHOICES,
             )
+
+
+def _completed(before: Any, now: Any) -> Any:
+    """A configuration from JSON with the defaults of fields that were added since.
+
+    Args:
+        now: a configuration of the same classes.
+    """
+    if isinstance(now, tuple) and isinstance(before, list) and len(before) == len(now):
+        return [_completed(b, n) for b, n in zip(before, now, strict=True)]
+    if not dataclasses.is_dataclass(now) or not isinstance(before, dict):
+        return before
+    result = dict(before)
+    for known in dataclasses.fields(now):
+        if known.name in before:
+            result[known.name] = _completed(before[known.name], getattr(now, known.name))
+        elif known.default is not dataclasses.MISSING:
+            result[known.name] = _as_json(known.default)
+        elif known.default_factory is not dataclasses.MISSING:
+            result[known.name] = _as_json(known.default_factory())
+    return result
+
+
+def _as_json(value: Any) -> Any:
+    """A configuration, or a value of one, as config.json holds it."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = dataclasses.asdict(value)
+    return json.loads(json.dumps(value, default=str))
 
 
 def __getattr__(name: str):

@@ -1,4 +1,4 @@
-"""Mistakes of a user, as exceptions."""
+"""Mistakes of a user, as exceptions with one root."""
 
 from __future__ import annotations
 
@@ -6,13 +6,29 @@ from __future__ import annotations
 class UserError(ValueError):
     """A mistake of the user: the message says what was expected and what came.
 
-    The command line shows it as one line. Every other exception is a fault of the program and
-    keeps its traceback.
+    The command line shows it as one line. Every other exception, but for files of the user that
+    cannot be read or written, is a fault of the program and keeps its traceback.
+
+    Args:
+        message: names Python arguments; a value to choose stands as `argument=value`.
+        arguments: names in the message that the command line replaces by its options.
     """
+
+    def __init__(self, message: str = "", *arguments: str):
+        super().__init__(message)
+        self.arguments = arguments
+
+
+class ConfigError(UserError):
+    """A configuration that contradicts itself, or a field of one that is out of range."""
 
 
 class DataError(UserError):
     """Input that cannot be used: the message names the file, what was expected and what came."""
+
+
+class NoSurface(UserError):
+    """A scene without a surface, or none of it in any photograph."""
 
 
 class NothingFound(UserError):
@@ -20,5 +36,30 @@ class NothingFound(UserError):
 
     def __init__(self):
         super().__init__(
-            "no object was found where the cameras look: say where it is with --box, or make masks"
+            "no object was found where the cameras look: say where it is with box, or make masks",
+            "box",
         )
+
+
+class FileError(UserError, OSError):
+    """A file of the user that cannot be written."""
+
+
+class MissingFile(FileError, FileNotFoundError):
+    """A file that is expected and not there."""
+
+
+class ExistingFile(FileError, FileExistsError):
+    """A file or folder in the way, which would be overwritten."""
+
+
+class MissingExtra(UserError, ImportError):
+    """An optional package that is not installed: the message says how to install it."""
+
+
+class MissingNative(UserError, RuntimeError):
+    """A part of the compiled extension that was not built: the message says how to build it."""
+
+
+class ProcessFailed(UserError, RuntimeError):
+    """Another process, a training or a renderer, that did not end well or is in the way."""

@@ -6,14 +6,6 @@ import torch
 from torch import Tensor
 
 
-def encode(linear: Tensor) -> Tensor:
-    """sRGB curve for losses: as `linear_to_srgb`, but going on above 1, so that a value that is too
-    bright still has a gradient."""
-    x = linear.clamp_min(0.0)
-    curve = 1.055 * x.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
-    return torch.where(x <= 0.0031308, 12.92 * x, curve)
-
-
 def photometric(
     encoded: Tensor, target: Tensor, weight: Tensor | None = None, clipped: float = 0.99
 ) -> Tensor:

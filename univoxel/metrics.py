@@ -14,6 +14,7 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from univoxel.color import linear_to_srgb
+from univoxel.errors import UserError
 from univoxel.records import Mesh
 
 BEST_PSNR = 100.0  # dB, where pictures are equal: keeps means finite
@@ -51,7 +52,7 @@ def ssim(picture: Tensor, truth: Tensor) -> float:
     """
     _same_size("ssim", picture, truth)
     if min(picture.shape[:2]) < 11:
-        raise ValueError(f"ssim: expected at least 11x11 pixels, got {list(picture.shape[:2])}")
+        raise UserError(f"ssim: expected at least 11x11 pixels, got {list(picture.shape[:2])}")
     similarity = structural_similarity(
         picture.double().numpy(),
         truth.double().numpy(),

@@ -1,4 +1,4 @@
-"""Words that the configuration and the command line share. Imports no torch."""
+"""Words and defaults that configuration, tasks and command line share. Imports no torch."""
 
 from __future__ import annotations
 
@@ -7,10 +7,23 @@ from typing import Literal, TypeAlias, get_args
 FieldName: TypeAlias = Literal["dense", "sparse", "hash"]
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
 PresetName: TypeAlias = Literal["draft", "fast", "full"]
+PresetOrAuto: TypeAlias = Literal["auto", "draft", "fast", "full"]
 Capacity: TypeAlias = Literal["fixed", "adaptive"]
+CapacityOrAuto: TypeAlias = Literal["auto", "adaptive", "fixed"]
 CamerasFrom: TypeAlias = Literal["auto", "given", "refined"]
 MasksFrom: TypeAlias = Literal["auto", "given"]
 Varying: TypeAlias = Literal["none", "exposure", "light"]
 Differing: TypeAlias = Literal["auto", "none", "exposure", "light"]
 FIELDS: tuple[FieldName, ...] = get_args(FieldName)
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
+
+Background: TypeAlias = Literal["transparent", "map", "black"]
+Ground: TypeAlias = float | Literal["lowest"] | None  # height of a floor, or at the lowest point
+Animation: TypeAlias = Literal["gif", "mp4"]
+ANIMATIONS: tuple[Animation, ...] = get_args(Animation)
+
+SAMPLES = 64  # of the light, per pixel of relit pictures
+BOUNCES = 2  # reflections between parts of the object in relit pictures
+ELEVATION = 25.0  # degrees, of an orbit's cameras above the object's middle
+MAP_ROWS = 128  # of a written environment map
+TEXTURE_SIZE = 1024  # texels along a side

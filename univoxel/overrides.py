@@ -1,4 +1,4 @@
-"""Fields of a configuration by their path and a value in text, as --set has them."""
+"""Fields of a configuration by their path and a value in text, such as stages.1.voxels=3."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from univoxel.errors import ConfigError, UserError
+
 
 def changed(config: Any, changes: Iterable[str]) -> Any:
     """A frozen config with fields replaced: changes are "field.field=value".
 
     Raises:
-        ValueError: no such field, or a value of another type than the field has.
+        ConfigError: no such field, or a value of another type than the field has.
     """
     for change in changes:
         path, equals, text = change.partition("=")
         if not equals:
-            raise ValueError(f"--set {change}: expected FIELD=VALUE")
+            raise ConfigError(f"changes={change}: expected FIELD=VALUE", "changes")
         try:
             config = _replaced(config, path.split("."), text)
-        except ValueError as error:
-            raise ValueError(f"--set {change}: {error}") from None
+        except UserError as error:
+            raise ConfigError(f"changes={change}: {error}", "changes") from None
     return config
 
 
@@ -33,7 +35,7 @@ def _replaced(node: Any, path: list[str], text: str) -> Any:
     name, *rest = path
     known = [str(i) for i in range(len(node))] if isinstance(node, tuple) else _fields(node)
     if name not in known:
-        raise ValueError(f"no field {name!r}, there are: {', '.join(known) or 'none'}")
+        raise ConfigError(f"no field {name!r}, there are: {', '.join(known) or 'none'}")
     if isinstance(node, tuple):
         i = int(name)
         return (*node[:i], _replaced(node[i], rest, text), *node[i + 1 :])
@@ -55,5 +57,5 @@ def _value(old, text: str):
     if isinstance(old, float) and type(new) is int:
         new = float(new)
     if type(new) is not type(old):
-        raise ValueError(f"expected a {type(old).__name__} such as {old!r}, got {text!r}")
+        raise ConfigError(f"expected a {type(old).__name__} such as {old!r}, got {text!r}")
     return new

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from univoxel.camera import Cameras, project
+from univoxel.errors import UserError
 
 
 class PoseSteps(nn.Module):
@@ -48,10 +49,10 @@ class PoseSteps(nn.Module):
         """The cameras where they are believed to be; differentiable in training.
 
         Raises:
-            ValueError: another number of cameras.
+            UserError: another number of cameras.
         """
         if len(cameras) != len(self):
-            raise ValueError(
+            raise UserError(
                 f"the run was trained on {len(self)} photographs with refined cameras, got "
                 f"{len(cameras)}"
             )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from univoxel.config import TrainConfig
+from univoxel.errors import UserError
 from univoxel.joint.config import JointConfig
 from univoxel.lights import (
     EnvmapConfig,
@@ -56,10 +57,10 @@ def preset(
         light, varying: see `budget`.
 
     Raises:
-        ValueError: an unknown name, or varying light with a map from the beginning.
+        UserError: an unknown name, or varying light with a map from the beginning.
     """
     if name not in PRESETS:
-        raise ValueError(f"preset must be draft, fast or full, got {name!r}")
+        raise UserError(f"preset must be draft, fast or full, got {name!r}", "preset")
     return _configuration(PRESETS[name], data, out, light, varying)
 
 
@@ -73,16 +74,16 @@ def budget(
         light: "sg", local lobes as published; "hybrid", local lobes while geometry forms, then one
             environment map with traced visibility for the materials, then lobes that follow them;
             "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
-            traced visibility from the beginning. docs/lights.md tells them apart.
+            traced visibility from the beginning. docs/guide/lights.md tells them apart.
         varying: what differs from photograph to photograph: "none"; "exposure", a gain per channel;
             "light", the light itself too; "auto", exposure where they are seen to differ.
 
     Raises:
-        ValueError: minutes out of range, no such light, or varying light with a map from the
+        UserError: minutes out of range, no such light, or varying light with a map from the
             beginning.
     """
     if not 0 < minutes < math.inf:
-        raise ValueError(f"minutes must be above 0, got {minutes:g}")
+        raise UserError(f"minutes must be above 0, got {minutes:g}", "minutes")
     return _configuration(work_in(minutes), data, out, light, varying)
 
 
@@ -189,7 +190,7 @@ def _configuration(
             stages, capacity = (coarse, fine), "fixed"
         case _:
             names = ", ".join(("hybrid", *alone))
-            raise ValueError(f"light must be one of {names}, got {light!r}")
+            raise UserError(f"light must be one of {names}, got {light!r}", "light")
     return TrainConfig(
         data,
         out,

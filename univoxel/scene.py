@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from univoxel.data import Photos
+from univoxel.errors import ConfigError, UserError
 from univoxel.fields.field import Field
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.lights import (
@@ -48,24 +49,24 @@ class SceneConfig:
     def __post_init__(self):
         for name in ("channels", "material_channels", "hidden", "codes"):
             if getattr(self, name) < 1:
-                raise ValueError(
+                raise ConfigError(
                     f"SceneConfig: {name} must be at least 1, got {getattr(self, name)}"
                 )
         if not 0 <= self.mirror_levels <= 8:
-            raise ValueError(
+            raise ConfigError(
                 f"SceneConfig: mirror_levels must be in [0, 8], got {self.mirror_levels}"
             )
         if self.material_channels > self.channels:
-            raise ValueError(
+            raise ConfigError(
                 f"SceneConfig: material_channels must be at most channels ({self.channels}), "
                 f"got {self.material_channels}"
             )
         if self.varying not in ("none", "exposure", "light"):
-            raise ValueError(
+            raise ConfigError(
                 f"SceneConfig: varying must be none, exposure or light, got {self.varying!r}"
             )
         if self.varying == "light" and not isinstance(self.light, LocalLightConfig):
-            raise ValueError(
+            raise ConfigError(
                 "SceneConfig: varying light needs hybrid or a local light, sg, sh or mlp, got "
                 f"{self.light.kind}; varying exposure goes with every light"
             )
@@ -136,9 +137,11 @@ class Scene(nn.Module):
         if self.views is not None:
             self.views.choose(view)
         elif view is not None:
-            raise ValueError(
-                f"--light-of: all views of this run have one light, got {view!r}; it was trained "
-                "without --varying"
+            raise UserError(
+                f"light_of: all views of this run have one light, got {view!r}; it was trained "
+                "without varying",
+                "light_of",
+                "varying",
             )
 
     def occluder(self) -> VisibilityScene:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from univoxel.errors import ConfigError
+
 
 def check_fields(config: object, wanted: str, holds: Callable[[Any], bool], *names: str) -> None:
     """Refuse a configuration whose named fields are not as wanted.
@@ -15,7 +17,7 @@ def check_fields(config: object, wanted: str, holds: Callable[[Any], bool], *nam
         holds: whether a value is in it; a TypeError counts as no.
 
     Raises:
-        ValueError: names class and field, says what is wanted and what came.
+        ConfigError: names class and field, says what is wanted and what came.
     """
     for name in names:
         value = getattr(config, name)
@@ -24,4 +26,4 @@ def check_fields(config: object, wanted: str, holds: Callable[[Any], bool], *nam
         except TypeError:
             held = False
         if not held:
-            raise ValueError(f"{type(config).__name__}: {name} must be {wanted}, got {value!r}")
+            raise ConfigError(f"{type(config).__name__}: {name} must be {wanted}, got {value!r}")

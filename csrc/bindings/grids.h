@@ -9,16 +9,16 @@
 namespace univoxel {
 
 using Size3 = std::array<int64_t, 3>;
+using Vec3 = std::array<double, 3>;
 
 /// Size [X, Y, Z], origin and voxel size as Python passes them; a size of 0 holds nothing.
-inline Lattice lattice_of(const Size3& size, const std::array<double, 3>& origin,
-                          double voxel_size) {
+inline Lattice lattice_of(const Size3& size, const Vec3& origin, double voxel_size) {
     require(size[0] > 0 && size[1] > 0 && size[2] > 0, "the grid has no nodes");
     return {{size[0], size[1], size[2]}, {origin[0], origin[1], origin[2]}, 1 / voxel_size};
 }
 
 /// Bricks of a table [A, B, C] that covers a grid of this size.
-inline BrickNodes brick_nodes_of(const array<int32_t>& table, const Size3& size) {
+inline BrickNodes brick_nodes_of(In<int32_t> table, const Size3& size) {
     for (int a = 0; a < 3; ++a) {
         require(table.ndim() == 3 && table.shape(a) == (size[a] + kBrick - 1) / kBrick,
                 "the table of bricks does not belong to this size");

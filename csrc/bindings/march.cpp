@@ -1,45 +1,34 @@
 #include "march.h"
 
-#include <pybind11/stl.h>
-
-#include <array>
-#include <optional>
-
 #include "bindings/grids.h"
 
 namespace univoxel {
 namespace {
 
 template <class T>
+array<T> array_of(const std::vector<T>& v) {
+    return array<T>(v.size(), v.data());
+}
+
+template <class T>
 void bind_march(py::module_& m) {
-    m.def(
-        "brick_minimum",
-        [](const array<T>& sdf, array<T>& out, int threads) {
-            const int64_t size[3] = {sdf.shape(0), sdf.shape(1), sdf.shape(2)};
-            T* o = out.mutable_data();
-            py::gil_scoped_release nogil;
-            brick_minimum(sdf.data(), size, o, threads);
-        },
-        py::arg("sdf").noconvert(), py::arg("out").noconvert(), py::arg("threads"));
-    m.def(
-        "sparse_brick_minimum",
-        [](const array<T>& sdf, const array<int32_t>& table, const array<int32_t>& place,
-           const Size3& size, array<T>& out, int threads) {
-            const BrickNodes nodes = brick_nodes_of(table, size);
+    def(m, "brick_minimum", "sdf out threads", [](In<T> sdf, Out<T> out, int threads) {
+        const int64_t size[3] = {sdf.shape(0), sdf.shape(1), sdf.shape(2)};
+        brick_minimum(sdf.data(), size, out.mutable_data(), threads);
+    });
+    def(m, "sparse_brick_minimum", "sdf table place size out threads",
+        [](In<T> sdf, In<int32_t> table, In<int32_t> place, const Size3& size, Out<T> out,
+           int threads) {
             require(out.size() == place.size(), "brick_minimum: out of another size");
-            T* o = out.mutable_data();
-            py::gil_scoped_release nogil;
-            sparse_brick_minimum(sdf.data(), size.data(), nodes, place.data(), place.size(), o,
-                                 threads);
-        },
-        py::arg("sdf").noconvert(), py::arg("table").noconvert(), py::arg("place").noconvert(),
-        py::arg("size"), py::arg("out").noconvert(), py::arg("threads"));
-    m.def(
-        "march",
-        [](const array<T>& sdf, const array<T>& brick_min, const array<T>& origin,
-           const array<T>& direction, const array<T>& jitter, std::array<double, 3> grid_origin,
-           double voxel_size, double step, double inv_s, double min_weight, double early_stop,
-           std::optional<array<int32_t>> table, const Size3& size, int threads) {
+            sparse_brick_minimum(sdf.data(), size.data(), brick_nodes_of(table, size), place.data(),
+                                 place.size(), out.mutable_data(), threads);
+        });
+    def(m, "march",
+        "sdf brick_min origin direction jitter grid_origin voxel_size step inv_s min_weight "
+        "early_stop table size threads",
+        [](In<T> sdf, In<T> brick_min, In<T> origin, In<T> direction, In<T> jitter,
+           const Vec3& grid_origin, double voxel_size, double step, double inv_s, double min_weight,
+           double early_stop, OptionalIn<int32_t> table, const Size3& size, int threads) {
             March<T> in{sdf.data(),    brick_min.data(),
                         origin.data(), direction.data(),
                         jitter.data(), {size[0], size[1], size[2]},
@@ -47,31 +36,19 @@ void bind_march(py::module_& m) {
                         T(voxel_size), T(step),
                         T(inv_s),      T(min_weight),
                         T(early_stop)};
+            bool fits = true;
             if (table) {
                 const BrickNodes nodes = brick_nodes_of(*table, size);
                 in.table = nodes.table, in.bricks_y = nodes.bricks_y, in.bricks_z = nodes.bricks_z;
-                require(brick_min.size() * kBrickNodes == sdf.size(),
-                        "march: brick_min does not belong to this sdf");
+                fits = brick_min.size() * kBrickNodes == sdf.size();
             } else {
-                for (int a = 0; a < 3; ++a)
-                    require(brick_min.shape(a) == bricks_along(size[a]),
-                            "march: brick_min does not belong to this sdf");
+                for (int a = 0; a < 3; ++a) fits &= brick_min.shape(a) == bricks_along(size[a]);
             }
-            Marched<T> out;
-            {
-                py::gil_scoped_release nogil;
-                out = march(in, threads);
-            }
-            const auto owned = [](const auto& v) {
-                using V = typename std::decay_t<decltype(v)>::value_type;
-                return array<V>(v.size(), v.data());
-            };
-            return py::make_tuple(owned(out.t), owned(out.connected), owned(out.offsets));
-        },
-        py::arg("sdf").noconvert(), py::arg("brick_min").noconvert(), py::arg("origin").noconvert(),
-        py::arg("direction").noconvert(), py::arg("jitter").noconvert(), py::arg("grid_origin"),
-        py::arg("voxel_size"), py::arg("step"), py::arg("inv_s"), py::arg("min_weight"),
-        py::arg("early_stop"), py::arg("table").noconvert(), py::arg("size"), py::arg("threads"));
+            require(fits, "march: brick_min does not belong to this sdf");
+            const PackedSamples<T> out = march(in, threads);
+            py::gil_scoped_acquire gil;
+            return py::make_tuple(array_of(out.t), array_of(out.connected), array_of(out.offsets));
+        });
 }
 
 }  // namespace

@@ -6,78 +6,43 @@ namespace univoxel {
 namespace {
 
 template <class T>
-ShadeSG<T> shade_sg_of(const array<T>& axis, const array<T>& sharpness, const array<T>& amplitude,
-                       const array<T>& normal, const array<T>& wo, const array<T>& albedo,
-                       const array<T>& roughness, const array<T>& directions,
-                       const array<T>& rotation, const array<T>& f0) {
+ShadeSG<T> shade_sg_of(In<T> axis, In<T> sharpness, In<T> amplitude, In<T> normal, In<T> wo,
+                       In<T> albedo, In<T> roughness, In<T> directions, In<T> rotation, In<T> f0) {
     const int64_t n = rotation.size(), k = n ? sharpness.size() / n : 0;
     require(axis.size() == 3 * n * k && sharpness.size() == n * k &&
                 amplitude.size() == 3 * n * k && normal.size() == 3 * n && wo.size() == 3 * n &&
                 albedo.size() == 3 * n && roughness.size() == n && directions.size() % 3 == 0 &&
                 (f0.size() == 1 || f0.size() == 3 * n),
             "shade_sg: sizes do not fit");
-    return {axis.data(),
-            sharpness.data(),
-            amplitude.data(),
-            normal.data(),
-            wo.data(),
-            albedo.data(),
-            roughness.data(),
-            directions.data(),
-            rotation.data(),
-            f0.data(),
-            n,
-            k,
-            directions.size() / 3,
-            f0.size() != 1};
+    return make<ShadeSG<T>>(axis, sharpness, amplitude, normal, wo, albedo, roughness, directions,
+                            rotation, f0, n, k, directions.size() / 3, f0.size() != 1);
 }
 
 template <class T>
 void bind_sg(py::module_& m) {
-    m.def(
-        "shade_sg_forward",
-        [](const array<T>& axis, const array<T>& sharpness, const array<T>& amplitude,
-           const array<T>& normal, const array<T>& wo, const array<T>& albedo,
-           const array<T>& roughness, const array<T>& directions, const array<T>& rotation,
-           const array<T>& f0, array<T>& rgb, int threads) {
+    def(m, "shade_sg_forward",
+        "axis sharpness amplitude normal wo albedo roughness directions rotation f0 rgb threads",
+        [](In<T> axis, In<T> sharpness, In<T> amplitude, In<T> normal, In<T> wo, In<T> albedo,
+           In<T> roughness, In<T> directions, In<T> rotation, In<T> f0, Out<T> rgb, int threads) {
             const auto in = shade_sg_of(axis, sharpness, amplitude, normal, wo, albedo, roughness,
                                         directions, rotation, f0);
-            T* out = rgb.mutable_data();
-            py::gil_scoped_release nogil;
-            shade_sg_forward(in, out, threads);
-        },
-        py::arg("axis").noconvert(), py::arg("sharpness").noconvert(),
-        py::arg("amplitude").noconvert(), py::arg("normal").noconvert(), py::arg("wo").noconvert(),
-        py::arg("albedo").noconvert(), py::arg("roughness").noconvert(),
-        py::arg("directions").noconvert(), py::arg("rotation").noconvert(),
-        py::arg("f0").noconvert(), py::arg("rgb").noconvert(), py::arg("threads"));
-    m.def(
-        "shade_sg_backward",
-        [](const array<T>& axis, const array<T>& sharpness, const array<T>& amplitude,
-           const array<T>& normal, const array<T>& wo, const array<T>& albedo,
-           const array<T>& roughness, const array<T>& directions, const array<T>& rotation,
-           const array<T>& f0, const array<T>& grad_rgb, array<T>& grad_axis,
-           array<T>& grad_sharpness, array<T>& grad_amplitude, array<T>& grad_normal,
-           array<T>& grad_wo, array<T>& grad_albedo, array<T>& grad_roughness, array<T>& grad_f0,
-           int threads) {
+            shade_sg_forward(in, rgb.mutable_data(), threads);
+        });
+    def(m, "shade_sg_backward",
+        "axis sharpness amplitude normal wo albedo roughness directions rotation f0 grad_rgb "
+        "grad_axis grad_sharpness grad_amplitude grad_normal grad_wo grad_albedo grad_roughness "
+        "grad_f0 threads",
+        [](In<T> axis, In<T> sharpness, In<T> amplitude, In<T> normal, In<T> wo, In<T> albedo,
+           In<T> roughness, In<T> directions, In<T> rotation, In<T> f0, In<T> grad_rgb,
+           Out<T> grad_axis, Out<T> grad_sharpness, Out<T> grad_amplitude, Out<T> grad_normal,
+           Out<T> grad_wo, Out<T> grad_albedo, Out<T> grad_roughness, Out<T> grad_f0, int threads) {
             const auto in = shade_sg_of(axis, sharpness, amplitude, normal, wo, albedo, roughness,
                                         directions, rotation, f0);
-            const ShadeSGGrad<T> grad{grad_axis.mutable_data(),      grad_sharpness.mutable_data(),
-                                      grad_amplitude.mutable_data(), grad_normal.mutable_data(),
-                                      grad_wo.mutable_data(),        grad_albedo.mutable_data(),
-                                      grad_roughness.mutable_data(), grad_f0.mutable_data()};
-            py::gil_scoped_release nogil;
+            const auto grad =
+                make<ShadeSGGrad<T>>(grad_axis, grad_sharpness, grad_amplitude, grad_normal,
+                                     grad_wo, grad_albedo, grad_roughness, grad_f0);
             shade_sg_backward(in, grad_rgb.data(), grad, threads);
-        },
-        py::arg("axis").noconvert(), py::arg("sharpness").noconvert(),
-        py::arg("amplitude").noconvert(), py::arg("normal").noconvert(), py::arg("wo").noconvert(),
-        py::arg("albedo").noconvert(), py::arg("roughness").noconvert(),
-        py::arg("directions").noconvert(), py::arg("rotation").noconvert(),
-        py::arg("f0").noconvert(), py::arg("grad_rgb").noconvert(),
-        py::arg("grad_axis").noconvert(), py::arg("grad_sharpness").noconvert(),
-        py::arg("grad_amplitude").noconvert(), py::arg("grad_normal").noconvert(),
-        py::arg("grad_wo").noconvert(), py::arg("grad_albedo").noconvert(),
-        py::arg("grad_roughness").noconvert(), py::arg("grad_f0").noconvert(), py::arg("threads"));
+        });
 }
 
 }  // namespace

@@ -78,7 +78,7 @@ def test_large_photographs_need_a_size(tmp_path, monkeypatch):
     monkeypatch.setattr(shots, "SUGGESTED", 5)
     with pytest.raises(DataError, match=r"8 photographs of 12x8 pixels take about .* GB") as caught:
         load_photos(tmp_path)
-    assert "such as --downscale 3 for 4x2, or --downscale 1 to keep theirs" in str(caught.value)
+    assert "such as downscale=3 for 4x2, or downscale=1 to keep theirs" in str(caught.value)
     assert load_photos(tmp_path, downscale=1).cameras.width == WIDTH
     assert load_photos(tmp_path, downscale=3).cameras.width == 4
     assert len(load_photos(tmp_path, "test")) == 2
@@ -88,7 +88,7 @@ def test_downscales_out_of_range(tmp_path):
     write_nerf(tmp_path, scene())
     with pytest.raises(ValueError, match="downscale must be at least 1, got -1"):
         load_photos(tmp_path, downscale=-1)
-    with pytest.raises(DataError, match="--downscale 9 leaves nothing of 12x8"):
+    with pytest.raises(DataError, match="downscale=9 leaves nothing of 12x8"):
         load_photos(tmp_path, downscale=9)
 
 

@@ -90,7 +90,7 @@ def test_failures_are_told_after_all_is_written(passed, tmp_path):
 
 
 def test_an_unknown_light(passed, tmp_path):
-    with pytest.raises(ValueError, match=r"--light must be one of hybrid, sg, .*, got 'moon'"):
+    with pytest.raises(ValueError, match=r"light must be one of hybrid, sg, .*, got 'moon'"):
         module.compare([tmp_path], tmp_path, light=["moon"])
     assert not passed
 

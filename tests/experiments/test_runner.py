@@ -10,9 +10,9 @@ from analytic import write_scene
 
 from univoxel.checkpoint import FILE
 from univoxel.errors import DataError
+from univoxel.evaluation.measures import MEASURES
 from univoxel.experiments import runner, worker
 from univoxel.experiments.record import Setting, load_outcome
-from univoxel.tasks.evaluate import MEASURES
 
 TINY = (
     *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),
@@ -144,9 +144,9 @@ def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):
     )
     escaping = dataclasses.replace(SMALL, name="../up")
     refused(ValueError, r"settings of different names, got \['../up'\]", settings=[escaping])
-    refused(ValueError, "--samples must be at least 1, got 0", samples=0)
+    refused(ValueError, "samples must be at least 1, got 0", samples=0)
     unknown = dataclasses.replace(SMALL, changes=("seed=x",))
-    refused(ValueError, "--set seed=x: expected a int", settings=[unknown])
+    refused(ValueError, "changes=seed=x: expected a int", settings=[unknown])
     assert not trained
     assert not out.exists()
 

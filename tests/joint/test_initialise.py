@@ -1,25 +1,34 @@
-"""What the joint solve supposes before it knows the light: roughness and metal of a sphere."""
+"""What the joint solve starts from before it knows the light: roughness and metal of a sphere."""
 
 import math
 
 import pytest
 import torch
-from observed_points import lamps, sphere_of
+from observed_points import lamps, no_metal, sphere_of
 
 from univoxel.joint import initialise
 from univoxel.joint.config import JointConfig
-from univoxel.joint.initialise import TRIALS, supposed
+from univoxel.joint.initialise import initialise_
+from univoxel.joint.newton import NewtonRound
 
 CFG = JointConfig(newton_points=500, newton_views=8)
 
 
+def initialised(scene, problem, seconds=math.inf, before=None):
+    """The decisions, where no trial meets trouble."""
+    before = before or no_metal(problem)
+    decisions, troubles = initialise_(scene, problem, before, CFG, seconds)
+    assert not troubles
+    return decisions
+
+
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
-def test_the_better_supposition_is_found_without_a_map(metallic):
+def test_the_better_hypothesis_is_found_without_a_map(metallic):
     """All of metal, or none: Newton under the wrong one leaves more of the photographs."""
     scene, problem = sphere_of((0.9, 0.6, 0.4), metallic, 0.3)
     with torch.no_grad():
         scene.sky.log_radiance.zero_()
-    found = supposed(scene, problem, CFG, math.inf, pytest.fail)
+    found = initialised(scene, problem)
     # Two short rounds from no map at all: where no lamp shines there is little evidence as yet
     assert (found.metal.float().mean() - metallic).abs() < 0.1
     error = (scene.sky.log_radiance - lamps(128).log()).detach()
@@ -27,10 +36,11 @@ def test_the_better_supposition_is_found_without_a_map(metallic):
     assert (error - error.mean()).abs().mean() < 0.5
 
 
-def test_without_sightings_nothing_is_supposed():
+def test_without_observations_nothing_is_decided():
     scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3, views=1)
     before = scene.sky.log_radiance.detach().clone()
-    assert supposed(scene, problem, CFG, math.inf, pytest.fail) is problem
+    decisions = no_metal(problem)
+    assert initialised(scene, problem, before=decisions) is decisions
     assert torch.equal(scene.sky.log_radiance, before)
 
 
@@ -38,15 +48,15 @@ def test_without_sightings_nothing_is_supposed():
     ("true", "begin", "wanted"),
     [(0.25, 0.6, 0.25), (0.7, 0.3, 0.7), (0.45, 0.45, 0.45)],
 )
-def test_the_roughness_that_explains_the_photographs_is_supposed(true, begin, wanted):
+def test_the_roughness_that_explains_the_photographs_is_chosen(true, begin, wanted):
     """From a wrong one the whole moves to a better; the right one stays, to the bit."""
     scene, problem = sphere_of((0.5, 0.3, 0.2), 0.0, true)
     with torch.no_grad():
         scene.sky.log_radiance.zero_()
-    features = scene.field.features_at(problem.seen.position)
+    features = scene.field.features_at(problem.observations.position)
     scene.material.shift_roughness(features, begin)
     before = scene.material(features)[1]
-    supposed(scene, problem, CFG, math.inf, pytest.fail)
+    initialised(scene, problem)
     found = scene.material(features)[1]
     torch.testing.assert_close(found.median(), torch.tensor(wanted), atol=1e-3, rtol=0)
     assert torch.equal(found, before) == (begin == wanted)
@@ -56,25 +66,27 @@ def test_trials_are_as_many_as_time_is_kept_for(monkeypatch):
     scene, problem = sphere_of((0.5, 0.3, 0.2), 0.0, 0.4)
     points, metals, spent = [], [], []
 
-    def newton_round(scene, problem, cfg, seconds, tell):
+    def newton_round_(scene, problem, decisions, cfg, seconds):
         points.append(torch.randperm(10).tolist())
-        metals.append(bool(problem.metal.all()))
+        metals.append(bool(decisions.metal.all()))
         spent.append(seconds)
-        assert cfg.newton_points == initialise.TRIED * seconds / 3.0
-        return [1.0]
+        assert cfg.newton_points == CFG.trials.points * seconds / 3.0
+        return NewtonRound([1.0])
 
-    monkeypatch.setattr(initialise, "newton_round", newton_round)
-    supposed(scene, problem, CFG, 3.0 * TRIALS, pytest.fail)
-    assert sum(spent) == 3.0 * TRIALS
-    assert all(p == points[0] for p in points)  # the trials differ in nothing but the supposition
+    monkeypatch.setattr(initialise, "newton_round_", newton_round_)
+    rounds = CFG.trials.rounds
+    initialised(scene, problem, 3.0 * rounds)
+    assert sum(spent) == 3.0 * rounds
+    assert all(p == points[0] for p in points)  # the trials differ in nothing but the hypothesis
     assert metals == [False] * 4 + [True] * 3 + [False]  # the last with the metals that were found
 
 
 def test_rounds_that_solve_nothing_change_nothing(monkeypatch):
     scene, problem = sphere_of((0.5, 0.3, 0.2), 0.0, 0.4)
     before = {k: v.clone() for k, v in scene.state_dict().items()}
-    monkeypatch.setattr(initialise, "newton_round", lambda *_: [])
-    assert supposed(scene, problem, CFG, math.inf, pytest.fail) is problem
+    monkeypatch.setattr(initialise, "newton_round_", lambda *_: NewtonRound())
+    decisions = no_metal(problem)
+    assert initialised(scene, problem, before=decisions) is decisions
     after = scene.state_dict()
     assert all(torch.equal(after[k], before[k]) for k in after)
 
@@ -92,16 +104,19 @@ def test_rounds_that_solve_nothing_change_nothing(monkeypatch):
 def test_metal_everywhere_has_to_be_convincing(monkeypatch, lowest, left, share, taken):
     """What it leaves of the photographs, everywhere or only where metal was found: under a wrong
     map that is less by chance. Less so where most of the surface is metal then."""
-    scene, problem = sphere_of((0.5, 0.3, 0.2), 0.0, 0.4)
+    (scene, problem), supposed = sphere_of((0.5, 0.3, 0.2), 0.0, 0.4), []
 
-    def newton_round(scene, problem, *_):
-        return [lowest if problem.metal.all() else left if problem.metal.any() else 1.0]
+    def newton_round_(scene, problem, decisions, *_):
+        metal = decisions.metal
+        supposed.append(metal)
+        return NewtonRound([lowest if metal.all() else left if metal.any() else 1.0])
 
     def find_metal(scene, problem, cfg, done):
         """A share is, of what is taken for metal everywhere; surely so, from a map for metals."""
-        assert done == float(problem.metal.all())
-        return problem.metal & (torch.linspace(0, 1, len(problem.metal)) < share)
+        metal = supposed[-1]
+        assert done == float(metal.all())
+        return metal & (torch.linspace(0, 1, len(metal)) < share)
 
-    monkeypatch.setattr(initialise, "newton_round", newton_round)
+    monkeypatch.setattr(initialise, "newton_round_", newton_round_)
     monkeypatch.setattr(initialise, "find_metal", find_metal)
-    assert bool(supposed(scene, problem, CFG, math.inf, pytest.fail).metal.any()) == taken
+    assert bool(initialised(scene, problem).metal.any()) == taken

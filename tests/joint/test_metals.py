@@ -6,11 +6,10 @@ import pytest
 import torch
 from observed_points import COUNT, NODES, photographed, sphere_of
 
-from univoxel import losses
+from univoxel.color import linear_to_srgb_unclipped
 from univoxel.joint import metals
 from univoxel.joint.config import JointConfig
-from univoxel.joint.equations import CAUCHY
-from univoxel.joint.metals import ASKED, METAL_BASE, evidence, find_metal, fitted
+from univoxel.joint.metals import evidence, find_metal, fitted
 
 CFG = JointConfig(newton_points=500, newton_views=8)
 
@@ -22,7 +21,7 @@ def test_copper_is_told_from_paint_of_its_colour(roughness):
     )
     found = find_metal(scene, problem, CFG, 1.0)
     assert found.dtype == torch.bool
-    x = problem.seen.normal[:, 0]
+    x = problem.observations.normal[:, 0]
     # 32 neighbours of 500 points lie within half a radian: the mean over them blurs the border
     assert found[x > 0.5].float().mean() > 0.97
     assert found[x < -0.5].float().mean() < 0.03
@@ -46,15 +45,15 @@ def test_under_even_light_nothing_is_taken_for_metal():
     assert not find_metal(scene, replace(problem, target=noisy), CFG, 1.0).any()
 
 
-def test_one_sighting_says_nothing():
+def test_one_observation_says_nothing():
     scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3, views=1)
     assert torch.equal(evidence(scene, problem, CFG), torch.zeros(COUNT))
     assert not find_metal(scene, problem, CFG, 1.0).any()
-    assert max(ASKED) < 0
+    assert max(CFG.metal.threshold) < 0
 
 
 def test_one_point_speaks_for_all():
-    """A scene may have no other whose sightings suffice."""
+    """A scene may have no other whose observations suffice."""
     scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3)
     found = evidence(scene, problem, replace(CFG, newton_points=1))
     assert len(found) == COUNT
@@ -66,19 +65,20 @@ def test_fitted_finds_the_best_base_within_its_bounds():
     torch.manual_seed(0)
     constant, slope = 0.1 * torch.rand(6, 5, 3), torch.rand(6, 5, 3)
     target = torch.rand(6, 5, 3).clamp(0.1, 0.9)
-    cost = fitted(constant, slope, target, 0.0)
+    cauchy = CFG.newton.cauchy
+    cost = fitted(constant, slope, target, CFG, 0.0)
     grey = torch.linspace(0.005, 1, 200)
     for p in range(6):
         best = 0.0
         for c in range(3):
             shown = constant[p, :, c] + grey[:, None] * slope[p, :, c]
-            r = (target[p, :, c] - losses.encode(shown)) / CAUCHY
-            best += CAUCHY**2 * torch.log1p(r.square()).mean(1).min() / 3
+            r = (target[p, :, c] - linear_to_srgb_unclipped(shown)) / cauchy
+            best += cauchy**2 * torch.log1p(r.square()).mean(1).min() / 3
         # Gauss-Newton on Cauchy costs may end in a neighbouring valley, never below the best
         assert cost[p] >= best - 1e-5
         assert cost[p] < 1.5 * best + 1e-5
-    held = fitted(constant, slope, torch.zeros(6, 5, 3), METAL_BASE)
-    assert (held > fitted(constant, slope, torch.zeros(6, 5, 3), 0.0)).all()
+    held = fitted(constant, slope, torch.zeros(6, 5, 3), CFG, CFG.metal.min_reflectance)
+    assert (held > fitted(constant, slope, torch.zeros(6, 5, 3), CFG, 0.0)).all()
 
 
 def test_metal_takes_stronger_evidence_while_the_map_is_wrong(monkeypatch):

@@ -13,6 +13,7 @@ from observed_points import (
     facing,
     in_double,
     lamps,
+    no_metal,
     photographed,
     photographs_under,
     problem_on_a_sphere,
@@ -20,11 +21,17 @@ from observed_points import (
 )
 from torch.nn.functional import normalize
 
-from univoxel import brdf, losses
+from univoxel import brdf
+from univoxel.color import linear_to_srgb_unclipped
 from univoxel.config import TrainConfig
 from univoxel.joint import equations, newton, stage
-from univoxel.joint.config import JointConfig
-from univoxel.joint.observations import draw, widened
+from univoxel.joint.config import JointConfig, NewtonConfig
+from univoxel.joint.newton import NewtonRound, newton_round_
+from univoxel.joint.observations import (
+    Decisions,
+    prefiltered_roughness,
+    sample_observations,
+)
 from univoxel.lights.sg import SGConfig
 from univoxel.ops import shade_map
 from univoxel.optim import RowAdam
@@ -34,22 +41,23 @@ from univoxel.sphere import fibonacci_sphere
 from univoxel.tasks import train as train_task
 from univoxel.training.config import StageConfig
 
+CAUCHY = NewtonConfig().cauchy
+
 
 @pytest.fixture(params=["dielectric", "metal"])
-def rows_and_map(request):
-    """Rows in double, a map and albedos that do not explain them, some sightings clipped."""
+def transport_and_map(request):
+    """Transport in double, a map and albedos that do not explain it, some observations clipped."""
     problem, metal = random_problem(), request.param == "metal"
     map, albedo = 0.7 + 2.5 * torch.rand(12, 3), 0.2 + 0.6 * torch.rand(5, 3)
     problem = photographed(problem, map, *of_metal(metal, albedo, torch.full((5,), 0.3)))
-    problem = replace(problem, metal=torch.full((5,), metal))
     target = problem.target + 0.03 * torch.randn_like(problem.target)
     target = target.clamp_max(1.0)  # as photographs are
     problem = replace(problem, target=target)
-    sighting = torch.arange(20).view(5, 4)
-    rows = newton.light_rows(problem, torch.arange(5), sighting, torch.full((5,), 0.3))
-    rows = in_double(rows)
+    point, observation = torch.arange(5), torch.arange(20).view(5, 4)
+    rough = torch.full((5,), 0.3)
+    transport = newton.linear_transport(problem, point, observation, rough, metal)
     map = map * torch.linspace(1.6, 0.9, 12)[:, None]
-    return rows, map.double(), albedo.log().double()
+    return in_double(transport), map.double(), albedo.log().double()
 
 
 def of_metal(metal: bool, base: torch.Tensor, roughness: torch.Tensor):
@@ -59,45 +67,49 @@ def of_metal(metal: bool, base: torch.Tensor, roughness: torch.Tensor):
 
 
 @pytest.mark.parametrize("metal", [False, True])
-def test_rows_draw_what_the_shading_draws(metal):
-    problem = replace(random_problem(), metal=torch.full((5,), metal))
+def test_transport_makes_what_the_shading_makes(metal):
+    problem = random_problem()
     map, albedo, roughness = torch.rand(12, 3), torch.rand(5, 3), 0.2 + 0.6 * torch.rand(5)
     problem = photographed(problem, map, *of_metal(metal, albedo, roughness))
-    which = torch.tensor([[3, 1], [9, 8], [18, 18]])
-    rows = newton.light_rows(problem, torch.tensor([0, 2, 4]), which, roughness[[0, 2, 4]])
-    drawn = drawn_by(rows, map, albedo[[0, 2, 4]])
-    assert torch.allclose(drawn, problem.seen.color[which], rtol=1e-4, atol=1e-6)
-    assert torch.equal(rows.target, problem.target[which])
+    point, which = torch.tensor([0, 2, 4]), torch.tensor([[3, 1], [9, 8], [18, 18]])
+    transport = newton.linear_transport(problem, point, which, roughness[point], metal)
+    radiance = radiance_of(transport, map, albedo[point])
+    assert torch.allclose(radiance, problem.observations.color[which], rtol=1e-4, atol=1e-6)
+    assert torch.equal(transport.target, problem.target[which])
 
 
-def drawn_by(rows: equations.Rows, map: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
-    sky = rows.through[..., None] * (rows.diffuse @ map)
-    return albedo[:, None] * (sky + rows.diffuse_blocked) + rows.shine @ map + rows.shine_blocked
+def radiance_of(transport: equations.LinearTransport, map: torch.Tensor, albedo: torch.Tensor):
+    sky = transport.diffuse_factor[..., None] * (transport.diffuse @ map)
+    specular = transport.specular @ map + transport.specular_indirect
+    return albedo[:, None] * (sky + transport.diffuse_indirect) + specular
 
 
-def weights(rows: equations.Rows, map: torch.Tensor, log_albedo: torch.Tensor) -> torch.Tensor:
-    residual = rows.target - losses.encode(drawn_by(rows, map, log_albedo.exp()))
-    weight = 1 / (1 + (residual / equations.CAUCHY) ** 2)
-    return torch.where((rows.target > equations.CLIPPED) & (residual < 0), 0.0, weight)
+def weights(transport: equations.LinearTransport, map: torch.Tensor, log_albedo: torch.Tensor):
+    residual = transport.target - linear_to_srgb_unclipped(
+        radiance_of(transport, map, log_albedo.exp())
+    )
+    weight = 1 / (1 + (residual / CAUCHY) ** 2)
+    return torch.where((transport.target > equations.CLIPPED) & (residual < 0), 0.0, weight)
 
 
-def test_equations_are_the_schur_complement_of_the_dense_system(rows_and_map):
-    rows, map, log_albedo = rows_and_map
-    weight = weights(rows, map, log_albedo)
-    assert 0 < int((weight == 0).sum()) < weight.numel() / 2  # clipped sightings are among them
-    eliminated, right, tie = equations.normal_equations(rows, map, log_albedo)
+def test_equations_are_the_schur_complement_of_the_dense_system(transport_and_map):
+    transport, map, log_albedo = transport_and_map
+    weight = weights(transport, map, log_albedo)
+    assert 0 < int((weight == 0).sum()) < weight.numel() / 2  # clipped observations are among them
+    state = transport, map, log_albedo, CAUCHY
+    eliminated, right, back = equations.normal_equations(*state)
     cost = 0.0
     for c in range(3):
 
         def encoded(x, a, c=c):
             light, albedo = map.clone(), log_albedo.exp()
             light[:, c], albedo[:, c] = x.exp(), a.exp()
-            return losses.encode(drawn_by(rows, light, albedo))[..., c].flatten()
+            return linear_to_srgb_unclipped(radiance_of(transport, light, albedo))[..., c].flatten()
 
         x, a = map[:, c].log(), log_albedo[:, c]
         j_map, j_albedo = torch.autograd.functional.jacobian(encoded, (x, a))
         w = weight[..., c].flatten()
-        residual = rows.target[..., c].flatten() - encoded(x, a)
+        residual = transport.target[..., c].flatten() - encoded(x, a)
         cost += (w * residual**2).sum()
         full = torch.cat([j_map, j_albedo], 1)
         hessian, gradient = full.T @ (w[:, None] * full), full.T @ (w * residual)
@@ -106,9 +118,9 @@ def test_equations_are_the_schur_complement_of_the_dense_system(rows_and_map):
         exact = {"rtol": 1e-6, "atol": 1e-9}  # double, but for float32 constants of the curve
         assert torch.allclose(eliminated[c], hessian[:12, :12] - cross @ inverse @ cross.T, **exact)
         assert torch.allclose(right[c], gradient[:12] - cross @ inverse @ gradient[12:], **exact)
-        assert torch.allclose(tie.own[c], gradient[12:], **exact)
-        assert torch.allclose(tie.norm[c], own.diagonal(), **exact)
-        assert torch.allclose(tie.cross[c], cross.T, **exact)
+        assert torch.allclose(back.gradient[c], gradient[12:], **exact)
+        assert torch.allclose(back.curvature[c], own.diagonal(), **exact)
+        assert torch.allclose(back.cross[c], cross.T, **exact)
 
         # One step of the eliminated system and what it says of the albedo: the dense solution
         damping = 1e-4 * torch.eye(12)
@@ -116,66 +128,69 @@ def test_equations_are_the_schur_complement_of_the_dense_system(rows_and_map):
         dense[12:, 12:], dense[:12, :12] = own, hessian[:12, :12] + damping
         solution = torch.linalg.solve(dense, gradient)
         step = torch.linalg.solve(eliminated[c] + damping, right[c])
-        change = (tie.own[c] - tie.cross[c] @ step) / tie.norm[c]
+        change = (back.gradient[c] - back.cross[c] @ step) / back.curvature[c]
         assert torch.allclose(step, solution[:12], rtol=1e-4, atol=1e-7)
         assert torch.allclose(change, solution[12:], rtol=1e-4, atol=1e-7)
-    assert tie.cost == pytest.approx(float(cost), rel=1e-9)
+    assert back.cost == pytest.approx(float(cost), rel=1e-9)
 
 
-def test_the_gradient_is_that_of_the_cost_at_fixed_weights(rows_and_map):
-    rows, map, log_albedo = rows_and_map
-    weight = weights(rows, map, log_albedo)
+def test_the_gradient_is_that_of_the_cost_at_fixed_weights(transport_and_map):
+    transport, map, log_albedo = transport_and_map
+    weight = weights(transport, map, log_albedo)
 
     def cost(log_map, log_albedo):
-        residual = rows.target - losses.encode(drawn_by(rows, log_map.exp(), log_albedo.exp()))
+        radiance = radiance_of(transport, log_map.exp(), log_albedo.exp())
+        residual = transport.target - linear_to_srgb_unclipped(radiance)
         return (weight * residual**2).sum()
 
     x, a = map.log(), log_albedo
-    _, right, tie = equations.normal_equations(rows, map, log_albedo)
+    _, right, back = equations.normal_equations(transport, map, log_albedo, CAUCHY)
     h = 1e-5
     for node, c in ((0, 0), (5, 1), (11, 2)):
         step = torch.zeros_like(x)
         step[node, c] = h
         slope = (cost(x + step, a) - cost(x - step, a)) / (2 * h)
         # The elimination's share of the gradient put back
-        g = right[c] + tie.cross[c].T @ (tie.own[c] / tie.norm[c])
+        g = right[c] + back.cross[c].T @ (back.gradient[c] / back.curvature[c])
         assert g[node].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
     step = torch.zeros_like(a)
     step[3, 1] = h
     slope = (cost(x, a + step) - cost(x, a - step)) / (2 * h)
-    assert tie.own[1, 3].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
+    assert back.gradient[1, 3].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
 
 
-def test_free_roughness_is_the_schur_complement_too():
+def test_roughness_is_eliminated_by_the_schur_complement_too():
     """Of the dense system of three channels, which roughness ties to one another; in double."""
     problem = random_problem()
     true, albedo = 0.7 + 2.5 * torch.rand(12, 3), 0.2 + 0.6 * torch.rand(5, 3)
     problem = photographed(problem, true, albedo, torch.full((5,), 0.5))
-    point, sighting, by = torch.arange(5), torch.arange(20).view(5, 4), 0.02
-    rows, more = (
-        in_double(newton.light_rows(problem, point, sighting, torch.full((5,), r)))
-        for r in (0.3, 0.3 + by)
+    point, observation, by = torch.arange(5), torch.arange(20).view(5, 4), 0.02
+    transport, rougher = (
+        in_double(newton.linear_transport(problem, point, observation, rough, False))
+        for rough in (torch.full((5,), 0.3), torch.full((5,), 0.3 + by))
     )
     map, log_albedo = (true * 1.2).double(), (0.9 * albedo).log().double()
-    pull, away = 0.3, torch.linspace(-0.1, 0.2, 5).double()
+    prior, deviation = 0.3, torch.linspace(-0.1, 0.2, 5).double()
 
     def encoded(x, a, rough):  # linear in roughness, as the equations take it
-        now, then = (drawn_by(r, x.view(12, 3).exp(), a.view(5, 3).exp()) for r in (rows, more))
-        return losses.encode(now + rough[:, None, None] / by * (then - now)).flatten()
+        state = x.view(12, 3).exp(), a.view(5, 3).exp()
+        now, then = (radiance_of(t, *state) for t in (transport, rougher))
+        return linear_to_srgb_unclipped(now + rough[:, None, None] / by * (then - now)).flatten()
 
     state = map.log().flatten(), log_albedo.flatten(), torch.zeros(5).double()
     jacobian = torch.cat(torch.autograd.functional.jacobian(encoded, state), 1)
-    w = weights(rows, map, log_albedo).flatten()
-    residual = rows.target.flatten() - encoded(*state)
+    w = weights(transport, map, log_albedo).flatten()
+    residual = transport.target.flatten() - encoded(*state)
     hessian, gradient = jacobian.T @ (w[:, None] * jacobian), jacobian.T @ (w * residual)
     hessian[36:51, 36:51] += 1e-6 * torch.eye(15)
-    hessian[51:, 51:] += pull * torch.eye(5)
-    gradient[51:] -= pull * away
+    hessian[51:, 51:] += prior * torch.eye(5)
+    gradient[51:] -= prior * deviation
 
-    rougher = equations.Rougher(more, by, pull, away)
-    own, right, tie = equations.normal_equations(rows, map, log_albedo, None, rougher)
-    taken, less = equations.free_roughness(tie.roughness)
-    system, right = torch.block_diag(*own) - taken, (right - less).flatten()
+    step = equations.RoughnessStep(rougher, by, prior, deviation)
+    state = transport, map, log_albedo, CAUCHY
+    own, right, back = equations.normal_equations(*state, None, step)
+    coupling, from_gradient = equations.roughness_terms(back.roughness)
+    system, right = torch.block_diag(*own) - coupling, (right - from_gradient).flatten()
     order = torch.arange(36).view(12, 3).T.flatten()  # channel after channel
     cross, inverse = hessian[:36, 36:], torch.linalg.inv(hessian[36:, 36:])
     exact = {"rtol": 1e-5, "atol": 1e-8}  # double, but for float32 constants of the curve
@@ -187,7 +202,7 @@ def test_free_roughness_is_the_schur_complement_too():
     hessian[:36, :36] += 1e-4 * torch.eye(36)
     solution = torch.linalg.solve(hessian, gradient)
     step = torch.linalg.solve(system + 1e-4 * torch.eye(36), right)
-    to_albedo, to_rough = tie.follow(step.view(3, 12))
+    to_albedo, to_rough = back.back_substituted(step.view(3, 12))
     found = {"rtol": 1e-4, "atol": 1e-7}
     assert torch.allclose(step, solution[:36][order], **found)
     assert torch.allclose(to_albedo.flatten(), solution[36:51], **found)
@@ -196,21 +211,13 @@ def test_free_roughness_is_the_schur_complement_too():
 
 @pytest.mark.parametrize(("count", "size"), [(30, 12), (3, 10), (5, 1), (0, 4)])
 def test_gram_is_the_product_with_the_transpose(count, size):
-    rows = torch.randn(count, size, dtype=torch.float64)
-    torch.testing.assert_close(equations.gram(rows), rows.T @ rows)
+    matrix = torch.randn(count, size, dtype=torch.float64)
+    torch.testing.assert_close(equations.gram(matrix), matrix.T @ matrix)
 
 
-def test_slope_is_the_derivative_of_the_curve():
-    x = torch.tensor([0.0, 0.001, 0.00313, 0.0032, 0.1, 0.9, 3.0], dtype=torch.float64)
-    x.requires_grad_()
-    (slope,) = torch.autograd.grad(losses.encode(x[1:]).sum(), x)
-    assert torch.allclose(equations.encoded_slope(x.detach())[1:], slope[1:], rtol=1e-6)
-    assert equations.encoded_slope(x.detach())[0] == 12.92
-
-
-def test_widened_lobes_cover_the_gap_between_nodes():
+def test_prefiltered_lobes_cover_the_gap_between_nodes():
     roughness = torch.tensor([0.05, 0.3, 1.0])
-    wide = widened(roughness, 64)
+    wide = prefiltered_roughness(roughness, 64)
     assert torch.allclose(wide**4 - roughness**4, torch.full((3,), 1 / 64), rtol=1e-4)
     # The mean over a gap of what point lights of 64 nodes make of a mirror: near the right one
     direction, normal = fibonacci_sphere(64), normalize(torch.randn(500, 3), dim=1)
@@ -225,7 +232,7 @@ def test_widened_lobes_cover_the_gap_between_nodes():
 
 def test_laplacian():
     direction = fibonacci_sphere(200)
-    matrix = equations.graph_laplacian(direction)
+    matrix = equations.graph_laplacian(direction, 6)
     assert (matrix.sum(1) == 0).all()
     assert torch.equal(matrix, matrix.T)
     assert (matrix.diagonal() >= 6).all()
@@ -239,18 +246,19 @@ def test_laplacian():
     assert rough @ matrix @ rough > edges
 
 
-def test_draw_takes_points_that_are_seen_and_their_own_sightings():
+def test_samples_are_points_that_are_seen_and_their_own_observations():
     torch.manual_seed(0)
     problem = problem_on_a_sphere(6, 1, 8)
     counts = torch.tensor([3, 0, 1, 0, 0, 5])
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
-    problem = replace(problem, seen=replace(problem.seen, offsets=offsets))
-    point, sighting = draw(problem, 300, 4)
-    assert point.shape == sighting.shape == (1200,)
+    seen = replace(problem.observations, offsets=offsets)
+    problem = replace(problem, observations=seen)
+    point, observation = sample_observations(problem, 300, 4)
+    assert point.shape == observation.shape == (1200,)
     assert (point.view(300, 4) == point.view(300, 4)[:, :1]).all()
     owner = torch.repeat_interleave(counts)
-    assert torch.equal(owner[sighting], point)
-    assert set(sighting.tolist()) == set(range(9))  # each is drawn at times
+    assert torch.equal(owner[observation], point)
+    assert set(observation.tolist()) == set(range(9))  # each is drawn at times
 
 
 CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
@@ -259,13 +267,13 @@ CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
 def test_newton_recovers_a_known_map():
     albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
     scene = scene_of(albedo, roughness, nodes)
-    problem = problem_on_a_sphere(400, 12, nodes)
+    problem = problem_on_a_sphere(400, 12, nodes, scene)
     torch.manual_seed(2)
     true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
-    shown = widened(torch.full((400,), roughness), nodes)  # a node is a patch of sky
+    shown = prefiltered_roughness(torch.full((400,), roughness), nodes)  # a node is a patch of sky
     problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
-    costs = newton.newton_round(scene, problem, CFG)
-    costs += newton.newton_round(scene, problem, CFG)
+    costs = newton_round_(scene, problem, no_metal(problem), CFG).costs
+    costs += newton_round_(scene, problem, no_metal(problem), CFG).costs
     assert len(costs) == 2 * CFG.newton_steps
     error = scene.sky.log_radiance.detach() - true.log()
     assert costs[-1] < 1e-3 * costs[0]
@@ -278,14 +286,13 @@ def test_newton_finds_the_map_under_a_roughness_that_is_wrong():
     errors = []
     for free in (0.0, CFG.newton_roughness):
         nodes, albedo = 64, torch.tensor([0.5, 0.4, 0.3])
-        scene, problem = (
-            scene_of(tuple(albedo.tolist()), 0.45, nodes),
-            problem_on_a_sphere(400, 12, nodes),
-        )
-        shown = widened(torch.full((400,), 0.3), nodes)
+        scene = scene_of(tuple(albedo.tolist()), 0.45, nodes)
+        problem = problem_on_a_sphere(400, 12, nodes, scene)
+        shown = prefiltered_roughness(torch.full((400,), 0.3), nodes)
         problem = photographed(problem, lamps(nodes), albedo.expand(400, 3), shown)
         for _ in range(2):
-            newton.newton_round(scene, problem, replace(CFG, newton_roughness=free))
+            cfg = replace(CFG, newton_roughness=free)
+            newton_round_(scene, problem, no_metal(problem), cfg)
         errors.append((scene.sky.log_radiance.detach() - lamps(nodes).log()).abs().mean())
     assert errors[1] < 0.5 * errors[0]  # not all: roughness has a pull to where it was
 
@@ -293,54 +300,64 @@ def test_newton_finds_the_map_under_a_roughness_that_is_wrong():
 @pytest.mark.parametrize("views", [2, 3])
 def test_newton_learns_from_few_photographs(views):
     albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
-    scene, problem = scene_of(albedo, roughness, nodes), problem_on_a_sphere(400, views, nodes)
+    scene = scene_of(albedo, roughness, nodes)
+    problem = problem_on_a_sphere(400, views, nodes, scene)
     true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
-    shown = widened(torch.full((400,), roughness), nodes)
+    shown = prefiltered_roughness(torch.full((400,), roughness), nodes)
     problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
-    costs = newton.newton_round(scene, problem, CFG)
+    costs = newton_round_(scene, problem, no_metal(problem), CFG).costs
     assert len(costs) == CFG.newton_steps
     assert costs[-1] < 0.1 * costs[0]
 
 
 def test_newton_in_no_time_takes_few_points(monkeypatch):
     scene, counts = scene_of((0.5, 0.4, 0.3), 0.4, 32), []
-    problem = problem_on_a_sphere(100, 12, 32)
+    problem = problem_on_a_sphere(100, 12, 32, scene)
     equations = newton.normal_equations
 
-    def counted(rows, *arguments):
-        counts.append(len(rows.diffuse))
-        return equations(rows, *arguments)
+    def counted(transport, *arguments):
+        counts.append(len(transport.diffuse))
+        return equations(transport, *arguments)
 
     monkeypatch.setattr(newton, "normal_equations", counted)
     monkeypatch.setattr(newton, "NEWTON_CHUNK", 20)
     cfg = replace(CFG, newton_steps=2)
-    newton.newton_round(scene, problem, cfg, seconds=0.0)
-    assert counts == [20] * (1 + cfg.newton_steps * newton.LEAST_CHUNKS)  # one to measure
+    newton_round_(scene, problem, no_metal(problem), cfg, seconds=0.0)
+    assert counts == [20] * (1 + cfg.newton_steps * cfg.newton.min_parts)  # one to measure
     counts.clear()
-    newton.newton_round(scene, problem, cfg, seconds=1e3)
+    newton_round_(scene, problem, no_metal(problem), cfg, seconds=1e3)
     assert counts == [20] * (1 + cfg.newton_steps * 5)
 
 
 def test_a_run_that_was_cut_traces_fewer_points(monkeypatch):
     asked = []
-    monkeypatch.setattr(stage, "pose", lambda scene, photos, cfg, seed: asked.append(cfg.points))
+
+    def build_problem(scene, photos, cfg, seed):
+        asked.append(cfg.points)
+        return problem_on_a_sphere(1, 1, 8)
+
+    monkeypatch.setattr(stage, "build_problem", build_problem)
     for pace in (1.0, 0.5, 0.0):
         steps = Steps(0)
         steps.pace = pace
         stage.solve(sphere_scene(8), photos_of(1, 8), JointConfig(points=10000), 0, steps)
-    assert asked == [10000, 5000, stage.LEAST_POINTS]
+    assert asked == [10000, 5000, JointConfig().surface.min_points]
 
 
 def test_no_steps_of_newton_leave_the_map():
-    scene, problem = scene_of((0.5, 0.5, 0.5), 0.4, 32), problem_on_a_sphere(20, 8, 32)
-    assert newton.newton_round(scene, problem, replace(CFG, newton_steps=0), seconds=10.0) == []
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
+    problem = problem_on_a_sphere(20, 8, 32, scene)
+    cfg = replace(CFG, newton_steps=0)
+    assert newton_round_(scene, problem, no_metal(problem), cfg, seconds=10.0) == NewtonRound()
     assert (scene.sky.log_radiance == 0).all()
 
 
 def test_newton_without_rich_points_leaves_the_map():
     scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
-    problem = problem_on_a_sphere(20, 1, 32)  # of one sighting the albedo explains everything
-    assert newton.newton_round(scene, problem, CFG) == []
+    problem = problem_on_a_sphere(
+        20, 1, 32, scene
+    )  # of one observation the albedo explains everything
+    assert newton_round_(scene, problem, no_metal(problem), CFG) == NewtonRound()
     assert (scene.sky.log_radiance == 0).all()
 
 
@@ -360,14 +377,15 @@ def test_metals_show_the_map():
     nodes, count = 64, 600
     base, roughness = torch.tensor([0.9, 0.6, 0.4]), 0.3
     scene = scene_of(tuple(base.tolist()), roughness, nodes)
-    problem = problem_on_a_sphere(count, 12, nodes)
-    metal = problem.seen.normal[:, 0] > 0
+    problem = problem_on_a_sphere(count, 12, nodes, scene)
+    metal = problem.observations.normal[:, 0] > 0
     torch.manual_seed(2)
     true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
-    shown = widened(torch.full((count,), roughness), nodes)
+    shown = prefiltered_roughness(torch.full((count,), roughness), nodes)
     diffuse, f0 = brdf.split(base.expand(count, 3), metal.float())
-    problem = replace(photographed(problem, true, diffuse, shown, f0), metal=metal)
-    costs = newton.newton_round(scene, problem, CFG) + newton.newton_round(scene, problem, CFG)
+    problem = photographed(problem, true, diffuse, shown, f0)
+    costs = newton_round_(scene, problem, Decisions(metal), CFG).costs
+    costs += newton_round_(scene, problem, Decisions(metal), CFG).costs
     assert costs[-1] < 1e-3 * costs[0]
     error = scene.sky.log_radiance.detach() - true.log()
     # What is left is the smoothness, as above
@@ -377,11 +395,11 @@ def test_metals_show_the_map():
 @pytest.mark.parametrize("metal", [False, True])
 def test_only_what_is_taken_for_metal_can_be_metal(metal):
     scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
-    problem = problem_on_a_sphere(20, 8, 32)
-    problem = replace(problem, metal=torch.full((20,), metal))
+    problem = problem_on_a_sphere(20, 8, 32, scene)
+    decisions = Decisions(torch.full((20,), metal))
     with torch.no_grad():
         scene.material.net[-1].bias[4] = 0.0
-    stage.objective(scene, problem, CFG)["joint"].backward()
+    stage.objective(scene, problem, decisions, CFG)["joint"].backward()
     slope = scene.material.net[-1].bias.grad
     assert slope[:4].abs().min() > 0
     assert (slope[4] != 0) == metal
@@ -393,14 +411,15 @@ def test_metal_is_learned_where_it_is():
     nodes, count = 64, 600
     problem = problem_on_a_sphere(count, 12, nodes)
     map = 0.3 + 4 * (torch.rand(nodes, 3) < 0.1)
-    copper = problem.seen.normal[:, 0] > 0
+    copper = problem.observations.normal[:, 0] > 0
     base = torch.where(
         copper[:, None], torch.tensor([0.95, 0.6, 0.4]), torch.tensor([0.4, 0.5, 0.6])
     )
-    shown = widened(torch.full((count,), 0.3), nodes)
+    shown = prefiltered_roughness(torch.full((count,), 0.3), nodes)
     albedo, f0 = brdf.split(base, copper.float())
-    problem = replace(photographed(problem, map, albedo, shown, f0), metal=copper)
+    problem = photographed(problem, map, albedo, shown, f0)
     scene = sphere_scene(nodes)
+    problem = replace(problem, sky=scene.sky)
     with torch.no_grad():
         scene.sky.log_radiance.copy_(map.log())
     optimizer = RowAdam(
@@ -409,11 +428,12 @@ def test_metal_is_learned_where_it_is():
     )
     for _ in range(400):
         optimizer.zero_grad(set_to_none=True)
-        torch.stack(list(stage.objective(scene, problem, CFG).values())).sum().backward()
+        terms = stage.objective(scene, problem, Decisions(copper), CFG)
+        torch.stack(list(terms.values())).sum().backward()
         optimizer.step()
-    features = scene.field.sample(problem.seen.position).features
+    features = scene.field.sample(problem.observations.position).features
     found, _, metallic = (m.detach() for m in scene.material(features))
-    inside = problem.seen.normal[:, 0].abs() > 0.2
+    inside = problem.observations.normal[:, 0].abs() > 0.2
     assert metallic[inside & copper].mean() > 0.9
     assert metallic[inside & ~copper].mean() < 0.05
     assert (found - base)[inside].abs().mean() < 0.05
@@ -494,17 +514,22 @@ def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, 
             rates[-1].append(self.param_groups[0]["lr"])
             made.append(None)
 
+    def newton_round_(*_):
+        when.append(len(made) / steps.count)
+        return NewtonRound()
+
     def objective(scene, *_):
         return {"joint": scene.sky.log_radiance.square().sum()}
 
-    monkeypatch.setattr(stage, "pose", lambda *_: random_problem())
+    scene = sphere_scene(8)
+    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(nodes=8, scene=scene))
     monkeypatch.setattr(stage, "objective", objective)
     monkeypatch.setattr(stage, "RowAdam", Optimizer)
     monkeypatch.setattr(stage, "find_metal", lambda *_: torch.zeros(5, dtype=torch.bool))
-    monkeypatch.setattr(stage, "supposed", lambda scene, problem, *_: problem)
-    monkeypatch.setattr(stage, "newton_round", lambda *_: when.append(len(made) / steps.count))
+    monkeypatch.setattr(stage, "initialise_", lambda scene, problem, decisions, *_: (decisions, []))
+    monkeypatch.setattr(stage, "newton_round_", newton_round_)
     cfg = JointConfig(rounds=4, lr_sdf=0.0)  # the objective above says nothing of the surface
-    stage.solve(sphere_scene(8), photos_of(1, 8), cfg, 0, steps)
+    stage.solve(scene, photos_of(1, 8), cfg, 0, steps)
     assert when == newton
     assert steps.asked == asked
     for rate in rates:  # every round runs through the whole of its schedule
@@ -515,53 +540,56 @@ def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, 
 @pytest.mark.parametrize("changed", [True, False])
 def test_paint_is_asked_before_and_after_newton(monkeypatch, changed):
     """Newton starts from the albedos under a map that the materials do not follow yet."""
-    told, begun = [], []
+    calls, begun = [], []
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
 
-    def newton_round(scene, problem, *_):
-        told.append("newton")
-        begun.append(problem.albedo)
-        return []
+    def newton_round_(scene, problem, decisions, *_):
+        calls.append("newton")
+        begun.append(decisions.albedo)
+        return NewtonRound()
 
-    def balance(scene, problem):
-        told.append("balance")
+    def minimise_entropy_(*_):
+        calls.append("entropy")
         return changed
 
-    monkeypatch.setattr(stage, "pose", lambda *_: random_problem())
+    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
     monkeypatch.setattr(stage, "find_metal", lambda *_: torch.zeros(5, dtype=torch.bool))
-    monkeypatch.setattr(stage, "supposed", lambda scene, problem, *_: problem)
-    monkeypatch.setattr(stage, "sunlit", lambda scene, problem, _: problem)
-    monkeypatch.setattr(stage, "matte_albedo", lambda *_: torch.full((5, 3), 0.3))
-    monkeypatch.setattr(stage, "follow", lambda *_: told.append("follow"))
-    monkeypatch.setattr(stage, "balance", balance)
-    monkeypatch.setattr(stage, "newton_round", newton_round)
-    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+    monkeypatch.setattr(stage, "initialise_", lambda scene, problem, decisions, *_: (decisions, []))
+    monkeypatch.setattr(stage, "fit_sun_", lambda *_: None)
+    monkeypatch.setattr(stage, "diffuse_albedo", lambda *_: torch.full((5, 3), 0.3))
+    monkeypatch.setattr(stage, "teach_albedo_", lambda *_: calls.append("teach"))
+    monkeypatch.setattr(stage, "minimise_entropy_", minimise_entropy_)
+    monkeypatch.setattr(stage, "newton_round_", newton_round_)
     stage.solve(scene, photos_of(1, 8), replace(CFG, rounds=2), 0, Steps(4))
-    first = ["balance", "newton", "balance", *["follow"] * changed]
-    assert told == [*first, "newton", "balance"]
+    first = ["entropy", "newton", "entropy", *["teach"] * changed]
+    assert calls == [*first, "newton", "entropy"]
     assert [albedo is not None for albedo in begun] == [changed, False]
-    told.clear()
+    calls.clear()
     stage.solve(scene, photos_of(1, 8), replace(CFG, rounds=2, colors=False), 0, Steps(4))
-    assert told == ["newton", "newton"]
+    assert calls == ["newton", "newton"]
 
 
 def test_materials_follow_a_map_that_was_changed(monkeypatch):
     """Albedo goes to what the photographs say; the rest, metals, and what none sees stay."""
     torch.manual_seed(0)
-    scene, problem = sphere_scene(12), problem_on_a_sphere(600, 4, 12)
-    wanted = torch.where(problem.seen.normal[:, :1] > 0, RED, BLUE)
+    scene = sphere_scene(12)
+    problem = problem_on_a_sphere(600, 4, 12, scene)
+    wanted = torch.where(problem.observations.normal[:, :1] > 0, RED, BLUE)
     told = wanted.clone()
     told[:20] = torch.nan
-    metal = problem.seen.normal[:, 2] > 0.5
+    metal = problem.observations.normal[:, 2] > 0.5
     told[metal] = 1.0
-    monkeypatch.setattr(stage, "matte_albedo", lambda *_: told)
-    features = scene.field.features_at(problem.seen.position)
+    monkeypatch.setattr(stage, "diffuse_albedo", lambda *_: told)
+    features = scene.field.features_at(problem.observations.position)
     before = [m.detach() for m in scene.material(features)]
     cfg = replace(CFG, rays=512, lr_features=0.2, lr_networks=0.03)  # from features that are 0
-    stage.follow(scene, replace(problem, metal=metal), cfg)
-    after = scene.material(scene.field.features_at(problem.seen.position))
+    stage.teach_albedo_(scene, problem, Decisions(metal), cfg)
+    after = scene.material(scene.field.features_at(problem.observations.position))
     # Between red, blue and metal features are mixed
-    matte = (problem.seen.normal[:, 0].abs() > 0.3) & (problem.seen.normal[:, 2] < 0.2)
-    held = problem.seen.normal[:, 2] > 0.8
+    matte = (problem.observations.normal[:, 0].abs() > 0.3) & (
+        problem.observations.normal[:, 2] < 0.2
+    )
+    held = problem.observations.normal[:, 2] > 0.8
     off = (before[0] - wanted).abs().mean(1)
     error = (after[0].detach() - wanted).abs().mean(1)
     assert error[matte].mean() < 0.2 * off[matte].mean()
@@ -571,21 +599,25 @@ def test_materials_follow_a_map_that_was_changed(monkeypatch):
 
 
 def test_without_paint_materials_stay(monkeypatch):
-    scene, problem = scene_of((0.5, 0.5, 0.5), 0.4, 12), problem_on_a_sphere(50, 4, 12)
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+    problem = problem_on_a_sphere(50, 4, 12, scene)
     before = {k: v.clone() for k, v in scene.state_dict().items()}
-    stage.follow(scene, replace(problem, metal=~problem.metal), CFG)
+    stage.teach_albedo_(scene, problem, Decisions(torch.ones(50, dtype=torch.bool)), CFG)
     after = scene.state_dict()
     assert all(torch.equal(after[k], before[k]) for k in after)
 
 
 def test_newton_starts_from_the_albedo_that_it_is_given():
-    scene, problem = scene_of((0.5, 0.5, 0.5), 0.4, 12), random_problem(50)
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+    problem = random_problem(50, scene=scene)
     cfg = replace(CFG, newton_points=20, newton_views=2)
     albedo = torch.rand(50, 3)
-    points = newton.choose(scene, replace(problem, albedo=albedo), cfg)
+    nothing, given = no_metal(problem), replace(no_metal(problem), albedo=albedo)
+    points = newton.choose_points(scene, problem, given, cfg)
     torch.testing.assert_close(points.log_albedo, albedo[points.point].clamp_min(1e-3).log())
     torch.testing.assert_close(
-        newton.choose(scene, problem, cfg).log_albedo, torch.full((20, 3), 0.5).log()
+        newton.choose_points(scene, problem, nothing, cfg).log_albedo,
+        torch.full((20, 3), 0.5).log(),
     )
 
 

@@ -43,7 +43,7 @@ def test_a_bright_node_is_where_the_conventions_say(node):
     picture = light.latlong(height)[..., 0]
     row, column = divmod(int(picture.argmax()), 2 * height)
     x, y, z = light.direction[node].tolist()
-    # docs/conventions.md, solved for column and row
+    # docs/reference/conventions.md, solved for column and row
     assert abs(row + 0.5 - height * (0.5 - math.asin(z) / math.pi)) < 1
     away = (column + 0.5 - 2 * height * (math.pi - math.atan2(y, x)) / (2 * math.pi)) % (2 * height)
     assert min(away, 2 * height - away) * math.sqrt(1 - z * z) < 1.5  # columns narrow to the poles

@@ -59,7 +59,7 @@ def test_the_light_of_a_view_is_shown(view, index):
 
 @pytest.mark.parametrize("view", ["3", "below", "-1"])
 def test_no_such_view(view):
-    wanted = f"--light-of: expected a number below 3 or one of left to above, got '{view}'"
+    wanted = f"light_of: expected a number below 3 or one of left to above, got '{view}'"
     with pytest.raises(ValueError, match=wanted):
         shaken().choose(view)
 
@@ -132,7 +132,7 @@ def test_one_light_for_all_has_no_views():
     assert scene.views is None
     features = torch.zeros(2, 4)
     assert scene.coded(features) is features
-    with pytest.raises(ValueError, match="--light-of: all views of this run have one light"):
+    with pytest.raises(ValueError, match="light_of: all views of this run have one light"):
         scene.show_light_of("left")
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from univoxel.envmap import EnvMap, tables
-from univoxel.ops import Lamp, Sun, VisibilityScene, native, relight
+from univoxel.ops import PointLight, Sun, VisibilityScene, native, relight
 from univoxel.records import Mesh
 
 pytestmark = pytest.mark.skipif(
@@ -60,7 +60,10 @@ def points(g, n, height, faces=6):
         "samples": 5,
         "bounces": 2,
         "suns": (Sun((0.3, 0, 1), (1e6, 1, 0)), Sun((0, 0, -1), (1, 1, 1), 179.0)),
-        "lamps": (Lamp((0, 0, 0), (1, 1e-30, 1)), Lamp((0, 0, 1e4), (1e6, 1, 1))),
+        "point_lights": (
+            PointLight((0, 0, 0), (1, 1e-30, 1)),
+            PointLight((0, 0, 1e4), (1e6, 1, 1)),
+        ),
     }
 
 

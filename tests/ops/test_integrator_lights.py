@@ -1,4 +1,4 @@
-"""Suns, lamps and coloured F0 in the path tracer: closed forms, shadows, bounces, bad input."""
+"""Suns, point lights and coloured F0 in the path tracer: closed forms, shadows, bounces."""
 
 import math
 
@@ -7,17 +7,17 @@ import torch
 from integrator_scenes import DARK, WHITE, octahedron, shade, sphere_points
 
 from univoxel import brdf
-from univoxel.ops import Lamp, Sun, VisibilityScene
+from univoxel.ops import PointLight, Sun, VisibilityScene
 from univoxel.records import Mesh
 
 ALBEDO, ROUGHNESS = torch.tensor([0.7, 0.4, 0.2]), torch.tensor(0.5)
 UP = torch.tensor([[0.0, 0, 1]])
 
 
-def lit(normal, wo, *, suns=(), lamps=(), envmap=DARK, **kwargs):
+def lit(normal, wo, *, suns=(), point_lights=(), envmap=DARK, **kwargs):
     mesh, scene = octahedron()
-    return shade(mesh, scene, envmap, normal, wo, ALBEDO, ROUGHNESS, suns=suns, lamps=lamps,
-                 **{"samples": 1, **kwargs})  # fmt: skip
+    return shade(mesh, scene, envmap, normal, wo, ALBEDO, ROUGHNESS, suns=suns,
+                 point_lights=point_lights, **{"samples": 1, **kwargs})  # fmt: skip
 
 
 def test_a_hard_sun_is_one_look_at_the_brdf():
@@ -59,32 +59,32 @@ def test_lamp_falls_with_the_square_and_stands_before_what_is_behind_it():
     scene = VisibilityScene(corner, torch.tensor([[0, 1, 2]], dtype=torch.int32))  # a ceiling
     start = {"position": torch.zeros(1, 3), "offset": 0.0, "samples": 1}
     near, far, above = (
-        shade(mesh, scene, DARK, UP, UP, ALBEDO, ROUGHNESS, lamps=[Lamp((0, 0, z), (4, 4, 4))],
-              **start)
+        shade(mesh, scene, DARK, UP, UP, ALBEDO, ROUGHNESS,
+              point_lights=[PointLight((0, 0, z), (4, 4, 4))], **start)
         for z in (1.0, 2.0, 4.0)
     )  # fmt: skip
     torch.testing.assert_close(near, 4 * far)
     assert near.gt(0).all()
     assert above.eq(0).all()  # the ceiling is in between
-    at_it = shade(mesh, scene, DARK, UP, UP, ALBEDO, ROUGHNESS, lamps=[Lamp((0, 0, 0), (1, 1, 1))],
-                  **start)  # fmt: skip
+    at_it = shade(mesh, scene, DARK, UP, UP, ALBEDO, ROUGHNESS,
+                  point_lights=[PointLight((0, 0, 0), (1, 1, 1))], **start)  # fmt: skip
     assert at_it.eq(0).all()
 
 
 def test_bounced_sunlight_has_its_closed_form():
-    """A lamp near a wide wall: the light that comes back from it, against quadrature."""
+    """A point light near a wide wall: the light that comes back from it, against quadrature."""
     side, n = 40.0, 400
     corner = torch.tensor([[-side, -side, 1], [side, -side, 1], [side, side, 1], [-side, side, 1]])
     faces = torch.tensor([[0, 2, 1], [0, 3, 2]], dtype=torch.int32)
     down = torch.tensor([0.0, 0, -1])
     mesh = Mesh(corner, faces, down.repeat(4, 1), torch.full((4, 3), 0.5), torch.ones(4))
     scene = VisibilityScene(corner, faces)
-    lamp = Lamp((0.0, 0.0, 0.5), (10.0, 10.0, 10.0))
-    common = {"position": torch.zeros(1, 3), "offset": 0.0, "lamps": [lamp],
+    point_light = PointLight((0.0, 0.0, 0.5), (10.0, 10.0, 10.0))
+    common = {"position": torch.zeros(1, 3), "offset": 0.0, "point_lights": [point_light],
               "f0": torch.zeros(1, 3), "mesh_f0": torch.zeros(4, 3), "samples": 65536}  # fmt: skip
     args = (mesh, scene, DARK, UP, UP, 1.0, torch.tensor(1.0))
     bounced = shade(*args, bounces=1, **common) - shade(*args, bounces=0, **common)
-    # Rings on the wall: they get 10 cos / d^2 from the lamp and send it down, both by our BRDF.
+    # Rings on the wall: they get 10 cos / d^2 from the light and send it down, by our BRDF.
     radius = torch.linspace(0, 1, n + 1)[:-1].double() + 0.5 / n
     theta = radius * math.pi / 2
     point = torch.stack([theta.tan(), torch.zeros(n).double(), torch.ones(n).double()], 1)
@@ -133,8 +133,8 @@ def test_calls_that_go_on_make_one_sequence():
         (lambda: Sun((0, 0, 0), (1, 1, 1)), "direction must have a length"),
         (lambda: Sun((0, 0, 1), (1, -1, 1)), "sun: irradiance must be finite and at least 0"),
         (lambda: Sun((0, 0, 1), (1, 1, 1), 180.0), r"angle must be in \[0, 180\) degrees"),
-        (lambda: Lamp((0, math.nan, 0), (1, 1, 1)), "lamp: position must be finite"),
-        (lambda: Lamp((0, 0, 0), (math.inf, 1, 1)), "lamp: intensity must be finite"),
+        (lambda: PointLight((0, math.nan, 0), (1, 1, 1)), "point light: position must be finite"),
+        (lambda: PointLight((0, 0, 0), (math.inf, 1, 1)), "point light: intensity must be finite"),
         (lambda: lit(UP, UP, first=-1), "first must be at least 0, got -1"),
         (lambda: lit(UP, UP, first=2**31), r"first \+ samples must be at most 2\^31"),
         (lambda: lit(UP, UP, f0=torch.zeros(2, 3)), r"f0 must be \[N, 3\]"),

@@ -18,7 +18,7 @@ from univoxel.pictures import timelapse as module
 from univoxel.pictures.timelapse import LABEL, Timelapse
 from univoxel.scene import SceneConfig
 from univoxel.tasks.train import train
-from univoxel.training import progress as progress_module
+from univoxel.training import clock as clock_module
 from univoxel.training.config import StageConfig
 
 
@@ -70,7 +70,7 @@ def test_frames_do_not_count_as_time(data, tmp_path, monkeypatch, often):
         clock.now += 1000
         return draw(*arguments)
 
-    monkeypatch.setattr(progress_module, "time", clock)
+    monkeypatch.setattr(clock_module, "time", clock)
     monkeypatch.setattr(module, "draw", slow)
     monkeypatch.setattr("univoxel.tasks.train.time", clock)
     run = train(config(data, tmp_path / "run"), timelapse=tmp_path / "frames")

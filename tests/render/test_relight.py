@@ -8,7 +8,7 @@ from integrator_scenes import DARK, WHITE, octahedron, sphere_points
 
 from univoxel.camera import Cameras
 from univoxel.envmap import EnvMap, tables
-from univoxel.ops import Lamp, Sun, VisibilityScene
+from univoxel.ops import PointLight, Sun, VisibilityScene
 from univoxel.records import Mesh, Rays, Surface
 from univoxel.render import relight as task
 from univoxel.render.frame import Quality, channels, render_picture, rgba, srgb
@@ -16,9 +16,9 @@ from univoxel.render.frame import Quality, channels, render_picture, rgba, srgb
 SUN = Sun((0.0, 0.0, 1.0), (2.0, 2.0, 2.0), 0.0)
 
 
-def a_stage():
+def a_traced_mesh():
     mesh, scene = octahedron(0.5)
-    return task.Stage(mesh, scene, 0.01)
+    return task.TracedMesh(mesh, scene, 0.01)
 
 
 def a_surface(n=300, opacity=None):
@@ -46,11 +46,11 @@ def test_the_noise_limit_holds_and_its_estimate_is_honest():
     surface, wo = a_surface()
     lighting, errors, told = a_bright_spot(), [], []
     truth = task.relight_surface(
-        surface, wo, a_stage(), lighting, samples=16384, bounces=1, seed=99
+        surface, wo, a_traced_mesh(), lighting, samples=16384, bounces=1, seed=99
     )
     for seed in range(4):
         rgb, noise, samples = task.relight_until(
-            surface, wo, a_stage(), lighting, noise=0.1, bounces=1, seed=seed
+            surface, wo, a_traced_mesh(), lighting, noise=0.1, bounces=1, seed=seed
         )
         assert noise <= 0.1
         assert samples >= 2 * task.FIRST_PASS
@@ -66,17 +66,17 @@ def test_passes_report_their_share_and_end_where_no_light_is():
     surface, wo = a_surface(50)
     shares = []
     _, _, samples = task.relight_until(
-        surface, wo, a_stage(), a_bright_spot(), noise=0.05, bounces=0, report=shares.append
+        surface, wo, a_traced_mesh(), a_bright_spot(), noise=0.05, bounces=0, report=shares.append
     )
     assert shares
     assert all(0 < share < 1 for share in shares)
     dark = task.Lighting(tables(DARK))
-    rgb, noise, few = task.relight_until(surface, wo, a_stage(), dark, noise=0.01, bounces=0)
+    rgb, noise, few = task.relight_until(surface, wo, a_traced_mesh(), dark, noise=0.01, bounces=0)
     assert (noise, few) == (0.0, 2 * task.FIRST_PASS)
     assert few < samples
     assert rgb.eq(0).all()
     with pytest.raises(ValueError, match="noise must be above 0, got 0"):
-        task.relight_until(surface, wo, a_stage(), dark, noise=0, bounces=0)
+        task.relight_until(surface, wo, a_traced_mesh(), dark, noise=0, bounces=0)
 
 
 def test_strategies_agree_within_their_confidence():
@@ -107,12 +107,12 @@ def test_turned_light_turns_map_and_suns_but_not_lamps():
     lighting = task.Lighting(
         tables(EnvMap(torch.ones(2, 4, 3), 10.0)),
         (Sun((1.0, 0.0, 1.0), (1, 1, 1)),),
-        (Lamp((1, 0, 0), (1, 1, 1)),),
+        (PointLight((1, 0, 0), (1, 1, 1)),),
     )
-    turned = task.turned(lighting, 90.0)
+    turned = task.rotated(lighting, 90.0)
     assert turned.tables.rotation == pytest.approx(math.radians(100))
     assert turned.suns[0].direction == pytest.approx((0.0, 1.0, 1.0), abs=1e-12)
-    assert turned.lamps == lighting.lamps
+    assert turned.point_lights == lighting.point_lights
 
 
 def lid(size=1.0, height=0.5):
@@ -122,7 +122,7 @@ def lid(size=1.0, height=0.5):
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
     up = torch.tensor([0.0, 0, 1]).repeat(4, 1)
     mesh = Mesh(corner, faces, up, torch.zeros(4, 3), torch.ones(4))
-    return task.Stage(mesh, VisibilityScene(corner, faces), 0.01)
+    return task.TracedMesh(mesh, VisibilityScene(corner, faces), 0.01)
 
 
 def falling(points):

@@ -78,7 +78,7 @@ def test_points_of_a_sphere_are_even_and_on_it(sphere):
     assert (torch.bincount(octant, minlength=8) - 500).abs().max() < 4 * math.sqrt(500)
 
 
-def test_sightings_of_a_sphere(sphere, photos):
+def test_observations_of_a_sphere(sphere, photos):
     position, normal = surface_points(sphere, 600, generator())
     tracer = VisibilityScene(sphere.vertices, sphere.faces)
     seen = observe(position, normal, photos, tracer, OFFSET)
@@ -167,10 +167,10 @@ def test_a_sphere_sees_the_whole_sky(sphere):
     cosine = normal @ direction.T
     # From OFFSET above, the sphere's edge lies 25 degrees below the horizon: 4 times the jitter
     # of nodes this coarse
-    open_share = arrived.open.float() / 255
-    assert open_share[cosine > 0.1].mean() > 0.9999
+    visibility = arrived.visibility.float() / 255
+    assert visibility[cosine > 0.1].mean() > 0.9999
     spread = math.sqrt(4 * math.pi / 128) / 2
-    assert (arrived.open[cosine < -spread - 1e-6] == 0).all()
+    assert (arrived.visibility[cosine < -spread - 1e-6] == 0).all()
     assert (arrived.indirect[cosine > 0.1].float().mean(1) <= 1e-4).float().mean() > 0.9999
     assert (arrived.indirect[cosine < -spread - 1e-6] == 0).all()
 
@@ -194,22 +194,22 @@ def test_half_a_ceiling_takes_its_solid_angle_and_shines_in_its_colour():
         generator(),
     )
     x, _, z = direction.unbind(1)
-    open_share, indirect = arrived.open.float() / 255, arrived.indirect.float()
-    assert (arrived.open[0, (x > 0.2) & (z > 0.2)] == 0).all()
-    assert (arrived.open[0, (x < -0.2) & (z > 0.2)] == 255).all()
+    visibility, indirect = arrived.visibility.float() / 255, arrived.indirect.float()
+    assert (arrived.visibility[0, (x > 0.2) & (z > 0.2)] == 0).all()
+    assert (arrived.visibility[0, (x < -0.2) & (z > 0.2)] == 255).all()
     assert torch.allclose(indirect[0, (x > 0.2) & (z > 0.2)], color, rtol=1e-3)
     assert (indirect[0, (x < -0.2) & (z > 0.2)] == 0).all()
     traced = (normal @ direction.T) > 0.1
-    blocked = (1 - open_share)[..., None] * color
+    blocked = (1 - visibility)[..., None] * color
     # uint8 of a share of 8 rays and half floats: 1/510 and 2^-11
     assert torch.allclose(indirect[traced], blocked[traced], atol=3e-3)
 
     solid = 4 * math.pi / len(direction)
     above = z > 0
-    assert ((1 - open_share[0, above]).sum() * solid).item() == pytest.approx(math.pi, rel=0.03)
+    assert ((1 - visibility[0, above]).sum() * solid).item() == pytest.approx(math.pi, rel=0.03)
     # For the point that looks along +X: what is below the plate's plane is open, what is above not
     ahead = x > 0
-    assert ((1 - open_share[1, ahead]).sum() * solid).item() == pytest.approx(math.pi, rel=0.03)
+    assert ((1 - visibility[1, ahead]).sum() * solid).item() == pytest.approx(math.pi, rel=0.03)
     irradiance = (z.clamp_min(0)[:, None] * indirect[0]).sum(0) * solid
     assert torch.allclose(irradiance, math.pi / 2 * color, rtol=0.03)
 
@@ -224,7 +224,7 @@ def points(position: torch.Tensor, normal: torch.Tensor) -> Observations:
 
 
 def views_of(seen: Observations, cameras) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which view each sighting is from, by its direction, and its point."""
+    """Which view each observation is from, by its direction, and its point."""
     point = torch.repeat_interleave(seen.offsets.diff())
     eye = cameras.camera_to_world[:, :, 3]
     towards = normalize(eye[None] - seen.position[point][:, None], dim=2)

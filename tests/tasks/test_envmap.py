@@ -123,10 +123,10 @@ def test_a_run_without_a_map(tmp_path):
 def test_bad_arguments(run):
     folder, _ = run
     with pytest.raises(
-        ValueError, match=r"--out: expected a name that ends in \.exr, got .*map\.hdr"
+        ValueError, match=r"out: expected a name that ends in \.exr, got .*map\.hdr"
     ):
         envmap(folder, folder / "map.hdr")
-    with pytest.raises(ValueError, match="--height must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="height must be at least 1, got 0"):
         envmap(folder, folder / "map.exr", height=0)
 
 

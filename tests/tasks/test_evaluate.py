@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import rich
 import torch
 from torch import nn
 
@@ -14,6 +15,8 @@ from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data import load_photos
 from univoxel.data.images import read_exr, read_image, write_png
 from univoxel.errors import DataError
+from univoxel.evaluation import measures
+from univoxel.evaluation.truth import expected_view
 from univoxel.pictures import layers as layers_module
 from univoxel.pictures.contact_sheet import TILE, Panel, contact_sheet, heat, shrink
 from univoxel.records import Mesh, Surface
@@ -101,9 +104,11 @@ def relit_calls(monkeypatch):
         wo = torch.tensor([0.6, 0.0, 0.8]).expand(n, 3)
         return surface, wo
 
-    def relight_surface(surface, wo, stage, lighting, *, samples, bounces):
+    def relight_surface(surface, wo, traced, lighting, *, samples, bounces):
         calls.append(
-            SimpleNamespace(mesh=stage.mesh, samples=samples, bounces=bounces, offset=stage.offset)
+            SimpleNamespace(
+                mesh=traced.mesh, samples=samples, bounces=bounces, offset=traced.offset
+            )
         )
         assert len(surface.opacity) == int(inside().sum())  # nothing outside is shaded
         return surface.albedo * lighting.tables.radiance.mean()
@@ -113,7 +118,7 @@ def relit_calls(monkeypatch):
         albedo = torch.tensor([[0.25, 0.5, 0.5], [0.75, 0.5, 0.5], [0.25, 0.5, 0.5]])
         return Mesh(corner, torch.tensor([[0, 1, 2]], dtype=torch.int32), albedo=albedo)
 
-    for module in (task, layers_module):
+    for module in (measures, layers_module):
         monkeypatch.setattr(module, "surface_of_view", surface_of_view)
     monkeypatch.setattr(layers_module, "shade", lambda scene, surface, wo: surface.albedo * SCALE)
     monkeypatch.setattr(layers_module, "relight_surface", relight_surface)
@@ -125,7 +130,7 @@ def relit_calls(monkeypatch):
 
 def test_measures_of_a_known_scene(folders, relit_calls, capsys):
     result = task.evaluate(folders.run, samples=5, bounces=1)
-    assert list(result) == list(task.MEASURES)
+    assert list(result) == list(measures.MEASURES)
     # Photographs store bytes; the estimate equals them to fp32.
     assert result["nvs_psnr"] == pytest.approx(100)
     assert result["nvs_ssim"] == pytest.approx(1)
@@ -143,6 +148,8 @@ def test_measures_of_a_known_scene(folders, relit_calls, capsys):
     assert result["peak_rss_mb"] == 700
     assert result["parameters"] == 8
     assert result["model_bytes"] == 123
+    assert capsys.readouterr().out == ""
+    rich.print(task.table(result))
     assert "normal_mae_deg" in capsys.readouterr().out
 
 
@@ -164,8 +171,8 @@ def test_foreground_psnr_leaves_the_background_out(folders, relit_calls):
     """A quarter of the picture is inside: the same error there weighs four times as much."""
     truth = load_photos(folders.data, "test")
     layers = layers_module.render_layers(nn.Identity(), truth.cameras, 0)
-    expected = task._expected(truth, {}, 0)
-    numbers = dict(task.score(layers, expected, task.Scales(torch.ones(3), torch.ones(3))))
+    expected = expected_view(truth, {}, 0)
+    numbers = dict(measures.score(layers, expected, measures.Scales(torch.ones(3), torch.ones(3))))
     difference = numbers["albedo_psnr_3ch"] - numbers["albedo_psnr_fg"]
     assert difference == pytest.approx(10 * math.log10(4), rel=1e-4)
 
@@ -219,7 +226,7 @@ def test_without_truth_measures_are_null(folders, relit_calls, tmp_path):
     result = task.evaluate(folders.run, save=tmp_path / "out")
     missing = {key for key, value in result.items() if value is None}
     training = {"train_seconds", "threads", "peak_rss_mb", "parameters", "model_bytes"}
-    assert missing == set(task.MEASURES) - training - {"nvs_psnr", "nvs_ssim"}
+    assert missing == set(measures.MEASURES) - training - {"nvs_psnr", "nvs_ssim"}
     assert not relit_calls
     assert (tmp_path / "out" / "contact_sheet.png").is_file()
 
@@ -233,19 +240,21 @@ def test_an_empty_mesh_has_no_chamfer_distance(folders, relit_calls, monkeypatch
 def test_doubts_are_compared_with_errors(folders, relit_calls, monkeypatch, tmp_path):
     """Doubts that grow with the error foretell it; those that shrink say the opposite."""
     photos = load_photos(folders.data, "test")
-    ones = task.Scales(torch.ones(3), torch.ones(3))
+    ones = measures.Scales(torch.ones(3), torch.ones(3))
     pairs = []
     for view in range(2):
         layers = layers_module.render_layers(nn.Identity(), photos.cameras, view)
-        expected = task._expected(photos, {}, view)
+        expected = expected_view(photos, {}, view)
         error = (linear_to_srgb(layers.albedo) - expected.albedo).abs().mean(-1)
         doubt = torch.stack([error.sqrt(), torch.zeros_like(error)], -1)
-        albedo, roughness = task._judged(dataclasses.replace(layers, doubt=doubt), expected, ones)
+        albedo, roughness = measures.doubts_and_errors(
+            dataclasses.replace(layers, doubt=doubt), expected, ones
+        )
         assert len(albedo[0]) == int(inside().sum())
         pairs.append((albedo, (-albedo[0], albedo[1]), roughness))
-    found = [task._foretold(list(p)) for p in zip(*pairs, strict=True)]
+    found = [measures.doubt_correlation(list(p)) for p in zip(*pairs, strict=True)]
     assert found == [pytest.approx(1.0), pytest.approx(-1.0), None]  # the last are all equal
-    assert task._foretold([None]) is None
+    assert measures.doubt_correlation([None]) is None
 
 
 def test_other_data_can_be_named(folders, relit_calls):

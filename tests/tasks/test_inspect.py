@@ -104,19 +104,19 @@ def test_irradiance_of_an_even_sky():
 def test_pixels_as_they_are_written():
     assert parse_pixel("12,34") == (12, 34)
     for text in ("12", "a,b", "1,2,3", "1.5,2"):
-        with pytest.raises(ValueError, match=f"--pixel: expected COLUMN,ROW, got '{text}'"):
+        with pytest.raises(ValueError, match=f"pixel: expected COLUMN,ROW, got '{text}'"):
             parse_pixel(text)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("r_7", (1, 1)), "--view: expected a number below 2 or one of r_0 to r_1, got 'r_7'"),
-        (("2", (1, 1)), "--view: expected a number below 2"),
-        (("0", (32, 1)), "--pixel: expected one of the 32x32 pixels, got 32,1"),
-        (("0", (-1, 1)), "--pixel: expected one of the 32x32 pixels, got -1,1"),
-        (("0", (0, 0)), "--pixel: there is no surface under pixel 0,0"),
-        (("0", (16, 16), "a.jpg"), r"--out: expected a name that ends in \.png, got a\.jpg"),
+        (("r_7", (1, 1)), "view: expected a number below 2 or one of r_0 to r_1, got 'r_7'"),
+        (("2", (1, 1)), "view: expected a number below 2"),
+        (("0", (32, 1)), "pixel: expected one of the 32x32 pixels, got 32,1"),
+        (("0", (-1, 1)), "pixel: expected one of the 32x32 pixels, got -1,1"),
+        (("0", (0, 0)), "pixel: there is no surface under 0,0"),
+        (("0", (16, 16), "a.jpg"), r"out: expected a name that ends in \.png, got a\.jpg"),
         (("0", (16, 16), None, 0), "height must be at least 1, got 0"),
     ],
 )

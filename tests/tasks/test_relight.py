@@ -12,7 +12,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.data.images import read_exr, read_image, write_exr
 from univoxel.envmap import EnvMap
 from univoxel.errors import DataError
-from univoxel.ops import Sun, VisibilityScene
+from univoxel.ops import Lamp, PointLight, Sun, VisibilityScene
 from univoxel.pictures.viewpoints import orbit
 from univoxel.records import Mesh, Surface
 from univoxel.tasks import relight as task
@@ -78,7 +78,7 @@ def frames(run, out="out", maps="white", **kwargs):
     cameras = kwargs.pop("cameras", str(run / "cameras.json"))
     options = {"samples": 32, "bounces": 1, "progress": False}
     envmap = [run / f"{m}.exr" for m in maps] if isinstance(maps, list) else run / f"{maps}.exr"
-    task.relight(run / "run", envmap, run / out, cameras=cameras, **(options | kwargs))
+    task.relight_to_files(run / "run", envmap, run / out, cameras=cameras, **(options | kwargs))
     return sorted(p.relative_to(run / out).as_posix() for p in (run / out).rglob("*.*"))
 
 
@@ -186,11 +186,12 @@ def test_test_views_come_from_the_data_of_the_run(run):
     ("options", "error", "message"),
     [
         ({"samples": 0}, ValueError, "samples must be at least 1, got 0"),
+        ({"samples": 2**31 + 1}, ValueError, r"samples must be at most 2\^31, got 2147483649"),
         ({"resolution": 0}, ValueError, "resolution must be at least 1, got 0"),
         ({"bounces": -1}, ValueError, "bounces must be at least 0, got -1"),
         ({"exposure": -1.0}, ValueError, "exposure must be finite and at least 0, got -1.0"),
         ({"maps": ["white", "white"]}, ValueError, "maps of different names"),
-        ({"maps": []}, ValueError, "expected an environment map, a sun or a lamp, got none"),
+        ({"maps": []}, ValueError, "expected an environment map, a sun or a point light, got none"),
         ({"rotate": math.inf}, ValueError, "rotate must be finite"),
         ({"noise": 0.0}, ValueError, "noise must be above 0, got 0.0"),
         ({"turn": 0}, ValueError, "turn must be at least 1 frame, got 0"),
@@ -244,15 +245,30 @@ def test_suns_alone_and_a_floor(run):
     assert set(layers["shadow"].ravel().tolist()) == {0.0, 1.0}  # a hard sun: all or nothing
 
 
+def test_options_have_the_name_of_before_too(run):
+    light = PointLight((2.0, 0.0, 0.0), (9.0, 9.0, 9.0))
+    where = run / "run", None, str(run / "cameras.json")
+    now, before = (
+        task.relight_images(*where, samples=1, **{name: [light]})
+        for name in ("point_lights", "lamps")
+    )
+    assert now[..., :3].max() > 0.1
+    assert torch.equal(now, before)
+    assert Lamp is PointLight
+    with pytest.raises(TypeError, match="moons"):
+        task.relight_images(*where, moons=[])
+
+
 def test_pictures_as_tensors(run):
     white = EnvMap(torch.ones(4, 8, 3))
-    made = task.images(run / "run", white, str(run / "cameras.json"), samples=8, noise=0.2)
+    made = task.relight_images(run / "run", white, str(run / "cameras.json"), samples=8, noise=0.2)
     assert made.shape == (2, SIZE, SIZE, 4)
     inside = made[..., 3] > 0
     assert made[inside][:, 0].mean() == pytest.approx(ALBEDO + 0.02, abs=0.05)
     assert made[~inside].eq(0).all()
     cameras = orbit(sphere(), 2, 16)
-    again = task.images(run / "run", run / "white.exr", cameras, samples=1, background="map")
+    options = {"samples": 1, "background": "map"}
+    again = task.relight_images(str(run / "run"), str(run / "white.exr"), cameras, **options)
     assert again.shape == (2, 16, 16, 4)
     assert again[..., 3].eq(1).all()
     torch.testing.assert_close(again[:, 0, 0, :3], torch.ones(2, 3))

@@ -12,21 +12,23 @@ from observed_points import (
     Steps,
     in_double,
     lamps,
+    no_metal,
     photographed,
     photographs_under,
     problem_on_a_sphere,
     random_problem,
 )
 
-from univoxel import losses
 from univoxel.checkpoint import load_checkpoint, load_scene, save_scene
 from univoxel.cli import main
+from univoxel.color import linear_to_srgb_unclipped
 from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.joint import equations, newton, stage
 from univoxel.joint.config import JointConfig
-from univoxel.joint.observations import draw_sightings, widened
+from univoxel.joint.newton import newton_round_
+from univoxel.joint.observations import prefiltered_roughness, shade_observations
 from univoxel.lights import SGConfig
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import Scene, SceneConfig
@@ -51,22 +53,23 @@ def varying(scene: Scene, views: int, kind: str = "light") -> Scene:
     return other
 
 
-def test_sightings_are_drawn_in_the_light_of_their_photographs():
+def test_observations_are_shaded_in_the_light_of_their_photographs():
     problem, albedo, roughness = random_problem(), torch.rand(5, 3), 0.2 + 0.6 * torch.rand(5)
     scene = varying(sphere_scene(NODES), 4)
+    problem = replace(problem, sky=scene.sky)
     f0, views = torch.full((20, 3), 0.04), scene.views
-    point = torch.repeat_interleave(problem.seen.offsets.diff())
+    point = torch.repeat_interleave(problem.observations.offsets.diff())
     order = torch.randperm(20)
     with torch.no_grad():
-        drawn = torch.empty(20, 3)
-        drawn[order] = draw_sightings(
-            *(scene, problem, point[order], order, problem.seen.normal[point][order]),
+        shaded = torch.empty(20, 3)
+        shaded[order] = shade_observations(
+            *(scene, problem, point[order], order, problem.observations.normal[point][order]),
             *(albedo[point][order], roughness[point][order], f0),
         )
         for v in range(4):
             map = (scene.sky.log_radiance + views.sky_change()[v]).exp()
-            alone = photographed(problem, map, albedo, roughness).seen.color * views.gain(v)
-            torch.testing.assert_close(drawn[v::4], alone[v::4])
+            alone = photographed(problem, map, albedo, roughness).observations.color * views.gain(v)
+            torch.testing.assert_close(shaded[v::4], alone[v::4])
 
 
 def test_equations_know_what_differs():
@@ -74,37 +77,40 @@ def test_equations_know_what_differs():
     problem = random_problem()
     map, albedo = 0.5 + torch.rand(NODES, 3), 0.2 + 0.6 * torch.rand(5, 3)
     problem = photographed(problem, map, albedo, torch.full((5,), 0.3))
-    sighting = torch.arange(20).view(5, 4)
-    rows = newton.light_rows(problem, torch.arange(5), sighting, torch.full((5,), 0.3))
-    assert torch.equal(rows.view, sighting % 4)
-    rows = in_double(rows)
-    differs = equations.view_differences(varying(sphere_scene(NODES), 4))
-    gain, change = differs.gain.detach().double(), differs.change.detach().double()
-    basis = differs.basis.detach().double()
+    point, observation = torch.arange(5), torch.arange(20).view(5, 4)
+    rough = torch.full((5,), 0.3)
+    transport = newton.linear_transport(problem, point, observation, rough, False)
+    assert torch.equal(transport.view, observation % 4)
+    transport = in_double(transport)
+    differences = equations.view_differences(varying(sphere_scene(NODES), 4))
+    gain = differences.gain.detach().double()
+    change = differences.map_factor.detach().double()
+    basis = differences.basis.detach().double()
     start = (map.log(), albedo.log(), gain.log(), torch.zeros(4, len(basis), 3))
     x, a, g, w = (value.double().requires_grad_() for value in start)
     more = torch.einsum("vrc,rd->vdc", w, basis)
-    light = x.exp() * (change * more.exp())[rows.view]  # [P, V, D, 3]
-    diffuse = torch.einsum("pxd,pvdc->pvc", rows.diffuse, light) * rows.through[..., None]
-    shine = torch.einsum("pvd,pvdc->pvc", rows.shine, light)
-    drawn = a.exp()[:, None] * (diffuse + rows.diffuse_blocked) + shine + rows.shine_blocked
-    residual = rows.target - losses.encode(g.exp()[rows.view] * drawn)
-    weight = 1 / (1 + (residual.detach() / equations.CAUCHY) ** 2)
-    weight = weight.masked_fill((rows.target > equations.CLIPPED) & (residual < 0), 0.0)
+    light = x.exp() * (change * more.exp())[transport.view]  # [P, V, D, 3]
+    diffuse = torch.einsum("pxd,pvdc->pvc", transport.diffuse, light)
+    diffuse = diffuse * transport.diffuse_factor[..., None] + transport.diffuse_indirect
+    specular = torch.einsum("pvd,pvdc->pvc", transport.specular, light)
+    shaded = a.exp()[:, None] * diffuse + specular + transport.specular_indirect
+    residual = transport.target - linear_to_srgb_unclipped(g.exp()[transport.view] * shaded)
+    cauchy = JointConfig().newton.cauchy
+    weight = 1 / (1 + (residual.detach() / cauchy) ** 2)
+    weight = weight.masked_fill((transport.target > equations.CLIPPED) & (residual < 0), 0.0)
     cost = (weight * residual.square()).sum()
     by_map, by_albedo, by_gain, by_weights = torch.autograd.grad(cost, (x, a, g, w))
-    _, right, tie = equations.normal_equations(
-        rows, map.double(), a.detach(), equations.Differs(gain, change, basis)
-    )
-    assert tie.cost == pytest.approx(cost.item(), rel=1e-6)
+    state = transport, map.double(), a.detach(), cauchy
+    differences = equations.ViewDifferences(gain, change, basis)
+    _, right, back = equations.normal_equations(*state, differences)
+    assert back.cost == pytest.approx(cost.item(), rel=1e-6)
     # The elimination's share of the gradient put back
-    full = right + torch.einsum("cpd,cp->cd", tie.cross, tie.own / tie.norm)
+    full = right + torch.einsum("cpd,cp->cd", back.cross, back.gradient / back.curvature)
     exact = {"rtol": 1e-5, "atol": 1e-7}
     torch.testing.assert_close(full[:, :NODES], -by_map.T / 2, **exact)
     torch.testing.assert_close(full[:, NODES:], -by_gain.T / 2, **exact)
-    torch.testing.assert_close(tie.own, -by_albedo.T / 2, **exact)
-    differs = equations.Differs(gain, change, basis)
-    _, slopes = equations.view_equations(rows, map.double(), a.detach(), differs)
+    torch.testing.assert_close(back.gradient, -by_albedo.T / 2, **exact)
+    _, slopes = equations.view_equations(*state, differences)
     torch.testing.assert_close(slopes[..., -1], -by_gain.T / 2, **exact)
     torch.testing.assert_close(slopes[..., :-1], -by_weights.permute(2, 0, 1) / 2, **exact)
 
@@ -119,7 +125,7 @@ def stops(views: int, most: float) -> torch.Tensor:
 def test_newton_finds_gains_and_what_each_map_has_of_its_own():
     nodes, views = 64, 12
     scene = varying(scene_of((0.5, 0.4, 0.3), 0.3, nodes), views)
-    problem = problem_on_a_sphere(400, views, nodes)
+    problem = problem_on_a_sphere(400, views, nodes, scene)
     map = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
     wanted = stops(views, 1.0)
     change = scene.views.sky_change().detach()
@@ -128,18 +134,18 @@ def test_newton_finds_gains_and_what_each_map_has_of_its_own():
             problem,
             map * change[v].exp() * 2 ** wanted[v],
             torch.tensor([0.5, 0.4, 0.3]).expand(400, 3),
-            widened(torch.full((400,), 0.3), nodes),
-        ).seen.color[v::views]
+            prefiltered_roughness(torch.full((400,), 0.3), nodes),
+        ).observations.color[v::views]
         for v in range(views)
     ]
     color = torch.stack(colors, 1).flatten(0, 1)
-    problem = replace(problem, target=losses.encode(color))
+    problem = replace(problem, target=linear_to_srgb_unclipped(color))
     with torch.no_grad():
         scene.views.gain_steps.zero_()
         scene.views.sky_weights.zero_()
     cfg = JointConfig(newton_points=400, newton_views=12, newton_steps=8)
-    costs = newton.newton_round(scene, problem, cfg)
-    costs += newton.newton_round(scene, problem, cfg)
+    costs = newton_round_(scene, problem, no_metal(problem), cfg).costs
+    costs += newton_round_(scene, problem, no_metal(problem), cfg).costs
     assert costs[-1] < 0.03 * costs[0]
     # A view sees half a sphere of normals, on which a change of degree 2 or 3 is nearly a gain and
     # one of degree 1: between them part stays open, though what they draw together does not

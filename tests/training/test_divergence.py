@@ -6,7 +6,7 @@ import json
 import pytest
 import torch
 from analytic import photos_of, sphere_scene, write_scene
-from observed_points import Steps, problem_on_a_sphere
+from observed_points import Steps, no_metal, problem_on_a_sphere
 
 from univoxel.checkpoint import load_scene
 from univoxel.config import TrainConfig
@@ -294,9 +294,9 @@ def test_a_system_is_damped_only_as_it_needs():
 
 
 def test_a_newton_round_without_a_solution_leaves_the_map(monkeypatch):
-    scene, told = sphere_scene(32), []
-    problem = problem_on_a_sphere(100, 12, 32)
+    scene = sphere_scene(32)
+    problem = problem_on_a_sphere(100, 12, 32, scene)
     monkeypatch.setattr(newton, "solve_damped", lambda *_: None)
-    assert newton.newton_round(scene, problem, JOINT, tell=told.append) == []
-    assert told == [newton.UNSOLVABLE]
+    solved = newton.newton_round_(scene, problem, no_metal(problem), JOINT)
+    assert solved == newton.NewtonRound([], [newton.UNSOLVABLE])
     assert (scene.sky.log_radiance == 0).all()

@@ -8,6 +8,7 @@ from torch import Tensor
 from univoxel.assets.atlas import dilated, rasterise, unwrap, vertex_normals, vertex_tangents
 from univoxel.assets.base import TexturedMesh
 from univoxel.brdf import metal_or_none
+from univoxel.errors import UserError
 from univoxel.fields.field import Field
 from univoxel.records import FieldSample, Mesh
 from univoxel.scene import Scene
@@ -62,7 +63,7 @@ def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
     tangents = vertex_tangents(vertices, faces, normals, uv)
     texel, face, weight = rasterise(uv, faces, size)
     if not len(texel):
-        raise ValueError(f"a texture of {size} x {size} is too small for {len(faces)} faces")
+        raise UserError(f"a texture of {size} x {size} is too small for {len(faces)} faces")
     parts = []
     for some, w in zip(face.split(POINTS_AT_ONCE), weight.split(POINTS_AT_ONCE), strict=True):
         corner = faces[some].long()

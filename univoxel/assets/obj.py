@@ -12,6 +12,7 @@ from univoxel.assets.base import (
     roughness_picture,
 )
 from univoxel.data.images import write_png
+from univoxel.errors import UserError
 from univoxel.files import replacing
 
 
@@ -29,7 +30,7 @@ def write_obj(path: Path, mesh: TexturedMesh) -> None:
     """
     name = path.stem
     if name.split() != [name]:
-        raise ValueError(f"{path}: readers of OBJ need a file name without spaces")
+        raise UserError(f"{path}: readers of OBJ need a file name without spaces")
     pictures = {
         "albedo": albedo_picture(mesh),
         "roughness": roughness_picture(mesh),

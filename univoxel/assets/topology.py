@@ -13,6 +13,7 @@ import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from univoxel.errors import NoSurface, UserError
 from univoxel.records import Mesh
 
 WELD = 1e-3  # of the mean edge: vertices closer than this become one
@@ -32,7 +33,7 @@ def clean(mesh: Mesh) -> Mesh:
     if len(faces):
         faces = _component_faces(vertices, _without_degenerate(_welded(vertices, faces)))
     if not len(faces):
-        raise ValueError("the surface has no part that encloses volume")
+        raise NoSurface("the surface has no part that encloses volume")
     used, index = np.unique(faces, return_inverse=True)
     return _mesh(vertices[used], index.reshape(-1, 3))
 
@@ -64,7 +65,7 @@ def close(mesh: Mesh) -> Mesh:
         vertices = np.concatenate([vertices, vertices[loop].mean(0, keepdims=True)])
     mesh = _mesh(vertices, faces)
     if bad := open_edges(mesh):
-        raise ValueError(f"the mesh cannot be made watertight: {bad} edges do not join two faces")
+        raise UserError(f"the mesh cannot be made watertight: {bad} edges do not join two faces")
     return mesh
 
 

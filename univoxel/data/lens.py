@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from univoxel.errors import UserError
+
 ZOOM = (0.5, 2.0)  # of the pinhole against the lens, at most
 HALVINGS = 30  # of the interval above: far below a thousandth of a pixel
 EDGE_POINTS = 65  # along each border of a picture, where it is asked what a lens sees
@@ -61,13 +63,13 @@ def straightened(lens: Lens) -> Lens:
         return lens
     low, high = ZOOM
     if not _fits(lens, high):
-        raise ValueError(f"its distortion leaves less than 1/{high:g} of the picture's width")
+        raise UserError(f"its distortion leaves less than 1/{high:g} of the picture's width")
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         low, high = (low, middle) if _fits(lens, middle) else (middle, high)
     pinhole = _zoomed(lens, high)
     if _folds(lens, pinhole):
-        raise ValueError("its distortion folds the picture over: check the coefficients")
+        raise UserError("its distortion folds the picture over: check the coefficients")
     return pinhole
 
 

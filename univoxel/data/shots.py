@@ -16,7 +16,7 @@ from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data.base import Photos, decode
 from univoxel.data.images import read_image
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
-from univoxel.errors import DataError
+from univoxel.errors import DataError, UserError
 
 LARGE = 200_000_000  # pixels in all photographs, from where on their size must be chosen
 TRAINING_BYTES = 25  # of memory that training takes for each of them, about
@@ -26,7 +26,7 @@ LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
 # How far +Z may be from the cameras' common up direction in a world that is taken as upright:
 # cameras are held askew and lean over, but worlds that are not upright are turned by much more.
 LEAN = math.radians(30)
-HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/data.md#masks"
+HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/guide/masks.md"
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def read_shots(
             last, grid = shot.lens, None
             try:
                 pinhole = straightened(shot.lens)
-            except ValueError as error:
+            except UserError as error:
                 raise DataError(f"{shot.where}: {error}") from None
             if shot.lens.bent:
                 grid = sources(shot.lens, pinhole)
@@ -253,8 +253,11 @@ def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
         raise DataError(
             f"{folder}: {len(shots)} photographs of {width}x{height} pixels take about "
             f"{pixels * TRAINING_BYTES / 1e9:.0f} GB of memory in training: choose a size, such as "
-            f"--downscale {factor} for {width // factor}x{height // factor}, or --downscale 1 to "
-            "keep theirs"
+            f"downscale={factor} for {width // factor}x{height // factor}, or downscale=1 to keep "
+            "theirs",
+            "downscale",
         )
     if downscale > min(width, height):
-        raise DataError(f"{folder}: --downscale {downscale} leaves nothing of {width}x{height}")
+        raise DataError(
+            f"{folder}: downscale={downscale} leaves nothing of {width}x{height}", "downscale"
+        )

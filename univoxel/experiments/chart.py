@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from univoxel.config import TrainConfig
+from univoxel.errors import ProcessFailed, UserError
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
-from univoxel.experiments.record import Outcome, Setting
+from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
 from univoxel.training.config import StageConfig
@@ -76,16 +76,16 @@ def chart(
         out/chart.png.
 
     Raises:
-        DataError, ValueError: a scene or an argument cannot be used; nothing was trained.
-        ImportError: matplotlib is missing.
-        RuntimeError: trainings failed; what came through is in the files.
+        UserError: a scene or an argument cannot be used; nothing was trained.
+        MissingExtra: matplotlib is missing.
+        ProcessFailed: trainings failed; what came through is in the files.
         OSError: a file cannot be written.
     """
     plots.require()
     chosen = settings(preset, light, tuple(changes))
     wanted = only or ((*dict.fromkeys(("draft", preset)), *QUICK) if quick else tuple(chosen))
     if unknown := [name for name in wanted if name not in chosen]:
-        raise ValueError(f"--only must be of {', '.join(chosen)}, got {', '.join(unknown)}")
+        raise UserError(f"only must be of {', '.join(chosen)}, got {', '.join(unknown)}", "only")
     outcomes = runner.run(scenes, [chosen[name] for name in wanted], out, samples)
     record = {
         "preset": preset,
@@ -93,16 +93,16 @@ def chart(
         "changes": list(changes),
         "samples": samples,
         "machine": plots.machine(),
-        "points": [asdict(outcome) for outcome in outcomes],
+        "points": [outcome.summary() for outcome in outcomes],
         "fronts": fronts(outcomes),
         "published": [asdict(point) for point in PUBLISHED],
     }
     with replacing(out / "chart.json") as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(result_text(record), encoding="utf-8")
     if any(not outcome.error for outcome in outcomes):
         draw(outcomes, out / "chart")
     if failed := runner.failures(outcomes):
-        raise RuntimeError(failed)
+        raise ProcessFailed(failed)
     return out / "chart.png"
 
 

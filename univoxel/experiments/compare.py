@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
 
+from univoxel.errors import ProcessFailed, UserError
 from univoxel.experiments import plots, runner
 from univoxel.experiments.plots import Measure
-from univoxel.experiments.record import Outcome, Setting
+from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
 
@@ -53,9 +52,9 @@ def compare(
         out/compare.md.
 
     Raises:
-        DataError, ValueError: a scene or an argument cannot be used; nothing was trained.
-        ImportError: matplotlib is missing.
-        RuntimeError: trainings failed; what came through is in the files.
+        UserError: a scene or an argument cannot be used; nothing was trained.
+        MissingExtra: matplotlib is missing.
+        ProcessFailed: trainings failed; what came through is in the files.
         OSError: a file cannot be written.
     """
     plots.require()
@@ -67,16 +66,16 @@ def compare(
         "changes": list(changes),
         "samples": samples,
         "machine": plots.machine(),
-        "rows": [asdict(outcome) for outcome in outcomes],
+        "rows": [outcome.summary() for outcome in outcomes],
     }
     with replacing(out / "compare.json") as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(result_text(record), encoding="utf-8")
     with replacing(out / "compare.md") as temporary:
         temporary.write_text(markdown(outcomes), encoding="utf-8")
     if any(not outcome.error for outcome in outcomes):
         draw(outcomes, out / "compare")
     if failed := runner.failures(outcomes):
-        raise RuntimeError(failed)
+        raise ProcessFailed(failed)
     return out / "compare.md"
 
 
@@ -136,7 +135,7 @@ def draw(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
 def _setting(text: str, preset: str, minutes: float | None, changes: tuple[str, ...]) -> Setting:
     name, _, fields = text.partition(":")
     if name not in LIGHTS:
-        raise ValueError(f"--light must be one of {', '.join(LIGHTS)}, got {text!r}")
+        raise UserError(f"light must be one of {', '.join(LIGHTS)}, got {text!r}", "light")
     light: LightName = name
     own = tuple(f"scene.light.{field}" for field in fields.split(",") if field)
     label = "-".join([name, *fields.split(",")]) if fields else name

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from univoxel import __version__
+from univoxel.errors import MissingExtra
 from univoxel.files import replacing
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def require() -> None:
     try:
         import matplotlib
     except ImportError:
-        raise ImportError("the pictures need matplotlib: pip install 'univoxel[chart]'") from None
+        raise MissingExtra("the pictures need matplotlib: pip install 'univoxel[chart]'") from None
     matplotlib.use("agg")
 
 

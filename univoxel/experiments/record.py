@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from univoxel.config import TrainConfig
+from univoxel.errors import DataError
 from univoxel.files import replacing
 from univoxel.names import LightName
 from univoxel.overrides import changed
@@ -44,8 +47,8 @@ class Outcome:
     scene: str
     setting: str
     identity: dict  # what a later call must agree with to take this for its own; JSON
-    # By the keys of tasks.evaluate.MEASURES, steps_made (share of the planned ones), and map_*, the
-    # fields of tasks.envmap.Comparison
+    # By the keys of evaluation.measures.MEASURES, steps_made (share of the planned ones), and
+    # map_*, the fields of tasks.envmap.Comparison
     measures: Mapping[str, float | int | None] = dataclasses.field(default_factory=dict)
     log: list[dict] = dataclasses.field(default_factory=list)  # seconds, stage, held_out_psnr
     load_average: float | None = None  # of the machine when it began
@@ -61,6 +64,12 @@ class Outcome:
             text = json.dumps(dataclasses.asdict(self), indent=1)
             temporary.write_text(text + "\n", encoding="utf-8")
 
+    def summary(self) -> dict:
+        """All but the identity, which result.json keeps."""
+        fields = dataclasses.asdict(self)
+        del fields["identity"]
+        return fields
+
 
 def load_outcome(folder: Path) -> Outcome | None:
     """What folder/result.json holds; None where there is none.
@@ -74,7 +83,7 @@ def load_outcome(folder: Path) -> Outcome | None:
     try:
         return Outcome(**json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"{path}: expected the record of a training: {error}") from None
+        raise DataError(f"{path}: expected the record of a training: {error}") from None
 
 
 def identity(config: TrainConfig, samples: int) -> dict:
@@ -82,3 +91,39 @@ def identity(config: TrainConfig, samples: int) -> dict:
     fields = dataclasses.asdict(config) | {"data": str(config.data.resolve())}
     del fields["out"]
     return json.loads(json.dumps({"samples": samples, "config": fields}, default=str))
+
+
+def result_text(record: dict) -> str:
+    """A record of measurements as JSON text, with one entry a line and six digits a number.
+
+    Each key of the record begins a line. Where its value is a list or a dict of records, each of
+    these has a line of its own. So files stay short, and a changed record is a changed line. JSON
+    has no number that is not finite: such numbers become text.
+    """
+    entries = [f"{json.dumps(key)}: {_lines(_rounded(value))}" for key, value in record.items()]
+    return "{\n" + ",\n".join(entries) + "\n}\n"
+
+
+def _lines(value: object) -> str:
+    """JSON of one entry; several records stand on a line each."""
+    if isinstance(value, list) and any(isinstance(item, (dict, list)) for item in value):
+        return "[\n" + ",\n".join(_line(item) for item in value) + "\n]"
+    if isinstance(value, dict) and any(isinstance(item, (dict, list)) for item in value.values()):
+        lines = (f"{json.dumps(key)}: {_line(item)}" for key, item in value.items())
+        return "{\n" + ",\n".join(lines) + "\n}"
+    return _line(value)
+
+
+def _line(value: object) -> str:
+    return json.dumps(value, allow_nan=False)
+
+
+def _rounded(value: Any) -> Any:
+    """The same with lists for tuples, text for keys, and numbers of six significant digits."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else str(value)
+    if isinstance(value, Mapping):
+        return {str(key): _rounded(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_rounded(item) for item in value]
+    return value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import re
 import signal
 import subprocess
@@ -13,12 +14,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
+from univoxel.bars import bar
 from univoxel.data import load_photos
+from univoxel.errors import UserError
 from univoxel.experiments import worker
 from univoxel.experiments.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.files import replacing
+
+log = logging.getLogger("univoxel")
 
 OUTPUT = "output.txt"  # what the process said
 NAME = re.compile(r"[\w.+=-]*\w[\w.+=-]*")
@@ -46,7 +51,7 @@ def run(
 
     Raises:
         DataError: a scene cannot be read.
-        ValueError: two scenes or settings of one name; as of `run_pairs`.
+        UserError: two scenes or settings of one name; as of `run_pairs`.
         OSError: `out` cannot be written.
     """
     settings = _distinct(settings)
@@ -76,7 +81,7 @@ def run_pairs(
         seconds: what one may take, a guess for the bar; the configuration's time when left out.
 
     Raises:
-        ValueError: a setting that no configuration follows from, a pair that comes twice, or
+        UserError: a setting that no configuration follows from, a pair that comes twice, or
             results of other settings in `out`.
         OSError: `out` cannot be written.
     """
@@ -91,16 +96,17 @@ def _run(jobs: Sequence[Job]) -> list[Outcome]:
     for job in jobs:
         found = before[job.folder]
         if found is not None and found.identity != job.identity:
-            raise ValueError(
+            raise UserError(
                 f"{job.folder / RESULT}: is of another configuration or data set: remove it, or "
-                "choose another --out"
+                "choose another out",
+                "out",
             )
     done = {folder: found for folder, found in before.items() if found and not found.error}
     missing = [job for job in jobs if job.folder not in done]
-    with _Bar(missing, len(jobs)) as bar:
+    with _Bar(missing, len(jobs)) as shown:
         for job in missing:
-            done[job.folder] = _train(job, bar)
-            bar.finished(job, done[job.folder])
+            done[job.folder] = _train(job, shown)
+            shown.finished(job, done[job.folder])
     return [done[job.folder] for job in jobs]
 
 
@@ -120,10 +126,10 @@ def _named(scenes: Iterable[Path]) -> list[Path]:
     """Scenes as absolute folders, whose names tell them apart."""
     folders = [Path(scene).resolve() for scene in scenes]
     if not folders:
-        raise ValueError("expected a scene, a folder of photographs, or more; got none")
+        raise UserError("expected a scene, a folder of photographs, or more; got none")
     if len({folder.name for folder in folders}) < len(folders):
         names = [str(folder) for folder in folders]
-        raise ValueError(f"expected scenes in folders of different names, got {names}")
+        raise UserError(f"expected scenes in folders of different names, got {names}")
     return folders
 
 
@@ -131,20 +137,20 @@ def _distinct(settings: Sequence[Setting]) -> Sequence[Setting]:
     names = [setting.name for setting in settings]
     bad = [name for name in names if not NAME.fullmatch(name) or names.count(name) > 1]
     if bad or not names:
-        raise ValueError(f"expected settings of different names, got {bad or names}")
+        raise UserError(f"expected settings of different names, got {bad or names}")
     return settings
 
 
 def _job(data: Path, setting: Setting, out: Path, samples: int, seconds: float | None) -> Job:
     if samples < 1:
-        raise ValueError(f"--samples must be at least 1, got {samples}")
+        raise UserError(f"samples must be at least 1, got {samples}", "samples")
     folder = out / data.name / setting.name
     config = setting.config(data, folder / worker.RUN)
     seconds = 60 * config.minutes + EVALUATION_SECONDS if seconds is None else seconds
     return Job(folder, data.name, data, setting, samples, identity(config, samples), seconds)
 
 
-def _train(job: Job, bar: _Bar) -> Outcome:
+def _train(job: Job, shown: _Bar) -> Outcome:
     """The outcome of a job, which is recorded in its folder."""
     job.folder.mkdir(parents=True, exist_ok=True)
     (job.folder / RESULT).unlink(missing_ok=True)  # of a failure before
@@ -159,7 +165,7 @@ def _train(job: Job, bar: _Bar) -> Outcome:
         begin = time.monotonic()
         try:
             while process.poll() is None:
-                bar.now(job, time.monotonic() - begin)
+                shown.now(job, time.monotonic() - begin)
                 time.sleep(POLL_SECONDS)
         finally:
             process.kill()  # only when this was interrupted is it still there
@@ -187,7 +193,7 @@ class _Bar:
         self._left = sum(job.seconds for job in jobs)
         self._spent, self._expected = 0.0, 0.0  # seconds of what was done in this sitting
         self._now = 0.0
-        self._progress = Progress(
+        self._progress = bar(
             TextColumn("{task.completed}/{task.total}"),
             BarColumn(),
             TextColumn("{task.description}  {task.fields[left]}"),
@@ -219,5 +225,4 @@ class _Bar:
         self._left -= job.seconds
         self._progress.advance(self._task)
         if outcome.error:
-            text = f"{job.scene}/{job.setting.name} failed: {outcome.error}"
-            self._progress.console.print(text, markup=False)
+            log.info("%s/%s failed: %s", job.scene, job.setting.name, outcome.error)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import fcntl
 import json
+import logging
 import os
 import shutil
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 
 from univoxel.checkpoint import load_checkpoint
 from univoxel.config import TrainConfig, check_same
+from univoxel.errors import ProcessFailed, UserError
 from univoxel.experiments.record import Outcome, Setting, identity
 from univoxel.tasks.envmap import Comparison, envmap
 from univoxel.tasks.evaluate import evaluate
@@ -36,7 +38,7 @@ def work(folder: Path) -> None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            raise RuntimeError(f"{folder}: another process is at work there") from None
+            raise ProcessFailed(f"{folder}: another process is at work there") from None
         job = json.load(file)
         setting = Setting(**job["setting"] | {"changes": tuple(job["setting"]["changes"])})
         config = setting.config(Path(job["data"]), folder / RUN)
@@ -65,7 +67,7 @@ def finished(config: TrainConfig) -> bool:
     try:
         check_same(config)
         return load_checkpoint(config.out)[1]["stage"] == len(config.stages)
-    except (ValueError, FileNotFoundError):
+    except UserError:
         return False
 
 
@@ -94,4 +96,5 @@ def read_log(path: Path) -> list[dict]:
 
 
 if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
     work(Path(sys.argv[1]))

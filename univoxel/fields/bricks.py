@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
+from univoxel.errors import NoSurface
 from univoxel.fields.distances import BAND, AbstractDistances, no_values
 from univoxel.grid import GridShape
 from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_sparse, smooth_rows_
@@ -147,7 +148,7 @@ class BrickDistances(AbstractDistances):
     def isosurface(self) -> tuple[Tensor, Tensor]:
         values, (planes, *_) = self.sdf.detach(), self.grid.size
         if self.count == Bricks.MISSING or not values.min() < 0 < values.max():
-            raise ValueError("the field has no surface: its sdf does not change sign")
+            raise NoSurface("the field has no surface: its sdf does not change sign")
         parts = []
         for begin in range(0, planes - 1, SLAB):  # the whole grid would take much memory
             slab = self._slab(values, begin, begin + SLAB + 1).numpy()

@@ -6,6 +6,7 @@ import torch
 from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
+from univoxel.errors import NoSurface
 from univoxel.fields.distances import AbstractDistances, no_values
 from univoxel.grid import GridShape, resample
 from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_dense, smooth_rows_
@@ -71,7 +72,7 @@ class DenseDistances(AbstractDistances):
     def isosurface(self) -> tuple[Tensor, Tensor]:
         sdf = self.sdf.detach().numpy()
         if not sdf.min() < 0 < sdf.max():
-            raise ValueError("the field has no surface: its sdf does not change sign")
+            raise NoSurface("the field has no surface: its sdf does not change sign")
         vertices, faces, _, _ = marching_cubes(sdf, 0.0, gradient_direction="descent")
         origin = torch.tensor(self.grid.origin)
         world = origin + self.voxel_size * torch.from_numpy(vertices.copy())

@@ -4,186 +4,181 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from univoxel import brdf
 from univoxel.fields.heads import MaterialHead
-from univoxel.joint.config import JointConfig
+from univoxel.joint.config import JointConfig, NewtonConfig
 from univoxel.joint.equations import (
-    Differs,
-    Rougher,
-    Rows,
-    Tie,
-    free_roughness,
+    EliminatedAlbedo,
+    LinearTransport,
+    RoughnessStep,
+    ViewDifferences,
     graph_laplacian,
     normal_equations,
+    roughness_terms,
     solve_damped,
     view_differences,
     view_equations,
 )
-from univoxel.joint.observations import LEAST_VIEWS, Problem, sightings_of, widened
+from univoxel.joint.observations import (
+    Decisions,
+    JointProblem,
+    observations_of,
+    prefiltered_roughness,
+)
 from univoxel.ops import specular_response
 from univoxel.scene import Scene
 
 NEWTON_CHUNK = 256  # points whose equations are built at once
-WEIGHTS_PRIOR = 10.0  # on changes of a view's map, in units of the Laplacian's weight
 UNSOLVABLE = "the equations for the map have no solution: it stays as it is in this round"
-NOISE = 0.02  # sRGB; what is left of a sighting
-DIFFERENCE = 0.02  # of roughness, that its slopes are taken over
-LEAST_CHUNKS = 2  # on a machine however slow
+
+
+@dataclass(frozen=True)
+class NewtonRound:
+    """What a round came to."""
+
+    costs: list[float] = field(default_factory=list)  # mean weighted squared residual by step
+    troubles: list[str] = field(default_factory=list)  # sentences about what had no solution
 
 
 @dataclass
-class Points:
-    """What a round of Newton looks at, and what it supposes of their materials by now."""
+class NewtonPoints:
+    """Points P of a round, V observations of each, and their materials as the steps have them."""
 
-    problem: Problem
+    problem: JointProblem
+    cfg: NewtonConfig
+    metal: Tensor  # [P] bool
     point: Tensor  # [P] int64, those of one material together
-    sighting: Tensor  # [P, V] int64
+    observation: Tensor  # [P, V] int64
     parts: list[Tensor]  # index into these, of points whose equations are built at once
     log_albedo: Tensor  # [P, 3]
     roughness: Tensor  # [P]
-    likely: Tensor  # [P] roughness as it was
-    pull: float  # on its squared distance from there, >= 0; 0: roughness stays
+    prior_roughness: Tensor  # [P] roughness as it was
+    prior_weight: float  # of the squared deviation from it, >= 0; 0: roughness stays
 
-    def keep(self, parts: int) -> None:
-        """Only the first parts."""
+    def keep_(self, parts: int) -> None:
+        """Keep only the first parts."""
         self.parts = self.parts[:parts]
         kept = slice(sum(map(len, self.parts)))
-        for name in ("point", "sighting", "log_albedo", "roughness", "likely"):
+        arrays = ("metal", "point", "observation", "log_albedo", "roughness", "prior_roughness")
+        for name in arrays:
             setattr(self, name, getattr(self, name)[kept])
 
-    def rows(self, part: Tensor, rougher: float = 0.0) -> Rows:
-        roughness = self.roughness[part] + rougher
-        shown = widened(roughness, len(self.problem.transport.direction))
-        return light_rows(self.problem, self.point[part], self.sighting[part], shown)
+    def transport(self, part: Tensor, roughness_step: float = 0.0) -> LinearTransport:
+        """Of a part, where its roughness is larger by the step."""
+        roughness = self.roughness[part] + roughness_step
+        roughness = prefiltered_roughness(roughness, self.problem.nodes)
+        metal = bool(self.metal[part].any())
+        point, observation = self.point[part], self.observation[part]
+        return linear_transport(self.problem, point, observation, roughness, metal)
 
     def equations(
-        self, part: Tensor, light: Tensor, differs: Differs | None
-    ) -> tuple[Tensor, Tensor, Tie]:
-        """Of a part under the map [D, 3], see `normal_equations`."""
-        state = self.rows(part), light, self.log_albedo[part], differs
-        if not self.pull:
+        self, part: Tensor, differences: ViewDifferences | None
+    ) -> tuple[Tensor, Tensor, EliminatedAlbedo]:
+        """Of a part under the present map, see `normal_equations`."""
+        sky, cauchy = self.problem.sky.radiance, self.cfg.cauchy
+        state = self.transport(part), sky, self.log_albedo[part], cauchy, differences
+        if not self.prior_weight:
             return normal_equations(*state)
-        away = (self.roughness - self.likely)[part]
-        rougher = Rougher(self.rows(part, DIFFERENCE), DIFFERENCE, self.pull, away)
-        return normal_equations(*state, rougher)
+        step = self.cfg.roughness_step
+        deviation = (self.roughness - self.prior_roughness)[part]
+        rougher = self.transport(part, step)
+        return normal_equations(*state, RoughnessStep(rougher, step, self.prior_weight, deviation))
 
-    def follow(self, ties: list[Tie], step: Tensor) -> None:
-        """Move albedo and roughness as a step of the light [3, D + B] wants it."""
-        steps = zip(*(tie.follow(step) for tie in ties), strict=True)
+    def step_(self, eliminated: list[EliminatedAlbedo], light_step: Tensor) -> None:
+        """Change albedo and roughness as it belongs to a step of the light [3, D + B]."""
+        steps = zip(*(e.back_substituted(light_step) for e in eliminated), strict=True)
         to_albedo, to_roughness = (torch.cat(x) for x in steps)
-        self.log_albedo = (self.log_albedo + to_albedo.clamp(-0.5, 0.5)).clamp(-7.0, 0.0)
-        moved = self.roughness + to_roughness.clamp(-0.1, 0.1)
-        self.roughness = moved.clamp(MaterialHead.min_roughness, 1.0)
+        most = self.cfg.max_albedo_change
+        log_albedo = self.log_albedo + to_albedo.clamp(-most, most)
+        self.log_albedo = log_albedo.clamp(self.cfg.min_log_albedo, 0.0)
+        most = self.cfg.max_roughness_change
+        roughness = self.roughness + to_roughness.clamp(-most, most)
+        self.roughness = roughness.clamp(MaterialHead.min_roughness, 1.0)
 
 
 @torch.no_grad()
-def newton_round(
+def newton_round_(
     scene: Scene,
-    problem: Problem,
+    problem: JointProblem,
+    decisions: Decisions,
     cfg: JointConfig,
     seconds: float = math.inf,
-    tell: Callable[[str], None] = print,
-) -> list[float]:
-    """Gauss-Newton steps on the log map, with albedo and roughness of every point eliminated.
+) -> NewtonRound:
+    """Change the scene's map, and what its views differ by, in Gauss-Newton steps; return their
+    costs. Albedo and roughness of every point are eliminated: the materials stay.
 
     The normal equations for log map, log albedo and roughness of the points are block diagonal in
-    the materials; their Schur complement is 3 D x 3 D. What then speaks for the map is only what no
-    material can explain: how a point's brightness changes from view to view, and with it the
-    absolute scale, from highlights of known reflectance. Were roughness fixed, map and roughness
-    would have to follow one another in many small steps: a bright map and rough surfaces look much
-    like a dim one and glossy surfaces. Residuals are in sRGB-encoded colour with Cauchy weights; a
-    graph Laplacian keeps the log map smooth. Where light varies, the views' log gains are solved
-    for together with the map, and before that, with the map as it is, what each view's map has of
-    its own. Returns the mean weighted squared residual before each step.
+    the materials; their Schur complement is 3 D x 3 D. What it leaves is what no material can
+    explain: how a point's brightness changes from view to view, and with it the absolute scale,
+    from highlights of known reflectance. Were roughness fixed, map and roughness would have to
+    follow one another in many small steps: a bright map and rough surfaces look much like a dim one
+    and glossy surfaces. Residuals are in sRGB-encoded colour with Cauchy weights; a graph Laplacian
+    keeps the log map smooth. Where light varies, the views' log gains are solved for together with
+    the map, and before that, with the map as it is, what each view's map has of its own.
 
     Args:
-        seconds: wall time that it may take, about: fewer points serve where all would take more.
-        tell: called with a sentence where the equations have no solution; then the round is over.
+        seconds: wall time that it may take, about: it takes fewer points where all would take more.
     """
     begin = time.monotonic()
-    sky = scene.sky
-    assert sky is not None
-    points = choose(scene, problem, cfg) if cfg.newton_steps else None
+    points = choose_points(scene, problem, decisions, cfg) if cfg.newton_steps else None
     if points is None:
-        return []
+        return NewtonRound()
     if seconds < math.inf:
         before = time.monotonic()
-        points.equations(points.parts[0], sky.radiance, None)
+        points.equations(points.parts[0], None)
         now = time.monotonic()
         room = (seconds - (now - begin)) / (cfg.newton_steps * max(now - before, 1e-6))
-        points.keep(max(LEAST_CHUNKS, int(room)))
-    count = points.sighting.numel()
-    smooth = cfg.newton_smooth * graph_laplacian(sky.direction)
-    unknowns = len(smooth) + (len(scene.views) if scene.views else 0)  # of a channel
-    smooth = torch.nn.functional.pad(smooth, 2 * (0, unknowns - len(smooth)))
+        points.keep_(max(cfg.newton.min_parts, int(room)))
+    laplacian = cfg.newton_smooth * graph_laplacian(problem.sky.direction, cfg.newton.neighbours)
     costs = []
     for _ in range(cfg.newton_steps):
-        differs = view_differences(scene)
-        if differs is not None and differs.basis is not None:
-            hessian = slope = torch.zeros(())
-            for k in points.parts:
-                state = points.rows(k), sky.radiance, points.log_albedo[k], differs
-                h, g = view_equations(*state)
-                hessian, slope = hessian + h / count, slope + g / count
-            if not views_step(scene, hessian, slope, cfg.newton_smooth):
-                tell(UNSOLVABLE)
-                break
-            differs = view_differences(scene)
-        x = sky.log_radiance.T  # [3, D]
-        if problem.sun is not None:
-            x = x - problem.sun.T
-        x = torch.nn.functional.pad(x, (0, unknowns - x.shape[1]))  # no gain is likelier than 1
-        system, right, ties = smooth, -x @ smooth, []
-        between = torch.zeros(())  # channels, which roughness ties to one another
-        for k in points.parts:  # added up at once: all would take much memory
-            h, g, tie = points.equations(k, sky.radiance, differs)
-            if tie.roughness is not None:
-                taken, less = free_roughness(tie.roughness)
-                between, g = between + taken / count, g - less
-            system, right = system + h / count, right + g / count
-            ties.append(tie)
-        system.diagonal(dim1=1, dim2=2).add_(cfg.newton_smooth)
-        if points.pull:
-            system, right = torch.block_diag(*system) - between, right.flatten()
-        step = solve_damped(system, right)
-        if step is None:
-            tell(UNSOLVABLE)
-            break
-        step = step.view(3, unknowns).clamp(-1, 1)
-        to_map, to_gain = step.split([len(sky.direction), unknowns - len(sky.direction)], 1)
-        sky.log_radiance.add_(to_map.T)
-        if scene.views is not None:
-            sky.log_radiance.add_(scene.views.add(to_gain.T))
-        points.follow(ties, step)
-        costs.append(sum(tie.cost for tie in ties) / count)
-    return costs
+        differences = view_differences(scene)
+        if differences is not None and differences.basis is not None:
+            if not views_step_(scene, points, differences, cfg.newton_smooth):
+                return NewtonRound(costs, [UNSOLVABLE])
+            differences = view_differences(scene)
+        cost = map_step_(scene, points, differences, decisions.sun, laplacian, cfg.newton_smooth)
+        if cost is None:
+            return NewtonRound(costs, [UNSOLVABLE])
+        costs.append(cost)
+    return NewtonRound(costs)
 
 
-def choose(scene: Scene, problem: Problem, cfg: JointConfig) -> Points | None:
+def choose_points(
+    scene: Scene, problem: JointProblem, decisions: Decisions, cfg: JointConfig
+) -> NewtonPoints | None:
     """Random points that are seen often, with the scene's materials; None: there are none."""
-    counts = problem.seen.offsets.diff()
+    counts = problem.observations.offsets.diff()
     # Points that are seen as often as usual: of few photographs that is less than is wanted
     usual = float(counts[counts > 0].float().median())
-    least = max(LEAST_VIEWS, min(cfg.newton_views // 2, usual))
-    rich = (counts >= least).nonzero()[:, 0]
-    chosen = rich[torch.randperm(len(rich))[: cfg.newton_points]]
-    if not len(chosen):
+    least = max(cfg.newton.min_views, min(cfg.newton_views // 2, usual))
+    candidates = (counts >= least).nonzero()[:, 0]
+    point = candidates[torch.randperm(len(candidates))[: cfg.newton_points]]
+    if not len(point):
         return None
-    chosen, parts = in_parts(chosen, problem.metal)
-    features = scene.field.features_at(problem.seen.position[chosen])
+    point, parts = in_parts(point, decisions.metal)
+    features = scene.field.features_at(problem.observations.position[point])
     albedo, roughness, _ = scene.material(features)
-    if problem.albedo is not None:
-        albedo = problem.albedo[chosen]
-    log_albedo = albedo.clamp_min(1e-3).log()
-    sighting = sightings_of(problem, chosen, cfg.newton_views)
-    pull = (NOISE / cfg.newton_roughness) ** 2 if cfg.newton_roughness else 0.0
-    return Points(problem, chosen, sighting, parts, log_albedo, roughness, roughness, pull)
+    if decisions.albedo is not None:
+        albedo = decisions.albedo[point]
+    prior = (cfg.newton.noise / cfg.newton_roughness) ** 2 if cfg.newton_roughness else 0.0
+    return NewtonPoints(
+        problem,
+        cfg.newton,
+        decisions.metal[point],
+        point,
+        observations_of(problem, point, cfg.newton_views),
+        parts,
+        log_albedo=albedo.clamp_min(1e-3).log(),
+        roughness=roughness,
+        prior_roughness=roughness,
+        prior_weight=prior,
+    )
 
 
 def in_parts(point: Tensor, metal: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -199,57 +194,115 @@ def in_parts(point: Tensor, metal: Tensor) -> tuple[Tensor, list[Tensor]]:
     return torch.cat(chunks), list(torch.arange(len(point)).split([len(c) for c in chunks]))
 
 
-def views_step(scene: Scene, hessian: Tensor, gradient: Tensor, smooth: float) -> bool:
-    """Gauss-Newton step of each view's gain and change of the map; False: there is none.
+def map_step_(
+    scene: Scene,
+    points: NewtonPoints,
+    differences: ViewDifferences | None,
+    sun: Tensor | None,
+    laplacian: Tensor,
+    damping: float,
+) -> float | None:
+    """Change the map, the views' gains and the points' materials by one step; return the cost
+    before it, or None if the equations have no solution and all stays.
 
     Args:
-        hessian, gradient: [3, B, R + 1, R + 1] and [3, B, R + 1] from `view_equations`, over the
-            number of sightings.
+        sun: [D, 3] what a sun adds to the log map: it is no want of smoothness.
+        laplacian: [D, D] with its weight.
+        damping: weight of the squared step.
     """
-    views, sky = scene.views, scene.sky
+    sky, count = points.problem.sky, points.observation.numel()
+    nodes = len(laplacian)
+    unknowns = nodes + (len(scene.views) if scene.views else 0)  # of a channel
+    laplacian = torch.nn.functional.pad(laplacian, 2 * (0, unknowns - nodes))
+    log_map = sky.log_radiance.T  # [3, D]
+    if sun is not None:
+        log_map = log_map - sun.T
+    log_map = torch.nn.functional.pad(log_map, (0, unknowns - nodes))  # no gain is likelier than 1
+    system, right, eliminated = laplacian, -log_map @ laplacian, []
+    coupling = torch.zeros(())  # of the channels, by roughness
+    for part in points.parts:  # added up at once: all would take much memory
+        hessian, gradient, albedo = points.equations(part, differences)
+        if albedo.roughness is not None:
+            from_hessian, from_gradient = roughness_terms(albedo.roughness)
+            coupling, gradient = coupling + from_hessian / count, gradient - from_gradient
+        system, right = system + hessian / count, right + gradient / count
+        eliminated.append(albedo)
+    system.diagonal(dim1=1, dim2=2).add_(damping)
+    if points.prior_weight:
+        system, right = torch.block_diag(*system) - coupling, right.flatten()
+    step = solve_damped(system, right)
+    if step is None:
+        return None
+    most = points.cfg.max_map_change
+    step = step.view(3, unknowns).clamp(-most, most)
+    to_map, to_gain = step.split([nodes, unknowns - nodes], 1)
+    sky.log_radiance.add_(to_map.T)
+    if scene.views is not None:
+        sky.log_radiance.add_(scene.views.add(to_gain.T))
+    points.step_(eliminated, step)
+    return sum(albedo.cost for albedo in eliminated) / count
+
+
+def views_step_(
+    scene: Scene, points: NewtonPoints, differences: ViewDifferences, smooth: float
+) -> bool:
+    """Change each view's gain and its change of the map by one step; return False if the equations
+    have no solution and all stays.
+
+    Args:
+        smooth: weight of the map's Laplacian.
+    """
+    views, sky, count = scene.views, points.problem.sky, points.observation.numel()
     assert views is not None
-    assert sky is not None
     assert views.sky_weights is not None
-    now = views.sky_weights - views.sky_weights.mean(0)  # [B, R, 3]
-    now = torch.nn.functional.pad(now.permute(2, 0, 1), (0, 1))
-    prior = WEIGHTS_PRIOR * smooth
+    hessian = gradient = torch.zeros(())
+    for part in points.parts:
+        state = points.transport(part), sky.radiance, points.log_albedo[part], points.cfg.cauchy
+        h, g = view_equations(*state, differences)
+        hessian, gradient = hessian + h / count, gradient + g / count
+    weights = views.sky_weights - views.sky_weights.mean(0)  # [B, R, 3]
+    weights = torch.nn.functional.pad(weights.permute(2, 0, 1), (0, 1))
+    prior = points.cfg.view_prior * smooth
     hessian.diagonal(dim1=2, dim2=3).add_(prior)
-    step = solve_damped(hessian, gradient - prior * now)
+    step = solve_damped(hessian, gradient - prior * weights)
     if step is None:
         return False
-    step = step.clamp(-1, 1).permute(1, 2, 0)
+    most = points.cfg.max_map_change
+    step = step.clamp(-most, most).permute(1, 2, 0)
     sky.log_radiance.add_(views.add(step[:, -1], step[:, :-1]))
     return True
 
 
-def light_rows(problem: Problem, point: Tensor, sighting: Tensor, roughness: Tensor) -> Rows:
-    """Rows for points [P], all of metal or none, sightings [P, V] and roughness [P]."""
-    transport, seen = problem.transport, problem.seen
-    count, views = sighting.shape
-    normal, wo = seen.normal[point][:, None], seen.wo[sighting]
+def linear_transport(
+    problem: JointProblem, point: Tensor, observation: Tensor, roughness: Tensor, metal: bool
+) -> LinearTransport:
+    """Of points [P], all of metal or none, in observations [P, V], with roughness [P]."""
+    transport, observations = problem.transport, problem.observations
+    count, views = observation.shape
+    normal, wo = observations.normal[point][:, None], observations.wo[observation]
     cosine = (normal @ transport.direction.T).clamp_min(0) * problem.solid_angle  # [P, 1, D]
-    share = transport.open[point].float()[:, None] / 255
-    blocked = transport.indirect[point].float()  # [P, D, 3]
+    visibility = transport.visibility[point].float()[:, None] / 255
+    indirect = transport.indirect[point].float()  # [P, D, 3]
 
     def layer(f0: float) -> Tensor:  # [P, V, D]
-        of_sightings = normal.expand_as(wo).flatten(0, 1), wo.flatten(0, 1)
-        rough = roughness.repeat_interleave(views)
+        of_observations = normal.expand_as(wo).flatten(0, 1), wo.flatten(0, 1)
+        repeated = roughness.repeat_interleave(views)
         options = transport.direction, problem.solid_angle, f0
-        return specular_response(*of_sightings, rough, *options).view(count, views, -1)
+        return specular_response(*of_observations, repeated, *options).view(count, views, -1)
 
-    if problem.metal[point].any():
-        shine = layer(0.0)
-        by_base = layer(1.0) - shine  # linear in F0
-        through = torch.ones(sighting.shape)
+    if metal:
+        specular = layer(0.0)
+        by_base = layer(1.0) - specular  # linear in F0
+        factor = torch.ones(observation.shape)
     else:
-        shine, by_base = layer(brdf.F0), cosine
-        through = (1 - brdf.specular_albedo((normal * wo).sum(2), roughness[:, None])) / math.pi
-    return Rows(
-        by_base * share,
-        through,
-        shine * share,
-        through[..., None] * (by_base @ blocked),
-        shine @ blocked,
-        problem.target[sighting],
-        seen.view[sighting],
+        specular, by_base = layer(brdf.F0), cosine
+        factor = (1 - brdf.specular_albedo((normal * wo).sum(2), roughness[:, None])) / math.pi
+    return LinearTransport(
+        by_base * visibility,
+        factor,
+        specular * visibility,
+        factor[..., None] * (by_base @ indirect),
+        specular @ indirect,
+        problem.target[observation],
+        observations.view[observation],
     )

@@ -10,9 +10,11 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from univoxel import losses
+from univoxel.color import linear_to_srgb_unclipped
 from univoxel.data import Photos
+from univoxel.errors import NoSurface
 from univoxel.joint.config import JointConfig
+from univoxel.lights.nodes import DistantLight
 from univoxel.ops import shade_map
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh
@@ -26,112 +28,136 @@ from univoxel.render.transport import (
 )
 from univoxel.scene import Scene
 
-VERTICES = 300_000  # of a mesh that are looked at; the presets' have fewer
-METAL = 0.2  # metallic from which on the stages before have taken a point for metal
-LEAST_VIEWS = 2  # of a point that is to tell anything: in one, its colour explains everything
-
 
 @dataclass(frozen=True)
-class Problem:
-    """Everything about the photographs and the geometry, which stay fixed, and what is metal."""
+class JointProblem:
+    """What the joint solve is given: photographs, geometry, and the map that it solves for."""
 
-    seen: Observations
-    transport: Transport
-    target: Tensor  # [S, 3] sRGB-encoded sightings
-    metal: Tensor  # [P] bool, what is taken for metal; no other point can become it
-    voxel_size: float
-    sun: Tensor | None = None  # [D, 3] what a sun adds to the log map, which else is smooth
-    albedo: Tensor | None = None  # [P, 3] where the materials do not follow the map yet
+    observations: Observations  # S observations of P points
+    transport: Transport  # from the D nodes of the map to the points
+    target: Tensor  # [S, 3] sRGB-encoded colour of the observations
+    voxel_size: float  # world units
+    sky: DistantLight  # the scene's own map: the solve changes it
+
+    @property
+    def nodes(self) -> int:
+        """Number D of the map's nodes."""
+        return len(self.transport.direction)
 
     @property
     def solid_angle(self) -> float:
-        return 4 * math.pi / len(self.transport.direction)
+        """Steradians that a node of the map stands for."""
+        return 4 * math.pi / self.nodes
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """What the joint solve has decided so far; replaced as it goes on."""
+
+    metal: Tensor  # [P] bool, which points are metal
+    sun: Tensor | None = None  # [D, 3] what a sun adds to the log map, which else is smooth
+    albedo: Tensor | None = None  # [P, 3] where the materials do not follow the map yet
 
 
 @torch.no_grad()
-def pose(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> Problem:
-    """Sample the surface, gather its sightings and trace what light can reach it.
+def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> JointProblem:
+    """The problem of a scene with a map: points of its surface, their observations, and what light
+    can reach them.
 
     Raises:
-        ValueError: there is no surface, or no photograph sees it.
+        NoSurface: there is no surface, or no photograph sees it.
     """
+    assert scene.sky is not None  # the configuration has seen to it
     generator = torch.Generator().manual_seed(seed)
     mesh = extract_mesh(scene)
-    assert mesh.normals is not None
-    assert scene.sky is not None
     tracer = scene.occluder()
     offset = scene.field.voxel_size
-    bright = vertex_colors(scene, mesh, photos)
+    vertex_color = vertex_colors(scene, mesh, photos, cfg.surface.vertices)
     position, normal = surface_points(mesh, cfg.points, generator)
-    seen = observe(position, normal, photos, tracer, offset)
-    if not len(seen.view):
-        raise ValueError("no photograph sees a point of the surface")
+    observations = observe(position, normal, photos, tracer, offset)
+    if not len(observations.view):
+        raise NoSurface("no photograph sees a point of the surface")
     direction = scene.sky.direction
-    transport = trace(seen, tracer, mesh, bright, direction, cfg.tracing, offset, generator)
-    metal = scene.material(scene.field.features_at(position))[2] > METAL
-    return Problem(seen, transport, losses.encode(seen.color), metal, offset)
+    transport = trace(
+        observations, tracer, mesh, vertex_color, direction, cfg.tracing, offset, generator
+    )
+    target = linear_to_srgb_unclipped(observations.color)
+    return JointProblem(observations, transport, target, offset, scene.sky)
 
 
 @torch.no_grad()
-def turned(scene: Scene, problem: Problem) -> Problem:
-    """The same with the normals that the surface has by now; points stay, and what they see."""
-    gradient = scene.field.sample(problem.seen.position).gradient
+def first_decisions(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Decisions:
+    """Decisions to start with: metal is what the stages before have made metallic."""
+    features = scene.field.features_at(problem.observations.position)
+    return Decisions(scene.material(features)[2] > cfg.metal.metallic_before)
+
+
+@torch.no_grad()
+def with_present_normals(scene: Scene, problem: JointProblem) -> JointProblem:
+    """The same problem with the normals that the surface has by now; points stay, and what they
+    see."""
+    observations = problem.observations
+    gradient = scene.field.sample(observations.position).gradient
     normal = normalize(gradient, dim=1, eps=1e-6)
-    return replace(problem, seen=replace(problem.seen, normal=normal))
+    return replace(problem, observations=replace(observations, normal=normal))
 
 
-def vertex_colors(scene: Scene, mesh: Mesh, photos: Photos) -> Tensor:
-    """Mean colour [P, 3] of a mesh's vertices in the photographs; of a large mesh that of the
-    nearest of some, for each has a sighting in every other photograph."""
+def vertex_colors(scene: Scene, mesh: Mesh, photos: Photos, most: int) -> Tensor:
+    """Mean colour [V, 3] of a mesh's vertices in the photographs.
+
+    Args:
+        most: vertices that are looked up. Of a larger mesh the others take the colour of the
+            nearest, for about every other photograph observes each.
+    """
     assert mesh.normals is not None
-    step = -(-len(mesh.vertices) // VERTICES)
-    some, normal = mesh.vertices[::step], mesh.normals[::step]
-    seen = observe(some, normal, photos, scene.occluder(), scene.field.voxel_size)
-    color = mean_colors(unexposed(scene, seen))
+    step = -(-len(mesh.vertices) // most)
+    position, normal = mesh.vertices[::step], mesh.normals[::step]
+    observations = observe(position, normal, photos, scene.occluder(), scene.field.voxel_size)
+    color = mean_colors(without_exposure(scene, observations))
     if step == 1:
         return color
-    near = KDTree(some.numpy()).query(mesh.vertices.numpy(), workers=-1)[1]
-    return color[torch.from_numpy(near)]
+    nearest = KDTree(position.numpy()).query(mesh.vertices.numpy(), workers=-1)[1]
+    return color[torch.from_numpy(nearest)]
 
 
-def unexposed(scene: Scene, seen: Observations) -> Observations:
-    """The same as one exposure would have it, as far as the scene knows the photographs'."""
-    return replace(seen, color=seen.color / scene.exposed(torch.ones_like(seen.color), seen.view))
+def without_exposure(scene: Scene, observations: Observations) -> Observations:
+    """The same observations as under one exposure, as far as the scene knows the photographs'."""
+    exposure = scene.exposed(torch.ones_like(observations.color), observations.view)
+    return replace(observations, color=observations.color / exposure)
 
 
-def draw(problem: Problem, points: int, views: int) -> tuple[Tensor, Tensor]:
-    """Random points that are seen, and random sightings of each: indices [points * views]."""
-    counts = problem.seen.offsets.diff()
+def sample_observations(problem: JointProblem, points: int, views: int) -> tuple[Tensor, Tensor]:
+    """Random points that are seen, and random observations of each: indices [points * views]."""
+    counts = problem.observations.offsets.diff()
     usable = (counts > 0).nonzero()[:, 0]
     point = usable[torch.randint(len(usable), (points,))]
-    return point.repeat_interleave(views), sightings_of(problem, point, views).reshape(-1)
+    return point.repeat_interleave(views), observations_of(problem, point, views).reshape(-1)
 
 
-def sightings_of(problem: Problem, point: Tensor, views: int) -> Tensor:
-    """Random sightings [P, views] of points [P], each of which has some."""
-    offsets = problem.seen.offsets
+def observations_of(problem: JointProblem, point: Tensor, views: int) -> Tensor:
+    """Random observations [P, views] of points [P], each of which has at least one."""
+    offsets = problem.observations.offsets
     which = (torch.rand(len(point), views) * offsets.diff()[point][:, None]).long()
     return offsets[point][:, None] + which
 
 
-def draw_sightings(
+def shade_observations(
     scene: Scene,
-    problem: Problem,
+    problem: JointProblem,
     point: Tensor,
-    sighting: Tensor,
+    observation: Tensor,
     normal: Tensor,
     diffuse: Tensor,
     roughness: Tensor,
     f0: Tensor,
 ) -> Tensor:
-    """What the map makes of sightings [N] of points [N], each in its photograph's light: [N, 3].
+    """Linear radiance [N, 3] of observations [N] of points [N], each in its photograph's light.
 
     Args:
         normal, diffuse, roughness, f0: of the points, [N, 3], [N, 3], [N] and [N, 3].
     """
-    seen, transport, sky = problem.seen, problem.transport, scene.sky
-    assert sky is not None
-    view = seen.view[sighting]
+    observations, transport, sky = problem.observations, problem.transport, problem.sky
+    view = observations.view[observation]
     change = scene.views.sky_change() if scene.views else None
     if change is None:
         order, parts, maps = None, (slice(None),), [sky.radiance]
@@ -142,19 +168,19 @@ def draw_sightings(
     rgb = torch.cat(
         [
             shade_map(
-                map,
-                transport.open,
+                radiance,
+                transport.visibility,
                 transport.indirect,
                 point[part],
                 normal[part],
-                seen.wo[sighting[part]],
+                observations.wo[observation[part]],
                 diffuse[part],
                 roughness[part],
                 transport.direction,
                 problem.solid_angle,
                 f0[part],
             )
-            for part, map in zip(parts, maps, strict=True)
+            for part, radiance in zip(parts, maps, strict=True)
         ]
     )
     if order is not None:
@@ -162,7 +188,7 @@ def draw_sightings(
     return scene.exposed(rgb, view)
 
 
-def widened(roughness: Tensor, nodes: int) -> Tensor:
+def prefiltered_roughness(roughness: Tensor, nodes: int) -> Tensor:
     """Roughness whose lobe covers the gap between the map's nodes.
 
     A node stands for 4 pi / D steradians of sky; between point lights a narrow highlight would be

@@ -2,194 +2,287 @@
 
 Local lobes explain every photograph and leave shadows in the albedo. Once geometry stands, the
 light is known to be one distant map that reaches a point where nothing is in the way, and what is
-in the way shines as bright as the photographs show it. That leaves few unknowns: Gauss-Newton steps
+in the way shines as bright as the photographs show it. That leaves few unknowns. Gauss-Newton steps
 on the map alternate with rounds of Adam on map, materials and the surface's normals, which shading
-and highlights tell better than silhouettes and colours did.
+and highlights determine better than silhouettes and colours did.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, normalize
 
 from univoxel import brdf, losses
-from univoxel.color import CLIPPED
+from univoxel.color import CLIPPED, linear_to_srgb_unclipped
 from univoxel.data import Photos
-from univoxel.joint.albedo_entropy import balance, matte_albedo, sunlit
+from univoxel.errors import NoSurface
+from univoxel.joint.albedo_entropy import diffuse_albedo, fit_sun_, minimise_entropy_
 from univoxel.joint.config import JointConfig
-from univoxel.joint.initialise import STEPS, TRIALS, TRIED, supposed
+from univoxel.joint.initialise import initialise_
 from univoxel.joint.metals import find_metal
-from univoxel.joint.newton import newton_round
-from univoxel.joint.observations import Problem, draw, draw_sightings, pose, turned, widened
+from univoxel.joint.newton import newton_round_
+from univoxel.joint.observations import (
+    Decisions,
+    JointProblem,
+    build_problem,
+    first_decisions,
+    prefiltered_roughness,
+    sample_observations,
+    shade_observations,
+    with_present_normals,
+)
 from univoxel.lights import priors
 from univoxel.optim import RowAdam
 from univoxel.scene import Scene
 from univoxel.training.divergence import Guard
 from univoxel.training.progress import Progress
-from univoxel.training.surface_update import EPS_FEATURES, EPS_SDF, MOMENTS, moved, spread_gradient
+from univoxel.training.surface_update import (
+    EPS_FEATURES,
+    EPS_SDF,
+    MOMENTS,
+    refresh_surface_,
+    smooth_sdf_gradient_,
+)
 
-# Of a sighting in a Newton step over one in a step of Adam, with trials and the search for metals;
-# measured
-NEWTON_COST = 6.5
-LEAST_POINTS = 2000  # on a machine however slow
-SPREAD = 2  # passes that smooth the sdf's gradient: fewer than where geometry forms
-FOLLOWING = 60  # steps in which materials follow a map that was changed
-FOLLOWED = 0.1  # weight of their loss, against Adam's eps; no other was tried
-HOLD = 3e-3  # on the squared distance, in voxels, between the surface and its points
+
+@dataclass(frozen=True)
+class Round:
+    """A round: Newton steps at its begin, and then Adam."""
+
+    begin: float  # progress of the stage, [0, 1]
+    end: float  # the same
+    left: int  # rounds after it
+    solved: bool  # whether Newton has made a step
 
 
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
     """Fit scene.sky, the materials and the normals to the photographs; other heads stay.
 
-    What a point sees, and is seen by, is traced once: the surface turns, and hardly moves.
+    What a point sees, and is seen by, is traced once: the surface turns, and hardly moves. Where
+    time is over, or there is nothing to see, all stays.
     """
-    assert scene.sky is not None
-    if progress.over:
-        progress.skip()
+    problem = traced_problem(scene, photos, cfg, seed, progress)
+    if problem is None:
+        progress.clock.skip()
         return
-    # What does not fit is cut alike: points here, steps of Adam by `steps`, points of Newton below
-    points = min(cfg.points, max(LEAST_POINTS, round(progress.pace * cfg.points)))
-    try:
-        scene.occluder()
-        problem = pose(scene, photos, replace(cfg, points=points), seed)
-    except ValueError as error:  # no surface, or none that is seen
-        progress.trouble(f"stage {progress.stage + 1}: {error}: light and materials stay")
-        progress.skip()
-        return
+    decisions = first_decisions(scene, problem, cfg)
     scene.field.sdf.requires_grad_(cfg.lr_sdf > 0)
-    first, turn, more = 0.0, -1.0, cfg.rounds  # begin and end of a round, rounds to come
     guard = Guard(progress)
-    for done in progress.steps(newton_share(cfg)):
-        if done >= turn:
-            seconds = progress.reserved / more
-            problem = turned(scene, problem)
-            if more == cfg.rounds:
-                with progress.apart():
-                    problem = supposed(scene, problem, cfg, seconds, progress.trouble)
-                    if cfg.colors:
-                        problem = sunlit(scene, problem, progress.say)
-                        if balance(scene, problem) or problem.sun is not None:
-                            problem = replace(problem, albedo=matte_albedo(scene, problem))
-            with progress.apart():
-                costs = newton_round(scene, problem, cfg, seconds, progress.trouble)
-                if cfg.colors:
-                    balance(scene, problem)
-                sure = 1 - (more - 1) / max(cfg.rounds - 1, 1)
-                problem = replace(problem, metal=find_metal(scene, problem, cfg, sure))
-                if problem.albedo is not None:
-                    follow(scene, problem, cfg)
-                    problem = replace(problem, albedo=None)
-            more = 1 + progress.room_for(more - 1)  # on a slow machine fewer and longer rounds
-            groups = [
-                {"params": [scene.field.features], "eps": EPS_FEATURES},
-                {"params": list(scene.material.parameters())},
-                {"params": [scene.sky.log_radiance]},
-                {"params": [scene.field.sdf], "eps": EPS_SDF},
-            ]
-            if scene.views:
-                groups.append({"params": [scene.views.gain_steps]})
-                if scene.views.sky_weights is not None:
-                    groups[2]["params"] += [scene.views.sky_weights, scene.views.sky_basis]
-            optimizer = RowAdam(groups, betas=MOMENTS)
+    now = Round(begin=0.0, end=-1.0, left=cfg.rounds, solved=False)
+    for done in progress.clock.steps(newton_share(cfg)):
+        if done >= now.end:
+            problem = with_present_normals(scene, problem)
+            decisions, solved = newton_phase_(scene, problem, decisions, cfg, now.left, progress)
+            # On a slow machine fewer and longer rounds
+            left = progress.clock.blocks_that_fit(now.left - 1)
+            now = Round(done, done + (1 - done) / (1 + left), left, solved)
+            optimizer = adam(scene, problem)
             guard.follow(optimizer)
-            first, turn, more = done, done + (1 - done) / more, more - 1
-        fade = 0.1 ** ((done - first) / (turn - first))
-        # After a Newton round light is better than what Adam would make of it while the albedo
-        # follows: the map moves slowly, gains do not
-        of_map, of_gains = (0.1, 0.0) if costs else (1.0, 1.0)
-        rates = (
-            cfg.lr_features,
-            cfg.lr_networks,
-            cfg.lr_map * of_map,
-            cfg.lr_sdf * scene.field.voxel_size,
-            cfg.lr_networks * of_gains,
-        )
-        for group, rate in zip(optimizer.param_groups, rates, strict=False):
-            group["lr"] = rate * fade * guard.scale
-        terms = objective(scene, problem, cfg)
+        set_rates_(optimizer, cfg, now, done, scene.field.voxel_size, guard.scale)
+        terms = objective(scene, problem, decisions, cfg)
         loss = torch.stack(list(terms.values())).sum()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         if not guard.sound(loss):
             continue
         if cfg.lr_sdf:
-            spread_gradient(scene.field, SPREAD)
+            smooth_sdf_gradient_(scene.field, cfg.adam.sdf_passes)
         optimizer.step()
         if progress.due():
             progress.report({k: v.item() for k, v in terms.items()}, None)
             guard.keep()
-    moved(scene)
+    refresh_surface_(scene)
 
 
-def follow(scene: Scene, problem: Problem, cfg: JointConfig) -> None:
-    """Teach the materials the albedos that the photographs have under a map that was changed.
-
-    Adam on the photographs does so too, in many more and dearer steps: paint that holds the shades
-    of another light, times this one, is far from them, and short trainings would end before. Metal,
-    roughness and metallic stay.
-    """
-    wanted = matte_albedo(scene, problem)
-    matte = wanted.isfinite().all(1) & ~problem.metal
-    if not matte.any():
-        return
-    position = problem.seen.position
-    with torch.no_grad():
-        albedo, rough, metallic = scene.material(scene.field.features_at(position))
-    wanted = torch.where(matte[:, None], wanted, albedo.clamp_min(1e-3)).log()
-    materials = {"params": list(scene.material.parameters())}
-    optimizer = RowAdam([{"params": [scene.field.features], "eps": EPS_FEATURES}, materials])
-    for step in range(FOLLOWING):
-        rates = cfg.lr_features, cfg.lr_networks
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * 0.1 ** (step / FOLLOWING)
-        some = torch.randint(len(position), (cfg.rays,))
-        found = scene.material(scene.field.features_at(position[some]))
-        albedo = found[0].clamp_min(1e-3).log()
-        loss = (albedo - wanted[some]).abs().mean()
-        for now, before in zip(found[1:], (rough, metallic), strict=True):
-            loss = loss + (now - before[some]).abs().mean()
-        optimizer.zero_grad(set_to_none=True)
-        (FOLLOWED * loss).backward()
-        optimizer.step()
+def traced_problem(
+    scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress
+) -> JointProblem | None:
+    """The problem on as many points as there is time for; None: no time, or no surface that is
+    seen, which the progress is told of."""
+    if progress.clock.over:
+        return None
+    # What does not fit is cut alike: points here, steps of Adam by `steps`, points of Newton there
+    points = min(cfg.points, max(cfg.surface.min_points, round(progress.clock.pace * cfg.points)))
+    try:
+        scene.occluder()
+        return build_problem(scene, photos, replace(cfg, points=points), seed)
+    except NoSurface as error:  # there is none, or none that is seen
+        progress.trouble(f"stage {progress.clock.stage + 1}: {error}: light and materials stay")
+        return None
 
 
 def newton_share(cfg: JointConfig) -> float:
     """Share of the stage's time that Newton rounds take if nothing is cut."""
     if not cfg.newton_steps:
         return 0.0
-    points = cfg.rounds * cfg.newton_steps * cfg.newton_points + TRIALS * STEPS * TRIED
-    sightings = points * cfg.newton_views
-    newton = NEWTON_COST * sightings
+    points = cfg.rounds * cfg.newton_steps * cfg.newton_points
+    points += cfg.trials.rounds * cfg.trials.steps * cfg.trials.points
+    newton = cfg.newton.cost * (points * cfg.newton_views)
     return newton / (newton + cfg.iterations * cfg.rays)
 
 
-def objective(scene: Scene, problem: Problem, cfg: JointConfig) -> dict[str, Tensor]:
-    """The weighted losses of a random batch of sightings."""
-    seen, transport = problem.seen, problem.transport
-    index, sighting = draw(problem, cfg.rays // cfg.views, cfg.views)
-    points = index[:: cfg.views]
-    position = seen.position[points]
-    beside = position + 2 * problem.voxel_size * torch.randn_like(position)
+def newton_phase_(
+    scene: Scene,
+    problem: JointProblem,
+    decisions: Decisions,
+    cfg: JointConfig,
+    left: int,
+    progress: Progress,
+) -> tuple[Decisions, bool]:
+    """Change the map by Newton and by the colours of paint; return the decisions under it, and
+    whether Newton made a step.
+
+    Args:
+        left: rounds that are left, this one among them; before the first the map is initialised.
+    """
+    seconds = progress.clock.reserved / left
+    if left == cfg.rounds:
+        with progress.clock.off_pace():
+            decisions = start_(scene, problem, decisions, cfg, seconds, progress)
+    with progress.clock.off_pace():
+        newton = newton_round_(scene, problem, decisions, cfg, seconds)
+        for trouble in newton.troubles:
+            progress.trouble(trouble)
+        if cfg.colors:
+            minimise_entropy_(scene, problem, decisions, cfg.entropy)
+        done = 1 - (left - 1) / max(cfg.rounds - 1, 1)
+        decisions = replace(decisions, metal=find_metal(scene, problem, cfg, done))
+        if decisions.albedo is not None:
+            teach_albedo_(scene, problem, decisions, cfg)
+            decisions = replace(decisions, albedo=None)
+    return decisions, bool(newton.costs)
+
+
+def start_(
+    scene: Scene,
+    problem: JointProblem,
+    decisions: Decisions,
+    cfg: JointConfig,
+    seconds: float,
+    progress: Progress,
+) -> Decisions:
+    """Change map and roughness to where the solve starts from; return the decisions there.
+
+    Args:
+        seconds: that the trials may take.
+    """
+    decisions, troubles = initialise_(scene, problem, decisions, cfg, seconds)
+    for trouble in troubles:
+        progress.trouble(trouble)
+    if not cfg.colors:
+        return decisions
+    sun = fit_sun_(scene, problem, decisions, cfg.entropy)
+    if sun is not None:
+        progress.say(str(sun))
+        decisions = replace(decisions, sun=sun.log_excess)
+    if minimise_entropy_(scene, problem, decisions, cfg.entropy) or sun is not None:
+        albedo = diffuse_albedo(scene, problem, cfg.entropy)
+        decisions = replace(decisions, albedo=albedo)
+    return decisions
+
+
+def teach_albedo_(
+    scene: Scene, problem: JointProblem, decisions: Decisions, cfg: JointConfig
+) -> None:
+    """Teach the materials the albedos that the photographs have under a map that was changed.
+
+    Adam on the photographs does so too, in many more and dearer steps: paint that holds the shades
+    of another light, times this one, is far from them, and short trainings would end before. Metal,
+    roughness and metallic stay.
+    """
+    target = diffuse_albedo(scene, problem, cfg.entropy)
+    diffuse = target.isfinite().all(1) & ~decisions.metal
+    if not diffuse.any():
+        return
+    position, steps = problem.observations.position, cfg.entropy.teaching_steps
+    with torch.no_grad():
+        albedo, *others = scene.material(scene.field.features_at(position))
+    target = torch.where(diffuse[:, None], target, albedo.clamp_min(1e-3)).log()
+    materials = {"params": list(scene.material.parameters())}
+    optimizer = RowAdam([{"params": [scene.field.features], "eps": EPS_FEATURES}, materials])
+    for step in range(steps):
+        rates = cfg.lr_features, cfg.lr_networks
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate * cfg.adam.decay ** (step / steps)
+        point = torch.randint(len(position), (cfg.rays,))
+        material = scene.material(scene.field.features_at(position[point]))
+        loss = (material[0].clamp_min(1e-3).log() - target[point]).abs().mean()
+        for value, before in zip(material[1:], others, strict=True):
+            loss = loss + (value - before[point]).abs().mean()
+        optimizer.zero_grad(set_to_none=True)
+        (cfg.entropy.teaching_weight * loss).backward()
+        optimizer.step()
+
+
+def adam(scene: Scene, problem: JointProblem) -> RowAdam:
+    """An optimiser with a group each for features, materials, map, sdf and, where views differ,
+    their gains."""
+    views, light = scene.views, [problem.sky.log_radiance]
+    if views is not None and views.sky_weights is not None:
+        light += [views.sky_weights, views.sky_basis]
+    groups = [
+        {"params": [scene.field.features], "eps": EPS_FEATURES},
+        {"params": list(scene.material.parameters())},
+        {"params": light},
+        {"params": [scene.field.sdf], "eps": EPS_SDF},
+    ]
+    if views is not None:
+        groups.append({"params": [views.gain_steps]})
+    return RowAdam(groups, betas=MOMENTS)
+
+
+def set_rates_(
+    optimizer: RowAdam, cfg: JointConfig, now: Round, done: float, voxel_size: float, scale: float
+) -> None:
+    """Set the learning rates of `adam`'s groups: they fall from the begin of a round to its end.
+
+    Args:
+        scale: factor on all of them.
+    """
+    fade = cfg.adam.decay ** ((done - now.begin) / (now.end - now.begin))
+    of_map = cfg.adam.map_after_newton if now.solved else 1.0
+    of_gains = cfg.adam.gains_after_newton if now.solved else 1.0
+    rates = (
+        cfg.lr_features,
+        cfg.lr_networks,
+        cfg.lr_map * of_map,
+        cfg.lr_sdf * voxel_size,
+        cfg.lr_networks * of_gains,
+    )
+    for group, rate in zip(optimizer.param_groups, rates, strict=False):
+        group["lr"] = rate * fade * scale
+
+
+def objective(
+    scene: Scene, problem: JointProblem, decisions: Decisions, cfg: JointConfig
+) -> dict[str, Tensor]:
+    """The weighted losses of a random batch of observations."""
+    index, observation = sample_observations(problem, cfg.rays // cfg.views, cfg.views)
+    point = index[:: cfg.views]
+    position = problem.observations.position[point]
+    distance = cfg.adam.beside * problem.voxel_size
+    beside = position + distance * torch.randn_like(position)
     # One sampling, one gradient: adding up sparse ones costs more than either
     sample = scene.field.sample(torch.cat([position, beside]))
     parts = (x.chunk(2) for x in scene.material(sample.features))
-    (albedo, albedo_near), (roughness, roughness_near), (metallic, _) = parts
-    metal = problem.metal[points].float()
+    (albedo, albedo_beside), (roughness, roughness_beside), (metallic, _) = parts
+    metal = decisions.metal[point].float()
     diffuse, f0 = brdf.split(albedo, metallic * metal)
     assert isinstance(f0, Tensor)
-    repeat = torch.arange(len(points)).repeat_interleave(cfg.views)
-    roughness_shown = widened(roughness, len(transport.direction))
-    normal = normalize(sample.gradient[: len(points)], dim=1, eps=1e-6)
-    shown = normal[repeat], diffuse[repeat], roughness_shown[repeat], f0[repeat]
-    rgb = draw_sightings(scene, problem, index, sighting, *shown)
-    encoded, target = losses.encode(rgb), problem.target[sighting]
+    repeat = torch.arange(len(point)).repeat_interleave(cfg.views)
+    wide = prefiltered_roughness(roughness, problem.nodes)
+    normal = normalize(sample.gradient[: len(point)], dim=1, eps=1e-6)
+    surface = normal[repeat], diffuse[repeat], wide[repeat], f0[repeat]
+    rgb = shade_observations(scene, problem, index, observation, *surface)
+    encoded, target = linear_to_srgb_unclipped(rgb), problem.target[observation]
+    away = (sample.sdf[: len(point)] / problem.voxel_size).square().mean()
     return {
         "joint": losses.photometric(encoded, target, clipped=CLIPPED),
-        "surface": HOLD * (sample.sdf[: len(points)] / problem.voxel_size).square().mean(),
-        "albedo": cfg.albedo_smoothness * priors.smoothness(albedo, albedo_near),
-        "roughness": cfg.roughness_smoothness * priors.smoothness(roughness, roughness_near),
+        "surface": cfg.adam.surface * away,
+        "albedo": cfg.albedo_smoothness * priors.smoothness(albedo, albedo_beside),
+        "roughness": cfg.roughness_smoothness * priors.smoothness(roughness, roughness_beside),
         "metallic": cfg.metallic * binary_cross_entropy(metallic, metal),
     }

@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 import torch
 
+from univoxel.errors import ConfigError
 from univoxel.lights.base import AbstractLight
 from univoxel.lights.lobes_map import EnvmapSGConfig, EnvmapSGLight
 from univoxel.lights.local import AbstractLocalLight, LocalLightConfig
@@ -69,11 +70,11 @@ def read_config(values: dict[str, Any]) -> LightConfig:
     """The configuration that dataclasses.asdict made a dictionary of.
 
     Raises:
-        ValueError, TypeError: no such light; a field that it has not; a number outside its range.
+        ConfigError, TypeError: no such light; a field that it has not; a number outside its range.
     """
     values = dict(values)
     kind = values.pop("kind", "sg")  # files from before there were others do not say
     kinds = {c.kind: c for c in (SGConfig, SHConfig, MLPLightConfig, EnvmapSGConfig, EnvmapConfig)}
     if kind not in kinds:
-        raise ValueError(f"light must be one of {', '.join(kinds)}, got {kind!r}")
+        raise ConfigError(f"light must be one of {', '.join(kinds)}, got {kind!r}")
     return kinds[kind](**values)

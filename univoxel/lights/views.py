@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from univoxel.errors import UserError
 from univoxel.sphere import real_harmonics
 
 DEGREE = 3  # of the harmonics that a view's map may differ by at first: halves, quarters of the sky
@@ -58,16 +59,17 @@ class ViewLights(nn.Module):
         """Show the light of a view, by name or number, where none is named; None: the mean light.
 
         Raises:
-            ValueError: no such view.
+            UserError: no such view.
         """
         if view is None or view in self.names:
             self.chosen = None if view is None else self.names.index(view)
         elif view.isdigit() and int(view) < len(self):
             self.chosen = int(view)
         else:
-            raise ValueError(
-                f"--light-of: expected a number below {len(self)} or one of {self.names[0]} to "
-                f"{self.names[-1]}, got {view!r}"
+            raise UserError(
+                f"light_of: expected a number below {len(self)} or one of {self.names[0]} to "
+                f"{self.names[-1]}, got {view!r}",
+                "light_of",
             )
 
     def add(self, to_gains: Tensor, to_weights: Tensor | None = None) -> Tensor:

@@ -4,7 +4,7 @@ from univoxel.ops.adam import adam_rows_, adam_rows_reference_
 from univoxel.ops.composite import composite, composite_reference
 from univoxel.ops.dense_grid import sample_dense, sample_dense_reference
 from univoxel.ops.hash_grid import encode_hash, encode_hash_reference
-from univoxel.ops.integrator import EnvTables, Lamp, Sun, relight
+from univoxel.ops.integrator import EnvTables, PointLight, Sun, relight
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.mlp import mlp, mlp_reference
 from univoxel.ops.native import use_backend
@@ -26,10 +26,13 @@ from univoxel.ops.sparse_grid import sample_sparse, sample_sparse_reference
 from univoxel.ops.stereo import match_cost, match_cost_reference, semi_global, semi_global_reference
 from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference, occluded_reference
 
+Lamp = PointLight  # its name before
+
 __all__ = [
     "EnvTables",
     "Hit",
     "Lamp",
+    "PointLight",
     "Sun",
     "VisibilityScene",
     "adam_rows_",

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from univoxel.ops import native
+from univoxel.ops import grid_sampling, native
 from univoxel.ops.checks import check
+from univoxel.ops.grid_sampling import SparseGrad, check_place
 
 
 def sample_dense(
@@ -82,20 +83,6 @@ def sample_dense(
     return sample_dense_reference(sdf, features, points, origin, voxel_size)
 
 
-def check_place(op: str, points: int, origin: Sequence[float], voxel_size: float) -> None:
-    """Check how many points are sampled, and where the grid lies.
-
-    Raises:
-        ValueError: a number out of range.
-    """
-    if points >= 2**31:
-        raise ValueError(f"{op}: points must be fewer than 2^31, got {points}")
-    if len(origin) != 3 or not all(math.isfinite(x) for x in origin):
-        raise ValueError(f"{op}: origin must be 3 finite numbers, got {list(origin)}")
-    if not 0 < voxel_size < math.inf:
-        raise ValueError(f"{op}: voxel_size must be above 0, got {voxel_size}")
-
-
 def sample_dense_reference(
     sdf: Tensor, features: Tensor, points: Tensor, origin: Sequence[float], voxel_size: float
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -125,18 +112,8 @@ def sample_dense_reference(
     return value, torch.where(lost, torch.nan, gradient), torch.where(lost, torch.nan, feature)
 
 
-class SparseGrad(torch.autograd.Function):
-    """The same grid with a gradient that is sparse in its first dimensions: for backends whose own
-    gradient is dense."""
-
-    @staticmethod
-    def forward(ctx, grid, dims):
-        ctx.dims = dims
-        return grid.view_as(grid)
-
-    @staticmethod
-    def backward(ctx, grad):
-        return grad.to_sparse(ctx.dims), None
+def _grid(sdf: Tensor, origin: list[float], voxel_size: float) -> Any:
+    return native.require().DenseGrid(list(sdf.shape), origin, voxel_size)
 
 
 @native.operator("sample_dense")
@@ -148,26 +125,7 @@ def _sample_dense(
     voxel_size: float,
     sparse_grad: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    out = _empty_outputs(features, points)
-    value, gradient, feature, order = out
-    native.require().sample_dense_forward(
-        *native.arrays(sdf, features, points, order, value, gradient, feature),
-        origin,
-        voxel_size,
-        native.threads(),
-    )
-    return out
-
-
-def _empty_outputs(features: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Value, gradient, feature, and the points' order by brick, which backward uses again."""
-    m = len(points)
-    return (
-        points.new_empty(m),
-        points.new_empty(m, 3),
-        features.new_empty(m, features.shape[3]),
-        points.new_empty(m, dtype=torch.int32),
-    )
+    return grid_sampling.sample(_grid(sdf, origin, voxel_size), sdf, features, points)
 
 
 @native.operator("sample_dense_backward")
@@ -183,78 +141,17 @@ def _sample_dense_backward(
     voxel_size: float,
     needs: list[bool],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    grads = _empty_grads(sdf, features, points, needs)
-    native.require().sample_dense_backward(
-        *native.arrays(sdf, features, points, order, grad_value, grad_gradient, grad_feature),
-        *[g.numpy() if need else None for g, need in zip(grads, needs, strict=True)],
-        None,
-        None,
-        origin,
-        voxel_size,
-        native.threads(),
-    )
-    return grads
-
-
-def _empty_grads(
-    sdf: Tensor, features: Tensor, points: Tensor, needs: list[bool]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients to fill; one that nobody needs is empty, because an op cannot return None."""
-    grads = [
-        torch.empty_like(t) if need else t.new_empty(0)
-        for t, need in zip((sdf, features, points), needs, strict=True)
-    ]
-    return grads[0], grads[1], grads[2]
-
-
-def _sparse_backward(
-    sdf: Tensor,
-    features: Tensor,
-    points: Tensor,
-    order: Tensor,
-    grad_outputs: list[Tensor],
-    origin: list[float],
-    voxel_size: float,
-    needs: list[bool],
-) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """The backward of sample_dense into touched rows; no op: how many there are depends on data."""
-    core, threads = native.require(), native.threads()
-    grids = (sdf, features)
-    rows = core.touched_rows(
-        *native.arrays(points, order), list(sdf.shape), origin, voxel_size, *needs[:2], threads
-    )
-    values = [
-        None if r is None else g.new_empty(len(r), *g.shape[3:])
-        for r, g in zip(rows, grids, strict=True)
-    ]
-    grad_points = torch.empty_like(points) if needs[2] else None
-    core.sample_dense_backward(
-        *native.arrays(sdf, features, points, order, *grad_outputs),
-        *[None if t is None else t.numpy() for t in (*values, grad_points)],
-        *rows,
-        origin,
-        voxel_size,
-        threads,
-    )
-    grads = [_sparse(r, v, g) for r, v, g in zip(rows, values, grids, strict=True)]
-    return grads[0], grads[1], grad_points
-
-
-def _sparse(rows, values: Tensor | None, grid: Tensor) -> Tensor | None:
-    """Values of touched rows as a sparse tensor of the grid's shape."""
-    if values is None:
-        return None
-    indices = torch.empty(3, len(rows), dtype=torch.int64)
-    rows.write_indices(indices.numpy(), native.threads())
-    # The rows are distinct, in order and inside by construction: checking costs more than they do.
-    return torch.sparse_coo_tensor(
-        indices, values, grid.shape, is_coalesced=True, check_invariants=False
+    return grid_sampling.sample_backward(
+        _grid(sdf, origin, voxel_size),
+        (sdf, features, points, order),
+        (grad_value, grad_gradient, grad_feature),
+        needs,
     )
 
 
 @_sample_dense.register_fake
 def _(sdf, features, points, origin, voxel_size, sparse_grad):
-    return _empty_outputs(features, points)
+    return grid_sampling.empty_outputs(features, points)
 
 
 @_sample_dense_backward.register_fake
@@ -270,7 +167,7 @@ def _(
     voxel_size,
     needs,
 ):
-    return _empty_grads(sdf, features, points, needs)
+    return grid_sampling.empty_grads(sdf, features, points, needs)
 
 
 def _save(ctx, inputs, output):
@@ -279,14 +176,14 @@ def _save(ctx, inputs, output):
 
 
 def _backward(ctx, grad_value, grad_gradient, grad_feature, _):
-    grad_outputs = [g.contiguous() for g in (grad_value, grad_gradient, grad_feature)]
+    grad_outputs = (grad_value.contiguous(), grad_gradient.contiguous(), grad_feature.contiguous())
     needs = list(ctx.needs_input_grad[:3])
-    sdf, features, points, order = ctx.saved_tensors
-    saved, place = (sdf, features, points, order), (ctx.origin, ctx.voxel_size, needs)
+    inputs, place = ctx.saved_tensors, (ctx.origin, ctx.voxel_size)
     if ctx.sparse_grad:
-        grads = _sparse_backward(*saved, grad_outputs, *place)
+        grid = _grid(inputs[0], *place)
+        grads = grid_sampling.sample_backward_sparse(grid, inputs, grad_outputs, needs)
     else:
-        dense = _sample_dense_backward(*saved, *grad_outputs, *place)
+        dense = _sample_dense_backward(*inputs, *grad_outputs, *place, needs)
         grads = [g if need else None for g, need in zip(dense, needs, strict=True)]
     return *grads, None, None, None
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from univoxel.ops import native
 from univoxel.ops.checks import check
-from univoxel.ops.dense_grid import SparseGrad
+from univoxel.ops.grid_sampling import SparseGrad
 
 PRIMES = (1, 2654435761, 805459861)
 
@@ -160,9 +160,9 @@ def _encode_hash_backward(
     needs: list[bool],
 ) -> tuple[Tensor, Tensor]:
     grads = _empty_grads(table, points, needs)
-    wanted = [g if need else None for g, need in zip(grads, needs, strict=True)]
+    into = [g if need else None for g, need in zip(grads, needs, strict=True)]
     place = _place(lower, upper, voxel_sizes)
-    _backward_into(table, points, grad_out, wanted[0], None, wanted[1], place)
+    _backward_into(table, points, grad_out, into[0], None, into[1], place)
     return grads
 
 

@@ -24,7 +24,7 @@ Strategy = Literal["mis", "map", "brdf"]
 class EnvTables:
     """An environment map as the integrator reads it; `univoxel.envmap.tables` makes them."""
 
-    texel: Tensor  # [H, W, 4] float32: linear radiance, >= 0; density of being drawn, 1 / steradian
+    texel: Tensor  # [H, W, 4] float32: linear radiance, >= 0; sampling density, 1 / steradian
     row_cdf: Tensor  # [H + 1] float32 from 0 to 1: which row a sample falls in
     column_cdf: Tensor  # [H, W + 1] float32 from 0 to 1: which column, given the row
     rotation: float  # radians, counter-clockwise about +Z
@@ -60,7 +60,7 @@ class Sun:
 
 
 @dataclass(frozen=True)
-class Lamp:
+class PointLight:
     """A point that shines evenly all around; irradiance falls with the distance squared.
 
     Raises:
@@ -72,8 +72,8 @@ class Lamp:
 
     def __post_init__(self) -> None:
         if not math.isfinite(sum(self.position)):
-            raise ValueError(f"lamp: position must be finite, got {self.position}")
-        _check_power("lamp: intensity", self.intensity)
+            raise ValueError(f"point light: position must be finite, got {self.position}")
+        _check_power("point light: intensity", self.intensity)
 
 
 def relight(
@@ -90,7 +90,7 @@ def relight(
     samples: int,
     bounces: int = 0,
     suns: Sequence[Sun] = (),
-    lamps: Sequence[Lamp] = (),
+    point_lights: Sequence[PointLight] = (),
     f0: Tensor | float = F0,
     mesh_f0: Tensor | float = F0,
     first: int = 0,
@@ -102,10 +102,10 @@ def relight(
         L(wo) = integral over the half-sphere of f(wi, wo) L_i(wi) (n.wi) dwi
 
     L_i is the light where nothing stands in the way, else what the mesh sends back, up to `bounces`
-    times. At every vertex of a path each sun and lamp is looked at once; of the map one direction
-    is drawn in proportion to its light and one from the BRDF, weighed by the power heuristic. The
-    points are Sobol's sequence with an Owen scramble of its own per surface point. Paths end at
-    random where they carry little.
+    times. Every vertex of a path sends a shadow ray to each sun and point light. It samples one
+    direction of the map in proportion to its light and one of the BRDF, weighed by the power
+    heuristic. The points are Sobol's sequence with an Owen scramble of its own per surface point.
+    Paths end at random where they carry little.
 
     Points given come from volume rendering and lie on the mesh only about: their rays start at
     position + offset * normal and pass through whatever is nearer than `offset` from there. Later
@@ -124,7 +124,7 @@ def relight(
         offset: world units, about one voxel, >= 0.
         samples: paths per point, >= 1; powers of 2 are best.
         bounces: reflections after the first point, >= 0; 0 is direct light only.
-        suns, lamps: lights besides the map.
+        suns, point_lights: lights besides the map.
         f0: [N, 3] float32 or a number, in [0, 1]: reflectance at normal incidence. A metal has its
             colour here and albedo 0.
         mesh_f0: [P, 3] likewise at the mesh's vertices, for bounces.
@@ -185,7 +185,7 @@ def relight(
         *map(_array, materials),
         *map(_array, light),
         tables.rotation,
-        *map(_array, (_pack_suns(suns), _pack_lamps(lamps))),
+        *map(_array, (_pack_suns(suns), _pack_point_lights(point_lights))),
         *map(_array, points),
         *native.arrays(rgb),
         offset,
@@ -236,9 +236,9 @@ def _pack_suns(suns: Sequence[Sun]) -> Tensor:
     return torch.tensor(rows, dtype=torch.float32).reshape(-1, 7)
 
 
-def _pack_lamps(lamps: Sequence[Lamp]) -> Tensor:
+def _pack_point_lights(point_lights: Sequence[PointLight]) -> Tensor:
     """[L, 6]: position, intensity."""
-    rows = [[*lamp.position, *lamp.intensity] for lamp in lamps]
+    rows = [[*light.position, *light.intensity] for light in point_lights]
     return torch.tensor(rows, dtype=torch.float32).reshape(-1, 6)
 
 

@@ -11,7 +11,7 @@ from univoxel.ops import native
 from univoxel.ops.checks import check, check_bricks
 from univoxel.records import Bricks, Samples
 
-BRICK = 4  # voxels along the side of a brick that is skipped as a whole; as in csrc/march.h
+BRICK = 4  # voxels along the side of a brick that is skipped as a whole; as kBrick in csrc/nodes.h
 
 
 def brick_minimum(sdf: Tensor, bricks: Bricks | None = None) -> Tensor:

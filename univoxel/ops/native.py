@@ -17,6 +17,8 @@ import numpy as np
 import torch  # first: the extension then shares torch's OpenMP runtime
 from torch import Tensor
 
+from univoxel.errors import MissingNative
+
 Backend = Literal["auto", "native", "reference"]
 
 _backend: Backend = "auto"
@@ -26,9 +28,9 @@ def _load() -> tuple[ModuleType | None, str]:
     """The build for this processor, or None and the reason why there is none."""
     folder = Path(__file__).parent.parent / "_core"
     built = {p.parent.name: p for p in folder.glob("*/_core.*") if p.suffix in (".so", ".pyd")}
-    wanted = torch.backends.cpu.get_cpu_capability().lower()
+    capability = torch.backends.cpu.get_cpu_capability().lower()
     rank = ["default", "avx2", "avx512"]
-    usable = rank[: rank.index(wanted) + 1] if wanted in rank else ["default"]
+    usable = rank[: rank.index(capability) + 1] if capability in rank else ["default"]
     for variant in reversed(usable):
         if variant not in built:
             continue
@@ -93,7 +95,7 @@ def use_backend(name: Backend) -> Iterator[None]:
 def require() -> ModuleType:
     """The extension, or an error that says why it is missing."""
     if core is None:
-        raise RuntimeError(f"univoxel's compiled extension is not loaded: {variant}")
+        raise MissingNative(f"univoxel's compiled extension is not loaded: {variant}")
     return core
 
 

@@ -92,10 +92,10 @@ def shade_map(
 
     Args:
         map: [D, 3] linear radiance of the distant light.
-        visibility: [P, D] the open share of each direction at P points: of map's dtype in [0, 1],
+        visibility: [P, D] the share of each direction that P points see: of map's dtype in [0, 1],
             or uint8 in 255ths.
-        indirect: [P, D, 3] linear radiance that arrives from the blocked share, times that share:
-            of map's dtype, or float16.
+        indirect: [P, D, 3] linear radiance from the occluded share, times that share: of map's
+            dtype, or float16.
         index: [N] int64 in [0, P), the point of each sample.
         normal, wo, albedo, roughness, directions, solid_angle, f0: as in shade_radiance.
 
@@ -297,7 +297,7 @@ def _empty_grads(
     to_light: bool,
     to_normal: bool,
 ):
-    """Room for the gradients; for those of light and normal, the dear ones, where asked for."""
+    """Room for the gradients; for those of light and normal, which cost most, only where needed."""
     grad_light = torch.empty_like(light) if to_light else light.new_empty(0)
     grad_normal = torch.empty_like(normal) if to_normal else normal.new_empty(0)
     materials = torch.empty_like(albedo), torch.empty_like(roughness), room_for_grad(f0)
@@ -310,8 +310,8 @@ def _(radiance, normal, *others):
 
 
 @_shade_radiance_backward.register_fake
-def _(radiance, normal, wo, albedo, roughness, directions, f0, grad_rgb, solid_angle, *asked):
-    return _empty_grads(radiance, normal, albedo, roughness, f0, *asked)
+def _(radiance, normal, wo, albedo, roughness, directions, f0, grad_rgb, solid_angle, *needs):
+    return _empty_grads(radiance, normal, albedo, roughness, f0, *needs)
 
 
 @_shade_map.register_fake
@@ -329,8 +329,8 @@ def _save(ctx, inputs, output):
     ctx.save_for_backward(*tensors)
 
 
-def _keep(asked: tuple[bool, ...], grads: tuple[Tensor, ...]) -> list[Tensor | None]:
-    return [grad if ask else None for ask, grad in zip(asked, grads, strict=True)]
+def _keep(needs: tuple[bool, ...], grads: tuple[Tensor, ...]) -> list[Tensor | None]:
+    return [grad if need else None for need, grad in zip(needs, grads, strict=True)]
 
 
 def _radiance_backward(ctx, grad_rgb):
@@ -338,8 +338,8 @@ def _radiance_backward(ctx, grad_rgb):
     grads = _shade_radiance_backward(
         *ctx.saved_tensors, grad_rgb.contiguous(), ctx.solid_angle, radiance, normal
     )
-    asked = (radiance, normal, albedo, roughness, f0)
-    radiance, normal, albedo, roughness, f0 = _keep(asked, grads)
+    needs = (radiance, normal, albedo, roughness, f0)
+    radiance, normal, albedo, roughness, f0 = _keep(needs, grads)
     return radiance, normal, None, albedo, roughness, None, f0, None
 
 
@@ -348,8 +348,8 @@ def _map_backward(ctx, grad_rgb):
     grads = _shade_map_backward(
         *ctx.saved_tensors, grad_rgb.contiguous(), ctx.solid_angle, map, normal
     )
-    asked = (map, normal, albedo, roughness, f0)
-    map, normal, albedo, roughness, f0 = _keep(asked, grads)
+    needs = (map, normal, albedo, roughness, f0)
+    map, normal, albedo, roughness, f0 = _keep(needs, grads)
     return map, None, None, None, normal, None, albedo, roughness, None, f0, None
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from univoxel.ops import native
+from univoxel.ops import grid_sampling, native
 from univoxel.ops.checks import check, check_bricks
-from univoxel.ops.dense_grid import SparseGrad, check_place, sample_dense_reference
+from univoxel.ops.dense_grid import sample_dense_reference
+from univoxel.ops.grid_sampling import SparseGrad, check_place
 from univoxel.records import Bricks
 
 
@@ -85,6 +87,10 @@ def sample_sparse_reference(
     return sample_dense_reference(whole, of_nodes, points, origin, voxel_size)
 
 
+def _grid(table: Tensor, size: list[int], origin: list[float], voxel_size: float) -> Any:
+    return native.require().SparseGrid(table.numpy(), size, origin, voxel_size)
+
+
 @native.operator("sample_sparse")
 def _sample_sparse(
     sdf: Tensor,
@@ -96,27 +102,8 @@ def _sample_sparse(
     voxel_size: float,
     sparse_grad: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    out = _empty_outputs(features, points)
-    value, gradient, feature, order = out
-    native.require().sample_sparse_forward(
-        *native.arrays(sdf, features, points, order, table, value, gradient, feature),
-        size,
-        origin,
-        voxel_size,
-        native.threads(),
-    )
-    return out
-
-
-def _empty_outputs(features: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Value, gradient, feature, and the points' order by brick, which backward uses again."""
-    m = len(points)
-    return (
-        points.new_empty(m),
-        points.new_empty(m, 3),
-        features.new_empty(m, features.shape[1]),
-        points.new_empty(m, dtype=torch.int32),
-    )
+    grid = _grid(table, size, origin, voxel_size)
+    return grid_sampling.sample(grid, sdf, features, points)
 
 
 @native.operator("sample_sparse_backward")
@@ -134,90 +121,17 @@ def _sample_sparse_backward(
     voxel_size: float,
     needs: list[bool],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    grads = _empty_grads(sdf, features, points, needs)
-    native.require().sample_sparse_backward(
-        *native.arrays(
-            sdf, features, points, order, table, grad_value, grad_gradient, grad_feature
-        ),
-        *[g.numpy() if need else None for g, need in zip(grads, needs, strict=True)],
-        None,
-        None,
-        size,
-        origin,
-        voxel_size,
-        native.threads(),
-    )
-    return grads
-
-
-def _empty_grads(
-    sdf: Tensor, features: Tensor, points: Tensor, needs: list[bool]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients to fill; one that nobody needs is empty, because an op cannot return None."""
-    grads = [
-        torch.empty_like(t) if need else t.new_empty(0)
-        for t, need in zip((sdf, features, points), needs, strict=True)
-    ]
-    return grads[0], grads[1], grads[2]
-
-
-def _into_touched_rows(
-    sdf: Tensor,
-    features: Tensor,
-    table: Tensor,
-    points: Tensor,
-    order: Tensor,
-    grad_outputs: list[Tensor],
-    size: list[int],
-    origin: list[float],
-    voxel_size: float,
-    needs: list[bool],
-) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-    """The backward into touched rows; no op: how many there are depends on data."""
-    core, threads = native.require(), native.threads()
-    pools = (sdf, features)
-    touched = core.touched_brick_rows(
-        *native.arrays(points, order, table),
-        len(sdf),
-        size,
-        origin,
-        voxel_size,
-        *needs[:2],
-        threads,
-    )
-    values = [
-        None if t is None else p.new_empty(len(t), *p.shape[1:])
-        for t, p in zip(touched, pools, strict=True)
-    ]
-    grad_points = torch.empty_like(points) if needs[2] else None
-    core.sample_sparse_backward(
-        *native.arrays(sdf, features, points, order, table, *grad_outputs),
-        *[None if t is None else t.numpy() for t in (*values, grad_points)],
-        *touched,
-        size,
-        origin,
-        voxel_size,
-        threads,
-    )
-    grads = [_sparse(t, v, p) for t, v, p in zip(touched, values, pools, strict=True)]
-    return grads[0], grads[1], grad_points
-
-
-def _sparse(touched, values: Tensor | None, pool: Tensor) -> Tensor | None:
-    """Values of touched rows as a sparse tensor of the pool's shape."""
-    if values is None:
-        return None
-    rows = torch.empty(1, len(touched), dtype=torch.int64)
-    touched.write_rows(rows.numpy(), native.threads())
-    # The rows are distinct, in order and inside by construction: checking costs more than they do.
-    return torch.sparse_coo_tensor(
-        rows, values, pool.shape, is_coalesced=True, check_invariants=False
+    return grid_sampling.sample_backward(
+        _grid(table, size, origin, voxel_size),
+        (sdf, features, points, order),
+        (grad_value, grad_gradient, grad_feature),
+        needs,
     )
 
 
 @_sample_sparse.register_fake
 def _(sdf, features, table, points, size, origin, voxel_size, sparse_grad):
-    return _empty_outputs(features, points)
+    return grid_sampling.empty_outputs(features, points)
 
 
 @_sample_sparse_backward.register_fake
@@ -235,7 +149,7 @@ def _(
     voxel_size,
     needs,
 ):
-    return _empty_grads(sdf, features, points, needs)
+    return grid_sampling.empty_grads(sdf, features, points, needs)
 
 
 def _save(ctx, inputs, output):
@@ -244,15 +158,16 @@ def _save(ctx, inputs, output):
 
 
 def _backward(ctx, grad_value, grad_gradient, grad_feature, _):
-    grad_outputs = [g.contiguous() for g in (grad_value, grad_gradient, grad_feature)]
+    grad_outputs = (grad_value.contiguous(), grad_gradient.contiguous(), grad_feature.contiguous())
     needs = [ctx.needs_input_grad[i] for i in (0, 1, 3)]
     sdf, features, table, points, order = ctx.saved_tensors
-    saved = (sdf, features, table, points, order)
-    place = (ctx.size, ctx.origin, ctx.voxel_size, needs)
+    place = (ctx.size, ctx.origin, ctx.voxel_size)
     if ctx.sparse_grad:
-        grads = _into_touched_rows(*saved, grad_outputs, *place)
+        inputs = (sdf, features, points, order)
+        grid = _grid(table, *place)
+        grads = grid_sampling.sample_backward_sparse(grid, inputs, grad_outputs, needs)
     else:
-        filled = _sample_sparse_backward(*saved, *grad_outputs, *place)
+        filled = _sample_sparse_backward(*ctx.saved_tensors, *grad_outputs, *place, needs)
         grads = [g if need else None for g, need in zip(filled, needs, strict=True)]
     return grads[0], grads[1], None, grads[2], None, None, None, None
 

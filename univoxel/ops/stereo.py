@@ -103,26 +103,26 @@ def match_cost_reference(
     height, width = rows.shape
     t = start[:, None] + step * torch.arange(steps, dtype=start.dtype, device=start.device)
     point = origin[:, None] + t[..., None] * direction[:, None]  # [N, K, 3]
-    apart = []
+    differences = []
     for view in others.tolist():
         x, y, z = (point @ matrix[view, :, :3].T + matrix[view, :, 3]).unbind(-1)
         at = torch.stack([x / z / width, y / z / height], -1) * 2 - 1
-        found = torch.nn.functional.grid_sample(
+        texel = torch.nn.functional.grid_sample(
             pictures[view].permute(2, 0, 1)[None].to(at) / 255, at[None], align_corners=False
         )[0].permute(1, 2, 0)
-        off = (found[..., :3] / found[..., 3:] - color[:, None]).abs().mean(-1)
+        off = (texel[..., :3] / texel[..., 3:] - color[:, None]).abs().mean(-1)
         half = at.new_tensor([1 / width, 1 / height])  # of a pixel: pictures are 2 wide
         inside = ((at >= half - 1) & (at < 1 - half)).all(-1) & (z > 0)
-        seen = inside & (found[..., 3] >= 0.5)
-        apart.append(torch.where(seen, off.clamp_max(most), most))
+        visible = inside & (texel[..., 3] >= 0.5)
+        differences.append(torch.where(visible, off.clamp_max(most), most))
     pixel = (rows.flatten() >= 0).nonzero()[:, 0]
-    spread = start.new_zeros(len(apart) * steps + 1, height * width)
-    values = torch.stack(apart).permute(0, 2, 1).reshape(-1, len(start))
+    spread = start.new_zeros(len(differences) * steps + 1, height * width)
+    values = torch.stack(differences).permute(0, 2, 1).reshape(-1, len(start))
     spread[:-1, pixel], spread[-1, pixel] = values[:, rows.flatten()[pixel]], 1.0
     mean = torch.nn.functional.avg_pool2d(
         spread.view(-1, height, width), 2 * radius + 1, 1, radius, count_include_pad=True
     ).flatten(1)[:, pixel]
-    cost = (mean[:-1] / mean[-1]).view(len(apart), steps, -1).sort(0).values[:best].mean(0).T
+    cost = (mean[:-1] / mean[-1]).view(len(differences), steps, -1).sort(0).values[:best].mean(0).T
     return torch.empty_like(cost).index_copy_(0, rows.flatten()[pixel], cost)
 
 
@@ -163,29 +163,29 @@ def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tenso
 
 def semi_global_reference(cost: Tensor, rows: Tensor, small: float, large: float) -> Tensor:
     """The same in eager torch, line after line."""
-    there = rows >= 0
+    has_ray = rows >= 0
     volume = cost.new_zeros(*rows.shape, cost.shape[1])
-    volume[there] = cost[rows[there]]
+    volume[has_ray] = cost[rows[has_ray]]
     total = torch.zeros_like(volume)
     for across in (False, True):
         for back in (False, True):
             turn = (lambda v: v.transpose(0, 1)) if across else (lambda v: v)
-            c, s, t = (turn(v) for v in (volume, there[..., None].to(cost.dtype), total))
-            before, begun = torch.zeros_like(c[0]), torch.zeros_like(s[0])
+            c, s, t = (turn(v) for v in (volume, has_ray[..., None].to(cost.dtype), total))
+            before, continues = torch.zeros_like(c[0]), torch.zeros_like(s[0])
             for i in range(len(c))[:: -1 if back else 1]:
                 wide = torch.nn.functional.pad(before, (1, 1), value=torch.inf)
-                beside = torch.minimum(wide[:, :-2], wide[:, 2:]) + small
+                neighbor = torch.minimum(wide[:, :-2], wide[:, 2:]) + small
                 least = before.amin(1, keepdim=True)
-                moved = torch.minimum(torch.minimum(before, beside), least + large) - least
-                before, begun = c[i] + begun * moved, s[i]
+                transition = torch.minimum(torch.minimum(before, neighbor), least + large) - least
+                before, continues = c[i] + continues * transition, s[i]
                 t[i] += before * s[i]
     result = torch.zeros_like(cost)
-    result[rows[there]] = total[there]
+    result[rows[has_ray]] = total[has_ray]
     return result
 
 
 def _check_rows(op: str, rows: Tensor, count: int) -> None:
     """Each of the N rays is the ray of one pixel."""
-    found = rows[rows >= 0].sort().values
-    if not torch.equal(found, torch.arange(count, device=rows.device)):
+    named = rows[rows >= 0].sort().values
+    if not torch.equal(named, torch.arange(count, device=rows.device)):
         raise ValueError(f"{op}: rows must name each of the {count} rays once, and -1 elsewhere")

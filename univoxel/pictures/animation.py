@@ -8,21 +8,22 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from univoxel.errors import MissingExtra, UserError
 from univoxel.files import replacing
+from univoxel.names import ANIMATIONS
 
 FRAMES_PER_SECOND = 25  # GIF counts in hundredths of a second
-KINDS = ("gif", "mp4")
 
 
 def require(kind: str) -> None:
     """Say before the work starts whether this kind can be written.
 
     Raises:
-        ValueError: another kind than gif and mp4.
-        ImportError: mp4 without imageio-ffmpeg.
+        UserError: another kind than gif and mp4.
+        MissingExtra: mp4 without imageio-ffmpeg.
     """
-    if kind not in KINDS:
-        raise ValueError(f"relight: animation must be gif or mp4, got {kind!r}")
+    if kind not in ANIMATIONS:
+        raise UserError(f"relight: animation must be gif or mp4, got {kind!r}", "animation")
     if kind == "mp4":
         _ffmpeg()
 
@@ -34,7 +35,7 @@ def write_animation(path: Path, pictures: Sequence[Path], rate: int = FRAMES_PER
 
     Raises:
         OSError: a file cannot be read or written.
-        ImportError: an MP4 without imageio-ffmpeg.
+        MissingExtra: an MP4 without imageio-ffmpeg.
     """
     frames = (_on_white(picture) for picture in pictures)
     with replacing(path) as temporary:
@@ -76,7 +77,7 @@ def _ffmpeg():
     try:
         import imageio_ffmpeg  # pyright: ignore[reportMissingImports]  the extra `video`
     except ImportError:
-        raise ImportError(
+        raise MissingExtra(
             "an MP4 needs imageio-ffmpeg: pip install 'univoxel[video]', or choose gif"
         ) from None
     return imageio_ffmpeg

@@ -10,7 +10,7 @@ from univoxel.camera import Cameras
 from univoxel.confidence import Doubts
 from univoxel.records import Surface
 from univoxel.render.pipeline import at_rays, shade, surface_of_view
-from univoxel.render.relight import Lighting, Stage, relight_surface
+from univoxel.render.relight import Lighting, TracedMesh, relight_surface
 from univoxel.scene import Scene
 
 DOUBTS = ("albedo", "roughness")
@@ -36,7 +36,7 @@ class Relighting:
     """How relit layers are made."""
 
     lights: dict[str, Lighting]  # by the name of their map
-    stage: Stage  # casts shadows and sends bounces
+    traced: TracedMesh  # casts shadows and sends bounces
     scale: Tensor  # [3] of the albedo, for the second set of pictures
     samples: int  # of the light, per pixel
     bounces: int
@@ -64,13 +64,13 @@ def render_layers(
     if relighting:
         # A scale above 1 must not make a surface that reflects more than it receives.
         bright = replace(surface, albedo=(surface.albedo * relighting.scale).clamp_max(1))
-        mesh = relighting.stage.mesh
+        mesh = relighting.traced.mesh
         if mesh.albedo is not None:
             mesh = replace(mesh, albedo=(mesh.albedo * relighting.scale).clamp_max(1))
-        scaled_stage = replace(relighting.stage, mesh=mesh)
+        scaled_mesh = replace(relighting.traced, mesh=mesh)
         for name in relighting.lights:
             relit[name] = picture(opacity * _relight(relighting, name, surface, wo))
-            scaled = _relight(replace(relighting, stage=scaled_stage), name, bright, wo)
+            scaled = _relight(replace(relighting, traced=scaled_mesh), name, bright, wo)
             relit_scaled[name] = picture(opacity * scaled)
     backward = cameras.camera_to_world[view, :, 2]
     return Layers(
@@ -102,7 +102,7 @@ def _relight(relighting: Relighting, name: str, surface: Surface, wo: Tensor) ->
     return relight_surface(
         surface,
         wo,
-        relighting.stage,
+        relighting.traced,
         relighting.lights[name],
         samples=relighting.samples,
         bounces=relighting.bounces,

@@ -16,14 +16,15 @@ from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import write_png
 from univoxel.envmap import EnvMap, tables
-from univoxel.errors import DataError
+from univoxel.errors import DataError, UserError
 from univoxel.joint.config import JointConfig
-from univoxel.pictures.animation import KINDS, require, write_animation
+from univoxel.names import ANIMATIONS
+from univoxel.pictures.animation import require, write_animation
 from univoxel.render.pipeline import extract_mesh, radiance_of, shade_hits, surface_of_view
-from univoxel.render.relight import Lighting, relight_surface, stage
+from univoxel.render.relight import Lighting, relight_surface, traced_mesh
 from univoxel.scene import Scene
+from univoxel.training.clock import Clock
 from univoxel.training.config import StageConfig
-from univoxel.training.progress import Progress
 
 FRAMES = 60  # in the whole time of a training
 FRAMES_PER_SECOND = 10
@@ -42,15 +43,16 @@ class Timelapse:
                 its end.
 
         Raises:
-            ValueError: another ending.
-            ImportError: an MP4 without imageio-ffmpeg.
+            UserError: another ending.
+            MissingExtra: an MP4 without imageio-ffmpeg.
             DataError: the photographs cannot be used.
         """
         kind = Path(path).suffix
         folder = str(path).endswith("/") or not kind
-        if not folder and kind[1:] not in KINDS:
-            raise ValueError(
-                f"--timelapse: expected a name that ends in .gif, .mp4 or / (a folder), got {path}"
+        if not folder and kind[1:] not in ANIMATIONS:
+            raise UserError(
+                f"timelapse: expected a name that ends in .gif, .mp4 or / (a folder), got {path}",
+                "timelapse",
             )
         if not folder:
             require(kind[1:])
@@ -64,24 +66,24 @@ class Timelapse:
         self.every = 60 * cfg.minutes / FRAMES  # seconds
         self._next = 0.0
 
-    def look(self, scene: Scene, progress: Progress, last: bool = False) -> None:
+    def look(self, scene: Scene, clock: Clock, last: bool = False) -> None:
         """Take a frame if it is time for one. The scene and the random numbers stay as they are."""
-        if progress.seconds < self._next and not last:
+        if clock.seconds < self._next and not last:
             return
-        self._next = progress.seconds + self.every
+        self._next = clock.seconds + self.every
         self.folder.mkdir(parents=True, exist_ok=True)
         with torch.random.fork_rng(devices=[]):
-            picture = draw(scene, self.cameras, *shown(progress))
-        path = self.folder / f"step_{progress.step:06d}.png"
-        write_png(path, labelled(picture, f"{progress.seconds:.1f} s"))
+            picture = draw(scene, self.cameras, *shown(clock))
+        path = self.folder / f"step_{clock.step:06d}.png"
+        write_png(path, labelled(picture, f"{clock.seconds:.1f} s"))
 
-    def finish(self, scene: Scene, progress: Progress) -> None:
+    def finish(self, scene: Scene, clock: Clock) -> None:
         """Take the last frame, and make the file of all.
 
         Raises:
             OSError: it cannot be written; the frames stay in the run's folder.
         """
-        self.look(scene, progress, last=True)
+        self.look(scene, clock, last=True)
         if self.file is None:
             return
         self.file.parent.mkdir(parents=True, exist_ok=True)
@@ -89,13 +91,13 @@ class Timelapse:
         shutil.rmtree(self.folder)
 
 
-def shown(progress: Progress) -> tuple[bool, bool]:
+def shown(clock: Clock) -> tuple[bool, bool]:
     """Whether the render is lit at all, by the radiance head alone before; and by the map."""
-    if progress.stage == len(progress.cfg.stages):
+    if clock.stage == len(clock.cfg.stages):
         return True, False
-    now = progress.cfg.stages[progress.stage]
+    now = clock.cfg.stages[clock.stage]
     if isinstance(now, StageConfig):
-        return progress.done >= now.physical_from, False
+        return clock.done >= now.physical_from, False
     return True, isinstance(now, JointConfig)
 
 
@@ -115,8 +117,8 @@ def draw(scene: Scene, cameras, lit: bool, by_map: bool) -> Tensor:
     if by_map:
         assert scene.sky is not None
         lighting = Lighting(tables(EnvMap(scene.sky.latlong(MAP_ROWS))))
-        place = stage(extract_mesh(scene), scene.field.voxel_size)
-        sent = relight_surface(surface, wo, place, lighting, samples=SAMPLES, bounces=BOUNCES)
+        traced = traced_mesh(extract_mesh(scene), scene.field.voxel_size)
+        sent = relight_surface(surface, wo, traced, lighting, samples=SAMPLES, bounces=BOUNCES)
         render = linear_to_srgb(sent * opacity)
     elif lit:
         render = linear_to_srgb(shade_hits(scene, surface, wo))

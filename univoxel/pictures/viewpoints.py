@@ -11,11 +11,12 @@ import torch
 
 from univoxel.camera import Cameras, resize
 from univoxel.data import load_cameras
+from univoxel.errors import UserError
+from univoxel.names import ELEVATION
 from univoxel.records import Mesh
 from univoxel.run import photos_of
 
 ORBIT_FRAMES = 60
-ELEVATION = 25.0  # degrees, of an orbit's cameras above the object's middle
 VIEW_ANGLE = 40.0  # degrees, of an orbit's cameras
 ORBIT_SIZE = 512  # pixels along an orbit's pictures
 MARGIN = 1.05  # room that an orbit leaves around the object
@@ -39,7 +40,7 @@ def frames_of(names: list[str], lights: Iterable[str], turn: int | None) -> list
             under still light.
     """
     if turn is not None and turn < 1:
-        raise ValueError(f"relight: turn must be at least 1 frame, got {turn}")
+        raise UserError(f"relight: turn must be at least 1 frame, got {turn}", "turn")
     if turn is None:
         return [Frame(name, view, light) for view, name in enumerate(names) for light in lights]
     return [
@@ -70,22 +71,27 @@ def views_of(
     elevation: float,
     mesh: Mesh,
 ) -> tuple[list[str], Cameras]:
-    """Names of the views, and their cameras; arguments as of `univoxel.tasks.relight.relight`.
+    """Names of the views, and their cameras; arguments as of `tasks.relight.RelightOptions`.
 
     Raises:
-        DataError, ValueError: the cameras cannot be used.
+        UserError: the cameras cannot be used.
     """
     if resolution is not None and resolution < 1:
-        raise ValueError(f"relight: resolution must be at least 1, got {resolution}")
+        raise UserError(f"relight: resolution must be at least 1, got {resolution}", "resolution")
     if isinstance(cameras, Cameras):
         names = [f"{i:04d}" for i in range(len(cameras))]
         return names, resize(cameras, resolution or cameras.width)
     word, _, count = str(cameras).partition(" ")
     if word == "orbit":
         if count and not (count.isdigit() and int(count)):
-            raise ValueError(f"relight: expected orbit or orbit N, N frames, got {str(cameras)!r}")
+            raise UserError(
+                f"relight: cameras: expected orbit or orbit N, N frames, got {str(cameras)!r}",
+                "cameras",
+            )
         if not -90 < elevation < 90:
-            raise ValueError(f"relight: elevation must be in (-90, 90) degrees, got {elevation}")
+            raise UserError(
+                f"relight: elevation must be in (-90, 90) degrees, got {elevation}", "elevation"
+            )
         frames = int(count or ORBIT_FRAMES)
         names = [f"orbit_{i:04d}" for i in range(frames)]
         return names, orbit(mesh, frames, resolution or ORBIT_SIZE, elevation)

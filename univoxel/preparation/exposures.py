@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 
 import torch
@@ -16,6 +17,8 @@ from univoxel.names import Varying
 from univoxel.ops import VisibilityScene
 from univoxel.records import Mesh
 from univoxel.render.transport import observe, surface_points
+
+log = logging.getLogger("univoxel")
 
 POINTS = 6000  # of the surface
 DARK = 0.1  # sRGB; of what is darker, rounding to 8 bits and reflections are too large a part
@@ -94,8 +97,10 @@ def exposures(
         if stops < DIFFERENT:
             return varying, None
         varying = "exposure"
-        print(
-            f"exposures differ by {stops:.2f} stops from photograph to photograph: a gain is "
-            "learned for each, see --varying"
+        log.info(
+            "exposures differ by %.2f stops from photograph to photograph: a gain is learned for "
+            "each, see varying",
+            stops,
+            extra={"arguments": ("varying",)},
         )
     return varying, gains

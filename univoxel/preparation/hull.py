@@ -8,6 +8,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from univoxel.camera import Cameras, looked_at, project
+from univoxel.errors import UserError
 from univoxel.grid import GridShape, fit_coarse, fit_grid, resample
 
 
@@ -63,7 +64,7 @@ def estimate_bounds(distance: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]
     """Corners [3], [3] of a box around the visual hull, with a margin of 3 % of its diagonal.
 
     Raises:
-        ValueError: the silhouettes share no volume.
+        UserError: the silhouettes share no volume.
     """
     centre = looked_at(cameras)
     away = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
@@ -75,7 +76,7 @@ def estimate_bounds(distance: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]
         nodes = grid.nodes().reshape(-1, 3)
         inside = nodes[hull_sdf(distance, cameras, nodes) < grid.voxel_size]
         if not len(inside):
-            raise ValueError(
+            raise UserError(
                 "the silhouettes of the photographs share no volume: check masks and cameras"
             )
         lower, upper = inside.amin(0), inside.amax(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import torch
@@ -12,6 +13,8 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.names import MasksFrom
 from univoxel.preparation.hull import mask_distances
+
+log = logging.getLogger("univoxel")
 
 VIEWS = 32  # photographs at most that are looked at
 REACH = 0.015, 6  # of a picture's larger side, and pixels at least: wider masks stay as they are
@@ -108,9 +111,9 @@ def masks_of(photos: Photos, wanted: MasksFrom) -> tuple[Photos, Tensor]:
         return photos, distance
     much = f"masks are {off} {'pixel' if off == 1 else 'pixels'} too wide"
     if wanted == "given":
-        print(f"{much}: see --masks auto")
+        log.info("%s: see masks=auto", much, extra={"arguments": ("masks",)})
         return photos, distance
-    print(f"{much}: they are taken in")
+    log.info("%s: they are taken in", much)
     coverage = taken_in(distance, off)
     stored = coverage if photos.alpha.is_floating_point() else (255 * coverage).round().byte()
     return replace(photos, alpha=stored), mask_distances(coverage)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -11,6 +13,8 @@ from univoxel.names import CamerasFrom
 from univoxel.poses import PoseSteps
 from univoxel.preparation.hull import estimate_bounds
 from univoxel.records import Rays
+
+log = logging.getLogger("univoxel")
 
 EDGE = -1.6, -0.5  # pixels inside a silhouette that count as its edge
 PLACES = 48  # that are looked at along a ray, twice
@@ -160,8 +164,13 @@ def object_box(
     off = contradiction(distance, cameras, box)
     refined = wanted == "refined" or (wanted == "auto" and off > AGREEING)
     if off > AGREEING:
-        then = "cameras are refined" if refined else "see --cameras refined"
-        print(f"silhouettes contradict one another by {off:.1f} pixels: {then}")
+        then = "cameras are refined" if refined else "see cameras=refined"
+        log.info(
+            "silhouettes contradict one another by %.1f pixels: %s",
+            off,
+            then,
+            extra={"arguments": ("cameras",)},
+        )
     if refined and off > 0:  # what the silhouettes share is too small by so much
         box = estimate_bounds(distance - off, cameras)
     return box, refined
@@ -180,5 +189,5 @@ def put_right(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tensor]) ->
     moved = poses.moved(cameras).square().mean().sqrt()
     left = contradiction(distance, poses.eval().corrected(cameras), box)
     left = f"still contradict one another by {left:.1f} pixels" if left > AGREEING else "agree"
-    print(f"cameras moved the object by {moved:.1f} pixels on average: silhouettes {left}")
+    log.info("cameras moved the object by %.1f pixels on average: silhouettes %s", moved, left)
     return poses

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import get_args
 
 import torch
 from torch import Tensor
@@ -14,10 +14,16 @@ from univoxel import envmap as env
 from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
+from univoxel.errors import UserError
+from univoxel.names import BOUNCES, SAMPLES, Background
 from univoxel.records import Surface
-from univoxel.render.relight import Lighting, Stage, ground_shadow, relight_surface, relight_until
-
-Background = Literal["transparent", "map", "black"]
+from univoxel.render.relight import (
+    Lighting,
+    TracedMesh,
+    ground_shadow,
+    relight_surface,
+    relight_until,
+)
 
 
 @dataclass(frozen=True)
@@ -25,24 +31,25 @@ class Quality:
     """How a frame is made.
 
     Raises:
-        ValueError: a field is out of range.
+        UserError: a field is out of range.
     """
 
-    samples: int = 64  # of the light, per pixel; >= 1
+    samples: int = SAMPLES  # of the light, per pixel; >= 1
     noise: float | None = None  # instead: samples until `relight_until` finds less; > 0
-    bounces: int = 2  # reflections between parts of the object, >= 0
+    bounces: int = BOUNCES  # reflections between parts of the object, >= 0
     background: Background = "transparent"
     ground: float | None = None  # z of a floor that catches the shadow, world units
 
     def __post_init__(self) -> None:
         for name, value, ok in (
             ("samples must be at least 1", self.samples, self.samples >= 1),
+            ("samples must be at most 2^31", self.samples, self.samples <= 2**31),
             ("noise must be above 0", self.noise, self.noise is None or self.noise > 0),
             ("bounces must be at least 0", self.bounces, self.bounces >= 0),
             (
                 "background must be transparent, map or black",
                 self.background,
-                self.background in ("transparent", "map", "black"),
+                self.background in get_args(Background),
             ),
             (
                 "ground must be finite",
@@ -51,7 +58,7 @@ class Quality:
             ),
         ):
             if not ok:
-                raise ValueError(f"relight: {name}, got {value!r}")
+                raise UserError(f"relight: {name}, got {value!r}", name.split()[0])
 
 
 @dataclass(frozen=True)
@@ -74,7 +81,7 @@ def render_picture(
     wo: Tensor,  # [H * W, 3]
     cameras: Cameras,
     view: int,
-    stage: Stage,
+    traced: TracedMesh,
     lighting: Lighting,
     quality: Quality,
     seed: int = 0,
@@ -88,20 +95,20 @@ def render_picture(
     options = {"bounces": quality.bounces, "seed": seed}
     samples = quality.samples
     if quality.noise is None:
-        rgb = relight_surface(surface, wo, stage, lighting, samples=samples, **options)
+        rgb = relight_surface(surface, wo, traced, lighting, samples=samples, **options)
     else:
         rgb, _, samples = relight_until(
-            surface, wo, stage, lighting, noise=quality.noise, report=report, **options
+            surface, wo, traced, lighting, noise=quality.noise, report=report, **options
         )
     alpha = surface.opacity[:, None]
-    there = alpha > 0
+    hit = alpha > 0
     rgb, clear = rgb * alpha, 1 - alpha
     rays, shadow = image_rays(cameras, view), None
     if quality.ground is not None:
         shadow = ground_shadow(
             rays,
             quality.ground,
-            stage,
+            traced,
             lighting,
             samples=samples,
             hidden=surface.opacity > 0.999,
@@ -119,8 +126,8 @@ def render_picture(
     return Picture(
         rgb=grid(rgb),
         albedo=grid(surface.albedo * alpha),
-        normal=grid(torch.where(there, surface.normal, 0.0)),
-        depth=grid(torch.where(there[:, 0], surface.depth * (wo @ backward), 0.0)),
+        normal=grid(torch.where(hit, surface.normal, 0.0)),
+        depth=grid(torch.where(hit[:, 0], surface.depth * (wo @ backward), 0.0)),
         alpha=grid(surface.opacity),
         shadow=None if shadow is None else grid(shadow),
         metallic=None if metallic is None else grid(metallic * surface.opacity),

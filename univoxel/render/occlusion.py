@@ -28,11 +28,11 @@ def occlusion(scene: Scene, surface: Surface, directions: int, rotation: Tensor)
         ValueError: the scene has no surface.
     """
     wi = half_sphere(surface, directions, rotation)
-    open_, indirect = look(scene, *starts(scene, surface, wi))
-    return Occlusion(rotation, open_.to(wi.dtype).view(wi.shape[:2]), indirect.view_as(wi))
+    visible, indirect = trace_and_shade(scene, *occlusion_rays(scene, surface, wi))
+    return Occlusion(rotation, visible.to(wi.dtype).view(wi.shape[:2]), indirect.view_as(wi))
 
 
-def starts(scene: Scene, surface: Surface, wi: Tensor) -> tuple[Tensor, Tensor]:
+def occlusion_rays(scene: Scene, surface: Surface, wi: Tensor) -> tuple[Tensor, Tensor]:
     """Rays from N points along wi [N, D, 3]: origins and directions, [N D, 3] each.
 
     They begin a voxel off the surface: rendered points lie only about on the mesh.
@@ -42,7 +42,7 @@ def starts(scene: Scene, surface: Surface, wi: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def look(
+def trace_and_shade(
     scene: Scene, start: Tensor, away: Tensor, tracer: VisibilityScene | None = None
 ) -> tuple[Tensor, Tensor]:
     """Which of M rays meet nothing [M], and the radiance [M, 3] that comes from what others meet.

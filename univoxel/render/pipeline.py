@@ -9,9 +9,8 @@ from torch import Tensor
 
 from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
-from univoxel.color import srgb_to_linear
+from univoxel.color import linear_to_srgb_unclipped, srgb_to_linear
 from univoxel.lights.quadrature import rotations
-from univoxel.losses import encode
 from univoxel.ops import composite
 from univoxel.records import Mesh, Rays, Surface
 from univoxel.render.density import section_alpha
@@ -72,7 +71,7 @@ def radiance_of(
     encoded = scene.radiance(scene.coded(surface.features, view), surface.normal, wo)
     if scene.views is None:
         return encoded
-    return encode(scene.exposed(srgb_to_linear(encoded), view))
+    return linear_to_srgb_unclipped(scene.exposed(srgb_to_linear(encoded), view))
 
 
 def shade(

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from univoxel.brdf import F0, split
 from univoxel.color import luminance
-from univoxel.ops import EnvTables, Lamp, Sun, VisibilityScene, relight
+from univoxel.errors import UserError
+from univoxel.ops import EnvTables, PointLight, Sun, VisibilityScene, relight
 from univoxel.records import Mesh, Rays, Surface
 
 FIRST_PASS = 4  # samples of either half of the first pass towards a noise limit
@@ -22,8 +23,8 @@ INTERVAL = 1.96  # standard deviations that hold 95 % of a normal distribution
 
 
 @dataclass(frozen=True)
-class Stage:
-    """What light meets; `stage` makes it, once for any number of pictures."""
+class TracedMesh:
+    """A mesh and its ray hierarchy; `traced_mesh` makes it, once for any number of pictures."""
 
     mesh: Mesh  # with materials at its vertices
     visibility: VisibilityScene  # of the same mesh
@@ -36,16 +37,16 @@ class Lighting:
 
     tables: EnvTables
     suns: tuple[Sun, ...] = ()
-    lamps: tuple[Lamp, ...] = ()
+    point_lights: tuple[PointLight, ...] = ()
 
 
-def stage(mesh: Mesh, offset: float) -> Stage:
-    """Build the ray hierarchy of a mesh, some 0.3 s per million triangles."""
-    return Stage(mesh, VisibilityScene(mesh.vertices, mesh.faces), offset)
+def traced_mesh(mesh: Mesh, offset: float) -> TracedMesh:
+    """A mesh with its ray hierarchy, which takes some 0.3 s per million triangles to build."""
+    return TracedMesh(mesh, VisibilityScene(mesh.vertices, mesh.faces), offset)
 
 
-def turned(lighting: Lighting, degrees: float) -> Lighting:
-    """The map and the suns turned counter-clockwise about +Z; lamps stay where they are."""
+def rotated(lighting: Lighting, degrees: float) -> Lighting:
+    """The light with map and suns turned counter-clockwise about +Z; point lights stay."""
     angle = math.radians(degrees)
     c, s = math.cos(angle), math.sin(angle)
     suns = tuple(
@@ -54,14 +55,14 @@ def turned(lighting: Lighting, degrees: float) -> Lighting:
         for x, y, z in [sun.direction]
     )
     tables = replace(lighting.tables, rotation=lighting.tables.rotation + angle)
-    return Lighting(tables, suns, lighting.lamps)
+    return Lighting(tables, suns, lighting.point_lights)
 
 
 @torch.no_grad()
 def relight_surface(
     surface: Surface,
     wo: Tensor,  # [N, 3]
-    stage: Stage,
+    traced: TracedMesh,
     lighting: Lighting,
     *,
     samples: int,
@@ -71,30 +72,30 @@ def relight_surface(
 ) -> Tensor:
     """Radiance [N, 3] that a surface sends along wo, linear; black where its opacity is 0.
 
-    The stage's mesh casts shadows and sends light on. Arguments, errors and sources as of
+    The traced mesh casts shadows and sends light on. Arguments, errors and sources as of
     `univoxel.ops.relight`.
     """
-    there = surface.opacity > 0
-    rgb = surface.position.new_zeros(len(there), 3)
-    metallic = None if surface.metallic is None else surface.metallic[there]
-    diffuse, f0 = split(surface.albedo[there], metallic)
-    mesh, mesh_f0 = _layers(stage.mesh)
-    rgb[there] = relight(
-        stage.visibility,
+    hit = surface.opacity > 0
+    rgb = surface.position.new_zeros(len(hit), 3)
+    metallic = None if surface.metallic is None else surface.metallic[hit]
+    diffuse, f0 = split(surface.albedo[hit], metallic)
+    mesh, mesh_f0 = _layers(traced.mesh)
+    rgb[hit] = relight(
+        traced.visibility,
         mesh,
         lighting.tables,
-        surface.position[there],
-        surface.normal[there],
-        wo[there],
+        surface.position[hit],
+        surface.normal[hit],
+        wo[hit],
         diffuse,
-        surface.roughness[there],
+        surface.roughness[hit],
         f0=f0,
         mesh_f0=mesh_f0,
-        offset=stage.offset,
+        offset=traced.offset,
         samples=samples,
         bounces=bounces,
         suns=lighting.suns,
-        lamps=lighting.lamps,
+        point_lights=lighting.point_lights,
         first=first,
         seed=seed,
     )
@@ -105,7 +106,7 @@ def relight_surface(
 def relight_until(
     surface: Surface,
     wo: Tensor,  # [N, 3]
-    stage: Stage,
+    traced: TracedMesh,
     lighting: Lighting,
     *,
     noise: float,
@@ -131,7 +132,7 @@ def relight_until(
         report: called after each pass with the share of the work that is done, as estimated.
     """
     if not noise > 0:
-        raise ValueError(f"relight: noise must be above 0, got {noise}")
+        raise UserError(f"relight: noise must be above 0, got {noise}", "noise")
     weight = surface.opacity[surface.opacity > 0]
     halves = [torch.zeros_like(surface.position) for _ in range(2)]
     done, more = 0, FIRST_PASS
@@ -140,7 +141,7 @@ def relight_until(
             # Seeds apart by an odd constant: those of other pictures count up from theirs.
             own = (seed + k * 0x9E3779B9) % 2**32
             rgb = relight_surface(
-                surface, wo, stage, lighting, samples=more, bounces=bounces, first=done, seed=own
+                surface, wo, traced, lighting, samples=more, bounces=bounces, first=done, seed=own
             )
             half.mul_(done / (done + more)).add_(rgb, alpha=more / (done + more))
         done += more
@@ -158,7 +159,7 @@ def relight_until(
 def ground_shadow(
     rays: Rays,
     height: float,
-    stage: Stage,
+    traced: TracedMesh,
     lighting: Lighting,
     *,
     samples: int,
@@ -186,11 +187,11 @@ def ground_shadow(
     origin, direction = rays.origin[where], rays.direction[where]
     points = origin + (height - origin[:, 2:]) / direction[:, 2:] * direction
     points[:, 2] = height
-    floor = partial(_floor, stage=stage, lighting=lighting, bounces=bounces, seed=seed)
+    floor = partial(_floor, traced=traced, lighting=lighting, bounces=bounces, seed=seed)
     shadow = rays.origin.new_zeros(len(meets))
     few = min(samples, SCOUTS)
     alone, lit = floor(points, first=0, samples=few)
-    # Most of a floor lies in full light: only where a ray met the object are there more to trace.
+    # Most of a floor lies in full light: only where a ray met the object are hit more to trace.
     if samples > few:
         touched = (alone != lit).nonzero()[:, 0]
         rest = floor(points[touched], first=few, samples=samples - few)
@@ -211,7 +212,7 @@ def _layers(mesh: Mesh) -> tuple[Mesh, Tensor | float]:
 def _floor(
     points: Tensor,
     *,
-    stage: Stage,
+    traced: TracedMesh,
     lighting: Lighting,
     bounces: int,
     first: int,
@@ -221,7 +222,7 @@ def _floor(
     """Luminance [N] that points of a white floor send up, without the object and with it."""
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(points)
     nothing = VisibilityScene(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int32))
-    mesh, mesh_f0 = _layers(stage.mesh)
+    mesh, mesh_f0 = _layers(traced.mesh)
     alone, lit = (
         relight(
             visibility,
@@ -235,13 +236,13 @@ def _floor(
             offset=0.0,
             bounces=reflections,
             suns=lighting.suns,
-            lamps=lighting.lamps,
+            point_lights=lighting.point_lights,
             f0=0.0,
             mesh_f0=mesh_f0,
             first=first,
             samples=samples,
             seed=seed,
         )
-        for visibility, reflections in ((nothing, 0), (stage.visibility, bounces))
+        for visibility, reflections in ((nothing, 0), (traced.visibility, bounces))
     )
     return luminance(alone), luminance(lit)

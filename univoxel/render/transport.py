@@ -16,17 +16,18 @@ from univoxel.ops import VisibilityScene
 from univoxel.records import Mesh
 
 MIN_COSINE = 0.15  # views at a more grazing angle blur over too much surface
+MIN_ALPHA = 0.99  # of a photograph where it shows a point and no background
 POINTS_AT_ONCE = 4096
 HALF_MAX = 65504.0
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Surface points as the photographs see them; S sightings, sorted by point."""
+    """Surface points as the photographs see them; S observations, sorted by point."""
 
     position: Tensor  # [P, 3]
     normal: Tensor  # [P, 3] unit
-    offsets: Tensor  # [P + 1] int64: point p has sightings offsets[p] .. offsets[p + 1]
+    offsets: Tensor  # [P + 1] int64: point p has observations offsets[p] .. offsets[p + 1]
     wo: Tensor  # [S, 3] unit, to the camera
     color: Tensor  # [S, 3] linear
     view: Tensor  # [S] int64: which photograph
@@ -34,11 +35,11 @@ class Observations:
 
 @dataclass(frozen=True)
 class Transport:
-    """What arrives at surface points from D directions: the sky's share, and what blocks it."""
+    """What arrives at surface points from D directions: visibility of the sky, and other light."""
 
     direction: Tensor  # [D, 3] unit, evenly spread over the sphere
-    open: Tensor  # [P, D] uint8: share of the direction that is open to the sky, 255 for all
-    indirect: Tensor  # [P, D, 3] float16: radiance from the blocked share, times that share
+    visibility: Tensor  # [P, D] uint8: share of the direction where the sky is visible, 255 for all
+    indirect: Tensor  # [P, D, 3] float16: radiance from the occluded share, times that share
 
 
 def surface_points(mesh: Mesh, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -60,10 +61,10 @@ def surface_points(mesh: Mesh, count: int, generator: torch.Generator) -> tuple[
 def observe(
     position: Tensor, normal: Tensor, photos: Photos, scene: VisibilityScene, offset: float
 ) -> Observations:
-    """Find in which photographs each point is seen, and its colour there.
+    """Where the photographs see each point, and its colour there.
 
-    A sighting counts where the photograph is opaque, the view not too grazing and nothing on the
-    mesh stands between.
+    An observation counts where the photograph is opaque, the view not too grazing and nothing on
+    the mesh stands between.
 
     Args:
         offset: world units that rays start above the surface.
@@ -76,21 +77,22 @@ def observe(
         pixel, depth = project(photos.cameras, v, position)
         size = torch.tensor([photos.cameras.width, photos.cameras.height])
         inside = ((pixel > 1) & (pixel < size - 1)).all(1) & (depth > 0)
-        near = (inside & ((normal * towards).sum(1) > MIN_COSINE)).nonzero()[:, 0]
+        facing = (inside & ((normal * towards).sum(1) > MIN_COSINE)).nonzero()[:, 0]
         picture = photos.color[v].movedim(-1, 0)[None].float()
-        uv = (2 * pixel[near] / size - 1)[None, None]
+        uv = (2 * pixel[facing] / size - 1)[None, None]
         # Interpolate as stored, then decode: what is seen between two pixels is their mean colour
-        seen = grid_sample(picture, uv, align_corners=False)[0, :, 0].T
-        seen = srgb_to_linear(seen / 255) if photos.color.dtype == torch.uint8 else seen
+        pixel_color = grid_sample(picture, uv, align_corners=False)[0, :, 0].T
+        if photos.color.dtype == torch.uint8:
+            pixel_color = srgb_to_linear(pixel_color / 255)
         alpha = grid_sample(coverage[v][None, None], uv, align_corners=False)[0, 0, 0]
-        start = position[near] + offset * (normal[near] + towards[near])
-        reach = (eye - start).norm(dim=1).max().item() if len(near) else 0.0
-        clear = ~scene.occluded(start, towards[near], 0.0, reach)
-        kept = clear & (alpha > 0.99)
-        point.append(near[kept])
-        wo.append(towards[near][kept])
-        color.append(seen[kept])
-        view.append(torch.full((int(kept.sum()),), v))
+        start = position[facing] + offset * (normal[facing] + towards[facing])
+        reach = (eye - start).norm(dim=1).max().item() if len(facing) else 0.0
+        visible = ~scene.occluded(start, towards[facing], 0.0, reach)
+        counted = visible & (alpha > MIN_ALPHA)
+        point.append(facing[counted])
+        wo.append(towards[facing][counted])
+        color.append(pixel_color[counted])
+        view.append(torch.full((int(counted.sum()),), v))
     index = torch.cat(point)
     order = torch.argsort(index, stable=True)
     counts = torch.bincount(index, minlength=len(position))
@@ -99,19 +101,20 @@ def observe(
     return Observations(position, normal, offsets, *sorted_)
 
 
-def mean_colors(seen: Observations) -> Tensor:
+def mean_colors(observations: Observations) -> Tensor:
     """Mean colour [P, 3] over the photographs that see a point: how bright it is for others.
 
     Black where none does: such places are deep and dark.
     """
-    counts = seen.offsets.diff()
+    counts = observations.offsets.diff()
     point = torch.repeat_interleave(counts)
-    total = seen.color.new_zeros(len(counts), 3).index_add(0, point, seen.color)
+    total = observations.color.new_zeros(len(counts), 3)
+    total = total.index_add(0, point, observations.color)
     return total / counts.clamp_min(1)[:, None]
 
 
 def trace(
-    seen: Observations,
+    observations: Observations,
     scene: VisibilityScene,
     mesh: Mesh,
     vertex_color: Tensor,
@@ -120,7 +123,7 @@ def trace(
     offset: float,
     generator: torch.Generator,
 ) -> Transport:
-    """Trace from every point into all directions above its horizon.
+    """What reaches every point from all directions above its horizon, by ray tracing.
 
     Occluded light needs no model: what a ray hits is as bright as the photographs show it.
 
@@ -130,16 +133,17 @@ def trace(
         rays: per direction, jittered within its share of the sphere.
         offset: world units that rays start above the surface.
     """
-    count, nodes = len(seen.position), len(direction)
+    count, nodes = len(observations.position), len(direction)
     spread = math.sqrt(4 * math.pi / nodes) / 2  # half the distance of neighbouring directions
     first = mesh.faces[:, 0].long()
-    open_share = torch.zeros(count, nodes, dtype=torch.uint8)
+    visibility = torch.zeros(count, nodes, dtype=torch.uint8)
     indirect = torch.zeros(count, nodes, 3, dtype=torch.float16)
     for begin in range(0, count, POINTS_AT_ONCE):
         part = slice(begin, min(begin + POINTS_AT_ONCE, count))
-        above = seen.normal[part] @ direction.T > -spread
+        above = observations.normal[part] @ direction.T > -spread
         point, node = above.nonzero().unbind(1)
-        start = (seen.position[part] + offset * seen.normal[part])[point]
+        start = observations.position[part] + offset * observations.normal[part]
+        start = start[point]
         sky = torch.zeros(len(point))
         radiance = torch.zeros(len(point), 3)
         for _ in range(rays):
@@ -147,6 +151,6 @@ def trace(
             hit = scene.closest_hit(start, normalize(direction[node] + jitter, dim=1)).face
             sky += hit < 0
             radiance += torch.where((hit >= 0)[:, None], vertex_color[first[hit.clamp_min(0)]], 0.0)
-        open_share[part][point, node] = (255 * sky / rays).round().to(torch.uint8)
+        visibility[part][point, node] = (255 * sky / rays).round().to(torch.uint8)
         indirect[part][point, node] = (radiance / rays).clamp_max(HALF_MAX).half()
-    return Transport(direction, open_share, indirect)
+    return Transport(direction, visibility, indirect)

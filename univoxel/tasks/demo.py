@@ -8,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from univoxel.checkpoint import FILE
+from univoxel.evaluation.measures import MEASURES
 from univoxel.files import replacing
 from univoxel.presets import preset
-from univoxel.tasks.evaluate import MEASURES, evaluate
+from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.export import export
-from univoxel.tasks.relight import relight
+from univoxel.tasks.relight import relight_to_files
 from univoxel.tasks.train import train
 from univoxel.training.config import StageConfig
 
@@ -57,7 +58,7 @@ makes of the true object.</p>
 """
 
 
-def demo(out: Path) -> Path:
+def demo(out: str | Path) -> Path:
     """Train on the bundled scene, evaluate, relight under two maps; returns the page to open.
 
     Writes into `out`: run/, test/ (what `univoxel eval --save` writes), relight/<map>/, mesh.ply
@@ -66,8 +67,9 @@ def demo(out: Path) -> Path:
 
     Raises:
         OSError: `out` cannot be written.
-        ValueError: the run that is there cannot be read.
+        UserError: the run that is there cannot be read.
     """
+    out = Path(out)
     run = out / "run"
     config = preset("fast", data=SCENE, out=run)
     # A voxel as wide as a pixel of these small pictures: finer ones would only fit noise.
@@ -78,7 +80,7 @@ def demo(out: Path) -> Path:
     config = replace(config, stages=stages, minutes=MINUTES)
     train(config, resume=(run / FILE).exists())
     measures = evaluate(run, save=out / "test")
-    relight(run, [SCENE / "envmaps" / f"{name}.hdr" for name in MAPS], out / "relight")
+    relight_to_files(run, [SCENE / "envmaps" / f"{name}.hdr" for name in MAPS], out / "relight")
     export(run, out / "mesh.ply")
 
     page = out / "index.html"

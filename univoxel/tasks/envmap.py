@@ -16,6 +16,8 @@ from univoxel.color import linear_to_srgb, luminance
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.maps import true_map
 from univoxel.envmap import EnvMap, lookup
+from univoxel.errors import UserError
+from univoxel.names import MAP_ROWS
 from univoxel.run import trained_on
 from univoxel.sphere import fibonacci_sphere, latlong_directions, texel_solid_angles
 
@@ -35,7 +37,7 @@ class Comparison:
 
 @torch.no_grad()
 def envmap(
-    run: Path, out: Path, height: int = 128, light_of: str | None = None
+    run: str | Path, out: str | Path, height: int = MAP_ROWS, light_of: str | None = None
 ) -> Comparison | None:
     """Write the recovered map of a run, and a picture of it beside; compare it with the true one.
 
@@ -56,19 +58,20 @@ def envmap(
 
     Raises:
         DataError: run or true map cannot be read.
-        ValueError: the run has no map; an argument out of range; light_of is no training view, or
+        UserError: the run has no map; an argument out of range; light_of is no training view, or
             light does not vary.
         OSError: a file cannot be written.
     """
+    run, out = Path(run), Path(out)
     if height < 1:
-        raise ValueError(f"--height must be at least 1, got {height}")
+        raise UserError(f"height must be at least 1, got {height}", "height")
     if out.suffix.lower() != ".exr":
-        raise ValueError(f"--out: expected a name that ends in .exr, got {out}")
+        raise UserError(f"out: expected a name that ends in .exr, got {out}", "out")
     scene = load_scene(run)
     scene.show_light_of(light_of)
     sky = scene.environment()
     if sky is None:
-        raise ValueError(
+        raise UserError(
             f"{run}: this run has no environment map: it was trained with local light, "
             f"{scene.cfg.light.kind}, alone"
         )

@@ -10,6 +10,8 @@ from univoxel.assets.obj import write_obj
 from univoxel.assets.ply import write_ply
 from univoxel.assets.topology import clean, close, simplify
 from univoxel.checkpoint import load_scene
+from univoxel.errors import UserError
+from univoxel.names import TEXTURE_SIZE
 from univoxel.records import Mesh
 
 SUFFIXES = (".glb", ".obj", ".ply")
@@ -18,14 +20,14 @@ TEXTURE_SIZES = (16, 4096)
 
 
 def export(
-    run: Path,
-    mesh: Path,
+    run: str | Path,
+    mesh: str | Path,
     *,
     faces: int | None = None,
-    texture_size: int = 1024,
+    texture_size: int = TEXTURE_SIZE,
     watertight: bool = False,
 ) -> None:
-    """Write the zero level of a scene's sdf with its materials; see docs/export.md.
+    """Write the zero level of a scene's sdf with its materials; see docs/guide/export.md.
 
     Args:
         run: folder of the trained scene.
@@ -36,22 +38,25 @@ def export(
         watertight: close holes.
 
     Raises:
-        FileNotFoundError, ValueError: the run cannot be used, an argument is out of range, there is
+        UserError: the run cannot be used, an argument is out of range, there is
             no surface, or none that can be closed.
         OSError: a file cannot be written.
     """
     mesh = Path(mesh)
     suffix = mesh.suffix.lower()
     if suffix not in SUFFIXES:
-        raise ValueError(f"export: expected a file that ends in {', '.join(SUFFIXES)}, got {mesh}")
+        raise UserError(
+            f"export: mesh: expected a file that ends in {', '.join(SUFFIXES)}, got {mesh}", "mesh"
+        )
     if faces is not None and faces < 4:
-        raise ValueError(f"export: faces must be at least 4, got {faces}")
+        raise UserError(f"export: faces must be at least 4, got {faces}", "faces")
     low, high = TEXTURE_SIZES
     if not low <= texture_size <= high or texture_size & (texture_size - 1):
-        raise ValueError(
-            f"export: texture_size must be a power of 2 from {low} to {high}, got {texture_size}"
+        raise UserError(
+            f"export: texture_size must be a power of 2 from {low} to {high}, got {texture_size}",
+            "texture_size",
         )
-    scene = load_scene(run)
+    scene = load_scene(Path(run))
     surface = clean(Mesh(*scene.field.isosurface()))
     if watertight:
         surface = close(surface)

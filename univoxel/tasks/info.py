@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-from rich import print
 from rich.table import Table
 from safetensors import safe_open
 
 from univoxel.checkpoint import FILE, load_checkpoint
 from univoxel.data.images import write_png
+from univoxel.errors import UserError
 from univoxel.files import replacing
 from univoxel.lights import LocalSG
 from univoxel.pictures.contact_sheet import heat
@@ -48,8 +48,10 @@ class Part:
     bytes: int  # with those that say where they belong
 
 
-def info(run: Path, json: Path | None = None, picture: Path | None = None) -> dict:
-    """What the model of a run takes up and where; printed as tables, and returned.
+def info(
+    run: str | Path, json: str | Path | None = None, picture: str | Path | None = None
+) -> dict:
+    """What the model of a run takes up and where.
 
     Parameters are the learned numbers that the file holds: distances and features of the nodes it
     stores, weights, light. Row numbers and directions of the map are bytes, and no parameters.
@@ -65,22 +67,19 @@ def info(run: Path, json: Path | None = None, picture: Path | None = None) -> di
         before, after, cost in dB and why.
 
     Raises:
-        FileNotFoundError, ValueError: no model there, or one that cannot be read.
+        UserError: no model there, or one that cannot be read.
         OSError: a file cannot be written.
     """
     run = Path(run)
+    json, picture = (None if path is None else Path(path) for path in (json, picture))
     if picture is not None and picture.suffix.lower() != ".png":
-        raise ValueError(f"--picture: expected a .png file, got {picture}")
+        raise UserError(f"picture: expected a .png file, got {picture}", "picture")
     scene, state = load_checkpoint(run)
     found = facts(scene, parts(run), state)
     found["bytes"] = (run / FILE).stat().st_size
-    for table in tables(found):
-        print(table)
-    for choice in found["chosen"]:
-        print(choice["said"])
-    for place in (json, picture):
-        if place:
-            place.parent.mkdir(parents=True, exist_ok=True)
+    for path in (json, picture):
+        if path:
+            path.parent.mkdir(parents=True, exist_ok=True)
     if json:
         with replacing(json) as temporary:
             temporary.write_text(jsonlib.dumps(found, indent=2) + "\n", encoding="utf-8")
@@ -127,7 +126,7 @@ def facts(scene: Scene, parts: dict[str, Part], state: dict) -> dict:
 
 
 def tables(found: dict) -> Iterable[Table]:
-    """What is printed."""
+    """The facts as the command prints them."""
     table = Table("part", "parameters", "bytes", "share", title="Model")
     for column in table.columns[1:]:
         column.justify = "right"

@@ -18,9 +18,11 @@ from univoxel.data.images import write_exr, write_png
 from univoxel.data.maps import true_map
 from univoxel.data.mesh import read_ply
 from univoxel.envmap import EnvMap, lookup
+from univoxel.errors import UserError
+from univoxel.names import MAP_ROWS
 from univoxel.ops import VisibilityScene
 from univoxel.records import Rays, Surface
-from univoxel.render.occlusion import look, starts
+from univoxel.render.occlusion import occlusion_rays, trace_and_shade
 from univoxel.render.pipeline import surface_at
 from univoxel.run import photos_of
 from univoxel.scene import Scene
@@ -37,16 +39,16 @@ class Incident:
 
     title: str
     radiance: Tensor  # [H, 2 H, 3] linear
-    open: Tensor | None = None  # [H, 2 H] bool: from the distant map, not from the object itself
+    visible: Tensor | None = None  # [H, 2 H] bool: from the distant map, not from the object itself
 
 
 @torch.no_grad()
 def inspect(
-    run: Path,
+    run: str | Path,
     view: str,
     pixel: tuple[int, int],
-    out: Path | None = None,
-    height: int = 128,
+    out: str | Path | None = None,
+    height: int = MAP_ROWS,
     light_of: str | None = None,
 ) -> Path:
     """Draw the light that a scene says falls on the surface under a pixel; returns the picture.
@@ -70,14 +72,15 @@ def inspect(
 
     Raises:
         DataError: the run or its data cannot be read.
-        ValueError: no such view or pixel, or no surface under it; an argument out of range;
+        UserError: no such view or pixel, or no surface under it; an argument out of range;
             light_of is no training view, or light does not vary.
         OSError: a file cannot be written.
     """
+    run, out = Path(run), None if out is None else Path(out)
     if height < 1:
-        raise ValueError(f"inspect: height must be at least 1, got {height}")
+        raise UserError(f"inspect: height must be at least 1, got {height}", "height")
     if out is not None and out.suffix.lower() != ".png":
-        raise ValueError(f"--out: expected a name that ends in .png, got {out}")
+        raise UserError(f"out: expected a name that ends in .png, got {out}", "out")
     scene = load_scene(run)
     scene.show_light_of(light_of)
     photos = photos_of(run)
@@ -85,7 +88,7 @@ def inspect(
     rays = _ray(photos, index, pixel)
     surface = surface_at(scene, rays)
     if not surface.opacity[0] > MIN_OPACITY:
-        raise ValueError(f"--pixel: there is no surface under pixel {pixel[0]},{pixel[1]}")
+        raise UserError(f"pixel: there is no surface under {pixel[0]},{pixel[1]}", "pixel")
     layers = arriving(scene, surface, height)
     truth = true_light(scene, photos.folder, rays, height)
     out = out or run / "inspect" / f"{photos.names[index]}_{pixel[0]}_{pixel[1]}.png"
@@ -94,8 +97,8 @@ def inspect(
     for layer in [*layers, *([truth] if truth else [])]:
         key = layer.title.replace(" ", "_")
         channels |= {f"{key}.{c}": x for c, x in zip("RGB", layer.radiance.unbind(2), strict=True)}
-        if layer.open is not None:
-            channels[f"{key}.open"] = layer.open.float()
+        if layer.visible is not None:
+            channels[f"{key}.open"] = layer.visible.float()
     write_exr(out.with_suffix(".exr"), channels, half=False)
     write_png(out, _sheet(photos, index, pixel, surface, layers, truth))
     return out
@@ -112,10 +115,10 @@ def arriving(scene: Scene, surface: Surface, height: int) -> list[Incident]:
         layers.append(Incident(f"local {scene.cfg.light.kind}", radiance.view(*shape, 3)))
     sky = scene.environment()
     if sky is not None:
-        clear, indirect = look(scene, *starts(scene, surface, wi))
-        radiance = torch.where(clear[:, None], sky.latlong(height).flatten(0, 1), indirect)
+        visible, indirect = trace_and_shade(scene, *occlusion_rays(scene, surface, wi))
+        radiance = torch.where(visible[:, None], sky.latlong(height).flatten(0, 1), indirect)
         radiance = scene.exposed(radiance)
-        layers.append(Incident("map", radiance.view(*shape, 3), clear.view(shape)))
+        layers.append(Incident("map", radiance.view(*shape, 3), visible.view(shape)))
     return layers
 
 
@@ -139,9 +142,9 @@ def true_light(scene: Scene, data: Path, rays: Rays, height: int) -> Incident | 
         normal = -normal
     wi = latlong_directions(height).flatten(0, 1)
     start = place + 1e-4 * hit.t[0] * normal  # off its own triangle
-    clear, indirect = look(scene, start.expand_as(wi).contiguous(), wi, tracer)
-    radiance = torch.where(clear[:, None], lookup(EnvMap(map), wi), indirect)
-    return Incident("truth", radiance.view(height, -1, 3), clear.view(height, -1))
+    visible, indirect = trace_and_shade(scene, start.expand_as(wi).contiguous(), wi, tracer)
+    radiance = torch.where(visible[:, None], lookup(EnvMap(map), wi), indirect)
+    return Incident("truth", radiance.view(height, -1, 3), visible.view(height, -1))
 
 
 def irradiance(radiance: Tensor, normal: Tensor) -> Tensor:
@@ -155,12 +158,12 @@ def parse_pixel(text: str) -> tuple[int, int]:
     """Column and row as the command line writes them.
 
     Raises:
-        ValueError: not two whole numbers.
+        UserError: not two whole numbers.
     """
     try:
         column, row = (int(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(f"--pixel: expected COLUMN,ROW, got {text!r}") from None
+        raise UserError(f"pixel: expected COLUMN,ROW, got {text!r}", "pixel") from None
     return column, row
 
 
@@ -169,17 +172,19 @@ def _view(photos: Photos, view: str) -> int:
         return photos.names.index(view)
     if view.isdigit() and int(view) < len(photos):
         return int(view)
-    raise ValueError(
-        f"--view: expected a number below {len(photos)} or one of {photos.names[0]} to "
-        f"{photos.names[-1]}, got {view!r}"
+    raise UserError(
+        f"view: expected a number below {len(photos)} or one of {photos.names[0]} to "
+        f"{photos.names[-1]}, got {view!r}",
+        "view",
     )
 
 
 def _ray(photos: Photos, view: int, pixel: tuple[int, int]) -> Rays:
     size = photos.cameras.width, photos.cameras.height
     if not all(0 <= p < n for p, n in zip(pixel, size, strict=True)):
-        raise ValueError(
-            f"--pixel: expected one of the {size[0]}x{size[1]} pixels, got {pixel[0]},{pixel[1]}"
+        raise UserError(
+            f"pixel: expected one of the {size[0]}x{size[1]} pixels, got {pixel[0]},{pixel[1]}",
+            "pixel",
         )
     return pixel_rays(photos.cameras, torch.tensor([view]), torch.tensor([pixel]) + 0.5)
 

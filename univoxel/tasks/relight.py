@@ -6,51 +6,81 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import torch
-from rich.progress import Progress
 from torch import Tensor
 
 from univoxel import envmap as env
+from univoxel.bars import bar
 from univoxel.camera import Cameras
 from univoxel.checkpoint import load_scene
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.maps import read_map
-from univoxel.ops import Lamp, Sun
+from univoxel.errors import UserError
+from univoxel.names import BOUNCES, ELEVATION, SAMPLES, Background, Ground
+from univoxel.ops import PointLight, Sun
 from univoxel.pictures.animation import require, write_animation
-from univoxel.pictures.viewpoints import ELEVATION, Frame, frames_of, views_of
+from univoxel.pictures.viewpoints import Frame, frames_of, views_of
 from univoxel.records import Surface
-from univoxel.render.frame import Background, Picture, Quality, channels, render_picture, rgba, srgb
+from univoxel.render.frame import Picture, Quality, channels, render_picture, rgba, srgb
 from univoxel.render.pipeline import extract_mesh, surface_of_view
-from univoxel.render.relight import Lighting, Stage, stage, turned
+from univoxel.render.relight import Lighting, TracedMesh, rotated, traced_mesh
 from univoxel.scene import Scene
 
 NO_MAP = "lights"  # name of light without a map
-Ground = float | Literal["lowest"] | None
 
 
-def relight(
-    run: Path,
-    envmap: Path | Sequence[Path],
-    out: Path,
+@dataclass(frozen=True)
+class RelightOptions:
+    """How relit pictures are made.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+
+    # "test" for the test views of the data trained on, "orbit" or "orbit N" for N frames around
+    # the object, a file in the form of transforms_test.json, or the cameras themselves
+    cameras: str | Path | Cameras = "test"
+    elevation: float = ELEVATION  # of an orbit's cameras, degrees in (-90, 90)
+    turn: int | None = None  # frames of a turn of maps and suns, seen by the first camera; >= 1
+    resolution: int | None = None  # pixels along the width; None: as the data's, an orbit's 512
+    rotate: float = 0.0  # turns maps and suns counter-clockwise about +Z, degrees
+    exposure: float = 1.0  # factor on all light, >= 0
+    suns: Sequence[Sun] = ()  # besides the map
+    point_lights: Sequence[PointLight] = ()  # besides the map
+    samples: int = SAMPLES  # of the light, per pixel, >= 1; noise falls with their root or faster
+    # Instead, samples until the relative noise that `render.relight.relight_until` defines is
+    # below this, such as 0.02; > 0
+    noise: float | None = None
+    bounces: int = BOUNCES  # reflections between parts of the object, >= 0
+    background: Background = "transparent"  # what stands behind; "map" is the light itself
+    ground: Ground = None  # z of a floor that catches the shadow, or "lowest" for the lowest point
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.rotate):
+            raise UserError(f"relight: rotate must be finite, got {self.rotate}", "rotate")
+        if not 0 <= self.exposure < math.inf:
+            raise UserError(
+                f"relight: exposure must be finite and at least 0, got {self.exposure}", "exposure"
+            )
+        self.quality()
+
+    def quality(self) -> Quality:
+        """How a frame is rendered; a ground at the lowest point is left to the mesh."""
+        ground = None if self.ground == "lowest" else self.ground
+        return Quality(self.samples, self.noise, self.bounces, self.background, ground)
+
+
+def relight_to_files(
+    run: str | Path,
+    envmap: str | Path | Sequence[str | Path],
+    out: str | Path,
     *,
-    cameras: str | Path = "test",
-    elevation: float = ELEVATION,
-    turn: int | None = None,
-    resolution: int | None = None,
-    rotate: float = 0.0,
-    exposure: float = 1.0,
-    suns: Sequence[Sun] = (),
-    lamps: Sequence[Lamp] = (),
-    samples: int = 64,
-    noise: float | None = None,
-    bounces: int = 2,
-    background: Background = "transparent",
-    ground: Ground = None,
     animation: Sequence[str] = (),
     resume: bool = False,
     progress: bool = True,
+    **options: Any,
 ) -> None:
     """Render a trained scene under new light, a PNG and an EXR file per frame.
 
@@ -63,121 +93,90 @@ def relight(
     Args:
         run: folder of the trained scene.
         envmap: an equirectangular map, or several: each then gets a folder of its name in `out`.
-            An empty sequence leaves the suns and lamps.
+            An empty sequence leaves the suns and point lights.
         out: folder for the pictures.
-        cameras: "test" for the test views of the data trained on, "orbit" or "orbit N" for N frames
-            around the object, else a file in the form of transforms_test.json.
-        elevation: of an orbit's cameras, degrees in (-90, 90).
-        turn: frames of a turn of the light, maps and suns, seen by the first camera.
-        resolution: pixels along the width; as in the data when left out (an orbit: 512).
-        rotate: turns the maps and suns counter-clockwise about +Z, degrees.
-        exposure: factor on all light.
-        suns, lamps: lights besides the map.
-        samples: light samples per pixel; noise falls with the root of it or faster.
-        noise: instead, samples until the relative noise that `render.relight.relight_until` defines
-            is below this, such as 0.02.
-        bounces: reflections between parts of the object, 0 for direct light only.
-        background: what stands behind the object; "map" is the light itself.
-        ground: z of a floor that catches the object's shadow, or "lowest" for its lowest point.
         animation: "gif" or "mp4" or both: the frames as animation.gif and so on beside them.
         resume: keep frames whose two files are there already.
         progress: show a bar.
+        options: fields of `RelightOptions`.
 
     Raises:
-        DataError, ValueError: the run, a map or the cameras cannot be used, or a number is out of
-            range.
-        ImportError: an MP4 without imageio-ffmpeg.
+        UserError: the run, a map or the cameras cannot be used, or a number is out of range.
+        MissingExtra: an MP4 without imageio-ffmpeg.
         OSError: a file cannot be read or written.
     """
-    several = not isinstance(envmap, (str, Path))
+    run, out, chosen = Path(run), Path(out), _options(options)
+    several = not isinstance(envmap, str | Path)
     paths = [Path(path) for path in envmap] if several else [Path(envmap)]
     if len({path.stem for path in paths}) != len(paths):
-        raise ValueError(
+        raise UserError(
             "relight: expected environment maps of different names, got "
             f"{[str(path) for path in paths]}"
         )
     for kind in animation:
         require(kind)
-    light = {"rotate": rotate, "exposure": exposure, "suns": suns, "lamps": lamps}
-    lights = {path.stem: lighting(path, **light) for path in paths}
+    lights = {path.stem: lighting(path, chosen) for path in paths}
     if not paths:
-        lights = {NO_MAP: lighting(None, **light)}
-    quality = Quality(samples, noise, bounces, background)
-    studio = _studio(run, cameras, resolution, elevation, quality, ground)
-    frames = frames_of(studio.names, lights, turn)
+        lights = {NO_MAP: lighting(None, chosen)}
+    studio = _studio(run, chosen)
+    frames = frames_of(studio.names, lights, chosen.turn)
     folders = {name: out / name if several and paths else out for name in lights}
     files = {frame: folders[frame.light] / frame.stem for frame in frames}
     missing = [f for f in frames if not (resume and all(p.is_file() for p in _pair(files[f])))]
-    with Progress(disable=not progress) as bar:
-        task = bar.add_task("relighting", total=len(frames), completed=len(frames) - len(missing))
+    with bar(shown=progress) as shown:
+        done = len(frames) - len(missing)
+        task = shown.add_task("relighting", total=len(frames), completed=done)
 
         def report(share: float) -> None:
-            bar.update(task, completed=len(frames) - len(missing) + share)
+            shown.update(task, completed=done + share)
 
-        for frame, made in _pictures(studio, missing, lights, report):
+        for frame, picture in _pictures(studio, missing, lights, report):
             png, exr = _pair(files[frame])
             png.parent.mkdir(parents=True, exist_ok=True)
-            write_exr(exr, channels(made))
-            write_png(png, srgb(made))
+            write_exr(exr, channels(picture))
+            write_png(png, srgb(picture))
     for name, folder in folders.items():
-        shown = [_pair(files[frame])[0] for frame in frames if frame.light == name]
+        pngs = [_pair(files[frame])[0] for frame in frames if frame.light == name]
         for kind in animation:
-            write_animation(folder / f"animation.{kind}", shown)
+            write_animation(folder / f"animation.{kind}", pngs)
 
 
-def images(
-    run: Path | str,
-    envmap: Path | str | env.EnvMap | None = None,
-    cameras: Path | str | Cameras = "test",
-    *,
-    elevation: float = ELEVATION,
-    turn: int | None = None,
-    resolution: int | None = None,
-    rotate: float = 0.0,
-    exposure: float = 1.0,
-    suns: Sequence[Sun] = (),
-    lamps: Sequence[Lamp] = (),
-    samples: int = 64,
-    noise: float | None = None,
-    bounces: int = 2,
-    background: Background = "transparent",
-    ground: Ground = None,
+def relight_images(
+    run: str | Path,
+    envmap: str | Path | env.EnvMap | None = None,
+    cameras: str | Path | Cameras = "test",
+    **options: Any,
 ) -> Tensor:
     """Render a trained scene under new light: [F, H, W, 4] linear RGBA, premultiplied.
 
-    Arguments and errors as of `relight`, and besides:
-
     Args:
-        envmap: a file, a map, or None for the suns and lamps alone.
-        cameras: as of `relight`, or the cameras themselves.
+        run: folder of the trained scene.
+        envmap: a file, a map, or None for the suns and point lights alone.
+        cameras, options: fields of `RelightOptions`.
+
+    Raises:
+        UserError: as of `relight_to_files`.
     """
-    light = lighting(envmap, rotate=rotate, exposure=exposure, suns=suns, lamps=lamps)
-    quality = Quality(samples, noise, bounces, background)
-    studio = _studio(Path(run), cameras, resolution, elevation, quality, ground)
-    frames = frames_of(studio.names, [NO_MAP], turn)
-    return torch.stack([rgba(made) for _, made in _pictures(studio, frames, {NO_MAP: light})])
+    chosen = _options({"cameras": cameras, **options})
+    light = lighting(envmap, chosen)
+    studio = _studio(Path(run), chosen)
+    frames = frames_of(studio.names, [NO_MAP], chosen.turn)
+    pictures = _pictures(studio, frames, {NO_MAP: light})
+    return torch.stack([rgba(picture) for _, picture in pictures])
 
 
 def lighting(
-    envmap: Path | str | env.EnvMap | None,
-    *,
-    rotate: float = 0.0,
-    exposure: float = 1.0,
-    suns: Sequence[Sun] = (),
-    lamps: Sequence[Lamp] = (),
+    envmap: str | Path | env.EnvMap | None, options: RelightOptions = RelightOptions()
 ) -> Lighting:
-    """Light of a map, if any, suns and lamps; rotation and exposure go for all of it.
+    """Light of a map, if any, suns and point lights; rotation and exposure go for all of it.
 
     Raises:
         DataError: the map cannot be used; the message names its file.
-        ValueError: there is no light, or a number is out of range.
+        UserError: there is no light.
     """
-    if envmap is None and not suns and not lamps:
-        raise ValueError("relight: expected an environment map, a sun or a lamp, got none")
-    if not math.isfinite(rotate):
-        raise ValueError(f"relight: rotate must be finite, got {rotate}")
-    if not 0 <= exposure < math.inf:
-        raise ValueError(f"relight: exposure must be finite and at least 0, got {exposure}")
+    suns, point_lights, exposure = options.suns, options.point_lights, options.exposure
+    if envmap is None and not suns and not point_lights:
+        raise UserError("relight: expected an environment map, a sun or a point light, got none")
     if envmap is None:
         envmap = env.EnvMap(torch.zeros(1, 2, 3))
     elif not isinstance(envmap, env.EnvMap):
@@ -186,9 +185,15 @@ def lighting(
     lights = Lighting(
         env.tables(replace(envmap, exposure=exposure * envmap.exposure)),
         tuple(replace(sun, irradiance=times(sun.irradiance)) for sun in suns),
-        tuple(replace(lamp, intensity=times(lamp.intensity)) for lamp in lamps),
+        tuple(replace(light, intensity=times(light.intensity)) for light in point_lights),
     )
-    return turned(lights, rotate)
+    return rotated(lights, options.rotate)
+
+
+def _options(given: dict[str, Any]) -> RelightOptions:
+    """The record of keyword arguments; those of before have another name for point lights."""
+    names = {"lamps": "point_lights"}
+    return RelightOptions(**{names.get(name, name): value for name, value in given.items()})
 
 
 @dataclass(frozen=True)
@@ -196,28 +201,21 @@ class _Studio:
     """What stays the same from frame to frame."""
 
     scene: Scene
-    stage: Stage
+    traced: TracedMesh
     names: list[str]  # of the views
     views: Cameras
     quality: Quality
 
 
-def _studio(
-    run: Path,
-    cameras: Path | str | Cameras,
-    resolution: int | None,
-    elevation: float,
-    quality: Quality,
-    ground: Ground,
-) -> _Studio:
+def _studio(run: Path, options: RelightOptions) -> _Studio:
     """Load the scene and its mesh, and build the mesh's ray hierarchy."""
     scene = load_scene(run)
     mesh = extract_mesh(scene)
-    names, views = views_of(run, cameras, resolution, elevation, mesh)
-    if ground == "lowest":
-        ground = float(mesh.vertices[:, 2].min())
-    quality = replace(quality, ground=ground)
-    return _Studio(scene, stage(mesh, scene.field.voxel_size), names, views, quality)
+    names, views = views_of(run, options.cameras, options.resolution, options.elevation, mesh)
+    quality = options.quality()
+    if options.ground == "lowest":
+        quality = replace(quality, ground=float(mesh.vertices[:, 2].min()))
+    return _Studio(scene, traced_mesh(mesh, scene.field.voxel_size), names, views, quality)
 
 
 def _pictures(
@@ -237,8 +235,8 @@ def _pictures(
                 *seen[1:],
                 studio.views,
                 frame.view,
-                studio.stage,
-                turned(lights[frame.light], frame.turn),
+                studio.traced,
+                rotated(lights[frame.light], frame.turn),
                 studio.quality,
                 seed=frame.view,
                 report=lambda share, number=number: report(number + share),

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from univoxel.training.progress import Progress, Rehearsal
+from univoxel.training.progress import Listener
 
 FAR = 6.0  # dB below its best at which held-out quality has collapsed: four times the error
 ENOUGH = 40.0  # dB; a best beyond counts as this: falls from there are no collapse
@@ -31,7 +31,7 @@ class Guard:
         restored: called when parameters have gone back, for what is derived from them.
     """
 
-    def __init__(self, progress: Progress | Rehearsal, restored: Callable[[], None] = lambda: None):
+    def __init__(self, progress: Listener, restored: Callable[[], None] = lambda: None):
         self.scale = 1.0  # on the step size
         self._progress, self._restored = progress, restored
         self._best, self._kind = -math.inf, False
@@ -125,13 +125,13 @@ class Guard:
                 parameter.copy_(copy)
             self._optimizer.state.clear()
             self._restored()
-        where = f"stage {self._progress.stage + 1}, step {self._progress.step}: {what}"
+        where = f"stage {self._progress.clock.stage + 1}, step {self._progress.clock.step}: {what}"
         if self._failures > LIMIT:
             self._progress.trouble(
                 f"{where}; {LIMIT} smaller steps did not help: the stage ends with the last state "
                 "that was good"
             )
-            self._progress.abandon()
+            self._progress.clock.abandon()
             return
         done = "went back to the last good state" if back else otherwise
         self._progress.trouble(f"{where}; {done}, steps are {self.scale:g} times as long from here")

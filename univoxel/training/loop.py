@@ -11,7 +11,7 @@ from torch import Tensor
 from univoxel import losses
 from univoxel.camera import pixel_rays
 from univoxel.checkpoint import save_scene
-from univoxel.color import linear_to_srgb
+from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.config import TrainConfig
 from univoxel.data import Photos
 from univoxel.lights import priors
@@ -24,17 +24,17 @@ from univoxel.scene import Scene
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
 from univoxel.training.plateau import Plateau
-from univoxel.training.progress import Progress, Rehearsal
+from univoxel.training.progress import Listener, Rehearsal
 from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
     MOMENTS,
     REFRESH,
     SMOOTH_EVERY,
-    between,
-    moved,
-    smooth,
-    spread_gradient,
+    geometric,
+    refresh_surface_,
+    smooth_sdf_gradient_,
+    smooth_touched_,
 )
 
 RETRACE = 100  # steps after which light is traced through the surface as it has become
@@ -56,65 +56,46 @@ class Batch:
         return -self.rays.direction
 
 
+@dataclass(frozen=True)
+class TrainingPixels:
+    """Photographs, and which of their pixels [P, 3] (view, row, column) serve what."""
+
+    photos: Photos
+    trained: Tensor
+    held_out: Tensor  # only looked at, to follow quality
+
+
 def run_stage(
     scene: Scene,
     cfg: TrainConfig,
     stage: StageConfig,
-    photos: Photos,
-    pixels: Tensor,
-    held_out: Tensor,
-    progress: Progress | Rehearsal,
+    pixels: TrainingPixels,
+    progress: Listener,
 ) -> None:
     """Optimise the scene on its present grid until the stage's steps or its time are over."""
     field = scene.field
     scene.train()
     scene.surface_moved()
-    field.sdf.requires_grad_()
-    scene.material.requires_grad_(not stage.refit)
-    networks = [scene.material, scene.radiance, scene.light]
-    if scene.mirrored:  # only with fixed materials: before, it would take their gloss upon itself
-        scene.mirrored.requires_grad_(stage.refit)
-        networks.append(scene.mirrored)
-    if scene.views:
-        scene.views.gain_steps.requires_grad_(not stage.refit)
-        networks.append(scene.views)
-    table, poses = scene.radiance.directions.table, []
-    if scene.poses is not None:
-        scene.poses.requires_grad_(not stage.refit)
-        poses = [scene.poses.steps]
-    optimizer = RowAdam(
-        [
-            {"params": [field.sdf], "eps": EPS_SDF},
-            {"params": [field.features, table], "eps": EPS_FEATURES},
-            {"params": [p for net in networks for p in net.parameters() if p is not table]},
-            {"params": poses},
-        ],
-        betas=MOMENTS,
-    )
+    optimizer = build_optimizer(scene, stage.refit)
     plateau = Plateau(cfg.patience)
-    guard = Guard(progress, restored=lambda: moved(scene))
+    guard = Guard(progress, restored=lambda: refresh_surface_(scene))
     guard.follow(optimizer)
-    for done in progress.steps():
+    for done in progress.clock.steps():
         physical = done >= stage.physical_from
-        rates = (
-            between(stage.lr_sdf, done) * field.voxel_size,
-            between(stage.lr_features, done),
-            between(stage.lr_networks, done),
-            between(stage.lr_poses, done),
-        )
+        rates = learning_rates(stage, done, field.voxel_size)
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate * guard.scale
-        scene.inv_s = 1 / (between(stage.sharpness, done) * field.voxel_size)
-        if progress.step % REFRESH == 0:
+        scene.inv_s = 1 / (geometric(stage.sharpness, done) * field.voxel_size)
+        if progress.clock.step % REFRESH == 0:
             before = field.sdf, field.features
             if field.refresh():
                 guard.forget()
             optimizer.follow(before[0], field.sdf)
             optimizer.follow(before[1], field.features)
-        if progress.step % RETRACE == 0 and not stage.refit:
+        if progress.clock.step % RETRACE == 0 and not stage.refit:
             scene.surface_moved()
 
-        batch = random_batch(scene.registered(photos), pixels, stage.rays)
+        batch = random_batch(scene.registered(pixels.photos), pixels.trained, stage.rays)
         surface = surface_at(scene, batch.rays, torch.rand(stage.rays))
         terms = objective(scene, cfg.loss, surface, batch, physical)
         loss = torch.stack(list(terms.values())).sum()
@@ -125,29 +106,69 @@ def run_stage(
         if stage.refit:
             field.encoding.hold_channels_(scene.material.channels)
         if stage.spread:
-            spread_gradient(field, stage.spread)
+            smooth_sdf_gradient_(field, stage.spread)
         optimizer.step()
-        if progress.step % SMOOTH_EVERY == 0 and not stage.refit:
-            smooth(field, stage)
+        if progress.clock.step % SMOOTH_EVERY == 0 and not stage.refit:
+            smooth_touched_(field, stage)
         if plateau.due(done):
-            quality = held_out_psnr(scene, photos, held_out, physical)
+            quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
             if plateau.flat(done, quality, physical):
-                progress.shorten()
+                progress.clock.shorten()
         if progress.due():
-            quality = held_out_psnr(scene, photos, held_out, physical)
+            quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
             progress.report({k: v.item() for k, v in terms.items()}, quality)
             guard.judge(quality, physical)
         if progress.checkpoint_due():
             save_scene(scene, cfg.out, progress.state())
-    moved(scene)
+    refresh_surface_(scene)
     scene.eval()
+
+
+def build_optimizer(scene: Scene, refit: bool) -> RowAdam:
+    """Adam over what a stage trains, in the groups of `learning_rates`; the rest is frozen.
+
+    Args:
+        refit: materials stay. Only then there is a network for what is mirrored sharply: before,
+            it would take the materials' gloss upon itself.
+    """
+    field = scene.field
+    field.sdf.requires_grad_()
+    scene.material.requires_grad_(not refit)
+    networks = [scene.material, scene.radiance, scene.light]
+    if scene.mirrored:
+        scene.mirrored.requires_grad_(refit)
+        networks.append(scene.mirrored)
+    if scene.views:
+        scene.views.gain_steps.requires_grad_(not refit)
+        networks.append(scene.views)
+    table, poses = scene.radiance.directions.table, []
+    if scene.poses is not None:
+        scene.poses.requires_grad_(not refit)
+        poses = [scene.poses.steps]
+    return RowAdam(
+        [
+            {"params": [field.sdf], "eps": EPS_SDF},
+            {"params": [field.features, table], "eps": EPS_FEATURES},
+            {"params": [p for net in networks for p in net.parameters() if p is not table]},
+            {"params": poses},
+        ],
+        betas=MOMENTS,
+    )
+
+
+def learning_rates(stage: StageConfig, done: float, voxel_size: float) -> tuple[float, ...]:
+    """Of distances (world units), features, networks and poses, at progress in [0, 1)."""
+    return (
+        geometric(stage.lr_sdf, done) * voxel_size,
+        geometric(stage.lr_features, done),
+        geometric(stage.lr_networks, done),
+        geometric(stage.lr_poses, done),
+    )
 
 
 def rehearsal(
     cfg: TrainConfig,
-    photos: Photos,
-    pixels: Tensor,
-    held_out: Tensor,
+    pixels: TrainingPixels,
     scene: Scene,
     stage: StageConfig,
     steps: int,
@@ -157,8 +178,8 @@ def rehearsal(
     # From middling rates on: what has been learned must not be shaken
     rates = {n: (math.sqrt(a * b), b) for n in RATES for a, b in [getattr(stage, n)]}
     stage, cfg = replace(stage, physical_from=1.0, **rates), replace(cfg, patience=0.0)
-    run_stage(scene, cfg, stage, photos, pixels, held_out, Rehearsal(steps))
-    return held_out_psnr(scene, photos, held_out, physical=False)
+    run_stage(scene, cfg, stage, pixels, Rehearsal(steps))
+    return held_out_psnr(scene, pixels.photos, pixels.held_out, physical=False)
 
 
 def objective(
@@ -182,7 +203,7 @@ def objective(
     met, view = at_rays(surface, hit), batch.view[hit]
     opacity, behind, target = opacity[hit], behind[hit], target[hit]
     shaded = shade(scene, met, batch.wo[hit], torch.default_generator, view)
-    encoded = losses.encode(shaded * opacity + behind * (1 - opacity))
+    encoded = linear_to_srgb_unclipped(shaded * opacity + behind * (1 - opacity))
     beside = met.position.detach() + scene.field.voxel_size * torch.randn_like(met.position)
     near = scene.field.features_at(beside)
     albedo, roughness, _ = scene.material(near)

@@ -16,7 +16,7 @@ MOMENTS = (0.9, 0.99)
 EPS_SDF, EPS_FEATURES = 1e-4, 1e-8
 
 
-def spread_gradient(field: Field, passes: int) -> None:
+def smooth_sdf_gradient_(field: Field, passes: int) -> None:
     """Diffuse the sdf's gradient over the nodes that it touches, before Adam sees it: the surface
     then moves in large pieces, far and without the bumps that steps of single nodes leave."""
     grad = field.sdf.grad
@@ -24,7 +24,7 @@ def spread_gradient(field: Field, passes: int) -> None:
     field.distances.diffuse_rows_(grad._values(), rows_of(grad), SPREAD, passes)
 
 
-def smooth(field: Field, stage: StageConfig) -> None:
+def smooth_touched_(field: Field, stage: StageConfig) -> None:
     """Regularise the nodes that the step has touched, beside the optimiser and not inside it."""
     sdf, features = field.sdf, field.features
     assert sdf.grad is not None
@@ -34,12 +34,12 @@ def smooth(field: Field, stage: StageConfig) -> None:
     field.encoding.smooth_(field.distances, rows_of(features.grad), diffusion)
 
 
-def moved(scene: Scene) -> None:
+def refresh_surface_(scene: Scene) -> None:
     """Look again at what follows from the sdf."""
     scene.field.refresh()
     scene.surface_moved()
 
 
-def between(ends: tuple[float, float], done: float) -> float:
+def geometric(ends: tuple[float, float], done: float) -> float:
     """Geometric interpolation."""
     return ends[0] * (ends[1] / ends[0]) ** done

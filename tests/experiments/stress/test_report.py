@@ -56,7 +56,8 @@ def test_a_failure_breaks_and_an_endless_severity_has_no_number():
     ("error", "wanted"),
     [
         (None, ""),
-        ("ValueError: expected masks", "refused"),
+        ("univoxel.errors.UserError: expected masks", "refused"),
+        ("ValueError: expected masks", "crashed"),
         ("univoxel.errors.DataError: p.png: broken", "refused"),
         ("FileNotFoundError: [Errno 2] no file", "refused"),
         ("FloatingPointError: the loss is nan at step 3", "not finite"),

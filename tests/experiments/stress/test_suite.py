@@ -49,7 +49,7 @@ def test_quick_keeps_the_reference_and_the_hardest():
         assert axis.levels[-1] == full.levels[-1]
     (views,) = axes.chosen(["views"], False)
     assert views == AXES["views"]
-    with pytest.raises(ValueError, match=r"--only must be of roughness, .*, bright, got fog"):
+    with pytest.raises(ValueError, match=r"only must be of roughness, .*, bright, got fog"):
         axes.chosen(["views", "fog"], True)
 
 

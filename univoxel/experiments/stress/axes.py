@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from univoxel.errors import UserError
 from univoxel.experiments.stress.damage import NO_MASK, Damage
 from univoxel.experiments.stress.scenes import Spec
 
@@ -109,7 +110,7 @@ def chosen(only: Sequence[str], quick: bool) -> list[Axis]:
         ValueError: there is no such axis.
     """
     if unknown := [name for name in only if name not in AXES]:
-        raise ValueError(f"--only must be of {', '.join(AXES)}, got {', '.join(unknown)}")
+        raise UserError(f"only must be of {', '.join(AXES)}, got {', '.join(unknown)}", "only")
     found = [AXES[name] for name in (only or AXES)]
     return [_shortened(axis) for axis in found] if quick else found
 

@@ -18,9 +18,10 @@ from univoxel.data import Photos, load_photos
 from univoxel.data.images import read_image, write_exr, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
-from univoxel.errors import NothingFound
+from univoxel.errors import NothingFound, UserError
 from univoxel.experiments.stress.render import SPEC
-from univoxel.tasks.cutout import find_object, mask, surroundings
+from univoxel.segmentation.distances import surroundings
+from univoxel.segmentation.separation import find_object, mask
 
 NO_MASK = math.inf  # as a dilation: masks are found by `cutout`
 
@@ -55,7 +56,7 @@ def damaged(
     """
     photos = load_photos(scene, "train")
     if len(photos) < damage.views:
-        raise ValueError(f"{scene}: expected {damage.views} photographs, got {len(photos)}")
+        raise UserError(f"{scene}: expected {damage.views} photographs, got {len(photos)}")
     random = np.random.default_rng(seed)
     photos = _first(photos, damage.views)
     if damage.light:

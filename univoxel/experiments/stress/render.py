@@ -22,6 +22,7 @@ import numpy as np
 from univoxel.camera import Cameras
 from univoxel.data.images import write_exr
 from univoxel.data.transforms import write_cameras
+from univoxel.errors import MissingExtra, ProcessFailed, UserError
 from univoxel.experiments.stress import scenes
 from univoxel.experiments.stress.scenes import RELIGHT, Spec
 from univoxel.experiments.stress.shapes import Part
@@ -38,19 +39,19 @@ def require() -> None:
     """Say before the work starts whether scenes can be rendered.
 
     Raises:
-        ImportError: Mitsuba is missing.
+        MissingExtra: Mitsuba is missing.
     """
     if importlib.util.find_spec("mitsuba") is None:
-        raise ImportError("the scenes need Mitsuba 3: pip install 'univoxel[stress]'")
+        raise MissingExtra("the scenes need Mitsuba 3: pip install 'univoxel[stress]'")
 
 
 def render(spec: Spec, folder: Path) -> Path:
     """Write the scene as a data set of linear OpenEXR pictures, unless it is there.
 
     Raises:
-        ValueError: the folder holds another scene.
-        ImportError: Mitsuba is missing.
-        RuntimeError: Mitsuba failed.
+        UserError: the folder holds another scene.
+        MissingExtra: Mitsuba is missing.
+        ProcessFailed: Mitsuba failed.
         OSError: a file cannot be written.
     """
     if rendered(spec, folder):
@@ -71,20 +72,22 @@ def render(spec: Spec, folder: Path) -> Path:
             said = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
     finally:
         shutil.rmtree(begun, ignore_errors=True)
-    raise RuntimeError(f"{folder}: Mitsuba could not render it: {said}")
+    raise ProcessFailed(f"{folder}: Mitsuba could not render it: {said}")
 
 
 def rendered(spec: Spec, folder: Path) -> bool:
     """Whether the folder holds the scene.
 
     Raises:
-        ValueError: it holds another one.
+        UserError: it holds another one.
     """
     path = folder / SPEC
     if not path.exists():
         return False
     if path.read_text(encoding="utf-8") != _identity(spec):
-        raise ValueError(f"{path}: is of another scene: remove {folder}, or choose another --out")
+        raise UserError(
+            f"{path}: is of another scene: remove {folder}, or choose another out", "out"
+        )
     return True
 
 

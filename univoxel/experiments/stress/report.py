@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any
 
+from univoxel.errors import UserError
 from univoxel.experiments import plots
 from univoxel.experiments.plots import Measure
 from univoxel.experiments.record import Outcome
@@ -17,7 +18,7 @@ from univoxel.experiments.stress.axes import Axis, Level
 DROP = 3.0  # dB of relit PSNR below the reference: broken
 ACROSS = 4  # panels in a row
 # As cli.MISTAKES: what ends in one line
-REFUSALS = (ValueError, OSError, RuntimeError, ImportError, FloatingPointError, MemoryError)
+REFUSALS = (UserError, OSError, MemoryError)
 COLUMNS = (
     plots.RELIT,
     plots.NVS,
@@ -90,9 +91,11 @@ def kind(outcome: Outcome) -> str:
     # The last line of a traceback begins with the exception's name, ours with their module
     name = outcome.error.partition(":")[0]
     found = pydoc.locate(name) if name.replace(".", "").replace("_", "").isalnum() else None
-    if not isinstance(found, type) or not issubclass(found, REFUSALS):
+    if not isinstance(found, type):
         return "crashed"
-    return "not finite" if issubclass(found, FloatingPointError) else "refused"
+    if issubclass(found, FloatingPointError):
+        return "not finite"
+    return "refused" if issubclass(found, REFUSALS) else "crashed"
 
 
 def counts(cells: Sequence[Cell]) -> dict[str, int]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from univoxel.errors import UserError
 from univoxel.experiments import plots, runner
-from univoxel.experiments.record import Outcome, Setting
+from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.experiments.stress import axes as of_axes
 from univoxel.experiments.stress import render, report
 from univoxel.experiments.stress.axes import BASE, INTACT, SECOND, Axis, Level
@@ -18,6 +19,8 @@ from univoxel.experiments.stress.report import Cell
 from univoxel.experiments.stress.scenes import Spec
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
+
+log = logging.getLogger("univoxel")
 
 SHOWN: tuple[LightName, ...] = ("hybrid", "sg", "sh", "envmap")
 SEEDS = 3
@@ -62,24 +65,23 @@ def stress(
         out/stress.md. A training that failed is a result.
 
     Raises:
-        ValueError: an argument cannot be used, or `out` holds other scenes or settings.
-        ImportError: Mitsuba or matplotlib is missing.
-        RuntimeError: Mitsuba failed.
+        UserError: an argument cannot be used, or `out` holds other scenes or settings.
+        MissingExtra: Mitsuba or matplotlib is missing.
+        ProcessFailed: Mitsuba failed.
         OSError: a file cannot be written.
     """
     found = of_axes.chosen(only, quick)
     lights = _lights(light) or (("hybrid",) if quick else SHOWN)
     seeds = (1 if quick else SEEDS) if seeds is None else seeds
     if seeds < 1:
-        raise ValueError(f"--seeds must be at least 1, got {seeds}")
+        raise UserError(f"seeds must be at least 1, got {seeds}", "seeds")
     plots.require()
     render.require()
     prepared = photographs(found, seeds, out)
     cells = _train(found, lights, seeds, prepared, out / "runs", tuple(changes))
     clipping = {path.name: clipped(path) for path in dict.fromkeys(prepared.values())}
     with replacing(out / "stress.json") as temporary:
-        text = json.dumps(_record(cells, clipping, changes), indent=1, allow_nan=False)
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(result_text(_record(cells, clipping, changes)), encoding="utf-8")
     with replacing(out / "stress.md") as temporary:
         temporary.write_text(report.markdown(cells), encoding="utf-8")
     plots.save_figure(report.draw(cells), out / "stress")
@@ -123,7 +125,7 @@ def setting(light: LightName, seed: int, level: Level, changes: tuple[str, ...] 
 
 def _lights(names: Sequence[str]) -> tuple[LightName, ...]:
     if unknown := [name for name in names if name not in LIGHTS]:
-        raise ValueError(f"--light must be of {', '.join(LIGHTS)}, got {', '.join(unknown)}")
+        raise UserError(f"light must be of {', '.join(LIGHTS)}, got {', '.join(unknown)}", "light")
     return tuple(light for light in LIGHTS if light in names)
 
 
@@ -146,10 +148,10 @@ def _train(
             place, one = data[level, seed], setting(light, seed, level, changes)
             try:
                 one.config(place, out)
-            except ValueError as error:
+            except UserError as error:
                 if not level.changes:
                     raise  # a mistake in `changes`
-                refused = Outcome(place.name, one.name, {}, error=f"ValueError: {error}")
+                refused = Outcome(place.name, one.name, {}, error=f"{_name(error)}: {error}")
                 done[place, one.name] = refused
             else:
                 wanted[place, one.name] = one
@@ -166,7 +168,7 @@ def _train(
 
 def _rendered(spec: Spec, place: Path) -> Path:
     if not render.rendered(spec, place):
-        print(f"rendering {place.name}", flush=True)
+        log.info("rendering %s", place.name)
     return render.render(spec, place)
 
 
@@ -179,16 +181,21 @@ def _damaged(
     path = place / IDENTITY
     if path.exists():
         if path.read_text(encoding="utf-8") != identity:
-            raise ValueError(f"{path}: is of other photographs: choose another --out")
+            raise UserError(f"{path}: is of other photographs: choose another out", "out")
         return place
     damaged(scene, place, damage, seed, second)
     path.write_text(identity, encoding="utf-8")
     return place
 
 
-def _plain(measures: Mapping[str, float | int | None]) -> dict[str, float | int | str | None]:
-    """JSON knows no NaN: it becomes text."""
-    return {k: v if v is None or math.isfinite(v) else str(v) for k, v in measures.items()}
+def _name(error: UserError) -> str:
+    """The exception as the last line of a traceback names it."""
+    return f"{type(error).__module__}.{type(error).__qualname__}"
+
+
+def _relit(measures: Mapping[str, float | int | None]) -> dict[str, float | int | None]:
+    """The measure that breaking points are judged by; runs/ keeps all of them."""
+    return {key: measures[key] for key in (plots.RELIT.key,) if key in measures}
 
 
 def _record(cells: Sequence[Cell], clipping: dict[str, float], changes: Sequence[str]) -> dict:
@@ -207,7 +214,7 @@ def _record(cells: Sequence[Cell], clipping: dict[str, float], changes: Sequence
                 "mean": {key: cell.mean(key) for key in keys},
                 "spread": {key: cell.spread(key) for key in keys},
                 "outcomes": [
-                    {"scene": o.scene, "setting": o.setting, "error": o.error, **_plain(o.measures)}
+                    {"scene": o.scene, "setting": o.setting, "error": o.error, **_relit(o.measures)}
                     for o in cell.outcomes
                 ],
             }

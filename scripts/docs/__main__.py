@@ -1,0 +1,35 @@
+"""Check the documentation against results and code, or bring it up to date.
+
+python scripts/docs [--write]
+
+Without --write nothing is changed, every difference is told, and the exit code is 1 if there is
+one. With --write generated blocks are filled anew; what is left to mend by hand is told.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import doc_blocks
+import doc_prose
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))  # the package of this tree, wherever the command is called
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="check the documentation, or bring it up to date")
+    parser.add_argument("--write", action="store_true", help="fill the generated blocks anew")
+    options = parser.parse_args()
+    faults = doc_blocks.update(ROOT, write=options.write)
+    faults += doc_blocks.unused(ROOT) + doc_prose.faults(ROOT)
+    for fault in faults:
+        print(fault)
+    print(f"{len(faults)} faults" if faults else "documentation: pages, results and code agree")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

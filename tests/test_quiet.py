@@ -1,0 +1,61 @@
+"""The package's functions return, write files and log; only the command line prints."""
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from analytic import write_scene
+
+import univoxel
+from univoxel.config import TrainConfig
+from univoxel.lights import SGConfig
+from univoxel.ops import PointLight
+from univoxel.scene import SceneConfig
+from univoxel.segmentation.config import COARSE, FINE, SegmentationConfig
+from univoxel.tasks.info import info
+from univoxel.training.config import StageConfig
+
+# The command line; train.py says what training found
+PRINTING = {"cli.py", "commands.py", "tasks/train.py"}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("quiet")
+    data = write_scene(folder / "data", views=6, size=16)
+    light = SGConfig(lobes=1, hidden=4, directions=8, directions_eval=8)
+    scene = SceneConfig(channels=2, material_channels=1, hidden=4, light=light, sky_nodes=0)
+    stage = StageConfig(0.004, 10, 1.0, 64, physical_from=0.5)
+    return univoxel.train(TrainConfig(data, folder / "run", (stage,), minutes=1.0, scene=scene))
+
+
+def test_nothing_is_printed(run, tmp_path, capsys):
+    """Paths may be text, too."""
+    capsys.readouterr()
+    small = SegmentationConfig(
+        replace(COARSE, voxels=0.004, iterations=2, rays=64),
+        replace(FINE, voxels=0.004, iterations=2, rays=64),
+    )
+    data, cut, here = run.parent / "data", tmp_path / "cut", str(run)
+    assert univoxel.evaluate(here, save=str(tmp_path / "test"))["nvs_psnr"] > 0
+    light = PointLight((0.0, 0.0, 3.0), (9.0, 9.0, 9.0))
+    assert len(univoxel.relight(here, point_lights=[light], samples=1)) == 2
+    univoxel.export(here, str(tmp_path / "a.ply"))
+    assert univoxel.cutout(str(data), str(cut), config=small) == cut
+    assert info(here)["bytes"] > 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_only_the_command_line_has_print():
+    package = Path(univoxel.__file__).parent
+    calls = set()
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            match node:
+                case (
+                    ast.Call(func=ast.Name(id="print"))
+                    | ast.Call(func=ast.Attribute(value=ast.Name(id="rich"), attr="print"))
+                ):
+                    calls.add(path.relative_to(package).as_posix())
+    assert calls <= PRINTING

@@ -1,0 +1,224 @@
+"""The budget of a run, on a clock of our own."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from univoxel.config import TrainConfig
+from univoxel.files import append_line
+from univoxel.training import clock as clock_module
+from univoxel.training.clock import RESERVE_SECONDS, REST
+from univoxel.training.config import StageConfig
+from univoxel.training.progress import Progress
+
+START = {"stage": 0, "progress": 0.0, "step": 0}
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that pass when a test says so."""
+
+    class Clock:
+        now = 1000.0
+
+        def monotonic(self):
+            return self.now
+
+    clock = Clock()
+    monkeypatch.setattr(clock_module, "time", clock)
+    return clock
+
+
+def config(out, *shares, iterations=10, minutes=1.0):
+    stages = tuple(StageConfig(voxels=1.0, iterations=iterations, share=s) for s in shares)
+    return TrainConfig(Path("photos"), out, stages, minutes)
+
+
+def steps(progress, clock, seconds):
+    """The schedule of a stage whose steps take so many seconds."""
+    done = []
+    for x in progress.clock.steps():
+        done.append(x)
+        clock.now += seconds
+    return done
+
+
+def test_a_fast_machine_makes_every_step(tmp_path, clock):
+    progress = Progress(config(tmp_path, 0.5, 0.5), clock.now, START)
+    assert steps(progress, clock, 0.01) == pytest.approx([i / 10 for i in range(10)])
+    assert (progress.clock.stage, progress.clock.done, progress.clock.step) == (1, 0.0, 10)
+
+
+def test_a_slow_machine_runs_through_the_whole_schedule_in_time(tmp_path, clock):
+    cfg, begin = config(tmp_path, 0.25, 0.75, iterations=1000), clock.now
+    progress = Progress(cfg, begin, START)
+    budget = 60 - RESERVE_SECONDS
+    first = steps(progress, clock, 0.5)
+    assert clock.now - begin == pytest.approx(0.25 * budget, abs=0.5)  # a step ends late at most
+    second = steps(progress, clock, 0.5)
+    assert clock.now - begin == pytest.approx(budget, abs=0.5)
+    for done in (first, second):
+        assert done == sorted(done)
+        assert done[0] == 0
+        assert done[-1] > 0.9
+
+
+def test_time_that_a_stage_leaves_goes_to_the_next(tmp_path, clock):
+    cfg, begin = config(tmp_path, 0.5, 0.5, iterations=100), clock.now
+    progress = Progress(cfg, begin, START)
+    steps(progress, clock, 0.01)  # all its steps in a second of 28
+    assert len(steps(progress, clock, 0.5)) == 100  # 50 s, more than its half of the budget
+
+
+def test_uneven_steps_run_through_the_whole_schedule(tmp_path, clock):
+    """What is slow at first and fast then makes every step that fits, and ends at 1."""
+    progress = Progress(config(tmp_path, 1.0, iterations=1000), clock.now, START)
+    done = []
+    for x in progress.clock.steps():
+        done.append(x)
+        clock.now += 0.5 if len(done) < 20 else 0.01
+    assert len(done) == 1000  # 10 s and 10 s of 56
+    assert done == sorted(done)
+    assert done[-1] > 0.98
+    assert progress.clock.cut() == ""
+
+
+def test_time_apart_is_taken_from_the_steps_to_come(tmp_path, clock):
+    progress = Progress(config(tmp_path, 1.0, iterations=1000), clock.now, START)
+    begin, budget, blocks, done = clock.now, 60 - RESERVE_SECONDS, 0, []
+    for x in progress.clock.steps(0.3):
+        done.append(x)
+        clock.now += 0.25
+        if x >= (blocks + 1) / 4 and blocks < 3:
+            with progress.clock.off_pace():
+                clock.now += 8.0
+            blocks += 1
+            assert progress.clock.blocks_that_fit(3 - blocks) == 3 - blocks
+    assert blocks == 3
+    assert clock.now - begin == pytest.approx(budget, abs=0.5)
+    assert len(done) == pytest.approx((budget - 3 * 8) / 0.25, abs=3)
+    steps_by_quarter = [sum(q <= 4 * x < q + 1 for x in done) for q in range(4)]
+    assert min(steps_by_quarter) > 0.6 * max(steps_by_quarter)  # the guess was 30 %, it was 43 %
+
+
+def test_blocks_that_do_not_fit_are_dropped(tmp_path, clock):
+    progress = Progress(config(tmp_path, 1.0, iterations=1000), clock.now, START)
+    for count, _ in enumerate(progress.clock.steps()):
+        clock.now += 0.1
+        if count == 10:
+            with progress.clock.off_pace():
+                clock.now += 10.0
+            # 45 s are left; half of it has room for two
+            assert progress.clock.blocks_that_fit(5) == 2
+            break
+    assert progress.clock.blocks_that_fit(1) == 1
+
+
+def test_a_pause_does_not_count(tmp_path, clock):
+    progress = Progress(config(tmp_path, 1.0, iterations=50), clock.now, START)
+    for _ in progress.clock.steps():
+        clock.now += 0.5
+        before = progress.clock.seconds, progress.due(), progress.checkpoint_due()
+        with progress.clock.stopped():
+            clock.now += 100
+            assert progress.clock.seconds == before[0]
+        assert (progress.clock.seconds, progress.due(), progress.checkpoint_due()) == before
+    assert progress.clock.made == [1.0]
+
+
+def test_a_watcher_is_called_between_steps_off_the_clock(tmp_path, clock):
+    seen = []
+
+    def watch():
+        seen.append(progress.clock.step)
+        clock.now += 1000
+
+    progress = Progress(config(tmp_path, 1.0), clock.now, START)
+    progress.clock.watch = watch
+    steps(progress, clock, 0.01)
+    assert seen == list(range(1, 11))
+    assert progress.clock.seconds == pytest.approx(0.1)
+
+
+def test_what_was_cut_is_told(tmp_path, clock, capsys):
+    cfg = config(tmp_path, 0.5, 0.5, iterations=100)
+    with Progress(cfg, clock.now, START) as progress:
+        steps(progress, clock, 0.01)
+        steps(progress, clock, 1.1)  # 50 of 100 in 55 s
+    assert progress.clock.made == pytest.approx([1.0, 0.5], abs=0.01)
+    assert progress.state()["made"] == progress.clock.made
+    assert progress.clock.pace == progress.clock.made[1]
+    told = capsys.readouterr().out
+    assert "time ended this training early: of the planned steps it made 50% in stage 2;" in told
+
+
+def test_a_stage_in_two_sittings_is_counted_whole(tmp_path, clock):
+    cfg = config(tmp_path, 1.0)
+    progress = Progress(cfg, clock.now, START)
+    for _ in progress.clock.steps():
+        clock.now += 0.01
+        if progress.clock.step == 3:
+            break
+    later = Progress(cfg, clock.now, progress.state())
+    steps(later, clock, 0.01)
+    assert later.clock.made == [1.0]
+
+
+def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, capsys):
+    with Progress(config(tmp_path, 1.0, iterations=1000), clock.now, START) as progress:
+        done = []
+        for x in progress.clock.steps():
+            done.append(x)
+            clock.now += 0.001
+            if len(done) == 500:
+                progress.clock.shorten()
+    assert len(done) == pytest.approx(500 + REST * 500, abs=1)
+    assert done[499] == pytest.approx(0.499)
+    assert done[-1] > 0.99
+    assert (progress.clock.early, progress.state()["early"]) == ([0], [0])
+    assert progress.clock.pace == 1.0
+    assert "time ended" not in capsys.readouterr().out
+
+
+def test_no_time_is_no_step(tmp_path, clock):
+    progress = Progress(config(tmp_path, 1.0, minutes=0.01), clock.now, START)
+    assert steps(progress, clock, 1.0) == []
+    assert progress.clock.stage == 1
+
+
+def test_a_later_sitting_goes_on_where_the_first_stopped(tmp_path, clock):
+    state = {"stage": 1, "progress": 0.6, "step": 160}
+    progress = Progress(config(tmp_path, 0.5, 0.5), clock.now - 30, state)
+    assert progress.clock.seconds == pytest.approx(30)
+    done = steps(progress, clock, 0.01)
+    assert done == pytest.approx([0.6, 0.7, 0.8, 0.9], abs=0.01)
+    assert progress.clock.step == 164
+
+
+def test_reports_and_checkpoints_come_by_the_clock(tmp_path, clock):
+    progress = Progress(config(tmp_path, 1.0), clock.now, START)
+    assert not progress.due()
+    assert not progress.checkpoint_due()
+    clock.now += 61
+    assert progress.due()
+    assert progress.checkpoint_due()
+    assert not progress.checkpoint_due()  # it counts from the last one
+    progress.clock.step += 5
+    progress.report({"radiance": 0.25}, 31.0)
+    assert not progress.due()
+    line = json.loads((tmp_path / "log.jsonl").read_text())
+    assert line["step"] == 5
+    assert line["seconds"] == pytest.approx(61)
+    assert line["losses"] == {"radiance": 0.25}
+    assert line["held_out_psnr"] == 31.0
+    assert line["rays_per_second"] == pytest.approx(5 * 2048 / 61)
+
+
+def test_a_line_is_appended_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "log.jsonl"
+    append_line(path, "one")
+    append_line(path, "two")
+    assert path.read_text() == "one\ntwo\n"
+    with pytest.raises(OSError, match=r"cannot write: No such file.*missing"):
+        append_line(tmp_path / "missing" / "log.jsonl", "three")

@@ -1,0 +1,1 @@
+"""A trained scene against the truth of its test views."""

@@ -1,0 +1,1 @@
+"""The object told from what stands around it, in photographs without masks."""

@@ -1,0 +1,228 @@
+"""Steps of a training against its time."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from univoxel.config import TrainConfig
+
+RESERVE_SECONDS = 4.0  # of the budget, kept for the last checkpoint and the preview
+PACE = 0.1  # weight of the newest step in the mean time of a step
+UNSURE = 4  # first steps of a stage, whose time is no measure for the others
+REST = 0.3  # of the steps that are left to a stage that is shortened: for its rates to fall
+ALL = 0.995  # share of the planned steps from which on a stage was not cut
+
+
+class StepClock(Protocol):
+    """What the training loop asks of a clock: a schedule of steps, and where it is."""
+
+    @property
+    def stage(self) -> int:
+        """Number of the present stage, from 0."""
+        ...
+
+    @property
+    def step(self) -> int:
+        """Steps that were made, over all stages."""
+        ...
+
+    def steps(self) -> Iterator[float]:
+        """Progress through the stage in [0, 1), once a step."""
+        ...
+
+    def shorten(self) -> None:
+        """Run through the rest of the stage's schedule in fewer steps."""
+        ...
+
+    def abandon(self) -> None:
+        """End the stage, between steps."""
+        ...
+
+
+class Clock:
+    """A whole run: its steps and its time, whichever is further along.
+
+    A schedule follows `steps`. On a slow machine a stage makes fewer steps and still runs through
+    the whole of its schedule. Every stage gets its share of the time that is left, so that a run
+    that is short of time is short in all its stages.
+    """
+
+    def __init__(self, cfg: TrainConfig, begin: float, state: dict):
+        """
+        Args:
+            begin: of training, on time.monotonic's clock.
+            state: as `state` gave it.
+        """
+        self.cfg, self.begin = cfg, begin
+        self.stage: int = state["stage"]
+        self.done: float = state["progress"]  # of the present stage, in [0, 1]
+        self.step: int = state["step"]
+        self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
+        self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
+        self.watch: Callable[[], None] | None = None  # called between steps; its time is no time
+        self.reserved = 0.0  # seconds of this stage that are kept for blocks off the pace
+        self._stopped: float | None = None  # when the clock was, see `stopped`
+        self._stage_steps: int = state.get("stage_steps", 0)  # made in the present stage
+        self._planned, self._count = 0, 0  # steps of the stage in this sitting
+        self._stage_begin = self.seconds  # of the stage in this sitting
+        self._stage_end = 0.0  # when its time is over
+        self._off_pace, self._last_block = 0.0, 0.0  # seconds, see `off_pace`
+
+    def state(self) -> dict:
+        """What a later sitting needs to go on; JSON."""
+        return {
+            "stage": self.stage,
+            "progress": self.done,
+            "step": self.step,
+            "made": self.made,
+            "early": self.early,
+            "stage_steps": self._stage_steps,
+            "seconds": self.seconds,
+        }
+
+    @property
+    def seconds(self) -> float:
+        """Training time so far, over all sittings."""
+        now = time.monotonic() if self._stopped is None else self._stopped
+        return now - self.begin
+
+    @property
+    def over(self) -> bool:
+        """Whether the time is up."""
+        return self.seconds >= 60 * self.cfg.minutes - RESERVE_SECONDS
+
+    @property
+    def pace(self) -> float:
+        """Share of its steps that the stage before made, if time cut it short; else 1."""
+        last = self.stage - 1
+        return self.made[last] if 0 <= last < len(self.made) and last not in self.early else 1.0
+
+    @property
+    def share_done(self) -> float:
+        """Of the whole run, in [0, 1], by stages or by time, whichever is further along."""
+        shares = [stage.share for stage in self.cfg.stages]
+        by_stage = sum(shares[: self.stage]) + shares[self.stage] * self.done
+        return max(by_stage / sum(shares), min(self.seconds / (60 * self.cfg.minutes), 1.0))
+
+    def steps(self, off_pace: float = 0.0) -> Iterator[float]:
+        """Progress through the present stage in [0, 1), once a step; then the next stage is on.
+
+        What is left of the schedule is spread over the steps that are left: those that were
+        planned, or as many as fit into the stage's time as steps went lately.
+
+        Args:
+            off_pace: share of the stage's time, a guess, that passes under `off_pace`.
+        """
+        self._plan(off_pace)
+        pace = 0.0  # seconds a step
+        while self.done < 1 and (begin := self.seconds) < self._stage_end:
+            before = self._off_pace
+            yield self.done
+            spent = self.seconds - begin - (self._off_pace - before)
+            pace = spent if self._count == 0 else (1 - PACE) * pace + PACE * spent
+            self.step, self._stage_steps = self.step + 1, self._stage_steps + 1
+            self._count += 1
+            room = self._stage_end - self.seconds - self.reserved
+            steps_left = self._planned - self._count + 1  # with the one that was made
+            if self._count > UNSURE and room < pace * (steps_left - 1):
+                steps_left = 1 + room / pace if room > 0 else 1
+            self.done += (1 - self.done) / max(steps_left, 1)
+            if self.done > 1 - 1e-9:
+                self.done = 1.0
+            if self.watch:
+                with self.stopped():
+                    self.watch()
+        self.skip()
+
+    def _plan(self, off_pace: float) -> None:
+        """How many steps are left of the stage, and when its time is over."""
+        stage = self.cfg.stages[self.stage]
+        shares = [
+            (1 - self.done) * stage.share,
+            *(s.share for s in self.cfg.stages[self.stage + 1 :]),
+        ]
+        left = max(60 * self.cfg.minutes - RESERVE_SECONDS - self._stage_begin, 0.0)
+        allowed = left * shares[0] / sum(shares)
+        self._planned, self._count = max(1, round((1 - self.done) * stage.iterations)), 0
+        self._stage_end, self.reserved = self._stage_begin + allowed, off_pace * allowed
+
+    def skip(self) -> None:
+        """Leave the present stage as it is for the next."""
+        self.made.append(self._stage_steps / self.cfg.stages[self.stage].iterations)
+        self.stage, self.done, self._stage_steps = self.stage + 1, 0.0, 0
+        self._stage_begin = self.seconds
+
+    def count_as_done(self, share: float) -> None:
+        """Count a share of the coming stage's steps as made."""
+        self.done = share
+        self._stage_steps = round(share * self.cfg.stages[self.stage].iterations)
+
+    def shorten(self) -> None:
+        """Run through the rest of the stage's schedule in fewer steps."""
+        self._planned = self._count + math.ceil(REST * (self._planned - self._count))
+        self.early.append(self.stage)
+
+    def abandon(self) -> None:
+        """Leave the present stage, between steps, with what it has."""
+        self.done = 1.0
+        self.early.append(self.stage)
+
+    @contextmanager
+    def off_pace(self) -> Iterator[None]:
+        """A block between steps whose time says nothing of how long steps take."""
+        begin = self.seconds
+        yield
+        self._last_block = self.seconds - begin
+        self._off_pace += self._last_block
+
+    def blocks_that_fit(self, blocks: int) -> int:
+        """How many blocks as long as the last under `off_pace` fit into half of what is left of
+        the stage, at most `blocks`; their time is kept for them."""
+        left = max(self._stage_end - self.seconds, 0.0) / 2
+        if self._last_block:
+            blocks = min(blocks, int(left / self._last_block))
+        self.reserved = blocks * self._last_block
+        return blocks
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """A block whose time does not count at all."""
+        self._stopped = time.monotonic()
+        yield
+        spent, self._stopped = time.monotonic() - self._stopped, None
+        self.begin += spent
+
+    def cut(self) -> str:
+        """A line about the stages that time ended before their steps; empty if none was."""
+        short = [
+            (i + 1, made) for i, made in enumerate(self.made) if made < ALL and i not in self.early
+        ]
+        if not short:
+            return ""
+        stages = ", ".join(f"{made:.0%} in stage {i}" for i, made in short)
+        return (
+            f"time ended this training early: of the planned steps it made {stages}; "
+            "more minutes give more quality"
+        )
+
+
+class CountedSteps:
+    """A clock of a few steps through the whole schedule of a stage, whatever time they take."""
+
+    def __init__(self, count: int):
+        self.stage, self.step, self._count = 0, 0, count
+
+    def steps(self) -> Iterator[float]:
+        while self.step < self._count:
+            yield self.step / self._count
+            self.step += 1
+
+    def shorten(self) -> None:
+        """A rehearsal makes all its steps: they are compared with another's."""
+
+    def abandon(self) -> None:
+        self._count = 0
