@@ -21,7 +21,7 @@ from univoxel.fields.packing import PACKED, pack, unpack
 from univoxel.grid import GridShape
 from univoxel.lights import read_config
 from univoxel.networks import DirectionTable
-from univoxel.records import Bricks
+from univoxel.records import HALF_MAX, Bricks
 from univoxel.scene import Scene, SceneConfig
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
@@ -32,7 +32,6 @@ TABLES = {
     "radiance.directions.table": ("radiance.direction_rows", "radiance.direction_values"),
 }
 SHELL = 4.0  # voxels around the surface, beyond which a finished scene needs no features
-HALF_MAX = 65504.0
 
 
 def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict[str, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import get_args
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +27,7 @@ from univoxel.lights.views import ViewLights
 from univoxel.names import Varying
 from univoxel.ops import VisibilityScene
 from univoxel.poses import PoseSteps
+from univoxel.validation import check_fields
 
 
 @dataclass(frozen=True)
@@ -47,24 +49,12 @@ class SceneConfig:
     views: tuple[str, ...] = ()
 
     def __post_init__(self):
-        for name in ("channels", "material_channels", "hidden", "codes"):
-            if getattr(self, name) < 1:
-                raise ConfigError(
-                    f"SceneConfig: {name} must be at least 1, got {getattr(self, name)}"
-                )
-        if not 0 <= self.mirror_levels <= 8:
-            raise ConfigError(
-                f"SceneConfig: mirror_levels must be in [0, 8], got {self.mirror_levels}"
-            )
-        if self.material_channels > self.channels:
-            raise ConfigError(
-                f"SceneConfig: material_channels must be at most channels ({self.channels}), "
-                f"got {self.material_channels}"
-            )
-        if self.varying not in ("none", "exposure", "light"):
-            raise ConfigError(
-                f"SceneConfig: varying must be none, exposure or light, got {self.varying!r}"
-            )
+        counts = ("channels", "material_channels", "hidden", "codes")
+        check_fields(self, "at least 1", lambda x: x >= 1, *counts)
+        check_fields(self, "in [0, 8]", lambda x: 0 <= x <= 8, "mirror_levels")
+        most = f"at most channels ({self.channels})"
+        check_fields(self, most, lambda x: x <= self.channels, "material_channels")
+        check_fields(self, "none, exposure or light", lambda x: x in get_args(Varying), "varying")
         if self.varying == "light" and not isinstance(self.light, LocalLightConfig):
             raise ConfigError(
                 "SceneConfig: varying light needs hybrid or a local light, sg, sh or mlp, got "
