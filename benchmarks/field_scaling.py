@@ -27,10 +27,8 @@ import torch
 from made import made
 
 from univoxel.experiments.record import result_text
-from univoxel.fields.base import AbstractField
-from univoxel.fields.dense import DenseField
-from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
-from univoxel.fields.sparse import SparseField
+from univoxel.fields.features import PER_LEVEL, Levels
+from univoxel.fields.field import Field, dense_field, hash_field
 from univoxel.grid import GridShape
 from univoxel.ops import composite
 from univoxel.optim import RowAdam, rows_of
@@ -49,22 +47,21 @@ def cube(n: int) -> GridShape:
     return GridShape((-1.0,) * 3, 2 / (n - 1), (n, n, n))
 
 
-def ball(channels: int) -> DenseField:
+def ball(channels: int) -> Field:
     grid = cube(COARSE)
     x = grid.nodes()
     bumps = 0.03 * (9 * x).sin().prod(-1)
-    return DenseField(grid, channels, x.norm(dim=-1) - 0.87 + bumps)
+    return dense_field(grid, channels, x.norm(dim=-1) - 0.87 + bumps)
 
 
-def refined(coarse: DenseField, grid: GridShape, kind: str) -> AbstractField:
+def refined(coarse: Field, grid: GridShape, kind: str) -> Field:
     """The ball on a fine grid, on a field of a kind."""
     if kind == "sparse":
-        return SparseField.around(coarse, grid)
+        return coarse.in_bricks(grid)
     if kind == "dense":
         return coarse.resized(grid)
     levels = Levels.of(grid.bounds(), grid.voxel_size, coarse.channels // PER_LEVEL)
-    distances = DenseField(coarse.grid, 0, coarse.sdf.detach())
-    return HashField(distances, levels).resized(grid)
+    return hash_field(coarse.grid, levels, coarse.sdf.detach()).resized(grid)
 
 
 def random_rays() -> Rays:
@@ -74,7 +71,7 @@ def random_rays() -> Rays:
     return Rays(origin, torch.nn.functional.normalize(target - origin, dim=1))
 
 
-def step(field: AbstractField, optimizer: RowAdam) -> None:
+def step(field: Field, optimizer: RowAdam) -> None:
     """One step towards features that are the position, at sharp opacity."""
     channels = field.channels
     rays, inv_s = random_rays(), 1 / (SHARPNESS * field.voxel_size)
@@ -121,8 +118,9 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
         if i % surface_update.SMOOTH_EVERY == 0:
             assert field.sdf.grad is not None
             assert field.features.grad is not None
-            field.smooth_rows_(field.sdf.data, rows_of(field.sdf.grad), 0.01, order=2)
-            field.smooth_features_(rows_of(field.features.grad), 0.01)
+            touched, read = rows_of(field.sdf.grad), rows_of(field.features.grad)
+            field.distances.smooth_rows_(field.sdf.detach(), touched, 0.01, order=2)
+            field.encoding.smooth_(field.distances, read, 0.01)
         seconds.append(time.perf_counter() - begin)
     peak = resident()
     begin = time.perf_counter()

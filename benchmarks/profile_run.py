@@ -24,8 +24,7 @@ from train_step import OTHER, STAGES, Clock
 
 from univoxel.config import TrainConfig
 from univoxel.experiments.record import result_text
-from univoxel.fields.dense import DenseField
-from univoxel.fields.hashed import HashField
+from univoxel.fields.field import Field
 from univoxel.joint import observations, stage
 from univoxel.joint.config import JointConfig
 from univoxel.ops import VisibilityScene
@@ -52,7 +51,7 @@ EVERY = 16  # backward passes of which one is divided
 START = "before"  # loading, hull; also what lies between the stages
 PARTS = {
     **STAGES,
-    "sample": [(f, n) for f in (DenseField, HashField) for n in ("sample", "features_at")],
+    "sample": [(Field, n) for n in ("sample", "features_at")],
     "light": [*STAGES["light"], (observations, "shade_map")],
     "hull": [(train, name) for name in ("masks_of", "object_box", "visual_hull")],
     "hollows": [(train, "opened")],

@@ -37,10 +37,10 @@ from univoxel.data.maps import read_map, true_map
 from univoxel.envmap import tables
 from univoxel.evaluation.measures import albedo_scales
 from univoxel.experiments.record import result_text
-from univoxel.fields.dense import DenseField
+from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape, fit_grid
 from univoxel.joint.config import JointConfig
-from univoxel.lights.distant import DistantLight
+from univoxel.lights.nodes import DistantLight
 from univoxel.metrics import on_black, psnr
 from univoxel.ops import VisibilityScene
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
@@ -142,7 +142,7 @@ def begin(folder: Path, out: Path, name: str, term: str) -> TrainConfig:
     sdf = true_sdf(folder, grid) if exact else visual_hull(distance, photos.cameras, grid)
     light = lights.scaled(cfg.scene.light, float((upper - lower).max()) / 2)
     torch.manual_seed(cfg.seed)
-    scene = Scene(replace(cfg.scene, light=light), DenseField(grid, cfg.scene.channels, sdf))
+    scene = Scene(replace(cfg.scene, light=light), dense_field(grid, cfg.scene.channels, sdf))
     radiance = true_map(folder)
     if term in ("light", "both") and radiance is not None:
         assert scene.sky is not None

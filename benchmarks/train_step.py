@@ -25,7 +25,7 @@ from made import made
 from univoxel import losses, ops
 from univoxel.data import load_photos
 from univoxel.experiments.record import result_text
-from univoxel.fields.dense import DenseField
+from univoxel.fields.field import Field, dense_field
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.grid import fit_grid
 from univoxel.lights import priors
@@ -43,8 +43,8 @@ HERE = Path(__file__).parent
 DATA = HERE.parent / "univoxel" / "example_data" / "tiny"
 STAGES = {
     "rays": [(loop, "random_batch")],
-    "march": [(DenseField, "march")],
-    "sample": [(DenseField, "sample")],
+    "march": [(Field, "march")],
+    "sample": [(Field, "sample")],
     "composite": [(pipeline, "composite")],
     "heads": [
         *((head, "forward") for head in (MaterialHead, RadianceHead, MirroredLight)),
@@ -57,7 +57,7 @@ STAGES = {
     ],
     "optimiser": [(RowAdam, "step")],
     "smoothing": [(loop, "smooth_touched_"), (loop, "smooth_sdf_gradient_")],
-    "refresh": [(DenseField, "refresh")],
+    "refresh": [(Field, "refresh")],
 }
 BACKWARD = "backward"
 OTHER = "other"  # points along rays, normals, opacities, gradients of what is used twice
@@ -108,7 +108,7 @@ def hull_scene(voxels: float) -> tuple[Scene, tuple]:
     lower, upper = estimate_bounds(distance, photos.cameras)
     grid = fit_grid(lower, upper, round(1e6 * voxels))
     cfg = preset("fast", DATA, DATA)
-    field = DenseField(grid, cfg.scene.channels, visual_hull(distance, photos.cameras, grid))
+    field = dense_field(grid, cfg.scene.channels, visual_hull(distance, photos.cameras, grid))
     light = replace(cfg.scene.light, scale=float((upper - lower).max()) / 2)
     return Scene(replace(cfg.scene, light=light), field), (
         photos,

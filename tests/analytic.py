@@ -10,7 +10,7 @@ from PIL import Image
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
-from univoxel.fields.dense import DenseField
+from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape
 from univoxel.lights import (
     EnvmapConfig,
@@ -113,7 +113,7 @@ def sphere_scene(
     grid = GridShape((float(axis[0]),) * 3, voxel_size, (size,) * 3)
     light = light or SGConfig(lobes=2, hidden=4, directions=8, directions_eval=8)
     cfg = SceneConfig(4, material_channels=2, hidden=8, sky_nodes=sky_nodes, light=light)
-    return Scene(cfg, DenseField(grid, cfg.channels, node.norm(dim=-1) - RADIUS))
+    return Scene(cfg, dense_field(grid, cfg.channels, node.norm(dim=-1) - RADIUS))
 
 
 def photos_of(views: int, size: int) -> Photos:

@@ -2,7 +2,7 @@
 
 import torch
 
-from univoxel.fields.dense import DenseField
+from univoxel.fields.field import dense_field
 from univoxel.grid import fit_grid
 from univoxel.lights import SGConfig
 from univoxel.scene import Scene, SceneConfig
@@ -37,7 +37,7 @@ def lopsided(voxels: int = 48**3, change=None, light=None) -> Scene:
     grid = fit_grid(torch.tensor([-0.5, -0.5, -0.5]), torch.tensor([0.65, 0.5, 0.65]), voxels)
     nodes = grid.nodes()
     distance = sdf(nodes) if change is None else change(nodes, sdf(nodes))
-    field = DenseField(grid, 4, distance)
+    field = dense_field(grid, 4, distance)
     with torch.no_grad():
         field.features.copy_(torch.cat([albedo(nodes), roughness(nodes)[..., None]], -1))
     cfg = SceneConfig(channels=4, material_channels=2, hidden=8, light=light or SGConfig())

@@ -44,8 +44,8 @@ def fit(light, surface, wo, target, parameters, steps, lr, turned=True, map_smoo
         optimizer.param_groups[0]["lr"] = lr * 0.1 ** (i / steps)
         loss = (light.reflected(surface, wo, generator=g) - target).square().mean()
         optimizer.zero_grad()
-        prior = light.regularisation(surface, surface).get("map_smoothness", 0.0)
-        (loss + map_smoothness * prior).backward()
+        prior = light.regularisation(surface, surface).map_smoothness
+        (loss if prior is None else loss + map_smoothness * prior).backward()
         optimizer.step()
         errors.append(loss.item())
     return errors[-1] / errors[0]

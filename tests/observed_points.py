@@ -16,7 +16,7 @@ from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.data import Photos
 from univoxel.joint.equations import LinearTransport
 from univoxel.joint.observations import Decisions, JointProblem, prefiltered_roughness
-from univoxel.lights.distant import DistantLight
+from univoxel.lights.nodes import DistantLight
 from univoxel.ops import shade_map
 from univoxel.render.transport import Observations, Transport
 from univoxel.scene import Scene

@@ -174,7 +174,7 @@ def test_data_that_cannot_be_used(data, tmp_path, refused, change, message):
         (["--set=stages.0.iterations=0"], "StageConfig: iterations must be at least 1, got 0"),
         (["--set=stages.0.share=1.5"], r"StageConfig: share must be in \(0, 1\], got 1.5"),
         (["--set=scene.channels=0"], "SceneConfig: channels must be at least 1, got 0"),
-        (["--set=scene.light.lobes=0"], "SGConfig: lobes must be >= 1, got 0"),
+        (["--set=scene.light.lobes=0"], "SGConfig: lobes must be at least 1, got 0"),
         (["--set=loss.radiance=-1"], "LossConfig: radiance must be at least 0, got -1.0"),
         (
             ["--varying", "light", "--light", "envmap"],

@@ -8,7 +8,7 @@ import pytest
 
 from univoxel.config import TrainConfig, check_same, save_config
 from univoxel.joint.config import JointConfig
-from univoxel.lights.sg import LocalSG, SGConfig
+from univoxel.lights.sg import SGConfig
 from univoxel.names import LIGHTS
 from univoxel.presets import budget, chosen, preset, with_field, work_in
 from univoxel.scene import SceneConfig
@@ -208,9 +208,9 @@ def test_values_out_of_range(config, change, message):
         replace(config, **change)
 
 
-def test_light_is_checked_when_it_is_made():
-    with pytest.raises(ValueError, match="SGConfig: lobes must be >= 1, got 0"):
-        LocalSG(4, SGConfig(lobes=0))
+def test_a_light_is_checked_as_soon_as_it_is_described():
+    with pytest.raises(ValueError, match="SGConfig: lobes must be at least 1, got 0"):
+        SGConfig(lobes=0)
 
 
 def saved(tmp_path, cut) -> TrainConfig:

@@ -41,8 +41,8 @@ LAYERS = [
 ]
 HELPERS = {
     "ops": {"checks", "dense_grid", "grid_sampling", "native", "reflectance", "visibility"},
-    "fields": {"base", "dense", "sparse"},
-    "lights": {"base", "distant_map", "head", "lobes", "priors", "quadrature"},
+    "fields": {"bricks", "dense", "distances", "features"},
+    "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},

@@ -11,10 +11,10 @@ from safetensors.torch import load_file, save_file
 
 from univoxel.checkpoint import FILE, SHELL, load_checkpoint, load_scene, save_scene
 from univoxel.compression import prune
-from univoxel.fields import hashed
-from univoxel.fields.dense import DenseField
-from univoxel.fields.hashed import HashField, Levels
-from univoxel.fields.sparse import SparseField
+from univoxel.fields import field as fields
+from univoxel.fields.bricks import BrickDistances
+from univoxel.fields.features import Levels
+from univoxel.fields.field import dense_field, hash_field
 from univoxel.grid import fit_grid
 from univoxel.lights import (
     EnvmapConfig,
@@ -40,7 +40,7 @@ LIGHTS = [
 def small_scene(light=None):
     torch.manual_seed(0)
     grid = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 12**3)
-    field = DenseField(grid, 4, grid.nodes().norm(dim=-1) - 0.5)
+    field = dense_field(grid, 4, grid.nodes().norm(dim=-1) - 0.5)
     with torch.no_grad():
         field.features[3:6, 3:6, 3:6] = torch.randn(3, 3, 3, 4)
     light = light or SGConfig()
@@ -108,19 +108,19 @@ def test_a_slim_file_holds_what_is_seen(tmp_path):
 def sparse_scene(nodes=20):
     scene = small_scene()
     grid = fit_grid(*scene.field.bounds(), nodes**3)
-    scene.field = SparseField.around(scene.field, grid)
+    scene.field = scene.field.in_bricks(grid)
     return scene
 
 
 def test_a_checkpoint_of_a_sparse_field(tmp_path):
     scene = sparse_scene()
-    field, rows = scene.field, 64 * scene.field.count
+    field, rows = scene.field, 64 * scene.field.distances.count
     assert len(field.sdf) > rows
     save_scene(scene, tmp_path, {})
     again = load_scene(tmp_path).field
-    assert isinstance(again, SparseField)
+    assert again.kind == "sparse"
     assert again.grid == field.grid
-    assert torch.equal(again.bricks.table, field.bricks.table)
+    assert torch.equal(again.distances.bricks.table, field.distances.bricks.table)
     assert torch.equal(again.sdf, field.sdf[:rows])
     assert torch.equal(again.features, field.features[:rows])
     again.refresh()  # it can go on
@@ -130,14 +130,14 @@ def test_a_checkpoint_of_a_hash_field(tmp_path):
     scene = small_scene()
     grid, channels = scene.field.grid, scene.cfg.channels
     levels = Levels.of(grid.bounds(), grid.voxel_size, channels // 2)
-    scene.field = field = HashField(DenseField(grid, 0, scene.field.sdf.detach()), levels)
+    scene.field = field = hash_field(grid, levels, scene.field.sdf.detach())
     with torch.no_grad():
         field.features[::3] = torch.randn(len(field.features[::3]), 2)
     for slim in (False, True):
         save_scene(scene, tmp_path, {}, slim=slim)
         again = load_scene(tmp_path).field
-        assert isinstance(again, HashField)
-        assert (again.grid, again.levels) == (field.grid, field.levels)
+        assert again.kind == "hash"
+        assert (again.grid, again.encoding.levels) == (field.grid, field.encoding.levels)
         tolerance = 2**-11 if slim else 0.0
         read = field.rows_near(SHELL * field.voxel_size if slim else math.inf)[:, None]
         assert read.float().mean() < (0.9 if slim else 1.1)
@@ -148,18 +148,18 @@ def test_a_checkpoint_of_a_hash_field(tmp_path):
 
 
 def test_a_checkpoint_of_a_hash_field_over_bricks(tmp_path, monkeypatch):
-    monkeypatch.setattr(hashed, "DENSE_MOST", 1000)
+    monkeypatch.setattr(fields, "DENSE_MOST", 1000)
     scene = small_scene()
     grid = scene.field.grid
     levels = Levels.of(grid.bounds(), grid.voxel_size, scene.cfg.channels // 2)
-    scene.field = HashField(DenseField(grid, 0, scene.field.sdf.detach()), levels)
+    scene.field = hash_field(grid, levels, scene.field.sdf.detach())
     scene.field = field = scene.field.resized(fit_grid(*grid.bounds(), 40**3))
     with torch.no_grad():
         field.features[::3] = 1.0
     for slim in (False, True):
         save_scene(scene, tmp_path, {}, slim=slim)
         again = load_scene(tmp_path).field
-        assert isinstance(again.distances, SparseField)
+        assert isinstance(again.distances, BrickDistances)
         rows = len(again.sdf)
         tolerance = 2**-11 if slim else 0.0
         torch.testing.assert_close(again.sdf, field.sdf[:rows], rtol=tolerance, atol=0)
@@ -172,7 +172,7 @@ def test_a_file_whose_field_has_other_channels_is_refused(tmp_path):
     scene = small_scene()
     grid = scene.field.grid
     levels = Levels.of(grid.bounds(), grid.voxel_size, 1 + scene.cfg.channels // 2)
-    scene.field = HashField(DenseField(grid, 0, scene.field.sdf.detach()), levels)
+    scene.field = hash_field(grid, levels, scene.field.sdf.detach())
     save_scene(scene, tmp_path, {})
     with pytest.raises(ValueError, match=r"6 channels in its field, 4 in its networks"):
         load_scene(tmp_path)

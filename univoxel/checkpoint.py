@@ -13,14 +13,15 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from univoxel.errors import DataError, FileError, MissingFile
-from univoxel.fields.dense import DenseField
-from univoxel.fields.hashed import HashField, Levels
+from univoxel.fields.bricks import BrickDistances, pack_bricks, unpack_bricks
+from univoxel.fields.dense import DenseDistances
+from univoxel.fields.features import HashFeatures, Levels, NodeFeatures
+from univoxel.fields.field import Field
 from univoxel.fields.packing import PACKED, pack, unpack
-from univoxel.fields.sparse import SparseField, pack_bricks, unpack_bricks
 from univoxel.grid import GridShape
 from univoxel.lights import read_config
 from univoxel.networks import DirectionTable
-from univoxel.records import Bricks
+from univoxel.records import HALF_MAX, Bricks
 from univoxel.scene import Scene, SceneConfig
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
@@ -31,19 +32,18 @@ TABLES = {
     "radiance.directions.table": ("radiance.direction_rows", "radiance.direction_values"),
 }
 SHELL = 4.0  # voxels around the surface, beyond which a finished scene needs no features
-HALF_MAX = 65504.0
 
 
 def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict[str, Tensor]:
     """The tensors of a scene's file, see `save_scene`."""
     tensors = {k: v.contiguous() for k, v in scene.state_dict().items() if k not in TABLES}
     sdf = scene.field.sdf.detach()
-    if isinstance(bricks := scene.field.distances, SparseField):
+    if isinstance(bricks := scene.field.distances, BrickDistances):
         tensors |= {f"field.{k}": v for k, v in pack_bricks(bricks).items()}
         sdf = tensors["field.sdf"] = sdf[: Bricks.NODES * bricks.count]
     # Features that no sample has touched are 0: only the others are stored.
     features = scene.field.features.detach().flatten(0, -2)
-    if scene.field.by_node:
+    if isinstance(scene.field.encoding, NodeFeatures):
         features = features[: sdf.numel()]
     touched = features.any(1)
     if slim:
@@ -88,8 +88,8 @@ def save_scene(
         "inv_s": scene.inv_s,
         "state": state,
     }
-    if isinstance(scene.field, HashField):
-        meta["levels"] = astuple(scene.field.levels)
+    if isinstance(scene.field.encoding, HashFeatures):
+        meta["levels"] = astuple(scene.field.encoding.levels)
     path = run / FILE
     temporary = path.with_suffix(".partial")
     try:
@@ -134,16 +134,17 @@ def load_checkpoint(run: str | Path) -> tuple[Scene, dict]:
             tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
         )
         kind = meta.get("field", "dense")
-        channels = 0 if kind == "hash" else cfg.channels
         if "field.place" in tensors:
             where = tensors.pop("field.place"), tensors.pop("field.inside")
-            field = SparseField(grid, channels, unpack_bricks(*where, grid.size))
+            distances = BrickDistances(grid, unpack_bricks(*where, grid.size))
         else:
-            field = DenseField(grid, channels)
+            distances = DenseDistances(grid)
         if kind == "hash":
             lower, upper, sizes, *rows = meta["levels"]
-            levels = Levels(tuple(lower), tuple(upper), tuple(sizes), *rows)
-            field = HashField(field, levels)
+            encoding = HashFeatures(Levels(tuple(lower), tuple(upper), tuple(sizes), *rows))
+        else:
+            encoding = NodeFeatures(torch.zeros(*distances.sdf.shape, cfg.channels))
+        field = Field(distances, encoding)
         if field.channels != cfg.channels:
             raise ValueError(
                 f"{field.channels} channels in its field, {cfg.channels} in its networks"

@@ -12,7 +12,7 @@ from typing import Any, get_args
 
 from univoxel.compression.config import CompressionConfig
 from univoxel.errors import ConfigError, UserError
-from univoxel.fields.hashed import PER_LEVEL
+from univoxel.fields.features import PER_LEVEL
 from univoxel.files import replacing
 from univoxel.joint.config import JointConfig
 from univoxel.names import CamerasFrom, Capacity, MasksFrom

@@ -11,6 +11,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+HALF_MAX = 65504.0  # the largest number of half precision
+
 
 @dataclass(frozen=True)
 class Rays:

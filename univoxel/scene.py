@@ -1,34 +1,33 @@
-"""A scene: field, heads and light; and its checkpoint."""
+"""A scene: field, heads and light."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import get_args
 
 import torch
 from torch import Tensor, nn
 
 from univoxel.data import Photos
 from univoxel.errors import ConfigError, UserError
-from univoxel.fields.base import AbstractField
+from univoxel.fields.field import Field
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.lights import (
+    AbstractLocalLight,
     EnvmapLight,
     EnvmapSGLight,
     LightConfig,
-    LocalMLP,
-    LocalSG,
-    LocalSH,
-    MLPLightConfig,
+    LocalLightConfig,
     SGConfig,
-    SHConfig,
     build,
 )
-from univoxel.lights.distant import DistantLight
 from univoxel.lights.mirrored import MirroredLight
+from univoxel.lights.nodes import DistantLight
 from univoxel.lights.views import ViewLights
 from univoxel.names import Varying
 from univoxel.ops import VisibilityScene
 from univoxel.poses import PoseSteps
+from univoxel.validation import check_fields
 
 
 @dataclass(frozen=True)
@@ -50,27 +49,13 @@ class SceneConfig:
     views: tuple[str, ...] = ()
 
     def __post_init__(self):
-        for name in ("channels", "material_channels", "hidden", "codes"):
-            if getattr(self, name) < 1:
-                raise ConfigError(
-                    f"SceneConfig: {name} must be at least 1, got {getattr(self, name)}"
-                )
-        if not 0 <= self.mirror_levels <= 8:
-            raise ConfigError(
-                f"SceneConfig: mirror_levels must be in [0, 8], got {self.mirror_levels}"
-            )
-        if self.material_channels > self.channels:
-            raise ConfigError(
-                f"SceneConfig: material_channels must be at most channels ({self.channels}), "
-                f"got {self.material_channels}"
-            )
-        if self.varying not in ("none", "exposure", "light"):
-            raise ConfigError(
-                f"SceneConfig: varying must be none, exposure or light, got {self.varying!r}"
-            )
-        if self.varying == "light" and not isinstance(
-            self.light, SGConfig | SHConfig | MLPLightConfig
-        ):
+        counts = ("channels", "material_channels", "hidden", "codes")
+        check_fields(self, "at least 1", lambda x: x >= 1, *counts)
+        check_fields(self, "in [0, 8]", lambda x: 0 <= x <= 8, "mirror_levels")
+        most = f"at most channels ({self.channels})"
+        check_fields(self, most, lambda x: x <= self.channels, "material_channels")
+        check_fields(self, "none, exposure or light", lambda x: x in get_args(Varying), "varying")
+        if self.varying == "light" and not isinstance(self.light, LocalLightConfig):
             raise ConfigError(
                 "SceneConfig: varying light needs hybrid or a local light, sg, sh or mlp, got "
                 f"{self.light.kind}; varying exposure goes with every light"
@@ -80,7 +65,7 @@ class SceneConfig:
 class Scene(nn.Module):
     """Everything that is learned of an object and of the light it stood in."""
 
-    def __init__(self, cfg: SceneConfig, field: AbstractField, inv_s: float = 1.0):
+    def __init__(self, cfg: SceneConfig, field: Field, inv_s: float = 1.0):
         super().__init__()
         self.cfg = cfg
         self.inv_s = inv_s  # sharpness of the NeuS density, 1 / world units
@@ -92,7 +77,7 @@ class Scene(nn.Module):
         self.light = build(inputs, cfg.light)
         self.sky = DistantLight(cfg.sky_nodes) if cfg.sky_nodes else None
         self.mirrored = None
-        if cfg.mirrored and isinstance(cfg.light, SGConfig | SHConfig | MLPLightConfig):
+        if cfg.mirrored and isinstance(cfg.light, LocalLightConfig):
             known = self.radiance.directions.channels
             self.mirrored = MirroredLight(inputs, cfg.hidden, cfg.light.scale, known)
         self.views = None
@@ -101,7 +86,7 @@ class Scene(nn.Module):
             self.views = ViewLights(cfg.views, codes, directions)
         self.poses = PoseSteps(len(cfg.views)) if cfg.refined else None
         if codes:  # at first they change nothing
-            assert isinstance(self.light, LocalSG | LocalSH | LocalMLP)
+            assert isinstance(self.light, AbstractLocalLight)
             nets = [self.radiance.net, self.light.head]
             nets += [self.mirrored.net] if self.mirrored else []
             for net in nets:

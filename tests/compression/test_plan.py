@@ -13,8 +13,8 @@ from univoxel.compression.config import CompressionConfig
 from univoxel.compression.quality import last_within_limit, reference_rays
 from univoxel.compression.storage import fit_budget_
 from univoxel.config import TrainConfig
-from univoxel.fields.dense import DenseField
-from univoxel.fields.hashed import FEWEST_ROWS, ROWS, HashField, Levels
+from univoxel.fields.features import FEWEST_ROWS, ROWS, Levels
+from univoxel.fields.field import hash_field
 from univoxel.joint.config import JointConfig
 from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.scene import Scene, SceneConfig
@@ -321,7 +321,7 @@ def hash_scene():
     levels = Levels.of(grid.bounds(), grid.voxel_size, 4)
     g = torch.Generator().manual_seed(1)
     torch.manual_seed(0)
-    field = HashField(DenseField(grid, 0, grid.nodes().norm(dim=-1) - 0.5), levels)
+    field = hash_field(grid, levels, grid.nodes().norm(dim=-1) - 0.5)
     scene = Scene(SceneConfig(8, 4, 16, sky_nodes=0, light=LIGHT), field).eval()
     scene.inv_s = 60.0
     with torch.no_grad():

@@ -65,26 +65,26 @@ def test_recovers_a_known_light():
 
 def test_regularisation_sees_change_and_colour():
     light, here, near = shaken(made()), ball(), ball(seed=1)
-    assert light.regularisation(here, here)["light_smoothness"] == 0
+    assert light.regularisation(here, here).light_smoothness == 0
     before = light.regularisation(here, near)
-    assert before["light_smoothness"] > 0
+    assert before.light_smoothness > 0
     with torch.no_grad():
         light.base[0, 0] += 5.0
-    assert light.regularisation(here, near)["white_light"] > before["white_light"]
+    assert light.regularisation(here, near).white_light > before.white_light
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"rank": 0}, "rank must be >= 1, got 0"),
-        ({"hidden": 0}, "hidden must be >= 1"),
-        ({"layers": -1}, "layers must be >= 0"),
-        ({"frequencies": -1}, "frequencies must be >= 0"),
-        ({"directions": 0}, "directions must be >= 1"),
-        ({"directions_eval": 0}, "directions_eval must be >= 1"),
-        ({"scale": -1.0}, "scale must be > 0"),
+        ({"rank": 0}, "rank must be at least 1, got 0"),
+        ({"hidden": 0}, "hidden must be at least 1"),
+        ({"layers": -1}, "layers must be at least 0"),
+        ({"frequencies": -1}, "frequencies must be at least 0"),
+        ({"directions": 0}, "directions must be at least 1"),
+        ({"directions_eval": 0}, "directions_eval must be at least 1"),
+        ({"scale": -1.0}, "scale must be above 0"),
     ],
 )
 def test_bad_config(change, message):
     with pytest.raises(ValueError, match=f"MLPLightConfig: {message}"):
-        LocalMLP(4, MLPLightConfig(**change))
+        MLPLightConfig(**change)

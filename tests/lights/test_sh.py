@@ -100,25 +100,25 @@ def test_recovers_a_known_light():
 
 def test_regularisation_sees_change_and_colour():
     light, here, near = shaken(LocalSH(4)), ball(), ball(seed=1)
-    assert light.regularisation(here, here)["light_smoothness"] == 0
+    assert light.regularisation(here, here).light_smoothness == 0
     before = light.regularisation(here, near)
-    assert before["light_smoothness"] > 0
+    assert before.light_smoothness > 0
     with torch.no_grad():
         light.base[0, 0] += 5.0
-    assert light.regularisation(here, near)["white_light"] > before["white_light"]
+    assert light.regularisation(here, near).white_light > before.white_light
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"order": -1}, "order must be >= 0, got -1"),
-        ({"hidden": 0}, "hidden must be >= 1"),
-        ({"layers": -1}, "layers must be >= 0"),
-        ({"directions": 0}, "directions must be >= 1"),
-        ({"directions_eval": 0}, "directions_eval must be >= 1"),
-        ({"scale": 0.0}, "scale must be > 0, got 0.0"),
+        ({"order": -1}, "order must be at least 0, got -1"),
+        ({"hidden": 0}, "hidden must be at least 1"),
+        ({"layers": -1}, "layers must be at least 0"),
+        ({"directions": 0}, "directions must be at least 1"),
+        ({"directions_eval": 0}, "directions_eval must be at least 1"),
+        ({"scale": 0.0}, "scale must be above 0, got 0.0"),
     ],
 )
 def test_bad_config(change, message):
     with pytest.raises(ValueError, match=f"SHConfig: {message}"):
-        LocalSH(4, SHConfig(**change))
+        SHConfig(**change)

@@ -5,7 +5,7 @@ import torch
 from analytic import RADIUS, cameras_around, sphere_normals
 
 from univoxel.camera import image_rays
-from univoxel.fields.dense import DenseField
+from univoxel.fields.field import dense_field
 from univoxel.grid import fit_grid
 from univoxel.render.pipeline import (
     at_rays,
@@ -22,7 +22,7 @@ from univoxel.scene import Scene, SceneConfig
 def scene():
     torch.manual_seed(0)
     grid = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 48**3)
-    field = DenseField(grid, 4, grid.nodes().norm(dim=-1) - RADIUS)
+    field = dense_field(grid, 4, grid.nodes().norm(dim=-1) - RADIUS)
     torch.nn.init.normal_(field.features)
     return Scene(
         SceneConfig(channels=4, material_channels=2, hidden=8), field, inv_s=2 / grid.voxel_size
@@ -89,7 +89,7 @@ def test_a_field_without_surface_has_no_mesh(scene):
     grid = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 8**3)
     empty = Scene(
         SceneConfig(channels=4, material_channels=2, hidden=8),
-        DenseField(grid, 4, torch.ones(grid.size)),
+        dense_field(grid, 4, torch.ones(grid.size)),
     )
     with pytest.raises(ValueError, match="no surface: its sdf does not change sign"):
         extract_mesh(empty)

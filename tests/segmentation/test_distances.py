@@ -6,7 +6,7 @@ from analytic import cameras_around
 from sphere_in_room import SIZE, VIEWS
 
 from univoxel.errors import NothingFound
-from univoxel.fields.dense import DenseField
+from univoxel.fields.field import dense_field
 from univoxel.grid import fit_grid
 from univoxel.segmentation import distances
 from univoxel.segmentation.config import SegmentationConfig
@@ -17,7 +17,7 @@ CFG = SegmentationConfig()
 def test_a_field_without_an_inside_is_nothing():
     grid = fit_grid(-torch.ones(3), torch.ones(3), 10**3)
     with pytest.raises(NothingFound, match="no object was found"):
-        distances.redistance_(DenseField(grid, 1, torch.ones(grid.size)), CFG)
+        distances.redistance_(dense_field(grid, 1, torch.ones(grid.size)), CFG)
 
 
 def test_what_cameras_look_at_is_the_box():
@@ -32,7 +32,7 @@ def test_small_parts_are_chaff():
     node = grid.nodes()
     ball = (node - torch.tensor([0.3, 0.0, 0.0])).norm(dim=-1) - 0.4
     speck = (node + torch.tensor([0.8, 0.0, 0.0])).norm(dim=-1) - 0.08
-    field = DenseField(grid, 1, torch.minimum(ball, speck))
+    field = dense_field(grid, 1, torch.minimum(ball, speck))
     near = ball.abs() < 0.1
     distances.redistance_(field, CFG)
     assert (field.sdf[speck < 0] < 0).all()

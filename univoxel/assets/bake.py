@@ -9,7 +9,7 @@ from univoxel.assets.atlas import dilated, rasterise, unwrap, vertex_normals, ve
 from univoxel.assets.base import TexturedMesh
 from univoxel.brdf import metal_or_none
 from univoxel.errors import UserError
-from univoxel.fields.base import AbstractField
+from univoxel.fields.field import Field
 from univoxel.records import FieldSample, Mesh
 from univoxel.scene import Scene
 
@@ -19,7 +19,7 @@ REACH = 2.0  # voxels: how far a point of the mesh may be moved to meet the fiel
 MIN_Z = 0.05  # of a texel's normal in the tangent frame: it looks out of the triangle
 
 
-def nearest_surface(field: AbstractField, points: Tensor) -> tuple[Tensor, FieldSample]:
+def nearest_surface(field: Field, points: Tensor) -> tuple[Tensor, FieldSample]:
     """Points [M, 3] moved onto the field's zero level, and the field there.
 
     Newton steps along the gradient, x - f grad f / |grad f|^2; where they would lead further than

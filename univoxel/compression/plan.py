@@ -24,7 +24,8 @@ from univoxel.compression.sizes import head_share, voxels_that_fit
 from univoxel.compression.storage import fit_budget_, shortest_reach
 from univoxel.config import TrainConfig
 from univoxel.data import Photos
-from univoxel.fields.dense import DenseField
+from univoxel.fields.dense import DenseDistances
+from univoxel.fields.features import NodeFeatures
 from univoxel.grid import fit_grid
 from univoxel.lights import LocalSG
 from univoxel.scene import Scene
@@ -81,7 +82,7 @@ def choose_grid_(
     if cfg.budget_mb:
         most = min(most, voxels_that_fit(scene, 1e6 * cfg.budget_mb, constants))
     room = f"the budget leaves room for {most:,}"
-    if not scene.field.by_node:
+    if not isinstance(scene.field.encoding, NodeFeatures):
         return [CapacityChoice("voxels", limit, most, 0.0, room)] if most < limit else []
     share = constants.rehearsal_share * pace
     steps = max(constants.rehearsal_steps, round(share * stage.iterations))
@@ -155,7 +156,7 @@ def reduce_networks_(
 ) -> list[CapacityChoice]:
     """Drop channels, mirror levels, lobes and hidden units; say what was chosen."""
     choices = []
-    if scene.field.by_node:
+    if isinstance(scene.field.encoding, NodeFeatures):
         of_channels = replace(criterion, limit_db=channels_limit_db)
         choices.append(search.fewer_channels_(scene, of_channels))
     if scene.cfg.mirror_levels:
@@ -179,9 +180,9 @@ def reduce_storage_(
     """
     constants = cfg.compression
     choices = []
-    if isinstance(scene.field.distances, DenseField):
+    if isinstance(scene.field.distances, DenseDistances):
         choices.append(shortest_reach(scene, held_out, constants))
-    if not scene.field.by_node:
+    if not isinstance(scene.field.encoding, NodeFeatures):
         far = (chosen_reach(choices) or SHELL) * scene.field.voxel_size
         probes = (  # drawn one by one: each is dropped before the next is
             random_reference_rays(photos, pixels, constants.row_probe_rays)
@@ -234,4 +235,5 @@ def stage_voxels(stage: StageConfig, choices: Iterable[CapacityChoice]) -> int:
 
 def begun_in_rehearsal(scene: Scene, choices: Iterable[CapacityChoice]) -> bool:
     """Whether the coming stage has made its first steps in a rehearsal, as choices tell."""
-    return scene.field.by_node and chosen_voxels(choices) is not None
+    by_node = isinstance(scene.field.encoding, NodeFeatures)
+    return by_node and chosen_voxels(choices) is not None

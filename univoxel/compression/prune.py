@@ -17,7 +17,8 @@ import torch
 from scipy.linalg import qr
 from torch import Tensor, nn
 
-from univoxel.lights import LocalMLP, LocalSG, LocalSH
+from univoxel.fields.features import NodeFeatures
+from univoxel.lights import AbstractLocalLight, LocalSG
 from univoxel.networks import MLP
 from univoxel.scene import Scene
 
@@ -33,12 +34,12 @@ def snapshot(scene: Scene) -> Snapshot:
     """The present networks, features and sizes of a scene."""
     names = [
         (scene, ("cfg",)),
-        (scene.field, ("features", "channels")),
+        (scene.field, ("features",)),
         (scene.material, ("net", "channels")),
         (scene.radiance, ("net",)),
         (scene.radiance.directions, ("table",)),
     ]
-    if isinstance(scene.light, LocalSG | LocalSH | LocalMLP):
+    if isinstance(scene.light, AbstractLocalLight):
         names.append((scene.light, ("head", "base", "config")))
     if scene.mirrored:
         names.append((scene.mirrored, ("net",)))
@@ -62,7 +63,7 @@ def replaced_networks(before: Snapshot) -> list[nn.Module]:
 def heads(scene: Scene) -> list[tuple[Any, str]]:
     """Owner and attribute of every network that reads features."""
     places: list[tuple[Any, str]] = [(scene.material, "net"), (scene.radiance, "net")]
-    if isinstance(scene.light, LocalSG | LocalSH | LocalMLP):
+    if isinstance(scene.light, AbstractLocalLight):
         places.append((scene.light, "head"))
     if scene.mirrored:
         places.append((scene.mirrored, "net"))
@@ -95,6 +96,8 @@ def drop_channels_(scene: Scene, keep: Tensor, mean: Tensor) -> None:
         keep: [K] increasing numbers, at least one of them a material channel.
         mean: [C] of the channels over the surface.
     """
+    encoding = scene.field.encoding
+    assert isinstance(encoding, NodeFeatures)
     channels, of_material = scene.cfg.channels, scene.material.channels
     dropped = torch.ones(channels, dtype=torch.bool)
     dropped[keep] = False
@@ -107,7 +110,7 @@ def drop_channels_(scene: Scene, keep: Tensor, mean: Tensor) -> None:
         setattr(owner, name, _network(weights, biases))
     scene.material.channels = int((keep < of_material).sum())
     scene.cfg = replace(scene.cfg, channels=len(keep), material_channels=scene.material.channels)
-    scene.field.keep_channels(keep)
+    encoding.keep_channels(keep)
 
 
 def drop_lobes_(scene: Scene, keep: Tensor) -> None:
@@ -198,17 +201,15 @@ def drop_units_(scene: Scene, width: int, inputs: dict[str, Tensor], ridge: floa
         inputs: of each head, as `recorded_inputs` gives them.
         ridge: see `narrowed`.
     """
+    cfg, light = scene.cfg, scene.light
+    light_config = light.narrowed(width) if isinstance(light, AbstractLocalLight) else None
     for owner, name in heads(scene):
-        if not isinstance(owner, LocalMLP):  # its two networks share their width
+        if owner is not light or light_config is not None:
             x = inputs[type(owner).__name__]
             setattr(owner, name, narrowed(getattr(owner, name), x, width, ridge))
-    cfg, light = scene.cfg, scene.light
-    if isinstance(light, LocalSG):
-        light.config = replace(light.config, hidden=min(width, light.config.hidden))
-    elif isinstance(light, LocalSH):
-        light.config = replace(light.config, hidden=min(width, light.config.hidden))
-    if isinstance(light, LocalSG | LocalSH):
-        cfg = replace(cfg, light=light.config)
+    if isinstance(light, AbstractLocalLight) and light_config is not None:
+        light.config = light_config
+        cfg = replace(cfg, light=light_config)
     scene.cfg = replace(cfg, hidden=min(width, cfg.hidden))
 
 

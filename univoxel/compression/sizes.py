@@ -7,7 +7,7 @@ import math
 from univoxel.checkpoint import SHELL, stored
 from univoxel.compression.config import CompressionConfig
 from univoxel.errors import UserError
-from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS
+from univoxel.fields.features import FEWEST_ROWS, PER_LEVEL, ROWS, NodeFeatures
 from univoxel.networks import DirectionTable
 from univoxel.scene import Scene, SceneConfig
 
@@ -28,7 +28,7 @@ def head_share(scene: Scene) -> float:
     rest = sum(x.numel() for name, x in scene.named_parameters() if not name.startswith(TABLES))
     near = nodes_near(scene)
     features = near * scene.cfg.channels
-    if not scene.field.by_node:
+    if not isinstance(scene.field.encoding, NodeFeatures):
         features = scene.field.features.shape[1] * int(scene.field.features.detach().any(1).sum())
     return rest / (rest + near + features)
 
@@ -94,13 +94,13 @@ def _direction_bytes(levels: int) -> int:
 def _node_bytes(scene: Scene) -> int:
     """Of a node near the surface: number of its row and distance, in halves; and, where features
     are of nodes, its number again and features."""
-    features = 4 + 2 * scene.cfg.channels if scene.field.by_node else 0
+    features = 4 + 2 * scene.cfg.channels if isinstance(scene.field.encoding, NodeFeatures) else 0
     return 4 + 2 + features
 
 
 def _bytes_apart_from_grid(scene: Scene) -> int:
     rest = (x for name, x in scene.state_dict().items() if not name.startswith(TABLES))
     names = NAME_BYTES * len(scene.cfg.views)
-    rows = 0 if scene.field.by_node else len(scene.field.features)
+    rows = 0 if isinstance(scene.field.encoding, NodeFeatures) else len(scene.field.features)
     rows_bytes = ROW_BYTES * rows + _direction_bytes(scene.cfg.mirror_levels)
     return HEADER_BYTES + names + rows_bytes + sum(x.numel() * x.element_size() for x in rest)

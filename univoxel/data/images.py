@@ -16,6 +16,7 @@ from torch import Tensor
 from univoxel.data.radiance import read_radiance
 from univoxel.errors import DataError
 from univoxel.files import replacing
+from univoxel.records import HALF_MAX
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
 
@@ -142,7 +143,7 @@ def write_exr(
         got = {name: list(array.shape) for name, array in arrays.items()}
         raise ValueError(f"write_exr: channels must be [H, W] of one size, got {got}")
     if half:
-        arrays = {name: array.clip(-65504, 65504) for name, array in arrays.items()}
+        arrays = {name: array.clip(-HALF_MAX, HALF_MAX) for name, array in arrays.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     pixels = {n: np.ascontiguousarray(a.astype(kind)) for n, a in arrays.items()}
     # Not straight to the file: when the disk fills up while OpenEXR closes a file, it says nothing.

@@ -1,4 +1,4 @@
-"""A dense grid: one signed distance and C features at every node."""
+"""A dense grid of signed distances: one at every node."""
 
 from __future__ import annotations
 
@@ -7,34 +7,35 @@ from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from univoxel.errors import NoSurface
-from univoxel.fields.base import AbstractField
+from univoxel.fields.distances import AbstractDistances, no_values
 from univoxel.grid import GridShape, resample
 from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_dense, smooth_rows_
 from univoxel.records import FieldSample, Rays, Samples
 
 
-class DenseField(AbstractField):
-    """SDF [X, Y, Z] and features [X, Y, Z, C] as parameters."""
+class DenseDistances(AbstractDistances):
+    """SDF [X, Y, Z] as a parameter."""
 
-    kind = "dense"
-
-    def __init__(self, grid: GridShape, channels: int, sdf: Tensor | None = None):
+    def __init__(self, grid: GridShape, sdf: Tensor | None = None):
+        """
+        Args:
+            sdf: [X, Y, Z] world units; 0 everywhere when left out.
+        """
         super().__init__()
-        self.grid, self.channels, self.voxel_size = grid, channels, grid.voxel_size
+        self.grid, self.voxel_size = grid, grid.voxel_size
         start = torch.zeros(grid.size) if sdf is None else sdf
         self.sdf = nn.Parameter(start.contiguous())
-        self.features = nn.Parameter(torch.zeros(*grid.size, channels))
         self._brick_min: Tensor | None = None
 
-    def sample(self, points: Tensor) -> FieldSample:
-        return self._sample(self.sdf, points)
+    def sample(self, points: Tensor, values: Tensor | None = None) -> FieldSample:
+        return self._sample(self.sdf, no_values(self.sdf) if values is None else values, points)
 
-    def features_at(self, points: Tensor) -> Tensor:
-        return self._sample(self.sdf.detach(), points).features
+    def interpolate(self, values: Tensor, points: Tensor) -> Tensor:
+        return self._sample(self.sdf.detach(), values, points).features
 
-    def _sample(self, sdf: Tensor, points: Tensor) -> FieldSample:
+    def _sample(self, sdf: Tensor, values: Tensor, points: Tensor) -> FieldSample:
         place = self.grid.origin, self.voxel_size
-        return FieldSample(*sample_dense(sdf, self.features, points, *place, sparse_grad=True))
+        return FieldSample(*sample_dense(sdf, values, points, *place, sparse_grad=True))
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         if self._brick_min is None:
@@ -61,11 +62,8 @@ class DenseField(AbstractField):
     def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
         diffuse_rows_(values, rows, self.grid.size, amount, passes)
 
-    def occupied(self) -> Tensor:
-        return self.features.detach().any(-1)
-
-    def within(self, far: float) -> Tensor:
-        return self.sdf.detach().abs() < far
+    def on_grid(self, values: Tensor) -> Tensor:
+        return values
 
     def blocks(self, far: float) -> Tensor:
         sdf = self.sdf.detach()
@@ -80,11 +78,10 @@ class DenseField(AbstractField):
         world = origin + self.voxel_size * torch.from_numpy(vertices.copy())
         return world.float(), torch.from_numpy(faces.astype("int32"))
 
-    def bounds(self) -> tuple[Tensor, Tensor]:
-        return self.grid.bounds()
+    @torch.no_grad()
+    def resized(self, grid: GridShape) -> DenseDistances:
+        return DenseDistances(grid, resample(self.sdf, self.grid, grid))
 
-    def resized(self, grid: GridShape) -> DenseField:
-        with torch.no_grad():
-            field = DenseField(grid, self.channels, resample(self.sdf, self.grid, grid))
-            field.features.copy_(resample(self.features, self.grid, grid))
-        return field
+    @torch.no_grad()
+    def values_from(self, source: AbstractDistances, values: Tensor) -> Tensor:
+        return resample(source.on_grid(values), source.grid, self.grid)

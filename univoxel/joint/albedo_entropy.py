@@ -30,7 +30,7 @@ from univoxel.joint.observations import (
     shade_observations,
     without_exposure,
 )
-from univoxel.lights.distant import DistantLight
+from univoxel.lights.nodes import DistantLight
 from univoxel.render.transport import mean_colors
 from univoxel.scene import Scene
 from univoxel.sphere import real_harmonics

@@ -14,7 +14,7 @@ from univoxel.color import linear_to_srgb_unclipped
 from univoxel.data import Photos
 from univoxel.errors import NoSurface
 from univoxel.joint.config import JointConfig
-from univoxel.lights.distant import DistantLight
+from univoxel.lights.nodes import DistantLight
 from univoxel.ops import shade_map
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh

@@ -9,21 +9,24 @@ import torch
 
 from univoxel.errors import ConfigError
 from univoxel.lights.base import AbstractLight
-from univoxel.lights.envmap import EnvmapConfig, EnvmapLight
-from univoxel.lights.envmap_sg import EnvmapSGConfig, EnvmapSGLight
+from univoxel.lights.lobes_map import EnvmapSGConfig, EnvmapSGLight
+from univoxel.lights.local import AbstractLocalLight, LocalLightConfig
 from univoxel.lights.mlp import LocalMLP, MLPLightConfig
 from univoxel.lights.sg import LocalSG, SGConfig
 from univoxel.lights.sh import LocalSH, SHConfig
+from univoxel.lights.texels import EnvmapConfig, EnvmapLight
 
 LightConfig: TypeAlias = SGConfig | SHConfig | MLPLightConfig | EnvmapSGConfig | EnvmapConfig
 
 __all__ = [
     "AbstractLight",
+    "AbstractLocalLight",
     "EnvmapConfig",
     "EnvmapLight",
     "EnvmapSGConfig",
     "EnvmapSGLight",
     "LightConfig",
+    "LocalLightConfig",
     "LocalMLP",
     "LocalSG",
     "LocalSH",
@@ -44,9 +47,6 @@ def build(
     Args:
         features: C of Surface.features, that local lights read.
         generator: draws the first weights of networks.
-
-    Raises:
-        ValueError: a number outside its range; the message names it.
     """
     match config:
         case SGConfig():
@@ -63,18 +63,14 @@ def build(
 
 def scaled(config: LightConfig, scale: float) -> LightConfig:
     """The configuration for an object of half extent `scale`, world units, where it has one."""
-    match config:
-        case SGConfig() | SHConfig() | MLPLightConfig():
-            return replace(config, scale=scale)
-        case EnvmapSGConfig() | EnvmapConfig():
-            return config
+    return replace(config, scale=scale) if isinstance(config, LocalLightConfig) else config
 
 
 def read_config(values: dict[str, Any]) -> LightConfig:
     """The configuration that dataclasses.asdict made a dictionary of.
 
     Raises:
-        ConfigError, TypeError: no such light; a field that it has not.
+        ConfigError, TypeError: no such light; a field that it has not; a number outside its range.
     """
     values = dict(values)
     kind = values.pop("kind", "sg")  # files from before there were others do not say

@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from univoxel.records import Occlusion, Surface
+
+
+@dataclass(frozen=True)
+class Regularisation:
+    """What keeps a light likely: terms [] >= 0, None where the light has no such term.
+
+    Each is weighted by the field of LossConfig of its name.
+    """
+
+    light_smoothness: Tensor | None = None  # how far light changes over the surface
+    map_smoothness: Tensor | None = None  # how far a map changes over the sphere
+    white_light: Tensor | None = None  # how far light is from grey on the whole
 
 
 class AbstractLight(nn.Module, ABC):
@@ -50,8 +63,8 @@ class AbstractLight(nn.Module, ABC):
         """
 
     @abstractmethod
-    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
-        """What keeps the light likely: terms >= 0, by the weight in LossConfig they belong to.
+    def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
+        """What keeps the light likely.
 
         Args:
             surface, near: N points of the surface, and one right beside each.

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from univoxel import brdf
-from univoxel.lights import head
+from univoxel.lights import local
 from univoxel.networks import MLP, DirectionTable, waves
 from univoxel.records import Surface
 
@@ -32,7 +32,7 @@ class MirroredLight(nn.Module):
         """
         super().__init__()
         self.scale = scale
-        inputs = features + 3 + 6 * head.FREQUENCIES + 6 * _OCTAVES + 2 + known
+        inputs = features + 3 + 6 * local.FREQUENCIES + 6 * _OCTAVES + 2 + known
         self.net = MLP([inputs, hidden, hidden, 3])
         last = self.net.linear[-1]
         nn.init.zeros_(last.weight)
@@ -47,7 +47,7 @@ class MirroredLight(nn.Module):
         cosine = (surface.normal * wo).sum(1, keepdim=True)
         mirrored = 2 * cosine * surface.normal - wo
         roughness = surface.roughness[:, None]
-        place = head.encode(surface, self.scale)
+        place = local.encode(surface, self.scale)
         way = [*waves(mirrored, _OCTAVES), roughness, cosine, table(mirrored)]
         light = self.net(torch.cat([place, *way], 1))
         _, f0 = brdf.split(surface.albedo, surface.metallic)

@@ -10,17 +10,19 @@ import torch
 from torch import Tensor, nn
 
 from univoxel import sphere
-from univoxel.lights import head, priors, quadrature
-from univoxel.lights.base import AbstractLight
+from univoxel.lights import priors, quadrature
+from univoxel.lights.base import Regularisation
+from univoxel.lights.local import AbstractLocalLight, LocalLightConfig, build_head, encode
 from univoxel.networks import MLP, waves
 from univoxel.records import Occlusion, Surface
+from univoxel.validation import check_fields
 
 _MEAN_OVER = 32  # directions that stand for the whole sphere where light is averaged
 _START = 0.5  # radiance from everywhere
 
 
 @dataclass(frozen=True)
-class MLPLightConfig:
+class MLPLightConfig(LocalLightConfig):
     """Local light as two networks."""
 
     kind: Literal["mlp"] = field(default="mlp", init=False)
@@ -32,8 +34,15 @@ class MLPLightConfig:
     directions_eval: int = 512  # in evaluation, >= 1
     scale: float = 1.0  # world units: half the extent of what is lit, > 0
 
+    def __post_init__(self):
+        check_fields(
+            self, "at least 1", lambda x: x >= 1, "rank", "hidden", "directions", "directions_eval"
+        )
+        check_fields(self, "at least 0", lambda x: x >= 0, "layers", "frequencies")
+        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "scale")
 
-class LocalMLP(AbstractLight):
+
+class LocalMLP(AbstractLocalLight):
     """Incident light as a network of features, position and direction, kept affordable.
 
         L(x, w) = softplus(code(x) . basis(w))
@@ -48,7 +57,7 @@ class LocalMLP(AbstractLight):
     Source: Yao et al. 2022 (NeILF) for light as a network of place and direction.
     """
 
-    traced = False
+    config: MLPLightConfig
 
     def __init__(
         self,
@@ -60,16 +69,11 @@ class LocalMLP(AbstractLight):
         Args:
             features: C of Surface.features, >= 0.
             generator: draws the first weights.
-
-        Raises:
-            ValueError: a number outside its range; the message names it.
         """
         super().__init__()
         self.config = config = config or MLPLightConfig()
-        least = {"rank": 1, "hidden": 1, "layers": 0, "frequencies": 0}
-        head.check(config, least | {"directions": 1, "directions_eval": 1}, "scale")
         outputs = 3 * (config.rank + 1)
-        self.head = head.build(features, config.hidden, config.layers, outputs, generator)
+        self.head = build_head(features, config.hidden, config.layers, outputs, generator)
         sizes = [3 + 6 * config.frequencies, *[config.hidden] * config.layers, config.rank]
         self.basis_net = MLP(sizes, generator or torch.default_generator)
         base = torch.zeros(config.rank + 1, 3)
@@ -82,7 +86,7 @@ class LocalMLP(AbstractLight):
 
     def code(self, surface: Surface) -> Tensor:
         """[N, rank + 1, 3] at each point."""
-        raw = self.head(head.encode(surface, self.config.scale))
+        raw = self.head(encode(surface, self.config.scale))
         return self.base + raw.unflatten(-1, (-1, 3))
 
     def basis(self, wi: Tensor) -> Tensor:
@@ -105,11 +109,14 @@ class LocalMLP(AbstractLight):
         """Radiance [N, 3] towards wo, summed over the whole sphere."""
         return quadrature.reflected_shared(self, surface, wo, occlusion, generator)
 
-    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
+    def narrowed(self, width: int) -> None:
+        """None: both networks have one width."""
+
+    def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         here, beside = self.code(surface), self.code(near)
         wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)
         light = nn.functional.softplus(self.basis(wi) @ here)
-        return {
-            "light_smoothness": priors.smoothness(here, beside),
-            "white_light": priors.chroma(light.mean(1)),
-        }
+        return Regularisation(
+            light_smoothness=priors.smoothness(here, beside),
+            white_light=priors.chroma(light.mean(1)),
+        )

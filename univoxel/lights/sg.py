@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from univoxel import brdf, ops, sphere
-from univoxel.lights import head, lobes, priors, quadrature
-from univoxel.lights.base import AbstractLight
+from univoxel.lights import lobes, priors, quadrature
+from univoxel.lights.base import Regularisation
+from univoxel.lights.local import AbstractLocalLight, LocalLightConfig, build_head, encode
 from univoxel.records import Occlusion, Surface
+from univoxel.validation import check_fields
 
 
 @dataclass(frozen=True)
-class SGConfig:
+class SGConfig(LocalLightConfig):
     """Local spherical Gaussian light."""
 
     kind: Literal["sg"] = field(default="sg", init=False)
@@ -27,8 +30,15 @@ class SGConfig:
     max_sharpness: float = 30.0  # of a lobe, > 0; its half width is about sqrt(2 / sharpness) rad
     scale: float = 1.0  # world units: half the extent of what is lit, > 0
 
+    def __post_init__(self):
+        check_fields(
+            self, "at least 1", lambda x: x >= 1, "lobes", "hidden", "directions", "directions_eval"
+        )
+        check_fields(self, "at least 0", lambda x: x >= 0, "layers")
+        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "max_sharpness", "scale")
 
-class LocalSG(AbstractLight):
+
+class LocalSG(AbstractLocalLight):
     """K lobes a point: one global light plus what an MLP adds to it.
 
         L(w) = sum_k amplitude_k exp(sharpness_k (w . axis_k - 1))
@@ -38,7 +48,7 @@ class LocalSG(AbstractLight):
     mid-grey. Source: Wu et al. 2024 (UniVoxel), section 3.3; the sharpness range is InvRender's.
     """
 
-    traced = False
+    config: SGConfig
 
     def __init__(
         self,
@@ -50,15 +60,10 @@ class LocalSG(AbstractLight):
         Args:
             features: C of Surface.features, >= 0.
             generator: draws the head's first weights.
-
-        Raises:
-            ValueError: a number outside its range; the message names it.
         """
         super().__init__()
         self.config = config = config or SGConfig()
-        least = {"lobes": 1, "hidden": 1, "layers": 0, "directions": 1, "directions_eval": 1}
-        head.check(config, least, "max_sharpness", "scale")
-        self.head = head.build(features, config.hidden, config.layers, 7 * config.lobes, generator)
+        self.head = build_head(features, config.hidden, config.layers, 7 * config.lobes, generator)
         self.base = nn.Parameter(lobes.white_light(config.lobes, config.max_sharpness))  # [K, 7]
 
     @property
@@ -67,7 +72,7 @@ class LocalSG(AbstractLight):
 
     def raw(self, surface: Surface) -> Tensor:
         """What the head adds to the global light at each point: [N, 7 K]."""
-        return self.head(head.encode(surface, self.config.scale))
+        return self.head(encode(surface, self.config.scale))
 
     def lobes_from_raw(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Unit axis [N, K, 3], sharpness [N, K] and amplitude [N, K, 3] >= 0 of deviations."""
@@ -107,10 +112,13 @@ class LocalSG(AbstractLight):
             f0,
         )
 
-    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
+    def narrowed(self, width: int) -> SGConfig:
+        return replace(self.config, hidden=min(width, self.config.hidden))
+
+    def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         raw = self.raw(surface)
         _, _, amplitude = self.lobes_from_raw(raw)
-        return {
-            "light_smoothness": priors.smoothness(raw, self.raw(near)),
-            "white_light": priors.chroma(amplitude.sum(1)),
-        }
+        return Regularisation(
+            light_smoothness=priors.smoothness(raw, self.raw(near)),
+            white_light=priors.chroma(amplitude.sum(1)),
+        )

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from univoxel import sphere
-from univoxel.lights import head, priors, quadrature
-from univoxel.lights.base import AbstractLight
+from univoxel.lights import priors, quadrature
+from univoxel.lights.base import Regularisation
+from univoxel.lights.local import AbstractLocalLight, LocalLightConfig, build_head, encode
 from univoxel.records import Occlusion, Surface
+from univoxel.validation import check_fields
 
 _MEAN_OVER = 32  # directions that stand for the whole sphere where light is averaged
 _START = 0.5  # radiance from everywhere
 
 
 @dataclass(frozen=True)
-class SHConfig:
+class SHConfig(LocalLightConfig):
     """Local light in spherical harmonics."""
 
     kind: Literal["sh"] = field(default="sh", init=False)
@@ -30,8 +32,15 @@ class SHConfig:
     directions_eval: int = 512  # in evaluation, >= 1
     scale: float = 1.0  # world units: half the extent of what is lit, > 0
 
+    def __post_init__(self):
+        check_fields(
+            self, "at least 1", lambda x: x >= 1, "hidden", "directions", "directions_eval"
+        )
+        check_fields(self, "at least 0", lambda x: x >= 0, "order", "layers")
+        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "scale")
 
-class LocalSH(AbstractLight):
+
+class LocalSH(AbstractLocalLight):
     """Real spherical harmonics a point: one global light plus what an MLP adds to it.
 
         L(w) = softplus(sum_lm c_lm Y_lm(w))
@@ -45,7 +54,7 @@ class LocalSH(AbstractLight):
     direction and a matrix product does the rest.
     """
 
-    traced = False
+    config: SHConfig
 
     def __init__(
         self,
@@ -57,16 +66,11 @@ class LocalSH(AbstractLight):
         Args:
             features: C of Surface.features, >= 0.
             generator: draws the head's first weights.
-
-        Raises:
-            ValueError: a number outside its range; the message names it.
         """
         super().__init__()
         self.config = config = config or SHConfig()
-        least = {"order": 0, "hidden": 1, "layers": 0, "directions": 1, "directions_eval": 1}
-        head.check(config, least, "scale")
         count = (config.order + 1) ** 2
-        self.head = head.build(features, config.hidden, config.layers, 3 * count, generator)
+        self.head = build_head(features, config.hidden, config.layers, 3 * count, generator)
         base = torch.zeros(count, 3)
         base[0] = math.log(math.expm1(_START)) * math.sqrt(4 * math.pi)  # Y_00 is 1 / sqrt(4 pi)
         self.base = nn.Parameter(base)  # [(order + 1)^2, 3]
@@ -77,7 +81,7 @@ class LocalSH(AbstractLight):
 
     def coefficients(self, surface: Surface) -> Tensor:
         """[N, (order + 1)^2, 3] of the sum that softplus is taken of."""
-        raw = self.head(head.encode(surface, self.config.scale))
+        raw = self.head(encode(surface, self.config.scale))
         return self.base + raw.unflatten(-1, (-1, 3))
 
     def incident(self, surface: Surface, wi: Tensor) -> Tensor:
@@ -95,11 +99,14 @@ class LocalSH(AbstractLight):
         """Radiance [N, 3] towards wo, summed over the whole sphere."""
         return quadrature.reflected_shared(self, surface, wo, occlusion, generator)
 
-    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
+    def narrowed(self, width: int) -> SHConfig:
+        return replace(self.config, hidden=min(width, self.config.hidden))
+
+    def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         here, beside = self.coefficients(surface), self.coefficients(near)
         wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)
         light = nn.functional.softplus(sphere.real_harmonics(self.config.order, wi) @ here)
-        return {
-            "light_smoothness": priors.smoothness(here, beside),
-            "white_light": priors.chroma(light.mean(1)),
-        }
+        return Regularisation(
+            light_smoothness=priors.smoothness(here, beside),
+            white_light=priors.chroma(light.mean(1)),
+        )

@@ -21,7 +21,7 @@ from torch.nn.functional import avg_pool2d, normalize
 from univoxel.camera import Cameras, image_rays, looked_at, project
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
-from univoxel.fields.dense import DenseField
+from univoxel.fields.dense import DenseDistances
 from univoxel.grid import GridShape
 from univoxel.ops import VisibilityScene, match_cost, semi_global
 
@@ -67,7 +67,7 @@ def hollowed(hull: Tensor, grid: GridShape, pictures: Tensor, cameras: Cameras) 
     free, say, better = torch.zeros(3, len(nodes))
     apart = torch.stack([_stretched(picture) for picture in pictures])
     for view, (depth, found, at_hull) in enumerate(
-        _depth_maps(apart, cameras, start, DenseField(grid, 0, hull))
+        _depth_maps(apart, cameras, start, DenseDistances(grid, hull))
     ):
         away, pixel = _seen(nodes, cameras, view)
         before = depth.flatten()[pixel] - away  # NaN: the view says nothing
@@ -111,7 +111,7 @@ def _stretched(picture: Tensor) -> Tensor:
 
 def _first_met(sdf: Tensor, grid: GridShape, cameras: Cameras) -> Iterator[Tensor]:
     """How far [H, W] pixels see to the surface, view after view; infinity: past it."""
-    surface = VisibilityScene(*DenseField(grid, 0, sdf).isosurface())
+    surface = VisibilityScene(*DenseDistances(grid, sdf).isosurface())
     for view in range(len(cameras)):
         rays = image_rays(cameras, view)
         met = surface.closest_hit(rays.origin, rays.direction).t
@@ -119,7 +119,7 @@ def _first_met(sdf: Tensor, grid: GridShape, cameras: Cameras) -> Iterator[Tenso
 
 
 def _depth_maps(
-    pictures: Tensor, cameras: Cameras, start: list[Tensor], hull: DenseField
+    pictures: Tensor, cameras: Cameras, start: list[Tensor], hull: DenseDistances
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """View after view: how far its pixels see, and how badly views that had no say in that agree
     there, and on the hull: three [H, W], NaN outside the object. What seems to lie beyond it, as in

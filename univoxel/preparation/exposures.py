@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.data import Photos
-from univoxel.fields.dense import DenseField
+from univoxel.fields.dense import DenseDistances
 from univoxel.grid import GridShape
 from univoxel.names import Varying
 from univoxel.ops import VisibilityScene
@@ -45,7 +45,7 @@ def log_gains(photos: Photos, sdf: Tensor, grid: GridShape) -> Tensor:
     Source: Brown and Lowe 2007, "Automatic panoramic image stitching using invariant features", for
     gains from overlaps; Cauchy's weights, iterated, as in robust statistics.
     """
-    field, gain = DenseField(grid, 0, sdf), torch.zeros(len(photos))
+    field, gain = DenseDistances(grid, sdf), torch.zeros(len(photos))
     if not sdf.min() < 0 < sdf.max():
         return gain
     vertices, faces = field.isosurface()

@@ -13,12 +13,11 @@ from univoxel.camera import project
 from univoxel.color import srgb_to_linear
 from univoxel.data import Photos
 from univoxel.ops import VisibilityScene
-from univoxel.records import Mesh
+from univoxel.records import HALF_MAX, Mesh
 
 MIN_COSINE = 0.15  # views at a more grazing angle blur over too much surface
 MIN_ALPHA = 0.99  # of a photograph where it shows a point and no background
 POINTS_AT_ONCE = 4096
-HALF_MAX = 65504.0
 
 
 @dataclass(frozen=True)

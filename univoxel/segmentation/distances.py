@@ -10,7 +10,7 @@ from torch import Tensor
 
 from univoxel.camera import Cameras, looked_at
 from univoxel.errors import NothingFound, UserError
-from univoxel.fields.dense import DenseField
+from univoxel.fields.field import Field
 from univoxel.segmentation.config import SegmentationConfig
 
 
@@ -40,7 +40,7 @@ def surroundings(cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def redistance_(field: DenseField, cfg: SegmentationConfig, whole: bool = False) -> None:
+def redistance_(field: Field, cfg: SegmentationConfig, whole: bool = False) -> None:
     """Make the sdf a distance again, but for what is near the surface.
 
     Args:
@@ -67,9 +67,7 @@ def redistance_(field: DenseField, cfg: SegmentationConfig, whole: bool = False)
     field.refresh()
 
 
-def surface_box(
-    field: DenseField, lower: Tensor, upper: Tensor, margin: float
-) -> tuple[Tensor, Tensor]:
+def surface_box(field: Field, lower: Tensor, upper: Tensor, margin: float) -> tuple[Tensor, Tensor]:
     """A box around the surface, within that of lower and upper.
 
     Args:

@@ -15,7 +15,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.errors import NothingFound
 from univoxel.fields.backdrop import Backdrop
-from univoxel.fields.dense import DenseField
+from univoxel.fields.field import Field, dense_field
 from univoxel.grid import fit_grid
 from univoxel.lights.sg import SGConfig
 from univoxel.metrics import psnr
@@ -44,7 +44,7 @@ class _Parts:
     """What explains the photographs together."""
 
     scene: Scene
-    field: DenseField  # of the scene
+    field: Field  # of the scene
     backdrop: Backdrop
 
 
@@ -101,7 +101,7 @@ def _ball(radius: float, lower: Tensor, upper: Tensor, cfg: SegmentationConfig) 
         mirrored=False,
         light=SGConfig(lobes=1),
     )
-    field = DenseField(grid, sizes.channels, ball)
+    field = dense_field(grid, sizes.channels, ball)
     return _Parts(Scene(sizes, field), field, backdrop)
 
 

@@ -18,10 +18,8 @@ from univoxel.compression.choices import chosen_reach
 from univoxel.config import TrainConfig, check_same, save_config
 from univoxel.data import Photos, load_photos
 from univoxel.errors import DataError
-from univoxel.fields.base import AbstractField
-from univoxel.fields.dense import DenseField
-from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
-from univoxel.fields.sparse import SparseField
+from univoxel.fields.features import PER_LEVEL, Levels
+from univoxel.fields.field import Field, dense_field, hash_field
 from univoxel.files import replacing
 from univoxel.grid import GridShape, fit_grid
 from univoxel.joint import stage as joint_stage
@@ -116,8 +114,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
                 joint_stage.solve(scene, scene.registered(photos), stage, cfg.seed, progress)
             else:
                 grid = fit_grid(*box, plan.stage_voxels(stage, progress.chosen))
-                if stage.field == "sparse" and not isinstance(scene.field, SparseField):
-                    scene.field = SparseField.around(scene.field, grid)
+                if stage.field == "sparse" and scene.field.kind != "sparse":
+                    scene.field = scene.field.in_bricks(grid)
                 elif scene.field.grid != grid:
                     scene.field = scene.field.resized(grid)
                 if cfg.capacity == "adaptive":
@@ -140,15 +138,15 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
 
 def first_field(
     cfg: TrainConfig, grid: GridShape, hull: Tensor, box: tuple[Tensor, Tensor]
-) -> AbstractField:
+) -> Field:
     """The field that training starts with, on the grid of the first stage."""
     stages = [s for s in cfg.stages if isinstance(s, StageConfig)]
     if stages[0].field != "hash":
-        return DenseField(grid, cfg.scene.channels, hull)
+        return dense_field(grid, cfg.scene.channels, hull)
     finest = min(fit_grid(*box, plan.stage_voxels(s, [])).voxel_size for s in stages)
     rows = sizes.table_rows(cfg.scene, cfg.budget_mb, cfg.compression)
     levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL, rows)
-    return HashField(DenseField(grid, 0, hull), levels)
+    return hash_field(grid, levels, hull)
 
 
 def say_trust(scene: Scene, photos: Photos, out: Path, troubles: list[str]) -> None:

@@ -15,6 +15,7 @@ from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.config import TrainConfig
 from univoxel.data import Photos
 from univoxel.lights import priors
+from univoxel.lights.base import Regularisation
 from univoxel.metrics import psnr
 from univoxel.optim import RowAdam
 from univoxel.records import Rays, Surface
@@ -103,7 +104,7 @@ def run_stage(
         if not guard.sound(loss):
             continue
         if stage.refit:
-            field.hold_channels_(scene.material.channels)
+            field.encoding.hold_channels_(scene.material.channels)
         if stage.spread:
             smooth_sdf_gradient_(field, stage.spread)
         optimizer.step()
@@ -209,14 +210,23 @@ def objective(
     assert met.metallic is not None
     here = replace(met, features=scene.coded(met.features, view))
     near = replace(met, features=scene.coded(near, view), position=beside)
-    prior = scene.light.regularisation(here, near)
     terms |= {
         "physical": losses.photometric(encoded, target),
         "albedo": weight.albedo_smoothness * priors.smoothness(met.albedo, albedo),
         "roughness": weight.roughness_smoothness * priors.smoothness(met.roughness, roughness),
         "metallic": weight.metallic * met.metallic.mean(),
     }
-    return terms | {name: getattr(weight, name) * value for name, value in prior.items()}
+    return terms | weighted(scene.light.regularisation(here, near), weight)
+
+
+def weighted(prior: Regularisation, weight: LossConfig) -> dict[str, Tensor]:
+    """The terms that a light has, each times its weight."""
+    terms = {
+        "light_smoothness": (weight.light_smoothness, prior.light_smoothness),
+        "map_smoothness": (weight.map_smoothness, prior.map_smoothness),
+        "white_light": (weight.white_light, prior.white_light),
+    }
+    return {name: factor * term for name, (factor, term) in terms.items() if term is not None}
 
 
 def random_batch(photos: Photos, pixels: Tensor, count: int) -> Batch:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from univoxel.fields.base import AbstractField
+from univoxel.fields.field import Field
 from univoxel.optim import rows_of
 from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
@@ -16,21 +16,22 @@ MOMENTS = (0.9, 0.99)
 EPS_SDF, EPS_FEATURES = 1e-4, 1e-8
 
 
-def smooth_sdf_gradient_(field: AbstractField, passes: int) -> None:
+def smooth_sdf_gradient_(field: Field, passes: int) -> None:
     """Diffuse the sdf's gradient over the nodes that it touches, before Adam sees it: the surface
     then moves in large pieces, far and without the bumps that steps of single nodes leave."""
     grad = field.sdf.grad
     assert grad is not None
-    field.diffuse_rows_(grad._values(), rows_of(grad), SPREAD, passes)
+    field.distances.diffuse_rows_(grad._values(), rows_of(grad), SPREAD, passes)
 
 
-def smooth_touched_(field: AbstractField, stage: StageConfig) -> None:
+def smooth_touched_(field: Field, stage: StageConfig) -> None:
     """Regularise the nodes that the step has touched, beside the optimiser and not inside it."""
     sdf, features = field.sdf, field.features
     assert sdf.grad is not None
     assert features.grad is not None
-    field.smooth_rows_(sdf.data, rows_of(sdf.grad), stage.plate * SMOOTH_EVERY, order=2)
-    field.smooth_features_(rows_of(features.grad), stage.diffusion * SMOOTH_EVERY)
+    plate, diffusion = stage.plate * SMOOTH_EVERY, stage.diffusion * SMOOTH_EVERY
+    field.distances.smooth_rows_(sdf.detach(), rows_of(sdf.grad), plate, order=2)
+    field.encoding.smooth_(field.distances, rows_of(features.grad), diffusion)
 
 
 def refresh_surface_(scene: Scene) -> None:

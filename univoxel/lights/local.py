@@ -1,36 +1,43 @@
-"""What the local lights share: the network that reads a surface point, and checks of its sizes."""
+"""What the local lights share: a global light, and a network that adds to it at each point."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from abc import ABC, abstractmethod
 
 import torch
 from torch import Tensor, nn
 
-from univoxel.errors import ConfigError
+from univoxel.lights.base import AbstractLight
 from univoxel.networks import MLP, waves
 from univoxel.records import Surface
 
 FREQUENCIES = 3  # of the position: sines of 1, 2, 4 half-turns over the scale
 
 
-def check(config: Any, at_least: dict[str, int], *above_zero: str) -> None:
-    """Refuse a configuration with a number out of range.
+class LocalLightConfig(ABC):
+    """What the configurations of all local lights have."""
 
-    Raises:
-        ConfigError: names the number.
-    """
-    name = type(config).__name__
-    for field, least in at_least.items():
-        if getattr(config, field) < least:
-            raise ConfigError(f"{name}: {field} must be >= {least}, got {getattr(config, field)}")
-    for field in above_zero:
-        if not 0 < getattr(config, field) < math.inf:
-            raise ConfigError(f"{name}: {field} must be > 0, got {getattr(config, field)}")
+    hidden: int  # width of the head, >= 1
+    scale: float  # world units: half the extent of what is lit, > 0
 
 
-def build(
+class AbstractLocalLight(AbstractLight):
+    """Light that differs from point to point and holds direct light, indirect light and visibility
+    together: `base`, the same everywhere, plus what `head` makes of a point."""
+
+    traced = False
+    config: LocalLightConfig
+    head: MLP  # from `encode` of the surface
+    base: nn.Parameter
+
+    @abstractmethod
+    def narrowed(self, width: int) -> LocalLightConfig | None:
+        """Its configuration once no hidden layer of the head has more than `width` units; None
+        where the head cannot be made narrower alone."""
+
+
+def build_head(
     features: int, hidden: int, layers: int, outputs: int, generator: torch.Generator | None
 ) -> MLP:
     """A network from `encode` to what is added to a global light: at first nothing.

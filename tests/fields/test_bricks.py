@@ -9,9 +9,9 @@ from asymmetric_scene import lopsided
 from asymmetric_scene import sdf as lopsided_sdf
 from scipy.spatial import KDTree
 
-from univoxel.fields import sparse
-from univoxel.fields.dense import DenseField
-from univoxel.fields.sparse import BAND, SparseField, pack_bricks, unpack_bricks
+from univoxel.fields import bricks as bricks_module
+from univoxel.fields.bricks import BAND, pack_bricks, unpack_bricks
+from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape, fit_grid
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import surface_of_view
@@ -21,7 +21,7 @@ RADIUS = 0.5
 
 def sphere(n=40, channels=2, radius=RADIUS):
     grid = GridShape((-0.7,) * 3, 1.4 / (n - 1), (n, n, n))
-    field = DenseField(grid, channels, grid.nodes().norm(dim=-1) - radius)
+    field = dense_field(grid, channels, grid.nodes().norm(dim=-1) - radius)
     with torch.no_grad():
         field.features.copy_(grid.nodes()[..., :channels])
     return field
@@ -36,7 +36,7 @@ def near_surface(count, distance, seed=0):
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
 def test_features_alone_send_nothing_to_the_sdf(kind):
     dense = sphere()
-    field = dense if kind == "dense" else SparseField.around(dense, dense.grid)
+    field = dense if kind == "dense" else dense.in_bricks(dense.grid)
     points = near_surface(50, field.voxel_size)
     features = field.features_at(points)
     assert torch.equal(features, field.sample(points).features)
@@ -48,7 +48,7 @@ def test_features_alone_send_nothing_to_the_sdf(kind):
 @pytest.mark.parametrize("nodes", [40, 41, 80])
 def test_near_the_surface_it_is_the_dense_field(nodes):
     dense, fine = sphere(), sphere(nodes).grid
-    wanted, field = dense.resized(fine), SparseField.around(dense, fine)
+    wanted, field = dense.resized(fine), dense.in_bricks(fine)
     points = near_surface(2000, 1.5 * fine.voxel_size)  # a node 2.45 voxels away is not cut off
     a, b = field.sample(points), wanted.sample(points)
     for name in ("sdf", "gradient", "features"):
@@ -59,7 +59,7 @@ def test_near_the_surface_it_is_the_dense_field(nodes):
     assert centre.item() == pytest.approx(-BAND * fine.voxel_size)
     # each side of the surface a band, and what of a brick is beyond it
     thick = (2 * BAND + 7) * fine.voxel_size
-    stored = 64 * (field.count - 2) * fine.voxel_size**3
+    stored = 64 * (field.distances.count - 2) * fine.voxel_size**3
     assert stored < thick * 4 * torch.pi * RADIUS**2
 
 
@@ -67,13 +67,16 @@ def test_a_part_of_the_box_and_another_origin():
     """Every brick of the other grid that the band meets is found, off the source's lattice."""
     dense = sphere(33)
     fine = GridShape((-0.71, 0.013, -0.63), 0.0137, (101, 51, 90))
-    field, wanted = SparseField.around(dense, fine), dense.resized(fine)
-    near = wanted.sdf.abs() < field.far - 1e-4
-    rows = field.bricks.grid_rows()
+    field, wanted = dense.in_bricks(fine), dense.resized(fine)
+    near = wanted.sdf.abs() < field.distances.far - 1e-4
+    rows = field.distances.bricks.grid_rows()
     assert near.any()
     assert (rows[near] >= 128).all()
     torch.testing.assert_close(
-        field.sdf[rows], wanted.sdf.clamp(-field.far, field.far), rtol=0, atol=3e-5
+        field.sdf[rows],
+        wanted.sdf.clamp(-field.distances.far, field.distances.far),
+        rtol=0,
+        atol=3e-5,
     )
 
 
@@ -97,7 +100,7 @@ def test_conversion_keeps_the_picture():
     dense = scene.field.resized(finer)
     before = images(scene, dense)
     truth = (before + 0.02 * torch.randn(before.shape)).clamp(0, 1)
-    once = SparseField.around(scene.field, finer)
+    once = scene.field.in_bricks(finer)
     assert psnr(images(scene, once), truth) == pytest.approx(psnr(before, truth), abs=0.05)
     twice, whole = once.resized(finest), dense.resized(finest)
     before, after = images(scene, whole), images(scene, twice)
@@ -108,8 +111,8 @@ def test_conversion_keeps_the_picture():
 
 def test_the_isosurface_is_the_dense_one():
     dense = sphere(41)
-    field = SparseField.around(dense, dense.grid)
-    assert (field.bricks.table == 1).any()
+    field = dense.in_bricks(dense.grid)
+    assert (field.distances.bricks.table == 1).any()
     for a, b in zip(field.isosurface(), dense.isosurface(), strict=True):
         torch.testing.assert_close(a, b)
     for a, b in zip(field.bounds(), dense.bounds(), strict=True):
@@ -118,9 +121,9 @@ def test_the_isosurface_is_the_dense_one():
 
 @pytest.mark.parametrize("planes", [8, 12, 40])  # the last: one plane of cells is left over
 def test_a_surface_found_in_slabs_is_sewn_together(monkeypatch, planes):
-    monkeypatch.setattr(sparse, "SLAB", planes)
+    monkeypatch.setattr(bricks_module, "SLAB", planes)
     dense = sphere(42)
-    vertices, faces = SparseField.around(dense, dense.grid).isosurface()
+    vertices, faces = dense.in_bricks(dense.grid).isosurface()
     wanted, whole = dense.isosurface()
     assert (len(vertices), len(faces)) == (len(wanted), len(whole))
     found = KDTree(vertices.numpy()).query(wanted.numpy())
@@ -135,66 +138,68 @@ def test_occupied_nodes_are_the_dense_ones():
     dense = sphere(41)
     with torch.no_grad():
         dense.features.copy_((dense.sdf.abs() < dense.voxel_size)[..., None])
-        field = SparseField.around(dense, dense.grid)
+        field = dense.in_bricks(dense.grid)
         field.features.masked_fill_(field.features < 0.5, 0.0)  # nodes were placed by rounding
     assert 0.01 < dense.occupied().float().mean() < 0.2
     assert torch.equal(field.occupied(), dense.occupied())
 
 
 def test_no_surface():
-    dense = DenseField(sphere(12).grid, 1, torch.ones(12, 12, 12))
-    field = SparseField.around(dense, dense.grid)
-    assert field.count == 2
+    dense = dense_field(sphere(12).grid, 1, torch.ones(12, 12, 12))
+    field = dense.in_bricks(dense.grid)
+    assert field.distances.count == 2
     with pytest.raises(ValueError, match="the field has no surface"):
         field.isosurface()
     field.refresh()
-    assert field.count == 2
+    assert field.distances.count == 2
 
 
 def test_bricks_follow_the_surface():
     """A sphere that grows by 9 voxels, one between looks, always has its bricks."""
     dense = sphere(64, radius=0.4)
-    field = SparseField.around(dense, dense.grid)
-    first, pool, distance = field.count, len(field.sdf), dense.grid.nodes().norm(dim=-1)
+    field = dense.in_bricks(dense.grid)
+    first, pool, distance = field.distances.count, len(field.sdf), dense.grid.nodes().norm(dim=-1)
     for step in range(1, 10):
         wanted = distance - 0.4 - step * field.voxel_size
-        rows = field.bricks.grid_rows()
+        rows = field.distances.bricks.grid_rows()
         stored = rows >= 128
         with torch.no_grad():
-            field.sdf[rows[stored]] = wanted[stored].clamp(-field.far, field.far)
-        before, grown = field.count, field.refresh()
-        assert grown == (field.count > before)
-        rows = field.bricks.grid_rows()
+            field.sdf[rows[stored]] = wanted[stored].clamp(
+                -field.distances.far, field.distances.far
+            )
+        before, grown = field.distances.count, field.refresh()
+        assert grown == (field.distances.count > before)
+        rows = field.distances.bricks.grid_rows()
         assert (rows[wanted.abs() < field.voxel_size] >= 128).all()
         # What is carried on goes along the axes: the way round a corner is longer by a half
         near = (wanted > 0) & (wanted < 2 * field.voxel_size)
         error = field.sdf[rows] - wanted
         assert error[near].abs().max() < 1.5 * field.voxel_size
-    assert field.count > first
+    assert field.distances.count > first
     assert not field.refresh()
     assert len(field.sdf) > pool  # it grew beyond the room there was
-    assert len(field.features) == len(field.sdf) == 64 * len(field.bricks.place)
+    assert len(field.features) == len(field.sdf) == 64 * len(field.distances.bricks.place)
 
 
 def test_new_bricks_carry_distances_on():
     """Past a plane that comes near the last stored brick."""
     grid = GridShape((0.0, 0.0, 0.0), 1.0, (32, 8, 8))
     x = torch.arange(32.0)[:, None, None].expand(32, 8, 8)
-    dense = DenseField(grid, 1, (x - 8.5).contiguous())
-    field = SparseField.around(dense, grid)
+    dense = dense_field(grid, 1, (x - 8.5).contiguous())
+    field = dense.in_bricks(grid)
     with torch.no_grad():
-        field.sdf[128 : 64 * field.count] -= 3  # the plane stands at x = 11.5
-    assert field.bricks.table[:, 0, 0].tolist() == [1, 2, 6, 10, 0, 0, 0, 0]
+        field.sdf[128 : 64 * field.distances.count] -= 3  # the plane stands at x = 11.5
+    assert field.distances.bricks.table[:, 0, 0].tolist() == [1, 2, 6, 10, 0, 0, 0, 0]
     field.refresh()
-    assert (field.bricks.table[4] >= 2).all()
-    line = field.sdf[field.bricks.grid_rows()[:, 3, 3]]
+    assert (field.distances.bricks.table[4] >= 2).all()
+    line = field.sdf[field.distances.bricks.grid_rows()[:, 3, 3]]
     # nodes 13 .. 15 were cut off at 4 before the plane moved by 3
     wanted = torch.tensor([-1.5, -0.5, 0.5, 1.0, 1.0, 1.0, 2.0, 3.0, 4.0, 4.0])
     torch.testing.assert_close(line[10:20], wanted)
 
 
 def test_the_optimiser_goes_on_when_bricks_come():
-    field = SparseField.around(sphere(48), sphere(48).grid)
+    field = sphere(48).in_bricks(sphere(48).grid)
     optimizer = RowAdam([field.sdf, field.features], lr=1e-3)
     points = near_surface(300, 0.02)
     for _ in range(3):
@@ -204,7 +209,7 @@ def test_the_optimiser_goes_on_when_bricks_come():
         optimizer.step()
         moments = optimizer.state[field.sdf]["exp_avg"].clone()
         with torch.no_grad():
-            field.sdf.view(-1, 64)[2 : field.count] -= 3 * field.voxel_size
+            field.sdf.view(-1, 64)[2 : field.distances.count] -= 3 * field.voxel_size
         before = field.sdf, field.features
         field.refresh()
         optimizer.follow(before[0], field.sdf)
@@ -223,11 +228,11 @@ def test_the_optimiser_goes_on_when_bricks_come():
 
 
 def test_bricks_pack_and_unpack():
-    field = SparseField.around(sphere(41), sphere(41).grid)
-    parts = pack_bricks(field)
+    field = sphere(41).in_bricks(sphere(41).grid)
+    parts = pack_bricks(field.distances)
     bricks = unpack_bricks(parts["place"], parts["inside"], field.grid.size)
-    assert torch.equal(bricks.table, field.bricks.table)
-    assert len(bricks.place) == field.count
+    assert torch.equal(bricks.table, field.distances.bricks.table)
+    assert len(bricks.place) == field.distances.count
     with pytest.raises((ValueError, IndexError)):
         unpack_bricks(parts["place"], parts["inside"], (8, 8, 8))
 
@@ -236,8 +241,8 @@ def test_rays_meet_the_same_surface_through_a_moved_scene():
     """March and sample agree with the dense field on an object that is no sphere."""
     scene = lopsided(48**3)
     dense = scene.field
-    assert isinstance(dense, DenseField)
-    sparse = SparseField.around(dense, dense.grid)
+    assert dense.kind == "dense"
+    sparse = dense.in_bricks(dense.grid)
     a, b = images(scene, sparse), images(scene, dense)
     assert psnr(a, b) > 55
     nodes = dense.grid.nodes()

@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import nn
 
-from univoxel.fields import hashed
-from univoxel.fields.dense import DenseField
-from univoxel.fields.hashed import COARSEST, PER_LEVEL, ROWS, HashField, Levels
-from univoxel.fields.sparse import SparseField
+from univoxel.fields import field as fields
+from univoxel.fields.bricks import BrickDistances
+from univoxel.fields.features import COARSEST, PER_LEVEL, ROWS, HashFeatures, Levels
+from univoxel.fields.field import Field, dense_field, hash_field
 from univoxel.grid import GridShape
 from univoxel.ops import encode_hash
 from univoxel.records import Rays
@@ -20,9 +20,9 @@ GRID = GridShape((-0.7,) * 3, 1.4 / 39, (40, 40, 40))
 COUNT = 4  # levels
 
 
-def ball() -> HashField:
+def ball() -> Field:
     levels = Levels.of(GRID.bounds(), GRID.voxel_size, COUNT)
-    field = HashField(DenseField(GRID, 0, GRID.nodes().norm(dim=-1) - 0.5), levels)
+    field = hash_field(GRID, levels, GRID.nodes().norm(dim=-1) - 0.5)
     torch.manual_seed(0)
     nn.init.normal_(field.features)
     return field
@@ -42,12 +42,12 @@ def test_levels_go_from_coarse_to_fine():
 
 def test_distances_are_the_dense_fields_and_features_the_tables():
     field = ball()
-    dense = DenseField(GRID, 1, field.sdf.detach().clone())
+    dense = dense_field(GRID, 1, field.sdf.detach().clone())
     points = 1.2 * torch.rand(200, 3) - 0.6
     found, wanted = field.sample(points), dense.sample(points)
     assert torch.equal(found.sdf, wanted.sdf)
     assert torch.equal(found.gradient, wanted.gradient)
-    levels = field.levels
+    levels = field.encoding.levels
     table = encode_hash(field.features, points, levels.lower, levels.upper, levels.voxel_sizes)
     for level in range(COUNT):
         for k in range(PER_LEVEL):
@@ -62,7 +62,9 @@ def test_held_channels_get_no_gradient():
     points = torch.rand(100, 3) - 0.5
     field.features_at(points).square().sum().backward()
     whole = field.features.grad.to_dense()
-    field.hold_channels_(COUNT + 1)  # the first of each level, and the second of the coarsest
+    field.encoding.hold_channels_(
+        COUNT + 1
+    )  # the first of each level, and the second of the coarsest
     held = field.features.grad.to_dense().view(COUNT, ROWS, PER_LEVEL)
     whole = whole.view(COUNT, ROWS, PER_LEVEL)
     assert (held[:, :, 0] == 0).all()
@@ -73,12 +75,12 @@ def test_held_channels_get_no_gradient():
 
 def test_tables_may_be_smaller():
     levels = Levels.of(GRID.bounds(), GRID.voxel_size, COUNT, rows=2**10)
-    field = HashField(DenseField(GRID, 0, GRID.nodes().norm(dim=-1) - 0.5), levels)
+    field = hash_field(GRID, levels, GRID.nodes().norm(dim=-1) - 0.5)
     assert field.features.shape == (COUNT * 2**10, PER_LEVEL)
     field.features_at(torch.rand(500, 3) - 0.5).sum().backward()
     touched = field.features.grad.coalesce().indices()[0]
     assert touched.max() < COUNT * 2**10
-    field.hold_channels_(COUNT)
+    field.encoding.hold_channels_(COUNT)
     held = field.features.grad.to_dense().view(COUNT, -1, PER_LEVEL)
     assert (held[:, :, 0] == 0).all()
     assert all(level.any() for level in held[:, :, 1])
@@ -88,7 +90,7 @@ def test_tables_may_be_smaller():
 def test_rows_near_are_all_that_points_near_the_surface_read(finest):
     field = ball()
     levels = replace(Levels.of(field.bounds(), finest * field.voxel_size, 4), rows=2**14)
-    field = HashField(field.distances, levels)
+    field = Field(field.distances, HashFeatures(levels))
     near = field.rows_near(1.5 * field.voxel_size)
     g = torch.Generator().manual_seed(0)
     direction = torch.nn.functional.normalize(torch.randn(2_000_000, 3, generator=g))
@@ -105,7 +107,7 @@ def test_rows_near_are_all_that_points_near_the_surface_read(finest):
     assert field.rows_near(math.inf).all()
 
 
-def rows_read(field: HashField, points: torch.Tensor) -> torch.Tensor:
+def rows_read(field: Field, points: torch.Tensor) -> torch.Tensor:
     """Rows of its table that have a say at points."""
     features = field.features_at(points)
     (grad,) = torch.autograd.grad(features.sum(), field.features)
@@ -128,7 +130,7 @@ def test_smoothing_leaves_the_table():
     field = ball()
     before = field.features.detach().clone()
     field.features_at(torch.rand(10, 3)).sum().backward()
-    field.smooth_features_(torch.arange(10), 0.1)
+    field.encoding.smooth_(field.distances, torch.arange(10), 0.1)
     assert torch.equal(field.features, before)
 
 
@@ -138,13 +140,13 @@ FINE = GridShape((-0.7,) * 3, 1.4 / 199, (200, 200, 200))
 @pytest.fixture
 def bricks(monkeypatch):
     """The ball on a grid so fine that only bricks around its surface are stored."""
-    monkeypatch.setattr(hashed, "DENSE_MOST", 1_000_000)
+    monkeypatch.setattr(fields, "DENSE_MOST", 1_000_000)
     return ball().resized(FINE)
 
 
 def test_distances_of_a_fine_grid_lie_in_bricks(bricks):
     dense = ball()
-    assert isinstance(bricks.distances, SparseField)
+    assert isinstance(bricks.distances, BrickDistances)
     assert bricks.sdf is bricks.distances.sdf
     assert bricks.sdf.numel() < 0.2 * FINE.nodes_count
     direction = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
@@ -182,4 +184,4 @@ def test_a_copy_stands_on_its_own(bricks):
 
 
 def test_once_in_bricks_always_in_bricks(bricks):
-    assert isinstance(bricks.resized(GRID).distances, SparseField)
+    assert isinstance(bricks.resized(GRID).distances, BrickDistances)

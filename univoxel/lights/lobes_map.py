@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -9,10 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from univoxel import envmap
-from univoxel.lights import distant_map, head, lobes, priors
-from univoxel.lights.base import AbstractLight
+from univoxel.lights import latlong, lobes, priors
+from univoxel.lights.base import AbstractLight, Regularisation
 from univoxel.records import Occlusion, Surface
 from univoxel.sphere import latlong_directions
+from univoxel.validation import check_fields
 
 GAIN = 10.0  # the learning rate of networks moves the lobes that much faster: they must reach a sun
 
@@ -27,6 +29,12 @@ class EnvmapSGConfig:
     rows: int = 64  # of the lat-long map that the lobes are summed on, >= 1
     directions: int = 64  # of the half-sphere, in training, >= 1
     directions_eval: int = 256  # in evaluation, >= 1
+
+    def __post_init__(self):
+        check_fields(
+            self, "at least 1", lambda x: x >= 1, "lobes", "rows", "directions", "directions_eval"
+        )
+        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "max_sharpness")
 
 
 class EnvmapSGLight(AbstractLight):
@@ -44,14 +52,8 @@ class EnvmapSGLight(AbstractLight):
     traced = True
 
     def __init__(self, config: EnvmapSGConfig | None = None) -> None:
-        """
-        Raises:
-            ValueError: a number outside its range; the message names it.
-        """
         super().__init__()
         self.config = config = config or EnvmapSGConfig()
-        least = {"lobes": 1, "rows": 1, "directions": 1, "directions_eval": 1}
-        head.check(config, least, "max_sharpness")
         start = lobes.white_light(config.lobes, config.max_sharpness)
         self.raw = nn.Parameter(start / GAIN)  # [K, 7]
 
@@ -84,10 +86,10 @@ class EnvmapSGLight(AbstractLight):
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Radiance [N, 3] towards wo; no gradient to normals."""
-        return distant_map.reflected(self, surface, wo, occlusion, generator)
+        return latlong.reflected(self, surface, wo, occlusion, generator)
 
-    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
+    def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         _, sharpness, amplitude = self.lobes()
         # What a lobe sends altogether, over 2 pi
         share = -torch.expm1(-2 * sharpness) / sharpness
-        return {"white_light": priors.chroma((share[:, None] * amplitude).sum(0)[None])}
+        return Regularisation(white_light=priors.chroma((share[:, None] * amplitude).sum(0)[None]))

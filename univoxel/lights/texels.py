@@ -10,9 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from univoxel import envmap
-from univoxel.lights import distant_map, head, priors
-from univoxel.lights.base import AbstractLight
+from univoxel.lights import latlong, priors
+from univoxel.lights.base import AbstractLight, Regularisation
 from univoxel.records import Occlusion, Surface
+from univoxel.validation import check_fields
 
 # The learning rate of networks moves log radiance that much faster: it must reach a sun
 GAIN = 30.0
@@ -27,6 +28,9 @@ class EnvmapConfig:
     rows: int = 256  # of the map, twice as wide, >= 1
     directions: int = 64  # of the half-sphere, in training, >= 1
     directions_eval: int = 256  # in evaluation, >= 1
+
+    def __post_init__(self):
+        check_fields(self, "at least 1", lambda x: x >= 1, "rows", "directions", "directions_eval")
 
 
 class EnvmapLight(AbstractLight):
@@ -45,13 +49,8 @@ class EnvmapLight(AbstractLight):
     traced = True
 
     def __init__(self, config: EnvmapConfig | None = None) -> None:
-        """
-        Raises:
-            ValueError: a number outside its range; the message names it.
-        """
         super().__init__()
         self.config = config = config or EnvmapConfig()
-        head.check(config, {"rows": 1, "directions": 1, "directions_eval": 1})
         rows = [config.rows]
         while rows[-1] % 4 == 0 and rows[-1] >= 4 * COARSEST:
             rows.append(rows[-1] // 4)
@@ -83,18 +82,18 @@ class EnvmapLight(AbstractLight):
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Radiance [N, 3] towards wo; no gradient to normals."""
-        return distant_map.reflected(self, surface, wo, occlusion, generator)
+        return latlong.reflected(self, surface, wo, occlusion, generator)
 
-    def regularisation(self, surface: Surface, near: Surface) -> dict[str, Tensor]:
+    def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         log_map = self.log_radiance
-        return {
-            "map_smoothness": priors.total_variation(log_map),
-            "white_light": distant_map.chroma(log_map.exp()),
-        }
+        return Regularisation(
+            map_smoothness=priors.total_variation(log_map),
+            white_light=latlong.chroma(log_map.exp()),
+        )
 
     def latlong(self, height: int) -> Tensor:
         """The map [height, 2 height, 3], linear, in the axes of docs/conventions.md."""
-        return distant_map.resampled(self.log_radiance.exp(), height)
+        return latlong.resampled(self.log_radiance.exp(), height)
 
 
 def _finer(level: Tensor, factor: int) -> Tensor:

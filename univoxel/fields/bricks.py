@@ -1,6 +1,8 @@
-"""A sparse grid: the nodes of bricks around the surface, and a far distance everywhere else."""
+"""A sparse grid of signed distances: bricks around the surface, and far distance elsewhere."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -9,7 +11,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from univoxel.errors import NoSurface
-from univoxel.fields.base import BAND, AbstractField
+from univoxel.fields.distances import BAND, AbstractDistances, no_values
 from univoxel.grid import GridShape
 from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_sparse, smooth_rows_
 from univoxel.records import Bricks, FieldSample, Rays, Samples
@@ -19,22 +21,19 @@ SPARE = 0.05  # share of the bricks that may come without moving the others in m
 BRICKS_AT_ONCE = 4096
 
 
-class SparseField(AbstractField):
-    """SDF [R] and features [R, C] as parameters, R the rows of `bricks`.
+class BrickDistances(AbstractDistances):
+    """SDF [R] as a parameter, R the rows of `bricks`.
 
     The sdf is cut off at BAND voxels; bricks in which it is so everywhere are missing. Memory and
     time grow with the surface. `refresh` adds bricks where the surface comes near.
     """
 
-    kind = "sparse"
-
-    def __init__(self, grid: GridShape, channels: int, bricks: Bricks):
+    def __init__(self, grid: GridShape, bricks: Bricks):
         super().__init__()
-        self.grid, self.channels, self.voxel_size = grid, channels, grid.voxel_size
+        self.grid, self.voxel_size = grid, grid.voxel_size
         self.bricks = bricks
         rows = Bricks.NODES * len(bricks.place)
         self.sdf = nn.Parameter(torch.full((rows,), self.far))
-        self.features = nn.Parameter(torch.zeros(rows, channels))
         self.sdf.data[Bricks.NODES : 2 * Bricks.NODES] = -self.far
         self._brick_min: Tensor | None = None
 
@@ -50,52 +49,48 @@ class SparseField(AbstractField):
 
     @classmethod
     @torch.no_grad()
-    def around(cls, source: AbstractField, grid: GridShape) -> SparseField:
-        """What another field is near its surface, on another grid."""
+    def around(cls, source: AbstractDistances, grid: GridShape) -> BrickDistances:
+        """What other distances are near their surface, on another grid."""
         far = BAND * grid.voxel_size
         shape = [-(-n // Bricks.SIDE) for n in grid.size]
         near = _overlapped(source, grid, far).flatten()
-        origin = torch.tensor(grid.origin, dtype=torch.float64)
         inside = torch.cartesian_prod(*[torch.arange(Bricks.SIDE)] * 3)
-
-        def nodes(flat: Tensor, of_brick: Tensor = inside) -> Tensor:
-            """World positions of nodes [K] of bricks [N]: [N K, 3]."""
-            node = torch.stack(torch.unravel_index(flat, tuple(shape)), -1) * Bricks.SIDE
-            node = (node[:, None] + of_brick).reshape(-1, 3)
-            return (origin + grid.voxel_size * node.double()).float()
-
-        stored = [
-            part[(source.sample(nodes(part)).sdf.view(-1, Bricks.NODES).abs() < far).any(1)]
-            for part in near.nonzero()[:, 0].split(BRICKS_AT_ONCE)
-        ]
+        stored = []
+        for part in near.nonzero()[:, 0].split(BRICKS_AT_ONCE):
+            sdf = source.sample(_nodes(grid, part, inside)).sdf.view(-1, Bricks.NODES)
+            stored.append(part[(sdf.abs() < far).any(1)])
         stored = torch.cat(stored) if stored else near.nonzero()[:, 0]
         table = torch.empty(len(near), dtype=torch.int32)
         for part in torch.arange(len(near)).split(Bricks.NODES * BRICKS_AT_ONCE):
-            table[part] = (source.sample(nodes(part, inside[:1])).sdf < 0).int()
+            table[part] = (source.sample(_nodes(grid, part, inside[:1])).sdf < 0).int()
         table[stored] = Bricks.MISSING + torch.arange(len(stored), dtype=torch.int32)
         used = Bricks.MISSING + len(stored)
         place = torch.full((round((1 + SPARE) * used),), -1, dtype=torch.int32)
         place[Bricks.MISSING : used] = stored.int()
 
-        field = cls(grid, source.channels, Bricks(table.view(shape), place, grid.size))
+        distances = cls(grid, Bricks(table.view(shape), place, grid.size))
+        for rows, points in distances._stored_nodes():
+            distances.sdf[rows] = source.sample(points).sdf.clamp(-far, far)
+        return distances
+
+    def _stored_nodes(self) -> Iterator[tuple[slice, Tensor]]:
+        """Rows of bricks, some at a time, and the world positions [K, 3] of their nodes."""
+        inside = torch.cartesian_prod(*[torch.arange(Bricks.SIDE)] * 3)
         begin = Bricks.MISSING * Bricks.NODES
-        for part in stored.split(BRICKS_AT_ONCE):
-            sample, end = source.sample(nodes(part)), begin + len(part) * Bricks.NODES
-            field.sdf[begin:end] = sample.sdf.clamp(-far, far)
-            field.features[begin:end] = sample.features
+        for part in self.bricks.place[Bricks.MISSING : self.count].long().split(BRICKS_AT_ONCE):
+            end = begin + len(part) * Bricks.NODES
+            yield slice(begin, end), _nodes(self.grid, part, inside)
             begin = end
-        return field
 
-    def sample(self, points: Tensor) -> FieldSample:
-        return self._sample(self.sdf, points)
+    def sample(self, points: Tensor, values: Tensor | None = None) -> FieldSample:
+        return self._sample(self.sdf, no_values(self.sdf) if values is None else values, points)
 
-    def features_at(self, points: Tensor) -> Tensor:
-        return self._sample(self.sdf.detach(), points).features
+    def interpolate(self, values: Tensor, points: Tensor) -> Tensor:
+        return self._sample(self.sdf.detach(), values, points).features
 
-    def _sample(self, sdf: Tensor, points: Tensor) -> FieldSample:
+    def _sample(self, sdf: Tensor, values: Tensor, points: Tensor) -> FieldSample:
         place = points, self.grid.origin, self.voxel_size
-        grids = sdf, self.features, self.bricks
-        return FieldSample(*sample_sparse(*grids, *place, sparse_grad=True))
+        return FieldSample(*sample_sparse(sdf, values, self.bricks, *place, sparse_grad=True))
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         if self._brick_min is None:
@@ -132,21 +127,20 @@ class SparseField(AbstractField):
             stored = stored.narrow(axis, 0, n) | stored.narrow(axis, 1, n)
         return stored
 
-    def within(self, far: float) -> Tensor:
-        return self._slab(self.sdf.detach().abs() < far)
-
-    def occupied(self) -> Tensor:
-        return self._slab(self.features.detach().any(-1))
+    def on_grid(self, values: Tensor) -> Tensor:
+        return self._slab(values)
 
     def _slab(self, values: Tensor, begin: int = 0, end: int | None = None) -> Tensor:
-        """Values [R] of the rows at all nodes from plane `begin` to before `end`: [end - begin, Y,
-        Z]; begin is where a brick begins."""
-        pool, (x, y, z) = values.view(-1, *[Bricks.SIDE] * 3), self.grid.size
+        """Values [R, ...] of the rows at all nodes from plane `begin` to before `end`:
+        [end - begin, Y, Z, ...]; begin is where a brick begins."""
+        channels, (x, y, z) = values.shape[1:], self.grid.size
+        pool = values.view(-1, *[Bricks.SIDE] * 3, *channels)
+        order = 2, 0, 3, 1, 4, *range(5, 5 + len(channels))
         end = x if end is None else min(end, x)
-        slab = values.new_empty(end - begin, y, z)
+        slab = values.new_empty(end - begin, y, z, *channels)
         for first in range(begin, end, Bricks.SIDE):
             plane = self.bricks.table[first // Bricks.SIDE].long()
-            part = pool[plane].permute(2, 0, 3, 1, 4).flatten(3, 4).flatten(1, 2)
+            part = pool[plane].permute(order).flatten(3, 4).flatten(1, 2)
             at = first - begin
             slab[at : at + Bricks.SIDE] = part[: end - first, :y, :z]
         return slab
@@ -165,11 +159,15 @@ class SparseField(AbstractField):
         world = torch.tensor(self.grid.origin) + self.voxel_size * torch.from_numpy(vertices)
         return world.float(), torch.from_numpy(faces.astype("int32"))
 
-    def bounds(self) -> tuple[Tensor, Tensor]:
-        return self.grid.bounds()
+    def resized(self, grid: GridShape) -> BrickDistances:
+        return BrickDistances.around(self, grid)
 
-    def resized(self, grid: GridShape) -> SparseField:
-        return SparseField.around(self, grid)
+    @torch.no_grad()
+    def values_from(self, source: AbstractDistances, values: Tensor) -> Tensor:
+        own = values.new_zeros(len(self.sdf), values.shape[-1])
+        for rows, points in self._stored_nodes():
+            own[rows] = source.interpolate(values, points)
+        return own
 
     def _grow(self) -> bool:
         """Store every brick beside one that the surface comes within a voxel of; False: there is
@@ -192,11 +190,9 @@ class SparseField(AbstractField):
             short += round(SPARE * len(place))
             place = torch.cat([place, place.new_full((short,), -1)])
             more = short * Bricks.NODES
-            sdf, features = self.sdf.detach(), self.features.detach()
+            sdf = self.sdf.detach()
             sdf = torch.cat([sdf, sdf.new_full((more,), self.far)])
-            features = torch.cat([features, features.new_zeros(more, self.channels)])
             self.sdf = nn.Parameter(sdf, self.sdf.requires_grad)
-            self.features = nn.Parameter(features, self.features.requires_grad)
         else:
             place = place.clone()
         sign = 1 - 2 * table[new].float()  # before there was a brick
@@ -230,6 +226,20 @@ class SparseField(AbstractField):
         return sign[:, None] * within.reshape(len(number), -1)
 
 
+def _nodes(grid: GridShape, flat: Tensor, inside: Tensor) -> Tensor:
+    """World positions [N K, 3] of nodes of bricks.
+
+    Args:
+        flat: [N] numbers of the bricks' places among all of the grid.
+        inside: [K, 3] int64 which nodes of each.
+    """
+    shape = tuple(-(-n // Bricks.SIDE) for n in grid.size)
+    node = torch.stack(torch.unravel_index(flat, shape), -1) * Bricks.SIDE
+    node = (node[:, None] + inside).reshape(-1, 3)
+    origin = torch.tensor(grid.origin, dtype=torch.float64)
+    return (origin + grid.voxel_size * node.double()).float()
+
+
 def _sewn(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Meshes of slabs along x in one: vertices of two in the plane between them become one.
 
@@ -252,7 +262,7 @@ def _sewn(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.nd
     return vertices[kept], faces[whole]
 
 
-def _overlapped(source: AbstractField, grid: GridShape, far: float) -> Tensor:
+def _overlapped(source: AbstractDistances, grid: GridShape, far: float) -> Tensor:
     """Which bricks of a grid meet blocks of the source that have something nearer than far."""
     near = source.blocks(far)
     for axis in range(3):
@@ -271,13 +281,13 @@ def _overlapped(source: AbstractField, grid: GridShape, far: float) -> Tensor:
     return near
 
 
-def pack_bricks(field: SparseField) -> dict[str, Tensor]:
-    """What of a field's bricks a file needs: where they stand, and bits of what is inside."""
-    inside = (field.bricks.table == 1).flatten()
+def pack_bricks(distances: BrickDistances) -> dict[str, Tensor]:
+    """What of the bricks a file needs: where they stand, and bits of what is inside."""
+    inside = (distances.bricks.table == 1).flatten()
     bits = torch.nn.functional.pad(inside, (0, -len(inside) % 8)).view(-1, 8).to(torch.uint8)
     weights = 2 ** torch.arange(8, dtype=torch.uint8)
     return {
-        "place": field.bricks.place[: field.count].clone(),
+        "place": distances.bricks.place[: distances.count].clone(),
         "inside": (bits * weights).sum(1, dtype=torch.uint8),
     }
 

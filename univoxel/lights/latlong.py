@@ -1,4 +1,4 @@
-"""What distant lights on a lat-long map share."""
+"""What the two lights on a lat-long map, of texels and of lobes, share."""
 
 from __future__ import annotations
 

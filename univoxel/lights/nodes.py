@@ -1,4 +1,4 @@
-"""One distant light for the whole object: an environment map at evenly spread directions."""
+"""One distant light for the whole object: an environment map at D nodes, which is solved for."""
 
 from __future__ import annotations
 

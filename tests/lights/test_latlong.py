@@ -14,7 +14,7 @@ from univoxel.lights import (
     EnvmapLight,
     EnvmapSGConfig,
     EnvmapSGLight,
-    distant_map,
+    latlong,
     quadrature,
 )
 from univoxel.records import Occlusion
@@ -171,32 +171,36 @@ def test_recovers_a_known_light_behind_an_occluder(kind):
 def test_regularisation_sees_noise_and_colour():
     light, s = EnvmapLight(EnvmapConfig(rows=16)), ball(1)
     even = light.regularisation(s, s)
-    assert even["map_smoothness"] == pytest.approx(0.0, abs=1e-6)
+    assert even.map_smoothness == pytest.approx(0.0, abs=1e-6)
     light.levels[0][..., 0] += 0.02 * torch.rand(16, 32)
     noisy = light.regularisation(s, s)
-    assert noisy["map_smoothness"] > 0.1
-    assert noisy["white_light"] > even["white_light"]
+    assert noisy.map_smoothness > 0.1
+    assert noisy.white_light > even.white_light
     red = of_lobes()
-    before = red.regularisation(s, s)["white_light"]
+    before = red.regularisation(s, s).white_light
     # in closed form, what the map sums up to
-    torch.testing.assert_close(before, distant_map.chroma(red.latlong(64)), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(before, latlong.chroma(red.latlong(64)), rtol=1e-3, atol=1e-4)
     red.raw[:, 4] += 0.1
-    assert red.regularisation(s, s)["white_light"] > before
+    assert red.regularisation(s, s).white_light > before
 
 
 @pytest.mark.parametrize(
-    ("config", "message"),
+    ("kind", "change", "message"),
     [
-        (EnvmapConfig(rows=0), "EnvmapConfig: rows must be >= 1, got 0"),
-        (EnvmapConfig(directions=0), "EnvmapConfig: directions must be >= 1"),
-        (EnvmapConfig(directions_eval=0), "EnvmapConfig: directions_eval must be >= 1"),
-        (EnvmapSGConfig(lobes=0), "EnvmapSGConfig: lobes must be >= 1"),
-        (EnvmapSGConfig(rows=0), "EnvmapSGConfig: rows must be >= 1"),
-        (EnvmapSGConfig(directions=0), "EnvmapSGConfig: directions must be >= 1"),
-        (EnvmapSGConfig(directions_eval=0), "EnvmapSGConfig: directions_eval must be >= 1"),
-        (EnvmapSGConfig(max_sharpness=0.0), "EnvmapSGConfig: max_sharpness must be > 0"),
+        (EnvmapConfig, {"rows": 0}, "EnvmapConfig: rows must be at least 1, got 0"),
+        (EnvmapConfig, {"directions": 0}, "EnvmapConfig: directions must be at least 1"),
+        (EnvmapConfig, {"directions_eval": 0}, "EnvmapConfig: directions_eval must be at least 1"),
+        (EnvmapSGConfig, {"lobes": 0}, "EnvmapSGConfig: lobes must be at least 1"),
+        (EnvmapSGConfig, {"rows": 0}, "EnvmapSGConfig: rows must be at least 1"),
+        (EnvmapSGConfig, {"directions": 0}, "EnvmapSGConfig: directions must be at least 1"),
+        (
+            EnvmapSGConfig,
+            {"directions_eval": 0},
+            "EnvmapSGConfig: directions_eval must be at least 1",
+        ),
+        (EnvmapSGConfig, {"max_sharpness": 0.0}, "EnvmapSGConfig: max_sharpness must be above 0"),
     ],
 )
-def test_bad_config(config, message):
+def test_bad_config(kind, change, message):
     with pytest.raises(ValueError, match=message):
-        (EnvmapLight if isinstance(config, EnvmapConfig) else EnvmapSGLight)(config)
+        kind(**change)

@@ -1,0 +1,93 @@
+"""What every grid of signed distances offers."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from torch import Tensor, nn
+
+from univoxel.grid import GridShape
+from univoxel.records import FieldSample, Rays, Samples
+
+BAND = 4.0  # voxels from the surface beyond which density is nothing: 8 s at a sharpness of 0.5
+
+
+class AbstractDistances(nn.Module, ABC):
+    """Signed distances at nodes of a grid, each with a row of the sdf.
+
+    Gradients to the sdf are sparse: only the nodes around samples are in them, and `RowAdam`
+    updates only those. Their rows are the numbers of these nodes. Other values of nodes are tensors
+    of the sdf's shape, or with channels after it.
+    """
+
+    grid: GridShape
+    voxel_size: float  # of the grid, world units
+    sdf: nn.Parameter
+
+    @abstractmethod
+    def sample(self, points: Tensor, values: Tensor | None = None) -> FieldSample:
+        """SDF, its spatial gradient and values of nodes, as features, at world points [M, 3].
+
+        Args:
+            values: as the sdf, and C; without them C is 0.
+        """
+
+    @abstractmethod
+    def interpolate(self, values: Tensor, points: Tensor) -> Tensor:
+        """Values of nodes alone at world points [M, 3]: [M, C]; no gradient to the sdf, not even
+        one of zeros."""
+
+    @abstractmethod
+    def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
+        """The samples along rays that matter under density sharpness 1 / s; no gradients."""
+
+    @abstractmethod
+    def refresh(self) -> bool:
+        """Look again which bricks are empty, after the sdf has moved; True: nodes were added.
+
+        Where that needs room, the sdf is a new parameter afterwards, with more rows at the end:
+        `RowAdam.follow` takes the optimiser along.
+        """
+
+    @abstractmethod
+    def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
+        """`ops.smooth_rows_` of values of nodes."""
+
+    @abstractmethod
+    def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
+        """`ops.diffuse_rows_` of values [K] of nodes."""
+
+    @abstractmethod
+    def on_grid(self, values: Tensor) -> Tensor:
+        """Values of nodes where these lie in the grid: [X, Y, Z], and C if they have channels."""
+
+    @abstractmethod
+    def blocks(self, far: float) -> Tensor:
+        """Whether the sdf can be nearer to 0 than far in each block of 4^3 voxels: [A, B, C]."""
+
+    @abstractmethod
+    def isosurface(self) -> tuple[Tensor, Tensor]:
+        """Vertices [P, 3] float32 and faces [F, 3] int32 of the zero level (marching cubes,
+        Lewiner et al. 2003), counter-clockwise seen from outside.
+
+        Raises:
+            ValueError: the sdf has no zero level.
+        """
+
+    @abstractmethod
+    def resized(self, grid: GridShape) -> AbstractDistances:
+        """The same distances on another grid, by trilinear interpolation."""
+
+    @abstractmethod
+    def values_from(self, source: AbstractDistances, values: Tensor) -> Tensor:
+        """Values of the source's nodes, with C channels, at the nodes of this grid."""
+
+
+def nodes_within(distances: AbstractDistances, far: float) -> Tensor:
+    """Which nodes of the grid have an sdf nearer to 0 than far: [X, Y, Z] bool."""
+    return distances.on_grid(distances.sdf.detach().abs() < far)
+
+
+def no_values(sdf: Tensor) -> Tensor:
+    """Values of nodes with no channels."""
+    return sdf.detach().new_empty(*sdf.shape, 0)
