@@ -129,7 +129,7 @@ def run_steps(scene: Scene, views: tuple, rays: int, count: int, begin: float = 
             yield begin + (1 - begin) * i / count
 
     clock.steps = steps
-    loop.run_stage(scene, cfg, stage, *views, progress)
+    loop.run_stage(scene, cfg, stage, loop.TrainingPixels(*views), progress)
 
 
 def profile(scene: Scene, views: tuple, rays: int, count: int, divide: bool) -> dict:

@@ -9,10 +9,3 @@ html_title = "univoxel"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_copyright = False
-# Pages whose subjects are on their way into guide/ and explanation/
-exclude_patterns = [
-    f"{name}.md"
-    for name in (
-        *("architecture", "capacity", "data", "export", "fields", "lights", "relight", "trust"),
-    )
-]

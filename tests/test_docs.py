@@ -18,11 +18,7 @@ from univoxel.cli import _deferred
 from univoxel.commands import COMMANDS
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted(
-    page
-    for page in doc_blocks.pages(ROOT)
-    if page.relative_to(ROOT).as_posix() not in doc_prose.LEAVING
-)
+PAGES = sorted(doc_blocks.pages(ROOT))
 COMMAND = re.compile(r"^(?:    |)univoxel +([a-z].*)$", re.MULTILINE)
 
 

@@ -70,7 +70,7 @@ def test_a_checkpoint_gives_the_same_scene(tmp_path, light):
 
 def test_a_file_without_a_table_of_directions_is_one_from_before_there_were_any(tmp_path):
     scene = small_scene()
-    prune.drop_mirror_levels(scene, 0)
+    prune.drop_mirror_levels_(scene, 0)
     path = save_scene(scene, tmp_path, {})
     with safe_open(path, "pt") as file:
         meta = json.loads(file.metadata()["univoxel"])

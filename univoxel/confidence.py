@@ -1,7 +1,7 @@
 """What the photographs fix of a scene's materials, and what they leave open: maps and words.
 
-No truth is read: only the photographs that were trained on, and the scene. docs/trust.md explains
-the terms and says how well they foretell the true error.
+No truth is read: only the photographs that were trained on, and the scene.
+docs/explanation/trust.md explains the terms.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ POINTS = 20000  # on the surface, for maps
 FEW_POINTS = 2000  # on the surface, for words alone
 OBSERVATIONS = 8  # of a point that are rendered again, at most
 DIRECTIONS = 64  # that visibility is measured in where the scene has no map with its own
-ROUGHNESS_STEP = 0.05  # of roughness, in the difference that tells what it changes
+ROUGHNESS_STEP = 0.05  # of roughness, that the slope of the render is taken over
 ENOUGH = 3.0  # views straight from above that determine an albedo to a doubt of one half
 NOISE = 0.02  # sRGB; disagreement with the photographs that means a doubt of one half
 BLACK = 0.02  # sRGB; darker pixels are noise

@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
 
+from univoxel.compression.config import CompressionConfig
 from univoxel.errors import ConfigError, UserError
 from univoxel.fields.hashed import PER_LEVEL
 from univoxel.files import replacing
@@ -53,10 +54,11 @@ class TrainConfig:
     hollows: float = 0.0
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
-    capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see tasks/capacity.py
+    capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see compression/plan.py
     budget_mb: float | None = None  # 1e6 bytes that the model's file may have, > 0; adaptive only
     scene: SceneConfig = field(default_factory=SceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
+    compression: CompressionConfig = field(default_factory=CompressionConfig)
 
     def __post_init__(self):
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")

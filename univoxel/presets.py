@@ -74,7 +74,7 @@ def budget(
         light: "sg", local lobes as published; "hybrid", local lobes while geometry forms, then one
             environment map with traced visibility for the materials, then lobes that follow them;
             "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
-            traced visibility from the beginning. docs/lights.md tells them apart.
+            traced visibility from the beginning. docs/guide/lights.md tells them apart.
         varying: what differs from photograph to photograph: "none"; "exposure", a gain per channel;
             "light", the light itself too; "auto", exposure where they are seen to differ.
 

@@ -8,8 +8,10 @@ import torch
 from analytic import photos_of, sphere_scene, write_scene
 
 from univoxel.checkpoint import FILE, load_checkpoint, load_scene, save_scene
-from univoxel.compression import plan, prune, search
-from univoxel.compression.quality import smallest
+from univoxel.compression import plan, prune, search, sizes
+from univoxel.compression.config import CompressionConfig
+from univoxel.compression.quality import last_within_limit, reference_rays
+from univoxel.compression.storage import fit_budget_
 from univoxel.config import TrainConfig
 from univoxel.fields.dense import DenseField
 from univoxel.fields.hashed import FEWEST_ROWS, ROWS, HashField, Levels
@@ -18,19 +20,20 @@ from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.scene import Scene, SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.info import info
-from univoxel.tasks.train import look_at, train
+from univoxel.tasks.train import train
 from univoxel.training import loop
 from univoxel.training.config import StageConfig
 from univoxel.training.progress import Rehearsal
 
+CFG = CompressionConfig()
 LIGHT = SGConfig(lobes=4, hidden=16, directions=16, directions_eval=16)
 
 
 @pytest.fixture(scope="module")
-def looks():
+def reference():
     photos = photos_of(2, 24)
     pixels = torch.cartesian_prod(torch.arange(2), torch.arange(24), torch.arange(24))
-    return look_at(photos, pixels), look_at(photos, pixels[::2])
+    return reference_rays(photos, pixels), reference_rays(photos, pixels[::2])
 
 
 def feature_scene():
@@ -49,7 +52,7 @@ def feature_scene():
 
 
 @pytest.mark.parametrize("wanted", range(6))
-def test_the_smallest_that_costs_no_more_than_the_limit(wanted):
+def test_the_last_that_costs_no_more_than_the_limit(wanted):
     candidates = [9, 7, 5, 4, 2, 1]
     seen = []
 
@@ -57,53 +60,47 @@ def test_the_smallest_that_costs_no_more_than_the_limit(wanted):
         seen.append(x)
         return 0.01 if x >= candidates[wanted] else 0.03
 
-    assert smallest(candidates, cost, 0.02) == candidates[wanted]
+    assert last_within_limit(candidates, cost, 0.02) == candidates[wanted]
     assert 9 not in seen
     assert len(seen) <= 3
 
 
-def test_channels_that_nothing_reads_are_dropped(looks):
+def test_channels_that_nothing_reads_are_dropped(reference):
     scene = feature_scene()
-    look, lesson = looks
-    surface = look.meet(scene)
-    with torch.no_grad():  # photographs of this scene, with noise: every change is for the worse
-        drawn = look.decode(scene, surface, surface.features)["physical"]
+    held_out, calibration = reference
+    # photographs of this scene, with noise: every change is for the worse
+    drawn = held_out.decoded(scene).physical
     noise = 0.05 * torch.randn(drawn.shape, generator=torch.Generator().manual_seed(0))
-    look = dataclasses.replace(look, target=drawn + noise)
-    choice = search.fewer_channels(scene, look, lesson, 1e-4)
+    held_out = dataclasses.replace(held_out, target=drawn + noise)
+    criterion = search.Criterion(held_out, calibration, 1e-4, CFG)
+    choice = search.fewer_channels_(scene, criterion)
     assert (choice.before, choice.after) == (4, 2)
     assert scene.cfg.channels == 2
     assert scene.cfg.material_channels == 1
     assert choice.cost <= 1e-4
 
 
-@pytest.mark.parametrize("saving", [search.fewer_lobes, search.fewer_units])
-def test_what_is_saved_costs_no_more_than_the_limit(looks, saving):
+@pytest.mark.parametrize("saving", [search.fewer_lobes_, search.fewer_units_])
+def test_what_is_saved_costs_no_more_than_the_limit(reference, saving):
     """What the choice says is what is seen afterwards; and what would cost more is left."""
     scene = feature_scene()
-    look, _ = looks
-    surface = look.meet(scene)
-    with torch.no_grad():
-        before = look.decode(scene, surface, surface.features)
-    choice = saving(scene, *looks, 0.05)
-    with torch.no_grad():
-        after = look.decode(scene, surface, surface.features)
-    assert look.cost(before, after) == pytest.approx(choice.cost, abs=1e-4)
+    held_out, _ = reference
+    before = held_out.decoded(scene)
+    choice = saving(scene, search.Criterion(*reference, 0.05, CFG))
+    loss_db = held_out.loss_db(before, held_out.decoded(scene))
+    assert loss_db == pytest.approx(choice.cost, abs=1e-4)
     assert choice.cost <= 0.05
-    loose = saving(feature_scene(), *looks, 100.0)  # at any cost
+    loose = saving(feature_scene(), search.Criterion(*reference, 100.0, CFG))  # at any cost
     assert loose.after < choice.before
     assert loose.after <= choice.after
 
 
-def test_moved_materials_are_a_cost(looks):
-    look, _ = looks
-    scene = feature_scene()
-    surface = look.meet(scene)
-    with torch.no_grad():
-        before = look.decode(scene, surface, surface.features)
-    moved = before | {"material": before["material"] + 0.1}
-    assert look.cost(before, before) == 0
-    assert look.cost(before, moved) > 0.02
+def test_moved_materials_are_a_cost(reference):
+    held_out, _ = reference
+    before = held_out.decoded(feature_scene())
+    moved = before._replace(material=before.material + 0.1)
+    assert held_out.loss_db(before, before) == 0
+    assert held_out.loss_db(before, moved) > 0.02
 
 
 @pytest.mark.parametrize(
@@ -117,26 +114,34 @@ def test_moved_materials_are_a_cost(looks):
         ({364_500: 30.0, 40_500: 30.5, 4_500: 30.3, 13_500: 30.39}, 40_500),  # against the best
     ],
 )
-def test_a_grid_is_as_coarse_as_its_rehearsal_allows(quality, chosen):
+def test_a_grid_is_as_coarse_as_its_rehearsal_allows(quality, chosen, tmp_path, monkeypatch):
     scene = sphere_scene(0, voxel_size=0.1)
-    sizes = {plan.fit_grid(*scene.field.bounds(), n): n for n in quality}
+    box = scene.field.bounds()
+    counts = {plan.fit_grid(*box, n): n for n in quality}
 
-    def rehearse(tried):
+    stage = StageConfig(voxels=0.3645, iterations=40, share=1.0)
+    cfg = TrainConfig(tmp_path, tmp_path, (stage, stage), minutes=1.0)
+    pixels = loop.TrainingPixels(photos_of(2, 8), torch.zeros(1, 3), torch.zeros(1, 3))
+
+    def rehearse(cfg_, pixels_, tried, on_grid, steps):
+        assert (cfg_, pixels_, steps) == (cfg, pixels, 8)
+        assert on_grid == plan.on_grid(stage, box, tried.field.voxel_size)
         with torch.no_grad():
-            tried.material.net.linear[-1].bias[0] = sizes[tried.field.grid]
-        return quality[sizes[tried.field.grid]]
+            tried.material.net.linear[-1].bias[0] = counts[tried.field.grid]
+        return quality[counts[tried.field.grid]]
 
-    choice = plan.coarser_grid(scene, 364_500, scene.field.bounds(), rehearse)
-    assert choice.after == chosen
-    assert sizes[scene.field.grid] == chosen
+    monkeypatch.setattr(plan, "rehearsal", rehearse)
+    (choice,) = plan.choose_grid_(scene, cfg, stage, box, pixels, pace=1.0)
+    assert (choice.kind, choice.before, choice.after) == ("voxels", 364_500, chosen)
+    assert counts[scene.field.grid] == chosen
     assert scene.material.net.linear[-1].bias[0] == chosen  # it goes on from that rehearsal
     assert "364,500 30.00 dB" in choice.why
 
 
 def test_a_rehearsal_is_off_the_record():
     rehearsal = Rehearsal(4)
-    assert list(rehearsal.steps()) == [0, 0.25, 0.5, 0.75]
-    assert rehearsal.step == 4
+    assert list(rehearsal.clock.steps()) == [0, 0.25, 0.5, 0.75]
+    assert rehearsal.clock.step == 4
     assert not rehearsal.due()
     assert not rehearsal.checkpoint_due()
 
@@ -157,34 +162,36 @@ def test_no_grid_is_finer_than_the_photographs(tmp_path):
     cfg = TrainConfig(tmp_path, tmp_path, (grids[0], JointConfig(), grids[1]), minutes=1.0)
     box = torch.tensor([-0.5, -0.5, -1.0]), torch.tensor([0.5, 0.5, 1.0])
     for wide in (1.0, 2.0):
-        cut = plan.within_pixels(dataclasses.replace(cfg, voxel_pixels=wide), photos.cameras, box)
+        cut = plan.limited_to_pixels(
+            dataclasses.replace(cfg, voxel_pixels=wide), photos.cameras, box
+        )
         assert cut.stages[:2] == cfg.stages[:2]
-        grid = plan.fit_grid(*box, plan.voxels(cut.stages[2], []))
+        grid = plan.fit_grid(*box, plan.stage_voxels(cut.stages[2], []))
         assert grid.voxel_size == pytest.approx(wide * pixel, rel=1e-3)
-    cut = plan.within_pixels(dataclasses.replace(cfg, voxel_pixels=99.0), photos.cameras, box)
-    assert plan.voxels(cut.stages[2], []) == plan.FEWEST_VOXELS
+    cut = plan.limited_to_pixels(dataclasses.replace(cfg, voxel_pixels=99.0), photos.cameras, box)
+    assert plan.stage_voxels(cut.stages[2], []) == CFG.fewest_voxels
     free = dataclasses.replace(cfg, voxel_pixels=0.0)
-    assert plan.within_pixels(free, photos.cameras, box) == free
+    assert plan.limited_to_pixels(free, photos.cameras, box) == free
 
 
-def test_a_budget_is_kept_at_any_cost(looks, tmp_path):
-    look, _ = looks
+def test_a_budget_is_kept_at_any_cost(reference, tmp_path):
+    held_out, _ = reference
     scene = feature_scene()
     scene.field = scene.field.resized(plan.fit_grid(*scene.field.bounds(), 60_000))
     whole = save_scene(scene, tmp_path, {}, slim=True, reach=4.0).stat().st_size
-    assert plan.within(scene, look, 4.0, 2 * whole) == []
+    assert fit_budget_(scene, held_out, 4.0, 2 * whole, CFG) == []
     budget = 0.15 * whole
-    found = plan.within(scene, look, 4.0, budget)
-    assert [c.what for c in found] == ["reach", "voxels"]
-    assert found[0].cost > 0
-    file = save_scene(scene, tmp_path, {}, slim=True, reach=found[0].after)
+    choices = fit_budget_(scene, held_out, 4.0, budget, CFG)
+    assert [c.kind for c in choices] == ["reach", "voxels"]
+    assert choices[0].cost > 0
+    file = save_scene(scene, tmp_path, {}, slim=True, reach=choices[0].after)
     assert file.stat().st_size <= budget
 
 
 def test_a_budget_too_small_for_anything():
     with pytest.raises(ValueError, match=r"budget_mb: 0.001 is too small for anything: .* need 0"):
-        plan.check_budget(sphere_scene(16), 0.001)
-    plan.check_budget(sphere_scene(16), 1.0)
+        sizes.check_budget(sphere_scene(16), 0.001, CFG)
+    sizes.check_budget(sphere_scene(16), 1.0, CFG)
 
 
 @pytest.fixture(scope="module")
@@ -238,8 +245,8 @@ def test_the_log_tells_of_choices(run):
     ("megabytes", "levels"), [(None, 5), (40.0, 5), (1.0, 3), (0.3, 2), (0.02, 1)]
 )
 def test_a_budget_leaves_room_for_some_mirror_levels(megabytes, levels):
-    assert plan.mirror_levels(SceneConfig(), megabytes) == levels
-    assert plan.mirror_levels(SceneConfig(mirror_levels=1), megabytes) == 1
+    assert sizes.mirror_levels(SceneConfig(), megabytes, CFG) == levels
+    assert sizes.mirror_levels(SceneConfig(mirror_levels=1), megabytes, CFG) == 1
 
 
 def test_mirror_levels_that_draw_nothing_are_dropped():
@@ -251,34 +258,34 @@ def test_mirror_levels_that_draw_nothing_are_dropped():
         scene.radiance.net.linear[0].weight[:, -table.channels :] *= 10
     photos = photos_of(4, 24)
     pixels = torch.cartesian_prod(torch.arange(4), torch.arange(24), torch.arange(24))
-    look = look_at(photos, pixels)
-    with torch.no_grad():  # photographs that show what the coarse levels say
-        drawn = look.decode(scene, surface := look.meet(scene), surface.features)["radiance"]
-    look = dataclasses.replace(look, target=drawn + 0.01 * torch.randn_like(drawn))
-    choice = search.fewer_mirror_levels(scene, look, look)
+    rays = reference_rays(photos, pixels)
+    drawn = rays.decoded(scene).radiance  # photographs that show what the coarse levels say
+    rays = dataclasses.replace(rays, target=drawn + 0.01 * torch.randn_like(drawn))
+    criterion = search.Criterion(rays, rays, CFG.tolerance_db, CFG)
+    choice = search.fewer_mirror_levels_(scene, criterion)
     assert (choice.before, choice.after) == (5, 2)
     assert scene.cfg.mirror_levels == table.levels == 2
 
 
 def test_resume_goes_on_with_what_was_chosen(data, tmp_path, monkeypatch):
     cfg = config(data, tmp_path / "run")
-    original, sizes = task.run_stage, []
+    original, counts = task.run_stage, []
 
-    def killed(scene, cfg, stage, photos, pixels, held_out, progress):
+    def killed(scene, cfg, stage, pixels, progress):
         if not isinstance(progress, Rehearsal):
             if progress.clock.stage == 1:
                 raise KeyboardInterrupt
-            original(scene, cfg, stage, photos, pixels, held_out, progress)
+            original(scene, cfg, stage, pixels, progress)
         # A rehearsal: the third grid serves as well as the first
-        sizes.append(scene.field.grid.nodes_count)
+        counts.append(scene.field.grid.nodes_count)
 
     for module in (task, loop):  # stages, and their rehearsals
         monkeypatch.setattr(module, "run_stage", killed)
     monkeypatch.setattr(loop, "held_out_psnr", lambda *_, **__: 20.0)
     with pytest.raises(KeyboardInterrupt):
         train(cfg)
-    coarsest = sizes[-1]
-    assert coarsest < sizes[1]
+    coarsest = counts[-1]
+    assert coarsest < counts[1]
     with pytest.raises(ValueError, match="the run began with other capacity"):
         train(dataclasses.replace(cfg, capacity="fixed"), resume=True)
     seen = []
@@ -326,58 +333,56 @@ def hash_scene():
     return scene
 
 
-def test_rows_that_say_nothing_are_dropped(looks):
+def drop_rows_(scene, held_out, probes, limit_db=CFG.tolerance_db):
+    far = 4 * scene.field.voxel_size
+    return search.fewer_rows_(scene, held_out, probes, far, limit_db, CFG.dropped_row_shares)
+
+
+def test_rows_that_say_nothing_are_dropped(reference):
     scene = hash_scene()
-    field, look = scene.field, looks[0]
+    field, rays = scene.field, reference[0]
     far = 4 * field.voxel_size
     before = field.features.detach().clone()
-    with torch.no_grad():
-        surface = look.meet(scene)
-        drawn = look.decode(scene, surface, surface.features)
+    drawn = rays.decoded(scene)
     # photographs that show just that, but for noise of 70 dB: what is read is missed
-    look = dataclasses.replace(
-        look, target=drawn["radiance"] + 3e-4 * torch.randn_like(drawn["radiance"])
-    )
-    choice = search.fewer_rows(scene, look, [look] * 4, far)
+    noise = 3e-4 * torch.randn_like(drawn.radiance)
+    rays = dataclasses.replace(rays, target=drawn.radiance + noise)
+    choice = drop_rows_(scene, rays, [rays] * 4)
     there = (before.any(1) & field.rows_near(far)).view(4, -1)
     gone = there & ~field.features.detach().any(1).view(4, -1)
-    assert (choice.what, choice.before) == ("rows", there.sum())
+    assert (choice.kind, choice.before) == ("rows", there.sum())
     assert choice.before - choice.after == gone.sum()
     # Half of a level is behind the object, or beyond what rays sample, and of no use either
     assert gone[2:].sum() == 2 * gone[2].sum() > 0.4 * there[2:].sum()
     assert gone[:2].sum() < 0.6 * gone[2:].sum()
     assert choice.cost <= 0.02
-    with torch.no_grad():
-        surface = look.meet(scene)
-        after = look.decode(scene, surface, surface.features)
-    assert look.cost(drawn, after) == pytest.approx(choice.cost, abs=1e-6)
+    assert rays.loss_db(drawn, rays.decoded(scene)) == pytest.approx(choice.cost, abs=1e-6)
 
 
-def test_rows_that_no_probe_meets_stay(looks):
+def test_rows_that_no_probe_meets_stay(reference):
     scene = hash_scene()
     before = scene.field.features.detach().clone()
-    choice = search.fewer_rows(scene, looks[0], [], 4 * scene.field.voxel_size)
+    choice = drop_rows_(scene, reference[0], [])
     assert choice.before == choice.after > 0
     assert torch.equal(scene.field.features, before)
 
 
-def test_rows_whose_going_would_be_seen_stay(looks):
+def test_rows_whose_going_would_be_seen_stay(reference):
     scene = hash_scene()
     for owner, name in prune.heads(scene):  # all levels are read
         getattr(owner, name).linear[0].weight.data.normal_()
     before = scene.field.features.detach().clone()
-    far = 4 * scene.field.voxel_size
-    choice = search.fewer_rows(scene, looks[0], [looks[0]], far, limit=-1.0)
+    choice = drop_rows_(scene, reference[0], [reference[0]], limit_db=-1.0)
     assert (choice.cost, choice.before) == (0.0, choice.after)
     assert torch.equal(scene.field.features, before)
 
 
 def test_a_budget_decides_on_the_rows_of_a_hash_table():
     scene = SceneConfig()  # 16 channels: 8 levels
-    assert plan.table_rows(scene, None) == ROWS
-    assert plan.table_rows(scene, 100.0) == ROWS
-    assert plan.table_rows(scene, 1.0) == 2**12  # 8 levels of 8 bytes a row: half of 0.5 MB
-    assert plan.table_rows(scene, 1e-3) == FEWEST_ROWS
+    assert sizes.table_rows(scene, None, CFG) == ROWS
+    assert sizes.table_rows(scene, 100.0, CFG) == ROWS
+    assert sizes.table_rows(scene, 1.0, CFG) == 2**12  # 8 levels of 8 bytes a row: half of 0.5 MB
+    assert sizes.table_rows(scene, 1e-3, CFG) == FEWEST_ROWS
 
 
 def test_a_light_without_networks_is_adapted_too(data, tmp_path):

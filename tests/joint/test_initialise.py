@@ -36,7 +36,7 @@ def test_the_better_hypothesis_is_found_without_a_map(metallic):
     assert (error - error.mean()).abs().mean() < 0.5
 
 
-def test_without_observations_nothing_is_supposed():
+def test_without_observations_nothing_is_decided():
     scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3, views=1)
     before = scene.sky.log_radiance.detach().clone()
     decisions = no_metal(problem)
@@ -48,7 +48,7 @@ def test_without_observations_nothing_is_supposed():
     ("true", "begin", "wanted"),
     [(0.25, 0.6, 0.25), (0.7, 0.3, 0.7), (0.45, 0.45, 0.45)],
 )
-def test_the_roughness_that_explains_the_photographs_is_supposed(true, begin, wanted):
+def test_the_roughness_that_explains_the_photographs_is_chosen(true, begin, wanted):
     """From a wrong one the whole moves to a better; the right one stays, to the bit."""
     scene, problem = sphere_of((0.5, 0.3, 0.2), 0.0, true)
     with torch.no_grad():

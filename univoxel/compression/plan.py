@@ -1,4 +1,4 @@
-"""How much model a scene needs: what is chosen, when, and how large its file may be.
+"""What is chosen when, so that a model is no larger than its scene needs.
 
 No grid is finer than the photographs. Capacity that adapts chooses more: after the coarse stage,
 by rehearsals of the next, the voxels of a dense grid; after the first stage with light its
@@ -10,286 +10,189 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from univoxel.camera import Cameras
-from univoxel.checkpoint import SHELL, stored
+from univoxel.checkpoint import SHELL
 from univoxel.compression import search
-from univoxel.compression.quality import TOLERANCE, Choice, Look, smallest
+from univoxel.compression.choices import CapacityChoice, chosen_reach, chosen_voxels
+from univoxel.compression.quality import ReferenceRays, random_reference_rays, reference_rays
+from univoxel.compression.sizes import head_share, voxels_that_fit
+from univoxel.compression.storage import fit_budget_, shortest_reach
 from univoxel.config import TrainConfig
-from univoxel.errors import UserError
+from univoxel.data import Photos
 from univoxel.fields.dense import DenseField
-from univoxel.fields.hashed import FEWEST_ROWS, PER_LEVEL, ROWS
 from univoxel.grid import fit_grid
 from univoxel.lights import LocalSG
-from univoxel.networks import DirectionTable
-from univoxel.scene import Scene, SceneConfig
+from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
-
-REGAINED = 0.1  # dB that channels may cost where training goes on with what is left
-GRID_TOLERANCE = 0.1  # dB that a rehearsal on a coarser grid may fall short of the best so far
-STRIDE, STEP = 1 / 9, 1 / 3  # voxels of a grid over those of the next finer that is tried
-FEWEST_VOXELS = 16**3
-REHEARSAL = 0.05  # share of a stage's steps that a grid is tried for; of the chosen one they count
-FEWEST_STEPS = 8  # of a rehearsal: fewer tell nothing
-LESSON = 1024  # rays of the training photographs that heads settle on
-REACH_TOLERANCE = 0.05  # dB that nodes far from the surface may be worth and are not stored
-PROBE, PROBES = 4096, 8  # rays that tell what rows of a table are worth, and how often so many
-REACHES = (3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5, 1.25, 1.0)  # voxels
-ROW_BYTES = 4 + 2 * PER_LEVEL  # of a row of a hash table: its number, and features in halves
-MIRROR_SHARE = 0.1  # of a budget, that the table of mirrored directions may have
-HEADER, NAME = 8192, 64  # bytes of a model's file that hold no numbers, and of a view's name
+from univoxel.training.loop import TrainingPixels, rehearsal
 
 
-def coarser_grid(
-    scene: Scene,
-    most: int,
-    box: tuple[Tensor, Tensor],
-    rehearse: Callable[[Scene], float],
-) -> Choice:
-    """Bring the field to the coarsest grid that a rehearsal of the next stage draws as well with.
-
-    Tries grids with STRIDE of each other's voxels, all of them: rehearsals are too short to err
-    evenly, and coarse grids cost little. The coarsest that ends no more than GRID_TOLERANCE below
-    the best is taken, or one with STEP of its voxels, if that does too. Every rehearsal begins from
-    the scene as it is; the scene goes on from the one on its grid.
-
-    Args:
-        most: voxels of the finest grid.
-        box: corners [3], [3].
-        rehearse: trains a scene and returns the PSNR of its held-out rays.
-    """
-    scene.surface_moved()
-    found: dict[int, float] = {}
-    chosen, kept = most, scene
-
-    def enough(voxels: int) -> bool:
-        return found[voxels] >= max(found.values()) - GRID_TOLERANCE
-
-    def attempt(voxels: int) -> None:
-        nonlocal chosen, kept
-        tried = copy.deepcopy(scene)
-        tried.field = tried.field.resized(fit_grid(*box, voxels))
-        found[voxels] = rehearse(tried)
-        if enough(voxels):
-            chosen, kept = voxels, tried
-
-    strides = range(1 + int(math.log(max(most / FEWEST_VOXELS, 1), 1 / STRIDE)))
-    for k in strides:
-        attempt(round(most * STRIDE**k))
-    if (coarser := round(chosen * STEP)) >= FEWEST_VOXELS:
-        attempt(coarser)
-    copy_over(kept, scene)
-    why = "held-out rays after rehearsals: "
-    why += ", ".join(f"{v:,} {found[v]:.2f} dB" for v in sorted(found, reverse=True))
-    return Choice("voxels", most, chosen, max(found.values()) - found[chosen], why)
-
-
-def copy_over(source: Scene, target: Scene) -> None:
-    """Let target be what source is."""
-    target.field, target.inv_s = source.field, source.inv_s
-    target.load_state_dict(source.state_dict())
-    target.surface_moved()
-
-
-def shorter_reach(scene: Scene, look: Look, limit: float = REACH_TOLERANCE) -> Choice:
-    """How far from the surface a finished scene is stored, in voxels."""
-    with torch.no_grad():
-        before = look.decode(scene, surface := look.meet(scene), surface.features)
-    costs = {SHELL: 0.0}
-
-    def cost(reach: float) -> float:
-        costs[reach] = paid(scene, look, before, reach)
-        return costs[reach]
-
-    reach = smallest([SHELL, *REACHES], cost, limit)
-    nodes = scene.field.sdf.detach().abs() / scene.field.voxel_size
-    kept, all_kept = int((nodes < reach).sum()), int((nodes < SHELL).sum())
-    why = (
-        f"{kept:,} of {nodes.numel():,} nodes are stored instead of {all_kept:,}; "
-        f"costs {costs[reach]:.3f} dB"
-    )
-    return Choice("reach", SHELL, reach, costs[reach], why)
-
-
-@torch.no_grad()
-def paid(scene: Scene, look: Look, before: dict[str, Tensor], reach: float | None) -> float:
-    """dB that a scene loses against `before` when it is stored only so many voxels far; None: when
-    it is stored as it is."""
-    field = scene.field
-    sdf, features = field.sdf.data, field.features.data
-    far = math.inf if reach is None else reach * field.voxel_size
-    try:
-        read = field.rows_near(far).view(*features.shape[:-1], 1)
-        field.sdf.data = torch.where(sdf.abs() < far, sdf, SHELL * field.voxel_size * sdf.sign())
-        field.features.data = features * read
-        surface = look.meet(scene)
-        return look.cost(before, look.decode(scene, surface, surface.features))
-    finally:
-        field.sdf.data, field.features.data = sdf, features
-
-
-def adapt(
+def adapt_(
     scene: Scene,
     cfg: TrainConfig,
     index: int,
     box: tuple[Tensor, Tensor],
-    look: Look,
-    lesson: Callable[[int], Look],
-    rehearse: Callable[[Scene, StageConfig, int], float],
+    pixels: TrainingPixels,
     pace: float = 1.0,
-) -> list[Choice]:
-    """Fit what comes after stage `index` to the scene, in place; what was chosen, in order.
+) -> list[CapacityChoice]:
+    """Fit the sizes of a scene to what stage `index` left, and say in order what was chosen.
 
     Args:
         box: corners [3], [3] of the grid.
-        look: the held-out rays.
-        lesson: draws so many of those that are trained on.
-        rehearse: trains a scene in a stage's manner in so many steps and returns the PSNR of its
-            held-out rays.
         pace: share of its steps that time let the last stage make.
     """
-    found: list[Choice] = []
+    photos = scene.registered(pixels.photos)
+    held_out = reference_rays(photos, pixels.held_out)
     stage, after = cfg.stages[index], cfg.stages[index + 1 :]
-    follows = after[0] if after else None
-    if isinstance(follows, StageConfig) and not follows.refit:
-        most = limit = round(1e6 * follows.voxels)
-        steps = max(FEWEST_STEPS, round(REHEARSAL * pace * follows.iterations))
-        if cfg.budget_mb:
-            most = min(most, affordable(scene, 1e6 * cfg.budget_mb))
-
-        def rehearsed(tried: Scene) -> float:
-            return rehearse(tried, on_grid(follows, box, tried.field.voxel_size), steps)
-
-        room = f"the budget leaves room for {most:,}"
-        if scene.field.by_node:
-            choice = coarser_grid(scene, most, box, rehearsed)
-            if most < limit:
-                choice = replace(choice, before=limit, why=f"{room}; {choice.why}")
-            found.append(choice)
-        elif most < limit:
-            # Only then: a node is one number there, and a coarser grid costs more than it saves
-            found.append(Choice("voxels", limit, most, 0.0, room))
+    choices: list[CapacityChoice] = []
+    if after and isinstance(after[0], StageConfig) and not after[0].refit:
+        choices += choose_grid_(scene, cfg, after[0], box, pixels, pace)
     if isinstance(stage, StageConfig) and not stage.refit and stage.physical_from < 1:
-        tolerance, taught = REGAINED if after else TOLERANCE, lesson(LESSON)
-        if scene.field.by_node:
-            found.append(search.fewer_channels(scene, look, taught, tolerance))
-        if scene.cfg.mirror_levels:
-            found.append(search.fewer_mirror_levels(scene, look, taught))
-        if search.share_of_heads(scene) > search.WORTH:
-            if isinstance(scene.light, LocalSG):
-                found.append(search.fewer_lobes(scene, look, taught))
-            found.append(search.fewer_units(scene, look, taught))
+        constants = cfg.compression
+        calibration = random_reference_rays(photos, pixels.trained, constants.calibration_rays)
+        channels_limit_db = constants.regained_db if after else constants.tolerance_db
+        criterion = search.Criterion(held_out, calibration, constants.tolerance_db, constants)
+        choices += reduce_networks_(scene, criterion, channels_limit_db)
     if not after:
-        if isinstance(scene.field.distances, DenseField):
-            found.append(shorter_reach(scene, look))
-        if not scene.field.by_node:
-            far = (reach([c.noted() for c in found]) or SHELL) * scene.field.voxel_size
-            found.append(
-                search.fewer_rows(scene, look, (lesson(PROBE) for _ in range(PROBES)), far)
-            )
-        if cfg.budget_mb:
-            found += within(scene, look, reach([c.noted() for c in found]), 1e6 * cfg.budget_mb)
-    return found
+        choices += reduce_storage_(scene, cfg, held_out, photos, pixels.trained)
+    return choices
 
 
-def check_budget(scene: Scene, megabytes: float) -> None:
-    """Refuse a budget that the networks and the map as they are, and the coarsest grid with half of
-    its nodes near the surface, do not fit into.
+def choose_grid_(
+    scene: Scene,
+    cfg: TrainConfig,
+    stage: StageConfig,
+    box: tuple[Tensor, Tensor],
+    pixels: TrainingPixels,
+    pace: float,
+) -> list[CapacityChoice]:
+    """Bring a dense field to the grid of the coming stage, and say what was chosen.
 
-    Raises:
-        UserError: says how much is needed.
+    Of a hash field only the budget bounds the grid: a node is one number there, and a coarser grid
+    costs more than it saves.
     """
-    least = _apart_from_grid(scene) + FEWEST_VOXELS // 2 * _node_bytes(scene)
-    if 1e6 * megabytes < least:
-        raise UserError(
-            f"budget_mb: {megabytes:g} is too small for anything: networks, map and the coarsest "
-            f"grid need {least / 1e6:.2g}",
-            "budget_mb",
-        )
+    constants = cfg.compression
+    limit = most = round(1e6 * stage.voxels)
+    if cfg.budget_mb:
+        most = min(most, voxels_that_fit(scene, 1e6 * cfg.budget_mb, constants))
+    room = f"the budget leaves room for {most:,}"
+    if not scene.field.by_node:
+        return [CapacityChoice("voxels", limit, most, 0.0, room)] if most < limit else []
+    share = constants.rehearsal_share * pace
+    steps = max(constants.rehearsal_steps, round(share * stage.iterations))
+    choice = coarsest_grid_(scene, cfg, stage, box, pixels, most, steps)
+    if most < limit:
+        choice = replace(choice, before=limit, why=f"{room}; {choice.why}")
+    return [choice]
 
 
-def within(scene: Scene, look: Look, reach: float | None, budget: float) -> list[Choice]:
-    """Bring a finished scene into a file of `budget` bytes, whatever that costs: first less far
-    from the surface, then on a coarser grid.
+def coarsest_grid_(
+    scene: Scene,
+    cfg: TrainConfig,
+    stage: StageConfig,
+    box: tuple[Tensor, Tensor],
+    pixels: TrainingPixels,
+    most: int,
+    steps: int,
+) -> CapacityChoice:
+    """Bring the field to the coarsest grid that a rehearsal of a stage draws as well with.
+
+    Tries grids with `grid_stride` of each other's voxels, all of them: rehearsals are too short to
+    err evenly, and coarse grids cost little. The coarsest that ends no more than
+    `grid_tolerance_db` below the best is taken, or one with `grid_step` of its voxels, if that does
+    too. Every rehearsal begins from the scene as it is; the scene goes on from the one on its grid.
 
     Args:
-        reach: voxels from the surface that nodes are stored; None: bricks are, as they are.
+        box: corners [3], [3].
+        most: voxels of the finest grid.
+        steps: of a rehearsal.
     """
-
-    def size(reach: float | None) -> int:
-        tensors = stored(scene, slim=True, reach=reach).values()
-        names = NAME * len(scene.cfg.views)
-        return HEADER + names + sum(x.numel() * x.element_size() for x in tensors)
-
-    if size(reach) <= budget:
-        return []
-    with torch.no_grad():
-        before = look.decode(scene, surface := look.meet(scene), surface.features)
-    least = reach
-    if reach is not None:
-        shorter = [r for r in REACHES if r < reach]
-        least = next((r for r in shorter if size(r) <= budget), REACHES[-1])
-    nodes = count = scene.field.grid.nodes_count
-    while size(least) > budget and count > FEWEST_VOXELS:
-        count = round(0.8 * count)
-        scene.field = scene.field.resized(fit_grid(*scene.field.bounds(), count))
+    constants = cfg.compression
     scene.surface_moved()
-    cost, found = paid(scene, look, before, least), []
-    if reach is not None and least is not None:
-        found.append(Choice("reach", reach, least, cost, "for the budget"))
-    if count < nodes:
-        found.append(Choice("voxels", nodes, count, cost, "for the budget"))
-    return found
+    psnr: dict[int, float] = {}
+    chosen, rehearsed = most, scene
+
+    def rehearse(voxels: int) -> Scene:
+        copied = copy.deepcopy(scene)
+        copied.field = copied.field.resized(fit_grid(*box, voxels))
+        on_it = on_grid(stage, box, copied.field.voxel_size)
+        psnr[voxels] = rehearsal(cfg, pixels, copied, on_it, steps)
+        return copied
+
+    def good_enough(voxels: int) -> bool:
+        return psnr[voxels] >= max(psnr.values()) - constants.grid_tolerance_db
+
+    range_of_sizes = max(most / constants.fewest_voxels, 1)
+    for k in range(1 + int(math.log(range_of_sizes, 1 / constants.grid_stride))):
+        voxels = round(most * constants.grid_stride**k)
+        attempt = rehearse(voxels)
+        if good_enough(voxels):
+            chosen, rehearsed = voxels, attempt
+    if (voxels := round(chosen * constants.grid_step)) >= constants.fewest_voxels:
+        attempt = rehearse(voxels)
+        if good_enough(voxels):
+            chosen, rehearsed = voxels, attempt
+    become_(scene, rehearsed)
+    why = "held-out rays after rehearsals: "
+    why += ", ".join(f"{v:,} {psnr[v]:.2f} dB" for v in sorted(psnr, reverse=True))
+    return CapacityChoice("voxels", most, chosen, max(psnr.values()) - psnr[chosen], why)
 
 
-def affordable(scene: Scene, budget: float) -> int:
-    """Voxels of the finest grid on which the scene's surface fits into a file of `budget` bytes.
+def become_(scene: Scene, source: Scene) -> None:
+    """Give a scene the field, networks and light of another one."""
+    scene.field, scene.inv_s = source.field, source.inv_s
+    scene.load_state_dict(source.state_dict())
+    scene.surface_moved()
 
-    The nodes near a surface are as many as its area has squares of a voxel's side.
+
+def reduce_networks_(
+    scene: Scene, criterion: search.Criterion, channels_limit_db: float
+) -> list[CapacityChoice]:
+    """Drop channels, mirror levels, lobes and hidden units; say what was chosen."""
+    choices = []
+    if scene.field.by_node:
+        of_channels = replace(criterion, limit_db=channels_limit_db)
+        choices.append(search.fewer_channels_(scene, of_channels))
+    if scene.cfg.mirror_levels:
+        choices.append(search.fewer_mirror_levels_(scene, criterion))
+    if head_share(scene) > criterion.cfg.least_head_share:
+        if isinstance(scene.light, LocalSG):
+            choices.append(search.fewer_lobes_(scene, criterion))
+        choices.append(search.fewer_units_(scene, criterion))
+    return choices
+
+
+def reduce_storage_(
+    scene: Scene, cfg: TrainConfig, held_out: ReferenceRays, photos: Photos, pixels: Tensor
+) -> list[CapacityChoice]:
+    """Decide what the file of a finished scene leaves out, drop rows of its hash table, and bring
+    it into the budget; say what was chosen.
+
+    Args:
+        photos: with cameras as they are registered.
+        pixels: that were trained on [P, 3]; their rays probe rows.
     """
-    near = _node_bytes(scene) * search.nodes_near(scene)
-    room = max(budget - _apart_from_grid(scene), 0.0)
-    return max(FEWEST_VOXELS, int(scene.field.grid.nodes_count * (room / near) ** 1.5))
-
-
-def table_rows(scene: SceneConfig, budget_mb: float | None) -> int:
-    """Rows of a level's hash table: as many as half of the budget has room for, if there is one."""
-    if budget_mb is None:
-        return ROWS
-    room = 0.5e6 * budget_mb / (scene.channels // PER_LEVEL * ROW_BYTES)
-    return min(max(2 ** int(math.log2(max(room, 1.0))), FEWEST_ROWS), ROWS)
-
-
-def mirror_levels(scene: SceneConfig, budget_mb: float | None) -> int:
-    """Levels of the table of mirrored directions: as many as a share of the budget has room for."""
-    if budget_mb is None:
-        return scene.mirror_levels
-    levels = range(scene.mirror_levels + 1)
-    return max(n for n in levels if _direction_bytes(n) <= MIRROR_SHARE * 1e6 * budget_mb)
-
-
-def _direction_bytes(levels: int) -> int:
-    return ROW_BYTES * sum(DirectionTable.rows_used(k) for k in range(levels))
-
-
-def _node_bytes(scene: Scene) -> int:
-    """Of a node near the surface: number of its row and distance, in halves; and, where features
-    are of nodes, its number again and features."""
-    features = 4 + 2 * scene.cfg.channels if scene.field.by_node else 0
-    return 4 + 2 + features
-
-
-def _apart_from_grid(scene: Scene) -> int:
-    rest = (x for name, x in scene.state_dict().items() if not name.startswith(search.TABLES))
-    names = NAME * len(scene.cfg.views)
-    rows = 0 if scene.field.by_node else len(scene.field.features)
-    rows_bytes = ROW_BYTES * rows + _direction_bytes(scene.cfg.mirror_levels)
-    return HEADER + names + rows_bytes + sum(x.numel() * x.element_size() for x in rest)
+    constants = cfg.compression
+    choices = []
+    if isinstance(scene.field.distances, DenseField):
+        choices.append(shortest_reach(scene, held_out, constants))
+    if not scene.field.by_node:
+        far = (chosen_reach(choices) or SHELL) * scene.field.voxel_size
+        probes = (  # drawn one by one: each is dropped before the next is
+            random_reference_rays(photos, pixels, constants.row_probe_rays)
+            for _ in range(constants.row_probes)
+        )
+        limit_db, shares = constants.tolerance_db, constants.dropped_row_shares
+        choices.append(search.fewer_rows_(scene, held_out, probes, far, limit_db, shares))
+    if cfg.budget_mb:
+        reach = chosen_reach(choices)
+        choices += fit_budget_(scene, held_out, reach, 1e6 * cfg.budget_mb, constants)
+    return choices
 
 
 def on_grid(stage: StageConfig, box: tuple[Tensor, Tensor], voxel_size: float) -> StageConfig:
@@ -298,21 +201,23 @@ def on_grid(stage: StageConfig, box: tuple[Tensor, Tensor], voxel_size: float) -
     Edges stay as sharp in the world as on the finest grid: what a coarse grid cannot say is bends
     of the surface, not the place of an edge.
     """
-    own = fit_grid(*box, round(1e6 * stage.voxels)).voxel_size
-    begin, end = (s * min(own / voxel_size, 1.0) for s in stage.sharpness)
+    own_size = fit_grid(*box, round(1e6 * stage.voxels)).voxel_size
+    begin, end = (s * min(own_size / voxel_size, 1.0) for s in stage.sharpness)
     return replace(stage, sharpness=(begin, end))
 
 
-def within_pixels(cfg: TrainConfig, cameras: Cameras, box: tuple[Tensor, Tensor]) -> TrainConfig:
+def limited_to_pixels(
+    cfg: TrainConfig, cameras: Cameras, box: tuple[Tensor, Tensor]
+) -> TrainConfig:
     """The same with no grid finer than the photographs are: voxels of cfg.voxel_pixels pixels or
     more, as half of the cameras see them at the middle of the box."""
     if not cfg.voxel_pixels:
         return cfg
     lower, upper = box
-    away = (cameras.camera_to_world[:, :, 3] - (lower + upper) / 2).norm(dim=1)
-    pixel = float((away / cameras.focal.mean(1)).median())
+    distance = (cameras.camera_to_world[:, :, 3] - (lower + upper) / 2).norm(dim=1)
+    pixel = float((distance / cameras.focal.mean(1)).median())
     most = float((upper - lower).prod()) / (cfg.voxel_pixels * pixel) ** 3
-    most = max(most, FEWEST_VOXELS) / 1e6
+    most = max(most, cfg.compression.fewest_voxels) / 1e6
     stages = (
         replace(s, voxels=min(s.voxels, most)) if isinstance(s, StageConfig) else s
         for s in cfg.stages
@@ -320,18 +225,13 @@ def within_pixels(cfg: TrainConfig, cameras: Cameras, box: tuple[Tensor, Tensor]
     return replace(cfg, stages=tuple(stages))
 
 
-def voxels(stage: StageConfig, chosen: list[dict]) -> int:
-    """Of a stage's grid: its own, or fewer where that was chosen."""
-    fewer = [round(c["after"]) for c in chosen if c["what"] == "voxels"]
-    return min([round(1e6 * stage.voxels), *fewer])
+def stage_voxels(stage: StageConfig, choices: Iterable[CapacityChoice]) -> int:
+    """Voxels of a stage's grid: its own, or fewer where that was chosen."""
+    own = round(1e6 * stage.voxels)
+    chosen = chosen_voxels(choices)
+    return own if chosen is None else min(own, chosen)
 
 
-def rehearsed(scene: Scene, choices: list[Choice]) -> bool:
-    """Whether the coming stage has made its first steps in a rehearsal."""
-    return scene.field.by_node and any(c.what == "voxels" for c in choices)
-
-
-def reach(chosen: list[dict]) -> float | None:
-    """What `shorter_reach` chose, if it did."""
-    found = [c["after"] for c in chosen if c["what"] == "reach"]
-    return found[-1] if found else None
+def begun_in_rehearsal(scene: Scene, choices: Iterable[CapacityChoice]) -> bool:
+    """Whether the coming stage has made its first steps in a rehearsal, as choices tell."""
+    return scene.field.by_node and chosen_voxels(choices) is not None

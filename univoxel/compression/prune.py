@@ -1,7 +1,7 @@
-"""A trained scene with fewer channels, lobes and hidden units, which says nearly the same.
+"""Surgery on a trained scene: fewer channels, lobes, mirror levels and hidden units.
 
 Everything here replaces networks and parameters by new ones and leaves the old as they were, so
-that `parts_of` and `put_back` undo a trial.
+that `snapshot` and `restore_` undo a trial.
 """
 
 from __future__ import annotations
@@ -21,17 +21,15 @@ from univoxel.lights import LocalMLP, LocalSG, LocalSH
 from univoxel.networks import MLP
 from univoxel.scene import Scene
 
-RIDGE = 1e-4  # of the mean square: what a fit of what is dropped by what is kept is damped by
-
 
 @dataclass(frozen=True)
-class Parts:
-    """What this module replaces: (owner, attribute, what it was)."""
+class Snapshot:
+    """The networks, features and sizes of a scene at one time."""
 
-    held: tuple[tuple[Any, str, Any], ...]
+    entries: tuple[tuple[Any, str, Any], ...]  # owner, attribute, value
 
 
-def parts_of(scene: Scene) -> Parts:
+def snapshot(scene: Scene) -> Snapshot:
     """The present networks, features and sizes of a scene."""
     names = [
         (scene, ("cfg",)),
@@ -44,26 +42,34 @@ def parts_of(scene: Scene) -> Parts:
         names.append((scene.light, ("head", "base", "config")))
     if scene.mirrored:
         names.append((scene.mirrored, ("net",)))
-    return Parts(tuple((o, n, getattr(o, n)) for o, some in names for n in some))
+    return Snapshot(
+        tuple((owner, name, getattr(owner, name)) for owner, group in names for name in group)
+    )
 
 
-def put_back(parts: Parts) -> None:
-    """Undo what was done to the scene since `parts_of`."""
-    for owner, name, value in parts.held:
+def restore_(before: Snapshot) -> None:
+    """Give the scene of a snapshot the networks, features and sizes that it had then."""
+    for owner, name, value in before.entries:
         setattr(owner, name, value)
+
+
+def replaced_networks(before: Snapshot) -> list[nn.Module]:
+    """The networks that the scene of a snapshot has now and did not have then."""
+    present = ((getattr(owner, name), value) for owner, name, value in before.entries)
+    return [now for now, then in present if now is not then and isinstance(now, nn.Module)]
 
 
 def heads(scene: Scene) -> list[tuple[Any, str]]:
     """Owner and attribute of every network that reads features."""
-    found: list[tuple[Any, str]] = [(scene.material, "net"), (scene.radiance, "net")]
+    places: list[tuple[Any, str]] = [(scene.material, "net"), (scene.radiance, "net")]
     if isinstance(scene.light, LocalSG | LocalSH | LocalMLP):
-        found.append((scene.light, "head"))
+        places.append((scene.light, "head"))
     if scene.mirrored:
-        found.append((scene.mirrored, "net"))
-    return found
+        places.append((scene.mirrored, "net"))
+    return places
 
 
-def rotate(scene: Scene, basis: Tensor) -> None:
+def rotate_(scene: Scene, basis: Tensor) -> None:
     """Change the features to features @ basis and every first layer such that nothing changes.
 
     Args:
@@ -82,7 +88,7 @@ def rotate(scene: Scene, basis: Tensor) -> None:
     scene.field.features = nn.Parameter(features @ basis.to(features))
 
 
-def drop_channels(scene: Scene, keep: Tensor, mean: Tensor) -> None:
+def drop_channels_(scene: Scene, keep: Tensor, mean: Tensor) -> None:
     """Keep some of the feature channels; of the others the heads see the mean from now on.
 
     Args:
@@ -90,12 +96,12 @@ def drop_channels(scene: Scene, keep: Tensor, mean: Tensor) -> None:
         mean: [C] of the channels over the surface.
     """
     channels, of_material = scene.cfg.channels, scene.material.channels
-    gone = torch.ones(channels, dtype=torch.bool)
-    gone[keep] = False
+    dropped = torch.ones(channels, dtype=torch.bool)
+    dropped[keep] = False
     for owner, name in heads(scene):
         weights, biases = _layers(getattr(owner, name))
         n = of_material if owner is scene.material else channels
-        first, out = weights[0], gone[:n]
+        first, out = weights[0], dropped[:n]
         biases[0] = biases[0] + first[:, :n][:, out] @ mean[:n][out]
         weights[0] = torch.cat([first[:, :n][:, ~out], first[:, n:]], 1)
         setattr(owner, name, _network(weights, biases))
@@ -104,7 +110,7 @@ def drop_channels(scene: Scene, keep: Tensor, mean: Tensor) -> None:
     scene.field.keep_channels(keep)
 
 
-def drop_lobes(scene: Scene, keep: Tensor) -> None:
+def drop_lobes_(scene: Scene, keep: Tensor) -> None:
     """Keep the lobes [K] of a light of spherical Gaussians; the others go dark."""
     light = scene.light
     assert isinstance(light, LocalSG)
@@ -117,29 +123,30 @@ def drop_lobes(scene: Scene, keep: Tensor) -> None:
     scene.cfg = replace(scene.cfg, light=light.config)
 
 
-def drop_mirror_levels(scene: Scene, levels: int) -> None:
+def drop_mirror_levels_(scene: Scene, levels: int) -> None:
     """Keep the coarsest levels of the table of mirrored directions; of the others the networks that
     read it see 0 from now on."""
     table = scene.radiance.directions
-    gone = table.channels - table.per_level * levels
+    dropped = table.channels - table.per_level * levels
     for owner in (scene.radiance, scene.mirrored):
         if owner is not None:
             weights, biases = _layers(owner.net)
-            weights[0] = weights[0][:, : weights[0].shape[1] - gone]
+            weights[0] = weights[0][:, : weights[0].shape[1] - dropped]
             owner.net = _network(weights, biases)
     table.table = nn.Parameter(table.table.data[: levels * table.rows].clone())
     scene.cfg = replace(scene.cfg, mirror_levels=levels)
 
 
-def narrow(net: MLP, x: Tensor, width: int) -> MLP:
+def narrowed(net: MLP, x: Tensor, width: int, ridge: float) -> MLP:
     """The network with at most `width` units in every hidden layer.
 
-    Units are kept in the order of what the kept ones cannot say of them, weighted by what the next
-    layer makes of it (QR with column pivoting); the next layer takes from the kept ones what it had
-    from the others, as far as a least-squares fit over x can tell.
+    Units are kept in the order of QR with column pivoting: next comes the one of which the kept
+    ones explain least, weighted by the next layer. The next layer takes from the kept ones what it
+    had from the others, by a least-squares fit over x.
 
     Args:
-        x: [N, sizes[0]] what the network reads.
+        x: [N, sizes[0]] inputs of the network.
+        ridge: damping of the fit, over the mean square of the kept units, > 0.
     """
     weights, biases = _layers(net)
     h = x
@@ -154,45 +161,47 @@ def narrow(net: MLP, x: Tensor, width: int) -> MLP:
         keep = torch.from_numpy(order[:width].copy()).long().sort().values
         kept = centred[:, keep].double()
         gram = kept.T @ kept
-        gram.diagonal().add_(RIDGE * gram.diagonal().mean().clamp_min(1e-12))
-        # What is kept stands for itself; of the others the fit
-        said = torch.linalg.solve(gram, kept.T @ centred.double()).float()  # [K, H]
-        said[:, keep] = torch.eye(width)
+        gram.diagonal().add_(ridge * gram.diagonal().mean().clamp_min(1e-12))
+        # Kept units stand for themselves, the fit for the others
+        fit = torch.linalg.solve(gram, kept.T @ centred.double()).float()  # [K, H]
+        fit[:, keep] = torch.eye(width)
         weights[i], biases[i] = weights[i][keep], biases[i][keep]
-        biases[i + 1] = biases[i + 1] + weights[i + 1] @ (mean - mean[keep] @ said)
-        weights[i + 1] = weights[i + 1] @ said.T
+        biases[i + 1] = biases[i + 1] + weights[i + 1] @ (mean - mean[keep] @ fit)
+        weights[i + 1] = weights[i + 1] @ fit.T
         h = h[:, keep]
     return _network(weights, biases)
 
 
 @contextmanager
-def reads(scene: Scene) -> Iterator[dict[str, Tensor]]:
-    """What each head reads in this block, by the name of its owner's class."""
-    read: dict[str, Tensor] = {}
+def recorded_inputs(scene: Scene) -> Iterator[dict[str, Tensor]]:
+    """Inputs [N, inputs] of each head as run last in this block, by its owner's class name."""
+    inputs: dict[str, Tensor] = {}
 
     def note(name: str, _: nn.Module, x: tuple[Tensor]) -> None:
-        read[name] = x[0]
+        inputs[name] = x[0]
 
     hooks = [
         getattr(owner, name).register_forward_pre_hook(partial(note, type(owner).__name__))
         for owner, name in heads(scene)
     ]
     try:
-        yield read
+        yield inputs
     finally:
         for hook in hooks:
             hook.remove()
 
 
-def drop_units(scene: Scene, width: int, read: dict[str, Tensor]) -> None:
-    """At most `width` units in the hidden layers of every head.
+def drop_units_(scene: Scene, width: int, inputs: dict[str, Tensor], ridge: float) -> None:
+    """Keep at most `width` units in the hidden layers of every head.
 
     Args:
-        read: what each head reads, [N, inputs], by the name of its owner's class; see `reads`.
+        inputs: of each head, as `recorded_inputs` gives them.
+        ridge: see `narrowed`.
     """
     for owner, name in heads(scene):
         if not isinstance(owner, LocalMLP):  # its two networks share their width
-            setattr(owner, name, narrow(getattr(owner, name), read[type(owner).__name__], width))
+            x = inputs[type(owner).__name__]
+            setattr(owner, name, narrowed(getattr(owner, name), x, width, ridge))
     cfg, light = scene.cfg, scene.light
     if isinstance(light, LocalSG):
         light.config = replace(light.config, hidden=min(width, light.config.hidden))

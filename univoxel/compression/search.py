@@ -4,84 +4,111 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from univoxel.checkpoint import SHELL
 from univoxel.compression import prune
-from univoxel.compression.quality import TOLERANCE, Choice, Look, smallest
+from univoxel.compression.choices import CapacityChoice, Kind
+from univoxel.compression.config import CompressionConfig
+from univoxel.compression.quality import Decoded, ReferenceRays, last_within_limit
+from univoxel.compression.sizes import head_share
 from univoxel.lights import LocalSG
 from univoxel.records import Surface
 from univoxel.render.pipeline import surface_at
 from univoxel.scene import Scene
 
-SHARES = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2, 3 / 8, 1 / 4, 1 / 8)  # that are tried, of what there is
-WORTH = 0.1  # share of the parameters from which on it is worth the time to make heads smaller
-SETTLE_STEPS, SETTLE_RATE = 20, 1e-3  # of Adam, for heads of which something was taken
-TABLES = ("field.", "radiance.directions.")  # names of parameters that begin so are no head's
-PROBES = 8  # random mixtures of the outputs whose gradients tell what they depend on
-# Of the rows of a table, that may go
-DROPPED = (0, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 11 / 16, 3 / 4, 13 / 16, 7 / 8, 29 / 32, 15 / 16)
+
+@dataclass(frozen=True)
+class Criterion:
+    """What decides how small the networks of a scene may be."""
+
+    held_out: ReferenceRays  # they judge
+    calibration: ReferenceRays  # of the training photographs: smaller networks settle on them
+    limit_db: float  # that one kind of saving may cost
+    cfg: CompressionConfig
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What a scene gave along rays before it was made smaller."""
+
+    rays: ReferenceRays
+    surface: Surface
+    decoded: Decoded
+
+    @staticmethod
+    def of(scene: Scene, rays: ReferenceRays) -> Baseline:
+        surface = rays.surface(scene)
+        with torch.no_grad():
+            return Baseline(rays, surface, rays.decode(scene, surface, surface.features))
+
+    def decode(self, scene: Scene, channels: Tensor | None) -> Decoded:
+        """What the smaller scene's networks make of the same features.
+
+        Args:
+            channels: those that it has left [K]; None: all.
+        """
+        features = self.surface.features
+        if channels is not None:
+            features = features[:, channels]
+        return self.rays.decode(scene, self.surface, features)
+
+    @torch.no_grad()
+    def loss_db(self, scene: Scene, channels: Tensor | None = None) -> float:
+        """Quality that the smaller scene has lost."""
+        return self.rays.loss_db(self.decoded, self.decode(scene, channels))
 
 
 @contextmanager
 def trial(scene: Scene) -> Iterator[None]:
-    """A block whose changes by `shrink` are undone after it."""
-    parts = prune.parts_of(scene)
+    """A block whose changes by `prune` are undone after it."""
+    before = prune.snapshot(scene)
     try:
         yield
     finally:
-        prune.put_back(parts)
+        prune.restore_(before)
 
 
-def fewer_lobes(scene: Scene, look: Look, lesson: Look, limit: float = TOLERANCE) -> Choice:
+def fewer_lobes_(scene: Scene, criterion: Criterion) -> CapacityChoice:
     """Drop lobes of a spherical-Gaussian light, those whose going alone costs least first."""
     assert isinstance(scene.light, LocalSG)
     count = scene.light.config.lobes
-    surface = look.meet(scene)
-    with torch.no_grad():
-        before = look.decode(scene, surface, surface.features)
-        costs = []
-        for gone in range(count if count > 1 else 0):
-            with trial(scene):
-                prune.drop_lobes(scene, torch.tensor([k for k in range(count) if k != gone]))
-                costs.append(look.cost(before, look.decode(scene, surface, surface.features)))
-    order = torch.tensor(costs).argsort(descending=True)
+    baseline = Baseline.of(scene, criterion.held_out)
+    losses = []
+    for lobe in range(count if count > 1 else 0):
+        with trial(scene), torch.no_grad():
+            prune.drop_lobes_(scene, torch.tensor([k for k in range(count) if k != lobe]))
+            losses.append(baseline.loss_db(scene))
+    order = torch.tensor(losses).argsort(descending=True)
 
-    def reduce(kept: int) -> None:
-        prune.drop_lobes(scene, order[:kept].sort().values)
+    def reduce_(kept: int) -> None:
+        prune.drop_lobes_(scene, order[:kept].sort().values)
 
-    return _spare("lobes", scene, look, lesson, shares(count), reduce, limit)
+    return _reduce_(scene, "lobes", sizes_to_try(count, criterion.cfg), reduce_, criterion)
 
 
-def channel_basis(scene: Scene, look: Look) -> tuple[Tensor, Tensor]:
+def channel_basis(scene: Scene, rays: ReferenceRays, probes: int) -> tuple[Tensor, Tensor]:
     """A basis [C, C] of the features whose channels matter in turn, and how much each does [C].
 
     What matters is a channel's variance over the surface times the squared gradient of everything
     that is decoded: within the material channels, and within the others, the eigenvectors of one
     in the metric of the other. Every new channel has the group's mean scale, that the optimiser's
     rates fit.
+
+    Args:
+        probes: random mixtures of the outputs whose gradients are averaged.
     """
-    surface = look.meet(scene)
-    features = surface.features.clone().requires_grad_()
-    outputs = look.decode(scene, surface, features)
-    gram = torch.zeros(features.shape[1], features.shape[1], dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(PROBES):
-        mixed = [
-            (x * (torch.randint(0, 2, x.shape, generator=generator) * 2 - 1)).sum()
-            for x in outputs.values()
-        ]
-        (slope,) = torch.autograd.grad(torch.stack(mixed).sum(), features, retain_graph=True)
-        gram += slope.double().T @ slope.double() / (PROBES * len(slope))
+    surface = rays.surface(scene)
+    gram = _mean_squared_gradient(scene, rays, surface, probes)
     weight = surface.opacity.double()[:, None] / surface.opacity.sum().clamp_min(1e-6)
     centred = surface.features.double() - mean_features(surface)
-    cov = centred.T @ (weight * centred)
+    covariance = centred.T @ (weight * centred)
     m, c = scene.material.channels, scene.cfg.channels
     basis, worth = torch.zeros(c, c, dtype=torch.float64), torch.zeros(c, dtype=torch.float64)
     for part in (slice(0, m), slice(m, c)):
-        g, v = gram[part, part], cov[part, part]
+        g, v = gram[part, part], covariance[part, part]
         if not len(g):
             continue
         floor = 1e-4 * g.diagonal().mean().clamp_min(1e-20)
@@ -96,204 +123,200 @@ def channel_basis(scene: Scene, look: Look) -> tuple[Tensor, Tensor]:
     return basis, worth
 
 
+def _mean_squared_gradient(
+    scene: Scene, rays: ReferenceRays, surface: Surface, probes: int
+) -> Tensor:
+    """E[J^T J] [C, C], float64, of the gradient J of everything that is decoded from features."""
+    features = surface.features.clone().requires_grad_()
+    outputs = rays.decode(scene, surface, features)
+    gram = torch.zeros(features.shape[1], features.shape[1], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(probes):
+        mixed = [
+            (x * (torch.randint(0, 2, x.shape, generator=generator) * 2 - 1)).sum() for x in outputs
+        ]
+        (slope,) = torch.autograd.grad(torch.stack(mixed).sum(), features, retain_graph=True)
+        gram += slope.double().T @ slope.double() / (probes * len(slope))
+    return gram
+
+
 def mean_features(surface: Surface) -> Tensor:
     """Mean [C] of the features, weighted by opacity."""
     weight = surface.opacity / surface.opacity.sum().clamp_min(1e-6)
     return weight @ surface.features
 
 
-def fewer_channels(scene: Scene, look: Look, lesson: Look, limit: float) -> Choice:
+def fewer_channels_(scene: Scene, criterion: Criterion) -> CapacityChoice:
     """Turn the features to their principal channels and drop those that matter least."""
-    basis, worth = channel_basis(scene, look)
-    prune.rotate(scene, basis.float())
-    surface = look.meet(scene)
-    mean = mean_features(surface)
+    basis, worth = channel_basis(scene, criterion.held_out, criterion.cfg.channel_probes)
+    prune.rotate_(scene, basis.float())
+    mean = mean_features(criterion.held_out.surface(scene))
     worth[0] = torch.inf  # materials keep at least one
     order = worth.argsort(descending=True)
 
-    def reduce(kept: int) -> Tensor:
+    def reduce_(kept: int) -> Tensor:
         keep = order[:kept].sort().values
-        prune.drop_channels(scene, keep, mean)
+        prune.drop_channels_(scene, keep, mean)
         return keep
 
-    return _spare("channels", scene, look, lesson, shares(scene.cfg.channels), reduce, limit)
+    sizes = sizes_to_try(scene.cfg.channels, criterion.cfg)
+    return _reduce_(scene, "channels", sizes, reduce_, criterion)
 
 
-def fewer_rows(
-    scene: Scene, look: Look, probes: Iterable[Look], far: float, limit: float = TOLERANCE
-) -> Choice:
-    """Let rows of a hash table be 0, which a file does not hold: those first that say least.
+def fewer_mirror_levels_(scene: Scene, criterion: Criterion) -> CapacityChoice:
+    """Drop the finest levels of the table of mirrored directions."""
 
-    What a row says is, to first order, its features times the gradient of everything that is
+    def reduce_(levels: int) -> None:
+        prune.drop_mirror_levels_(scene, levels)
+
+    sizes = range(scene.cfg.mirror_levels, -1, -1)
+    return _reduce_(scene, "mirror levels", sizes, reduce_, criterion)
+
+
+def fewer_units_(scene: Scene, criterion: Criterion) -> CapacityChoice:
+    """Narrow the hidden layers of all heads."""
+    with prune.recorded_inputs(scene) as inputs:
+        criterion.calibration.decoded(scene)
+
+    def reduce_(units: int) -> None:
+        prune.drop_units_(scene, units, inputs, criterion.cfg.ridge)
+
+    sizes = sizes_to_try(scene.cfg.hidden, criterion.cfg)
+    return _reduce_(scene, "hidden units", sizes, reduce_, criterion)
+
+
+def fewer_rows_(
+    scene: Scene,
+    held_out: ReferenceRays,
+    probes: Iterable[ReferenceRays],
+    far: float,
+    limit_db: float,
+    shares: Sequence[float],
+) -> CapacityChoice:
+    """Set the rows of a hash table to 0, which a file does not hold, that matter least.
+
+    A row matters, to first order, by its features times the gradient of everything that is
     decoded. Rows that no probe meets are not judged, and stay.
 
     Args:
-        probes: rays of the training photographs, some at a time.
+        probes: rays of the training photographs, a batch at a time.
         far: world units from the surface, beyond which rows are not looked at.
+        shares: of the rows that are dropped on trial, from 0 rising.
 
     Source: as LeCun et al. 1990, "Optimal Brain Damage", with squared gradients for the Hessian.
     """
     features = scene.field.features
-    before_them = features.detach().clone()
-    there = before_them.any(1) & scene.field.rows_near(far)
-    squared = torch.zeros_like(before_them)
-    met = torch.zeros_like(there)
+    whole = features.detach().clone()
+    stored_rows = whole.any(1) & scene.field.rows_near(far)
+    squared = torch.zeros_like(whole)
+    judged = torch.zeros_like(stored_rows)
     for probe in probes:
-        rows, slope = _slopes(scene, probe)
+        rows, slope = _row_gradients(scene, probe)
         squared[rows] += slope.square()
-        met[rows] = True
-    said = (squared * before_them.square()).sum(1)
-    order = (there & met).nonzero()[:, 0]
-    order = order[said[order].argsort()]
-    with torch.no_grad():
-        before = look.decode(scene, surface := look.meet(scene), surface.features)
-    paid = {0.0: 0.0}
+        judged[rows] = True
+    worth = (squared * whole.square()).sum(1)
+    order = (stored_rows & judged).nonzero()[:, 0]
+    order = order[worth[order].argsort()]
+    before = held_out.decoded(scene)
+    losses = {0.0: 0.0}
 
     @torch.no_grad()
-    def drop(share: float) -> None:
-        features.copy_(before_them)
+    def drop_(share: float) -> None:
+        features.copy_(whole)
         features[order[: round(share * len(order))]] = 0
 
-    def cost(share: float) -> float:
-        drop(share)
-        with torch.no_grad():
-            surface = look.meet(scene)
-            paid[share] = look.cost(before, look.decode(scene, surface, surface.features))
-        return paid[share]
+    def loss_db(share: float) -> float:
+        drop_(share)
+        losses[share] = held_out.loss_db(before, held_out.decoded(scene))
+        return losses[share]
 
-    share = smallest(DROPPED, cost, limit)
-    drop(share)
-    count = int(there.sum())
-    kept, why = count - round(share * len(order)), f"costs {paid[share]:.3f} dB"
-    return Choice("rows", count, kept, paid[share], why)
+    share = last_within_limit(shares, loss_db, limit_db)
+    drop_(share)
+    count = int(stored_rows.sum())
+    kept, why = count - round(share * len(order)), f"costs {losses[share]:.3f} dB"
+    return CapacityChoice("rows", count, kept, losses[share], why)
 
 
-def _slopes(scene: Scene, probe: Look) -> tuple[Tensor, Tensor]:
+def _row_gradients(scene: Scene, probe: ReferenceRays) -> tuple[Tensor, Tensor]:
     """Rows [K] of the features that rays read, and the gradient [K, F] of a random mixture of
     everything that is decoded; its square is on average the sum of all outputs' squares."""
     surface = surface_at(scene, probe.rays)
     outputs = probe.decode(scene, surface, surface.features)
-    mixed = [(x * (torch.randint_like(x, 2) * 2 - 1)).sum() for x in outputs.values()]
+    mixed = [(x * (torch.randint_like(x, 2) * 2 - 1)).sum() for x in outputs]
     (slope,) = torch.autograd.grad(torch.stack(mixed).sum(), scene.field.features)
     slope = slope.coalesce()
     return slope._indices()[0], slope._values()
 
 
-def fewer_mirror_levels(scene: Scene, look: Look, lesson: Look, limit: float = TOLERANCE) -> Choice:
-    """Drop the finest levels of the table of mirrored directions."""
-
-    def reduce(levels: int) -> None:
-        prune.drop_mirror_levels(scene, levels)
-
-    candidates = range(scene.cfg.mirror_levels, -1, -1)
-    return _spare("mirror levels", scene, look, lesson, candidates, reduce, limit)
+def sizes_to_try(count: int, cfg: CompressionConfig) -> list[int]:
+    """Shares of a number, from the number itself down to 1 at least."""
+    return sorted({max(1, round(share * count)) for share in cfg.size_shares}, reverse=True)
 
 
-def fewer_units(scene: Scene, look: Look, lesson: Look, limit: float = TOLERANCE) -> Choice:
-    """Narrow the hidden layers of all heads."""
-    surface = lesson.meet(scene)
-    with torch.no_grad(), prune.reads(scene) as read:
-        lesson.decode(scene, surface, surface.features)
-
-    def reduce(units: int) -> None:
-        prune.drop_units(scene, units, read)
-
-    return _spare("hidden units", scene, look, lesson, shares(scene.cfg.hidden), reduce, limit)
-
-
-def shares(count: int) -> list[int]:
-    """SHARES of a number, from the number itself down to 1 at least."""
-    return sorted({max(1, round(s * count)) for s in SHARES}, reverse=True)
-
-
-def _spare(
-    what: str,
+def _reduce_(
     scene: Scene,
-    look: Look,
-    lesson: Look,
-    candidates: Sequence[int],
-    reduce: Callable[[int], Tensor | None],
-    limit: float,
-) -> Choice:
-    """Reduce something of a scene to the smallest number that costs at most `limit` dB after the
-    heads have settled, where those are worth the time.
+    kind: Kind,
+    sizes: Sequence[int],
+    reduce_: Callable[[int], Tensor | None],
+    criterion: Criterion,
+) -> CapacityChoice:
+    """Reduce one kind of a scene's sizes to the smallest that costs at most the criterion's limit.
+
+    Where networks are worth the time, they settle before a size is given up.
 
     Args:
-        candidates: numbers that fall from what there is.
-        lesson: rays of the training photographs, to settle on.
-        reduce: does it, by `shrink`; returns the channels it kept where it dropped any.
+        sizes: falling, from the present one.
+        reduce_: brings the scene to a size, by `prune`; returns the channels that it kept where it
+            dropped any.
     """
-    surface, taught = look.meet(scene), lesson.meet(scene)
-    with torch.no_grad():
-        before = look.decode(scene, surface, surface.features)
-        wanted = lesson.decode(scene, taught, taught.features)
-    settles = share_of_heads(scene) > WORTH
-    count = candidates[0]
-    parts = {count: prune.parts_of(scene)}
-    paid = {count: 0.0}
+    baseline = Baseline.of(scene, criterion.held_out)
+    lesson = Baseline.of(scene, criterion.calibration)
+    settles = head_share(scene) > criterion.cfg.least_head_share
+    limit = criterion.limit_db
+    whole = sizes[0]
+    snapshots = {whole: prune.snapshot(scene)}
+    losses = {whole: 0.0}
 
-    def cost(kept: int) -> float:
+    def loss_db(size: int) -> float:
         with trial(scene):
-            keep = reduce(kept)
-            here, there = surface.features, taught.features
-            if keep is not None:
-                here, there = here[:, keep], there[:, keep]
-            with torch.no_grad():
-                paid[kept] = look.cost(before, look.decode(scene, surface, here))
-            if paid[kept] > limit and settles:
-                settle(scene, parts[count], lesson, taught, there, wanted)
-                with torch.no_grad():
-                    paid[kept] = look.cost(before, look.decode(scene, surface, here))
-            parts[kept] = prune.parts_of(scene)
-        return paid[kept]
+            channels = reduce_(size)
+            losses[size] = baseline.loss_db(scene, channels)
+            if losses[size] > limit and settles:
+                _settle_(scene, snapshots[whole], lesson, channels, criterion.cfg)
+                losses[size] = baseline.loss_db(scene, channels)
+            snapshots[size] = prune.snapshot(scene)
+        return losses[size]
 
-    kept = smallest(candidates, cost, limit)
-    prune.put_back(parts[kept])
-    why = f"costs {paid[kept]:.3f} dB"
-    if more := [k for k in paid if k < kept]:
-        why += f", {max(more)} would cost {paid[max(more)]:.3f} dB"
-    return Choice(what, count, kept, paid[kept], why)
+    size = last_within_limit(sizes, loss_db, limit)
+    prune.restore_(snapshots[size])
+    why = f"costs {losses[size]:.3f} dB"
+    if smaller := [k for k in losses if k < size]:
+        why += f", {max(smaller)} would cost {losses[max(smaller)]:.3f} dB"
+    return CapacityChoice(kind, whole, size, losses[size], why)
 
 
-def share_of_heads(scene: Scene) -> float:
-    """Share of the parameters near the surface and of the heads that the heads have."""
-    rest = sum(x.numel() for name, x in scene.named_parameters() if not name.startswith(TABLES))
-    near = nodes_near(scene)
-    features = near * scene.cfg.channels
-    if not scene.field.by_node:
-        features = scene.field.features.shape[1] * int(scene.field.features.detach().any(1).sum())
-    return rest / (rest + near + features)
-
-
-def nodes_near(scene: Scene) -> int:
-    """Nodes of the grid within SHELL voxels of the surface."""
-    return int((scene.field.sdf.detach().abs() < SHELL * scene.field.voxel_size).sum())
-
-
-def settle(
+def _settle_(
     scene: Scene,
-    before: prune.Parts,
-    lesson: Look,
-    surface: Surface,
-    features: Tensor,
-    wanted: dict[str, Tensor],
+    before: prune.Snapshot,
+    lesson: Baseline,
+    channels: Tensor | None,
+    cfg: CompressionConfig,
 ) -> None:
-    """Teach the networks that were replaced since `before` to say what was said before them.
+    """Train the networks that were replaced since a snapshot to give what was decoded before.
 
     Args:
-        surface, features: what the rays of the lesson meet, and its features as they are now.
-        wanted: what was decoded there.
+        lesson: what the scene gave then along the calibration rays.
+        channels: those that features have left [K]; None: all.
     """
-    parameters: list[Tensor] = []
-    for owner, name, value in before.held:
-        now = getattr(owner, name)
-        if now is not value and isinstance(now, nn.Module):
-            parameters += now.parameters()
-    optimizer = torch.optim.Adam(parameters, lr=SETTLE_RATE)
-    for k in range(SETTLE_STEPS):
-        optimizer.param_groups[0]["lr"] = SETTLE_RATE * (1 - k / SETTLE_STEPS)
-        said = lesson.decode(scene, surface, features)
-        loss = torch.stack([(said[n] - wanted[n]).square().mean() for n in wanted]).sum()
+    parameters = [p for network in prune.replaced_networks(before) for p in network.parameters()]
+    optimizer = torch.optim.Adam(parameters, lr=cfg.settle_rate)
+    for k in range(cfg.settle_steps):
+        optimizer.param_groups[0]["lr"] = cfg.settle_rate * (1 - k / cfg.settle_steps)
+        decoded = lesson.decode(scene, channels)
+        errors = [
+            (x - target).square().mean() for x, target in zip(decoded, lesson.decoded, strict=True)
+        ]
+        loss = torch.stack(errors).sum()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()

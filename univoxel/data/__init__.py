@@ -38,7 +38,7 @@ def load_photos(
 ) -> Photos:
     """Read the photographs of one split in whatever layout the folder has.
 
-    Lens distortion is taken out. docs/data.md shows the layouts.
+    Lens distortion is taken out. docs/reference/data-sets.md shows the layouts.
 
     Args:
         downscale: side of the squares of pixels that become one, >= 1; 0 for 1, refused where the

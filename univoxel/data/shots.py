@@ -26,7 +26,7 @@ LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
 # How far +Z may be from the cameras' common up direction in a world that is taken as upright:
 # cameras are held askew and lean over, but worlds that are not upright are turned by much more.
 LEAN = math.radians(30)
-HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/data.md#masks"
+HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/guide/masks.md"
 
 
 @dataclass(frozen=True)

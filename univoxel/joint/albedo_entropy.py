@@ -85,7 +85,7 @@ def painted_points(
     """Some points that are no metal, not dark and seen often.
 
     None: there are too few, or most are metal, or each photograph has a light of its own, which
-    tells more.
+    determines more.
     """
     if scene.views is not None and scene.views.sky_change() is not None:
         return None
@@ -179,7 +179,7 @@ def minimise_entropy_(
             entropy, best = points.entropy(irradiance).min(0)
             if float(entropy) < least - cfg.min_gain:
                 least, log_map = float(entropy), candidates[int(best)]
-    # Colours do not tell the scale of light against albedo
+    # Colours do not determine the scale of light against albedo
     sky.log_radiance.copy_(log_map + brightness - points.irradiance(log_map.exp()).log().mean(0))
     return least < first
 

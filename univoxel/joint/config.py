@@ -18,7 +18,7 @@ _RANGE = ("two numbers in [0, 1], rising", lambda x: len(x) == 2 and 0 <= x[0] <
 
 @dataclass(frozen=True)
 class SurfaceConfig:
-    """Points of the surface that the joint solve looks at."""
+    """Points of the surface that the joint solve samples, see joint/observations.py."""
 
     # points that are traced on a machine however slow, >= 1; on a fast one JointConfig.points
     min_points: int = 2000
@@ -49,7 +49,7 @@ class NewtonConfig:
     max_albedo_change: float = 0.5
     # roughness, > 0, by which a step changes a point at most
     max_roughness_change: float = 0.1
-    # log albedo below which no point goes, <= 0: black, of which light tells nothing
+    # log albedo below which no point goes, <= 0: what is blacker does not determine the light
     min_log_albedo: float = -7.0
     # weight, > 0, of the prior on changes of a view's own map, in units of newton_smooth
     view_prior: float = 10.0
@@ -116,7 +116,7 @@ class MetalConfig:
 
 @dataclass(frozen=True)
 class EntropyConfig:
-    """What the few colours of paint tell of the light, see joint/albedo_entropy.py."""
+    """The prior that paint comes in few colours, see joint/albedo_entropy.py."""
 
     # points whose colours are compared, at most, >= 1
     points: int = 3000
@@ -148,7 +148,7 @@ class EntropyConfig:
     sweeps: int = 2
     # nats of entropy, >= 0, that a change has to save: 15 for all of the points
     min_gain: float = 0.005
-    # observations of a point that tell its albedo once the light is known, >= 1
+    # observations of a point that its albedo is averaged over once the light is known, >= 1
     albedo_views: int = 2
     # bounds of a diffuse albedo, in [0, 1]: coal and snow
     albedo: tuple[float, float] = (0.01, 0.95)
@@ -176,9 +176,9 @@ class TrialConfig:
 
     # points of the rounds that compare roughnesses, >= 1
     points: int = 100
-    # times as many points, >= 1, in the two rounds that tell whether all is metal
+    # times as many points, >= 1, in the two rounds that decide whether all is metal
     deciding: int = 3
-    # Newton steps of a round, >= 1; after three, from no map, too glossy still looks better than
+    # Newton steps of a round, >= 1; after three, from no map, too glossy still fits better than
     # right
     steps: int = 6
     # medians of roughness, (0, 1), that are tried beside the present one
@@ -242,7 +242,7 @@ class JointConfig:
     rounds: int = 4  # of Newton steps on the map and then of Adam, >= 1
     points: int = 20000  # on the surface, >= 1
     tracing: int = 2  # visibility rays per point and direction, >= 1
-    colors: bool = True  # whether the few colours of paint tell of the light, see EntropyConfig
+    colors: bool = True  # whether the light minimises the entropy of albedo, see entropy
     lr_features: float = 0.03  # at the begin of a round; all rates > 0
     lr_networks: float = 3e-3
     lr_map: float = 0.05  # of the log map

@@ -21,7 +21,7 @@ from univoxel.scene import Scene
 class Hypothesis:
     """What is metal, the scene's state under it, and what it leaves of the photographs."""
 
-    lowest: float  # residual with the metal as supposed, on TrialConfig.points
+    lowest: float  # residual with the metal that was assumed, on TrialConfig.points
     decisive: float  # residual with the metal as found, on more points; inf: nothing was solved
     metal: Tensor  # [P] bool, as found
     states: list[dict]  # of the scene's parts
@@ -112,7 +112,7 @@ def best_roughness_(trials: Trials, metal: Tensor) -> Hypothesis:
         if residual < (lowest if roughness is None else cfg.trials.better * lowest):
             lowest, states = residual, trials.states()
     trials.restore_(states)
-    # Under a map for metals what is no metal tells itself apart at once: the last threshold serves
+    # Under a map for metals dielectrics stand out at once: the last threshold serves
     metal = find_metal(scene, problem, cfg, float(metal.all()))
     decisive = trials.residual_(metal, cfg.trials.deciding)
     return Hypothesis(lowest, decisive, metal, trials.states())

@@ -87,7 +87,7 @@ def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> 
 
 @torch.no_grad()
 def first_decisions(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Decisions:
-    """What the materials of the stages before say of the points' metal."""
+    """Decisions to start with: metal is what the stages before have made metallic."""
     features = scene.field.features_at(problem.observations.position)
     return Decisions(scene.material(features)[2] > cfg.metal.metallic_before)
 

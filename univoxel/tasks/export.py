@@ -27,7 +27,7 @@ def export(
     texture_size: int = TEXTURE_SIZE,
     watertight: bool = False,
 ) -> None:
-    """Write the zero level of a scene's sdf with its materials; see docs/export.md.
+    """Write the zero level of a scene's sdf with its materials; see docs/guide/export.md.
 
     Args:
         run: folder of the trained scene.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import rich
@@ -14,8 +13,8 @@ from torch import Tensor
 
 from univoxel import confidence, lights
 from univoxel.checkpoint import FILE, load_checkpoint, save_scene
-from univoxel.color import linear_to_srgb
-from univoxel.compression import plan
+from univoxel.compression import plan, sizes
+from univoxel.compression.choices import chosen_reach
 from univoxel.config import TrainConfig, check_same, save_config
 from univoxel.data import Photos, load_photos
 from univoxel.errors import DataError
@@ -36,7 +35,7 @@ from univoxel.preparation.registration import object_box, put_right
 from univoxel.render.picture import preview
 from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
-from univoxel.training.loop import batch_at, rehearsal, run_stage
+from univoxel.training.loop import TrainingPixels, run_stage
 from univoxel.training.progress import Progress
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
@@ -66,19 +65,19 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
 
     begin = time.monotonic()  # only now: how long reading takes is the photographs' affair
     photos, distance = masks_of(photos, cfg.masks)
-    pixels, held_out = split_pixels(distance)
+    pixels = TrainingPixels(photos, *split_pixels(distance))
     try:
         box, refined = object_box(distance, photos.cameras, cfg.cameras)
     except ValueError as error:
         raise DataError(f"{cfg.data}: {error}") from None
-    asked, cfg = cfg, plan.within_pixels(cfg, photos.cameras, box)
+    asked, cfg = cfg, plan.limited_to_pixels(cfg, photos.cameras, box)
     if resume:
         scene, state = load_checkpoint(cfg.out)
         check_same(asked)
         begin -= state["seconds"]
     else:
         assert isinstance(cfg.stages[0], StageConfig)
-        first = fit_grid(*box, plan.voxels(cfg.stages[0], []))
+        first = fit_grid(*box, plan.stage_voxels(cfg.stages[0], []))
         poses = put_right(distance, photos.cameras, box) if refined else None
         cameras = poses.corrected(photos.cameras) if poses else photos.cameras
         hull = visual_hull(distance, cameras, first)
@@ -95,7 +94,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             varying=varying,
             refined=refined,
             views=views,
-            mirror_levels=plan.mirror_levels(cfg.scene, cfg.budget_mb),
+            mirror_levels=sizes.mirror_levels(cfg.scene, cfg.budget_mb, cfg.compression),
         )
         scene = Scene(own, field)
         if poses:
@@ -104,7 +103,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             scene.views.add(gains[:, None].expand(-1, 3))
         state = {"stage": 0, "progress": 0.0, "step": 0}
         if cfg.budget_mb is not None:
-            plan.check_budget(scene, cfg.budget_mb)
+            sizes.check_budget(scene, cfg.budget_mb, cfg.compression)
 
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
     save_config(asked)
@@ -116,24 +115,21 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             if isinstance(stage, JointConfig):
                 joint_stage.solve(scene, scene.registered(photos), stage, cfg.seed, progress)
             else:
-                grid = fit_grid(*box, plan.voxels(stage, progress.chosen))
+                grid = fit_grid(*box, plan.stage_voxels(stage, progress.chosen))
                 if stage.field == "sparse" and not isinstance(scene.field, SparseField):
                     scene.field = SparseField.around(scene.field, grid)
                 elif scene.field.grid != grid:
                     scene.field = scene.field.resized(grid)
                 if cfg.capacity == "adaptive":
                     stage = plan.on_grid(stage, box, grid.voxel_size)
-                run_stage(scene, cfg, stage, photos, pixels, held_out, progress)
+                run_stage(scene, cfg, stage, pixels, progress)
             done = index + 1 == len(cfg.stages)
             if cfg.capacity == "adaptive" and (done or not progress.clock.over):
-                rehearse = partial(rehearsal, cfg, photos, pixels, held_out)
-                shot = scene.registered(photos)
-                looks = look_at(shot, held_out), partial(random_look, shot, pixels)
-                chosen = plan.adapt(scene, cfg, index, box, *looks, rehearse, progress.clock.pace)
-                progress.chosen += [choice.noted() for choice in chosen]
-                if not done and plan.rehearsed(scene, chosen):
-                    progress.clock.count_as_done(plan.REHEARSAL)
-            reach = plan.reach(progress.chosen)
+                choices = plan.adapt_(scene, cfg, index, box, pixels, progress.clock.pace)
+                progress.chosen += choices
+                if not done and plan.begun_in_rehearsal(scene, choices):
+                    progress.clock.count_as_done(cfg.compression.rehearsal_share)
+            reach = chosen_reach(progress.chosen)
             save_scene(scene, cfg.out, progress.state(), slim=done, reach=reach)
             preview(scene, scene.registered(photos), cfg.out / "preview.png")
         if film:
@@ -149,8 +145,8 @@ def first_field(
     stages = [s for s in cfg.stages if isinstance(s, StageConfig)]
     if stages[0].field != "hash":
         return DenseField(grid, cfg.scene.channels, hull)
-    finest = min(fit_grid(*box, plan.voxels(s, [])).voxel_size for s in stages)
-    rows = plan.table_rows(cfg.scene, cfg.budget_mb)
+    finest = min(fit_grid(*box, plan.stage_voxels(s, [])).voxel_size for s in stages)
+    rows = sizes.table_rows(cfg.scene, cfg.budget_mb, cfg.compression)
     levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL, rows)
     return HashField(DenseField(grid, 0, hull), levels)
 
@@ -176,15 +172,3 @@ def split_pixels(distance: Tensor) -> tuple[Tensor, Tensor]:
     if not held:  # so few that none can be spared
         return pixels, pixels
     return pixels[order[held:]], pixels[order[:held]]
-
-
-def random_look(photos: Photos, pixels: Tensor, count: int) -> plan.Look:
-    """`look_at` some of the pixels, `count` at most."""
-    return look_at(photos, pixels[torch.randperm(len(pixels))[:count]])
-
-
-def look_at(photos: Photos, pixels: Tensor) -> plan.Look:
-    """Pixels as capacity looks at them."""
-    batch = batch_at(photos, pixels)
-    target = linear_to_srgb(batch.color * batch.alpha[:, None])
-    return plan.Look(batch.rays, batch.view, target)

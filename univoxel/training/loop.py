@@ -55,13 +55,20 @@ class Batch:
         return -self.rays.direction
 
 
+@dataclass(frozen=True)
+class TrainingPixels:
+    """Photographs, and which of their pixels [P, 3] (view, row, column) serve what."""
+
+    photos: Photos
+    trained: Tensor
+    held_out: Tensor  # only looked at, to follow quality
+
+
 def run_stage(
     scene: Scene,
     cfg: TrainConfig,
     stage: StageConfig,
-    photos: Photos,
-    pixels: Tensor,
-    held_out: Tensor,
+    pixels: TrainingPixels,
     progress: Listener,
 ) -> None:
     """Optimise the scene on its present grid until the stage's steps or its time are over."""
@@ -87,7 +94,7 @@ def run_stage(
         if progress.clock.step % RETRACE == 0 and not stage.refit:
             scene.surface_moved()
 
-        batch = random_batch(scene.registered(photos), pixels, stage.rays)
+        batch = random_batch(scene.registered(pixels.photos), pixels.trained, stage.rays)
         surface = surface_at(scene, batch.rays, torch.rand(stage.rays))
         terms = objective(scene, cfg.loss, surface, batch, physical)
         loss = torch.stack(list(terms.values())).sum()
@@ -103,11 +110,11 @@ def run_stage(
         if progress.clock.step % SMOOTH_EVERY == 0 and not stage.refit:
             smooth_touched_(field, stage)
         if plateau.due(done):
-            quality = held_out_psnr(scene, photos, held_out, physical)
+            quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
             if plateau.flat(done, quality, physical):
                 progress.clock.shorten()
         if progress.due():
-            quality = held_out_psnr(scene, photos, held_out, physical)
+            quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
             progress.report({k: v.item() for k, v in terms.items()}, quality)
             guard.judge(quality, physical)
         if progress.checkpoint_due():
@@ -160,9 +167,7 @@ def learning_rates(stage: StageConfig, done: float, voxel_size: float) -> tuple[
 
 def rehearsal(
     cfg: TrainConfig,
-    photos: Photos,
-    pixels: Tensor,
-    held_out: Tensor,
+    pixels: TrainingPixels,
     scene: Scene,
     stage: StageConfig,
     steps: int,
@@ -172,8 +177,8 @@ def rehearsal(
     # From middling rates on: what has been learned must not be shaken
     rates = {n: (math.sqrt(a * b), b) for n in RATES for a, b in [getattr(stage, n)]}
     stage, cfg = replace(stage, physical_from=1.0, **rates), replace(cfg, patience=0.0)
-    run_stage(scene, cfg, stage, photos, pixels, held_out, Rehearsal(steps))
-    return held_out_psnr(scene, photos, held_out, physical=False)
+    run_stage(scene, cfg, stage, pixels, Rehearsal(steps))
+    return held_out_psnr(scene, pixels.photos, pixels.held_out, physical=False)
 
 
 def objective(

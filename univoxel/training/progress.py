@@ -11,6 +11,7 @@ import torch
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
+from univoxel.compression.choices import CapacityChoice
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
 from univoxel.training.clock import Clock, CountedSteps, StepClock
@@ -56,7 +57,7 @@ class Progress:
             state: as `state` gave it.
         """
         self.cfg, self.clock = cfg, Clock(cfg, begin, state)
-        self.chosen: list[dict] = list(state.get("chosen", ()))  # of capacity
+        self.chosen = [CapacityChoice.from_json(entry) for entry in state.get("chosen", ())]
         self.troubles: list[str] = list(state.get("troubles", ()))  # what went wrong and was mended
         self._log = cfg.out / "log.jsonl"
         self._reported, self._reported_step = self.clock.seconds, self.clock.step
@@ -77,7 +78,7 @@ class Progress:
         self._bar.stop()
         if kind is not None:
             return
-        for line in (*(c["said"] for c in self.chosen), self.clock.cut()):
+        for line in (*(c.sentence for c in self.chosen), self.clock.cut()):
             if line:
                 self.say(line)
         if self.troubles:
@@ -89,7 +90,7 @@ class Progress:
     def state(self) -> dict:
         """What a later sitting needs to go on, and what evaluation reports; JSON."""
         return self.clock.state() | {
-            "chosen": self.chosen,
+            "chosen": [choice.as_json() for choice in self.chosen],
             "troubles": self.troubles,
             "threads": torch.get_num_threads(),
             "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,

@@ -1,0 +1,179 @@
+"""Draws the pictures of docs/guide and docs/explanation that show the bundled scene.
+
+    univoxel train univoxel/example_data/tiny --out RUN --preset fast --minutes 20 \\
+        --set stages.0.voxels=0.27 --set stages.1.voxels=0.6 --set stages.3.voxels=0.6 \\
+        --timelapse RUN/film/
+    python docs/figures/bundled.py RUN docs/images
+
+Commands of univoxel make the pictures. This script puts them side by side.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from univoxel.data.images import read_exr
+
+SCENE = Path(__file__).parents[2] / "univoxel/example_data/tiny"
+VIEW = 2  # of the test views: pepper and avocado side by side
+SIDE = 220  # pixels of a picture
+FRAME = 120  # pixels of one in a timelapse
+GAP = 6  # between pictures
+LABEL = 18  # pixels above a frame of a timelapse, and above a picture of `univoxel inspect`
+
+
+def univoxel(*arguments: str) -> None:
+    subprocess.run([sys.executable, "-m", "univoxel.cli", *arguments], check=True)
+
+
+def beside(pictures: list[Image.Image], background: str = "white") -> Image.Image:
+    """Pictures of one height in a row."""
+    width = sum(p.width for p in pictures) + GAP * (len(pictures) - 1)
+    row, x = Image.new("RGB", (width, pictures[0].height), background), 0
+    for picture in pictures:
+        row.paste(picture.convert("RGB"), (x, 0))
+        x += picture.width + GAP
+    return row
+
+
+def below(pictures: list[Image.Image], background: str = "white") -> Image.Image:
+    """Pictures of one width, one below another."""
+    turned = [p.convert("RGB").transpose(Image.Transpose.TRANSPOSE) for p in pictures]
+    return beside(turned, background).transpose(Image.Transpose.TRANSPOSE)
+
+
+def square(picture: Image.Image) -> Image.Image:
+    return picture.resize((SIDE, SIDE), Image.Resampling.LANCZOS)
+
+
+def opened(path: Path, background: str = "black") -> Image.Image:
+    """A picture over a colour."""
+    picture = Image.open(path).convert("RGBA")
+    plate = Image.new("RGBA", picture.size, background)
+    return Image.alpha_composite(plate, picture).convert("RGB")
+
+
+def from_values(values: np.ndarray, most: float = 1.0) -> Image.Image:
+    """Values [H, W] from 0, black, to `most`, white."""
+    scaled = np.clip(values / most, 0, 1)
+    return square(Image.fromarray((255 * scaled).round().astype(np.uint8)))
+
+
+def encoded(linear: np.ndarray) -> np.ndarray:
+    """sRGB of linear colours."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+def from_color(linear: np.ndarray) -> Image.Image:
+    return square(Image.fromarray((255 * encoded(linear)).round().astype(np.uint8)))
+
+
+def masks(out: Path) -> None:
+    """Some photographs, and their masks below."""
+    paths = [SCENE / f"train/r_{n:03d}.png" for n in (0, 7, 14, 21)]
+    photographs = beside([square(opened(p, "#8d9aa3")) for p in paths])
+    shapes = beside([square(Image.open(p).getchannel("A")) for p in paths])
+    below([photographs, shapes]).save(out / "masks.png", optimize=True)
+
+
+def stage_frames(run: Path, out: Path) -> None:
+    """Render, albedo and normals as each stage ends."""
+    stages = json.loads((run / "config.json").read_text())["stages"]
+    film = {int(path.stem.removeprefix("step_")): path for path in (run / "film").glob("*.png")}
+    columns, end = [], 0
+    for stage in stages:
+        end += stage["iterations"]
+        frame = Image.open(film[max(step for step in film if step <= end)]).convert("RGB")
+        side = frame.width // 3
+        left, top = side // 8, LABEL + side // 8  # of what is not just black
+        parts = [
+            frame.crop((k * side + left, top, (k + 1) * side - left, LABEL + side - side // 8))
+            for k in range(3)
+        ]
+        size = (FRAME, FRAME)
+        columns.append(below([part.resize(size, Image.Resampling.LANCZOS) for part in parts]))
+    beside(columns).save(out / "stage_frames.png", optimize=True)
+
+
+def doubt(test: Path, out: Path) -> None:
+    """Render, albedo, doubt of the albedo and its true error, in one view."""
+    layers = read_exr(test / f"r_{VIEW:03d}.exr")
+    albedo = np.stack([layers[f"albedo.{c}"] for c in "RGB"], -1)
+    render = np.stack([layers[f"rgb.{c}"] for c in "RGB"], -1)
+    truth = np.load(SCENE / f"test/gt/r_{VIEW:03d}.npz")
+    inside = truth["alpha"] > 127
+    scale = np.median(truth["albedo"][inside] / albedo[inside].clip(1e-3), 0)
+    error = np.abs(encoded(albedo * scale) - encoded(truth["albedo"])).mean(-1) * inside
+    known = layers["doubt.albedo"]
+    low, high = np.quantile(known[inside], (0.02, 0.98))  # doubt is relative
+    shown = (known - low) / (high - low) * inside
+    pictures = [from_color(render), from_color(albedo), from_values(shown)]
+    beside([*pictures, from_values(error, 0.15)]).save(out / "doubt.png", optimize=True)
+
+
+def relit(run: Path, work: Path, out: Path) -> None:
+    """A test view as photographed, under two maps, and under a sun on a floor."""
+    size = "--resolution", str(SIDE)
+    maps = [str(SCENE / f"envmaps/{name}.hdr") for name in ("city", "sunset")]
+    univoxel("relight", str(run), "--envmap", *maps, *size, "--out", str(work / "maps"))
+    sun = ("--sun", "250", "45", "2.5", "4", "--envmap", maps[0], "--exposure", "0.8")
+    floor = ("--ground", "lowest", "--samples", "256")
+    univoxel("relight", str(run), *sun, *floor, *size, "--out", str(work / "sun"))
+    name = f"r_{VIEW:03d}.png"
+    pictures = [opened(SCENE / "test" / name), opened(work / "maps/city" / name)]
+    pictures += [opened(work / "maps/sunset" / name), opened(work / "sun" / name, "white")]
+    beside([square(p) for p in pictures]).save(out / "relit.png", optimize=True)
+
+
+def point_light(run: Path, work: Path, out: Path) -> None:
+    """The view and its point; the local light there, the map with what blocks it, the truth."""
+    path = work / "point.png"
+    at = "--view", "0", "--pixel", "50,50"
+    univoxel("inspect", str(run), *at, "--out", str(path))
+    whole = Image.open(path).convert("RGB")
+    height = whole.height // 3  # of a label and a picture
+    left = whole.crop((0, LABEL, 256, LABEL + 256))
+    right = [
+        whole.crop((whole.width - 256, k * height + LABEL, whole.width, (k + 1) * height))
+        for k in range(3)
+    ]
+    view = left.resize((right[0].height, right[0].height), Image.Resampling.LANCZOS)
+    beside([view, *right]).save(out / "point_light.png", optimize=True)
+
+
+def info(run: Path, work: Path, out: Path) -> None:
+    """Where nodes are stored, without the numbers below."""
+    path = work / "info.png"
+    univoxel("info", str(run), "--picture", str(path))
+    whole = Image.open(path).convert("RGB")
+    rows = np.asarray(whole)[:, 12]
+    colored = np.flatnonzero((rows.max(1).astype(int) - rows.min(1)) > 60)
+    bar = colored[np.flatnonzero(np.diff(colored) > 3)[0]] if len(colored) else whole.height
+    whole.crop((0, 0, whole.width, int(bar) + 10)).save(out / "info.png", optimize=True)
+
+
+def main() -> None:
+    run, out = map(Path, sys.argv[1:])
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        masks(out)
+        stage_frames(run, out)
+        univoxel("envmap", str(run), "--out", str(work / "light.exr"))
+        Image.open(work / "light.png").save(out / "envmap.png", optimize=True)
+        univoxel("eval", str(run), "--save", str(work / "test"))
+        doubt(work / "test", out)
+        relit(run, work, out)
+        point_light(run, work, out)
+        info(run, work, out)
+
+
+if __name__ == "__main__":
+    main()
