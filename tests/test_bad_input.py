@@ -252,11 +252,15 @@ def full_disk(room: int):
     ("room", "report", "message", "left"),
     [
         (100, 99.0, r"cannot write: .*config\.json", set()),
-        (4000, 0.0, r"cannot write: .*log\.jsonl", {"config.json", "log.jsonl"}),
-        (4000, 99.0, r"scene\.safetensors: cannot write the checkpoint", {"config.json"}),
+        (None, 0.0, r"cannot write: .*log\.jsonl", {"config.json", "log.jsonl"}),
+        (None, 99.0, r"scene\.safetensors: cannot write the checkpoint", {"config.json"}),
     ],
 )
-def test_training_on_a_full_disk(data, tmp_path, refused, monkeypatch, room, report, message, left):
+def test_training_on_a_full_disk(
+    template, data, tmp_path, refused, monkeypatch, room, report, message, left
+):
+    """Without a number there is room for the configuration, and a little more."""
+    room = room or (template / "run" / "config.json").stat().st_size + 500
     monkeypatch.setattr(progress, "REPORT_SECONDS", report)
     out = tmp_path / "out"
     with full_disk(room):
