@@ -28,6 +28,7 @@ from univoxel.fields.hashed import HashField
 from univoxel.joint import observations, stage
 from univoxel.joint.config import JointConfig
 from univoxel.ops import VisibilityScene
+from univoxel.preparation import prepare
 from univoxel.presets import chosen
 from univoxel.tasks import train
 from univoxel.training import loop
@@ -53,9 +54,9 @@ PARTS = {
     **STAGES,
     "sample": [(f, n) for f in (DenseField, HashField) for n in ("sample", "features_at")],
     "light": [*STAGES["light"], (observations, "shade_map")],
-    "hull": [(train, name) for name in ("masks_of", "object_box", "visual_hull")],
-    "hollows": [(train, "opened")],
-    "cameras": [(train, "put_right")],
+    "hull": [(prepare, name) for name in ("masks_of", "object_box", "visual_hull")],
+    "hollows": [(prepare, "opened")],
+    "cameras": [(prepare, "put_right")],
     "loading": [(train, "load_photos")],
     "mesh for rays": [(VisibilityScene, "__init__")],
     **ONCE,

@@ -35,8 +35,8 @@ from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hu
 from univoxel.presets import preset
 from univoxel.render import pipeline
 from univoxel.scene import Scene
-from univoxel.tasks import train
 from univoxel.training import loop
+from univoxel.training.pixels import split_pixels
 
 HERE = Path(__file__).parent
 DATA = HERE.parent / "univoxel" / "example_data" / "tiny"
@@ -111,7 +111,7 @@ def hull_scene(voxels: float) -> tuple[Scene, tuple]:
     light = replace(cfg.scene.light, scale=float((upper - lower).max()) / 2)
     return Scene(replace(cfg.scene, light=light), field), (
         photos,
-        *train.split_pixels(distance),
+        *split_pixels(distance),
     )
 
 

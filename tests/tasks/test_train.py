@@ -17,16 +17,18 @@ from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.fields.sparse import SparseField
 from univoxel.lights import SGConfig
+from univoxel.preparation import prepare as preparation
 from univoxel.presets import preset, with_field
 from univoxel.render.pipeline import extract_mesh
 from univoxel.run import photos_of as photos_of_run
 from univoxel.scene import SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.info import info
-from univoxel.tasks.train import split_pixels, train
+from univoxel.tasks.train import train
 from univoxel.training import loop, surface_update
 from univoxel.training.config import StageConfig
 from univoxel.training.loop import batch_at
+from univoxel.training.pixels import split_pixels
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +153,7 @@ def test_hollows_are_opened_where_light_is_the_same(
         return hull + 0.25
 
     monkeypatch.setattr(task, "run_stage", lambda *_: None)
-    monkeypatch.setattr(task, "opened", larger)
+    monkeypatch.setattr(preparation, "opened", larger)
     cfg = config(data, tmp_path / "run", hollows=hollows)
     cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, varying=varying))
     away = extract_mesh(load_scene(train(cfg))).vertices.norm(dim=1)

@@ -1,0 +1,58 @@
+"""The scene that training begins with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from univoxel import lights
+from univoxel.compression import plan
+from univoxel.config import TrainConfig
+from univoxel.fields.base import AbstractField
+from univoxel.fields.dense import DenseField
+from univoxel.fields.hashed import PER_LEVEL, HashField, Levels
+from univoxel.grid import fit_grid
+from univoxel.preparation.prepare import Prepared
+from univoxel.scene import Scene
+from univoxel.training.config import StageConfig
+
+
+def build_scene(prepared: Prepared, cfg: TrainConfig) -> Scene:
+    """A scene whose surface is the carved hull, with poses and gains as far as they are known.
+
+    Draws the first weights from torch's generator.
+
+    Raises:
+        ValueError: cfg.budget_mb is too small for any such scene.
+    """
+    silhouettes, varying = prepared.silhouettes, prepared.varying
+    lower, upper = silhouettes.box
+    field = build_field(prepared, cfg)
+    views = tuple(silhouettes.photos.names) if silhouettes.refined or varying != "none" else ()
+    sizes = replace(
+        cfg.scene,
+        light=lights.scaled(cfg.scene.light, float((upper - lower).max()) / 2),
+        varying=varying,
+        refined=silhouettes.refined,
+        views=views,
+        mirror_levels=plan.mirror_levels(cfg.scene, cfg.budget_mb),
+    )
+    scene = Scene(sizes, field)
+    if prepared.poses:
+        scene.poses = prepared.poses
+    if scene.views and prepared.gains is not None:
+        scene.views.add(prepared.gains[:, None].expand(-1, 3))
+    if cfg.budget_mb is not None:
+        plan.check_budget(scene, cfg.budget_mb)
+    return scene
+
+
+def build_field(prepared: Prepared, cfg: TrainConfig) -> AbstractField:
+    """The field of the first stage, its surface that of the carved hull."""
+    grid, hull, box = prepared.grid, prepared.hull, prepared.silhouettes.box
+    stages = [s for s in cfg.stages if isinstance(s, StageConfig)]
+    if stages[0].field != "hash":
+        return DenseField(grid, cfg.scene.channels, hull)
+    finest = min(fit_grid(*box, plan.voxels(s, [])).voxel_size for s in stages)
+    rows = plan.table_rows(cfg.scene, cfg.budget_mb)
+    levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL, rows)
+    return HashField(DenseField(grid, 0, hull), levels)
