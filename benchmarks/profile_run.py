@@ -28,6 +28,7 @@ from univoxel.fields.field import Field
 from univoxel.joint import observations, stage
 from univoxel.joint.config import JointConfig
 from univoxel.ops import VisibilityScene
+from univoxel.preparation import prepare
 from univoxel.presets import chosen
 from univoxel.tasks import train
 from univoxel.training import loop
@@ -45,7 +46,7 @@ ONCE = {
     "held-out rays": [(loop, "held_out_psnr")],
     "previews": [(train, "preview")],
     "checkpoints": [(train, "save_scene"), (loop, "save_scene")],
-    "trust": [(train, "say_trust")],
+    "trust": [(train, "save_trust")],
 }  # seconds of a stage whatever the number of its steps
 EVERY = 16  # backward passes of which one is divided
 START = "before"  # loading, hull; also what lies between the stages
@@ -53,9 +54,9 @@ PARTS = {
     **STAGES,
     "sample": [(Field, n) for n in ("sample", "features_at")],
     "light": [*STAGES["light"], (observations, "shade_map")],
-    "hull": [(train, name) for name in ("masks_of", "object_box", "visual_hull")],
-    "hollows": [(train, "opened")],
-    "cameras": [(train, "put_right")],
+    "hull": [(prepare, name) for name in ("masks_of", "object_box", "visual_hull")],
+    "hollows": [(prepare, "opened")],
+    "cameras": [(prepare, "put_right")],
     "loading": [(train, "load_photos")],
     "mesh for rays": [(VisibilityScene, "__init__")],
     **ONCE,

@@ -36,8 +36,8 @@ from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hu
 from univoxel.presets import preset
 from univoxel.render import pipeline
 from univoxel.scene import Scene
-from univoxel.tasks import train
 from univoxel.training import loop
+from univoxel.training.pixels import TrainingPixels, split_pixels
 
 HERE = Path(__file__).parent
 DATA = HERE.parent / "univoxel" / "example_data" / "tiny"
@@ -101,8 +101,8 @@ class Clock:
                 self.backward[stage.get(event.sequence_nr, OTHER)] += seconds
 
 
-def hull_scene(voxels: float) -> tuple[Scene, tuple]:
-    """The scene as training starts it, and what a stage needs of the photographs."""
+def hull_scene(voxels: float) -> tuple[Scene, TrainingPixels]:
+    """The scene as training starts it, and the pixels it is trained on."""
     photos = load_photos(DATA, "train")
     distance = mask_distances(photos.coverage())
     lower, upper = estimate_bounds(distance, photos.cameras)
@@ -110,13 +110,12 @@ def hull_scene(voxels: float) -> tuple[Scene, tuple]:
     cfg = preset("fast", DATA, DATA)
     field = dense_field(grid, cfg.scene.channels, visual_hull(distance, photos.cameras, grid))
     light = replace(cfg.scene.light, scale=float((upper - lower).max()) / 2)
-    return Scene(replace(cfg.scene, light=light), field), (
-        photos,
-        *train.split_pixels(distance),
-    )
+    return Scene(replace(cfg.scene, light=light), field), split_pixels(photos, distance)
 
 
-def run_steps(scene: Scene, views: tuple, rays: int, count: int, begin: float = 0.5) -> None:
+def run_steps(
+    scene: Scene, pixels: TrainingPixels, rays: int, count: int, begin: float = 0.5
+) -> None:
     """`count` steps of the training loop, with every term of the loss; `begin`: of its schedule."""
     cfg = preset("fast", DATA, DATA)
     stage = replace(cfg.stages[1], rays=rays, physical_from=0.0)
@@ -129,12 +128,12 @@ def run_steps(scene: Scene, views: tuple, rays: int, count: int, begin: float = 
             yield begin + (1 - begin) * i / count
 
     clock.steps = steps
-    loop.run_stage(scene, cfg, stage, loop.TrainingPixels(*views), progress)
+    loop.run_stage(scene, cfg, stage, pixels, progress)
 
 
-def profile(scene: Scene, views: tuple, rays: int, count: int, divide: bool) -> dict:
+def profile(scene: Scene, pixels: TrainingPixels, rays: int, count: int, divide: bool) -> dict:
     """Milliseconds a step, whole and by stage."""
-    run_steps(scene, views, rays, 1)
+    run_steps(scene, pixels, rays, 1)
     clock, originals = Clock(), []
     for name, places in (STAGES | {BACKWARD: [(torch.Tensor, "backward")]}).items():
         for owner, attribute in places:
@@ -142,7 +141,7 @@ def profile(scene: Scene, views: tuple, rays: int, count: int, divide: bool) -> 
             setattr(owner, attribute, clock.timed(name, originals[-1][2]))
     start = time.perf_counter()
     with torch.autograd.profiler.profile(enabled=divide) as events:
-        run_steps(scene, views, rays, count)
+        run_steps(scene, pixels, rays, count)
     whole = time.perf_counter() - start
     for owner, attribute, original in originals:
         setattr(owner, attribute, original)
@@ -198,8 +197,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=HERE / "results" / "train_step.json")
     options = parser.parse_args()
     torch.manual_seed(0)
-    scene, views = hull_scene(options.voxels)
-    run_steps(scene, views, options.rays, options.warm_up, begin=0.0)
+    scene, pixels = hull_scene(options.voxels)
+    run_steps(scene, pixels, options.rays, options.warm_up, begin=0.0)
     result = {
         "rays": options.rays,
         "grid": list(scene.field.grid.size),
@@ -208,7 +207,7 @@ def main() -> None:
     }
     for backend, count in COUNT.items():
         with ops.use_backend(backend):
-            result[backend] = profile(scene, views, options.rays, count, backend == "native")
+            result[backend] = profile(scene, pixels, options.rays, count, backend == "native")
     result["load_average"] = os.getloadavg()[0]
     options.out.write_text(result_text(made() | result))
     print(table(result))

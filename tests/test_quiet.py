@@ -16,8 +16,7 @@ from univoxel.segmentation.config import COARSE, FINE, SegmentationConfig
 from univoxel.tasks.info import info
 from univoxel.training.config import StageConfig
 
-# The command line; train.py says what training found
-PRINTING = {"cli.py", "commands.py", "tasks/train.py"}
+PRINTING = {"cli.py", "commands.py"}  # the command line
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from univoxel.tasks.info import info
 from univoxel.tasks.train import train
 from univoxel.training import loop
 from univoxel.training.config import StageConfig
+from univoxel.training.pixels import TrainingPixels
 from univoxel.training.progress import Rehearsal
 
 CFG = CompressionConfig()
@@ -121,7 +122,7 @@ def test_a_grid_is_as_coarse_as_its_rehearsal_allows(quality, chosen, tmp_path, 
 
     stage = StageConfig(voxels=0.3645, iterations=40, share=1.0)
     cfg = TrainConfig(tmp_path, tmp_path, (stage, stage), minutes=1.0)
-    pixels = loop.TrainingPixels(photos_of(2, 8), torch.zeros(1, 3), torch.zeros(1, 3))
+    pixels = TrainingPixels(photos_of(2, 8), torch.zeros(1, 3), torch.zeros(1, 3))
 
     def rehearse(cfg_, pixels_, tried, on_grid, steps):
         assert (cfg_, pixels_, steps) == (cfg, pixels, 8)

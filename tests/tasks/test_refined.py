@@ -16,7 +16,7 @@ from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
 from univoxel.experiments.stress.damage import turned
 from univoxel.lights import SGConfig
-from univoxel.preparation.hull import mask_distances
+from univoxel.preparation.prepare import find_silhouettes
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig
 from univoxel.tasks import train as task
@@ -116,11 +116,7 @@ def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):
     monkeypatch.setattr(task, "run_stage", lambda scene, *_: seen.append(scene.field.grid))
     train(cfg, resume=True)
     torch.testing.assert_close(load_scene(cfg.out).poses.steps, before)
-    box, _ = task.object_box(
-        mask_distances(load_photos(data, "train").coverage()),
-        load_photos(data, "train").cameras,
-        "auto",
-    )
+    box = find_silhouettes(load_photos(data, "train"), cfg).box
     assert seen == [task.fit_grid(*box, 20000)]
 
 

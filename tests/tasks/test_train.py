@@ -16,16 +16,18 @@ from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.lights import SGConfig
+from univoxel.preparation import prepare as preparation
 from univoxel.presets import preset, with_field
 from univoxel.render.pipeline import extract_mesh
 from univoxel.run import photos_of as photos_of_run
 from univoxel.scene import SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.info import info
-from univoxel.tasks.train import split_pixels, train
+from univoxel.tasks.train import train
 from univoxel.training import loop, surface_update
 from univoxel.training.config import StageConfig
 from univoxel.training.loop import batch_at
+from univoxel.training.pixels import split_pixels
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +152,7 @@ def test_hollows_are_opened_where_light_is_the_same(
         return hull + 0.25
 
     monkeypatch.setattr(task, "run_stage", lambda *_: None)
-    monkeypatch.setattr(task, "opened", larger)
+    monkeypatch.setattr(preparation, "opened", larger)
     cfg = config(data, tmp_path / "run", hollows=hollows)
     cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, varying=varying))
     away = extract_mesh(load_scene(train(cfg))).vertices.norm(dim=1)
@@ -286,7 +288,8 @@ def test_a_run_is_not_overwritten(run, data):
 
 def test_held_out_pixels_are_not_trained_on(data):
     photos = load_photos(data, "train")
-    pixels, held = split_pixels(torch.where(photos.coverage() > 0, -1.0, 99.0))
+    split = split_pixels(photos, torch.where(photos.coverage() > 0, -1.0, 99.0))
+    pixels, held = split.trained, split.held_out
     both = torch.cat([pixels, held])
     assert len(both.unique(dim=0)) == len(both)
     batch = batch_at(photos, held)
@@ -296,7 +299,8 @@ def test_held_out_pixels_are_not_trained_on(data):
 def test_so_few_pixels_that_none_is_spared():
     distance = torch.full((1, 30, 30), 99.0)
     distance[0, 3, 4:8] = -1.0
-    pixels, held = split_pixels(distance)
+    split = split_pixels(photos_of(1, 30), distance)
+    pixels, held = split.trained, split.held_out
     assert len(pixels) == 4
     assert torch.equal(pixels, held)
 

@@ -86,7 +86,7 @@ def rotate_(scene: Scene, basis: Tensor) -> None:
         weights[0] = torch.cat([first[:, :n] @ inverse[:n, :n].T, first[:, n:]], 1).float()
         setattr(owner, name, _network(weights, biases))
     features = scene.field.features.data
-    scene.field.features = nn.Parameter(features @ basis.to(features))
+    scene.field.encoding.values = nn.Parameter(features @ basis.to(features))
 
 
 def drop_channels_(scene: Scene, keep: Tensor, mean: Tensor) -> None:

@@ -55,12 +55,12 @@ class Clock:
         """
         Args:
             begin: of training, on time.monotonic's clock.
-            state: as `state` gave it.
+            state: as `state` gave it; empty at the begin of a run.
         """
         self.cfg, self.begin = cfg, begin
-        self.stage: int = state["stage"]
-        self.done: float = state["progress"]  # of the present stage, in [0, 1]
-        self.step: int = state["step"]
+        self.stage: int = state.get("stage", 0)
+        self.done: float = state.get("progress", 0.0)  # of the present stage, in [0, 1]
+        self.step: int = state.get("step", 0)
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
         self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
         self.watch: Callable[[], None] | None = None  # called between steps; its time is no time

@@ -23,6 +23,7 @@ from univoxel.render.pipeline import at_rays, radiance_of, shade, surface_at
 from univoxel.scene import Scene
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
+from univoxel.training.pixels import TrainingPixels
 from univoxel.training.plateau import Plateau
 from univoxel.training.progress import Listener, Rehearsal
 from univoxel.training.surface_update import (
@@ -54,15 +55,6 @@ class Batch:
     @property
     def wo(self) -> Tensor:
         return -self.rays.direction
-
-
-@dataclass(frozen=True)
-class TrainingPixels:
-    """Photographs, and which of their pixels [P, 3] (view, row, column) serve what."""
-
-    photos: Photos
-    trained: Tensor
-    held_out: Tensor  # only looked at, to follow quality
 
 
 def run_stage(

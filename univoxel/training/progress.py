@@ -9,8 +9,8 @@ from typing import Protocol
 
 import torch
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bar
 
+from univoxel.bars import bar
 from univoxel.compression.choices import CapacityChoice
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
@@ -54,7 +54,7 @@ class Progress:
         """
         Args:
             begin: of training, on time.monotonic's clock.
-            state: as `state` gave it.
+            state: as `state` gave it; empty at the begin of a run.
         """
         self.cfg, self.clock = cfg, Clock(cfg, begin, state)
         self.chosen = [CapacityChoice.from_json(entry) for entry in state.get("chosen", ())]
@@ -62,7 +62,7 @@ class Progress:
         self._log = cfg.out / "log.jsonl"
         self._reported, self._reported_step = self.clock.seconds, self.clock.step
         self._saved = self.clock.seconds
-        self._bar = Bar(
+        self._bar = bar(
             TextColumn("{task.description}"),
             BarColumn(),
             TextColumn("{task.percentage:3.0f} %  {task.fields[facts]}"),
@@ -98,7 +98,7 @@ class Progress:
 
     def say(self, what: str) -> None:
         """Tell at once of something that was found."""
-        self._bar.console.print(what, markup=False, highlight=False)
+        log.info(what)
 
     def trouble(self, what: str) -> None:
         """Tell, at once and in the log, of something that went wrong and was mended."""

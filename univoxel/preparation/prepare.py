@@ -1,0 +1,76 @@
+"""What masks, cameras and photographs say before the first gradient, in order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from univoxel.config import TrainConfig
+from univoxel.data import Photos
+from univoxel.errors import DataError, UserError
+from univoxel.grid import GridShape, fit_grid
+from univoxel.names import Varying
+from univoxel.poses import PoseSteps
+from univoxel.preparation.carving import opened
+from univoxel.preparation.exposures import exposures
+from univoxel.preparation.hull import visual_hull
+from univoxel.preparation.masks import masks_of
+from univoxel.preparation.registration import object_box, put_right
+from univoxel.training.config import StageConfig
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """What masks and cameras say; a run that is resumed needs it too, and it is the same then."""
+
+    photos: Photos  # masks as they are used, cameras as they were given
+    distance: Tensor  # [V, H, W] pixels to the silhouette, negative inside
+    box: tuple[Tensor, Tensor]  # corners [3], [3] around the object
+    refined: bool  # whether the cameras are refined
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What a new scene is built from."""
+
+    silhouettes: Silhouettes
+    poses: PoseSteps | None  # steps to cameras whose silhouettes agree; None: they stay
+    grid: GridShape  # of the first stage
+    hull: Tensor  # [X, Y, Z] sdf of the carved visual hull on the grid, world units
+    varying: Varying  # what differs from photograph to photograph
+    gains: Tensor | None  # [V] log gains of the exposures; None: all are alike
+
+
+def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
+    """The photographs with the masks that are used, and the box around the object.
+
+    Raises:
+        DataError: the silhouettes share no volume.
+    """
+    photos, distance = masks_of(photos, cfg.masks)
+    try:
+        box, refined = object_box(distance, photos.cameras, cfg.cameras)
+    except UserError as error:
+        raise DataError(f"{cfg.data}: {error}") from None
+    return Silhouettes(photos, distance, box, refined)
+
+
+def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
+    """Cameras, carved hull and exposures that training begins with.
+
+    Args:
+        cfg: its first stage says how many voxels the hull's grid has.
+    """
+    stage = cfg.stages[0]
+    assert isinstance(stage, StageConfig)
+    photos, distance, box = silhouettes.photos, silhouettes.distance, silhouettes.box
+    grid = fit_grid(*box, round(1e6 * stage.voxels))
+    poses = put_right(distance, photos.cameras, box) if silhouettes.refined else None
+    if poses:
+        photos = replace(photos, cameras=poses.corrected(photos.cameras))
+    hull = visual_hull(distance, photos.cameras, grid)
+    varying, gains = exposures(photos, hull, grid, cfg.scene.varying, cfg.exposures)
+    if cfg.hollows and varying != "light":
+        hull = opened(hull, grid, photos, gains, cfg.hollows * 60 * cfg.minutes)
+    return Prepared(silhouettes, poses, grid, hull, varying, gains)

@@ -1,0 +1,36 @@
+"""Which pixels of the photographs training looks at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from univoxel.data import Photos
+
+MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
+HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
+
+
+@dataclass(frozen=True)
+class TrainingPixels:
+    """Photographs, and which of their pixels [P, 3] (view, row, column) serve what."""
+
+    photos: Photos
+    trained: Tensor
+    held_out: Tensor  # only looked at, to follow quality
+
+
+def split_pixels(photos: Photos, distance: Tensor) -> TrainingPixels:
+    """The pixels in or near silhouettes: those to train on, and some that are held out.
+
+    Args:
+        distance: [V, H, W] pixels to the silhouette, negative inside.
+    """
+    pixels = (distance < MARGIN).nonzero()
+    order = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))
+    held = min(HELD_OUT, len(pixels) // 10)
+    if not held:  # so few that none can be spared
+        return TrainingPixels(photos, pixels, pixels)
+    return TrainingPixels(photos, pixels[order[held:]], pixels[order[:held]])
