@@ -54,12 +54,12 @@ def adapt_(
         choices += choose_grid_(scene, cfg, after[0], box, pixels, pace)
     if isinstance(stage, StageConfig) and not stage.refit and stage.physical_from < 1:
         constants = cfg.compression
-        calibration = random_reference_rays(photos, pixels.pixels, constants.calibration_rays)
+        calibration = random_reference_rays(photos, pixels.trained, constants.calibration_rays)
         channels_limit_db = constants.regained_db if after else constants.tolerance_db
         criterion = search.Criterion(held_out, calibration, constants.tolerance_db, constants)
         choices += reduce_networks_(scene, criterion, channels_limit_db)
     if not after:
-        choices += reduce_storage_(scene, cfg, held_out, photos, pixels.pixels)
+        choices += reduce_storage_(scene, cfg, held_out, photos, pixels.trained)
     return choices
 
 

@@ -125,8 +125,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
                 run_stage(scene, cfg, stage, photos, pixels, held_out, progress)
             done = index + 1 == len(cfg.stages)
             if cfg.capacity == "adaptive" and (done or not progress.over):
-                trained = TrainingPixels(photos, pixels, held_out)
-                choices = plan.adapt_(scene, cfg, index, box, trained, progress.pace)
+                split = TrainingPixels(photos, pixels, held_out)
+                choices = plan.adapt_(scene, cfg, index, box, split, progress.pace)
                 progress.chosen += choices
                 if not done and plan.begun_in_rehearsal(scene, choices):
                     progress.credit(cfg.compression.rehearsal_share)

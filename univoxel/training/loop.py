@@ -60,7 +60,7 @@ class TrainingPixels:
     """Photographs, and which of their pixels [P, 3] (view, row, column) serve what."""
 
     photos: Photos
-    pixels: Tensor  # trained on
+    trained: Tensor
     held_out: Tensor  # only looked at, to follow quality
 
 
@@ -164,7 +164,7 @@ def rehearsal(
     # From middling rates on: what has been learned must not be shaken
     rates = {n: (math.sqrt(a * b), b) for n in RATES for a, b in [getattr(stage, n)]}
     stage, cfg = replace(stage, physical_from=1.0, **rates), replace(cfg, patience=0.0)
-    run_stage(scene, cfg, stage, photos, pixels.pixels, held_out, Rehearsal(steps))
+    run_stage(scene, cfg, stage, photos, pixels.trained, held_out, Rehearsal(steps))
     return held_out_psnr(scene, photos, held_out, physical=False)
 
 
