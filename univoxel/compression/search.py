@@ -270,7 +270,7 @@ def _reduce_(
             dropped any.
     """
     baseline = Baseline.of(scene, criterion.held_out)
-    lesson = Baseline.of(scene, criterion.calibration)
+    calibration = Baseline.of(scene, criterion.calibration)
     settles = head_share(scene) > criterion.cfg.least_head_share
     limit = criterion.limit_db
     whole = sizes[0]
@@ -282,7 +282,7 @@ def _reduce_(
             channels = reduce_(size)
             losses[size] = baseline.loss_db(scene, channels)
             if losses[size] > limit and settles:
-                _settle_(scene, snapshots[whole], lesson, channels, criterion.cfg)
+                _settle_(scene, snapshots[whole], calibration, channels, criterion.cfg)
                 losses[size] = baseline.loss_db(scene, channels)
             snapshots[size] = prune.snapshot(scene)
         return losses[size]
@@ -298,23 +298,24 @@ def _reduce_(
 def _settle_(
     scene: Scene,
     before: prune.Snapshot,
-    lesson: Baseline,
+    calibration: Baseline,
     channels: Tensor | None,
     cfg: CompressionConfig,
 ) -> None:
     """Train the networks that were replaced since a snapshot to give what was decoded before.
 
     Args:
-        lesson: what the scene gave then along the calibration rays.
+        calibration: what the scene gave then along the calibration rays.
         channels: those that features have left [K]; None: all.
     """
     parameters = [p for network in prune.replaced_networks(before) for p in network.parameters()]
     optimizer = torch.optim.Adam(parameters, lr=cfg.settle_rate)
     for k in range(cfg.settle_steps):
         optimizer.param_groups[0]["lr"] = cfg.settle_rate * (1 - k / cfg.settle_steps)
-        decoded = lesson.decode(scene, channels)
+        decoded = calibration.decode(scene, channels)
         errors = [
-            (x - target).square().mean() for x, target in zip(decoded, lesson.decoded, strict=True)
+            (x - target).square().mean()
+            for x, target in zip(decoded, calibration.decoded, strict=True)
         ]
         loss = torch.stack(errors).sum()
         optimizer.zero_grad(set_to_none=True)
