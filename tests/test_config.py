@@ -248,3 +248,9 @@ def test_a_run_does_not_go_on_with_more_stages(tmp_path):
 def test_a_file_that_holds_no_configuration(tmp_path):
     with pytest.raises(ValueError, match=r"config\.json: expected an object"):
         check_same(saved(tmp_path, lambda content: [content]))
+
+
+def test_a_run_does_not_go_on_under_other_constants_of_compression(tmp_path):
+    cfg = saved(tmp_path, lambda content: content["compression"].update(rehearsal_steps=99))
+    with pytest.raises(ValueError, match="the run began with other compression"):
+        check_same(cfg)

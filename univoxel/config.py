@@ -137,7 +137,7 @@ def check_same(cfg: TrainConfig) -> None:
     since |= {"masks": "given", "cameras": "given", "exposures": False}
     began |= {name: value for name, value in since.items() if name not in before}
     now = _as_json(cfg)
-    for name in ("stages", "scene", *since):
+    for name in ("stages", "scene", "compression", *since):
         if began.get(name) != now[name]:
             raise UserError(
                 f"{path}: the run began with other {name}: resume with the same "
