@@ -46,7 +46,7 @@ HELPERS = {
     "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
-    "preparation": {"carving", "exposures", "hull", "masks", "registration"},
+    "preparation": {"depth_sweep", "carving", "exposures", "hull", "masks", "registration"},
     "training": {"clock", "pixels", "divergence", "plateau", "progress", "surface_update"},
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
     "compression": {"prune", "quality", "search", "sizes", "storage"},

@@ -67,3 +67,38 @@ def test_config_json_records_them(config, tmp_path):
     stage = json.loads((tmp_path / "config.json").read_text())["stages"][2]
     assert stage["metal"]["threshold"] == [-0.5, -0.2]
     assert set(stage) >= {"surface", "newton", "metal", "entropy", "trials", "adam"}
+
+
+@pytest.mark.parametrize(
+    ("record", "name", "text", "value"),
+    [
+        ("masks", "views", "8", 8),
+        ("hull", "margin", "0.1", 0.1),
+        ("registration", "edge", "(-2.0, -1.0)", (-2.0, -1.0)),
+        ("exposures", "min_stops", "1", 1.0),
+        ("carving", "agree", "0.7", 0.7),
+    ],
+)
+def test_the_constants_of_preparation(config, tmp_path, record, name, text, value):
+    other = replace(changed(config, [f"preparation.{record}.{name}={text}"]), out=tmp_path)
+    before = getattr(config.preparation, record)
+    assert getattr(other.preparation, record) == replace(before, **{name: value})
+    save_config(other)
+    held = json.loads((tmp_path / "config.json").read_text())["preparation"][record][name]
+    assert held == (list(value) if isinstance(value, tuple) else value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("carving.agree=1.5", r"CarvingConfig: agree must be in \[0, 1\], got 1.5"),
+        ("carving.jump=0.001", "CarvingConfig: jump must be at least slope, got 0.001"),
+        ("registration.lr=(0.0, 1.0)", "RegistrationConfig: lr must be two numbers above 0"),
+        ("masks.ring=(4.0, 1.0)", "MaskConfig: ring must be two numbers, at least 0 and rising"),
+        ("hull.box_nodes=4", "HullConfig: box_nodes must be at least 8, got 4"),
+        ("exposures.prior=0.0", "ExposureConfig: prior must be above 0, got 0.0"),
+    ],
+)
+def test_ranges_of_preparation(config, change, message):
+    with pytest.raises(ValueError, match=message):
+        changed(config, [f"preparation.{change}"])

@@ -76,3 +76,20 @@ def resize(cameras: Cameras, width: int) -> Cameras:
     return Cameras(
         cameras.camera_to_world, cameras.focal * scale, cameras.centre * scale, width, height
     )
+
+
+def pixel_width(cameras: Cameras, point: Tensor) -> float:
+    """How wide a pixel is at a point [3], in world units: the median over the cameras."""
+    distance = (cameras.camera_to_world[:, :, 3] - point).norm(dim=1)
+    return float((distance / cameras.focal.mean(1)).median())
+
+
+def projection_matrices(cameras: Cameras) -> Tensor:
+    """World to (x z, y z, z) of pixels: [V, 3, 4]."""
+    pose = cameras.camera_to_world
+    turn = pose[:, :, :3].transpose(1, 2) * torch.tensor([1.0, -1.0, -1.0])[:, None]
+    local = torch.cat([turn, -turn @ pose[:, :, 3:]], 2)  # x right, y down, z away
+    lens = torch.zeros(len(pose), 3, 3)
+    lens[:, 0, 0], lens[:, 1, 1] = cameras.focal.unbind(1)
+    lens[:, :2, 2], lens[:, 2, 2] = cameras.centre, 1.0
+    return lens @ local

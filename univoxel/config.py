@@ -16,6 +16,7 @@ from univoxel.fields.features import PER_LEVEL
 from univoxel.files import replacing
 from univoxel.joint.config import JointConfig
 from univoxel.names import CamerasFrom, Capacity, MasksFrom
+from univoxel.preparation.config import PreparationConfig
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.validation import check_fields
@@ -58,6 +59,7 @@ class TrainConfig:
     budget_mb: float | None = None  # 1e6 bytes that the model's file may have, > 0; adaptive only
     scene: SceneConfig = field(default_factory=SceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)
+    preparation: PreparationConfig = field(default_factory=PreparationConfig)
     compression: CompressionConfig = field(default_factory=CompressionConfig)
 
     def __post_init__(self):
@@ -137,7 +139,7 @@ def check_same(cfg: TrainConfig) -> None:
     since |= {"masks": "given", "cameras": "given", "exposures": False}
     began |= {name: value for name, value in since.items() if name not in before}
     now = _as_json(cfg)
-    for name in ("stages", "scene", "compression", *since):
+    for name in ("stages", "scene", "preparation", "compression", *since):
         if began.get(name) != now[name]:
             raise UserError(
                 f"{path}: the run began with other {name}: resume with the same "

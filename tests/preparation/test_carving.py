@@ -8,8 +8,9 @@ from analytic import cameras_around, look_at
 
 from univoxel.camera import Cameras, image_rays
 from univoxel.grid import fit_grid
-from univoxel.preparation import carving
-from univoxel.preparation.carving import hollowed
+from univoxel.preparation.carving import carve_concavities
+from univoxel.preparation.config import CarvingConfig
+from univoxel.preparation.depth_sweep import log_colors
 from univoxel.preparation.hull import mask_distances, visual_hull
 
 SIZE, VIEWS = 48, 30
@@ -79,7 +80,7 @@ def from_above(views=VIEWS):
 
 @cache
 def hull_of(shape, look, cameras):
-    """What `hollowed` takes."""
+    """What `carve_concavities` takes."""
     pictures = photographed(shape, look, cameras)
     distance = mask_distances(pictures[..., 3] / 255)
     grid = fit_grid(torch.full((3,), -0.6), torch.full((3,), 0.6), 40_000)
@@ -90,7 +91,7 @@ def hull_of(shape, look, cameras):
 def opened(shape, look, cameras):
     """The hull's SDF, what became of it, and the shape's own, on the same nodes."""
     hull, grid, *photos = hull_of(shape, look, cameras)
-    return hull, hollowed(hull, grid, *photos), shape(grid.nodes()), grid.voxel_size
+    return hull, carve_concavities(hull, grid, *photos), shape(grid.nodes()), grid.voxel_size
 
 
 def test_a_pit_is_opened():
@@ -103,24 +104,24 @@ def test_a_pit_is_opened():
     assert (found >= hull).all()
 
 
-def test_a_dark_pit_is_opened(monkeypatch):
+def test_a_dark_pit_is_opened():
     hull, found, truth, voxel = opened(with_pit, dim, from_above())
     pit = (hull < -voxel) & (truth > voxel)
     assert (found[pit] > 0).float().mean() > 0.8
-    monkeypatch.setattr(carving, "DARK_SHARE", 0.0)
-    as_it_is = hollowed(*hull_of(with_pit, dim, from_above()))
+    as_it_is = CarvingConfig(log_share=0.0)
+    as_it_is = carve_concavities(*hull_of(with_pit, dim, from_above()), as_it_is)
     assert (as_it_is[pit] > 0).float().mean() < (found[pit] > 0).float().mean() - 0.2
 
 
 def test_dark_colours_are_taken_further_apart():
     color = torch.tensor([0, 10, 20, 120, 245, 255], dtype=torch.uint8)
     opaque = torch.stack([color] * 3 + [torch.full_like(color, 255)], 1)[None]
-    found = carving._stretched(opaque)[0, :, 0].int()
+    found = log_colors(opaque)[0, :, 0].int()
     assert found[0] == 0
     assert found[-1] == 255
     assert found[2] - found[1] > 3 * (found[5] - found[4])
     half = torch.cat([opaque[..., :3] // 2, torch.full_like(opaque[..., 3:], 128)], 2)
-    again = carving._stretched(half)[0]
+    again = log_colors(half)[0]
     # Halves are rounded, and a step of them is several in the dark
     assert (2 * again[:, 0].int() - found).abs().max() < 8
     assert (again[:, 3] == 128).all()
@@ -146,12 +147,12 @@ def test_what_photographs_cannot_tell_stays(look):
 
 @pytest.mark.parametrize(
     ("rule", "strict"),
-    [("AGREE", 1.0), ("LEAST", 1.0), ("ENOUGH", 1.0), ("BETTER", 1.0), ("PIECE", 0.2)],
+    [("agree", 1.0), ("least", 1.0), ("enough", 1.0), ("better", 1.0), ("piece", 0.2)],
 )
-def test_each_rule_can_keep_the_pit_closed(monkeypatch, rule, strict):
-    monkeypatch.setattr(carving, rule, strict)
+def test_each_rule_can_keep_the_pit_closed(rule, strict):
+    cfg = CarvingConfig(**{rule: strict})
     case = hull_of(with_pit, checks, from_above())
-    assert torch.equal(hollowed(*case), case[0])
+    assert torch.equal(carve_concavities(*case, cfg), case[0])
 
 
 @cache
@@ -164,12 +165,11 @@ def mostly_from_below():
     return Cameras(torch.stack([look_at(p) for p in at]), cameras.focal, cameras.centre, SIZE, SIZE)
 
 
-def test_what_few_views_see_through_stays(monkeypatch):
+def test_what_few_views_see_through_stays():
     """They may all look at a lamp in something glossy."""
     case = hull_of(with_pit, checks, mostly_from_below())
-    assert torch.equal(hollowed(*case), case[0])
-    monkeypatch.setattr(carving, "LEAST", 0.05)
-    assert not torch.equal(hollowed(*case), case[0])
+    assert torch.equal(carve_concavities(*case), case[0])
+    assert not torch.equal(carve_concavities(*case, CarvingConfig(least=0.05)), case[0])
 
 
 def test_two_views_open_nothing():

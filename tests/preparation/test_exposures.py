@@ -11,7 +11,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.grid import fit_grid
 from univoxel.names import Varying
 from univoxel.preparation import exposures as task
-from univoxel.preparation.exposures import exposures, log_gains
+from univoxel.preparation.exposures import log_gains, varying_and_gains
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
 
 VIEWS = 16
@@ -119,7 +119,7 @@ def test_what_differs(
     photos, hull, caplog, most: float, varying: Varying, look: bool, wanted: Varying, told: bool
 ):
     caplog.set_level("INFO", "univoxel")
-    found, gains = exposures(exposed(photos, stops(most)), *hull, varying, look)
+    found, gains = varying_and_gains(exposed(photos, stops(most)), *hull, varying, look)
     assert found == wanted
     assert (gains is not None) == told
     if gains is not None:
@@ -131,4 +131,4 @@ def test_what_differs(
 
 def test_nothing_is_looked_for_that_was_not_asked_for(photos, hull, monkeypatch):
     monkeypatch.setattr(task, "log_gains", None)
-    assert exposures(photos, *hull, "none", look=False) == ("none", None)
+    assert varying_and_gains(photos, *hull, "none", look=False) == ("none", None)

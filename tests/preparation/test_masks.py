@@ -4,9 +4,9 @@ import pytest
 import torch
 from scipy import ndimage
 
-from univoxel.preparation import masks as masks_module
+from univoxel.preparation.config import MASKS, MaskConfig
 from univoxel.preparation.hull import mask_distances
-from univoxel.preparation.masks import taken_in, too_wide
+from univoxel.preparation.masks import eroded, mask_excess, repeats_edge
 
 VIEWS, SIZE, RADIUS = 6, 96, 26
 
@@ -38,8 +38,8 @@ def before(surroundings: torch.Tensor, disc: torch.Tensor) -> torch.Tensor:
     return inside * disc + (1 - inside) * surroundings
 
 
-def found(color: torch.Tensor, masks: torch.Tensor) -> int:
-    return too_wide(color, masks, mask_distances(masks))
+def found(color: torch.Tensor, masks: torch.Tensor, cfg: MaskConfig = MASKS) -> int:
+    return mask_excess(color, masks, mask_distances(masks), cfg)
 
 
 @pytest.mark.parametrize("eight_bits", [False, True])
@@ -71,10 +71,10 @@ def test_colours_of_the_edge_that_go_on_outside_are_no_surroundings(spread):
         y, x = torch.from_numpy(nearest)
         picture.copy_(picture[y, x])
     distance = mask_distances(masks)
-    assert all(masks_module._bled(c, d) for c, d in zip(color, distance, strict=True))
+    assert all(repeats_edge(c, d) for c, d in zip(color, distance, strict=True))
     if not spread:  # what stands behind
         color = before(patterned(0, 0.0, 0.4), color)
-        assert not any(masks_module._bled(c, d) for c, d in zip(color, distance, strict=True))
+        assert not any(repeats_edge(c, d) for c, d in zip(color, distance, strict=True))
     assert found(color, masks) == 0
 
 
@@ -91,23 +91,22 @@ def test_no_edge_says_nothing(masks):
     assert found(torch.rand(2, 9, 9, 3), masks) == 0
 
 
-def test_wider_masks_than_are_looked_for_stay(monkeypatch):
+def test_wider_masks_than_are_looked_for_stay():
     color = before(patterned(0, 0.0, 0.4), patterned(1, 0.3, 0.9))
     assert found(color, coverage(9)) == 0
-    monkeypatch.setattr(masks_module, "REACH", (0.1, 6))  # of 96 pixels
-    assert found(color, coverage(9)) == 9
+    further = MaskConfig(reach_share=0.1)  # of 96 pixels
+    assert found(color, coverage(9), further) == 9
 
 
-def test_of_many_photographs_some_are_looked_at(monkeypatch):
-    monkeypatch.setattr(masks_module, "VIEWS", 2)
+def test_of_many_photographs_some_are_looked_at():
     color, alpha = before(patterned(0, 0.0, 0.4), patterned(1, 0.3, 0.9)), coverage(0)
     alpha[::3] = coverage(3)[::3]  # two of six
-    assert found(color, alpha) == 3
+    assert found(color, alpha, MaskConfig(views=2)) == 3
 
 
 def test_taken_in_masks_end_where_the_object_does():
     wide = mask_distances(coverage(3))
-    inner = taken_in(wide, 3)
+    inner = eroded(wide, 3)
     # Distances to pixels, not to the true edge: up to half a pixel off
     assert (inner - coverage(0)).abs().max() < 0.6
     assert (inner - coverage(0)).abs().mean() < 0.01

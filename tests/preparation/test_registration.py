@@ -11,7 +11,7 @@ from univoxel.camera import project
 from univoxel.experiments.stress.damage import turned
 from univoxel.poses import PoseSteps
 from univoxel.preparation.hull import mask_distances
-from univoxel.preparation.registration import Edges, align, contradiction
+from univoxel.preparation.registration import Edges, align_, contradiction
 
 VIEWS, SIZE = 16, 64
 BOX = torch.full((3,), -0.7), torch.full((3,), 0.7)
@@ -37,7 +37,7 @@ def off(cameras):
 def aligned(cameras):
     poses = PoseSteps(VIEWS)
     poses.about(cameras, torch.zeros(3), 0.7)
-    align(poses, distances(), cameras, BOX)
+    align_(poses, distances(), cameras, BOX)
     return poses.eval().corrected(cameras)
 
 
@@ -88,5 +88,5 @@ def test_without_silhouettes_nothing_is_said_and_nothing_moves():
     cameras, empty = cameras_around(VIEWS, SIZE), torch.full((VIEWS, SIZE, SIZE), 64.0)
     assert contradiction(empty, cameras, BOX) == 0.0
     poses = PoseSteps(VIEWS)
-    align(poses, empty, cameras, BOX)
+    align_(poses, empty, cameras, BOX)
     assert not poses.steps.any()

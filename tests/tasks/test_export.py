@@ -61,7 +61,7 @@ def written(scene, tmp_path_factory):
     """The scene in each format: name -> path."""
     folder = tmp_path_factory.mktemp("out")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task, "load_scene", lambda run: {"run": scene}[run])
+        patch.setattr(task, "load_scene", lambda run: {"run": scene}[str(run)])
         for name in ("a.glb", "a.obj", "a.ply"):
             task.export("run", folder / "deep" / name, faces=FACES, texture_size=SIZE)
     return folder / "deep"

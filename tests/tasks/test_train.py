@@ -144,15 +144,15 @@ def test_masks_that_are_too_wide_are_taken_in(tmp_path, monkeypatch, caplog, mas
 def test_hollows_are_opened_where_light_is_the_same(
     data, tmp_path, monkeypatch, hollows, varying, wanted
 ):
-    """What training starts with is what `opened` makes of the hull in its share of 2 minutes."""
+    """What training starts with is what carving makes of the hull in its share of 2 minutes."""
     given = []
 
-    def larger(hull, grid, photos, gains, seconds):
+    def larger(hull, grid, photos, gains, seconds, cfg):
         given.append(seconds)
         return hull + 0.25
 
     monkeypatch.setattr(task, "run_stage", lambda *_: None)
-    monkeypatch.setattr(preparation, "opened", larger)
+    monkeypatch.setattr(preparation, "carve_within_time", larger)
     cfg = config(data, tmp_path / "run", hollows=hollows)
     cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, varying=varying))
     away = extract_mesh(load_scene(train(cfg))).vertices.norm(dim=1)
@@ -178,7 +178,8 @@ def test_a_gradient_spreads_over_the_nodes_that_it_touches():
     torch.testing.assert_close(spread.sum(), torch.tensor(1.0))  # two passes stay in the block
 
 
-def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, capsys):
+def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, caplog):
+    caplog.set_level("INFO", "univoxel")
     """The sphere, 40 times as large, far away and upside down, from half of the pixels."""
     scale, centre = 40.0, torch.tensor([100.0, -50.0, 30.0])
     photos = photos_of(16, 64)
@@ -194,7 +195,7 @@ def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, capsys):
     stages = (StageConfig(voxels=0.01, iterations=40, share=1.0, rays=256),)
     out = train(config(data, tmp_path / "run", stages=stages, downscale=2))
     said = "COLMAP model, 14 photographs of 32x32 pixels in train, shrunk to 1/2, world turned to"
-    assert said in capsys.readouterr().out
+    assert said in caplog.text
     mesh = extract_mesh(load_scene(out))
     middle = (mesh.vertices.amin(0) + mesh.vertices.amax(0)) / 2
     away = (mesh.vertices - middle).norm(dim=1) / scale - RADIUS
@@ -235,7 +236,7 @@ def test_a_sparse_run_is_resumed(data, tmp_path, monkeypatch):
 
     for module in (task, loop):  # the last of a stage, and those within
         monkeypatch.setattr(module, "save_scene", killed)
-    monkeypatch.setattr(task.Progress, "checkpoint_due", lambda self: self.step == 70)
+    monkeypatch.setattr(task.Progress, "checkpoint_due", lambda self: self.clock.step == 70)
     with pytest.raises(KeyboardInterrupt):
         train(cfg)
     first = load_scene(cfg.out)
@@ -282,7 +283,7 @@ def test_resume_refuses_another_configuration(run, data):
 
 
 def test_a_run_is_not_overwritten(run, data):
-    with pytest.raises(FileExistsError, match="holds a run already: pass --resume"):
+    with pytest.raises(FileExistsError, match="holds a run already: pass resume"):
         train(config(data, run))
 
 

@@ -141,7 +141,8 @@ def test_a_watcher_is_called_between_steps_off_the_clock(tmp_path, clock):
     assert progress.clock.seconds == pytest.approx(0.1)
 
 
-def test_what_was_cut_is_told(tmp_path, clock, capsys):
+def test_what_was_cut_is_told(tmp_path, clock, caplog):
+    caplog.set_level("INFO", "univoxel")
     cfg = config(tmp_path, 0.5, 0.5, iterations=100)
     with Progress(cfg, clock.now, START) as progress:
         steps(progress, clock, 0.01)
@@ -149,7 +150,7 @@ def test_what_was_cut_is_told(tmp_path, clock, capsys):
     assert progress.clock.made == pytest.approx([1.0, 0.5], abs=0.01)
     assert progress.state()["made"] == progress.clock.made
     assert progress.clock.pace == progress.clock.made[1]
-    told = capsys.readouterr().out
+    told = caplog.text
     assert "time ended this training early: of the planned steps it made 50% in stage 2;" in told
 
 
@@ -165,7 +166,8 @@ def test_a_stage_in_two_sittings_is_counted_whole(tmp_path, clock):
     assert later.clock.made == [1.0]
 
 
-def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, capsys):
+def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, caplog):
+    caplog.set_level("INFO", "univoxel")
     with Progress(config(tmp_path, 1.0, iterations=1000), clock.now, START) as progress:
         done = []
         for x in progress.clock.steps():
@@ -178,7 +180,7 @@ def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, ca
     assert done[-1] > 0.99
     assert (progress.clock.early, progress.state()["early"]) == ([0], [0])
     assert progress.clock.pace == 1.0
-    assert "time ended" not in capsys.readouterr().out
+    assert "time ended" not in caplog.text
 
 
 def test_no_time_is_no_step(tmp_path, clock):

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from univoxel.camera import Cameras
+from univoxel.camera import Cameras, pixel_width
 from univoxel.checkpoint import SHELL
 from univoxel.compression import search
 from univoxel.compression.choices import CapacityChoice, chosen_reach, chosen_voxels
@@ -215,8 +215,7 @@ def limited_to_pixels(
     if not cfg.voxel_pixels:
         return cfg
     lower, upper = box
-    distance = (cameras.camera_to_world[:, :, 3] - (lower + upper) / 2).norm(dim=1)
-    pixel = float((distance / cameras.focal.mean(1)).median())
+    pixel = pixel_width(cameras, (lower + upper) / 2)
     most = float((upper - lower).prod()) / (cfg.voxel_pixels * pixel) ** 3
     most = max(most, cfg.compression.fewest_voxels) / 1e6
     stages = (

@@ -15,20 +15,17 @@ from univoxel.fields.dense import DenseDistances
 from univoxel.grid import GridShape
 from univoxel.names import Varying
 from univoxel.ops import VisibilityScene
+from univoxel.preparation.config import EXPOSURES, ExposureConfig
 from univoxel.records import Mesh
 from univoxel.render.transport import observe, surface_points
 
 log = logging.getLogger("univoxel")
 
-POINTS = 6000  # of the surface
-DARK = 0.1  # sRGB; of what is darker, rounding to 8 bits and reflections are too large a part
-ALIKE = 0.07  # in log: what is seen of one point may differ by before it counts for less
-ROUNDS = 20
-LOOSE = 1e-3  # points that speak for a gain of 1: of a photograph that shares none with others
-
 
 @torch.no_grad()
-def log_gains(photos: Photos, sdf: Tensor, grid: GridShape) -> Tensor:
+def log_gains(
+    photos: Photos, sdf: Tensor, grid: GridShape, cfg: ExposureConfig = EXPOSURES
+) -> Tensor:
     """The log gains of photographs that agree best on how bright a surface's points are.
 
     log brightness_pv = log gain_v + log albedo_p, in robust least squares: many sightings are of
@@ -51,34 +48,33 @@ def log_gains(photos: Photos, sdf: Tensor, grid: GridShape) -> Tensor:
     vertices, faces = field.isosurface()
     normals = normalize(field.sample(vertices).gradient, dim=1, eps=1e-6)
     mesh = Mesh(vertices, faces, normals)
-    points = surface_points(mesh, POINTS, torch.Generator().manual_seed(0))
+    points = surface_points(mesh, cfg.points, torch.Generator().manual_seed(0))
     seen = observe(*points, photos, VisibilityScene(vertices, faces), grid.voxel_size)
     encoded = linear_to_srgb(seen.color)
-    usable = (encoded.mean(1) > DARK) & (encoded < CLIPPED).all(1)
+    usable = (encoded.mean(1) > cfg.dark) & (encoded < CLIPPED).all(1)
     where = torch.repeat_interleave(seen.offsets.diff())[usable], seen.view[usable]
-    log, there = torch.zeros(2, POINTS, len(photos), dtype=torch.double)
+    log, there = torch.zeros(2, cfg.points, len(photos), dtype=torch.double)
     log[where], there[where] = seen.color[usable].mean(1).double().log(), 1.0
     weight = there
-    for _ in range(ROUNDS):
+    for _ in range(cfg.rounds):
         share = weight / weight.sum(1, keepdim=True).clamp_min(1e-9)
         # The albedos eliminated: a Laplacian of the photographs, tied by the points that they share
-        system = torch.diag(weight.sum(0) + LOOSE) - weight.T @ share
+        system = torch.diag(weight.sum(0) + cfg.prior) - weight.T @ share
         right = (weight * (log - (share * log).sum(1, keepdim=True))).sum(0)
         gain = torch.linalg.solve(system, right)
         gain = gain - gain.mean()
         albedo = (share * (log - gain)).sum(1, keepdim=True)
-        weight = there / (1 + ((log - gain - albedo) / ALIKE).square())
+        weight = there / (1 + ((log - gain - albedo) / cfg.cauchy).square())
     return gain.float()
 
 
-# Stops, root mean square, from which on exposures count as different. Where they are alike, what
-# reflects and a hull that is too large look like 0.01 to 0.16. All of metal, or light that changes,
-# look like 0.25: gains do no harm there
-DIFFERENT = 0.2
-
-
-def exposures(
-    photos: Photos, hull: Tensor, grid: GridShape, varying: Varying, look: bool
+def varying_and_gains(
+    photos: Photos,
+    hull: Tensor,
+    grid: GridShape,
+    varying: Varying,
+    look: bool,
+    cfg: ExposureConfig = EXPOSURES,
 ) -> tuple[Varying, Tensor | None]:
     """What differs from photograph to photograph, and their log gains [V] where anything does.
 
@@ -91,10 +87,10 @@ def exposures(
     """
     if varying == "none" and not look:
         return varying, None
-    gains = log_gains(photos, hull, grid)
+    gains = log_gains(photos, hull, grid, cfg)
     stops = float(gains.square().mean().sqrt()) / math.log(2)
     if varying == "none":
-        if stops < DIFFERENT:
+        if stops < cfg.min_stops:
             return varying, None
         varying = "exposure"
         log.info(

@@ -10,6 +10,7 @@ from torch import Tensor
 from univoxel.camera import Cameras, looked_at, project
 from univoxel.errors import UserError
 from univoxel.grid import GridShape, fit_coarse, fit_grid, resample
+from univoxel.preparation.config import HULL, HullConfig
 
 
 def mask_distances(alpha: Tensor) -> Tensor:
@@ -60,8 +61,10 @@ def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
     return torch.where(sdf.isinf(), torch.inf, sdf)
 
 
-def estimate_bounds(distance: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Corners [3], [3] of a box around the visual hull, with a margin of 3 % of its diagonal.
+def estimate_bounds(
+    distance: Tensor, cameras: Cameras, cfg: HullConfig = HULL
+) -> tuple[Tensor, Tensor]:
+    """Corners [3], [3] of a box around the visual hull, with a margin.
 
     Raises:
         UserError: the silhouettes share no volume.
@@ -69,10 +72,10 @@ def estimate_bounds(distance: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]
     centre = looked_at(cameras)
     away = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
     field_of_view = max(cameras.width, cameras.height) / (2 * cameras.focal.min(1).values)
-    half = float((away * field_of_view).max()) * 1.2
+    half = float((away * field_of_view).max()) * cfg.first_box
     lower, upper = centre - half, centre + half
-    for _ in range(2):  # each round sees the hull at a finer grid
-        grid = fit_grid(lower, upper, 64**3)
+    for _ in range(cfg.box_rounds):  # each round sees the hull at a finer grid
+        grid = fit_grid(lower, upper, cfg.box_nodes)
         nodes = grid.nodes().reshape(-1, 3)
         inside = nodes[hull_sdf(distance, cameras, nodes) < grid.voxel_size]
         if not len(inside):
@@ -80,14 +83,16 @@ def estimate_bounds(distance: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]
                 "the silhouettes of the photographs share no volume: check masks and cameras"
             )
         lower, upper = inside.amin(0), inside.amax(0)
-        margin = 0.03 * (upper - lower).norm() + grid.voxel_size
+        margin = cfg.margin * (upper - lower).norm() + grid.voxel_size
         lower, upper = lower - margin, upper + margin
     return lower, upper
 
 
-def visual_hull(distance: Tensor, cameras: Cameras, grid: GridShape) -> Tensor:
-    """SDF of the visual hull on a grid: [X, Y, Z], world units; evaluated at about 1 M nodes."""
-    stride = max(1, round((np.prod(grid.size) / 1e6) ** (1 / 3)))
+def visual_hull(
+    distance: Tensor, cameras: Cameras, grid: GridShape, cfg: HullConfig = HULL
+) -> Tensor:
+    """SDF of the visual hull on a grid: [X, Y, Z], world units; at about cfg.nodes evaluated."""
+    stride = max(1, round((np.prod(grid.size) / cfg.nodes) ** (1 / 3)))
     coarse = fit_coarse(grid, stride)
     sdf = hull_sdf(distance, cameras, coarse.nodes().reshape(-1, 3)).reshape(coarse.size)
     far = sum(n * n for n in grid.size) ** 0.5 * grid.voxel_size

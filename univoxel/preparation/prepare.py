@@ -12,11 +12,11 @@ from univoxel.errors import DataError, UserError
 from univoxel.grid import GridShape, fit_grid
 from univoxel.names import Varying
 from univoxel.poses import PoseSteps
-from univoxel.preparation.carving import opened
-from univoxel.preparation.exposures import exposures
+from univoxel.preparation.carving import carve_within_time
+from univoxel.preparation.exposures import varying_and_gains
 from univoxel.preparation.hull import visual_hull
-from univoxel.preparation.masks import masks_of
-from univoxel.preparation.registration import object_box, put_right
+from univoxel.preparation.masks import fitted_masks
+from univoxel.preparation.registration import bounds_and_refinement, registered_poses
 from univoxel.training.config import StageConfig
 
 
@@ -48,9 +48,9 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
     Raises:
         DataError: the silhouettes share no volume.
     """
-    photos, distance = masks_of(photos, cfg.masks)
+    photos, distance = fitted_masks(photos, cfg.masks, cfg.preparation.masks)
     try:
-        box, refined = object_box(distance, photos.cameras, cfg.cameras)
+        box, refined = bounds_and_refinement(distance, photos.cameras, cfg.cameras, cfg.preparation)
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
     return Silhouettes(photos, distance, box, refined)
@@ -64,13 +64,18 @@ def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
     """
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)
+    constants = cfg.preparation
     photos, distance, box = silhouettes.photos, silhouettes.distance, silhouettes.box
     grid = fit_grid(*box, round(1e6 * stage.voxels))
-    poses = put_right(distance, photos.cameras, box) if silhouettes.refined else None
-    if poses:
+    poses = None
+    if silhouettes.refined:
+        poses = registered_poses(distance, photos.cameras, box, constants.registration)
         photos = replace(photos, cameras=poses.corrected(photos.cameras))
-    hull = visual_hull(distance, photos.cameras, grid)
-    varying, gains = exposures(photos, hull, grid, cfg.scene.varying, cfg.exposures)
+    hull = visual_hull(distance, photos.cameras, grid, constants.hull)
+    varying, gains = varying_and_gains(
+        photos, hull, grid, cfg.scene.varying, cfg.exposures, constants.exposures
+    )
     if cfg.hollows and varying != "light":
-        hull = opened(hull, grid, photos, gains, cfg.hollows * 60 * cfg.minutes)
+        seconds = cfg.hollows * 60 * cfg.minutes
+        hull = carve_within_time(hull, grid, photos, gains, seconds, constants.carving)
     return Prepared(silhouettes, poses, grid, hull, varying, gains)

@@ -11,17 +11,16 @@ from torch.nn.functional import grid_sample
 from univoxel.camera import Cameras, pixel_rays
 from univoxel.names import CamerasFrom
 from univoxel.poses import PoseSteps
+from univoxel.preparation.config import (
+    PREPARATION,
+    REGISTRATION,
+    PreparationConfig,
+    RegistrationConfig,
+)
 from univoxel.preparation.hull import estimate_bounds
 from univoxel.records import Rays
 
 log = logging.getLogger("univoxel")
-
-EDGE = -1.6, -0.5  # pixels inside a silhouette that count as its edge
-PLACES = 48  # that are looked at along a ray, twice
-LOOKED_AT = 1000  # rays through edges that tell whether cameras contradict one another
-MOST = 0.95  # share of them that may miss by less than what is called the contradiction
-STEPS, RATES = 150, (5e-3, 2.5e-4)  # of Adam, at begin and end: radians, radii of the object
-RAYS, VIEWS = 256, 32  # a step: rays, and silhouettes that they are held against
 
 
 class Edges:
@@ -34,13 +33,19 @@ class Edges:
     Circular Motion".
     """
 
-    def __init__(self, distance: Tensor, box: tuple[Tensor, Tensor]) -> None:
+    def __init__(
+        self,
+        distance: Tensor,
+        box: tuple[Tensor, Tensor],
+        cfg: RegistrationConfig = REGISTRATION,
+    ) -> None:
         """
         Args:
             distance: [V, H, W] from `hull.mask_distances`, pixels.
             box: corners [3], [3] around the object.
         """
-        low, high = EDGE
+        low, high = cfg.edge
+        self.ray_samples = cfg.ray_samples
         self.distance = distance[:, None]
         self.pixels = ((distance > low) & (distance < high)).nonzero()  # [K, 3] view, row, column
         self.middle = (box[0] + box[1]) / 2
@@ -74,12 +79,12 @@ class Edges:
         middle = ((self.middle - rays.origin) * rays.direction).sum(1)
         reach = self.reach
         for _ in range(2):  # again, closer, around what was found
-            share = torch.linspace(-1, 1, PLACES)
+            share = torch.linspace(-1, 1, self.ray_samples)
             t = middle[:, None] + reach * share
             points = rays.origin[:, None] + t[..., None] * rays.direction[:, None]
             outside, view = self._outside(cameras, points.reshape(-1, 3), others)
             best = outside.view(t.shape).argmin(1, keepdim=True)
-            middle, reach = t.gather(1, best)[:, 0], 2 * reach / PLACES
+            middle, reach = t.gather(1, best)[:, 0], 2 * reach / self.ray_samples
         return middle, view.view(t.shape).gather(1, best)[:, 0]
 
     def _outside(self, cameras: Cameras, points: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
@@ -95,22 +100,33 @@ class Edges:
         return torch.where(most.isinf(), torch.inf, most), worst  # unseen places are outside
 
 
-def contradiction(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tensor]) -> float:
-    """Pixels that all but a twentieth of rays through silhouettes' edges miss the others by, at
+def contradiction(
+    distance: Tensor,
+    cameras: Cameras,
+    box: tuple[Tensor, Tensor],
+    cfg: RegistrationConfig = REGISTRATION,
+) -> float:
+    """Pixels that a cfg.quantile of the rays through silhouettes' edges miss the others by, at
     most: -0.3 or less where cameras and masks are exact, about their error where they are not.
 
     Args:
         distance, box: see `Edges`.
     """
-    edges, generator = Edges(distance, box), torch.Generator().manual_seed(0)
+    edges, generator = Edges(distance, box, cfg), torch.Generator().manual_seed(0)
     if not len(edges.pixels):
         return 0.0
-    pixels, views = edges.draw(LOOKED_AT, generator), torch.arange(len(cameras))
+    pixels, views = edges.draw(cfg.test_rays, generator), torch.arange(len(cameras))
     missed = edges.missed(cameras, pixels, views)
-    return float(missed.quantile(MOST))
+    return float(missed.quantile(cfg.quantile))
 
 
-def align(poses: PoseSteps, distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tensor]) -> None:
+def align_(
+    poses: PoseSteps,
+    distance: Tensor,
+    cameras: Cameras,
+    box: tuple[Tensor, Tensor],
+    cfg: RegistrationConfig = REGISTRATION,
+) -> None:
     """Move the cameras, by steps of `poses`, to where their silhouettes agree.
 
     What silhouettes do not show - how a ball is turned - stays as it is.
@@ -118,19 +134,19 @@ def align(poses: PoseSteps, distance: Tensor, cameras: Cameras, box: tuple[Tenso
     Args:
         distance, box: see `Edges`.
     """
-    edges, generator = Edges(distance, box), torch.Generator().manual_seed(0)
+    edges, generator = Edges(distance, box, cfg), torch.Generator().manual_seed(0)
     if not len(edges.pixels):
         return
-    begin, end = RATES
+    begin, end = cfg.lr
     optimizer = torch.optim.Adam(poses.parameters(), betas=(0.9, 0.99))
     poses.train()
-    for k in range(STEPS):
-        optimizer.param_groups[0]["lr"] = begin * (end / begin) ** (k / STEPS)
+    for k in range(cfg.steps):
+        optimizer.param_groups[0]["lr"] = begin * (end / begin) ** (k / cfg.steps)
         now = poses.corrected(cameras)
-        others = torch.randperm(len(cameras), generator=generator)[:VIEWS]
-        missed = edges.missed(now, edges.draw(RAYS, generator), others)
+        others = torch.randperm(len(cameras), generator=generator)[: cfg.views]
+        missed = edges.missed(now, edges.draw(cfg.rays, generator), others)
         # An edge pixel's own silhouette contains it by some 1: only more than that contradicts
-        off = (missed - sum(EDGE) / 2).clamp_min(0)
+        off = (missed - sum(cfg.edge) / 2).clamp_min(0)
         optimizer.zero_grad()
         (off.square() / (1 + off)).mean().backward()  # robust: some masks are wrong, not cameras
         optimizer.step()
@@ -145,11 +161,11 @@ def _seen(cameras: Cameras, points: Tensor, view: Tensor) -> tuple[Tensor, Tenso
     return pixel * torch.tensor([2 / cameras.width, 2 / cameras.height]) - 1, -z
 
 
-AGREEING = 0.25  # pixels that silhouettes may contradict one another by: -0.4 where all is exact
-
-
-def object_box(
-    distance: Tensor, cameras: Cameras, wanted: CamerasFrom
+def bounds_and_refinement(
+    distance: Tensor,
+    cameras: Cameras,
+    wanted: CamerasFrom,
+    cfg: PreparationConfig = PREPARATION,
 ) -> tuple[tuple[Tensor, Tensor], bool]:
     """Corners [3], [3] of a box around the object, and whether its cameras are to be refined.
 
@@ -158,12 +174,13 @@ def object_box(
         wanted: as of the configuration.
 
     Raises:
-        ValueError: the silhouettes share no volume.
+        UserError: the silhouettes share no volume.
     """
-    box = estimate_bounds(distance, cameras)
-    off = contradiction(distance, cameras, box)
-    refined = wanted == "refined" or (wanted == "auto" and off > AGREEING)
-    if off > AGREEING:
+    box = estimate_bounds(distance, cameras, cfg.hull)
+    off = contradiction(distance, cameras, box, cfg.registration)
+    limit = cfg.registration.max_contradiction
+    refined = wanted == "refined" or (wanted == "auto" and off > limit)
+    if off > limit:
         then = "cameras are refined" if refined else "see cameras=refined"
         log.info(
             "silhouettes contradict one another by %.1f pixels: %s",
@@ -172,22 +189,29 @@ def object_box(
             extra={"arguments": ("cameras",)},
         )
     if refined and off > 0:  # what the silhouettes share is too small by so much
-        box = estimate_bounds(distance - off, cameras)
+        box = estimate_bounds(distance - off, cameras, cfg.hull)
     return box, refined
 
 
-def put_right(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tensor]) -> PoseSteps:
-    """Steps to cameras whose silhouettes agree, as far as these tell; says how far they went.
+def registered_poses(
+    distance: Tensor,
+    cameras: Cameras,
+    box: tuple[Tensor, Tensor],
+    cfg: RegistrationConfig = REGISTRATION,
+) -> PoseSteps:
+    """Steps to cameras whose silhouettes agree, as far as these tell; logs how far they went.
 
     Args:
-        distance, box: see `object_box`.
+        distance, box: see `bounds_and_refinement`.
     """
     half = (box[1] - box[0]) / 2
     poses = PoseSteps(len(cameras))
     poses.about(cameras, box[0] + half, float(half.max()))
-    align(poses, distance, cameras, box)
+    align_(poses, distance, cameras, box, cfg)
     moved = poses.moved(cameras).square().mean().sqrt()
-    left = contradiction(distance, poses.eval().corrected(cameras), box)
-    left = f"still contradict one another by {left:.1f} pixels" if left > AGREEING else "agree"
-    log.info("cameras moved the object by %.1f pixels on average: silhouettes %s", moved, left)
+    rest = contradiction(distance, poses.eval().corrected(cameras), box, cfg)
+    result = "agree"
+    if rest > cfg.max_contradiction:
+        result = f"still contradict one another by {rest:.1f} pixels"
+    log.info("cameras moved the object by %.1f pixels on average: silhouettes %s", moved, result)
     return poses

@@ -1,0 +1,205 @@
+"""Thresholds, counts and lengths of what happens before the first gradient."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from univoxel.validation import check_fields
+
+_WHOLE = ("at least 1", lambda x: x >= 1)
+_ABOVE = ("above 0", lambda x: 0 < x < math.inf)
+_NOT_BELOW = ("at least 0", lambda x: 0 <= x < math.inf)
+_SHARE = ("in [0, 1]", lambda x: 0 <= x <= 1)
+_RANGE = ("two numbers, at least 0 and rising", lambda x: len(x) == 2 and 0 <= x[0] < x[1])
+
+
+@dataclass(frozen=True)
+class MaskConfig:
+    """Whether masks end where the object does, see preparation/masks.py."""
+
+    # photographs that are looked at, at most, >= 1: the excess is a mean, more change it little
+    views: int = 32
+    # share of a picture's larger side, in [0, 1], up to which an excess is looked for. Further in,
+    # the object's own pattern would be taken for its outline
+    reach_share: float = 0.015
+    # pixels up to which an excess is looked for at least, >= 1, in small pictures
+    reach_pixels: int = 6
+    # pixels further in, from and to, >= 0, whose colour change an outline is compared with
+    comparison: tuple[int, int] = (3, 5)
+    # colour change at an outline over that at the masks' edge, and over that further in, > 0: less
+    # is the object's pattern
+    contrast: float = 1.5
+    # pixels outside of the masks, from and to, >= 0, that tell whether they repeat the
+    # colour of the edge
+    ring: tuple[float, float] = (1.0, 4.0)
+    # colour change away from the edge over change along it, > 0, below which the edge's colours are
+    # repeated outside, as pictures for blending do: those show no surroundings
+    repeated: float = 0.5
+    # share of the surroundings that have one colour, in [0, 1], above which they are cut away
+    one_color: float = 0.9
+    # pixels at a depth, >= 1, below which their mean is noise and is left out
+    min_pixels: int = 50
+
+    def __post_init__(self) -> None:
+        check_fields(self, *_WHOLE, "views", "reach_pixels", "min_pixels")
+        check_fields(self, *_SHARE, "reach_share", "one_color")
+        check_fields(self, *_RANGE, "comparison", "ring")
+        check_fields(self, *_ABOVE, "contrast", "repeated")
+
+
+@dataclass(frozen=True)
+class HullConfig:
+    """The visual hull and the box around it, see preparation/hull.py."""
+
+    # the half of the first box over what the widest view shows at its distance, > 0: an object that
+    # fills a picture, seen along the diagonal, reaches a little beyond it
+    first_box: float = 1.2
+    # nodes, >= 8, of the grid that finds the box: a node is a 64th of the box
+    box_nodes: int = 64**3
+    # grids in a row, >= 1, each around what the one before found: the second sees thin parts
+    box_rounds: int = 2
+    # share of the box's diagonal, >= 0, left free around it: silhouettes are a little off
+    margin: float = 0.03
+    # nodes, > 0, at which the hull is evaluated, about; finer grids are interpolated, for time
+    nodes: float = 1e6
+
+    def __post_init__(self) -> None:
+        check_fields(self, "at least 8", lambda x: x >= 8, "box_nodes")
+        check_fields(self, *_WHOLE, "box_rounds")
+        check_fields(self, *_ABOVE, "first_box", "nodes")
+        check_fields(self, *_NOT_BELOW, "margin")
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """Cameras against silhouettes, see preparation/registration.py."""
+
+    # pixels to the silhouette, negative inside and rising, that count as its edge. Nearer ones lie
+    # outside of the object where masks are hard
+    edge: tuple[float, float] = (-1.6, -0.5)
+    # points along a ray, >= 2, where silhouettes are looked up; twice, the second time closer
+    ray_samples: int = 48
+    # rays through edges, >= 1, that the contradiction is measured with
+    test_rays: int = 1000
+    # share of these rays, in [0, 1], that miss by less than the contradiction: the rest may go
+    # through faults of single masks
+    quantile: float = 0.95
+    # pixels, > -inf, above which cameras are refined: exact ones contradict by about -0.4
+    max_contradiction: float = 0.25
+    # steps of Adam, >= 1
+    steps: int = 150
+    # learning rate at begin and end, radians and radii of the object, > 0
+    lr: tuple[float, float] = (5e-3, 2.5e-4)
+    # rays of a step, >= 1
+    rays: int = 256
+    # silhouettes that the rays of a step are held against, >= 1
+    views: int = 32
+
+    def __post_init__(self) -> None:
+        check_fields(self, "two numbers, rising", lambda x: len(x) == 2 and x[0] < x[1], "edge")
+        check_fields(self, "at least 2", lambda x: x >= 2, "ray_samples")
+        check_fields(self, *_WHOLE, "test_rays", "steps", "rays", "views")
+        check_fields(self, *_SHARE, "quantile")
+        check_fields(self, "a finite number", lambda x: math.isfinite(x), "max_contradiction")
+        check_fields(
+            self, "two numbers above 0", lambda x: len(x) == 2 and 0 < min(x) < math.inf, "lr"
+        )
+
+
+@dataclass(frozen=True)
+class ExposureConfig:
+    """How photographs' exposures differ, see preparation/exposures.py."""
+
+    # points of the surface, >= 1, whose colours are compared
+    points: int = 6000
+    # sRGB, in [0, 1]; darker colours are left out: rounding to 8 bits and reflections are too
+    # large a part of them
+    dark: float = 0.1
+    # natural log, > 0; the scale of the Cauchy weights: what is seen of one point may differ by
+    # this before it counts for less
+    cauchy: float = 0.07
+    # rounds of iteratively reweighted least squares, >= 1
+    rounds: int = 20
+    # points that speak for a gain of 1, > 0: of a photograph that shares none with others
+    prior: float = 1e-3
+    # stops, root mean square, >= 0, above which exposures differ. Where they are alike, reflections
+    # and a hull that is too large look like 0.01 to 0.16 stops. Metal or light that changes looks
+    # like 0.25: gains do no harm there
+    min_stops: float = 0.2
+
+    def __post_init__(self) -> None:
+        check_fields(self, *_WHOLE, "points", "rounds")
+        check_fields(self, *_SHARE, "dark")
+        check_fields(self, *_ABOVE, "cauchy", "prior")
+        check_fields(self, *_NOT_BELOW, "min_stops")
+
+
+@dataclass(frozen=True)
+class CarvingConfig:
+    """Concavities that no silhouette shows, see preparation/carving.py."""
+
+    # photographs that are used, at most, >= 1: for time
+    views: int = 100
+    # seconds that a pixel of the object takes, > 0; measured on two cores
+    pixel_seconds: float = 1e-5
+    # depths along a ray, >= 2, a voxel apart: deeper concavities are opened as far as this
+    depths: int = 48
+    # views that a view's depths come from, >= 1; as many again check them
+    neighbours: int = 8
+    # of them, views that agree best and count, >= 1: others are occluded
+    best: int = 4
+    # share, in [0, 1], of a logarithmic curve in the colours that are compared. Cloth inside of a
+    # shoe shows its pattern in few steps of 8 bits: dark colours are taken further apart
+    log_share: float = 2 / 3
+    # steepness of that curve, > 0: how many times further apart black is taken than with log(1 + x)
+    log_steepness: float = 40.0
+    # colour difference, >= 0, that a step of one depth between neighbouring pixels costs
+    slope: float = 0.0033
+    # colour difference, >= 0, that a larger step costs, at least slope
+    jump: float = 0.0133
+    # voxels behind a view's depth, >= 0, up to which it has a say on nodes
+    behind: float = 2.5
+    # share of the views with a say, in [0, 1], above which a node is carved that they see through
+    agree: float = 0.6
+    # share of all views, in [0, 1], above which it is: fewer may see a lamp in something glossy
+    least: float = 0.2
+    # share of a pixel's disagreement on the hull, in [0, 1], by which the depth has to be better
+    better: float = 0.1
+    # colour difference, >= 0, by which it has to be better at least: a third of a step of 8 bits
+    # where it is bright
+    visible: float = 0.0007
+    # share of the pixels that see through a node, in [0, 1], above which the depth has to be better
+    enough: float = 0.25
+    # voxels, > 0, around a node within which that share is taken
+    around: float = 2.0
+    # share of the hull's nodes, in [0, 1], that a concavity has at least: smaller ones are left to
+    # training
+    piece: float = 5e-4
+    # rounds, >= 1, in which nodes are put back whose absence uncovers a silhouette
+    rounds: int = 3
+
+    def __post_init__(self) -> None:
+        check_fields(self, *_WHOLE, "views", "neighbours", "best", "rounds")
+        check_fields(self, "at least 2", lambda x: x >= 2, "depths")
+        check_fields(self, *_ABOVE, "pixel_seconds", "log_steepness", "around")
+        check_fields(self, *_NOT_BELOW, "slope", "behind", "visible")
+        check_fields(self, "at least slope", lambda x: self.slope <= x < math.inf, "jump")
+        shares = ("log_share", "agree", "least", "better", "enough", "piece")
+        check_fields(self, *_SHARE, *shares)
+
+
+@dataclass(frozen=True)
+class PreparationConfig:
+    """What happens before the first gradient, in order."""
+
+    masks: MaskConfig = field(default_factory=MaskConfig)
+    hull: HullConfig = field(default_factory=HullConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    exposures: ExposureConfig = field(default_factory=ExposureConfig)
+    carving: CarvingConfig = field(default_factory=CarvingConfig)
+
+
+MASKS, HULL, REGISTRATION = MaskConfig(), HullConfig(), RegistrationConfig()
+EXPOSURES, CARVING = ExposureConfig(), CarvingConfig()
+PREPARATION = PreparationConfig()

@@ -1,0 +1,87 @@
+"""A semi-global plane sweep below the visual hull: how far pixels see, how views agree there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from univoxel.camera import Cameras, image_rays, looked_at, projection_matrices
+from univoxel.fields.dense import DenseDistances
+from univoxel.grid import GridShape
+from univoxel.ops import VisibilityScene, match_cost, semi_global
+from univoxel.preparation.config import CARVING, CarvingConfig
+
+
+def log_colors(picture: Tensor, cfg: CarvingConfig = CARVING) -> Tensor:
+    """The same picture [H, W, 4] uint8 with dark colours further apart: 0 and 1 stay."""
+    coverage = picture[..., 3:] / 255
+    color = (picture[..., :3] / 255 / coverage.clamp_min(1e-3)).clamp_max(1)
+    logarithm = (cfg.log_steepness * color).log1p() / math.log1p(cfg.log_steepness)
+    color = torch.lerp(color, logarithm, cfg.log_share) * coverage
+    return torch.cat([(255 * color).round().byte(), picture[..., 3:]], 2)
+
+
+def surface_depths(sdf: Tensor, grid: GridShape, cameras: Cameras) -> Iterator[Tensor]:
+    """Distance [H, W] along each pixel's ray to the surface, view after view; infinity: past it.
+
+    Args:
+        sdf: [X, Y, Z] world units.
+        grid: of the sdf.
+    """
+    surface = VisibilityScene(*DenseDistances(grid, sdf).isosurface())
+    for view in range(len(cameras)):
+        rays = image_rays(cameras, view)
+        distance = surface.closest_hit(rays.origin, rays.direction).t
+        yield distance.view(cameras.height, cameras.width)
+
+
+def depth_maps(
+    pictures: Tensor,
+    cameras: Cameras,
+    hull_depths: list[Tensor],
+    hull: Tensor,
+    grid: GridShape,
+    cfg: CarvingConfig = CARVING,
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """View after view: distance along each pixel's ray, and colour difference of views that had no
+    say in it, there and on the hull: three [H, W], NaN outside the object.
+
+    What seems to lie beyond the object, as in a flat mirror, is taken for the hull.
+
+    Args:
+        pictures: [V, H, W, 4] uint8 from `log_colors`.
+        hull_depths: V, [H, W], from `surface_depths`.
+        hull: [X, Y, Z] sdf, world units.
+        grid: of the hull.
+    """
+    field, step = DenseDistances(grid, hull), grid.voxel_size
+    matrix = projection_matrices(cameras)
+    toward = normalize(cameras.camera_to_world[:, :, 3] - looked_at(cameras), dim=1)
+    similarity = (toward @ toward.T).fill_diagonal_(-2.0)
+    for view in range(len(cameras)):
+        inside = (pictures[view, :, :, 3] >= 128) & hull_depths[view].isfinite()
+        rows = torch.where(inside, inside.flatten().cumsum(0).view(inside.shape) - 1, -1)
+        rays, hull_depth = image_rays(cameras, view), hull_depths[view][inside]
+        origin, direction = rays.origin[inside.flatten()], rays.direction[inside.flatten()]
+        color = pictures[view][inside].float()
+        of_pixels = color[:, :3] / color[:, 3:], rows
+        lines = pictures, matrix, origin, direction
+        near = similarity[view].topk(min(2 * cfg.neighbours, len(cameras) - 1)).indices
+
+        def difference(start: Tensor, others: Tensor, depths: int) -> Tensor:
+            best = min(cfg.best, len(others))
+            return match_cost(*lines, start, *of_pixels, others, step, depths, best=best)  # noqa: B023
+
+        cost = difference(hull_depth, near[::2], cfg.depths)
+        depth = hull_depth + step * semi_global(cost, rows, cfg.slope, cfg.jump).argmin(1)
+        point = origin + depth[:, None] * direction
+        depth = torch.where(field.sample(point).sdf > 0.5 * step, hull_depth, depth)
+        maps = torch.full((3, *inside.shape), torch.nan)
+        maps[:, inside] = torch.stack(
+            [depth, *(difference(start, near[1::2], 1)[:, 0] for start in (depth, hull_depth))]
+        )
+        yield maps[0], maps[1], maps[2]
