@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from univoxel.commands import COMMANDS
+
 ROOT = Path(__file__).parent.parent
 
 # From the bottom up. A module imports only from layers below its own and, inside its folder, the
@@ -172,3 +174,20 @@ def test_one_place_includes(library):
     sources = [p for p in (ROOT / "csrc").rglob("*") if p.is_file()]
     users = {p for p in sources if pattern.search(p.read_text("utf-8"))}
     assert {p.relative_to(ROOT / "csrc").parts[0] for p in users} == {INCLUDES[library]}
+
+
+LONGEST = 80  # lines of a function, with its docstring: what a reader takes in at one sitting
+
+
+def test_functions_are_short():
+    for path in (ROOT / "univoxel").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                assert lines <= LONGEST, f"{path}: {node.name} has {lines} lines"
+
+
+def test_tasks_are_commands():
+    names = {path.stem for path in (ROOT / "univoxel" / "tasks").glob("*.py")} - {"__init__"}
+    commands = {"cutout", "train", "eval", "relight", "export", "envmap", "inspect", "info", "demo"}
+    assert names - {"evaluate"} | {"eval"} == commands <= set(COMMANDS)

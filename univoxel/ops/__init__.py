@@ -31,7 +31,6 @@ Lamp = PointLight  # its name before
 __all__ = [
     "EnvTables",
     "Hit",
-    "Lamp",
     "PointLight",
     "Sun",
     "VisibilityScene",

@@ -142,9 +142,8 @@ def relight(
             of the range above; materials are missing; the scene is of another mesh.
         RuntimeError: the compiled extension is missing; there is no reference to fall back to.
 
-    Carries no gradients.
-    Source: Veach 1997, chapters 9 and 10; Heitz 2018 and Dupuy and Benyoub 2023 (visible normals);
-    Burley 2020 (Owen scrambling).
+    Carries no gradients. Source: Veach 1997, chapters 9 and 10; Heitz 2018 and Dupuy and Benyoub
+    2023 (visible normals); Burley 2020 (Owen scrambling).
     """
     points = (position, normal, wo, albedo, roughness)
     _check_tensors(points, tables, f0)
@@ -154,8 +153,8 @@ def relight(
     if traced is None:
         raise RuntimeError("relight: runs on the native backend only, got use_backend('reference')")
     lights = (tables, _pack_suns(suns), _pack_point_lights(point_lights))
-    points = (*points, _rows_of_f0(f0, position))
     numbers = (offset, first, samples, bounces, seed)
+    points = (*points, _rows_of_f0(f0, position))
     return _relight(traced, materials, lights, points, numbers, strategy)
 
 
