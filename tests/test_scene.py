@@ -1,5 +1,6 @@
 """Checkpoints: what goes in comes out; what is damaged is refused in one line."""
 
+import copy
 import json
 import math
 import os
@@ -215,17 +216,70 @@ def test_the_environment_is_the_map_there_is():
         assert scene.environment().latlong(4).shape == (4, 8, 3)
 
 
-def test_the_occluder_follows_the_surface_when_told():
-    scene = small_scene()
+def radius(tracer) -> float:
+    return float(tracer.vertices.norm(dim=1).mean())
+
+
+def grow(field):
+    """In place, as an optimiser does."""
+    with torch.no_grad():
+        field.sdf += 0.2
+
+
+def swap(field):
+    field.sdf.data = field.sdf.data + 0.2
+
+
+def smooth(field):
+    """As between steps, through a view of the parameter."""
+    field.sdf.detach().add_(0.2)
+
+
+@pytest.mark.parametrize("change", [grow, swap, smooth])
+def test_the_occluder_follows_the_surface(change):
+    scene = small_scene()  # a ball of 0.5
     before = scene.occluder()
     assert scene.occluder() is before
-    with torch.no_grad():
-        scene.field.sdf += 0.2  # a ball of 0.5 to one of 0.3
+    change(scene.field)
+    assert radius(before) > 0.45
+    assert radius(scene.occluder()) < 0.35
+
+
+def test_the_occluder_follows_another_field():
+    scene = small_scene()
+    before = scene.occluder()
+    scene.field = scene.field.resized(fit_grid(*scene.field.bounds(), 2000))
+    assert scene.occluder() is not before
+
+
+def test_a_held_surface_stays_until_it_is_released():
+    scene = small_scene()
+    grow(scene.field)
+    with scene.surface_held():
+        before = scene.occluder()
+        assert radius(before) < 0.35
+        grow(scene.field)
+        assert scene.occluder() is before
+        scene.release_surface()
+        assert radius(scene.occluder()) < 0.2
+    grow(scene.field)
+    with pytest.raises(ValueError, match=r"zero level|surface"):
+        scene.occluder()
+
+
+def test_what_is_stale_is_not_held():
+    scene = small_scene()
+    before = scene.occluder()
+    grow(scene.field)
+    with scene.surface_held():
+        assert scene.occluder() is not before
+
+
+def test_a_copy_traces_for_itself():
+    scene = small_scene()
+    before = scene.occluder()
+    assert copy.deepcopy(scene).occluder() is not before
     assert scene.occluder() is before
-    scene.surface_moved()
-    after = scene.occluder().vertices.norm(dim=1)
-    assert before.vertices.norm(dim=1).mean() > 0.45
-    assert after.mean() < 0.35
 
 
 def test_untouched_features_take_no_room(tmp_path):

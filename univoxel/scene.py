@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor, nn
 
 from univoxel.data import Photos
 from univoxel.errors import ConfigError, UserError
+from univoxel.fields.distances import SurfaceVersion
 from univoxel.fields.field import Field
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.lights import (
@@ -91,7 +94,8 @@ class Scene(nn.Module):
             nets += [self.mirrored.net] if self.mirrored else []
             for net in nets:
                 net.linear[0].weight.data[:, cfg.channels : inputs] = 0
-        self._occluder: VisibilityScene | None = None
+        self._traced: tuple[VisibilityScene, SurfaceVersion] | None = None  # see `occluder`
+        self._held = False
 
     def coded(self, features: Tensor, view: Tensor | int | None = None) -> Tensor:
         """Features [N, C] as the networks of light read them: [N, C + Z], with the view's code.
@@ -135,18 +139,38 @@ class Scene(nn.Module):
             )
 
     def occluder(self) -> VisibilityScene:
-        """The surface, ready for rays: as it was when first asked for since `surface_moved`.
+        """The present surface, ready for rays; within `surface_held`, the one that is held.
 
         Raises:
             ValueError: the scene has no surface.
         """
-        if self._occluder is None:
-            self._occluder = VisibilityScene(*self.field.isosurface())
-        return self._occluder
+        if self._traced is not None:
+            tracer, version = self._traced
+            if self._held or version.holds(self.field.sdf):
+                return tracer
+        tracer = VisibilityScene(*self.field.isosurface())
+        self._traced = tracer, SurfaceVersion.of(self.field.sdf)
+        return tracer
 
-    def surface_moved(self) -> None:
-        """Say that the field has changed: `occluder` looks at it anew."""
-        self._occluder = None
+    @contextmanager
+    def surface_held(self) -> Iterator[None]:
+        """A block in which `occluder` stays as it was first asked for, though the surface moves,
+        until `release_surface`: tracing anew in every step would cost more than the step."""
+        if self._traced is not None and not self._traced[1].holds(self.field.sdf):
+            self._traced = None
+        before, self._held = self._held, True
+        try:
+            yield
+        finally:
+            self._held = before
+
+    def release_surface(self) -> None:
+        """Within `surface_held`: hold the present surface from now on."""
+        self._traced = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies: what traces rays cannot be copied, and is made again."""
+        return self.__dict__ | {"_traced": None, "_held": False}
 
     def environment(self) -> DistantLight | EnvmapLight | EnvmapSGLight | None:
         """The one distant map that the scene stood in, where it has one; without gains."""

@@ -114,7 +114,6 @@ def coarsest_grid_(
         steps: of a rehearsal.
     """
     constants = cfg.compression
-    scene.surface_moved()
     psnr: dict[int, float] = {}
     chosen, rehearsed = most, scene
 
@@ -148,7 +147,6 @@ def become_(scene: Scene, source: Scene) -> None:
     """Give a scene the field, networks and light of another one."""
     scene.field, scene.inv_s = source.field, source.inv_s
     scene.load_state_dict(source.state_dict())
-    scene.surface_moved()
 
 
 def reduce_networks_(

@@ -50,7 +50,8 @@ def storage_loss_db(
         near = field.rows_near(far).view(*features.shape[:-1], 1)
         field.sdf.data = torch.where(sdf.abs() < far, sdf, SHELL * field.voxel_size * sdf.sign())
         field.features.data = features * near
-        return held_out.loss_db(before, held_out.decoded(scene))
+        with scene.surface_held():  # only nodes far from it change
+            return held_out.loss_db(before, held_out.decoded(scene))
     finally:
         field.sdf.data, field.features.data = sdf, features
 
@@ -80,7 +81,6 @@ def fit_budget_(
     while file_bytes(scene, new_reach) > budget_bytes and count > cfg.fewest_voxels:
         count = round(cfg.budget_step * count)
         scene.field = scene.field.resized(fit_grid(*scene.field.bounds(), count))
-    scene.surface_moved()
     cost = storage_loss_db(scene, held_out, before, new_reach)
     choices = []
     if reach is not None and new_reach is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
 from torch import Tensor, nn
 
@@ -10,6 +11,29 @@ from univoxel.grid import GridShape
 from univoxel.records import FieldSample, Rays, Samples
 
 BAND = 4.0  # voxels from the surface beyond which density is nothing: 8 s at a sharpness of 0.5
+
+
+@dataclass(frozen=True)
+class SurfaceVersion:
+    """Which state an sdf is in, told without reading it.
+
+    Notices other memory, as of another grid or after `sdf.data = ...`, and what torch counts:
+    every change in place of the parameter or of `sdf.detach()`. Changes in place of `sdf.data` are
+    the only ones that nobody counts.
+    """
+
+    values: Tensor  # the sdf's memory, kept: an address that is free may be used again
+    changes: int
+
+    @staticmethod
+    def of(sdf: Tensor) -> SurfaceVersion:
+        """The present one."""
+        return SurfaceVersion(sdf.detach(), sdf._version)
+
+    def holds(self, sdf: Tensor) -> bool:
+        """Whether the sdf has not changed since."""
+        same_memory = (sdf.data_ptr(), sdf.shape) == (self.values.data_ptr(), self.values.shape)
+        return same_memory and sdf._version == self.changes
 
 
 class AbstractDistances(nn.Module, ABC):

@@ -43,7 +43,6 @@ from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
     MOMENTS,
-    refresh_surface_,
     smooth_sdf_gradient_,
 )
 
@@ -94,7 +93,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         if progress.due():
             progress.report({k: v.item() for k, v in terms.items()}, None)
             guard.keep()
-    refresh_surface_(scene)
+    scene.field.refresh()
 
 
 def traced_problem(

@@ -33,7 +33,6 @@ from univoxel.training.surface_update import (
     REFRESH,
     SMOOTH_EVERY,
     geometric,
-    refresh_surface_,
     smooth_sdf_gradient_,
     smooth_touched_,
 )
@@ -67,52 +66,52 @@ def run_stage(
     """Optimise the scene on its present grid until the stage's steps or its time are over."""
     field = scene.field
     scene.train()
-    scene.surface_moved()
     optimizer = build_optimizer(scene, stage.refit)
     plateau = Plateau(cfg.patience)
-    guard = Guard(progress, restored=lambda: refresh_surface_(scene))
+    guard = Guard(progress, restored=field.refresh)
     guard.follow(optimizer)
-    for done in progress.clock.steps():
-        physical = done >= stage.physical_from
-        rates = learning_rates(stage, done, field.voxel_size)
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * guard.scale
-        scene.inv_s = 1 / (geometric(stage.sharpness, done) * field.voxel_size)
-        if progress.clock.step % REFRESH == 0:
-            before = field.sdf, field.features
-            if field.refresh():
-                guard.forget()
-            optimizer.follow(before[0], field.sdf)
-            optimizer.follow(before[1], field.features)
-        if progress.clock.step % RETRACE == 0 and not stage.refit:
-            scene.surface_moved()
+    with scene.surface_held():
+        for done in progress.clock.steps():
+            physical = done >= stage.physical_from
+            rates = learning_rates(stage, done, field.voxel_size)
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * guard.scale
+            scene.inv_s = 1 / (geometric(stage.sharpness, done) * field.voxel_size)
+            if progress.clock.step % REFRESH == 0:
+                before = field.sdf, field.features
+                if field.refresh():
+                    guard.forget()
+                optimizer.follow(before[0], field.sdf)
+                optimizer.follow(before[1], field.features)
+            if progress.clock.step % RETRACE == 0 and not stage.refit:
+                scene.release_surface()
 
-        batch = random_batch(scene.registered(pixels.photos), pixels.trained, stage.rays)
-        surface = surface_at(scene, batch.rays, torch.rand(stage.rays))
-        terms = objective(scene, cfg.loss, surface, batch, physical)
-        loss = torch.stack(list(terms.values())).sum()
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        if not guard.sound(loss):
-            continue
-        if stage.refit:
-            field.encoding.hold_channels_(scene.material.channels)
-        if stage.spread:
-            smooth_sdf_gradient_(field, stage.spread)
-        optimizer.step()
-        if progress.clock.step % SMOOTH_EVERY == 0 and not stage.refit:
-            smooth_touched_(field, stage)
-        if plateau.due(done):
-            quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
-            if plateau.flat(done, quality, physical):
-                progress.clock.shorten()
-        if progress.due():
-            quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
-            progress.report({k: v.item() for k, v in terms.items()}, quality)
-            guard.judge(quality, physical)
-        if progress.checkpoint_due():
-            save_scene(scene, cfg.out, progress.state())
-    refresh_surface_(scene)
+            batch = random_batch(scene.registered(pixels.photos), pixels.trained, stage.rays)
+            surface = surface_at(scene, batch.rays, torch.rand(stage.rays))
+            terms = objective(scene, cfg.loss, surface, batch, physical)
+            loss = torch.stack(list(terms.values())).sum()
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            if not guard.sound(loss):
+                continue
+            if stage.refit:
+                field.encoding.hold_channels_(scene.material.channels)
+            if stage.spread:
+                smooth_sdf_gradient_(field, stage.spread)
+            optimizer.step()
+            if progress.clock.step % SMOOTH_EVERY == 0 and not stage.refit:
+                smooth_touched_(field, stage)
+            if plateau.due(done):
+                quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
+                if plateau.flat(done, quality, physical):
+                    progress.clock.shorten()
+            if progress.due():
+                quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
+                progress.report({k: v.item() for k, v in terms.items()}, quality)
+                guard.judge(quality, physical)
+            if progress.checkpoint_due():
+                save_scene(scene, cfg.out, progress.state())
+    field.refresh()
     scene.eval()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from univoxel.fields.field import Field
 from univoxel.optim import rows_of
-from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
 
 SMOOTH_EVERY = 4  # steps between smoothings of what the step has touched
@@ -32,12 +31,6 @@ def smooth_touched_(field: Field, stage: StageConfig) -> None:
     plate, diffusion = stage.plate * SMOOTH_EVERY, stage.diffusion * SMOOTH_EVERY
     field.distances.smooth_rows_(sdf.detach(), rows_of(sdf.grad), plate, order=2)
     field.encoding.smooth_(field.distances, rows_of(features.grad), diffusion)
-
-
-def refresh_surface_(scene: Scene) -> None:
-    """Look again at what follows from the sdf."""
-    scene.field.refresh()
-    scene.surface_moved()
 
 
 def geometric(ends: tuple[float, float], done: float) -> float:
