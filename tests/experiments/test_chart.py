@@ -71,7 +71,7 @@ def test_fronts_by_scene_and_measure():
 
 
 def test_the_picture_is_drawn(tmp_path):
-    png, svg = module.draw(ROWS, tmp_path / "chart")
+    png, svg = module.plot(ROWS, tmp_path / "chart")
     assert png.read_bytes().startswith(b"\x89PNG")
     assert "<svg" in svg.read_text()
 

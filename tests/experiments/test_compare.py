@@ -43,7 +43,7 @@ def test_one_scene_has_no_mean():
 
 
 def test_the_picture_is_drawn(tmp_path):
-    png, svg = module.draw(ROWS, tmp_path / "a.b")
+    png, svg = module.plot(ROWS, tmp_path / "a.b")
     assert (png.name, svg.name) == ("a.b.png", "a.b.svg")
     assert png.read_bytes().startswith(b"\x89PNG")
     assert "<svg" in svg.read_text()

@@ -64,14 +64,14 @@ def test_frames_do_not_count_as_time(data, tmp_path, monkeypatch, often):
         def monotonic(self):
             return self.now
 
-    clock, draw = Clock(), module.draw
+    clock, draw = Clock(), module.frame
 
     def slow(*arguments):
         clock.now += 1000
         return draw(*arguments)
 
     monkeypatch.setattr(clock_module, "time", clock)
-    monkeypatch.setattr(module, "draw", slow)
+    monkeypatch.setattr(module, "frame", slow)
     monkeypatch.setattr("univoxel.tasks.train.time", clock)
     run = train(config(data, tmp_path / "run"), timelapse=tmp_path / "frames")
     assert load_checkpoint(run)[1]["seconds"] == 0.0

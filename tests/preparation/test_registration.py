@@ -79,7 +79,7 @@ def test_a_view_says_nothing_of_what_lies_beyond_its_picture():
 def test_places_that_no_picture_shows_are_no_part_of_the_object():
     """In a box far too large rays go on behind the one camera that they are held against."""
     edges = Edges(distances(), (6 * BOX[0], 6 * BOX[1]))
-    pixels = edges.draw(200, torch.Generator().manual_seed(0))
+    pixels = edges.sample(200, torch.Generator().manual_seed(0))
     missed = edges.missed(cameras_around(VIEWS, SIZE), pixels, torch.tensor([0]))
     assert missed.quantile(0.95) < 0.1
 

@@ -100,7 +100,7 @@ def chart(
     with replacing(out / "chart.json") as temporary:
         temporary.write_text(result_text(record), encoding="utf-8")
     if any(not outcome.error for outcome in outcomes):
-        draw(outcomes, out / "chart")
+        plot(outcomes, out / "chart")
     if failed := runner.failures(outcomes):
         raise ProcessFailed(failed)
     return out / "chart.png"
@@ -134,7 +134,7 @@ def fronts(outcomes: Sequence[Outcome]) -> dict[str, dict[str, list[str]]]:
     return found
 
 
-def draw(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
+def plot(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
     """For each scene a panel for each measure that there is, and one of the held-out rays while
     training went on."""
     from matplotlib.figure import Figure

@@ -73,7 +73,7 @@ def compare(
     with replacing(out / "compare.md") as temporary:
         temporary.write_text(markdown(outcomes), encoding="utf-8")
     if any(not outcome.error for outcome in outcomes):
-        draw(outcomes, out / "compare")
+        plot(outcomes, out / "compare")
     if failed := runner.failures(outcomes):
         raise ProcessFailed(failed)
     return out / "compare.md"
@@ -90,7 +90,7 @@ def markdown(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(parts)
 
 
-def draw(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
+def plot(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
     """A panel for each measure that there is, a row for each light, a dot for each scene."""
     from matplotlib.figure import Figure
 

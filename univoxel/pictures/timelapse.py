@@ -66,14 +66,14 @@ class Timelapse:
         self.every = 60 * cfg.minutes / FRAMES  # seconds
         self._next = 0.0
 
-    def look(self, scene: Scene, clock: Clock, last: bool = False) -> None:
+    def take_frame(self, scene: Scene, clock: Clock, last: bool = False) -> None:
         """Take a frame if it is time for one. The scene and the random numbers stay as they are."""
         if clock.seconds < self._next and not last:
             return
         self._next = clock.seconds + self.every
         self.folder.mkdir(parents=True, exist_ok=True)
         with torch.random.fork_rng(devices=[]):
-            picture = draw(scene, self.cameras, *shown(clock))
+            picture = frame(scene, self.cameras, *shown(clock))
         path = self.folder / f"step_{clock.step:06d}.png"
         write_png(path, labelled(picture, f"{clock.seconds:.1f} s"))
 
@@ -83,7 +83,7 @@ class Timelapse:
         Raises:
             OSError: it cannot be written; the frames stay in the run's folder.
         """
-        self.look(scene, clock, last=True)
+        self.take_frame(scene, clock, last=True)
         if self.file is None:
             return
         self.file.parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ def shown(clock: Clock) -> tuple[bool, bool]:
 
 
 @torch.no_grad()
-def draw(scene: Scene, cameras, lit: bool, by_map: bool) -> Tensor:
+def frame(scene: Scene, cameras, lit: bool, by_map: bool) -> Tensor:
     """Render, albedo and normal of the first view [H, 3 W, 3], sRGB on black.
 
     Args:

@@ -51,7 +51,7 @@ class Edges:
         self.middle = (box[0] + box[1]) / 2
         self.reach = float((box[1] - box[0]).norm()) / 2
 
-    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
         """So many edge pixels [count, 3], drawn with replacement."""
         return self.pixels[torch.randint(len(self.pixels), (count,), generator=generator)]
 
@@ -115,7 +115,7 @@ def contradiction(
     edges, generator = Edges(distance, box, cfg), torch.Generator().manual_seed(0)
     if not len(edges.pixels):
         return 0.0
-    pixels, views = edges.draw(cfg.test_rays, generator), torch.arange(len(cameras))
+    pixels, views = edges.sample(cfg.test_rays, generator), torch.arange(len(cameras))
     missed = edges.missed(cameras, pixels, views)
     return float(missed.quantile(cfg.quantile))
 
@@ -144,7 +144,7 @@ def align_(
         optimizer.param_groups[0]["lr"] = begin * (end / begin) ** (k / cfg.steps)
         now = poses.corrected(cameras)
         others = torch.randperm(len(cameras), generator=generator)[: cfg.views]
-        missed = edges.missed(now, edges.draw(cfg.rays, generator), others)
+        missed = edges.missed(now, edges.sample(cfg.rays, generator), others)
         # An edge pixel's own silhouette contains it by some 1: only more than that contradicts
         off = (missed - sum(cfg.edge) / 2).clamp_min(0)
         optimizer.zero_grad()

@@ -84,7 +84,7 @@ def info(
         with replacing(json) as temporary:
             temporary.write_text(jsonlib.dumps(found, indent=2) + "\n", encoding="utf-8")
     if picture:
-        write_png(picture, draw(scene, found))
+        write_png(picture, capacity_picture(scene, found))
     return found
 
 
@@ -152,7 +152,7 @@ def tables(found: dict) -> Iterable[Table]:
     yield table
 
 
-def draw(scene: Scene, found: dict) -> np.ndarray:
+def capacity_picture(scene: Scene, found: dict) -> np.ndarray:
     """Where the capacity went: [H, W, 3] in [0, 1].
 
     Nodes with features, counted along each axis of the grid, the brightest where there are most;

@@ -65,7 +65,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     save_config(cfg)
     with Progress(limited, begin - state.get("seconds", 0.0), state) as progress:
         if film:
-            progress.clock.watch = lambda: film.look(scene, progress.clock)
+            progress.clock.watch = lambda: film.take_frame(scene, progress.clock)
         for index in range(progress.clock.stage, len(cfg.stages)):
             make_stage_(scene, limited, index, silhouettes.box, pixels, progress)
         if film:

@@ -140,13 +140,13 @@ def test_a_reference_that_failed():
 def test_the_picture(tmp_path):
     more = cells("sg", *[(30.0,)] * 5, axis=AXES["views"])
     for found in (CELLS, [*CELLS[4:], *more], cells("sg", *[(FAILED,)] * 4)):
-        png, svg = plots.save_figure(report.draw(found), tmp_path / "stress")
+        png, svg = plots.save_figure(report.plot(found), tmp_path / "stress")
         assert png.read_bytes().startswith(b"\x89PNG")
         assert "<svg" in svg.read_text()
 
 
 def test_panels_lines_and_crosses():
-    figure = report.draw(CELLS)
+    figure = report.plot(CELLS)
     (panel,) = figure.axes
     assert [t.get_text() for t in panel.get_xticklabels()] == ["0", "1", "2", "4"]
     assert len(panel.containers) == 2  # lines with error bars

@@ -168,7 +168,7 @@ def markdown(cells: Sequence[Cell]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw(cells: Sequence[Cell]) -> Any:
+def plot(cells: Sequence[Cell]) -> Any:
     """A figure with a panel for each axis and a line for each light: relit PSNR."""
     from matplotlib.figure import Figure
 

@@ -84,7 +84,7 @@ def stress(
         temporary.write_text(result_text(_record(cells, clipping, changes)), encoding="utf-8")
     with replacing(out / "stress.md") as temporary:
         temporary.write_text(report.markdown(cells), encoding="utf-8")
-    plots.save_figure(report.draw(cells), out / "stress")
+    plots.save_figure(report.plot(cells), out / "stress")
     return out / "stress.md"
 
 
