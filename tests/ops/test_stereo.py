@@ -6,9 +6,8 @@ import pytest
 import torch
 from analytic import look_at
 
-from univoxel.camera import Cameras, image_rays, project
+from univoxel.camera import Cameras, image_rays, project, projection_matrices
 from univoxel.ops import match_cost, native, semi_global, use_backend
-from univoxel.preparation.carving import _projections
 
 SIZE, VIEWS, STEP, STEPS = 24, 5, 0.1, 7
 TRUE = 3  # the step that the surface lies at
@@ -47,12 +46,12 @@ def case(holes=True, seed=0):
     rays = image_rays(cameras, 0)
     color = pictures[0].flatten(0, 1)[inside, :3] / 255
     lines = rays.origin[inside], rays.direction[inside], starts[0][inside], color
-    return pictures, _projections(cameras), *lines, rows, torch.arange(1, VIEWS)
+    return pictures, projection_matrices(cameras), *lines, rows, torch.arange(1, VIEWS)
 
 
 def test_projections_are_those_of_the_cameras():
     cameras, points = close_by(), torch.randn(20, 3) * 0.3
-    for view, matrix in enumerate(_projections(cameras)):
+    for view, matrix in enumerate(projection_matrices(cameras)):
         found = points @ matrix[:, :3].T + matrix[:, 3]
         pixel, depth = project(cameras, view, points)
         torch.testing.assert_close(found[:, 2], depth)
