@@ -18,10 +18,10 @@ _RANGE = ("two numbers, at least 0 and rising", lambda x: len(x) == 2 and 0 <= x
 class MaskConfig:
     """Whether masks end where the object does, see preparation/masks.py."""
 
-    # photographs that are looked at, at most, >= 1: the excess is a mean, more change it little
+    # photographs that are looked at, at most, >= 1: the excess is a mean over them
     views: int = 32
-    # share of a picture's larger side, in [0, 1], up to which an excess is looked for. Further in,
-    # the object's own pattern would be taken for its outline
+    # share of a picture's larger side, in [0, 1], up to which an excess is looked for: wider masks
+    # stay as they are
     reach_share: float = 0.015
     # pixels up to which an excess is looked for at least, >= 1, in small pictures
     reach_pixels: int = 6
@@ -52,14 +52,13 @@ class MaskConfig:
 class HullConfig:
     """The visual hull and the box around it, see preparation/hull.py."""
 
-    # the half of the first box over what the widest view shows at its distance, > 0: an object that
-    # fills a picture, seen along the diagonal, reaches a little beyond it
+    # the half of the first box over what the widest view shows at its distance, > 0
     first_box: float = 1.2
     # nodes, >= 8, of the grid that finds the box: a node is a 64th of the box
     box_nodes: int = 64**3
-    # grids in a row, >= 1, each around what the one before found: the second sees thin parts
+    # grids in a row, >= 1, each around what the one before found, and so finer
     box_rounds: int = 2
-    # share of the box's diagonal, >= 0, left free around it: silhouettes are a little off
+    # share of the box's diagonal, >= 0, left free around the hull
     margin: float = 0.03
     # nodes, > 0, at which the hull is evaluated, about; finer grids are interpolated, for time
     nodes: float = 1e6
@@ -75,15 +74,13 @@ class HullConfig:
 class RegistrationConfig:
     """Cameras against silhouettes, see preparation/registration.py."""
 
-    # pixels to the silhouette, negative inside and rising, that count as its edge. Nearer ones lie
-    # outside of the object where masks are hard
+    # pixels to the silhouette, negative inside and rising, that count as its edge
     edge: tuple[float, float] = (-1.6, -0.5)
     # points along a ray, >= 2, where silhouettes are looked up; twice, the second time closer
     ray_samples: int = 48
     # rays through edges, >= 1, that the contradiction is measured with
     test_rays: int = 1000
-    # share of these rays, in [0, 1], that miss by less than the contradiction: the rest may go
-    # through faults of single masks
+    # share of these rays, in [0, 1], that miss by less than the contradiction
     quantile: float = 0.95
     # pixels, > -inf, above which cameras are refined: exact ones contradict by about -0.4
     max_contradiction: float = 0.25
@@ -103,7 +100,10 @@ class RegistrationConfig:
         check_fields(self, *_SHARE, "quantile")
         check_fields(self, "a finite number", lambda x: math.isfinite(x), "max_contradiction")
         check_fields(
-            self, "two numbers above 0", lambda x: len(x) == 2 and 0 < min(x) < math.inf, "lr"
+            self,
+            "two numbers above 0",
+            lambda x: len(x) == 2 and 0 < min(x) <= max(x) < math.inf,
+            "lr",
         )
 
 
@@ -141,7 +141,7 @@ class CarvingConfig:
 
     # photographs that are used, at most, >= 1: for time
     views: int = 100
-    # seconds that a pixel of the object takes, > 0; measured on two cores
+    # seconds that a pixel of the object takes, about, on two cores, > 0
     pixel_seconds: float = 1e-5
     # depths along a ray, >= 2, a voxel apart: deeper concavities are opened as far as this
     depths: int = 48
