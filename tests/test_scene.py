@@ -28,6 +28,7 @@ from univoxel.lights import (
     scaled,
 )
 from univoxel.scene import Scene, SceneConfig
+from univoxel.training.loop import restore_surface_
 
 LIGHTS = [
     SGConfig(lobes=3),
@@ -273,6 +274,18 @@ def test_what_is_stale_is_not_held():
     grow(scene.field)
     with scene.surface_held():
         assert scene.occluder() is not before
+
+
+def test_parameters_that_went_back_are_not_held():
+    """As the guard of a stage does it, whose surface is held."""
+    scene = small_scene()
+    with scene.surface_held():
+        grow(scene.field)
+        assert radius(scene.occluder()) < 0.35
+        with torch.no_grad():
+            scene.field.sdf -= 0.2
+        restore_surface_(scene)
+        assert radius(scene.occluder()) > 0.45
 
 
 def test_a_copy_traces_for_itself():

@@ -1,13 +1,23 @@
 """What the file of a finished scene leaves out."""
 
+import torch
 from spare_scene import feature_scene, reference_of_two_views
 
 from univoxel.checkpoint import save_scene
 from univoxel.compression.config import CompressionConfig
-from univoxel.compression.storage import fit_budget_
+from univoxel.compression.storage import fit_budget_, storage_loss_db
 from univoxel.grid import fit_grid
 
 CFG = CompressionConfig()
+
+
+def test_what_a_file_leaves_out_is_no_reason_to_trace_anew():
+    held_out, _ = reference_of_two_views()
+    scene = feature_scene()
+    tracer, sdf = scene.occluder(), scene.field.sdf.detach().clone()
+    storage_loss_db(scene, held_out, held_out.decoded(scene), 1.0)
+    assert scene.occluder() is tracer
+    assert torch.equal(scene.field.sdf, sdf)
 
 
 def test_a_budget_is_kept_at_any_cost(tmp_path):

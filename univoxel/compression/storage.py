@@ -46,14 +46,16 @@ def storage_loss_db(
     field = scene.field
     sdf, features = field.sdf.data, field.features.data
     far = math.inf if reach is None else reach * field.voxel_size
-    try:
-        near = field.rows_near(far).view(*features.shape[:-1], 1)
-        field.sdf.data = torch.where(sdf.abs() < far, sdf, SHELL * field.voxel_size * sdf.sign())
-        field.features.data = features * near
-        with scene.surface_held():  # only nodes far from it change
+    with scene.surface_held():  # only far nodes change, and they come back
+        try:
+            near = field.rows_near(far).view(*features.shape[:-1], 1)
+            field.sdf.data = torch.where(
+                sdf.abs() < far, sdf, SHELL * field.voxel_size * sdf.sign()
+            )
+            field.features.data = features * near
             return held_out.loss_db(before, held_out.decoded(scene))
-    finally:
-        field.sdf.data, field.features.data = sdf, features
+        finally:
+            field.sdf.data, field.features.data = sdf, features
 
 
 def fit_budget_(

@@ -31,7 +31,7 @@ class Guard:
         restored: called when parameters have gone back, for what is derived from them.
     """
 
-    def __init__(self, progress: Listener, restored: Callable[[], object] = lambda: None):
+    def __init__(self, progress: Listener, restored: Callable[[], None] = lambda: None):
         self.scale = 1.0  # on the step size
         self._progress, self._restored = progress, restored
         self._best, self._kind = -math.inf, False

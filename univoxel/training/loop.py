@@ -68,7 +68,7 @@ def run_stage(
     scene.train()
     optimizer = build_optimizer(scene, stage.refit)
     plateau = Plateau(cfg.patience)
-    guard = Guard(progress, restored=field.refresh)
+    guard = Guard(progress, restored=lambda: restore_surface_(scene))
     guard.follow(optimizer)
     with scene.surface_held():
         for done in progress.clock.steps():
@@ -113,6 +113,12 @@ def run_stage(
                 save_scene(scene, cfg.out, progress.state())
     field.refresh()
     scene.eval()
+
+
+def restore_surface_(scene: Scene) -> None:
+    """After parameters went back: look anew at what follows from them, even if it is held."""
+    scene.field.refresh()
+    scene.release_surface()
 
 
 def build_optimizer(scene: Scene, refit: bool) -> RowAdam:
