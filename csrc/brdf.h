@@ -1,5 +1,5 @@
-// The BRDF of docs/conventions.md in scalars: a GGX layer over a Lambertian base. univoxel/brdf.py
-// is its twin; tests hold one against the other.
+// The BRDF of docs/reference/conventions.md in scalars: a GGX layer over a Lambertian base.
+// univoxel/brdf.py is its twin; tests hold one against the other.
 #pragma once
 
 #include <algorithm>

@@ -1,5 +1,6 @@
-// Lookup and importance sampling of an equirectangular environment map; docs/conventions.md has its
-// axes. univoxel/envmap.py builds the tables and is the twin of this.
+// Lookup and importance sampling of an equirectangular environment map;
+// docs/reference/conventions.md has its axes. univoxel/envmap.py builds the tables and is the twin
+// of this.
 #pragma once
 
 #include <algorithm>

@@ -261,6 +261,8 @@ def test_a_held_surface_stays_until_it_is_released():
         assert radius(before) < 0.35
         grow(scene.field)
         assert scene.occluder() is before
+        with scene.surface_held():  # within another block nothing is let go
+            assert scene.occluder() is before
         scene.release_surface()
         assert radius(scene.occluder()) < 0.2
     grow(scene.field)

@@ -1,4 +1,4 @@
-"""The BRDF of docs/conventions.md: a GGX layer over a Lambertian base.
+"""The BRDF of docs/reference/conventions.md: a GGX layer over a Lambertian base.
 
 Directions are unit vectors [..., 3] that broadcast against each other; cosines and materials are
 [...]; F0 is a number, or [..., 3] per channel, and then what depends on it has channels too. ``wo``

@@ -30,7 +30,7 @@ PACKAGE = Path(__file__).resolve().parent
 OPTIONS = {"changes": "--set"}
 
 # Turns that a thread waits before it leaves its core to other programs. By default it waits for
-# so long that a training beside one other program took six times as long (docs/speed.md)
+# so long that a training beside one other program took six times as long (docs/research/speed.md)
 SPINS = "3000"
 
 

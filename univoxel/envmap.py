@@ -16,7 +16,7 @@ from univoxel.sphere import direction_to_latlong, rotate_z, texel_solid_angles
 
 @dataclass(frozen=True)
 class EnvMap:
-    """Light from far away, in the axes of docs/conventions.md.
+    """Light from far away, in the axes of docs/reference/conventions.md.
 
     Raises:
         ValueError: the map is not [H, 2H, 3] floating, negative or not finite; exposure is.

@@ -156,7 +156,8 @@ class Scene(nn.Module):
     def surface_held(self) -> Iterator[None]:
         """A block in which `occluder` stays as it was first asked for, though the surface moves,
         until `release_surface`: tracing anew in every step would cost more than the step."""
-        if self._traced is not None and not self._traced[1].holds(self.field.sdf):
+        stale = self._traced is not None and not self._traced[1].holds(self.field.sdf)
+        if stale and not self._held:
             self._traced = None
         before, self._held = self._held, True
         try:

@@ -66,7 +66,7 @@ class EnvmapSGLight(AbstractLight):
         return lobes.decode(GAIN * self.raw, self.config.max_sharpness)
 
     def latlong(self, height: int) -> Tensor:
-        """The map [height, 2 height, 3], linear, in the axes of docs/conventions.md."""
+        """The map [height, 2 height, 3], linear, in the axes of docs/reference/conventions.md."""
         axis, sharpness, amplitude = self.lobes()
         wi = latlong_directions(height).to(axis).flatten(0, 1)
         exponent = torch.addmm(-sharpness[None], wi, (sharpness[:, None] * axis).T)

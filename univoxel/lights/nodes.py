@@ -44,6 +44,6 @@ class DistantLight(nn.Module):
         return torch.cat(parts)
 
     def latlong(self, height: int) -> Tensor:
-        """An equirectangular map [height, 2 height, 3] in the axes of docs/conventions.md."""
+        """The map [height, 2 height, 3], linear, in the axes of docs/reference/conventions.md."""
         wi = sphere.latlong_directions(height)
         return self.incident(wi.flatten(0, 1)).reshape(height, 2 * height, 3)

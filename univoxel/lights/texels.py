@@ -63,7 +63,7 @@ class EnvmapLight(AbstractLight):
 
     @property
     def log_radiance(self) -> Tensor:
-        """[H, 2 H, 3], in the axes of docs/conventions.md."""
+        """[H, 2 H, 3], in the axes of docs/reference/conventions.md."""
         fine, *coarse = self.levels
         total = fine
         for level in coarse:
@@ -92,7 +92,7 @@ class EnvmapLight(AbstractLight):
         )
 
     def latlong(self, height: int) -> Tensor:
-        """The map [height, 2 height, 3], linear, in the axes of docs/conventions.md."""
+        """The map [height, 2 height, 3], linear, in the axes of docs/reference/conventions.md."""
         return latlong.resampled(self.log_radiance.exp(), height)
 
 

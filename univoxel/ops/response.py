@@ -23,8 +23,8 @@ def specular_response(
 
         response_nd = solid_angle f_specular(w_d, wo_n) max(n.w_d, 0)
 
-    with f of docs/conventions.md: the rows of an equation for light that is not known yet. Linear
-    in F0.
+    with f of docs/reference/conventions.md. These are rows of an equation for a light that is not
+    known yet. Linear in F0.
 
     Args:
         normal, wo: [N, 3] unit, world; wo points to the eye.

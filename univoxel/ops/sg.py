@@ -30,8 +30,8 @@ def shade_sg(
         rgb = (2 pi / D) sum_d L(w_d) f(w_d, wo) max(n.w_d, 0)
         L(w) = sum_k amplitude_k exp(sharpness_k (w.axis_k - 1))
 
-    with f the BRDF of docs/conventions.md and w_d the directions, turned by the rotation about +Z
-    and put into the frame of the normal (sphere.frame).
+    with f the BRDF of docs/reference/conventions.md and w_d the directions, turned by the rotation
+    about +Z and put into the frame of the normal (sphere.frame).
 
     Args:
         axis: [N, K, 3] unit, world; any number of lobes.

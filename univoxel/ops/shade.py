@@ -27,7 +27,7 @@ def shade_radiance(
 
         rgb_n = solid_angle sum_d radiance_nd f(w_d, wo_n) max(n.w_d, 0)
 
-    with f the BRDF of docs/conventions.md.
+    with f the BRDF of docs/reference/conventions.md.
 
     Args:
         radiance: [N, D, 3] linear, arriving from each direction; what comes from below a point's

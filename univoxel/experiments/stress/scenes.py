@@ -79,7 +79,11 @@ def radiance(name: str, direction: np.ndarray, sun: float = 0.0) -> np.ndarray:
 
 
 def environment(spec: Spec, name: str, poles: bool = False) -> np.ndarray:
-    """A map [H, 2H, 3] float32 of docs/conventions.md; its rows end on the poles where asked."""
+    """A map [H, 2H, 3] float32, as in docs/reference/conventions.md.
+
+    Args:
+        poles: whether its first and last row lie on the poles.
+    """
     if not poles:
         direction = latlong_directions(MAP_HEIGHT).double().numpy()
     else:
