@@ -13,6 +13,7 @@ from univoxel.fields import bricks as bricks_module
 from univoxel.fields.bricks import BAND, pack_bricks, unpack_bricks
 from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape, fit_grid
+from univoxel.ops import brick_minimum
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import surface_of_view
 
@@ -247,3 +248,25 @@ def test_rays_meet_the_same_surface_through_a_moved_scene():
     assert psnr(a, b) > 55
     nodes = dense.grid.nodes()
     torch.testing.assert_close(dense.sdf.detach(), lopsided_sdf(nodes))
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_marching_follows_the_surface_but_in_training(kind):
+    """There it moves in every step, and `refresh` says when to look again."""
+    dense = sphere()
+    field = dense if kind == "dense" else dense.in_bricks(dense.grid)
+    distances = field.distances
+    distances.eval()
+    before = distances.brick_minimum()
+    assert distances.brick_minimum() is before
+    with torch.no_grad():
+        field.sdf += field.voxel_size
+    follows = distances.brick_minimum()
+    assert torch.allclose(follows, before + field.voxel_size, atol=1e-6)
+    distances.train()
+    with torch.no_grad():
+        field.sdf += field.voxel_size
+    assert distances.brick_minimum() is follows
+    field.refresh()
+    bricks = () if kind == "dense" else (distances.bricks,)
+    assert torch.equal(distances.brick_minimum(), brick_minimum(field.sdf.detach(), *bricks))

@@ -29,13 +29,14 @@ class BrickDistances(AbstractDistances):
     """
 
     def __init__(self, grid: GridShape, bricks: Bricks):
-        super().__init__()
-        self.grid, self.voxel_size = grid, grid.voxel_size
+        far = BAND * grid.voxel_size
+        sdf = torch.full((Bricks.NODES * len(bricks.place),), far)
+        sdf[Bricks.NODES : 2 * Bricks.NODES] = -far
+        super().__init__(grid, sdf)
         self.bricks = bricks
-        rows = Bricks.NODES * len(bricks.place)
-        self.sdf = nn.Parameter(torch.full((rows,), self.far))
-        self.sdf.data[Bricks.NODES : 2 * Bricks.NODES] = -self.far
-        self._brick_min: Tensor | None = None
+
+    def _brick_minimum(self) -> Tensor:
+        return brick_minimum(self.sdf.detach(), self.bricks)
 
     @property
     def far(self) -> float:
@@ -93,11 +94,9 @@ class BrickDistances(AbstractDistances):
         return FieldSample(*sample_sparse(sdf, values, self.bricks, *place, sparse_grad=True))
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
-        if self._brick_min is None:
-            self._brick_min = brick_minimum(self.sdf.detach(), self.bricks)
         return march(
             self.sdf.detach(),
-            self._brick_min,
+            self.brick_minimum(),
             rays.origin,
             rays.direction,
             jitter,
@@ -107,12 +106,6 @@ class BrickDistances(AbstractDistances):
             inv_s=inv_s,
             bricks=self.bricks,
         )
-
-    @torch.no_grad()
-    def refresh(self) -> bool:
-        grown = self._grow()
-        self._brick_min = brick_minimum(self.sdf.detach(), self.bricks)
-        return grown
 
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
         smooth_rows_(values.view(len(values), -1), rows, amount, order, self.bricks)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from skimage.measure import marching_cubes
-from torch import Tensor, nn
+from torch import Tensor
 
 from univoxel.errors import NoSurface
 from univoxel.fields.distances import AbstractDistances, no_values
@@ -21,11 +21,11 @@ class DenseDistances(AbstractDistances):
         Args:
             sdf: [X, Y, Z] world units; 0 everywhere when left out.
         """
-        super().__init__()
-        self.grid, self.voxel_size = grid, grid.voxel_size
         start = torch.zeros(grid.size) if sdf is None else sdf
-        self.sdf = nn.Parameter(start.contiguous())
-        self._brick_min: Tensor | None = None
+        super().__init__(grid, start.contiguous())
+
+    def _brick_minimum(self) -> Tensor:
+        return brick_minimum(self.sdf.detach())
 
     def sample(self, points: Tensor, values: Tensor | None = None) -> FieldSample:
         return self._sample(self.sdf, no_values(self.sdf) if values is None else values, points)
@@ -38,11 +38,9 @@ class DenseDistances(AbstractDistances):
         return FieldSample(*sample_dense(sdf, values, points, *place, sparse_grad=True))
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
-        if self._brick_min is None:
-            self._brick_min = brick_minimum(self.sdf.detach())
         return march(
             self.sdf.detach(),
-            self._brick_min,
+            self.brick_minimum(),
             rays.origin,
             rays.direction,
             jitter,
@@ -51,10 +49,6 @@ class DenseDistances(AbstractDistances):
             step=self.voxel_size,
             inv_s=inv_s,
         )
-
-    def refresh(self) -> bool:
-        self._brick_min = brick_minimum(self.sdf.detach())
-        return False
 
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
         smooth_rows_(values.view(*self.grid.size, -1), rows, amount, order)

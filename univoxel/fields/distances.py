@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor, nn
 
 from univoxel.grid import GridShape
@@ -48,6 +49,27 @@ class AbstractDistances(nn.Module, ABC):
     voxel_size: float  # of the grid, world units
     sdf: nn.Parameter
 
+    def __init__(self, grid: GridShape, sdf: Tensor):
+        super().__init__()
+        self.grid, self.voxel_size = grid, grid.voxel_size
+        self.sdf = nn.Parameter(sdf)
+        self._minimum: tuple[Tensor, SurfaceVersion] | None = None
+
+    def brick_minimum(self) -> Tensor:
+        """Of the present sdf, see `ops.brick_minimum`. While the module is in training, where the
+        sdf moves in every step: of the sdf at the last `refresh`."""
+        if self._minimum is not None:
+            minimum, version = self._minimum
+            if self.training or version.holds(self.sdf):
+                return minimum
+        minimum = self._brick_minimum()
+        self._minimum = minimum, SurfaceVersion.of(self.sdf)
+        return minimum
+
+    @abstractmethod
+    def _brick_minimum(self) -> Tensor:
+        """`ops.brick_minimum` of the sdf."""
+
     @abstractmethod
     def sample(self, points: Tensor, values: Tensor | None = None) -> FieldSample:
         """SDF, its spatial gradient and values of nodes, as features, at world points [M, 3].
@@ -65,13 +87,21 @@ class AbstractDistances(nn.Module, ABC):
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         """The samples along rays that matter under density sharpness 1 / s; no gradients."""
 
-    @abstractmethod
+    @torch.no_grad()
     def refresh(self) -> bool:
-        """Look again which bricks are empty, after the sdf has moved; True: nodes were added.
+        """Add nodes where the surface came near, and look again which bricks are empty; True: nodes
+        were added.
 
         Where that needs room, the sdf is a new parameter afterwards, with more rows at the end:
         `RowAdam.follow` takes the optimiser along.
         """
+        grown = self._grow()
+        self._minimum = None
+        return grown
+
+    def _grow(self) -> bool:
+        """Add nodes where the surface came near; False: there are none to add."""
+        return False
 
     @abstractmethod
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:

@@ -64,7 +64,6 @@ def redistance_(field: Field, cfg: SegmentationConfig, whole: bool = False) -> N
     keep = (np.abs(sdf) < near) & (np.abs(distance) < near)
     keep &= inside == (sdf < 0)
     field.sdf.copy_(torch.from_numpy(np.where(keep, sdf, distance)).float())
-    field.refresh()
 
 
 def surface_box(field: Field, lower: Tensor, upper: Tensor, margin: float) -> tuple[Tensor, Tensor]:

@@ -142,9 +142,10 @@ def separate_(
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
         scene.inv_s = 1 / (geometric(stage.sharpness, done) * field.voxel_size)
-        if step % cfg.redistance_every == 0:
+        redistanced = step % cfg.redistance_every == 0
+        if redistanced:
             redistance_(field, cfg)
-        if step % REFRESH == 0:
+        if redistanced or step % REFRESH == 0:
             field.refresh()
         view, row, column = (
             torch.randint(n, (stage.rays,)) for n in (len(photos), *photos.color.shape[1:3])
