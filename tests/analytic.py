@@ -13,6 +13,7 @@ from univoxel.data import Photos
 from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape
 from univoxel.lights import (
+    BakedConfig,
     EnvmapConfig,
     EnvmapSGConfig,
     LightConfig,
@@ -29,6 +30,7 @@ LIGHTS = (
     MLPLightConfig(rank=4, hidden=16, directions=64, directions_eval=64),
     EnvmapSGConfig(lobes=16, rows=16, directions=16, directions_eval=32),
     EnvmapConfig(rows=16, directions=16, directions_eval=32),
+    BakedConfig(),
 )
 
 

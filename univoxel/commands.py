@@ -165,7 +165,8 @@ def train(
             full the best, 12; auto is what fits into --minutes, or else fast
         light: sg, local lobes as published; hybrid, then one environment map with traced
             visibility, which cleans shadows from the albedo; others to compare with: sh and mlp,
-            local too, envmap-sg and envmap, one map from the beginning
+            local too, envmap-sg and envmap, one map from the beginning, and baked, none: the
+            photographs' colours are taken for albedo, as a photogrammetry mesh has them
         varying: what differs from photograph to photograph: exposure, with the colour balance, or
             the light itself too; auto is exposure where the photographs' are seen to differ, or
             else none

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal, TypeAlias, get_args
 
 FieldName: TypeAlias = Literal["dense", "sparse", "hash"]
-LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap"]
+LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap", "baked"]
 PresetName: TypeAlias = Literal["draft", "fast", "full"]
 PresetOrAuto: TypeAlias = Literal["auto", "draft", "fast", "full"]
 Capacity: TypeAlias = Literal["fixed", "adaptive"]

@@ -10,6 +10,7 @@ from univoxel.config import TrainConfig
 from univoxel.errors import UserError
 from univoxel.joint.config import JointConfig
 from univoxel.lights import (
+    BakedConfig,
     EnvmapConfig,
     EnvmapSGConfig,
     LightConfig,
@@ -17,7 +18,7 @@ from univoxel.lights import (
     SGConfig,
     SHConfig,
 )
-from univoxel.names import Differing, FieldName, LightName
+from univoxel.names import LIGHTS, Differing, FieldName, LightName
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
 
@@ -74,7 +75,8 @@ def budget(
         light: "sg", local lobes as published; "hybrid", local lobes while geometry forms, then one
             environment map with traced visibility for the materials, then lobes that follow them;
             "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
-            traced visibility from the beginning. docs/guide/lights.md tells them apart.
+            traced visibility from the beginning; "baked", none: the photographs' colours are taken
+            for albedo. docs/guide/lights.md tells them apart.
         varying: what differs from photograph to photograph: "none"; "exposure", a gain per channel;
             "light", the light itself too; "auto", exposure where they are seen to differ.
 
@@ -183,13 +185,18 @@ def _configuration(
             )
             scene, loss = SceneConfig(varying=known), LossConfig()
             stages, capacity = (coarse, fine, joint, refit), "adaptive"
+        case "baked":
+            scene = SceneConfig(
+                sky_nodes=0, mirrored=False, light=BakedConfig(), varying=known, roughness=0.5
+            )
+            stages, capacity, loss = (coarse, fine), "fixed", LossConfig()
         case _ if light in alone:
             scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=known)
             # Lobes that light the materials to the end: what leaves least shading in the albedo
             loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
             stages, capacity = (coarse, fine), "fixed"
         case _:
-            names = ", ".join(("hybrid", *alone))
+            names = ", ".join(LIGHTS)
             raise UserError(f"light must be one of {names}, got {light!r}", "light")
     return TrainConfig(
         data,

@@ -44,6 +44,8 @@ class SceneConfig:
     sky_nodes: int = 512  # directions of the environment map, >= 0; 0: the scene has none
     mirrored: bool = True  # whether a local light gets a network for what is mirrored sharply
     light: LightConfig = field(default_factory=SGConfig)
+    # Of everything, in (0, 1], where it is known and nothing is metal; None: both are learned
+    roughness: float | None = None
     varying: Varying = "none"  # what differs from photograph to photograph, see ViewLights
     codes: int = 8  # numbers that tell the light of a view, where that varies, >= 1
     # Training fills in whether the photographs' cameras are learned too, see PoseSteps, and their
@@ -57,6 +59,7 @@ class SceneConfig:
         check_fields(self, "in [0, 8]", lambda x: 0 <= x <= 8, "mirror_levels")
         most = f"at most channels ({self.channels})"
         check_fields(self, most, lambda x: x <= self.channels, "material_channels")
+        check_fields(self, "None or in (0, 1]", lambda x: x is None or 0 < x <= 1, "roughness")
         check_fields(self, "none, exposure or light", lambda x: x in get_args(Varying), "varying")
         if self.varying == "light" and not isinstance(self.light, LocalLightConfig):
             raise ConfigError(
@@ -73,7 +76,7 @@ class Scene(nn.Module):
         self.cfg = cfg
         self.inv_s = inv_s  # sharpness of the NeuS density, 1 / world units
         self.field = field
-        self.material = MaterialHead(cfg.material_channels, cfg.hidden)
+        self.material = MaterialHead(cfg.material_channels, cfg.hidden, cfg.roughness)
         codes = cfg.codes if cfg.varying == "light" else 0
         inputs = cfg.channels + codes  # of what draws photographs: features and the view's code
         self.radiance = RadianceHead(inputs, cfg.hidden, cfg.mirror_levels)

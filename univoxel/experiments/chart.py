@@ -20,7 +20,7 @@ BETWEEN = (2, 8)  # minutes, where the curve is looked at between the presets
 PRESETS = ("draft", "fast", "full")
 SHOWN = (plots.NVS, plots.ALBEDO, plots.ROUGHNESS, plots.RELIT, plots.NORMAL)
 ACROSS = 3  # panels in a row
-QUICK = ("voxels-x0.5", "rays-x0.5", "light-sg")  # beside draft and the preset
+QUICK = ("voxels-x0.5", "rays-x0.5", "light-sg", "light-baked")  # beside draft and the preset
 
 
 @dataclass(frozen=True)

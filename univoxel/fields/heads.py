@@ -16,9 +16,13 @@ class MaterialHead(nn.Module):
 
     min_roughness = 0.05  # below, a highlight is narrower than the light's own detail
 
-    def __init__(self, channels: int, hidden: int):
+    def __init__(self, channels: int, hidden: int, roughness: float | None = None):
+        """
+        Args:
+            roughness: of everything, if it is known: then nothing is metal. None: both are learned.
+        """
         super().__init__()
-        self.channels = channels
+        self.channels, self.roughness = channels, roughness
         self.net = MLP([channels, hidden, hidden, 5])
         last = self.net.linear[-1]
         # Start mid-grey, glossy and no metal, whatever the features. Glossy: what is rough becomes
@@ -29,6 +33,9 @@ class MaterialHead(nn.Module):
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         out = torch.sigmoid(self.net(features[:, : self.channels]))
+        if self.roughness is not None:
+            known = torch.full_like(out[:, 3], self.roughness)
+            return out[:, :3], known, torch.zeros_like(known)
         low = self.min_roughness
         return out[:, :3], low + (1 - low) * out[:, 3], out[:, 4]
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, get_args
 
 import torch
 
 from univoxel.errors import ConfigError
+from univoxel.lights.baked import BakedConfig, BakedLight
 from univoxel.lights.base import AbstractLight
 from univoxel.lights.lobes_map import EnvmapSGConfig, EnvmapSGLight
 from univoxel.lights.local import AbstractLocalLight, LocalLightConfig
@@ -16,11 +17,15 @@ from univoxel.lights.sg import LocalSG, SGConfig
 from univoxel.lights.sh import LocalSH, SHConfig
 from univoxel.lights.texels import EnvmapConfig, EnvmapLight
 
-LightConfig: TypeAlias = SGConfig | SHConfig | MLPLightConfig | EnvmapSGConfig | EnvmapConfig
+LightConfig: TypeAlias = (
+    SGConfig | SHConfig | MLPLightConfig | EnvmapSGConfig | EnvmapConfig | BakedConfig
+)
 
 __all__ = [
     "AbstractLight",
     "AbstractLocalLight",
+    "BakedConfig",
+    "BakedLight",
     "EnvmapConfig",
     "EnvmapLight",
     "EnvmapSGConfig",
@@ -59,6 +64,8 @@ def build(
             return EnvmapSGLight(config)
         case EnvmapConfig():
             return EnvmapLight(config)
+        case BakedConfig():
+            return BakedLight(config)
 
 
 def scaled(config: LightConfig, scale: float) -> LightConfig:
@@ -74,7 +81,7 @@ def read_config(values: dict[str, Any]) -> LightConfig:
     """
     values = dict(values)
     kind = values.pop("kind", "sg")  # files from before there were others do not say
-    kinds = {c.kind: c for c in (SGConfig, SHConfig, MLPLightConfig, EnvmapSGConfig, EnvmapConfig)}
+    kinds = {c.kind: c for c in get_args(LightConfig)}
     if kind not in kinds:
         raise ConfigError(f"light must be one of {', '.join(kinds)}, got {kind!r}")
     return kinds[kind](**values)

@@ -72,8 +72,8 @@ def envmap(
     sky = scene.environment()
     if sky is None:
         raise UserError(
-            f"{run}: this run has no environment map: it was trained with local light, "
-            f"{scene.cfg.light.kind}, alone"
+            f"{run}: this run has no environment map: it was trained with {scene.cfg.light.kind} "
+            "light alone"
         )
     recovered, true = scene.exposed(sky.latlong(height)), true_map(trained_on(run))
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -55,8 +55,9 @@ def test_quick_keeps_the_reference_and_the_hardest():
 
 @pytest.mark.parametrize("light", LIGHTS)
 def test_trainings_are_by_steps(light):
-    axes = ["views"] if light.startswith("envmap") else ["views", "light-varying"]
-    for level in [AXES[axis].levels[1] for axis in axes]:  # the light of a map cannot vary
+    one_light = light.startswith("envmap") or light == "baked"
+    axes = ["views"] if one_light else ["views", "light-varying"]
+    for level in [AXES[axis].levels[1] for axis in axes]:
         one = suite.setting(light, 2, level)
         config = one.config(Path("photos"), Path("run"))
         assert config.minutes == suite.MINUTES
