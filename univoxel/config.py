@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from univoxel.compression.config import CompressionConfig
+from univoxel.confidence.config import ConfidenceConfig
 from univoxel.errors import ConfigError, UserError
 from univoxel.fields.features import PER_LEVEL
 from univoxel.files import replacing
@@ -67,6 +68,8 @@ class TrainConfig:
     preparation: PreparationConfig = field(default_factory=PreparationConfig)
     # how the model's sizes are chosen, where capacity is adaptive
     compression: CompressionConfig = field(default_factory=CompressionConfig)
+    # what is said of the scene afterwards; evaluation reads it from the run's config.json
+    confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
 
     def __post_init__(self):
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")

@@ -244,9 +244,8 @@ class JointConfig:
     tracing: int = 2  # visibility rays per point and direction, >= 1
     colors: bool = True  # whether the light minimises the entropy of albedo, see entropy
     lr_features: float = 0.03  # at the begin of a round; all rates > 0
-    lr_networks: float = (
-        3e-3  # at the begin of a round: of the materials' head and the views' gains
-    )
+    # at the begin of a round: of the materials' head and the views' gains
+    lr_networks: float = 3e-3
     lr_map: float = 0.05  # of the log map
     lr_sdf: float = 0.04  # of the surface, voxels per step, >= 0; 0: it stays
     # weight of the change of the albedo near each point, see AdamConfig.beside; all weights >= 0
