@@ -32,7 +32,8 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
     """Names and cameras of a file in the form of transforms_<split>.json, without pictures.
 
     Args:
-        size: pixels, width and height of the pictures to come where the file gives no w and h.
+        size: pixels, width and height of the pictures to come where the file gives no w and h,
+            for all or with a frame.
 
     Returns:
         A name for each frame, from its file_path or its number, and the cameras.
@@ -47,13 +48,13 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
     names = [view_name(str(f.get("file_path", f"{i:04d}"))) for i, f in enumerate(frames)]
     if len(set(names)) != len(names):
         raise DataError(f"{path}: expected every frame under a name of its own")
-    values = {"w": size, "h": size} | root
-    width, height = (int(number(values, key, str(path), 0, math.inf)) for key in ("w", "h"))
     poses, lenses = [], []
     for index, frame in enumerate(frames):
         where = f"{path}: frame {index}"
         poses.append(pose_of(frame.get("transform_matrix"), where))
-        lens = lens_of({"w": width, "h": height} | root | frame, where, width, height)
+        values = {"w": size, "h": size} | root | frame
+        width, height = (int(number(values, key, where, 0, math.inf)) for key in ("w", "h"))
+        lens = lens_of(values, where, width, height)
         if lens.bent:
             raise DataError(f"{where}: expected cameras without lens distortion, got some")
         lenses.append(lens)
