@@ -18,7 +18,7 @@ from torch import Tensor
 from univoxel.camera import Cameras, sizes_of
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data.base import Photos, coverage_of, decode
-from univoxel.data.images import read_image
+from univoxel.data.images import orientation, read_image, turn_note
 from univoxel.data.kept import kept_pixels, origin_of
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
 from univoxel.errors import DataError, UserError
@@ -190,12 +190,12 @@ def _words(cameras: Cameras) -> str:
     """The size of the pictures; of several, how many have which."""
     sizes, counts = cameras.size_of_each().unique(dim=0, return_counts=True)
     order = counts.argsort(descending=True, stable=True).tolist()
-    texts = [f"{w}x{h}" for w, h in sizes[order].tolist()]
-    if len(texts) == 1:
-        return texts[0]
-    if len(texts) > SIZES_TOLD:
-        return f"{len(texts)} sizes up to {cameras.width}x{cameras.height}"
-    return " and ".join(f"{t} ({n})" for t, n in zip(texts, counts[order].tolist(), strict=True))
+    if len(order) == 1:
+        return f"{cameras.width}x{cameras.height}"
+    if len(order) > SIZES_TOLD:
+        return f"{len(order)} sizes up to {cameras.width}x{cameras.height}"
+    *first, last = (f"{sizes[i, 0]}x{sizes[i, 1]} ({counts[i]})" for i in order)
+    return f"{', '.join(first)} and {last}"
 
 
 def cameras_of(poses: Sequence[np.ndarray], lenses: Sequence[Lens]) -> Cameras:
@@ -238,7 +238,9 @@ def read_photo(path: Path, mask: Path | None = None, masks: bool = True) -> tupl
     if mask is not None:
         alpha = read_image(mask)[..., 0]
         if alpha.shape != color.shape[:2]:
-            raise DataError(f"{mask}: expected {size_of(color)} pixels, got {size_of(alpha)}")
+            raise DataError(
+                f"{mask}: expected {size_of(color)} pixels, got {size_of(alpha)}{turn_note(path)}"
+            )
     if alpha is None:
         raise DataError(
             f"{path}: expected an alpha channel or a mask {beside[0].name}, got neither: "
@@ -312,12 +314,13 @@ def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
 def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     """The shots in a world whose +Z is up, and what was done.
 
-    The world of structure from motion has any direction. Cameras are held level, mostly: their
-    right axes then lie in the horizontal plane, and up is what is across to all of them. A world
+    The world of structure from motion has any direction. Cameras are held level, mostly, or a
+    quarter turn from that, as EXIF then says: what is to the right in their photographs lies in the
+    horizontal plane, and up is what is across to all of that. A world
     that is upright already, to within LEAN, stays as it is; and one whose cameras do not agree.
     """
-    axes = np.stack([shot.pose[:, :3] for shot in shots])
-    right, mean_up = axes[:, :, 0], axes[:, :, 1].mean(0)
+    held = np.stack([_right_and_up(shot) for shot in shots])
+    right, mean_up = held[:, 0], held[:, 1].mean(0)
     _, spread, directions = np.linalg.svd(right, full_matrices=True)
     up = directions[2] * (1 if directions[2] @ mean_up >= 0 else -1)
     if len(spread) < 2 or spread[1] < 0.1 * spread[0] or up @ mean_up < math.sin(LEAN):
@@ -330,6 +333,19 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
 
 def size_of(image: Tensor) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def _right_and_up(shot: Shot) -> np.ndarray:
+    """To the right and up, in the world, of a photograph as it is looked at: [2, 3]."""
+    right, up = shot.pose[:, 0], shot.pose[:, 1]
+    match orientation(shot.image):  # 2, 4, 5 and 7 are mirrored: no camera makes them
+        case 3:
+            right, up = -right, -up
+        case 6:
+            right, up = up, -right
+        case 8:
+            right, up = -up, right
+    return np.stack([right, up])
 
 
 def _turn(up: np.ndarray) -> np.ndarray:
