@@ -202,9 +202,8 @@ def _read_pillow(path: Path) -> np.ndarray:
                     return np.asarray(image, np.float32)[..., None] / 65535
                 grey = image.mode in ("1", "L")
                 transparent = image.has_transparency_data
-                array = np.asarray(
-                    image.convert("L" if grey else "RGBA" if transparent else "RGB")
-                ).copy()
+                mode = "L" if grey else "RGBA" if transparent else "RGB"
+                array = np.array(image if image.mode == mode else image.convert(mode))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: expected a PNG or JPEG, could not read it: {error}") from None
     return array[..., None] if grey else array

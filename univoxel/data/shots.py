@@ -28,7 +28,7 @@ from univoxel.errors import DataError, UserError
 FINE = 1000
 LARGE = 200_000_000  # pixels in all photographs, at most: training takes 25 bytes for each, about
 READERS = 4  # photographs that are read at once, at most: each may take 0.4 GB while it is shrunk
-BAND = 1 << 20  # pixels of a file, about, that are shrunk at once
+BAND = 1 << 18  # pixels of a file, about, that are shrunk at once
 SIZES_TOLD = 3  # of the photographs, that are named one by one, at most
 TEST_EVERY = 8
 LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
@@ -272,11 +272,18 @@ def resampled(
 
 
 def _premultiplied(color: Tensor, alpha: Tensor) -> Tensor:
-    """Stored colour and alpha as linear light times coverage, and coverage: [H, W, 4] float32."""
+    """Stored colour and alpha as linear light times coverage, and coverage: [H, W, 4] float32.
+
+    Channel by channel in memory, as what comes next wants it.
+    """
     if color.dtype == torch.uint8:  # a table is many times as fast as the curve
         color = torch.from_numpy(LINEAR[color.numpy()])
     linear, coverage = decode(color, alpha)
-    return torch.cat([linear * coverage[..., None], coverage[..., None]], -1)
+    planes = torch.empty(4, *alpha.shape)
+    for plane, channel in zip(planes, linear.unbind(-1), strict=False):
+        torch.mul(channel, coverage, out=plane)
+    planes[3] = coverage
+    return planes.movedim(0, -1)
 
 
 def _stored(picture: Tensor, of_color: torch.dtype, of_alpha: torch.dtype) -> tuple[Tensor, Tensor]:
