@@ -259,16 +259,31 @@ def resampled(
     color: Tensor, alpha: Tensor, factor: int, grid: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Stored colour and alpha, straightened and then shrunk in linear light; stored as before."""
-    rows = factor * max(1, BAND // (factor * color.shape[1]))  # of a band, to save memory
-    bands = range(0, color.shape[0] // factor * factor, rows)
-    if grid is None:
-        parts = (_premultiplied(color[i : i + rows], alpha[i : i + rows]) for i in bands)
-    else:
-        whole = _premultiplied(color, alpha)
-        parts = (straighten(whole, grid[i : i + rows]) for i in bands)
-    shrunk_parts = [_stored(shrink(part, factor), color.dtype, alpha.dtype) for part in parts]
-    colors, alphas = zip(*shrunk_parts, strict=True)
-    return torch.cat(colors), torch.cat(alphas)
+    height, width = (n // factor for n in alpha.shape)
+    colors, alphas = color.new_zeros(height, width, 3), alpha.new_zeros(height, width)
+    top, left, bottom, right = 0, 0, height, width
+    if grid is None:  # what a mask hides is black
+        top, bottom = _span(alpha.any(1), factor)
+        left, right = _span(alpha.any(0), factor)
+    whole = None if grid is None else _premultiplied(color, alpha)
+    rows = max(1, BAND // (factor * color.shape[1]))  # in bands, to save memory
+    for row in range(top, bottom, rows):
+        into = slice(row, min(row + rows, bottom)), slice(left, right)
+        of = tuple(slice(factor * s.start, factor * s.stop) for s in into)
+        if grid is None:
+            part = _premultiplied(color[of], alpha[of])
+        else:
+            part = straighten(whole, grid[of])
+        colors[into], alphas[into] = _stored(shrink(part, factor), color.dtype, alpha.dtype)
+    return colors, alphas
+
+
+def _span(there: Tensor, factor: int) -> tuple[int, int]:
+    """The first and the end of the blocks of `factor` numbers [N] of which one is true."""
+    found = there.nonzero()[:, 0]
+    if not len(found):
+        return 0, 0
+    return int(found[0]) // factor, min(int(found[-1]) // factor + 1, len(there) // factor)
 
 
 def _premultiplied(color: Tensor, alpha: Tensor) -> Tensor:
