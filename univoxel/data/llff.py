@@ -19,10 +19,10 @@ import numpy as np
 
 from univoxel.data.base import Photos
 from univoxel.data.images import SUFFIXES, image_size, turn_note
-from univoxel.data.lens import Lens
+from univoxel.data.lens import Lens, checked
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
 from univoxel.data.transforms import pose_of
-from univoxel.errors import DataError
+from univoxel.errors import DataError, UserError
 
 FILE = "poses_bounds.npy"
 COLUMNS = 17  # 3 x 5 for the camera, and two depths
@@ -102,4 +102,7 @@ def _lens(size_and_focal: np.ndarray, picture: Path, where: str) -> Lens:
             f"{picture}: expected a picture of the shape {width:g}x{height:g} as in {where}, got "
             f"{w}x{h}{turn_note(picture)}"
         )
-    return Lens(w, h, (focal * across, focal * down), (w / 2, h / 2))
+    try:
+        return checked(Lens(w, h, (focal * across, focal * down), (w / 2, h / 2)))
+    except UserError as error:
+        raise DataError(f"{where}: {error}") from None
