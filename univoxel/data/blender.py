@@ -33,9 +33,9 @@ def load_blender(
     path = folder / f"transforms_{split}.json"
     if not path.is_file():
         raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
-    _, shots = read_frames(path)
+    _, shots, remarks = read_frames(path)
     shots = [replace(shot, mask=shot.mask or _mask(shot.image)) for shot in shots]
-    return read_shots(folder, "NeRF layout", split, shots, downscale, masks=masks)
+    return read_shots(folder, "NeRF layout", split, shots, downscale, remarks, masks)
 
 
 def _mask(image: Path) -> Path | None:

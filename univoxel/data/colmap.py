@@ -19,7 +19,9 @@ import numpy as np
 from univoxel.data.base import Photos
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import Lens
+from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.data.transforms import listed_image
 from univoxel.errors import DataError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -71,19 +73,15 @@ def load_colmap(
     if not images:
         raise DataError(f"{images_file}: expected photographs with poses, got none")
 
-    photos = next((p for p in (folder / "images", folder) if (p / images[0].name).is_file()), None)
-    if photos is None:
-        raise DataError(
-            f"{images_file}: no picture {images[0].name} in {folder / 'images'} or {folder}"
-        )
-    shots = []
+    shots, missing = [], []
     for image in images:
-        path = photos / image.name
         if image.camera not in cameras:
             raise DataError(f"{images_file}: {image.name} has camera {image.camera}, got no such")
+        path = place_of(folder, image.name, str(images_file))
+        if path is None:
+            missing.append(image.name)
+            continue
         lens = cameras[image.camera]
-        if not path.is_file():
-            raise DataError(f"{images_file}: no picture {path}")
         width, height = image_size(path)
         if (width, height) != (lens.width, lens.height):
             raise DataError(
@@ -91,11 +89,20 @@ def load_colmap(
                 f"{cameras_file.name}, got {width}x{height}{turn_note(path)}"
             )
         name = Path(image.name).with_suffix("").as_posix().replace("/", "_")
-        mask = find_mask(folder, image.name)
+        mask = find_mask(folder, image.name) or find_mask(
+            folder, str(Path(image.name).with_suffix(path.suffix))
+        )
         shots.append(Shot(name, str(images_file), path, mask, image.pose, lens))
+    note = f" (looked in {folder / 'images'} and {folder})"
+    lost = left_out(str(images_file), missing, len(images), note)
     shots, remarks = upright(shots)
     shots = every_eighth(folder, shots, split)
-    return read_shots(folder, "COLMAP model", split, shots, downscale, remarks, masks)
+    return read_shots(folder, "COLMAP model", split, shots, downscale, [*lost, *remarks], masks)
+
+
+def place_of(folder: Path, name: str, where: str) -> Path | None:
+    """A photograph by its name in a list of them: in images/ or in the folder itself."""
+    return listed_image(folder / "images", name, where) or listed_image(folder, name, where)
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:

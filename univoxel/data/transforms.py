@@ -18,6 +18,7 @@ import numpy as np
 from univoxel.camera import Cameras
 from univoxel.data.images import SUFFIXES, image_size, turn_note
 from univoxel.data.lens import Lens
+from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, cameras_of
 from univoxel.errors import DataError
 from univoxel.files import replacing
@@ -25,6 +26,11 @@ from univoxel.files import replacing
 # How far the axes of a camera may be from orthonormal. Six printed digits give 1e-6; what is off
 # by more than this was scaled or sheared.
 RIGID_TOLERANCE = 1e-3
+CAPITAL = (".JPG", ".JPEG", ".PNG")
+ENDINGS = ("", ".png", "_rgba.png", "_rgb.exr", ".exr", ".jpg", ".jpeg", *CAPITAL)
+LOOKED_FOR = f"looked for the endings {', '.join(ending or 'none' for ending in ENDINGS)}"
+# Endings of pictures that are not read: names may be those of files before they were converted
+FOREIGN = (".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp", ".dng", ".cr2", ".nef", ".arw")
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
 
@@ -82,16 +88,22 @@ def read_transforms(path: Path) -> tuple[dict, list[dict]]:
     return root, frames
 
 
-def read_frames(path: Path) -> tuple[dict, list[Shot]]:
-    """The root of the file, and its frames with their pictures, which lie relative to it."""
+def read_frames(path: Path) -> tuple[dict, list[Shot], list[str]]:
+    """The root of the file, its frames with their pictures, which lie relative to it, and remarks.
+
+    Frames without a picture are left out, as `left_out` says.
+    """
     root, frames = read_transforms(path)
-    shots = []
+    shots, missing = [], []
     for index, frame in enumerate(frames):
         where = f"{path}: frame {index}"
         file_path = frame.get("file_path")
         if not isinstance(file_path, str):
             raise DataError(f"{where}: expected an object with a file_path, got {short(file_path)}")
-        image = find_image(path.parent, file_path, where)
+        image = listed_image(path.parent, file_path, where)
+        if image is None:
+            missing.append(path.parent / file_path)
+            continue
         shots.append(
             Shot(
                 name=view_name(file_path),
@@ -102,25 +114,34 @@ def read_frames(path: Path) -> tuple[dict, list[Shot]]:
                 lens=lens_of(root | frame, where, *image_size(image), turn_note(image)),
             )
         )
-    return root, shots
+    return root, shots, left_out(str(path), missing, len(frames), f" ({LOOKED_FOR})")
 
 
 def find_image(folder: Path, file_path: str, where: str) -> Path:
-    """The picture that a frame's file_path means, with or without its extension."""
-    endings = ("", ".png", "_rgba.png", "_rgb.exr", ".exr", ".jpg")
-    for ending in endings:
-        if (path := folder / (file_path + ending)).is_file():
-            return path
-    raise DataError(
-        f"{where}: no picture {folder / file_path} (looked for the endings "
-        f"{', '.join(ending or 'none' for ending in endings)})"
-    )
+    """The picture that a frame's file_path means, as of `listed_image`.
+
+    Raises:
+        DataError: there is none.
+    """
+    found = listed_image(folder, file_path, where)
+    if found is None:
+        raise DataError(f"{where}: no picture {folder / file_path} ({LOOKED_FOR})")
+    return found
+
+
+def listed_image(folder: Path, file_path: str, where: str) -> Path | None:
+    """The picture that a name in a file means: as it is, without its ending, or with another."""
+    names = [file_path + ending for ending in ENDINGS]
+    path = Path(file_path)
+    if path.suffix.lower() in (*SUFFIXES, *FOREIGN):
+        names += [str(path.with_suffix(ending)) for ending in (*SUFFIXES, *CAPITAL)]
+    return next((found for name in names if (found := folder / name).is_file()), None)
 
 
 def view_name(file_path: str) -> str:
     """./train/r_000 and ./train/r_000.png are r_000; r_0.5 stays."""
     path = Path(file_path)
-    name = path.stem if path.suffix.lower() in SUFFIXES else path.name
+    name = path.stem if path.suffix.lower() in (*SUFFIXES, *FOREIGN) else path.name
     return name.removesuffix("_rgba").removesuffix("_rgb")
 
 
