@@ -46,7 +46,7 @@ HELPERS = {
     "fields": {"bricks", "dense", "distances", "features"},
     "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
     "data": {
-        *("base", "images", "kept", "lens", "missing", "radiance", "shots", "tensoir"),
+        *("base", "foreign", "images", "kept", "lens", "missing", "radiance", "shots", "tensoir"),
         *("transforms",),
     },
     "render": {"density", "occlusion", "pipeline", "relight"},

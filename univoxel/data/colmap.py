@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.data.base import Photos
+from univoxel.data.foreign import TO_OPENGL, find_photo
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import Lens
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
-from univoxel.data.transforms import listed_image
 from univoxel.errors import DataError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -31,7 +31,6 @@ MODELS = (
     *("FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
 SUPPORTED = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
-TO_OPENGL = np.diag([1.0, -1.0, -1.0])  # of camera axes: x right, y down, z forward in COLMAP
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ def load_colmap(
     for image in images:
         if image.camera not in cameras:
             raise DataError(f"{images_file}: {image.name} has camera {image.camera}, got no such")
-        path = place_of(folder, image.name, str(images_file))
+        path = find_photo(folder, image.name, str(images_file))
         if path is None:
             missing.append(image.name)
             continue
@@ -98,11 +97,6 @@ def load_colmap(
     shots, remarks = upright(shots)
     shots = every_eighth(folder, shots, split)
     return read_shots(folder, "COLMAP model", split, shots, downscale, [*lost, *remarks], masks)
-
-
-def place_of(folder: Path, name: str, where: str) -> Path | None:
-    """A photograph by its name in a list of them: in images/ or in the folder itself."""
-    return listed_image(folder / "images", name, where) or listed_image(folder, name, where)
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:

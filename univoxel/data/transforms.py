@@ -135,7 +135,15 @@ def listed_image(folder: Path, file_path: str, where: str) -> Path | None:
     path = Path(file_path)
     if path.suffix.lower() in (*SUFFIXES, *FOREIGN):
         names += [str(path.with_suffix(ending)) for ending in (*SUFFIXES, *CAPITAL)]
-    return next((found for name in names if (found := folder / name).is_file()), None)
+    return next((found for name in names if _is_file(found := folder / name)), None)
+
+
+def _is_file(path: Path) -> bool:
+    """Whether there is such a file; names that no file can have are those of none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def view_name(file_path: str) -> str:
