@@ -54,6 +54,7 @@ class Config:
     seed: int = 0
     capacity: str = "as preset"
     budget_mb: float | None = None
+    allow_outside: bool = False
     loss: LossConfig = LossConfig()
     stages: tuple[StageConfig, ...] = (StageConfig(), StageConfig())
 
@@ -124,12 +125,14 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
         "given",
         "--cameras",
         "refined",
+        "--allow-outside",
         *(f"--set={change}" for change in changes),
     ]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
     stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0, field="hash")
     expected = Config(
         *(Path("photos"), out, "draft", "sg", "exposure", 2.0, "given", "refined", 4, 7),
+        allow_outside=True,
         loss=LossConfig(2.0),
         stages=stages,
     )
@@ -140,7 +143,7 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
 def test_cutout(calls, capsys):
     options = ["--box", "-1", "-2", "0", "1", "2", "0.5", "--downscale", "2"]
     assert main(["cutout", "photos", "--out", "cut", *options]) == 0
-    given = {"box": (-1.0, -2.0, 0.0, 1.0, 2.0, 0.5), "downscale": 2}
+    given = {"box": (-1.0, -2.0, 0.0, 1.0, 2.0, 0.5), "downscale": 2, "allow_outside": False}
     assert calls.noted == [("cutout", (Path("photos"), Path("cut")), given)]
     assert capsys.readouterr().out == "cut\n"
 
@@ -447,6 +450,22 @@ def test_help_does_not_wait_for_torch():
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert "--preset {auto,draft,fast,full}" in run.stdout
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("", "expected arguments that are not empty, got ''"),
+        ("--out=", "expected arguments that are not empty, got '--out='"),
+        ("run\udcff", r"expected arguments in UTF-8, got b'run\xff'"),
+    ],
+)
+def test_arguments_that_no_command_can_use(calls, capsys, argument, message):
+    """An empty path would be the present folder; a name that is not UTF-8 trained to its end."""
+    rest = [argument] if argument.startswith("-") else ["--out", argument]
+    assert main(["train", "photos", *rest]) == 2
+    assert capsys.readouterr().err == f"univoxel: {message}; see univoxel --help\n"
+    assert not calls.noted
 
 
 def test_version(capsys):

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from univoxel.config import TrainConfig, check_same, save_config
+from univoxel.errors import ConfigError
 from univoxel.joint.config import JointConfig
 from univoxel.lights.sg import SGConfig
 from univoxel.names import LIGHTS
@@ -27,6 +28,12 @@ def test_presets(name):
     voxels = [stage.voxels for stage in grids]
     assert voxels == sorted(voxels)
     assert grids[-1].physical_from < 1  # or materials would never be learned
+
+
+@pytest.mark.parametrize("field", ["data", "out"])
+def test_names_of_folders_that_files_cannot_hold(field):
+    with pytest.raises(ConfigError, match=rf"{field} must be a path in UTF-8, got .*run.udcff"):
+        replace(CONFIG, **{field: Path("run\udcff")})
 
 
 def test_fine_stages_may_be_sparse():

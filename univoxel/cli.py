@@ -63,6 +63,9 @@ def _run(arguments: list[str]) -> int:
         return 0
     traceback = "--traceback" in arguments
     arguments = [a for a in arguments if a != "--traceback"]
+    if (wrong := unusable(arguments)) is not None:
+        print(f"univoxel: {wrong}; see univoxel --help", file=sys.stderr)
+        return 2
     # Parse alone first: what a command raises must not pass for an error of its arguments.
     said = io.StringIO()
     try:
@@ -94,6 +97,22 @@ def _run(arguments: list[str]) -> int:
         print(f"univoxel {arguments[0]}: {message}", file=sys.stderr)
         return 2
     return 0
+
+
+def unusable(arguments: Sequence[str]) -> str | None:
+    """What is wrong with arguments that no command can use; None: nothing.
+
+    An empty path would be the present folder. Names that are not UTF-8 can be made, but the formats
+    of files cannot hold them, nor every library open them.
+    """
+    for argument in arguments:
+        if not argument or re.fullmatch(r"--[\w-]+=", argument):
+            return f"expected arguments that are not empty, got {argument!r}"
+        try:
+            argument.encode()
+        except UnicodeEncodeError:
+            return f"expected arguments in UTF-8, got {os.fsencode(argument)!r}"
+    return None
 
 
 def is_mistake(error: Exception) -> bool:

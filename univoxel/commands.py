@@ -151,6 +151,7 @@ def train(
     budget_mb: Annotated[
         float | None, arg(metavar="MB", help_behavior_hint="(default: no limit)")
     ] = None,
+    allow_outside: bool = False,
     resume: bool = False,
     timelapse: Annotated[
         str | None, arg(metavar="FILE.gif|FILE.mp4|DIR/", help_behavior_hint="(default: none)")
@@ -186,7 +187,8 @@ def train(
             lights other than hybrid
         budget_mb: most that the file of the model may have, in millions of bytes; implies
             --capacity adaptive
-        resume: go on with the run in --out
+        allow_outside: read photographs outside of DATA too, where its files or links name such
+        resume: go on with the run in --out; where nothing was saved yet, it begins
         timelapse: picture of a test view over training time, or a folder of its frames; making
             them does not count as training
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
@@ -199,9 +201,9 @@ def train(
     check_minutes(minutes)
     if not resume and (out / "scene.safetensors").exists():
         raise ExistingFile(f"{out} holds a run already: add --resume, or choose another --out")
-    downscale = check_downscale(downscale)
     config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
-    config = dataclasses.replace(config, masks=masks, cameras=cameras, downscale=downscale)
+    options = {"masks": masks, "cameras": cameras, "allow_outside": allow_outside}
+    config = dataclasses.replace(config, downscale=check_downscale(downscale), **options)
     config = with_field(config, field)
     if budget_mb is not None and capacity == "auto":
         capacity = "adaptive"
@@ -219,6 +221,7 @@ def cutout(
         arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: around what cameras look at)"),
     ] = None,
     downscale: Annotated[Downscale, arg(metavar="auto|N")] = "auto",
+    allow_outside: bool = False,
 ) -> None:
     """Cut the object out of photographs without masks.
 
@@ -231,10 +234,12 @@ def cutout(
         box: lower and upper corner of where the object is, in the world of the cameras; what lies
             in it, such as a table, is part of the object
         downscale: write photographs of 1/N of their width and height; auto as of train
+        allow_outside: as of train
     """
     from univoxel.tasks import cutout as task
 
-    print(task.cutout(data, out, box=box, downscale=check_downscale(downscale)))
+    options = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
+    print(task.cutout(data, out, box=box, **options))
 
 
 def evaluate(

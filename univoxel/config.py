@@ -50,6 +50,8 @@ class TrainConfig:
     # whether photographs are looked at for exposures that differ; where they do, scene.varying
     # becomes exposure, of none
     exposures: bool = False
+    # whether what the data set's files and links name may lie outside of its folder
+    allow_outside: bool = False
     # share of the minutes, >= 0, that opening hollows before training may be expected to take, or
     # they are left alone: hollows that no silhouette shows, where photographs agree on them. Never
     # where their light varies, other than in exposure
@@ -65,6 +67,7 @@ class TrainConfig:
 
     def __post_init__(self):
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")
+        check_fields(self, "a path in UTF-8", _is_utf8, "data", "out")
         check_fields(
             self,
             "a StageConfig first, which makes the grid",
@@ -108,6 +111,14 @@ class TrainConfig:
             raise ConfigError(
                 f"TrainConfig: budget_mb {self.budget_mb:g} needs adaptive capacity, got fixed"
             )
+
+
+def _is_utf8(path: Path) -> bool:
+    """Whether files can hold the name: others can be made, but not every library opens them."""
+    try:
+        return bool(str(path).encode())
+    except UnicodeEncodeError:
+        return False
 
 
 def save_config(cfg: TrainConfig) -> None:

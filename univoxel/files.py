@@ -1,12 +1,16 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and JSON in files."""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+from univoxel.errors import DataError
 
 
 @contextmanager
@@ -43,3 +47,25 @@ def append_line(path: Path, line: str) -> None:
         if path.exists() and path.stat().st_size > before:
             os.truncate(path, before)
         raise OSError(error.errno, f"cannot write: {error.strerror}", str(path)) from error
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds; it may begin with a byte order mark.
+
+    Raises:
+        DataError: not JSON, not UTF-8, nested too deep or with a number too long to read; names the
+            file.
+        OSError: the file cannot be read.
+    """
+    try:
+        return json.loads(path.read_bytes().decode("utf-8-sig"))
+    except json.JSONDecodeError as error:
+        raise DataError(
+            f"{path}: broken JSON in line {error.lineno}, column {error.colno}: {error.msg}"
+        ) from None
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: expected text in UTF-8, got {error.reason}") from None
+    except RecursionError:
+        raise DataError(f"{path}: expected JSON, got lists or objects nested too deep") from None
+    except ValueError:  # Python converts no integers of more than 4300 digits
+        raise DataError(f"{path}: expected JSON, got an integer of too many digits") from None

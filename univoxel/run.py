@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
-from json import loads
+from dataclasses import dataclass
 from pathlib import Path
 
 from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import DataError
+from univoxel.files import read_json
+
+
+@dataclass(frozen=True)
+class Source:
+    """Photographs that a run was trained on."""
+
+    folder: Path
+    downscale: int  # pixels of the files along a side of one that was trained on
+    allow_outside: bool  # as of `load_photos`
 
 
 def kept_photos(run: Path, split: str) -> Path:
@@ -16,7 +26,7 @@ def kept_photos(run: Path, split: str) -> Path:
 
 def trained_on(run: Path) -> Path:
     """The data set that a run's config.json names."""
-    return _data_of(run)[0]
+    return _source_of(run).folder
 
 
 def photos_of(run: Path, data: Path | None = None, split: str = "test") -> Photos:
@@ -30,23 +40,32 @@ def photos_of(run: Path, data: Path | None = None, split: str = "test") -> Photo
     """
     if data is not None and not (run / "config.json").is_file():
         return load_photos(data, split)
-    folder, downscale = _data_of(run)
-    if data is not None and data != folder:
-        return load_photos(data, split, downscale)
+    source = _source_of(run)
+    size, outside = source.downscale, source.allow_outside
+    if data is not None and data != source.folder:
+        return load_photos(data, split, size, allow_outside=outside)
     kept = kept_photos(run, split)
-    photos = load_photos(folder, split, downscale, kept=kept)
+    photos = load_photos(source.folder, split, size, kept=kept, allow_outside=outside)
     keep_photos(photos, kept)
     return photos
 
 
-def _data_of(run: Path) -> tuple[Path, int]:
-    """The data set that a run's config.json names, and how far its photographs were shrunk."""
+def _source_of(run: Path) -> Source:
+    """What photographs a run's config.json says that it was trained on."""
     path = run / "config.json"
-    try:
-        config = loads(path.read_text(encoding="utf-8"))
-        # 0 in runs from before a size was chosen for large photographs: those were refused
-        return Path(config["data"]), int(config.get("downscale", 0)) or 1
-    except FileNotFoundError:
-        raise DataError(f"{run}: expected the folder of a run, got no {path.name}") from None
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise DataError(f"{path}: expected JSON with the key data: {error!r}") from None
+    if not path.is_file():
+        raise DataError(f"{run}: expected the folder of a run, got no {path.name}")
+    config = read_json(path)
+    if not isinstance(config, dict):
+        raise DataError(f"{path}: expected an object with the configuration, got {config!r:.80}")
+    # In runs from before there was a choice
+    before = {"downscale": 0, "allow_outside": False}
+    data, downscale, outside = ((before | config).get(f) for f in ("data", *before))
+    kinds = type(data), type(downscale), type(outside)
+    if kinds != (str, int, bool) or not data or "\0" in data or downscale < 0:
+        raise DataError(
+            f"{path}: expected data, a folder, and downscale, at least 0, got {data!r:.80} and "
+            f"{downscale!r:.80}"
+        )
+    # 0 in runs from before a size was chosen for large photographs: those were refused
+    return Source(Path(data), downscale or 1, outside)

@@ -71,7 +71,7 @@ TEXT = {
     ),
     "focal length": (
         edited("cameras.txt", lambda t: t.replace("11.0", "-11.0")),
-        r"cameras\.txt: .* camera 3 has size 12x8 and parameters \[-11",
+        r"cameras\.txt: .*: expected focal lengths from 0\.006 to 1\.2e\+06 pixels .*, got -11",
     ),
     "camera": (
         edited("images.txt", lambda t: t.replace(" 3 p_004", " 9 p_004")),

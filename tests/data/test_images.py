@@ -4,6 +4,7 @@ import errno
 import os
 import stat
 import struct
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import OpenEXR
@@ -339,3 +340,24 @@ def test_size_without_reading(tmp_path, name):
         images.image_size(path)
     with pytest.raises(DataError, match="none: expected a file, got nothing there"):
         images.image_size(tmp_path / "none")
+
+
+def test_what_openexr_says_of_damage_stays_away(tmp_path, capfd):
+    """One line is promised: the library's own lines go to no one, from any thread."""
+    path = tmp_path / "a.exr"
+    write_exr(path, {c: np.random.default_rng(0).random((64, 64)) for c in "RGB"}, half=False)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    capfd.readouterr()
+    with ThreadPoolExecutor(4) as pool:
+        failures = list(pool.map(failure_of, [path] * 16))
+    assert all("expected an OpenEXR file, could not read it" in str(f) for f in failures)
+    os.write(2, b"heard")
+    assert capfd.readouterr().err == "heard"
+
+
+def failure_of(path):
+    try:
+        read_image(path)
+    except DataError as error:
+        return error

@@ -59,7 +59,10 @@ def two_lights(folder):
         (meta(cam_transform_mat=[1.0]), "expected JSON with cam_transform_mat, numbers"),
         (meta(cam_angle_x=40), "expected cam_angle_x between 0 and 3.142, got 40"),
         (meta(imw=13), r"metadata\.json: expected pictures of 13x8 pixels .*, got 12x8"),
-        (lambda f: (f / "train_001" / "metadata.json").write_text("{"), "expected JSON with"),
+        (
+            lambda f: (f / "train_001" / "metadata.json").write_text("{"),
+            "metadata.json: broken JSON",
+        ),
         (lambda f: (f / "train_001" / "rgba_sunset.png").unlink(), "expected rgba_sunset.png"),
         (two_lights, r"train_000: expected rgba\.png, .* got rgba_a\.png, rgba_b\.png"),
     ],

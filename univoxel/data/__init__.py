@@ -6,6 +6,7 @@ from univoxel.data.base import Photos, Truth
 from univoxel.data.blender import is_blender, load_blender
 from univoxel.data.colmap import is_colmap, load_colmap
 from univoxel.data.idr import is_idr, load_idr
+from univoxel.data.inside import staying_in
 from univoxel.data.kept import keep_photos, looking_in
 from univoxel.data.llff import is_llff, load_llff
 from univoxel.data.metashape import is_metashape, load_metashape
@@ -53,6 +54,7 @@ def load_photos(
     downscale: int = 0,
     masks: bool = True,
     kept: Path | None = None,
+    allow_outside: bool = False,
 ) -> Photos:
     """Read the photographs of one split in whatever layout the folder has.
 
@@ -64,6 +66,7 @@ def load_photos(
         masks: False for photographs as they are, the whole picture opaque.
         kept: a file of `keep_photos`, there or not. Where it has these photographs, as their files
             are now, the pixels come from it.
+        allow_outside: whether what the folder's files and links name may lie outside of it.
 
     Raises:
         DataError: one line that names the file, what was expected and what came.
@@ -74,7 +77,7 @@ def load_photos(
         raise DataError(f"{folder}: expected a folder with a scene, got {what}")
     for fits, load in _LAYOUTS:
         if fits(folder, split):
-            with looking_in(kept):
+            with looking_in(kept), staying_in(None if allow_outside else folder):
                 return load(folder, split, downscale, masks)
     files = sorted(path.name for path in folder.iterdir())
     came = ", ".join(files[:5]) + (", ..." if len(files) > 5 else "") or "an empty folder"

@@ -19,7 +19,7 @@ import numpy as np
 from univoxel.data.base import Photos
 from univoxel.data.foreign import TO_OPENGL, find_photo
 from univoxel.data.images import image_size, turn_note
-from univoxel.data.lens import Lens
+from univoxel.data.lens import FARTHEST, Lens, checked
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
 from univoxel.errors import DataError
@@ -31,6 +31,8 @@ MODELS = (
     *("FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
 SUPPORTED = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+# What reading a broken file may raise; OverflowError: of sizes of hundreds of digits
+BROKEN = (struct.error, IndexError, ValueError, OverflowError)
 
 
 @dataclass(frozen=True)
@@ -63,15 +65,21 @@ def load_colmap(
     cameras_file, images_file = model / f"cameras{ending}", model / f"images{ending}"
     try:
         cameras = read_cameras(cameras_file)
-    except (struct.error, IndexError, ValueError) as error:
+    except BROKEN as error:
         raise _broken(cameras_file, error) from None
     try:
         images = read_images(images_file)
-    except (struct.error, IndexError, ValueError) as error:
+    except BROKEN as error:
         raise _broken(images_file, error) from None
     if not images:
         raise DataError(f"{images_file}: expected photographs with poses, got none")
-
+    names: set[str] = set()
+    for image in images:  # all of them, before a picture is opened
+        if image.name in names or not image.name or "\0" in image.name:
+            raise DataError(
+                f"{images_file}: expected names of photographs, each once, got {image.name!r}"
+            )
+        names.add(image.name)
     shots, missing = [], []
     for image in images:
         if image.camera not in cameras:
@@ -121,9 +129,9 @@ def read_cameras(path: Path) -> dict[int, Lens]:
             case _:
                 radial, tangential = (p[4], p[5], 0.0), (p[6], p[7])
                 lens = Lens(width, height, (p[0], p[1]), (p[2], p[3]), radial, tangential)
-        if min(width, height, *lens.focal) <= 0 or not np.isfinite(p).all():
+        if min(width, height) <= 0 or not np.isfinite(p).all():
             raise ValueError(f"camera {number} has size {width}x{height} and parameters {p}")
-        lenses[number] = lens
+        lenses[number] = checked(lens)
     return lenses
 
 
@@ -137,7 +145,7 @@ def read_images(path: Path) -> list[Registered]:
     images = []
     for quaternion, translation, camera, name in rows:
         length = np.linalg.norm(quaternion)
-        if not 0.5 < length < 2 or not np.isfinite(translation).all():
+        if not 0.5 < length < 2 or not np.abs(translation).max() <= FARTHEST:
             raise ValueError(f"the pose of {name} is {quaternion}, {translation}")
         w, x, y, z = np.asarray(quaternion) / length
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.data.images import image_size, turn_note
-from univoxel.data.lens import Lens
+from univoxel.data.lens import Lens, checked
 from univoxel.data.shots import Shot
 from univoxel.data.transforms import listed_image, short
-from univoxel.errors import DataError
+from univoxel.errors import DataError, UserError
 
 TO_OPENGL = np.diag([1.0, -1.0, -1.0])  # of camera axes: x right, y down, z forward in OpenCV
 TALLER = 0.01  # share by which a shrunk picture may be taller or wider than its original
@@ -42,13 +42,11 @@ def fitted(lens: Lens, picture: Path, where: str) -> Lens:
             f"{where}, got {w}x{h}{turn_note(picture)}"
         )
     (fx, fy), (cx, cy) = lens.focal, lens.centre
-    return replace(
-        lens,
-        width=w,
-        height=h,
-        focal=(fx * across, fy * down),
-        centre=(cx * across, cy * down),
-    )
+    focal, centre = (fx * across, fy * down), (cx * across, cy * down)
+    try:
+        return checked(replace(lens, width=w, height=h, focal=focal, centre=centre))
+    except UserError as error:
+        raise DataError(f"{where}: {error}") from None
 
 
 def check_skew(skew: float, lens: Lens, where: str) -> None:

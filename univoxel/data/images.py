@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import OpenEXR
@@ -18,6 +21,7 @@ from univoxel.errors import DataError
 from univoxel.files import replacing
 from univoxel.records import HALF_MAX
 
+_STDERR = Lock()
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
 
 
@@ -63,7 +67,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
     _require_file(path)
     try:
         if path.suffix.lower() == ".exr":
-            with OpenEXR.File(str(path), header_only=True) as file:
+            with _silenced(), OpenEXR.File(str(path), header_only=True) as file:
                 low, high = file.header()["dataWindow"]
             return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
         with warnings.catch_warnings():
@@ -113,7 +117,7 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     path = Path(path)
     _require_file(path)
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with _silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
             crop = not np.array_equal(file.header()["dataWindow"], file.header()["displayWindow"])
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError) as error:
@@ -179,6 +183,25 @@ def write_exr(
     OpenEXR.File(header, pixels).write(encoded)
     with replacing(path) as temporary:
         temporary.write_bytes(encoded.getbuffer())
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """A block whose C code writes nothing to stderr: OpenEXR tells of damage there, and raises."""
+    with _STDERR:  # the descriptor is the process's, not the thread's
+        try:
+            kept = os.dup(2)
+        except OSError:  # there is none
+            yield
+            return
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(nowhere, 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            os.close(nowhere)
 
 
 def _require_file(path: Path) -> None:

@@ -14,6 +14,11 @@ from univoxel.errors import UserError
 ZOOM = (0.5, 2.0)  # of the pinhole against the lens, at most
 HALVINGS = 30  # of the interval above: far below a thousandth of a pixel
 EDGE_POINTS = 65  # along each border of a picture, where it is asked what a lens sees
+# Of the longer side: a focal length in them is of a view of 0.0006 to 179.9 degrees. Beyond,
+# directions of neighbouring pixels are one in float32, or the picture's border is at infinity
+FOCALS = (5e-4, 1e5)
+STRONGEST = 1e6  # coefficient of distortion; the squares of larger ones leave float32
+FARTHEST = 1e9  # of a camera from the origin, world units: volumes of boxes stay within float32
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,30 @@ class Lens:
             self.centre[0] + self.focal[0] * bent_x,
             self.centre[1] + self.focal[1] * bent_y,
         )
+
+
+def checked(lens: Lens) -> Lens:
+    """The lens, if float32 can hold what it does.
+
+    Raises:
+        UserError: a focal length, centre or distortion is out of range.
+    """
+    side = max(lens.width, lens.height)
+    low, high = (share * side for share in FOCALS)
+    if not all(low <= focal <= high for focal in lens.focal):
+        x, y = lens.focal
+        raise UserError(
+            f"expected focal lengths from {low:.4g} to {high:.4g} pixels for pictures of "
+            f"{lens.width}x{lens.height}, got {x:.4g} and {y:.4g}"
+        )
+    if not all(abs(at) <= high for at in lens.centre):
+        raise UserError(f"expected a centre within {high:.4g} pixels, got {lens.centre}")
+    if not all(abs(k) <= STRONGEST for k in (*lens.radial, *lens.tangential)):
+        raise UserError(
+            f"expected coefficients of distortion up to {STRONGEST:.0e}, got "
+            f"{(*lens.radial, *lens.tangential)}"
+        )
+    return lens
 
 
 def straightened(lens: Lens) -> Lens:

@@ -19,6 +19,7 @@ from univoxel.camera import Cameras, sizes_of
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data.base import Photos, coverage_of, decode
 from univoxel.data.images import orientation, read_image, turn_note
+from univoxel.data.inside import inside
 from univoxel.data.kept import kept_pixels, origin_of
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
 from univoxel.errors import DataError, UserError
@@ -75,6 +76,9 @@ def read_shots(
     """
     if downscale < 0:
         raise ValueError(f"downscale must be at least 1, got {downscale}")
+    for shot in shots:
+        for path in _files(shot):
+            inside(path, shot.where)
     _check(folder, shots, downscale)
     factor = downscale or fitting_downscale(shots)
     pinholes = _pinholes(shots)

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from univoxel.data.images import image_size
 from univoxel.data.shots import Shot, read_shots
 from univoxel.data.transforms import lens_of, number, pose_of, short
 from univoxel.errors import DataError
+from univoxel.files import read_json
 
 LIGHT = "sunset"  # of the photographs that the data set is trained on, where there are several
 
@@ -60,9 +60,11 @@ def photographed(folder: Path) -> str:
 def _shot(view: Path, picture: str) -> Shot:
     path = view / "metadata.json"
     try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
+        meta = read_json(path)
         text = meta["cam_transform_mat"]
         values = [float(value) for value in text.split(",")]
+    except DataError:
+        raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
             f"{path}: expected JSON with cam_transform_mat, numbers between commas, got {error!r}"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,11 +18,12 @@ import numpy as np
 
 from univoxel.camera import Cameras
 from univoxel.data.images import SUFFIXES, image_size, turn_note
-from univoxel.data.lens import Lens
+from univoxel.data.inside import inside
+from univoxel.data.lens import FARTHEST, Lens, checked
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, cameras_of
-from univoxel.errors import DataError
-from univoxel.files import replacing
+from univoxel.errors import DataError, UserError
+from univoxel.files import read_json, replacing
 
 # How far the axes of a camera may be from orthonormal. Six printed digits give 1e-6; what is off
 # by more than this was scaled or sheared.
@@ -31,7 +33,12 @@ ENDINGS = ("", ".png", "_rgba.png", "_rgb.exr", ".exr", ".jpg", ".jpeg", *CAPITA
 LOOKED_FOR = f"looked for the endings {', '.join(ending or 'none' for ending in ENDINGS)}"
 # Endings of pictures that are not read: names may be those of files before they were converted
 FOREIGN = (".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp", ".dng", ".cr2", ".nef", ".arw")
+WIDEST = 1 << 16  # pixels along a side of pictures to be made: what formats of files hold
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
+
+_SHORT = reprlib.Repr()  # writes the beginning of values of any size and depth
+_SHORT.maxlist = _SHORT.maxdict = 20
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 200
 
 
 def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
@@ -59,7 +66,7 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
         where = f"{path}: frame {index}"
         poses.append(pose_of(frame.get("transform_matrix"), where))
         values = {"w": size, "h": size} | root | frame
-        width, height = (int(number(values, key, where, 0, math.inf)) for key in ("w", "h"))
+        width, height = (int(number(values, key, where, 0, WIDEST)) for key in ("w", "h"))
         lens = lens_of(values, where, width, height)
         if lens.bent:
             raise DataError(f"{where}: expected cameras without lens distortion, got some")
@@ -69,14 +76,7 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
 
 def read_transforms(path: Path) -> tuple[dict, list[dict]]:
     """The root of the file, and its frames."""
-    try:
-        root = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise DataError(
-            f"{path}: broken JSON in line {error.lineno}, column {error.colno}: {error.msg}"
-        ) from None
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: expected text in UTF-8, got {error.reason}") from None
+    root = read_json(path)
     if not isinstance(root, dict):
         raise DataError(f"{path}: expected a JSON object, got {short(root)}")
     frames = root.get("frames")
@@ -94,12 +94,17 @@ def read_frames(path: Path) -> tuple[dict, list[Shot], list[str]]:
     Frames without a picture are left out, as `left_out` says.
     """
     root, frames = read_transforms(path)
+    names: set[str] = set()
+    for index, frame in enumerate(frames):  # all of them, before a picture is opened
+        where, file_path = f"{path}: frame {index}", frame.get("file_path")
+        if not isinstance(file_path, str) or "\0" in file_path:
+            raise DataError(f"{where}: expected an object with a file_path, got {short(file_path)}")
+        if (name := view_name(file_path)) in names:
+            raise DataError(f"{where}: the name {name} of {file_path} came before")
+        names.add(name)
     shots, missing = [], []
     for index, frame in enumerate(frames):
-        where = f"{path}: frame {index}"
-        file_path = frame.get("file_path")
-        if not isinstance(file_path, str):
-            raise DataError(f"{where}: expected an object with a file_path, got {short(file_path)}")
+        where, file_path = f"{path}: frame {index}", frame["file_path"]
         image = listed_image(path.parent, file_path, where)
         if image is None:
             missing.append(path.parent / file_path)
@@ -132,10 +137,10 @@ def find_image(folder: Path, file_path: str, where: str) -> Path:
 def listed_image(folder: Path, file_path: str, where: str) -> Path | None:
     """The picture that a name in a file means: as it is, without its ending, or with another."""
     names = [file_path + ending for ending in ENDINGS]
-    path = Path(file_path)
-    if path.suffix.lower() in (*SUFFIXES, *FOREIGN):
-        names += [str(path.with_suffix(ending)) for ending in (*SUFFIXES, *CAPITAL)]
-    return next((found for name in names if _is_file(found := folder / name)), None)
+    if (named := Path(file_path)).suffix.lower() in (*SUFFIXES, *FOREIGN):
+        names += [str(named.with_suffix(ending)) for ending in (*SUFFIXES, *CAPITAL)]
+    found = next((path for name in names if _is_file(path := folder / name)), None)
+    return None if found is None else inside(found, where)
 
 
 def _is_file(path: Path) -> bool:
@@ -157,12 +162,14 @@ def pose_of(matrix: object, where: str) -> np.ndarray:
     """Camera-to-world [3, 4] with its axes made exactly orthonormal."""
     try:
         pose = np.array(matrix, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
         raise DataError(f"{where}: expected a finite 4x4 transform_matrix, got {short(matrix)}")
     if len(pose) == 4 and not np.allclose(pose[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE, rtol=0):
         raise DataError(f"{where}: expected the last row 0 0 0 1, got {pose[3].tolist()}")
+    if (largest := np.abs(pose).max()) > FARTHEST:
+        raise DataError(f"{where}: expected numbers up to {FARTHEST:.0e}, got {largest:.4g}")
     u, scale, v = np.linalg.svd(pose[:3, :3])
     if np.abs(scale - 1).max() > RIGID_TOLERANCE:
         raise DataError(
@@ -204,29 +211,37 @@ def lens_of(values: dict, where: str, width: int, height: int, note: str = "") -
         key: number(values, key, where, -math.inf, math.inf) if key in values else 0.0
         for key in ("k1", "k2", "k3", "p1", "p2")
     }
-    return Lens(
-        width,
-        height,
-        focal=(x, y),
-        centre=(
-            number(values, "cx", where, -width, 2 * width) if "cx" in values else width / 2,
-            number(values, "cy", where, -height, 2 * height) if "cy" in values else height / 2,
-        ),
-        radial=(bent["k1"], bent["k2"], bent["k3"]),
-        tangential=(bent["p1"], bent["p2"]),
+    centre = (
+        number(values, "cx", where, -width, 2 * width) if "cx" in values else width / 2,
+        number(values, "cy", where, -height, 2 * height) if "cy" in values else height / 2,
     )
+    radial, tangential = (bent["k1"], bent["k2"], bent["k3"]), (bent["p1"], bent["p2"])
+    try:
+        return checked(Lens(width, height, (x, y), centre, radial, tangential))
+    except UserError as error:
+        raise DataError(f"{where}: {error}") from None
 
 
 def number(values: dict, key: str, where: str, low: float, high: float) -> float:
+    """A number of a frame that lies between two others.
+
+    Raises:
+        DataError: it is missing, no number, or lies elsewhere.
+    """
     value = values.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
-        came = "nothing" if value is None else short(value)
-        raise DataError(f"{where}: expected {key} between {low:.4g} and {high:.4g}, got {came}")
-    return float(value)
+    try:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            if low < (found := float(value)) < high:
+                return found
+    except OverflowError:  # an integer of hundreds of digits
+        pass
+    came = "nothing" if value is None else short(value)
+    raise DataError(f"{where}: expected {key} between {low:.4g} and {high:.4g}, got {came}")
 
 
 def short(value: object) -> str:
-    text = repr(value)
+    """A value as Python writes it, cut off where it is long."""
+    text = _SHORT.repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
@@ -254,6 +269,6 @@ def _mask(folder: Path, frame: dict, where: str) -> Path | None:
     named = frame.get("mask_path")
     if named is None:
         return None
-    if not isinstance(named, str) or not (folder / named).is_file():
-        raise DataError(f"{where}: no mask {folder / str(named)} (mask_path)")
-    return folder / named
+    if not isinstance(named, str) or "\0" in named or not (folder / named).is_file():
+        raise DataError(f"{where}: no mask {folder / str(named)[:200]} (mask_path)")
+    return inside(folder / named, where)

@@ -59,7 +59,8 @@ def run(
     jobs = [_job(data, setting, out, samples, None) for data, setting in pairs]
     for data in scenes:
         for split in ("train", "test"):
-            load_photos(data, split, settings[0].config(data, out).downscale)
+            config = settings[0].config(data, out)
+            load_photos(data, split, config.downscale, allow_outside=config.allow_outside)
     return _run(jobs)
 
 

@@ -58,10 +58,11 @@ class Timelapse:
             require(kind[1:])
         self.file = None if folder else Path(path)
         self.folder = Path(path) if folder else cfg.out / "timelapse"
+        size, outside = cfg.downscale, cfg.allow_outside
         try:
-            cameras = load_photos(cfg.data, "test", cfg.downscale).cameras
+            cameras = load_photos(cfg.data, "test", size, allow_outside=outside).cameras
         except DataError:
-            cameras = load_photos(cfg.data, "train", cfg.downscale).cameras
+            cameras = load_photos(cfg.data, "train", size, allow_outside=outside).cameras
         self.cameras = resize(cameras, min(cameras.width, SIZE))
         self.every = 60 * cfg.minutes / FRAMES  # seconds
         self._next = 0.0

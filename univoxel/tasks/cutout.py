@@ -6,6 +6,7 @@ cameras all around agree on inside the box is the object, and its silhouettes ar
 
 from __future__ import annotations
 
+import functools
 import logging
 import shutil
 from pathlib import Path
@@ -33,6 +34,7 @@ def cutout(
     downscale: int = 0,
     seed: int = 0,
     config: SegmentationConfig = DEFAULTS,
+    allow_outside: bool = False,
 ) -> Path:
     """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
 
@@ -45,6 +47,7 @@ def cutout(
             what the cameras look at, as large as their pictures.
         downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
         config: how the object is found.
+        allow_outside: as of `load_photos`.
 
     Raises:
         DataError: photographs that cannot be used.
@@ -55,9 +58,10 @@ def cutout(
     data, out = Path(data), Path(out)
     if out.exists():
         raise ExistingFile(f"{out} is there already: choose another out", "out")
-    photos = load_photos(data, "train", downscale, masks=False)
+    load = functools.partial(load_photos, data, masks=False, allow_outside=allow_outside)
+    photos = load("train", downscale)
     splits = {
-        name: photos if name == "train" else load_photos(data, name, photos.downscale, masks=False)
+        name: photos if name == "train" else load(name, photos.downscale)
         for name in splits_of(data)
     }
     log.info(photos.about)

@@ -51,7 +51,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     """
     film = None if timelapse is None else Timelapse(timelapse, cfg)
     torch.manual_seed(cfg.seed)
-    photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept_photos(cfg.out, "train"))
+    kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
+    photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
     cfg = replace(cfg, downscale=photos.downscale)
     if not resume and (cfg.out / FILE).exists():
         raise ExistingFile(
@@ -66,7 +67,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     scene, state = start(silhouettes, cfg, limited, resume)
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
     save_config(cfg)
-    keep_photos(photos, kept_photos(cfg.out, "train"))
+    keep_photos(photos, kept)
     with Progress(limited, begin - state.get("seconds", 0.0), state) as progress:
         if film:
             progress.clock.watch = lambda: film.take_frame(scene, progress.clock)
