@@ -221,11 +221,11 @@ def write_metashape(
     scene: Scene,
     calibration: str = "",
     original: int = 1,
-    shift: tuple[float, ...] = (0.5, -1.0, 0.25),
 ) -> Path:
     """Labels without endings; a component that is turned, scaled and moved against the world."""
     write_pictures(folder, scene, "images", "masks", pad="_mask")
     height, width = (original * n for n in scene.pictures.shape[1:3])
+    shift = np.array([0.5, -1.0, 0.25])
     turn, scale = Rotation.from_rotvec([0.3, -1.0, 0.6]).as_matrix(), 2.5
     cameras = []
     for v, (pose, name) in enumerate(zip(scene.poses, scene.names, strict=True)):
@@ -239,7 +239,7 @@ def write_metashape(
             f"<transform>{text}</transform><orientation>1</orientation></camera>"
         )
     cameras.append('<camera id="90" sensor_id="3" label="not_placed"/>')
-    numbers = [" ".join(map(repr, a)) for a in (turn.ravel().tolist(), list(shift))]
+    numbers = [" ".join(map(repr, a)) for a in (turn.ravel().tolist(), shift.tolist())]
     half = len(cameras) // 2
     (folder / "cameras.xml").write_text(
         f"""<?xml version="1.0" encoding="UTF-8"?>

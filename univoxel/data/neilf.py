@@ -11,7 +11,6 @@ Source: the public code of Yao et al. 2022 (NeILF), `load_cams_from_sfmscene`.
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path, PureWindowsPath
 
@@ -19,10 +18,12 @@ import numpy as np
 
 from univoxel.data.base import Photos
 from univoxel.data.foreign import TO_OPENGL, fitted
+from univoxel.data.lens import Lens
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
 from univoxel.data.transforms import lens_of, listed_image, number, pose_of, short
 from univoxel.errors import DataError
+from univoxel.files import read_json
 
 FILE = "inputs/sfm_scene.json"
 MASKS = ("inputs/masks", "inputs/pmasks", "masks")
@@ -72,7 +73,7 @@ def load_neilf(
 def _read(path: Path) -> tuple[dict[str, str], dict]:
     """Names of photographs and what is said of them, both by index."""
     try:
-        root = json.loads(path.read_text(encoding="utf-8"))
+        root = read_json(path)
         names = (root["image_path"] if "image_path" in root else root["image_list"])["file_paths"]
         images = root["camera_track_map"]["images"]
         if isinstance(names, list):
@@ -80,7 +81,9 @@ def _read(path: Path) -> tuple[dict[str, str], dict]:
         found = {index: PureWindowsPath(name).name for index, name in names.items()}
         if not isinstance(images, dict) or not found:
             raise TypeError("no images")
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except DataError:
+        raise
+    except (KeyError, TypeError, AttributeError) as error:
         raise DataError(
             f"{path}: expected JSON with image_path.file_paths and camera_track_map.images, "
             f"got {error!r}"
@@ -88,7 +91,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict]:
     return found, images
 
 
-def _camera(image: dict, where: str):
+def _camera(image: dict, where: str) -> tuple[Lens, np.ndarray]:
     """Lens and pose of an image."""
     try:
         camera = image["camera"]
@@ -97,7 +100,7 @@ def _camera(image: dict, where: str):
         values |= {"w": image["size"][0], "h": image["size"][1]}
         matrix = camera["extrinsic"]
         to_camera = np.array(matrix, np.float64).reshape(4, 4)
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise DataError(
             f"{where}: expected size [w, h] and a camera of focal, ppt and 16 numbers as "
             f"extrinsic, got {short(image)} ({error!r})"

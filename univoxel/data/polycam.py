@@ -13,7 +13,6 @@ Source: nerfstudio's documentation of its converter for Polycam; Apple's of ARCa
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots
 from univoxel.data.transforms import lens_of, listed_image, number, pose_of, short
 from univoxel.errors import DataError
+from univoxel.files import read_json
 
 # Where cameras and images are; what loops were closed in comes first
 PLACES = ("keyframes/corrected_", "keyframes/", "corrected_")
@@ -45,9 +45,11 @@ def load_polycam(
     Raises:
         DataError: one line that names the file, what was expected and what came.
     """
-    place = folder / (_place(folder) or PLACES[0])
-    cameras = sorted(place.with_name(f"{place.name}cameras").glob("*.json"))
-    pictures = place.with_name(f"{place.name}images")
+    place = _place(folder) or PLACES[0]
+    cameras, pictures = (
+        sorted((folder / f"{place}cameras").glob("*.json")),
+        folder / f"{place}images",
+    )
     shots, missing = [], []
     for path in cameras:
         picture = listed_image(pictures, path.stem, str(path))
@@ -75,10 +77,7 @@ def _place(folder: Path) -> str | None:
 
 def _read(path: Path) -> dict:
     """Intrinsics in the words of `lens_of`, width, height and the pose [3, 4]."""
-    try:
-        root = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise DataError(f"{path}: expected JSON, could not read it: {error}") from None
+    root = read_json(path)
     if not isinstance(root, dict):
         raise DataError(f"{path}: expected a JSON object, got {short(root)}")
     found = {key: number(root, key, str(path), 0, math.inf) for key in ("width", "height")}
