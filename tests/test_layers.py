@@ -46,8 +46,8 @@ HELPERS = {
     "fields": {"bricks", "dense", "distances", "features"},
     "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
     "data": {
-        *("base", "foreign", "images", "inside", "kept", "lens", "missing", "radiance", "shots"),
-        *("tensoir", "transforms"),
+        *("base", "foreign", "images", "inside", "kept", "lens", "missing", "orb", "radiance"),
+        *("shots", "tensoir", "transforms"),
     },
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},

@@ -5,6 +5,7 @@ transforms_<split>.json     see univoxel.data.transforms
 <file_path>_rgba.png        the same
 <file_path>_rgb.exr         linear photograph, with <file_path>_mask.png
 train/0001.exr              linear photograph, with train_mask/0001.png
+transforms_novel.json       views of other scenes, as of Stanford-ORB: split "novel"
 """
 
 from __future__ import annotations

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.data.base import Photos
-from univoxel.data.foreign import TO_OPENGL, find_photo
+from univoxel.data.foreign import TO_OPENGL, find_photo, listed_split
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked
 from univoxel.data.missing import left_out
-from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.data.shots import Shot, find_mask, read_shots, upright
 from univoxel.errors import DataError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -51,7 +51,7 @@ def is_colmap(folder: Path, split: str) -> bool:
 def load_colmap(
     folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
 ) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
+    """Photographs and cameras of one split, as of `listed_split`.
 
     The world keeps its scale and origin, and is turned so that +Z is up.
 
@@ -103,7 +103,7 @@ def load_colmap(
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(images_file), missing, len(images), note)
     shots, remarks = upright(shots)
-    shots = every_eighth(folder, shots, split)
+    shots = listed_split(folder, shots, split)
     return read_shots(folder, "COLMAP model", split, shots, downscale, [*lost, *remarks], masks)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import Lens, checked
-from univoxel.data.shots import Shot
+from univoxel.data.missing import left_out
+from univoxel.data.shots import Shot, every_eighth
 from univoxel.data.transforms import listed_image, short
 from univoxel.errors import DataError, UserError
 
@@ -26,6 +27,22 @@ FAR = 1000
 def find_photo(folder: Path, name: str, where: str) -> Path | None:
     """A photograph by its name in a list of them: in images/ or in the folder itself."""
     return listed_image(folder / "images", name, where) or listed_image(folder, name, where)
+
+
+def listed_split(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
+    """The split of train_id.txt and test_id.txt, as of Stanford-ORB; without, every eighth."""
+    files = {name: folder / f"{name}_id.txt" for name in ("train", "test")}
+    if split not in files or not all(file.is_file() for file in files.values()):
+        return every_eighth(folder, shots, split)
+    path, by_name = files[split], {shot.image.stem: shot for shot in shots}
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    names = [line.strip() for line in lines if line.strip()]
+    found = [by_name[stem] for name in names if (stem := Path(name).stem) in by_name]
+    missing = [name for name in names if Path(name).stem not in by_name]
+    if not names:
+        raise DataError(f"{path}: expected names of photographs, got an empty file")
+    left_out(str(path), missing, len(names))
+    return found
 
 
 def fitted(lens: Lens, picture: Path, where: str) -> Lens:

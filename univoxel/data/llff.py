@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.data.base import Photos
-from univoxel.data.foreign import fitted
+from univoxel.data.foreign import fitted, listed_split
 from univoxel.data.images import SUFFIXES
 from univoxel.data.lens import Lens
-from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.data.shots import Shot, find_mask, read_shots, upright
 from univoxel.data.transforms import pose_of
 from univoxel.errors import DataError
 
@@ -34,7 +34,7 @@ def is_llff(folder: Path, split: str) -> bool:
 
 
 def load_llff(folder: Path, split: str = "train", downscale: int = 0, masks: bool = True) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
+    """Photographs and cameras of one split, as of `listed_split`.
 
     The world keeps its scale and origin, and is turned so that +Z is up.
 
@@ -58,7 +58,7 @@ def load_llff(folder: Path, split: str = "train", downscale: int = 0, masks: boo
         mask = find_mask(folder, picture.name, f"masks{ending}")
         shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
     shots, remarks = upright(shots)
-    shots = every_eighth(folder, shots, split)
+    shots = listed_split(folder, shots, split)
     return read_shots(folder, "LLFF layout", split, shots, downscale, remarks, masks)
 
 

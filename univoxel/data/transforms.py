@@ -3,7 +3,8 @@
 {"camera_angle_x" (or "fl_x", "fl_y", "cx", "cy"), "w", "h", "k1" .., "p1", "p2", "frames": [
     {"file_path": .., "transform_matrix": camera-to-world with OpenGL axes, "mask_path": ..}]}
 
-Everything but frames may stand with a frame too.
+Everything but frames may stand with a frame too. Where it has a scene_name, its file_path is
+relative to the folder of that name beside the file's (Stanford-ORB's transforms_novel.json).
 """
 
 from __future__ import annotations
@@ -99,19 +100,20 @@ def read_frames(path: Path) -> tuple[dict, list[Shot], list[str]]:
         where, file_path = f"{path}: frame {index}", frame.get("file_path")
         if not isinstance(file_path, str) or "\0" in file_path:
             raise DataError(f"{where}: expected an object with a file_path, got {short(file_path)}")
-        if (name := view_name(file_path)) in names:
+        if (name := _name(frame)) in names:
             raise DataError(f"{where}: the name {name} of {file_path} came before")
         names.add(name)
     shots, missing = [], []
     for index, frame in enumerate(frames):
         where, file_path = f"{path}: frame {index}", frame["file_path"]
-        image = listed_image(path.parent, file_path, where)
+        folder = _folder(path, frame, where)
+        image = listed_image(folder, file_path, where)
         if image is None:
-            missing.append(path.parent / file_path)
+            missing.append(folder / file_path)
             continue
         shots.append(
             Shot(
-                name=view_name(file_path),
+                name=_name(frame),
                 where=where,
                 image=image,
                 mask=_mask(path.parent, frame, where),
@@ -120,6 +122,22 @@ def read_frames(path: Path) -> tuple[dict, list[Shot], list[str]]:
             )
         )
     return root, shots, left_out(str(path), missing, len(frames), f" ({LOOKED_FOR})")
+
+
+def _name(frame: dict) -> str:
+    """Unique within a file: Stanford-ORB's novel views are of several scenes."""
+    name = view_name(frame["file_path"])
+    return f"{scene}_{name}" if isinstance(scene := frame.get("scene_name"), str) else name
+
+
+def _folder(path: Path, frame: dict, where: str) -> Path:
+    """What a frame's file_path is relative to: the file's folder, or that of another scene."""
+    scene = frame.get("scene_name")
+    if scene is None:
+        return path.parent
+    if not isinstance(scene, str) or Path(scene).name != scene or scene in ("", ".."):
+        raise DataError(f"{where}: expected scene_name as the name of a folder, got {short(scene)}")
+    return path.parent.resolve().parent / scene
 
 
 def find_image(folder: Path, file_path: str, where: str) -> Path:
