@@ -149,6 +149,139 @@ def write_llff(folder: Path, scene: Scene, original: int = 1, place: str = "imag
     return folder
 
 
+def to_camera(pose: np.ndarray) -> np.ndarray:
+    """From the world to a camera with the axes x right, y down, z forward: [4, 4]."""
+    right, up, back, position = pose[:3].T
+    rotation = np.stack([right, -up, -back])
+    return np.block([[rotation, -rotation @ position[:, None]], [0, 0, 0, 1]])
+
+
+def write_pictures(folder: Path, scene: Scene, images: str, masks: str, pad: str = "") -> None:
+    for place in (images, masks):
+        (folder / place).mkdir(parents=True)
+    for name, picture in zip(scene.names, scene.pictures, strict=True):
+        write_png(folder / images / f"{name}.png", picture[..., :3])
+        write_png(folder / masks / f"{name}{pad}.png", picture[..., 3])
+
+
+def write_idr(
+    folder: Path, scene: Scene, file: str = "cameras_sphere.npz", factor: float = 1.0
+) -> Path:
+    """Projections of any scale and sign, and the sphere that they are scaled to."""
+    write_pictures(folder, scene, "image", "mask")
+    height, width = scene.pictures.shape[1:3]
+    intrinsics = np.array([[FOCAL, 0, width / 2, 0], [0, FOCAL, height / 2, 0], [0, 0, 1, 0]])
+    arrays = {}
+    for v, pose in enumerate(scene.poses):
+        matrix = np.eye(4)
+        matrix[:3] = factor * intrinsics @ to_camera(pose)
+        arrays |= {f"world_mat_{v}": matrix, f"scale_mat_{v}": np.diag([2.0, 2.0, 2.0, 1.0])}
+        arrays[f"world_mat_inv_{v}"] = np.linalg.inv(matrix)
+    np.savez(folder / file, **arrays)
+    return folder
+
+
+def write_neilf(folder: Path, scene: Scene, original: int = 1) -> Path:
+    write_pictures(folder, scene, "inputs/images", "inputs/masks")
+    height, width = (original * n for n in scene.pictures.shape[1:3])
+    intrinsic = {"focal": [original * FOCAL] * 2, "ppt": [width / 2, height / 2]}
+    images = {
+        str(v): {
+            "size": [width, height],
+            "flg": 2,
+            "camera": {"intrinsic": intrinsic, "extrinsic": to_camera(pose).ravel().tolist()},
+        }
+        for v, pose in enumerate(scene.poses)
+    }
+    # From the computer where it was made, and of another ending
+    names = {str(v): f"C:\\shots\\{name}.exr" for v, name in enumerate(scene.names)}
+    root = {"image_path": {"file_paths": names}, "camera_track_map": {"images": images}}
+    root["bbox"] = {"transform": np.eye(4).ravel().tolist()}
+    (folder / "inputs" / "sfm_scene.json").write_text(json.dumps(root))
+    return folder
+
+
+def write_polycam(folder: Path, scene: Scene, place: str = "keyframes/corrected_") -> Path:
+    """ARKit's world has +Y up."""
+    write_pictures(folder, scene, f"{place}images", "keyframes/masks")
+    (folder / f"{place}cameras").mkdir(parents=True)
+    height, width = scene.pictures.shape[1:3]
+    for pose, name in zip(scene.poses, scene.names, strict=True):
+        x, y, z = pose[:3]
+        values = {"fx": FOCAL, "fy": FOCAL, "cx": width / 2, "cy": height / 2, "blur_score": 80.0}
+        values |= {"width": width, "height": height, "timestamp": 7, "neighbors": []}
+        for row, numbers in enumerate((x, z, -y)):
+            values |= {f"t_{row}{column}": value for column, value in enumerate(numbers)}
+        (folder / f"{place}cameras" / f"{name}.json").write_text(json.dumps(values))
+    return folder
+
+
+def write_metashape(
+    folder: Path,
+    scene: Scene,
+    calibration: str = "",
+    original: int = 1,
+) -> Path:
+    """Labels without endings; a component that is turned, scaled and moved against the world."""
+    write_pictures(folder, scene, "images", "masks", pad="_mask")
+    height, width = (original * n for n in scene.pictures.shape[1:3])
+    shift = np.array([0.5, -1.0, 0.25])
+    turn, scale = Rotation.from_rotvec([0.3, -1.0, 0.6]).as_matrix(), 2.5
+    cameras = []
+    for v, (pose, name) in enumerate(zip(scene.poses, scene.names, strict=True)):
+        right, up, back, position = pose[:3].T
+        local = np.eye(4)
+        local[:3, :3] = turn.T @ np.stack([right, -up, -back], 1)
+        local[:3, 3] = turn.T @ (position - shift) / scale
+        text = " ".join(map(repr, local.ravel().tolist()))
+        cameras.append(
+            f'<camera id="{v}" sensor_id="3" component_id="0" label="{name}">'
+            f"<transform>{text}</transform><orientation>1</orientation></camera>"
+        )
+    cameras.append('<camera id="90" sensor_id="3" label="not_placed"/>')
+    numbers = [" ".join(map(repr, a)) for a in (turn.ravel().tolist(), shift.tolist())]
+    half = len(cameras) // 2
+    (folder / "cameras.xml").write_text(
+        f"""<?xml version="1.0" encoding="UTF-8"?>
+<document version="2.0.0"><chunk label="Chunk 1" enabled="true">
+<sensors next_id="4"><sensor id="3" label="unknown" type="frame">
+<resolution width="{width}" height="{height}"/>
+<calibration type="frame" class="initial"><f>1</f></calibration>
+<calibration type="frame" class="adjusted"><resolution width="{width}" height="{height}"/>
+<f>{original * FOCAL}</f>{calibration}</calibration></sensor></sensors>
+<components><component id="0"><transform><rotation>{numbers[0]}</rotation>
+<translation>{numbers[1]}</translation><scale>{scale}</scale></transform></component></components>
+<cameras>{"".join(cameras[:half])}<group>{"".join(cameras[half:])}</group></cameras>
+</chunk></document>"""
+    )
+    return folder
+
+
+def write_realitycapture(
+    folder: Path,
+    scene: Scene,
+    head: str = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
+    lens: str = "0,0,0,0,0,0,0,0",
+    shift: tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> Path:
+    """Angles by the vendor's matrix from the world to the camera, y = pitch, x = roll, z = heading:
+
+    ( .. .. -cy sx ) ( -cy sz -cy cz -sy ) ( .. .. -cx cy )
+    """
+    write_pictures(folder, scene, "images", "masks")
+    side = max(scene.pictures.shape[1:3])
+    lines = [head]
+    for pose, name in zip(scene.poses, scene.names, strict=True):
+        m = to_camera(pose)
+        pitch = math.asin(-m[1, 2])
+        heading, roll = math.atan2(-m[1, 0], -m[1, 1]), math.atan2(-m[0, 2], -m[2, 2])
+        values = [*(pose[:3, 3] + shift), *map(math.degrees, (heading, pitch, roll))]
+        values.append(FOCAL / side * 36)
+        lines.append(",".join([f"{name}.png", *(repr(float(x)) for x in values), lens]).rstrip(","))
+    (folder / "cameras.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
 def write_tensoir(folder: Path, scene: Scene) -> Path:
     for split in ("train", "test"):
         for i, v in enumerate(scene.split(split)):

@@ -134,7 +134,10 @@ def frame_two_away(pose):
             edit(lambda t: t["frames"][2].update(file_path=7)),
             r"frame 2: expected an object with a file_path",
         ),
-        (lambda d: (d / "train" / "r_3.png").unlink(), r"frame 3: no picture .*train/r_3"),
+        (
+            lambda d: [(d / "train" / f"r_{v}.png").unlink() for v in range(1, 5)],
+            r"no picture .*train/r_1, .*train/r_2, .*train/r_3, \.\.\.: 4 of 6 are missing",
+        ),
         (
             lambda d: (d / "train" / "r_1.png").write_bytes(b"no picture"),
             r"r_1\.png: expected a PNG or JPEG",

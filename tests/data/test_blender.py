@@ -251,9 +251,9 @@ BROKEN = {
     ),
     "no picture": (
         lambda f: without(f, "train/r_1.png"),
-        r"frame 1: no picture .*train/r_1 \(looked for the endings none, \.png",
+        r"train\.json: no picture .*train/r_1: 1 of 2 are missing.*for the endings none, \.png",
     ),
-    "empty path": (frame(file_path=""), "frame 1: no picture"),
+    "empty path": (frame(file_path=""), "train.json: no picture"),
     "double name": (frame(file_path="./train/r_0.png"), "frame 1: the name r_0 .* came before"),
     "distortion by k4": (frame(k4=0.1), "frame 1: expected distortion by k1 k2 k3 p1 p2, got k4"),
     "distortion in words": (frame(k2="0"), "frame 1: expected k2 between -inf and inf, got '0'"),

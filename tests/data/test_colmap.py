@@ -87,12 +87,12 @@ TEXT = {
         r"images\.txt: .* the pose of p_000\.png is",
     ),
     "no picture": (
-        lambda f: (f / "images" / "p_004.png").unlink(),
-        r"images\.txt: no picture .*images/p_004\.png",
+        lambda f: [(f / "images" / f"p_00{v}.png").unlink() for v in range(1, 9)],
+        r"images\.txt: no picture p_008\.png, p_007\.png, p_006\.png, \.\.\.: 8 of 10 are missing",
     ),
     "no pictures": (
         lambda f: (f / "images").rename(f / "photos"),
-        r"images\.txt: no picture p_009\.png in .*images or ",
+        r"images\.txt: no picture p_009\.png, .* 10 of 10 are missing.*looked in .*images and ",
     ),
     "size": (other_size, r"p_004\.png: expected 12x8 pixels as its camera .*, got 13x8"),
 }

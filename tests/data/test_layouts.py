@@ -9,9 +9,14 @@ from layouts import (
     WIDTH,
     scene,
     write_colmap,
+    write_idr,
     write_llff,
+    write_metashape,
+    write_neilf,
     write_nerf,
     write_nerfstudio,
+    write_polycam,
+    write_realitycapture,
     write_tensoir,
 )
 from scipy.spatial.transform import Rotation
@@ -26,8 +31,22 @@ WRITERS = {
     "COLMAP model": write_colmap,
     "COLMAP text": lambda folder, s: write_colmap(folder, s, text=True),
     "LLFF layout": write_llff,
+    "IDR layout (cameras_sphere.npz)": write_idr,
+    "NeILF layout": write_neilf,
+    "Polycam raw data": write_polycam,
+    "Metashape cameras": write_metashape,
+    "RealityCapture cameras": write_realitycapture,
     "TensoIR layout (rgba_sunset.png)": write_tensoir,
 }
+REMARKS = {
+    "Polycam raw data": ", world turned from +Y to +Z up",
+    "Metashape cameras": (
+        ", 1 of 11 cameras left out: not placed, not enabled or in another component"
+    ),
+}
+# Those that are made by structure from motion
+TURNED = (write_colmap, write_nerfstudio, write_llff, write_idr, write_neilf, write_metashape)
+TURNED += (write_realitycapture,)
 
 
 @pytest.mark.parametrize("split", ["train", "test"])
@@ -53,10 +72,11 @@ def test_same_photographs_and_same_rays(tmp_path, layout, split):
     kind = layout.replace("COLMAP text", "COLMAP model")
     assert photos.about == (
         f"{tmp_path / 'data'}: {kind}, {len(views)} photographs of 12x8 pixels in {split}"
+        f"{REMARKS.get(layout, '')}"
     )
 
 
-@pytest.mark.parametrize("writer", [write_colmap, write_nerfstudio, write_llff])
+@pytest.mark.parametrize("writer", TURNED)
 def test_a_world_in_any_direction_is_turned_upright(tmp_path, writer):
     """Distances between cameras and points stay, and what was up is +Z again."""
     turn = Rotation.from_rotvec([2.0, -0.5, 0.7])

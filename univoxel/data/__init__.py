@@ -5,10 +5,15 @@ from pathlib import Path
 from univoxel.data.base import Photos, Truth
 from univoxel.data.blender import is_blender, load_blender
 from univoxel.data.colmap import is_colmap, load_colmap
+from univoxel.data.idr import is_idr, load_idr
 from univoxel.data.inside import staying_in
 from univoxel.data.kept import keep_photos, looking_in
 from univoxel.data.llff import is_llff, load_llff
+from univoxel.data.metashape import is_metashape, load_metashape
+from univoxel.data.neilf import is_neilf, load_neilf
 from univoxel.data.nerfstudio import is_nerfstudio, load_nerfstudio
+from univoxel.data.polycam import is_polycam, load_polycam
+from univoxel.data.realitycapture import is_realitycapture, load_realitycapture
 from univoxel.data.tensoir import is_tensoir, load_tensoir
 from univoxel.data.transforms import load_cameras
 from univoxel.data.truth import load_points, load_relit, load_truth, relight_maps
@@ -34,6 +39,11 @@ _LAYOUTS = (
     (is_nerfstudio, load_nerfstudio),
     (is_colmap, load_colmap),
     (is_llff, load_llff),
+    (is_idr, load_idr),
+    (is_neilf, load_neilf),
+    (is_polycam, load_polycam),
+    (is_metashape, load_metashape),
+    (is_realitycapture, load_realitycapture),
     (is_tensoir, load_tensoir),
 )
 
@@ -74,8 +84,9 @@ def load_photos(
     raise DataError(
         f"{folder}: expected photographs with their cameras, got {came} (looked for "
         f"transforms_{split}.json, transforms.json, cameras and images (.bin or .txt) of COLMAP in "
-        f"sparse/0, sparse, colmap/sparse/0 and here, poses_bounds.npy, "
-        f"{split}_000/metadata.json)"
+        f"sparse/0, sparse, colmap/sparse/0 and here, poses_bounds.npy, cameras_sphere.npz, "
+        f"inputs/sfm_scene.json, keyframes/corrected_cameras, XML of Metashape, CSV of "
+        f"RealityCapture, {split}_000/metadata.json)"
     )
 
 

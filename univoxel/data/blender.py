@@ -5,6 +5,7 @@ transforms_<split>.json     see univoxel.data.transforms
 <file_path>_rgba.png        the same
 <file_path>_rgb.exr         linear photograph, with <file_path>_mask.png
 train/0001.exr              linear photograph, with train_mask/0001.png
+transforms_novel.json       views of other scenes, as of Stanford-ORB: split "novel"
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ def load_blender(
     path = folder / f"transforms_{split}.json"
     if not path.is_file():
         raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
-    _, shots = read_frames(path)
+    _, shots, remarks = read_frames(path)
     shots = [replace(shot, mask=shot.mask or _mask(shot.image)) for shot in shots]
-    return read_shots(folder, "NeRF layout", split, shots, downscale, masks=masks)
+    return read_shots(folder, "NeRF layout", split, shots, downscale, remarks, masks)
 
 
 def _mask(image: Path) -> Path | None:

@@ -17,10 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.data.base import Photos
+from univoxel.data.foreign import TO_OPENGL, find_photo, listed_split
 from univoxel.data.images import image_size, turn_note
-from univoxel.data.inside import inside
 from univoxel.data.lens import FARTHEST, Lens, checked
-from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.data.missing import left_out
+from univoxel.data.shots import Shot, find_mask, read_shots, upright
 from univoxel.errors import DataError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -32,7 +33,6 @@ MODELS = (
 SUPPORTED = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
 # What reading a broken file may raise; OverflowError: of sizes of hundreds of digits
 BROKEN = (struct.error, IndexError, ValueError, OverflowError)
-TO_OPENGL = np.diag([1.0, -1.0, -1.0])  # of camera axes: x right, y down, z forward in COLMAP
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def is_colmap(folder: Path, split: str) -> bool:
 def load_colmap(
     folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
 ) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
+    """Photographs and cameras of one split, as of `listed_split`.
 
     The world keeps its scale and origin, and is turned so that +Z is up.
 
@@ -80,19 +80,15 @@ def load_colmap(
                 f"{images_file}: expected names of photographs, each once, got {image.name!r}"
             )
         names.add(image.name)
-    photos = next((p for p in (folder / "images", folder) if (p / images[0].name).is_file()), None)
-    if photos is None:
-        raise DataError(
-            f"{images_file}: no picture {images[0].name} in {folder / 'images'} or {folder}"
-        )
-    shots = []
+    shots, missing = [], []
     for image in images:
-        path = inside(photos / image.name, str(images_file))
         if image.camera not in cameras:
             raise DataError(f"{images_file}: {image.name} has camera {image.camera}, got no such")
+        path = find_photo(folder, image.name, str(images_file))
+        if path is None:
+            missing.append(image.name)
+            continue
         lens = cameras[image.camera]
-        if not path.is_file():
-            raise DataError(f"{images_file}: no picture {path}")
         width, height = image_size(path)
         if (width, height) != (lens.width, lens.height):
             raise DataError(
@@ -100,11 +96,15 @@ def load_colmap(
                 f"{cameras_file.name}, got {width}x{height}{turn_note(path)}"
             )
         name = Path(image.name).with_suffix("").as_posix().replace("/", "_")
-        mask = find_mask(folder, image.name)
+        mask = find_mask(folder, image.name) or find_mask(
+            folder, str(Path(image.name).with_suffix(path.suffix))
+        )
         shots.append(Shot(name, str(images_file), path, mask, image.pose, lens))
+    note = f" (looked in {folder / 'images'} and {folder})"
+    lost = left_out(str(images_file), missing, len(images), note)
     shots, remarks = upright(shots)
-    shots = every_eighth(folder, shots, split)
-    return read_shots(folder, "COLMAP model", split, shots, downscale, remarks, masks)
+    shots = listed_split(folder, shots, split)
+    return read_shots(folder, "COLMAP model", split, shots, downscale, [*lost, *remarks], masks)
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:

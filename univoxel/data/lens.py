@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 import torch
@@ -26,8 +27,8 @@ class Lens:
 
     A direction (x, y, 1), x right, y down, r^2 = x^2 + y^2, is seen at centre + focal (x', y'):
 
-        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
-        y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
+        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + ..) + 2 p1 x y + p2 (r^2 + 2 x^2)
+        y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6 + ..) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
     Source: Brown 1966, with the names and signs of OpenCV and COLMAP.
     """
@@ -36,7 +37,7 @@ class Lens:
     height: int
     focal: tuple[float, float]  # pixels, along x and y
     centre: tuple[float, float]  # pixels from the top left corner
-    radial: tuple[float, float, float] = (0.0, 0.0, 0.0)  # k1, k2, k3
+    radial: tuple[float, ...] = (0.0, 0.0, 0.0)  # k1, k2, k3 and on
     tangential: tuple[float, float] = (0.0, 0.0)  # p1, p2
 
     @property
@@ -45,9 +46,10 @@ class Lens:
 
     def seen(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates of the directions (x, y, 1)."""
-        (k1, k2, k3), (p1, p2) = self.radial, self.tangential
+        p1, p2 = self.tangential
         rr = x * x + y * y
-        factor = 1 + rr * (k1 + rr * (k2 + rr * k3))
+        *others, last = self.radial
+        factor = 1 + rr * reduce(lambda inner, k: k + rr * inner, reversed(others), last)
         bent_x = x * factor + 2 * p1 * x * y + p2 * (rr + 2 * x * x)
         bent_y = y * factor + p1 * (rr + 2 * y * y) + 2 * p2 * x * y
         return (

@@ -18,15 +18,15 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.data.base import Photos
-from univoxel.data.images import SUFFIXES, image_size, turn_note
-from univoxel.data.lens import Lens, checked
-from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.data.foreign import fitted, listed_split
+from univoxel.data.images import SUFFIXES
+from univoxel.data.lens import Lens
+from univoxel.data.shots import Shot, find_mask, read_shots, upright
 from univoxel.data.transforms import pose_of
-from univoxel.errors import DataError, UserError
+from univoxel.errors import DataError
 
 FILE = "poses_bounds.npy"
 COLUMNS = 17  # 3 x 5 for the camera, and two depths
-TALLER = 0.01  # share by which a shrunk picture may be taller or wider than its original
 
 
 def is_llff(folder: Path, split: str) -> bool:
@@ -34,7 +34,7 @@ def is_llff(folder: Path, split: str) -> bool:
 
 
 def load_llff(folder: Path, split: str = "train", downscale: int = 0, masks: bool = True) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
+    """Photographs and cameras of one split, as of `listed_split`.
 
     The world keeps its scale and origin, and is turned so that +Z is up.
 
@@ -58,7 +58,7 @@ def load_llff(folder: Path, split: str = "train", downscale: int = 0, masks: boo
         mask = find_mask(folder, picture.name, f"masks{ending}")
         shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
     shots, remarks = upright(shots)
-    shots = every_eighth(folder, shots, split)
+    shots = listed_split(folder, shots, split)
     return read_shots(folder, "LLFF layout", split, shots, downscale, remarks, masks)
 
 
@@ -90,19 +90,10 @@ def _pictures(folder: Path) -> tuple[list[Path], str]:
 def _lens(size_and_focal: np.ndarray, picture: Path, where: str) -> Lens:
     """The pinhole of a picture that may be smaller than what its row describes."""
     height, width, focal = size_and_focal.tolist()
-    if not all(0 < x < 1e9 for x in (height, width, focal)):
+    if not all(1 <= x < 1e9 for x in (height, width)) or not 0 < focal < 1e9:
         raise DataError(
             f"{where}: expected height, width and focal length above 0, got {height:g}, "
             f"{width:g}, {focal:g}"
         )
-    w, h = image_size(picture)
-    across, down = w / width, h / height
-    if abs(across / down - 1) > TALLER + 1 / min(w, h):
-        raise DataError(
-            f"{picture}: expected a picture of the shape {width:g}x{height:g} as in {where}, got "
-            f"{w}x{h}{turn_note(picture)}"
-        )
-    try:
-        return checked(Lens(w, h, (focal * across, focal * down), (w / 2, h / 2)))
-    except UserError as error:
-        raise DataError(f"{where}: {error}") from None
+    whole = Lens(int(width), int(height), (focal, focal), (width / 2, height / 2))
+    return fitted(whole, picture, where)

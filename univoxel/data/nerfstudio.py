@@ -31,24 +31,31 @@ def load_nerfstudio(
         DataError: one line that names the file, what was expected and what came.
     """
     path = folder / "transforms.json"
-    root, shots = read_frames(path)
+    root, shots, lost = read_frames(path)
     shots = [replace(s, mask=s.mask or find_mask(folder, s.image.name)) for s in shots]
     shots, remarks = upright(shots)
     chosen = root.get(f"{split}_filenames")
     if chosen is None:
         shots = every_eighth(folder, shots, split)
     else:
-        shots = _named(path, shots, f"{split}_filenames", chosen)
-    return read_shots(folder, "nerfstudio layout", split, shots, downscale, remarks, masks)
+        listed = {view_name(frame["file_path"]) for frame in root["frames"]}
+        shots = _named(path, shots, listed, f"{split}_filenames", chosen)
+    return read_shots(
+        folder, "nerfstudio layout", split, shots, downscale, [*lost, *remarks], masks
+    )
 
 
-def _named(path: Path, shots: list[Shot], key: str, chosen: object) -> list[Shot]:
+def _named(path: Path, shots: list[Shot], listed: set[str], key: str, chosen: object) -> list[Shot]:
+    """The shots of a split. What is listed and has no picture is left out of it, too."""
     if not isinstance(chosen, list) or not all(isinstance(name, str) for name in chosen):
         raise DataError(f"{path}: expected {key} as a list of file_paths, got {short(chosen)}")
     by_name = {shot.name: shot for shot in shots}
     names = [view_name(name) for name in chosen]
-    unknown = [name for name in names if name not in by_name]
+    unknown = [name for name in names if name not in listed]
     if unknown or not names:
         came = ", ".join(unknown[:1]) or "an empty list"
         raise DataError(f"{path}: expected frames of the file in {key}, got {came}")
-    return [by_name[name] for name in names]
+    found = [by_name[name] for name in names if name in by_name]
+    if not found:
+        raise DataError(f"{path}: expected frames with pictures in {key}, got {len(names)} without")
+    return found

@@ -3,7 +3,8 @@
 {"camera_angle_x" (or "fl_x", "fl_y", "cx", "cy"), "w", "h", "k1" .., "p1", "p2", "frames": [
     {"file_path": .., "transform_matrix": camera-to-world with OpenGL axes, "mask_path": ..}]}
 
-Everything but frames may stand with a frame too.
+Everything but frames may stand with a frame too. Where it has a scene_name, its file_path is
+relative to the folder of that name beside the file's (Stanford-ORB's transforms_novel.json).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from univoxel.camera import Cameras
 from univoxel.data.images import SUFFIXES, image_size, turn_note
 from univoxel.data.inside import inside
 from univoxel.data.lens import FARTHEST, Lens, checked
+from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, cameras_of
 from univoxel.errors import DataError, UserError
 from univoxel.files import read_json, replacing
@@ -27,6 +29,11 @@ from univoxel.files import read_json, replacing
 # How far the axes of a camera may be from orthonormal. Six printed digits give 1e-6; what is off
 # by more than this was scaled or sheared.
 RIGID_TOLERANCE = 1e-3
+CAPITAL = (".JPG", ".JPEG", ".PNG")
+ENDINGS = ("", ".png", "_rgba.png", "_rgb.exr", ".exr", ".jpg", ".jpeg", *CAPITAL)
+LOOKED_FOR = f"looked for the endings {', '.join(ending or 'none' for ending in ENDINGS)}"
+# Endings of pictures that are not read: names may be those of files before they were converted
+FOREIGN = (".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp", ".dng", ".cr2", ".nef", ".arw")
 WIDEST = 1 << 16  # pixels along a side of pictures to be made: what formats of files hold
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
@@ -82,24 +89,31 @@ def read_transforms(path: Path) -> tuple[dict, list[dict]]:
     return root, frames
 
 
-def read_frames(path: Path) -> tuple[dict, list[Shot]]:
-    """The root of the file, and its frames with their pictures, which lie relative to it."""
+def read_frames(path: Path) -> tuple[dict, list[Shot], list[str]]:
+    """The root of the file, its frames with their pictures, which lie relative to it, and remarks.
+
+    Frames without a picture are left out, as `left_out` says.
+    """
     root, frames = read_transforms(path)
     names: set[str] = set()
     for index, frame in enumerate(frames):  # all of them, before a picture is opened
         where, file_path = f"{path}: frame {index}", frame.get("file_path")
         if not isinstance(file_path, str) or "\0" in file_path:
             raise DataError(f"{where}: expected an object with a file_path, got {short(file_path)}")
-        if (name := view_name(file_path)) in names:
+        if (name := _name(frame)) in names:
             raise DataError(f"{where}: the name {name} of {file_path} came before")
         names.add(name)
-    shots = []
+    shots, missing = [], []
     for index, frame in enumerate(frames):
         where, file_path = f"{path}: frame {index}", frame["file_path"]
-        image = find_image(path.parent, file_path, where)
+        folder = _folder(path, frame, where)
+        image = listed_image(folder, file_path, where)
+        if image is None:
+            missing.append(folder / file_path)
+            continue
         shots.append(
             Shot(
-                name=view_name(file_path),
+                name=_name(frame),
                 where=where,
                 image=image,
                 mask=_mask(path.parent, frame, where),
@@ -107,25 +121,58 @@ def read_frames(path: Path) -> tuple[dict, list[Shot]]:
                 lens=lens_of(root | frame, where, *image_size(image), turn_note(image)),
             )
         )
-    return root, shots
+    return root, shots, left_out(str(path), missing, len(frames), f" ({LOOKED_FOR})")
+
+
+def _name(frame: dict) -> str:
+    """Unique within a file: Stanford-ORB's novel views are of several scenes."""
+    name = view_name(frame["file_path"])
+    return f"{scene}_{name}" if isinstance(scene := frame.get("scene_name"), str) else name
+
+
+def _folder(path: Path, frame: dict, where: str) -> Path:
+    """What a frame's file_path is relative to: the file's folder, or that of another scene."""
+    scene = frame.get("scene_name")
+    if scene is None:
+        return path.parent
+    if not isinstance(scene, str) or Path(scene).name != scene or scene in ("", ".."):
+        raise DataError(f"{where}: expected scene_name as the name of a folder, got {short(scene)}")
+    return path.parent.resolve().parent / scene
 
 
 def find_image(folder: Path, file_path: str, where: str) -> Path:
-    """The picture that a frame's file_path means, with or without its extension."""
-    endings = ("", ".png", "_rgba.png", "_rgb.exr", ".exr", ".jpg")
-    for ending in endings:
-        if (path := folder / (file_path + ending)).is_file():
-            return inside(path, where)
-    raise DataError(
-        f"{where}: no picture {folder / file_path} (looked for the endings "
-        f"{', '.join(ending or 'none' for ending in endings)})"
-    )
+    """The picture that a frame's file_path means, as of `listed_image`.
+
+    Raises:
+        DataError: there is none.
+    """
+    found = listed_image(folder, file_path, where)
+    if found is None:
+        raise DataError(f"{where}: no picture {folder / file_path} ({LOOKED_FOR})")
+    return found
+
+
+def listed_image(folder: Path, file_path: str, where: str) -> Path | None:
+    """The picture that a name in a file means: as it is, without its ending, or with another."""
+    names = [file_path + ending for ending in ENDINGS]
+    if (named := Path(file_path)).suffix.lower() in (*SUFFIXES, *FOREIGN):
+        names += [str(named.with_suffix(ending)) for ending in (*SUFFIXES, *CAPITAL)]
+    found = next((path for name in names if _is_file(path := folder / name)), None)
+    return None if found is None else inside(found, where)
+
+
+def _is_file(path: Path) -> bool:
+    """Whether there is such a file; names that no file can have are those of none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def view_name(file_path: str) -> str:
     """./train/r_000 and ./train/r_000.png are r_000; r_0.5 stays."""
     path = Path(file_path)
-    name = path.stem if path.suffix.lower() in SUFFIXES else path.name
+    name = path.stem if path.suffix.lower() in (*SUFFIXES, *FOREIGN) else path.name
     return name.removesuffix("_rgba").removesuffix("_rgb")
 
 

@@ -3,6 +3,7 @@
 test/gt/<name>.npz                                  of this project's scenes
 test/<name>_albedo.png, _rough.png, _normal.png     Synthetic4Relight, Shiny Blender
 <name>/albedo.png, normal.png                       TensoIR-Synthetic
+../../ground_truth/<scene>/                         Stanford-ORB, see univoxel.data.orb
 relight/<map>/<name>.png                            test views under envmaps/<map>.hdr
 test_rli/<map>_<name>.png                           the same in Synthetic4Relight
 <name>/rgba_<map>.png                               the same in TensoIR-Synthetic
@@ -23,6 +24,7 @@ from univoxel.color import srgb_to_linear
 from univoxel.data.base import Photos, Truth
 from univoxel.data.images import read_image
 from univoxel.data.lens import shrink
+from univoxel.data.orb import orb_files, orb_geometry
 from univoxel.data.shots import read_photo, resampled, size_of
 from univoxel.data.tensoir import is_tensoir, photographed
 from univoxel.data.transforms import find_image
@@ -146,11 +148,16 @@ def _pictures(photos: Photos, view: int) -> Truth:
     """Truth from pictures of the data sets in the field.
 
     The albedo is sRGB in Synthetic4Relight and linear in TensoIR-Synthetic; normals are 1/2 + n/2
-    in the world; roughness is as it is.
+    in the world; roughness is as it is. Of Stanford-ORB, the albedo is sRGB.
     """
     folder, name = photos.folder, photos.names[view]
+    orb = orb_files(photos, view)
     files = {
-        "albedo": (folder / "test" / f"{name}_albedo.png", folder / name / "albedo.png"),
+        "albedo": (
+            folder / "test" / f"{name}_albedo.png",
+            orb.get("albedo", folder),
+            folder / name / "albedo.png",
+        ),
         "roughness": (folder / "test" / f"{name}_rough.png",),
         "normal": (folder / "test" / f"{name}_normal.png", folder / name / "normal.png"),
     }
@@ -167,16 +174,23 @@ def _pictures(photos: Photos, view: int) -> Truth:
             raise DataError(f"{path}: expected a picture with 3 or 4 channels, got 1")
         elif key == "normal":
             value = 2 * value - 1
-        elif path == paths[0]:
+        elif path in paths[:2]:
             value = srgb_to_linear(value)
-        value = _shrunk(key, value, alpha, photos.downscale)
-        if value.shape[:2] != coverage.shape:
-            raise DataError(
-                f"{path}: expected {size_of(coverage)} pixels like the photograph's, "
-                f"got {size_of(value)}"
-            )
-        fields[key] = value * (coverage > 0).view(*coverage.shape, *[1] * (value.dim() - 2))
+        fields[key] = _fitting(path, _shrunk(key, value, alpha, photos.downscale), coverage)
+    for key in {"normal", "depth"} & orb.keys():
+        value, there = orb_geometry(orb[key], key, photos.cameras.camera_to_world[view])
+        fields[key] = _fitting(orb[key], _shrunk(key, value, there, photos.downscale), coverage)
     return Truth(**fields, mask=coverage > WHOLE) if fields else Truth()
+
+
+def _fitting(path: Path, value: Tensor, coverage: Tensor) -> Tensor:
+    """A layer of truth where the photograph has something, if their sizes are the same."""
+    if value.shape[:2] != coverage.shape:
+        raise DataError(
+            f"{path}: expected {size_of(coverage)} pixels like the photograph's, "
+            f"got {size_of(value)}"
+        )
+    return value * (coverage > 0).view(*coverage.shape, *[1] * (value.dim() - 2))
 
 
 def _channels(path: Path) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,178 @@
+"""Metashape's XML: lenses, components and errors. Axes are checked by test_layouts."""
+
+import numpy as np
+import pytest
+import torch
+from layouts import FOCAL, HEIGHT, WIDTH, scene, write_metashape
+
+from univoxel.data import load_photos, metashape
+from univoxel.errors import DataError
+
+TERMS = {"k1": 0.03, "k2": -0.02, "k3": 0.01, "k4": 0.05, "p1": 0.004, "p2": -0.007}
+OFFSETS = {"cx": 0.75, "cy": -0.5, "b1": 0.4}
+
+
+def calibration(**terms):
+    return "".join(f"<{key}>{value}</{key}>" for key, value in terms.items())
+
+
+def test_lenses_bend_as_the_manual_says(tmp_path):
+    """x' = x (1 + K1 r2 + ..) + P1 (r2 + 2 x2) + 2 P2 x y, u = w / 2 + cx + x' f + x' B1."""
+    text = calibration(**TERMS, **OFFSETS)
+    path = write_metashape(tmp_path, scene(), text) / "cameras.xml"
+    sensor = metashape._chunk(path).find("sensors/sensor")
+    u, v = metashape._lens(sensor, "here").seen(
+        x := np.array([0.3, -0.2]), y := np.array([0.1, 0.25])
+    )
+    rr = x * x + y * y
+    radial = 1 + 0.03 * rr - 0.02 * rr**2 + 0.01 * rr**3 + 0.05 * rr**4
+    bent_x = x * radial + 0.004 * (rr + 2 * x * x) - 2 * 0.007 * x * y
+    bent_y = y * radial - 0.007 * (rr + 2 * y * y) + 2 * 0.004 * x * y
+    np.testing.assert_allclose(u, WIDTH / 2 + 0.75 + bent_x * (FOCAL + 0.4), rtol=1e-12)
+    np.testing.assert_allclose(v, HEIGHT / 2 - 0.5 + bent_y * FOCAL, rtol=1e-12)
+
+
+def test_distortion_is_taken_out(tmp_path):
+    photos = load_photos(write_metashape(tmp_path, scene(), calibration(k1=0.01)))
+    assert "lens distortion taken out" in photos.about
+
+
+def test_sensors_of_larger_originals(tmp_path):
+    cameras = load_photos(write_metashape(tmp_path, scene(), original=4)).cameras
+    assert cameras.focal.unique().tolist() == [FOCAL]
+    assert cameras.centre[0].tolist() == [6, 4]
+
+
+def edited(*changes):
+    def apply(folder):
+        path = folder / "cameras.xml"
+        text = path.read_text()
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        path.write_text(text)
+
+    return apply
+
+
+def test_coordinates_of_the_earth_are_moved_to_the_origin(tmp_path):
+    """Distances between cameras stay as exact as float32 has them."""
+    written = scene()
+    write_metashape(tmp_path, written)
+    edited(("<translation>0.5 -1.0 0.25", "<translation>4100000.5 899999.0 4800000.25"))(tmp_path)
+    photos = load_photos(tmp_path)
+    assert "world moved by -4100000 -900000 -480000" in photos.about
+    place = photos.cameras.camera_to_world[:, :, 3]
+    wanted = torch.from_numpy(written.poses[written.split("train"), :3, 3]).float()
+    torch.testing.assert_close(torch.cdist(place, place), torch.cdist(wanted, wanted))
+
+
+def test_the_largest_component_is_read(tmp_path):
+    write_metashape(tmp_path, scene())
+    edited(
+        *(
+            (f'component_id="0" label="p_00{v}"', f'component_id="1" label="p_00{v}"')
+            for v in (1, 5)
+        )
+    )(tmp_path)
+    photos = load_photos(tmp_path)
+    assert photos.names == ["p_002", "p_003", "p_004", "p_006", "p_007", "p_008", "p_009"]
+    assert "3 of 11 cameras left out: not placed, not enabled or in another" in photos.about
+
+
+def test_cameras_that_are_not_enabled(tmp_path):
+    write_metashape(tmp_path, scene())
+    edited(('label="p_003"', 'label="p_003" enabled="0"'))(tmp_path)
+    assert "p_003" not in load_photos(tmp_path).names
+
+
+def test_a_chunk_without_components(tmp_path):
+    """Its own transform leads to the world then."""
+    written = scene()
+    write_metashape(tmp_path, written)
+    edited(
+        ('<components><component id="0">', ""),
+        ("</component></components>", ""),
+        (' component_id="0"', ""),
+    )(tmp_path)
+    found = load_photos(tmp_path).cameras.camera_to_world[:, :, 3]
+    wanted = written.poses[written.split("train"), :3, 3]
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
+
+
+def test_pictures_that_are_not_there(tmp_path):
+    write_metashape(tmp_path, scene())
+    (tmp_path / "images" / "p_001.png").unlink()
+    assert "1 of 10 listed left out" in load_photos(tmp_path).about
+
+
+SENSOR = '<sensor id="3" label="unknown" type="frame">'
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (edited(("</chunk>", "")), "cameras.xml: expected XML, could not read it: mismatched tag"),
+        (
+            edited(("<document", '<!DOCTYPE d [<!ENTITY a "b">]><document')),
+            "cameras.xml: expected XML of Metashape, got one with definitions of its own",
+        ),
+        (
+            edited(("<chunk", "<x><chunk"), ("</chunk>", "</chunk></x>")),
+            "expected one chunk, got 0",
+        ),
+        (
+            edited(("transform>", "other>")),
+            "xml: expected cameras with a transform, got 11 without",
+        ),
+        (edited((SENSOR, '<sensor id="4">')), "sensor 3 of p_000: expected it among the sensors"),
+        (
+            edited((SENSOR, '<sensor id="3" type="fisheye">')),
+            "sensor 3 of p_000: expected a sensor of type frame, got fisheye",
+        ),
+        (
+            edited(("calibration", "other")),
+            "sensor 3 of p_000: expected a calibration, got none",
+        ),
+        (edited(("<f>11.0</f>", "")), "sensor 3 of p_000: expected a number as f, got nothing"),
+        (edited(("<f>11.0", "<f>wide")), "sensor 3 of p_000: expected a number as f, got 'wide'"),
+        (edited(("<f>11.0", "<f>-11.0")), "sensor 3 of p_000: expected fl_x between 0 and inf"),
+        (edited(("<f>11.0", "<p3>.1</p3><f>11.0")), "expected distortion by k1 to k4, p1 and p2"),
+        (edited(("<f>11.0", "<b2>2</b2><f>11.0")), "p_000: expected pixels with axes square"),
+        (
+            edited(('width="12"', 'width="0"')),
+            "sensor 3 of p_000: expected a resolution above 0, got 0x8",
+        ),
+        (edited(('width="12"', "")), "sensor 3 of p_000: expected a number as width, got nothing"),
+        (
+            edited(('width="12"', 'width="9"')),
+            r"p_000.png: expected a picture of the shape 9x8 as in .*camera p_000, got 12x8",
+        ),
+        (
+            edited(("<scale>2.5", "<scale>-2.5")),
+            "transform of component 0: expected a scale above 0, got -2.5",
+        ),
+        (
+            edited(("<scale>2.5", "<scale>2.5 1")),
+            "transform of component 0: expected 1 numbers as scale, got '2.5 1'",
+        ),
+        (
+            edited(("<rotation>", "<rotation>1 ")),
+            "transform of component 0: expected 9 numbers as rotation",
+        ),
+        (
+            edited(('label="p_000"><transform>', 'label="p_000"><transform>1 ')),
+            "camera p_000: expected 16 numbers as transform",
+        ),
+        (
+            lambda f: (f / "images").rename(f / "photos"),
+            "cameras.xml: no picture p_000, p_001, p_002, .*looked in .*images and",
+        ),
+    ],
+)
+def test_one_line_for_what_is_broken(tmp_path, damage, message):
+    write_metashape(tmp_path, scene())
+    damage(tmp_path)
+    with pytest.raises(DataError, match=message) as caught:
+        load_photos(tmp_path)
+    assert "\n" not in str(caught.value)

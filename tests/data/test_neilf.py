@@ -1,0 +1,108 @@
+"""sfm_scene.json: what it may say, and errors. Axes are checked by test_layouts."""
+
+import json
+
+import numpy as np
+import pytest
+from layouts import FOCAL, scene, write_neilf
+
+from univoxel.data import load_photos
+from univoxel.errors import DataError
+
+
+def edited(change):
+    def apply(folder):
+        path = folder / "inputs" / "sfm_scene.json"
+        root = json.loads(path.read_text())
+        change(root)
+        path.write_text(json.dumps(root))
+
+    return apply
+
+
+def image(change):
+    """A change of image 3."""
+    return edited(lambda root: change(root["camera_track_map"]["images"]["3"]))
+
+
+def text(content):
+    return lambda folder: (folder / "inputs" / "sfm_scene.json").write_text(content)
+
+
+def test_sizes_may_be_those_of_larger_originals(tmp_path):
+    cameras = load_photos(write_neilf(tmp_path, scene(), original=4)).cameras
+    assert cameras.focal.unique().tolist() == [FOCAL]
+    assert cameras.centre[0].tolist() == [6, 4]
+
+
+def test_images_that_were_not_placed(tmp_path):
+    write_neilf(tmp_path, scene())
+    image(lambda i: i.update(flg=1))(tmp_path)
+    edited(lambda root: root["camera_track_map"]["images"].pop("5"))(tmp_path)
+    (tmp_path / "inputs" / "images" / "p_002.png").unlink()
+    photos = load_photos(tmp_path)
+    assert photos.names == ["p_001", "p_004", "p_006", "p_007", "p_008", "p_009"]
+    assert "1 of 8 listed left out: no such pictures, 2 without a camera left out" in photos.about
+
+
+@pytest.mark.parametrize("place", ["inputs/pmasks", "masks"])
+def test_places_of_masks(tmp_path, place):
+    written = scene()
+    write_neilf(tmp_path, written)
+    (tmp_path / "inputs" / "masks").rename(tmp_path / place)
+    assert np.array_equal(load_photos(tmp_path, "test").alpha[0], written.pictures[0, ..., 3])
+
+
+def test_names_as_the_readme_has_them(tmp_path):
+    """A list, in image_list."""
+
+    def change(root):
+        root["image_list"] = {"file_paths": list(root.pop("image_path")["file_paths"].values())}
+
+    write_neilf(tmp_path, scene())
+    edited(change)(tmp_path)
+    assert len(load_photos(tmp_path)) == 8
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (text("{"), "sfm_scene.json: broken JSON in line 1"),
+        (text("[1]"), r"sfm_scene.json: expected JSON with image_path.file_paths and"),
+        (text("{}"), r"sfm_scene.json: expected JSON with .* KeyError\('image_list'\)"),
+        (
+            edited(lambda r: r["camera_track_map"].update(images=[])),
+            "json: expected JSON with .*no images",
+        ),
+        (
+            edited(lambda r: [i.update(flg=0) for i in r["camera_track_map"]["images"].values()]),
+            "sfm_scene.json: expected images with flg 2, which have cameras, got none",
+        ),
+        (image(lambda i: i.pop("camera")), r"image 3: expected size \[w, h\] and a camera of"),
+        (image(lambda i: i.update(size=[12])), r"image 3: expected size \[w, h\] and a camera of"),
+        (image(lambda i: i["camera"].update(extrinsic=[1.0] * 15)), "image 3: .* 16 numbers"),
+        (
+            image(lambda i: i["camera"].update(extrinsic=(2 * np.eye(4)).ravel().tolist())),
+            "image 3: expected the last row 0 0 0 1",
+        ),
+        (
+            image(lambda i: i["camera"]["intrinsic"].update(focal=[-1.0, 2.0])),
+            "image 3: expected fl_x between 0 and inf, got -1.0",
+        ),
+        (image(lambda i: i.update(size=[-12, 8])), "image 3: expected w between 0 and inf, got -1"),
+        (
+            image(lambda i: i.update(size=[12, 12])),
+            r"p_003.png: expected a picture of the shape 12x12 as in .*image 3, got 12x8",
+        ),
+        (
+            lambda f: (f / "inputs" / "images").rename(f / "photos"),
+            "json: no picture p_000.exr, .*: 10 of 10 are missing.*looked in .*inputs/images",
+        ),
+    ],
+)
+def test_one_line_for_what_is_broken(tmp_path, damage, message):
+    write_neilf(tmp_path, scene())
+    damage(tmp_path)
+    with pytest.raises(DataError, match=message) as caught:
+        load_photos(tmp_path)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,122 @@
+"""RealityCapture's CSV: lenses, columns and errors. Angles are checked by test_layouts."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+from layouts import FOCAL, scene, write_realitycapture
+
+from univoxel.data import load_photos, realitycapture
+from univoxel.errors import DataError
+
+NEWER = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
+SHORT = "#name,x,y,alt,heading,pitch,roll,f"
+
+
+@pytest.mark.parametrize(
+    ("head", "lens"), [(NEWER, ",".join("0" * 8)), (SHORT, ""), (f"#cameras 10\n{SHORT}", "")]
+)
+def test_columns(tmp_path, head, lens):
+    photos = load_photos(write_realitycapture(tmp_path, scene(), head, lens))
+    assert len(photos) == 8
+    assert photos.cameras.focal.unique().tolist() == pytest.approx([FOCAL])
+    assert photos.cameras.centre[0].tolist() == [6, 4]
+
+
+def test_lenses_bend_as_the_vendor_says(tmp_path):
+    """px and py in longer sides; t1 along x, as OpenCV's p2."""
+    lens = "0.05,-0.025,0.03,-0.02,0.01,0.05,0.004,-0.007"
+    path = write_realitycapture(tmp_path, scene(), lens=lens) / "cameras.csv"
+    _, row = realitycapture._rows(path)[0]
+    found = realitycapture._lens(row, tmp_path / "images" / "p_000.png", "here")
+    u, v = found.seen(x := np.array([0.3, -0.2]), y := np.array([0.1, 0.25]))
+    rr = x * x + y * y
+    radial = 1 + 0.03 * rr - 0.02 * rr**2 + 0.01 * rr**3 + 0.05 * rr**4
+    bent_x = x * radial + 0.004 * (rr + 2 * x * x) - 2 * 0.007 * x * y
+    bent_y = y * radial - 0.007 * (rr + 2 * y * y) + 2 * 0.004 * x * y
+    np.testing.assert_allclose(u, 6 + 12 * 0.05 + bent_x * FOCAL, rtol=1e-12)
+    np.testing.assert_allclose(v, 4 - 12 * 0.025 + bent_y * FOCAL, rtol=1e-12)
+
+
+def test_coordinates_of_the_earth_are_moved_to_the_origin(tmp_path):
+    written = scene()
+    photos = load_photos(write_realitycapture(tmp_path, written, shift=(391234.5, 5.82e6, 34.0)))
+    assert re.search(r"world moved by -39123\d -5820000 -3\d", photos.about)
+    place = photos.cameras.camera_to_world[:, :, 3]
+    wanted = torch.from_numpy(written.poses[written.split("train"), :3, 3]).float()
+    torch.testing.assert_close(torch.cdist(place, place), torch.cdist(wanted, wanted))
+
+
+def edited(*changes):
+    def apply(folder):
+        path = folder / "cameras.csv"
+        text = path.read_text()
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        path.write_text(text)
+
+    return apply
+
+
+def test_pictures_that_are_not_there_and_names_with_folders(tmp_path):
+    write_realitycapture(tmp_path, scene())
+    (tmp_path / "images" / "p_001.png").unlink()
+    edited(("p_002.png", r"D:\shots\p_002.tif"))(tmp_path)
+    photos = load_photos(tmp_path)
+    assert photos.names[0] == "p_002"
+    assert "1 of 10 listed left out" in photos.about
+
+
+def value(index, new):
+    """A change of one value of p_003, in the fifth line."""
+
+    def apply(folder):
+        lines = (folder / "cameras.csv").read_text().splitlines()
+        values = lines[4].split(",")
+        values[index] = new
+        lines[4] = ",".join(values)
+        (folder / "cameras.csv").write_text("\n".join(lines))
+
+    return apply
+
+
+def only_a_head(folder):
+    (folder / "cameras.csv").write_text(SHORT + "\n")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (value(4, "north"), "line 5: expected a number as heading, got 'north'"),
+        (value(1, ""), "line 5: expected a number as x, got ''"),
+        (value(3, "nan"), "line 5: expected a number as alt, got 'nan'"),
+        (value(7, "0"), "line 5: expected fl_x between 0 and inf, got 0.0"),
+        (value(8, "3"), "line 5: expected cx between -12 and 24, got 42.0"),
+        (value(12, "far"), "line 5: expected a number as k3, got 'far'"),
+        (value(10, "0,0"), "line 5: expected 16 values, got 17"),
+        (only_a_head, "cameras.csv: expected a line for each camera, got none"),
+        (
+            lambda f: (f / "cameras.csv").write_bytes(SHORT.encode() + b"\n\xff"),
+            "cameras.csv: expected text in UTF-8",
+        ),
+        (
+            lambda f: (f / "images").rename(f / "photos"),
+            "cameras.csv: no picture p_000.png, p_001.png, .*looked in .*images and",
+        ),
+    ],
+)
+def test_one_line_for_what_is_broken(tmp_path, damage, message):
+    write_realitycapture(tmp_path, scene())
+    damage(tmp_path)
+    with pytest.raises(DataError, match=message) as caught:
+        load_photos(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_another_csv_is_none_of_these(tmp_path):
+    (tmp_path / "list.csv").write_text("name,price\n")
+    (tmp_path / "list.xml").write_text("<html></html>")
+    with pytest.raises(DataError, match=r"expected photographs with their cameras, got list\.csv"):
+        load_photos(tmp_path)
