@@ -36,13 +36,13 @@ from univoxel.training.config import StageConfig
 
 HERE = Path(__file__).parent
 ONCE = {
-    "joint: pose and trace": [(stage, "build_problem")],
-    "joint: trials": [(stage, "initialise_")],
-    "joint: colors": [
+    "joint: observations and visibility": [(stage, "build_problem")],
+    "joint: hypothesis trials": [(stage, "initialise_")],
+    "joint: entropy": [
         (stage, name) for name in ("fit_sun_", "minimise_entropy_", "diffuse_albedo")
     ],
     "joint: Newton": [(stage, "newton_round_")],
-    "joint: metal": [(stage, "find_metal")],
+    "joint: metal decision": [(stage, "find_metal")],
     "held-out rays": [(loop, "held_out_psnr")],
     "previews": [(train, "preview")],
     "checkpoints": [(train, "save_scene"), (loop, "save_scene")],
@@ -55,7 +55,7 @@ PARTS = {
     "sample": [(Field, n) for n in ("sample", "features_at")],
     "light": [*STAGES["light"], (observations, "shade_map")],
     "hull": [(prepare, name) for name in ("fitted_masks", "bounds_and_refinement", "visual_hull")],
-    "hollows": [(prepare, "carve_within_time")],
+    "carving": [(prepare, "carve_within_time")],
     "cameras": [(prepare, "registered_poses")],
     "loading": [(train, "load_photos")],
     "mesh for rays": [(VisibilityScene, "__init__")],

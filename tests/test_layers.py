@@ -5,68 +5,12 @@ import re
 from pathlib import Path
 
 import pytest
+from layers import HELPERS, LAYERS, drawn_layers
 
 from univoxel.commands import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 
-# From the bottom up. A module imports only from layers below its own and, inside its folder, the
-# helpers named here.
-LAYERS = [
-    {"errors"},
-    {"bars", "files", "names", "records", "validation"},
-    {"brdf", "camera", "color", "grid", "sphere"},
-    {"ops"},
-    {"envmap", "networks", "poses"},
-    {"data", "fields", "lights", "optim"},
-    {"scene"},
-    {"checkpoint", "run"},
-    {"losses"},
-    {"assets", "metrics", "render"},
-    {
-        "joint.config",
-        "preparation.config",
-        "training.config",
-        "compression.config",
-        "confidence.config",
-    },
-    {"compression.choices"},
-    {"config", "overrides"},
-    {"presets"},
-    {"preparation", "training"},
-    {"joint"},
-    {"confidence"},
-    {"compression", "pictures"},
-    {"build", "evaluation", "segmentation"},
-    {"tasks"},
-    {"tasks.demo"},
-    {"experiments.plots", "experiments.record"},
-    {"experiments.worker"},
-    {"experiments.runner"},
-    {"experiments"},
-    {"commands"},
-    {"cli"},
-]
-HELPERS = {
-    "ops": {"checks", "dense_grid", "grid_sampling", "native", "reflectance", "visibility"},
-    "fields": {"bricks", "dense", "distances", "features"},
-    "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
-    "data": {
-        *("base", "foreign", "images", "inside", "kept", "lens", "missing", "orb", "radiance"),
-        *("shots", "tensoir", "transforms"),
-    },
-    "render": {"density", "occlusion", "pipeline", "relight"},
-    "assets": {"atlas", "base"},
-    "preparation": {"depth_sweep", "carving", "exposures", "hull", "masks", "registration"},
-    "training": {"clock", "pixels", "divergence", "plateau", "progress", "surface_update"},
-    "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
-    "compression": {"prune", "quality", "search", "sizes", "storage"},
-    "confidence": {"survey"},
-    "pictures": {"animation"},
-    "evaluation": {"measures", "truth"},
-    "segmentation": {"config", "distances"},
-    "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
-}
 # Extras: imported inside the function that needs one
 OPTIONAL = {"drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh"}
 # The one file or folder of csrc/ that includes it; no header of ours passes it on to others.
@@ -79,7 +23,7 @@ def layer(module: str) -> int:
         for i, names in enumerate(LAYERS):
             if name in names:
                 return i
-    raise AssertionError(f"univoxel.{module} stands in no layer: add it to LAYERS")
+    raise AssertionError(f"univoxel.{module} stands in no layer: add it to tests/layers.py")
 
 
 def modules(package: Path) -> dict[str, Path]:
@@ -184,6 +128,13 @@ def test_one_place_includes(library):
     sources = [p for p in (ROOT / "csrc").rglob("*") if p.is_file()]
     users = {p for p in sources if pattern.search(p.read_text("utf-8"))}
     assert {p.relative_to(ROOT / "csrc").parts[0] for p in users} == {INCLUDES[library]}
+
+
+def test_the_diagram_shows_the_layers():
+    picture = (ROOT / "docs/images/layers.svg").read_text("utf-8")
+    rows = re.findall(r"<text [^>]*>([^<]*)</text>", picture)
+    shown = [", ".join(sorted(names)) for names in drawn_layers()]
+    assert [row for row in rows if row in shown] == shown
 
 
 LONGEST = 80  # lines of a function, with its docstring: what a reader takes in at one sitting

@@ -8,6 +8,8 @@ Each is an SVG file. With --png the same pictures are written as PNG, to look at
 from __future__ import annotations
 
 import argparse
+import sys
+from bisect import bisect_right
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,9 +20,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 
+sys.path.append(str(Path(__file__).parents[2] / "tests"))
+from layers import drawn_layers
+
 INK, SOFT, PALE = "#22333b", "#5b6f7a", "#eef2f4"
 BLUE, GREEN, ORANGE, RED = "#3a6ea5", "#4f8f5b", "#c9822b", "#b0413e"
 MIDDLE = 11.5  # nodes, of the shape in the section
+# What the layers are for: name, a module of the lowest layer, colour; from the bottom up
+BANDS = (
+    ("plain things", "errors", BLUE),
+    ("one scene", "data", GREEN),
+    ("configuration", "config", SOFT),
+    ("training", "preparation", ORANGE),
+    ("after training", "confidence", RED),
+    ("what a person runs", "tasks", SOFT),
+)
 STYLE = {
     "font.family": "sans-serif",
     "font.size": 9,
@@ -281,41 +295,31 @@ def fields() -> Figure:
 
 
 def layers() -> Figure:
-    """The folders of the package, from the bottom up."""
-    rows = [
-        ("cli, commands", SOFT),
-        ("experiments", SOFT),
-        ("tasks: a file for each command", SOFT),
-        ("evaluation, segmentation", RED),
-        ("confidence, compression, pictures", RED),
-        ("joint", ORANGE),
-        ("preparation, training", ORANGE),
-        ("config, presets, overrides", SOFT),
-        ("render, assets, losses, metrics", GREEN),
-        ("scene, checkpoint, run", GREEN),
-        ("data, fields, lights, optim", GREEN),
-        ("envmap, networks, poses", BLUE),
-        ("ops", BLUE),
-        ("brdf, camera, color, grid, sphere", BLUE),
-        ("records, names, errors, files, bars, validation", BLUE),
-    ]
+    """The folders of the package, from the bottom up, as tests/layers.py has them."""
+    rows = drawn_layers()
+    begins = [next(k for k, row in enumerate(rows) if first in row) for _, first, _ in BANDS]
     height = 0.3
     figure, axes = blank(7.9, height * len(rows) + 0.75)
-    for k, (text, color) in enumerate(reversed(rows)):
+    for k, names in enumerate(rows):
         y = 0.55 + height * k
+        color = BANDS[bisect_right(begins, k) - 1][2]
         axes.add_patch(Rectangle((0.7, y), 5.4, height - 0.05, fc=PALE, ec=color, lw=1.2))
+        text = ", ".join(sorted(names))
         axes.text(3.4, y + height / 2 - 0.03, text, ha="center", va="center")
     axes.add_patch(Rectangle((0.7, 0.1), 5.4, 0.3, fc="#dfe6ea", ec=INK, lw=1.2))
     axes.text(3.4, 0.25, "csrc: C++ kernels, loaded by ops.native alone", ha="center", va="center")
     arrow(axes, (0.4, 0.5 + height * len(rows)), (0.4, 0.5), color=INK)
-    axes.text(0.22, 2.6, "imports", rotation=90, va="center", ha="center", color=INK)
-    for name, begin, end, color in (
-        ("what a person runs", 12, 15, SOFT),
-        ("after training", 10, 12, RED),
-        ("training", 8, 10, ORANGE),
-        ("one scene", 4, 7, GREEN),
-        ("plain things", 0, 4, BLUE),
-    ):
+    axes.text(
+        0.22,
+        0.5 + height * len(rows) / 2,
+        "imports",
+        rotation=90,
+        va="center",
+        ha="center",
+        color=INK,
+    )
+    ends = [*begins[1:], len(rows)]
+    for (name, _, color), begin, end in zip(BANDS, begins, ends, strict=True):
         y = 0.55 + height * (begin + end) / 2 - 0.03
         axes.text(6.2, y, name, va="center", color=color, size=8)
     return figure

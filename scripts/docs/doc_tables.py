@@ -265,7 +265,7 @@ def _profile(record: dict[str, Any], _: str) -> str:
     """Seconds of a whole training by part and stage: a part of the steps, multiplied."""
     stages, part = record["stages"], record["part"]
     names = dict.fromkeys(name for s in stages.values() for name in s["rows"])
-    once = ("hull", "hollows", "loading", "previews", "checkpoints", "trust", "mesh for rays")
+    once = ("hull", "carving", "loading", "previews", "checkpoints", "trust", "mesh for rays")
 
     def seconds(stage: dict[str, Any], name: str) -> float:
         fixed = not stage["steps"] or name.startswith("joint:") or name in once

@@ -17,6 +17,7 @@ from univoxel.errors import ConfigError, DataError
 from univoxel.overrides import changed
 from univoxel.presets import preset
 from univoxel.render.transport import MIN_COSINE, Observations
+from univoxel.tasks.train import save_trust
 
 NODES, ROUGHNESS = 64, 0.4
 
@@ -37,6 +38,10 @@ def photos():
 @pytest.fixture(scope="module")
 def surveyed(scene, photos):
     return survey(scene, photos, 1000)
+
+
+def trust_text(run) -> str:
+    return (run / "trust.txt").read_text()
 
 
 def some_views(photos: Photos, keep) -> Photos:
@@ -160,6 +165,16 @@ def test_evaluation_reads_what_a_run_was_trained_with(tmp_path):
     save_config(changed(cfg, ["confidence.noise=0.03"]))
     assert confidence_of(tmp_path) == replace(CONFIDENCE, noise=0.03)
     check_same(cfg)  # it changes no training: a run goes on under another
+
+
+def test_training_reports_with_its_own_configuration(tmp_path, scene, photos):
+    cfg = preset("draft", tmp_path / "photos", tmp_path)
+    changes = ["confidence.report_points=200", "confidence.few_views=17"]
+    save_trust(scene, photos, changed(cfg, changes), [])
+    assert "100% of the surface is seen by fewer than 17 cameras" in trust_text(tmp_path)
+    save_trust(scene, photos, cfg, ["stage 1: a"])
+    assert "fewer than" not in trust_text(tmp_path)
+    assert "trouble 1 times, the last in stage 1: a." in trust_text(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,69 @@
+"""The layers of the package as data: test_layers.py holds every import to them, and
+docs/figures/diagrams.py draws them."""
+
+# From the bottom up. A module imports only from layers below its own and, inside its folder, the
+# helpers named here.
+LAYERS = [
+    {"errors"},
+    {"bars", "files", "names", "records", "validation"},
+    {"brdf", "camera", "color", "grid", "sphere"},
+    {"ops"},
+    {"envmap", "networks", "poses"},
+    {"data", "fields", "lights", "optim"},
+    {"scene"},
+    {"checkpoint", "run"},
+    {"losses"},
+    {"assets", "metrics", "render"},
+    {
+        "joint.config",
+        "preparation.config",
+        "training.config",
+        "compression.config",
+        "confidence.config",
+    },
+    {"compression.choices"},
+    {"config", "overrides"},
+    {"presets"},
+    {"preparation", "training"},
+    {"joint"},
+    {"confidence"},
+    {"compression", "pictures"},
+    {"build", "evaluation", "segmentation"},
+    {"tasks"},
+    {"tasks.demo"},
+    {"experiments.plots", "experiments.record"},
+    {"experiments.worker"},
+    {"experiments.runner"},
+    {"experiments"},
+    {"commands"},
+    {"cli"},
+]
+HELPERS = {
+    "ops": {"checks", "dense_grid", "grid_sampling", "native", "reflectance", "visibility"},
+    "fields": {"bricks", "dense", "distances", "features"},
+    "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
+    "data": {
+        *("base", "foreign", "images", "inside", "kept", "lens", "missing", "orb", "radiance"),
+        *("shots", "tensoir", "transforms"),
+    },
+    "render": {"density", "occlusion", "pipeline", "relight"},
+    "assets": {"atlas", "base"},
+    "preparation": {
+        *("depth_sweep", "carving", "exposures", "hull", "light_frame", "masks"),
+        *("observed_hull", "registration"),
+    },
+    "training": {"clock", "pixels", "divergence", "plateau", "progress", "surface_update"},
+    "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
+    "compression": {"prune", "quality", "search", "sizes", "storage"},
+    "confidence": {"survey"},
+    "pictures": {"animation"},
+    "evaluation": {"measures", "truth"},
+    "segmentation": {"config", "distances"},
+    "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
+}
+
+
+def drawn_layers() -> list[set[str]]:
+    """Layers of whole folders and files, from the bottom up; those of a folder's parts left out."""
+    whole = ({name for name in names if "." not in name} for names in LAYERS)
+    return [names for names in whole if names]
