@@ -202,15 +202,21 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
 
 def test_eval(calls, capsys):
     options = ["--samples", "8", "--bounces", "0", "--light-of", "r_7"]
+    options += ["--test-every", "16", "--background", "white", "--fit-light"]
     paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
     named = [str(part) for name, path in paths.items() for part in (f"--{name}", path)]
     assert main(["eval", "run", *named, *options]) == 0
     assert main(["eval", "run"]) == 0
     default = {"data": None, "save": None, "json": None, "samples": 64, "bounces": 2}
-    default["light_of"] = None
+    protocol = {"test_every": 16, "background": "white", "fit_light": True}
+    default |= {"light_of": None, "test_every": None, "background": "black", "fit_light": False}
     assert "table of {'psnr': 31.25, 'views': 5}" in capsys.readouterr().out
     assert calls.noted == [
-        ("evaluate", (Path("run"),), {**paths, "samples": 8, "bounces": 0, "light_of": "r_7"}),
+        (
+            "evaluate",
+            (Path("run"),),
+            {**paths, "samples": 8, "bounces": 0, "light_of": "r_7", **protocol},
+        ),
         ("evaluate", (Path("run"),), default),
     ]
 

@@ -25,6 +25,7 @@ from univoxel.names import (
     TEXTURE_SIZE,
     Animation,
     Background,
+    Behind,
     CamerasFrom,
     CapacityOrAuto,
     Differing,
@@ -257,6 +258,11 @@ def evaluate(
     samples: int = SAMPLES,
     bounces: int = BOUNCES,
     light_of: LightOf = None,
+    test_every: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: the test split)")
+    ] = None,
+    background: Behind = "black",
+    fit_light: bool = False,
 ) -> None:
     """Measure a run on the test views and print the table.
 
@@ -269,11 +275,26 @@ def evaluate(
         bounces: reflections between parts of the object in relit pictures, 0 for none
         light_of: training view, by name or number, in whose light novel views are rendered, where
             the run was trained with --varying
+        test_every: measure the first of every so many photographs, in order of all names; none of
+            them may have been trained on
+        background: what novel views are composited on
+        fit_light: render each novel view in the light in which it looks most like its photograph,
+            as the field does where light differs from photograph to photograph
     """
     from univoxel.tasks import evaluate as task
 
-    options = {"samples": samples, "bounces": bounces, "light_of": light_of}
-    measures = task.evaluate(run, data=data, save=save, json=json, **options)
+    measures = task.evaluate(
+        run,
+        data=data,
+        save=save,
+        json=json,
+        samples=samples,
+        bounces=bounces,
+        light_of=light_of,
+        test_every=test_every,
+        background=background,
+        fit_light=fit_light,
+    )
     rich.print(task.table(measures))
 
 

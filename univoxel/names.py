@@ -18,6 +18,7 @@ FIELDS: tuple[FieldName, ...] = get_args(FieldName)
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
 
 Background: TypeAlias = Literal["transparent", "map", "black"]
+Behind: TypeAlias = Literal["black", "white"]  # what measured novel views are composited on
 Ground: TypeAlias = float | Literal["lowest"] | None  # height of a floor, or at the lowest point
 Downscale: TypeAlias = Literal["auto"] | int  # side of the squares of pixels that become one
 Animation: TypeAlias = Literal["gif", "mp4"]

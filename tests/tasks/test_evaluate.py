@@ -153,6 +153,20 @@ def test_measures_of_a_known_scene(folders, relit_calls, capsys):
     assert "normal_mae_deg" in capsys.readouterr().out
 
 
+def test_novel_views_on_white(folders, relit_calls):
+    """Photograph and render alike: where nothing is, both are white."""
+    assert task.evaluate(folders.run, background="white")["nvs_psnr"] == pytest.approx(100)
+
+
+def test_photographs_and_renders_stand_on_the_same_grey(folders):
+    truth = load_photos(folders.data, "test")
+    black, white = (expected_view(truth, {}, 0, behind) for behind in ("black", "white"))
+    outside = ~inside()
+    assert not black.photo[outside].any()
+    torch.testing.assert_close(white.photo[outside], torch.ones_like(white.photo[outside]))
+    assert torch.equal(black.photo[inside()], white.photo[inside()])
+
+
 def test_raw_albedo_against_a_formula(folders, relit_calls):
     result = task.evaluate(folders.run)
     errors, inner = [], []
@@ -294,9 +308,16 @@ def test_bad_folders(folders, relit_calls, change, message):
         task.evaluate(folders.run)
 
 
-@pytest.mark.parametrize("change", [{"samples": 0}, {"bounces": -1}])
-def test_bad_settings(folders, change):
-    with pytest.raises(ValueError, match="expected samples >= 1 and bounces >= 0"):
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"samples": 0}, "expected samples >= 1 and bounces >= 0"),
+        ({"bounces": -1}, "expected samples >= 1 and bounces >= 0"),
+        ({"light_of": "r_0", "fit_light": True}, "light_of and fit_light exclude one another"),
+    ],
+)
+def test_bad_settings(folders, change, message):
+    with pytest.raises(ValueError, match=message):
         task.evaluate(folders.run, **change)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -33,6 +33,12 @@ class Photos:
     def pixels(self, view: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
         """Linear straight colour [..., 3] and alpha [...] of pixels, float32."""
         return decode(self.color[view, row, column], self.alpha[view, row, column])
+
+    def of(self, views: Tensor) -> Photos:
+        """Those of some views [K] int64."""
+        names = [self.names[view] for view in views.tolist()]
+        color, alpha = self.color[views], self.alpha[views]
+        return replace(self, names=names, color=color, alpha=alpha, cameras=self.cameras.of(views))
 
     def coverage(self) -> Tensor:
         """Alpha of all pixels [V, H, W], float32 in [0, 1]; 0 beyond a picture."""

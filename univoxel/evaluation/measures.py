@@ -1,4 +1,14 @@
-"""The measures of a trained scene, and what decides on them."""
+"""The measures of a trained scene, and what decides on them.
+
+- albedo_psnr_raw, _1ch, _3ch: albedo as it is; with one scale; with a scale per channel.
+- albedo_psnr_fg: as _3ch, over the pixels of the mask only.
+- relit_psnr: rendered with the albedo times the scale per channel, clipped to 1, on the surface
+  and on what it sees of itself; relit_psnr_raw: with the albedo as it is.
+- chamfer: samples of the mesh against points of the true surface.
+- trust_spearman: of doubt (see `univoxel.confidence`) and error over the pixels of the mask in
+  all views: of the albedo, with a scale per channel, mean absolute difference in sRGB; of the
+  roughness, absolute difference.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +64,7 @@ class Scales:
 def score(layers: Layers, expected: Expected, scales: Scales) -> list[tuple[str, float]]:
     """The measures of one view, by key; relit pictures give one pair of numbers for each map."""
     truth = expected.truth
-    picture = linear_to_srgb(layers.rgb)
+    picture = linear_to_srgb(layers.rgb + expected.behind * (1 - layers.alpha[..., None]))
     found = [
         ("nvs_psnr", metrics.psnr(picture, expected.photo)),
         ("nvs_ssim", metrics.ssim(picture, expected.photo)),

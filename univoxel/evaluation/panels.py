@@ -36,7 +36,11 @@ def panels_of_view(layers: Layers, expected: Expected, scales: Scales) -> list[P
         cosine = (layers.normal * truth.normal).sum(-1).clamp(-1, 1)
         bent = cosine.acos().rad2deg() * mask
     panels = [
-        colors("novel view", layers.rgb, expected.photo),
+        colors(
+            "novel view",
+            layers.rgb + expected.behind * (1 - layers.alpha[..., None]),
+            expected.photo,
+        ),
         colors("albedo, scaled", layers.albedo * scales.three, expected.albedo),
         Panel(
             "roughness",

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from univoxel import metrics
+from univoxel.color import linear_to_srgb
 from univoxel.data import Photos, Truth, load_points, load_relit, load_truth, relight_maps
 from univoxel.data.base import decode
 from univoxel.data.maps import read_map
 from univoxel.envmap import EnvMap
-from univoxel.errors import DataError
+from univoxel.errors import DataError, UserError
+from univoxel.names import Behind
 
 
 @dataclass(frozen=True)
@@ -25,12 +28,13 @@ class SceneTruth:
 
 @dataclass(frozen=True)
 class Expected:
-    """What a test view should look like; sRGB on black."""
+    """What a test view should look like; sRGB on black, but for the photograph."""
 
     photo: Tensor  # [H, W, 3]
     albedo: Tensor | None  # [H, W, 3]
     relit: dict[str, Tensor]  # [H, W, 3] by map
     truth: Truth
+    behind: float = 0.0  # linear grey that the photograph, and what is compared with it, stands on
 
 
 def load_scene_truth(photos: Photos) -> SceneTruth:
@@ -45,26 +49,54 @@ def load_scene_truth(photos: Photos) -> SceneTruth:
     return SceneTruth(relit, maps, points)
 
 
-def expected_view(photos: Photos, relit: dict[str, tuple[Tensor, Tensor]], view: int) -> Expected:
+def expected_view(
+    photos: Photos, relit: dict[str, tuple[Tensor, Tensor]], view: int, background: Behind = "black"
+) -> Expected:
     """The truth of one test view.
 
     Args:
         relit: as of `SceneTruth`.
+        background: what the photograph is composited on.
 
     Raises:
         DataError: a file cannot be used, or has other pixels than the views.
     """
     truth = view_truth(photos, view)
     color, alpha = photos.picture(view)
+    behind = 1.0 if background == "white" else 0.0
+    photo = color * alpha[..., None] + behind * (1 - alpha[..., None])
     return Expected(
-        photo=metrics.on_black(color, alpha),
+        photo=linear_to_srgb(photo),
         albedo=None if truth.albedo is None else metrics.on_black(truth.albedo, alpha),
         relit={
             name: metrics.on_black(*decode(*(photos.cameras.cut(view, x[view]) for x in stored)))
             for name, stored in relit.items()
         },
         truth=truth,
+        behind=behind,
     )
+
+
+def every_nth(photos: Photos, trained: list[str], every: int) -> Photos:
+    """The first of every so many photographs, in order of the names of all.
+
+    Args:
+        photos: that were kept for tests.
+        trained: names of those that were trained on.
+
+    Raises:
+        UserError: some were trained on, or none is left.
+    """
+    if every < 1:
+        raise UserError(f"test_every must be at least 1, got {every}", "test_every")
+    chosen = sorted([*photos.names, *trained])[::every]
+    if seen := sorted(set(chosen) & set(trained)):
+        raise UserError(
+            f"test_every {every} asks for {len(seen)} photographs that were trained on, such as "
+            f"{seen[0]}: novel views are those that training has not seen",
+            "test_every",
+        )
+    return photos.of(torch.tensor([photos.names.index(name) for name in chosen]))
 
 
 def view_truth(photos: Photos, view: int) -> Truth:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
@@ -10,6 +12,14 @@ from univoxel.sphere import real_harmonics
 
 DEGREE = 3  # of the harmonics that a view's map may differ by at first: halves, quarters of the sky
 RATE = 10.0  # the learning rate of networks moves log gains that much faster: a stop is soon taken
+
+
+@dataclass(frozen=True)
+class ShownLight:
+    """A light of no photograph that was trained on."""
+
+    gain: Tensor  # [3] factor on radiance
+    code: Tensor | None  # [Z], where views have codes
 
 
 class ViewLights(nn.Module):
@@ -42,6 +52,7 @@ class ViewLights(nn.Module):
         super().__init__()
         self.names = names
         self.chosen: int | None = None  # whose light is shown where no view is named; None: mean
+        self.shown: ShownLight | None = None  # in place of the mean
         self.gain_steps = nn.Parameter(torch.zeros(len(names), 3))
         self.raw_codes = None
         if codes:
@@ -93,7 +104,9 @@ class ViewLights(nn.Module):
     def gain(self, view: Tensor | int | None = None) -> Tensor:
         """Factor [N, 3] on radiance in the photographs of views [N]; [3] for one view, or none."""
         view = self.chosen if view is None else view
-        return self.gain_steps.new_ones(3) if view is None else self.log_gain[view].exp()
+        if view is None:
+            return self.gain_steps.new_ones(3) if self.shown is None else self.shown.gain
+        return self.log_gain[view].exp()
 
     def code(self, view: Tensor | int | None = None) -> Tensor | None:
         """[N, Z] of views [N]; [Z] for one view, or none. None where only gains differ."""
@@ -101,7 +114,10 @@ class ViewLights(nn.Module):
             return None
         view = self.chosen if view is None else view
         codes = _centred(self.raw_codes)
-        return torch.zeros_like(codes[0]) if view is None else codes[view]
+        if view is None:
+            shown = None if self.shown is None else self.shown.code
+            return torch.zeros_like(codes[0]) if shown is None else shown
+        return codes[view]
 
     def sky_change(self) -> Tensor | None:
         """What each view adds to the log map: [V, D, 3]; None where all have one map."""

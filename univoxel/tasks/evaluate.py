@@ -21,6 +21,7 @@ from univoxel.data import Photos
 from univoxel.data.images import write_exr, write_png
 from univoxel.envmap import tables
 from univoxel.errors import UserError
+from univoxel.evaluation.fitted_light import fit_light_
 from univoxel.evaluation.measures import (
     MEASURES,
     Pairs,
@@ -32,9 +33,9 @@ from univoxel.evaluation.measures import (
     score,
 )
 from univoxel.evaluation.panels import panels_of_view
-from univoxel.evaluation.truth import SceneTruth, expected_view, load_scene_truth
+from univoxel.evaluation.truth import SceneTruth, every_nth, expected_view, load_scene_truth
 from univoxel.files import replacing
-from univoxel.names import BOUNCES, SAMPLES
+from univoxel.names import BOUNCES, SAMPLES, Behind
 from univoxel.pictures.contact_sheet import contact_sheet
 from univoxel.pictures.layers import Relighting, exr_channels, render_layers
 from univoxel.records import Mesh
@@ -57,6 +58,14 @@ class _ViewMeasures:
     roughness_doubts: list[Pairs]
 
 
+@dataclass(frozen=True)
+class _Protocol:
+    """How novel views are compared with photographs."""
+
+    background: Behind
+    fit_light: bool
+
+
 @torch.no_grad()
 def evaluate(
     run: str | Path,
@@ -66,21 +75,16 @@ def evaluate(
     samples: int = SAMPLES,
     bounces: int = BOUNCES,
     light_of: str | None = None,
+    test_every: int | None = None,
+    background: Behind = "black",
+    fit_light: bool = False,
 ) -> dict[str, float | int | None]:
     """Measures of a trained scene on its test views, by the keys of `MEASURES`.
 
-    Pictures are compared as sRGB in [0, 1] composited on black, whole image; numbers are means over
-    the views (and maps) of numbers per view. `univoxel.metrics` defines each. What is weakly
-    determined is said in words through the log. In particular:
-
-    - albedo_psnr_raw, _1ch, _3ch: albedo as it is; with one scale; with a scale per channel.
-    - albedo_psnr_fg: as _3ch, over the pixels of the mask only.
-    - relit_psnr: rendered with the albedo times the scale per channel, clipped to 1, on the surface
-      and on what it sees of itself; relit_psnr_raw: with the albedo as it is.
-    - chamfer: samples of the mesh against points of the true surface.
-    - trust_spearman: of doubt (see `univoxel.confidence.survey`) and error over the pixels of the
-      mask in all views: of the albedo, with a scale per channel, mean absolute difference in sRGB;
-      of the roughness, absolute difference.
+    Pictures are compared as sRGB in [0, 1], whole image, composited on black, novel views on
+    `background`. Numbers are means over the views (and maps) of numbers per view;
+    `univoxel.evaluation.measures` and `univoxel.metrics` define each. What is weakly determined is
+    said in words through the log.
 
     A measure that the data has no truth for is None.
 
@@ -97,22 +101,24 @@ def evaluate(
         bounces: reflections between parts of the object in relit pictures, 0 for none.
         light_of: training view, by name or number, whose light novel views are rendered in, where
             light varies; their mean when left out.
+        test_every: the first of every so many photographs, in order of all their names, instead of
+            the whole test split. None of them may have been trained on.
+        background: what novel views are composited on.
+        fit_light: each novel view is rendered in the light in which it looks most like its
+            photograph, see `fit_light_`: what is measured then is geometry and materials.
 
     Raises:
         DataError: the run or the data cannot be read.
-        UserError: samples or bounces out of range; light_of is no training view, or light does not
-            vary.
+        UserError: samples, bounces or test_every out of range; light_of is no training view, or
+            light does not vary; both light_of and fit_light.
         OSError: a result cannot be written.
     """
-    if samples < 1 or bounces < 0:
-        raise UserError(
-            f"evaluate: expected samples >= 1 and bounces >= 0, got {samples} and {bounces}",
-            "samples",
-            "bounces",
-        )
+    _check(samples, bounces, light_of, fit_light)
     run = Path(run)
     data, save, json = (None if path is None else Path(path) for path in (data, save, json))
     photos = photos_of(run, data)
+    if test_every is not None:
+        photos = every_nth(photos, photos_of(run, data, "train").names, test_every)
     truth = load_scene_truth(photos)
     scene, report = load_checkpoint(run)
     scene.show_light_of(light_of)
@@ -124,7 +130,8 @@ def evaluate(
     mesh = extract_mesh(scene) if truth.maps or truth.points is not None else None
     scales = albedo_scales(scene, photos)
     relighting = _relighting(scene, mesh, truth, scales, samples, bounces)
-    views = _measure_views(scene, photos, truth, scales, relighting, surveyed, save)
+    protocol = _Protocol(background, fit_light)
+    views = _measure_views(scene, photos, truth, scales, relighting, surveyed, protocol, save)
     result = {key: fmean(values) if values else None for key, values in views.measures.items()}
     result |= {
         "chamfer": mesh_chamfer(mesh, truth.points),
@@ -138,6 +145,17 @@ def evaluate(
             text = dumps(result | figures, indent=2)
             temporary.write_text(text + "\n", encoding="utf-8")
     return result
+
+
+def _check(samples: int, bounces: int, light_of: str | None, fit_light: bool) -> None:
+    if samples < 1 or bounces < 0:
+        raise UserError(
+            f"evaluate: expected samples >= 1 and bounces >= 0, got {samples} and {bounces}",
+            "samples",
+            "bounces",
+        )
+    if fit_light and light_of is not None:
+        raise UserError("light_of and fit_light exclude one another", "light_of", "fit_light")
 
 
 def table(result: dict[str, float | int | None]) -> Table:
@@ -185,6 +203,7 @@ def _measure_views(
     scales: Scales,
     relighting: Relighting | None,
     surveyed: Survey | None,
+    protocol: _Protocol,
     save: Path | None,
 ) -> _ViewMeasures:
     """Render and measure all test views; write their layers and the contact sheet into `save`."""
@@ -193,8 +212,10 @@ def _measure_views(
     every = -(-len(photos) // SHEET_ROWS)
     rows = []
     for view in track(range(len(photos)), "rendering test views"):
+        if protocol.fit_light:
+            fit_light_(scene, photos, view)
         layers = render_layers(scene, photos.cameras, view, relighting, doubts)
-        expected = expected_view(photos, truth.relit, view)
+        expected = expected_view(photos, truth.relit, view, protocol.background)
         for key, value in score(layers, expected, scales):
             found.measures[key].append(value)
         albedo, roughness = doubts_and_errors(layers, expected, scales)
