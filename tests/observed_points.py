@@ -43,7 +43,7 @@ def problem_on_a_sphere(
     offsets = torch.arange(points + 1) * views
     black = torch.zeros(points * views, 3)
     view = torch.arange(points * views) % views
-    observations = Observations(RADIUS * normal, normal, offsets, wo, black, view)
+    observations = Observations(RADIUS * normal, normal, offsets, wo, black, view, wo[:views])
     visibility = torch.full((points, nodes), 255, dtype=torch.uint8)
     indirect = torch.zeros(points, nodes, 3, dtype=torch.float16)
     transport = Transport(fibonacci_sphere(nodes), visibility, indirect)

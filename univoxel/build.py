@@ -31,6 +31,7 @@ def build_scene(prepared: Prepared, cfg: TrainConfig) -> Scene:
         cfg.scene,
         light=lights.scaled(cfg.scene.light, float((upper - lower).max()) / 2),
         varying=varying,
+        turntable=prepared.turntable,
         refined=silhouettes.refined,
         views=views,
         mirror_levels=sizes.mirror_levels(cfg.scene, cfg.budget_mb, cfg.compression),

@@ -20,6 +20,7 @@ from univoxel.fields.field import Field
 from univoxel.fields.packing import PACKED, pack, unpack
 from univoxel.grid import GridShape
 from univoxel.lights import read_config
+from univoxel.lights.turntable import Turntable
 from univoxel.networks import DirectionTable
 from univoxel.records import HALF_MAX, Bricks
 from univoxel.scene import Scene, SceneConfig
@@ -125,11 +126,14 @@ def load_checkpoint(run: str | Path) -> tuple[Scene, dict]:
     try:
         light = read_config(meta["scene"].pop("light"))
         views = tuple(meta["scene"].pop("views", ()))
+        turntable = meta["scene"].pop("turntable", None)
+        if turntable is not None:
+            turntable = Turntable(**{name: tuple(value) for name, value in turntable.items()})
         if "mirror_levels" not in meta["scene"]:  # a file from before there were any
             meta["scene"]["mirror_levels"] = 0
             none = torch.zeros(0, dtype=torch.int32), torch.zeros(0, DirectionTable.per_level)
             tensors |= zip(TABLES["radiance.directions.table"], none, strict=True)
-        cfg = SceneConfig(**meta["scene"], light=light, views=views)
+        cfg = SceneConfig(**meta["scene"], light=light, views=views, turntable=turntable)
         grid = GridShape(
             tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
         )

@@ -32,6 +32,7 @@ from univoxel.names import (
     Downscale,
     FieldName,
     Ground,
+    LightFrameOrAuto,
     LightName,
     MasksFrom,
     PresetName,
@@ -141,6 +142,7 @@ def train(
     preset: PresetOrAuto = "auto",
     light: LightName = "hybrid",
     varying: Differing = "auto",
+    light_frame: LightFrameOrAuto = "auto",
     masks: MasksFrom = "auto",
     cameras: CamerasFrom = "auto",
     downscale: Annotated[Downscale, arg(metavar="auto|N")] = "auto",
@@ -173,6 +175,8 @@ def train(
         varying: what differs from photograph to photograph: exposure, with the colour balance, or
             the light itself too; auto is exposure where the photographs' are seen to differ, or
             else none
+        light_frame: what the light stands still in: the world of the cameras, or the room of a
+            turntable, whose camera stood still too; auto is what explains the photographs better
         masks: auto takes masks in that end outside of the object, as the photographs show it
         cameras: refined puts the photographs' cameras right, before training and in it; auto does
             so where their silhouettes contradict one another
@@ -206,6 +210,8 @@ def train(
     options = {"masks": masks, "cameras": cameras, "allow_outside": allow_outside}
     config = dataclasses.replace(config, downscale=check_downscale(downscale), **options)
     config = with_field(config, field)
+    if light_frame != "auto":
+        config = dataclasses.replace(config, light_frame=light_frame)
     if budget_mb is not None and capacity == "auto":
         capacity = "adaptive"
     if capacity != "auto":
@@ -575,9 +581,9 @@ def stress(
 
     Renders small scenes with Mitsuba 3, spoils their photographs, trains and measures. Writes
     DIR/stress.md with the breaking point of each axis, stress.json, stress.png and stress.svg.
-    Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, thin, noise,
-    placement, dark, bright; light-varying is trained with --varying light. A training that fails
-    is a result. What is done is kept: the same command goes on.
+    Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, thin, turntable,
+    noise, placement, dark, bright; light-varying is trained with --varying light. A training that
+    fails is a result. What is done is kept: the same command goes on.
 
     Args:
         out: folder for scenes, photographs, trainings and results

@@ -16,7 +16,7 @@ from univoxel.errors import ConfigError, UserError
 from univoxel.fields.features import PER_LEVEL
 from univoxel.files import replacing
 from univoxel.joint.config import JointConfig
-from univoxel.names import CamerasFrom, Capacity, MasksFrom
+from univoxel.names import CamerasFrom, Capacity, LightFrameOrAuto, MasksFrom
 from univoxel.preparation.config import PreparationConfig
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
@@ -24,7 +24,17 @@ from univoxel.validation import check_fields
 
 # Arguments that a configuration is made of
 CHOICES = (
-    *("preset", "minutes", "light", "varying", "masks", "cameras", "downscale", "capacity"),
+    *(
+        "preset",
+        "minutes",
+        "light",
+        "varying",
+        "light_frame",
+        "masks",
+        "cameras",
+        "downscale",
+        "capacity",
+    ),
     *("budget_mb", "changes"),
 )
 
@@ -56,6 +66,10 @@ class TrainConfig:
     exposures: bool = False
     # whether what the data set's files and links name may lie outside of its folder
     allow_outside: bool = False
+    # what the light stands still in: the world of the cameras, or the room of a turntable, whose
+    # camera stood still too; auto: which of the two explains better how colours change from
+    # photograph to photograph. scene.turntable then holds the axis
+    light_frame: LightFrameOrAuto = "world"
     # share of the minutes, >= 0, that opening hollows before training may be expected to take, or
     # they are left alone: hollows that no silhouette shows, where photographs agree on them. Never
     # where their light varies, other than in exposure
@@ -111,6 +125,8 @@ class TrainConfig:
         names = ("patience", "downscale", "voxel_pixels", "hollows")
         check_fields(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
         check_fields(self, "fixed or adaptive", lambda x: x in get_args(Capacity), "capacity")
+        frames = get_args(LightFrameOrAuto)
+        check_fields(self, "auto, world or turntable", lambda x: x in frames, "light_frame")
         check_fields(self, "auto or given", lambda x: x in get_args(MasksFrom), "masks")
         check_fields(
             self, "auto, given or refined", lambda x: x in get_args(CamerasFrom), "cameras"
@@ -157,7 +173,7 @@ def check_same(cfg: TrainConfig) -> None:
     began = _completed(before, cfg)
     # of configurations from before there were any
     since = {"downscale": 1, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
-    since |= {"masks": "given", "cameras": "given", "exposures": False}
+    since |= {"masks": "given", "cameras": "given", "exposures": False, "light_frame": "world"}
     began |= {name: value for name, value in since.items() if name not in before}
     now = _as_json(cfg)
     for one in (began, now):

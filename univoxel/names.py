@@ -14,6 +14,8 @@ CamerasFrom: TypeAlias = Literal["auto", "given", "refined"]
 MasksFrom: TypeAlias = Literal["auto", "given"]
 Varying: TypeAlias = Literal["none", "exposure", "light"]
 Differing: TypeAlias = Literal["auto", "none", "exposure", "light"]
+LightFrame: TypeAlias = Literal["world", "turntable"]
+LightFrameOrAuto: TypeAlias = Literal["auto", "world", "turntable"]
 FIELDS: tuple[FieldName, ...] = get_args(FieldName)
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
 

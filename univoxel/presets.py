@@ -14,6 +14,7 @@ from univoxel.lights import (
     EnvmapConfig,
     EnvmapSGConfig,
     LightConfig,
+    LocalLightConfig,
     MLPLightConfig,
     SGConfig,
     SHConfig,
@@ -206,6 +207,9 @@ def _configuration(
         masks="auto",
         cameras="auto",
         exposures=exposures,
+        light_frame="auto"
+        if isinstance(scene.light, LocalLightConfig) and known != "light"
+        else "world",
         hollows=HOLLOWS,
         capacity=capacity,
         scene=scene,

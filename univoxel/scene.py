@@ -26,6 +26,7 @@ from univoxel.lights import (
 )
 from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.nodes import DistantLight
+from univoxel.lights.turntable import Turntable
 from univoxel.lights.views import ViewLights
 from univoxel.names import Varying
 from univoxel.ops import VisibilityScene
@@ -47,6 +48,8 @@ class SceneConfig:
     light: LightConfig = field(default_factory=SGConfig)
     # Of everything, in (0, 1], where it is known and nothing is metal; None: both are learned
     roughness: float | None = None
+    # about which the light turns with the camera; None: it stands still
+    turntable: Turntable | None = None
     varying: Varying = "none"  # what differs from photograph to photograph, see ViewLights
     codes: int = 8  # numbers that tell the light of a view, where that varies, >= 1
     # whether the photographs' cameras are learned too, see PoseSteps; training fills it in
@@ -62,6 +65,20 @@ class SceneConfig:
         check_fields(self, most, lambda x: x <= self.channels, "material_channels")
         check_fields(self, "None or in (0, 1]", lambda x: x is None or 0 < x <= 1, "roughness")
         check_fields(self, "none, exposure or light", lambda x: x in get_args(Varying), "varying")
+        if self.turntable is not None and not isinstance(self.light, LocalLightConfig):
+            raise ConfigError(
+                "SceneConfig: light that turns with the camera needs hybrid or a local light, sg, "
+                f"sh or mlp, got {self.light.kind}",
+                "light_frame",
+                "light",
+            )
+        if self.turntable is not None and self.varying == "light":
+            raise ConfigError(
+                "SceneConfig: light that turns with the camera cannot vary otherwise too; varying "
+                "exposure goes with it",
+                "light_frame",
+                "varying",
+            )
         if self.varying == "light" and not isinstance(self.light, LocalLightConfig):
             raise ConfigError(
                 "SceneConfig: varying light needs hybrid or a local light, sg, sh or mlp, got "

@@ -212,7 +212,7 @@ def test_some_observations_are_spread_over_all():
     counts = torch.tensor([0, 3, 17])
     offsets = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
     nothing = torch.zeros(20, 3)
-    seen = Observations(nothing[:3], nothing[:3], offsets, nothing, nothing, offsets)
+    seen = Observations(nothing[:3], nothing[:3], offsets, nothing, nothing, offsets, nothing[:1])
     point, observation = spread_observations(seen, 4)
     assert point.tolist() == [1, 1, 1, 2, 2, 2, 2]
     assert observation.tolist() == [0, 1, 2, 3, 7, 11, 15]

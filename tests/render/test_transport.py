@@ -151,7 +151,7 @@ def test_mean_colors():
     color = torch.tensor([[0.2, 0.4, 0.6], [0.4, 0.4, 0.0], [1.0, 2.0, 3.0]])
     nothing = torch.zeros(3, 3)
     view = torch.zeros(3, dtype=torch.int64)
-    seen = Observations(nothing, nothing, torch.tensor([0, 2, 2, 3]), nothing, color, view)
+    seen = Observations(nothing, nothing, torch.tensor([0, 2, 2, 3]), nothing, color, view, nothing)
     expected = torch.tensor([[0.3, 0.4, 0.3], [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
     assert torch.allclose(mean_colors(seen), expected)
 
@@ -220,7 +220,7 @@ SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 def points(position: torch.Tensor, normal: torch.Tensor) -> Observations:
     nothing = torch.zeros(0, 3)
     offsets = torch.zeros(len(position) + 1, dtype=torch.int64)
-    return Observations(position, normal, offsets, nothing, nothing, offsets[:0])
+    return Observations(position, normal, offsets, nothing, nothing, offsets[:0], nothing)
 
 
 def views_of(seen: Observations, cameras) -> tuple[torch.Tensor, torch.Tensor]:

@@ -20,6 +20,7 @@ from univoxel.joint.observations import (
     JointProblem,
     prefiltered_roughness,
     shade_observations,
+    turned_maps,
     without_exposure,
 )
 from univoxel.records import Surface
@@ -209,7 +210,8 @@ def render(
     diffuse, f0 = brdf.split(surface.albedo, surface.metallic)
     assert isinstance(f0, Tensor)
     color, voxel_size = observations.color, scene.field.voxel_size
-    problem = JointProblem(observations, transport, color, voxel_size, scene.sky)
+    turned = turned_maps(scene, observations)
+    problem = JointProblem(observations, transport, color, voxel_size, scene.sky, turned)
     roughness = prefiltered_roughness(surface.roughness, problem.nodes)
     shaded = observations.normal[point], diffuse[point], roughness[point], f0[point]
     return shade_observations(scene, problem, point, observation, *shaded)

@@ -5,8 +5,8 @@
 - relit_psnr: rendered with the albedo times the scale per channel, clipped to 1, on the surface
   and on what it sees of itself; relit_psnr_raw: with the albedo as it is.
 - chamfer: samples of the mesh against points of the true surface.
-- trust_spearman: of doubt (see `univoxel.confidence`) and error over the pixels of the mask in
-  all views: of the albedo, with a scale per channel, mean absolute difference in sRGB; of the
+- trust_spearman: of doubt (see `univoxel.confidence.survey`) and error over the pixels of the mask
+  in all views: of the albedo, with a scale per channel, mean absolute difference in sRGB; of the
   roughness, absolute difference.
 """
 

@@ -87,6 +87,8 @@ def painted_points(
     None: there are too few, or most are metal, or each photograph has a light of its own, which
     determines more.
     """
+    if problem.turned is not None:
+        return None
     if scene.views is not None and scene.views.sky_change() is not None:
         return None
     observations = without_exposure(scene, problem.observations)

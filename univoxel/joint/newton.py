@@ -298,12 +298,31 @@ def linear_transport(
     else:
         specular, by_base = specular_layer(brdf.F0), cosine
         factor = (1 - brdf.specular_albedo((normal * wo).sum(2), roughness[:, None])) / math.pi
+    view = observations.view[observation]
     return LinearTransport(
-        by_base * visibility,
+        from_map(problem, by_base * visibility, view),
         factor,
-        specular * visibility,
+        from_map(problem, specular * visibility, view),
         factor[..., None] * (by_base @ indirect),
         specular @ indirect,
         problem.target[observation],
-        observations.view[observation],
+        view,
     )
+
+
+def from_map(problem: JointProblem, from_world: Tensor, view: Tensor) -> Tensor:
+    """Transport [P, 1 or V, D] from directions in the world, as from the nodes of the map: [P, V,
+    D] where it turns with the camera, as it is elsewhere.
+
+    Args:
+        view: [P, V] photographs.
+    """
+    if problem.turned is None:
+        return from_world
+    position = problem.turned.position[view].flatten()
+    rows = from_world.expand(*view.shape, -1).flatten(0, 1)
+    turned = torch.empty_like(rows)
+    for at in position.unique().tolist():
+        of_position = (position == at).nonzero()[:, 0]
+        turned[of_position] = rows[of_position] @ problem.turned.weights[at]
+    return turned.view(*view.shape, -1)

@@ -15,6 +15,7 @@ from univoxel.data import Photos
 from univoxel.errors import NoSurface
 from univoxel.joint.config import JointConfig
 from univoxel.lights.nodes import DistantLight
+from univoxel.lights.turntable import resampling
 from univoxel.ops import shade_map
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh
@@ -28,6 +29,17 @@ from univoxel.render.transport import (
 )
 from univoxel.scene import Scene
 
+TURNS = 64  # positions of a turntable that are told apart: closer than the map's nodes
+
+
+@dataclass(frozen=True)
+class TurnedMaps:
+    """How a map that turns with the camera reaches the object: what it is in the world, in B
+    positions of the turntable."""
+
+    weights: Tensor  # [B, D, D] from the map's nodes to those directions in the world
+    position: Tensor  # [V] int64: which of them a photograph was taken in
+
 
 @dataclass(frozen=True)
 class JointProblem:
@@ -38,6 +50,7 @@ class JointProblem:
     target: Tensor  # [S, 3] sRGB-encoded colour of the observations
     voxel_size: float  # world units
     sky: DistantLight  # the scene's own map: the solve changes it
+    turned: TurnedMaps | None = None  # None: the light stands still
 
     @property
     def nodes(self) -> int:
@@ -82,7 +95,21 @@ def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> 
         observations, tracer, mesh, vertex_color, direction, cfg.tracing, offset, generator
     )
     target = linear_to_srgb_unclipped(observations.color)
-    return JointProblem(observations, transport, target, offset, scene.sky)
+    turned = turned_maps(scene, observations)
+    return JointProblem(observations, transport, target, offset, scene.sky, turned)
+
+
+def turned_maps(scene: Scene, observations: Observations) -> TurnedMaps | None:
+    """The scene's map in the world of each photograph; None where it is the same for all."""
+    turntable = scene.cfg.turntable
+    if turntable is None or scene.sky is None:
+        return None
+    cosine, sine = turntable.turn(observations.eye)
+    step = 2 * math.pi / TURNS
+    rounded = (torch.atan2(sine, cosine) / step).round().long() % TURNS
+    used, position = rounded.unique(return_inverse=True)
+    turn = (used * step).cos(), (used * step).sin()
+    return TurnedMaps(resampling(scene.sky.direction, turntable, turn), position)
 
 
 @torch.no_grad()
@@ -159,12 +186,16 @@ def shade_observations(
     observations, transport, sky = problem.observations, problem.transport, problem.sky
     view = observations.view[observation]
     change = scene.views.sky_change() if scene.views else None
-    if change is None:
-        order, parts, maps = None, (slice(None),), [sky.radiance]
-    else:  # a map for each view
-        order = torch.argsort(view)
-        parts = order.split(torch.bincount(view, minlength=len(change)).tolist())
-        maps = (sky.log_radiance + change).exp().unbind()
+    if problem.turned is not None:
+        which, all_maps = problem.turned.position[view], problem.turned.weights @ sky.radiance
+    elif change is not None:
+        which, all_maps = view, (sky.log_radiance + change).exp()
+    else:
+        which, all_maps = None, sky.radiance[None]
+    maps, order, parts = all_maps.unbind(), None, (slice(None),)
+    if which is not None:
+        order = torch.argsort(which)
+        parts = order.split(torch.bincount(which, minlength=len(maps)).tolist())
     rgb = torch.cat(
         [
             shade_map(

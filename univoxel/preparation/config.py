@@ -191,6 +191,31 @@ class CarvingConfig:
 
 
 @dataclass(frozen=True)
+class LightFrameConfig:
+    """Whether the light turned with the camera, see preparation/light_frame.py."""
+
+    # points of the surface, >= 1, whose colours are compared
+    points: int = 1500
+    # sRGB, in [0, 1]; darker colours are left out: rounding to 8 bits is too large a part of them
+    dark: float = 0.05
+    # natural log, > 0; the scale of the Cauchy cost of a colour that is not explained
+    cauchy: float = 0.1
+    # rounds of iteratively reweighted least squares, >= 1
+    rounds: int = 6
+    # how many times as much a light that turns has to explain as one that stands still, > 0. Of
+    # four rendered scenes under a still light it was 0.1 to 0.2 times, of a bronze head on a
+    # turntable 1.8 times
+    better: float = 1.0
+    # share of the cost, in [0, 1], that it has to explain at least, over `better`
+    least: float = 0.03
+
+    def __post_init__(self) -> None:
+        check_fields(self, *_WHOLE, "points", "rounds")
+        check_fields(self, *_SHARE, "dark", "least")
+        check_fields(self, *_ABOVE, "cauchy", "better")
+
+
+@dataclass(frozen=True)
 class PreparationConfig:
     """What happens before the first gradient, in order."""
 
@@ -202,10 +227,13 @@ class PreparationConfig:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     # whether exposures differ, and by what gains
     exposures: ExposureConfig = field(default_factory=ExposureConfig)
+    # whether the light turned with the camera
+    light_frame: LightFrameConfig = field(default_factory=LightFrameConfig)
     # where the hull is opened
     carving: CarvingConfig = field(default_factory=CarvingConfig)
 
 
 MASKS, HULL, REGISTRATION = MaskConfig(), HullConfig(), RegistrationConfig()
 EXPOSURES, CARVING = ExposureConfig(), CarvingConfig()
+LIGHT_FRAME = LightFrameConfig()
 PREPARATION = PreparationConfig()

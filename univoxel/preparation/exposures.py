@@ -7,17 +7,13 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.data import Photos
-from univoxel.fields.dense import DenseDistances
 from univoxel.grid import GridShape
 from univoxel.names import Varying
-from univoxel.ops import VisibilityScene
 from univoxel.preparation.config import EXPOSURES, ExposureConfig
-from univoxel.records import Mesh
-from univoxel.render.transport import observe, surface_points
+from univoxel.preparation.observed_hull import observe_hull
 
 log = logging.getLogger("univoxel")
 
@@ -42,14 +38,10 @@ def log_gains(
     Source: Brown and Lowe 2007, "Automatic panoramic image stitching using invariant features", for
     gains from overlaps; Cauchy's weights, iterated, as in robust statistics.
     """
-    field, gain = DenseDistances(grid, sdf), torch.zeros(len(photos))
-    if not sdf.min() < 0 < sdf.max():
+    gain = torch.zeros(len(photos))
+    seen = observe_hull(photos, sdf, grid, cfg.points)
+    if seen is None:
         return gain
-    vertices, faces = field.isosurface()
-    normals = normalize(field.sample(vertices).gradient, dim=1, eps=1e-6)
-    mesh = Mesh(vertices, faces, normals)
-    points = surface_points(mesh, cfg.points, torch.Generator().manual_seed(0))
-    seen = observe(*points, photos, VisibilityScene(vertices, faces), grid.voxel_size)
     encoded = linear_to_srgb(seen.color)
     usable = (encoded.mean(1) > cfg.dark) & (encoded < CLIPPED).all(1)
     where = torch.repeat_interleave(seen.offsets.diff())[usable], seen.view[usable]

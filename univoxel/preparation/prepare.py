@@ -10,11 +10,13 @@ from univoxel.config import TrainConfig
 from univoxel.data import Photos
 from univoxel.errors import DataError, UserError
 from univoxel.grid import GridShape, fit_grid
+from univoxel.lights.turntable import Turntable
 from univoxel.names import Varying
 from univoxel.poses import PoseSteps
 from univoxel.preparation.carving import carve_within_time
 from univoxel.preparation.exposures import varying_and_gains
 from univoxel.preparation.hull import visual_hull
+from univoxel.preparation.light_frame import turntable_of
 from univoxel.preparation.masks import fitted_masks
 from univoxel.preparation.registration import bounds_and_refinement, registered_poses
 from univoxel.training.config import StageConfig
@@ -40,6 +42,7 @@ class Prepared:
     hull: Tensor  # [X, Y, Z] sdf of the carved visual hull on the grid, world units
     varying: Varying  # what differs from photograph to photograph
     gains: Tensor | None  # [V] log gains of the exposures; None: all are alike
+    turntable: Turntable | None  # about which the light turns; None: it stands still
 
 
 def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
@@ -75,7 +78,8 @@ def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
     varying, gains = varying_and_gains(
         photos, hull, grid, cfg.scene.varying, cfg.exposures, constants.exposures
     )
-    if cfg.hollows and varying != "light":
+    turntable = turntable_of(photos, hull, grid, cfg.light_frame, constants.light_frame)
+    if cfg.hollows and varying != "light" and turntable is None:
         seconds = cfg.hollows * 60 * cfg.minutes
         hull = carve_within_time(hull, grid, photos, gains, seconds, constants.carving)
-    return Prepared(silhouettes, poses, grid, hull, varying, gains)
+    return Prepared(silhouettes, poses, grid, hull, varying, gains, turntable)

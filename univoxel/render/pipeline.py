@@ -59,6 +59,19 @@ def at_rays(surface: Surface, index: Tensor) -> Surface:
     return Surface(**{name: x[index] for name, x in vars(surface).items() if x is not None})
 
 
+def in_light_frame(scene: Scene, surface: Surface, wo: Tensor) -> tuple[Surface, Tensor]:
+    """The surface's normals and wo [N, 3] as the light sees them, where it turns with the camera.
+
+    Places stay those of the object: what networks know of a point is its own.
+    """
+    turntable = scene.cfg.turntable
+    if turntable is None:
+        return surface, wo
+    turn = turntable.turn((surface.position + surface.depth[:, None] * wo).detach())
+    normal = turntable.into_light(surface.normal, turn)
+    return replace(surface, normal=normal), turntable.into_light(wo, turn)
+
+
 def radiance_of(
     scene: Scene, surface: Surface, wo: Tensor, view: Tensor | int | None = None
 ) -> Tensor:
@@ -68,6 +81,7 @@ def radiance_of(
         wo: [N, 3] unit, towards the eye.
         view: as of `shade`.
     """
+    surface, wo = in_light_frame(scene, surface, wo)
     encoded = scene.radiance(scene.coded(surface.features, view), surface.normal, wo)
     if scene.views is None:
         return encoded
@@ -90,6 +104,7 @@ def shade(
     """
     light = scene.light
     if not light.traced:
+        surface, wo = in_light_frame(scene, surface, wo)
         surface = replace(surface, features=scene.coded(surface.features, view))
         rgb = light.reflected(surface, wo, generator=generator)
         if scene.mirrored is not None:

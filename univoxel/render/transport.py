@@ -31,6 +31,7 @@ class Observations:
     wo: Tensor  # [S, 3] unit, to the camera
     color: Tensor  # [S, 3] linear
     view: Tensor  # [S] int64: which photograph
+    eye: Tensor  # [V, 3] where the photographs were taken from
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,9 @@ def observe(
     counts = torch.bincount(index, minlength=len(position))
     offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
     sorted_ = (torch.cat(parts)[order] for parts in (wo, color, view))
-    return Observations(position, normal, offsets, *sorted_)
+    return Observations(
+        position, normal, offsets, *sorted_, photos.cameras.camera_to_world[:, :, 3]
+    )
 
 
 def mean_colors(observations: Observations) -> Tensor:

@@ -1,6 +1,7 @@
 """Scenes of the stress suite: shapes, cameras, light and truth agree with one another."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -190,3 +191,17 @@ def test_a_hidden_part_casts_no_truth():
     together = scenes.truth_of_view(parts, cameras, 0)
     both = (alone["alpha"] == 255) & (together["alpha"] == 255)
     assert (together["depth"][both] <= alone["depth"][both] + 5e-3).all()
+
+
+@pytest.mark.parametrize("rings", [1, 2])
+def test_rings_stand_level_around_the_axis(rings):
+    spec = Spec(rings=rings, views=12, turning=True)
+    cameras = scenes.train_cameras(spec)
+    eye = cameras.camera_to_world[:, :, 3]
+    assert len(eye[:, 2].round(decimals=4).unique()) == rings
+    assert cameras.camera_to_world[:, 2, 0].abs().max() < 1e-6
+    turned = scenes.light_azimuths(spec, cameras)
+    assert turned[0] == 0
+    x, y, _ = eye.numpy().T
+    assert np.allclose(np.cos(turned), x / np.hypot(x, y))  # the first stands on +X
+    assert scenes.light_azimuths(replace(spec, turning=False), cameras) is None

@@ -63,6 +63,10 @@ def _photos(name: str, title: str, field: str, values: Sequence[float], sign=1, 
 
 
 _SHARES = 0.0, 0.25, 0.5, 1.0
+_TURNTABLES = (
+    *(("still-2", 2, False), ("turning-2", 2, True)),
+    *(("still-1", 1, False), ("turning-1", 1, True)),
+)
 AXES = {
     axis.name: axis
     for axis in (
@@ -95,6 +99,15 @@ AXES = {
             quick=(0, 2, 3),
         ),
         _scenes("thin", "diameter of rods", "amount", (0.16, 0.08, 0.04, 0.02), shape="rods"),
+        Axis(
+            "turntable",
+            "cameras in 2 rings or 1; light still, or turning with them",
+            tuple(
+                Level(value, label, replace(OTHER, rings=rings, turning=turning))
+                for value, (label, rings, turning) in enumerate(_TURNTABLES)
+            ),
+            quick=(0, 1, 3),
+        ),
         _photos("noise", "noise, of sRGB in [0, 1]", "noise", (0.0, 0.02, 0.05, 0.1)),
         _scenes("placement", "off the middle, world units", "shift", (0.0, 0.25, 0.5, 0.75)),
         _photos("dark", "stops too dark", "exposure", (0.0, 2.0, 4.0, 6.0), sign=-1),

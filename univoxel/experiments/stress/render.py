@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from univoxel.camera import Cameras
 from univoxel.data.images import write_exr
@@ -128,7 +129,13 @@ def work(folder: Path, variant: str) -> None:
 
     def photograph(place: Path, cameras: Cameras, light: str, samples: int) -> None:
         place.mkdir(parents=True, exist_ok=True)
-        found = _pictures(mi, meshes, scenes.environment(spec, light, True), cameras, samples)
+        map = scenes.environment(spec, light, True)
+        azimuth = scenes.light_azimuths(spec, cameras) if light == spec.light else None
+        if azimuth is None:
+            found = _pictures(mi, meshes, map, cameras, samples)
+        else:  # a light for each
+            each = [(cameras.of(torch.tensor([v])), float(a)) for v, a in enumerate(azimuth)]
+            found = [_pictures(mi, meshes, map, one, samples, a)[0] for one, a in each]
         for view, picture in enumerate(found):
             _write_picture(place / f"{name_of(view)}.exr", picture)
 
@@ -162,10 +169,22 @@ def _mesh(mi: Any, name: str, part: Part) -> Any:
 
 
 def _pictures(
-    mi: Any, meshes: dict[str, Any], light: np.ndarray, cameras: Cameras, samples: int
+    mi: Any,
+    meshes: dict[str, Any],
+    light: np.ndarray,
+    cameras: Cameras,
+    samples: int,
+    azimuth: float = 0.0,
 ) -> np.ndarray:
-    """[V, H, W, 4] linear, premultiplied by alpha."""
-    to_world = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]  # +Z up, see conventions
+    """[V, H, W, 4] linear, premultiplied by alpha.
+
+    Args:
+        azimuth: radians that the light is turned by about +Z, counter-clockwise from above.
+    """
+    upright = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]  # +Z up, see conventions
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    turn = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    to_world = (turn @ upright).tolist()
     film = {
         "type": "hdrfilm",
         "width": len(cameras) * cameras.width,

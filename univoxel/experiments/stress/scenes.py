@@ -19,6 +19,7 @@ DISTANCE = 3.0  # of the cameras from what they look at
 VIEW_DEGREES = 36.0  # across a picture: a ball of radius 0.92 about the middle is seen whole
 HEIGHTS = {"box": (0.4, 0.95)}  # z of the directions to the cameras; a box is looked into
 OTHER_HEIGHTS = (-0.4, 0.95)
+RING_HEIGHTS = (0.0, 0.7)
 MAP_HEIGHT = 128  # of environment maps
 RELIGHT = ("dusk", "studio")  # maps of the relit test views
 BRIGHTNESS = 1.0  # irradiance over pi from above, of every map
@@ -38,6 +39,8 @@ class Spec:
     sun: float = 0.0  # share of the light's power that comes from a small sun, in [0, 1)
     shift: float = 0.0  # how far the object is from where the cameras to train on look, world units
     light: str = "room"  # that the photographs are taken in: room or dusk
+    rings: int = 0  # heights of cameras in level rings; 0: they are spread over a sphere
+    turning: bool = False  # whether the light turns with the camera, as on a turntable
     views: int = 40  # to train on
     tests: int = 6  # 0: photographs to train on alone
     size: int = 96  # pixels
@@ -49,8 +52,13 @@ def parts_of(spec: Spec) -> list[Part]:
 
 
 def train_cameras(spec: Spec) -> Cameras:
-    """Cameras on a sphere; the first ones of many are as evenly spread as all."""
+    """Cameras on a sphere, of which the first of many are as evenly spread as all; or in rings."""
     index = np.arange(spec.views)
+    if spec.rings:
+        place, ring = index // spec.rings, index % spec.rings
+        share = (ring + 0.5) / spec.rings
+        turn = 2 * math.pi * (place + ring / spec.rings) / (spec.views / spec.rings)
+        return _cameras(spec, share, turn, np.zeros(3))
     share = np.array([int(f"{i:032b}"[::-1], 2) / 2**32 for i in index])  # van der Corput
     away = spec.shift * np.array([1.0, 1.0, 1.0]) / math.sqrt(3)
     return _cameras(spec, share, index * math.pi * (3 - math.sqrt(5)), -away)
@@ -60,6 +68,16 @@ def test_cameras(spec: Spec) -> Cameras:
     """Cameras between those to train on, that see the object in the middle."""
     index = np.arange(spec.tests)
     return _cameras(spec, (index + 0.5) / max(spec.tests, 1), 0.7 + 2.4 * index, np.zeros(3))
+
+
+def light_azimuths(spec: Spec, cameras: Cameras) -> np.ndarray | None:
+    """How far the light of the photographs has turned about +Z, radians [V], since the first of
+    those to train on; None: it stands still."""
+    if not spec.turning:
+        return None
+    x, y, _ = cameras.camera_to_world[:, :, 3].double().numpy().T
+    first, other, _ = train_cameras(spec).camera_to_world[0, :, 3].double().numpy()
+    return np.arctan2(y, x) - np.arctan2(other, first)
 
 
 def radiance(name: str, direction: np.ndarray, sun: float = 0.0) -> np.ndarray:
@@ -171,7 +189,7 @@ def _joined(parts: Sequence[Part]) -> tuple[dict[str, Tensor], Tensor]:
 
 
 def _cameras(spec: Spec, share: np.ndarray, phi: np.ndarray, target: np.ndarray) -> Cameras:
-    low, high = HEIGHTS.get(spec.shape, OTHER_HEIGHTS)
+    low, high = RING_HEIGHTS if spec.rings else HEIGHTS.get(spec.shape, OTHER_HEIGHTS)
     z, size = low + (high - low) * share, spec.size
     r = np.sqrt(1 - z**2)
     back = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)

@@ -1,0 +1,85 @@
+"""Light that turns with the camera: the axis, and directions in the light's frame."""
+
+import math
+
+import pytest
+import torch
+from analytic import cameras_around, look_at
+from scipy.spatial.transform import Rotation
+
+from univoxel.camera import Cameras
+from univoxel.errors import ConfigError
+from univoxel.lights.turntable import Turntable, resampling
+from univoxel.sphere import fibonacci_sphere
+
+TILTED = Rotation.from_rotvec([0.4, -0.3, 0.2])
+
+
+def ring(count: int = 12, height: float = 0.5, tilt: Rotation | None = None) -> Cameras:
+    """Level cameras around the origin, from azimuth 0 on; in a world that may be tilted."""
+    angle = 2 * math.pi * torch.arange(count) / count
+    place = torch.stack([angle.cos(), angle.sin(), torch.full((count,), height)], 1)
+    poses = torch.stack([look_at(3 * p) for p in place])
+    if tilt is not None:
+        poses = torch.from_numpy(tilt.as_matrix()).float() @ poses
+    focal = torch.full((count, 2), 30.0)
+    return Cameras(poses, focal, torch.full((count, 2), 16.0), 32, 32)
+
+
+@pytest.mark.parametrize("tilt", [None, TILTED])
+def test_the_axis_is_what_level_cameras_stand_around(tilt):
+    turntable = Turntable.of(ring(tilt=tilt))
+    up = [0.0, 0.0, 1.0] if tilt is None else tilt.apply([0.0, 0.0, 1.0]).tolist()
+    assert turntable.axis == pytest.approx(up, abs=1e-5)
+    assert turntable.point == pytest.approx([0, 0, 0], abs=1e-3)
+    assert turntable.start == pytest.approx(
+        [1, 0, 0] if tilt is None else tilt.apply([1.0, 0, 0]).tolist(), abs=1e-3
+    )
+
+
+def test_light_turns_as_the_camera_does():
+    """What the camera sees straight ahead lies in the same direction of the light's frame."""
+    cameras = ring(tilt=TILTED)
+    turntable = Turntable.of(cameras)
+    eye, back = cameras.camera_to_world[:, :, 3], cameras.camera_to_world[:, :, 2]
+    turn = turntable.turn(eye)
+    angle = torch.atan2(turn[1], turn[0]).remainder(2 * math.pi)
+    wanted = 2 * math.pi * torch.arange(len(cameras)) / len(cameras)
+    assert ((angle - wanted + math.pi).remainder(2 * math.pi) - math.pi).abs().max() < 1e-3
+    lit = turntable.into_light(back, turn)
+    torch.testing.assert_close(lit, back[:1].expand_as(lit), atol=2e-3, rtol=0)
+    torch.testing.assert_close(turntable.into_world(lit, turn), back)
+    torch.testing.assert_close(turntable.into_light(back[:1], (turn[0][:1], turn[1][:1])), back[:1])
+
+
+def test_a_map_is_resampled_to_what_it_is_in_the_world():
+    """Against the formula of a smooth light that is turned."""
+    cameras, direction = ring(), fibonacci_sphere(512)
+    turntable = Turntable.of(cameras)
+    turn = turntable.turn(cameras.camera_to_world[:, :, 3])
+
+    def light(w):  # in its own frame
+        return 2 + w @ torch.tensor([0.8, -0.5, 0.6])
+
+    weights = resampling(direction, turntable, turn)
+    found = weights @ light(direction)
+    wanted = light(turntable.into_light(direction[None], tuple(x[:, None] for x in turn)))
+    torch.testing.assert_close(weights.sum(2), torch.ones(12, 512))
+    assert (found - wanted).abs().max() < 0.05  # the nodes' Gaussians blur it a little
+
+
+def test_cameras_that_are_not_level_say_nothing():
+    tumbled = ring()
+    turns = torch.from_numpy(Rotation.random(12, random_state=0).as_matrix()).float()
+    poses = tumbled.camera_to_world.clone()
+    poses[:, :, :3] = poses[:, :, :3] @ turns
+    assert Turntable.of(Cameras(poses, tumbled.focal, tumbled.centre, 32, 32)) is None
+    assert Turntable.of(ring().of(torch.arange(2))) is None
+    assert Turntable.of(cameras_around(12)) is not None
+
+
+def test_axis_and_start_are_across():
+    with pytest.raises(ConfigError, match="axis and start must be unit vectors across each other"):
+        Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.6, 0.8))
+    with pytest.raises(ConfigError, match="axis and start must be unit"):
+        Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 2.0), (1.0, 0.0, 0.0))

@@ -1,0 +1,190 @@
+"""Photographs of a turntable: that the light turned is found, and the materials under it."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import cameras_around, scene_of, sphere_scene
+from observed_points import (
+    BLUE,
+    RED,
+    Steps,
+    lamps,
+    photographs_under,
+    problem_on_a_sphere,
+)
+
+from univoxel.checkpoint import load_scene, save_scene
+from univoxel.errors import ConfigError, DataError
+from univoxel.grid import fit_grid
+from univoxel.joint import stage
+from univoxel.joint.config import JointConfig
+from univoxel.joint.equations import channel_radiance
+from univoxel.joint.newton import linear_transport
+from univoxel.joint.observations import shade_observations, turned_maps
+from univoxel.lights import EnvmapConfig
+from univoxel.lights.turntable import Turntable, resampling
+from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
+from univoxel.preparation.light_frame import explained, turntable_of
+from univoxel.preparation.observed_hull import observe_hull
+from univoxel.records import Surface
+from univoxel.render.pipeline import extract_mesh, radiance_of, shade
+from univoxel.scene import Scene
+
+NODES, VIEWS = 128, 16
+TURNTABLE = Turntable.of(cameras_around(VIEWS))
+
+
+def turning(scene: Scene) -> Scene:
+    other = Scene(replace(scene.cfg, turntable=TURNTABLE), scene.field, scene.inv_s)
+    other.load_state_dict(scene.state_dict())
+    return other
+
+
+def turned_lamps() -> torch.Tensor:
+    """What the lamps are in the world of each photograph: [V, D, 3]."""
+    map = lamps(NODES)
+    turn = TURNTABLE.turn(cameras_around(VIEWS).camera_to_world[:, :, 3])
+    return resampling(torch.nn.functional.normalize(sky_directions(), dim=1), TURNTABLE, turn) @ map
+
+
+def sky_directions() -> torch.Tensor:
+    return sphere_scene(NODES).sky.direction
+
+
+@pytest.fixture(scope="module")
+def photographs():
+    """The same sphere under lamps that stand still, and under lamps that turn with the camera."""
+    return {
+        "still": photographs_under(lamps(NODES), 0.3, VIEWS),
+        "turning": photographs_under(turned_lamps(), 0.3, VIEWS),
+    }
+
+
+def hull_of(photos):
+    distance = mask_distances(photos.coverage())
+    grid = fit_grid(*estimate_bounds(distance, photos.cameras), 20000)
+    return visual_hull(distance, photos.cameras, grid), grid
+
+
+@pytest.mark.parametrize("light", ["still", "turning"])
+def test_which_light_it_was(photographs, light, caplog):
+    caplog.set_level("INFO", "univoxel")
+    photos = photographs[light]
+    found = explained(observe_hull(photos, *hull_of(photos), 1500), TURNTABLE)
+    turntable = turntable_of(photos, *hull_of(photos), "auto")
+    if light == "still":
+        assert found.by_still_light > 2 * found.by_turning_light
+        assert turntable is None
+        assert not caplog.text
+    else:
+        assert found.by_turning_light > 2 * found.by_still_light
+        assert turntable == TURNTABLE
+        assert "the light turns with the camera, as on a turntable" in caplog.text
+
+
+def test_what_is_known_is_not_looked_for(photographs):
+    photos = photographs["still"]
+    assert turntable_of(photos, *hull_of(photos), "turntable") == TURNTABLE
+    assert turntable_of(photographs["turning"], *hull_of(photos), "world") is None
+
+
+def test_a_turntable_without_an_axis(photographs):
+    photos = photographs["still"]
+    pose = photos.cameras.camera_to_world.clone()
+    pose[::2, :, :2] = torch.stack(
+        [pose[::2, :, 1], -pose[::2, :, 0]], 2
+    )  # every other on its side
+    tumbled = replace(photos, cameras=replace(photos.cameras, camera_to_world=pose))
+    with pytest.raises(DataError, match="light_frame turntable: the cameras do not stand around"):
+        turntable_of(tumbled, *hull_of(photos), "turntable")
+    assert turntable_of(tumbled, *hull_of(photos), "auto") is None
+
+
+def test_the_equations_see_the_map_as_the_renders_do():
+    """Newton's linear transport against the shading of observations, map by map."""
+    scene = turning(scene_of((0.5, 0.4, 0.3), 0.4, NODES))
+    with torch.no_grad():
+        scene.sky.log_radiance.copy_(lamps(NODES).log())
+    problem = problem_on_a_sphere(20, 4, NODES, scene)
+    eye = cameras_around(VIEWS).camera_to_world[:4, :, 3]
+    problem = replace(problem, observations=replace(problem.observations, eye=eye))
+    problem = replace(problem, turned=turned_maps(scene, problem.observations))
+    point, observation = torch.arange(20), torch.arange(80).view(20, 4)
+    rough = torch.full((20,), 0.5)
+    with torch.no_grad():
+        transport = linear_transport(problem, point, observation, rough, False)
+        albedo = torch.full((20, 3), 0.5)
+        index = point.repeat_interleave(4)
+        shaded = shade_observations(
+            *(scene, problem, index, observation.flatten(), problem.observations.normal[index]),
+            *(albedo[index], rough[index], torch.full((80, 3), 0.04)),
+        )
+        for c in range(3):
+            _, radiance = channel_radiance(transport, scene.sky.radiance, albedo.log(), c, None)
+            # The split sum of the diffuse layer's share is an approximation of its quadrature
+            torch.testing.assert_close(radiance.flatten(), shaded[:, c], rtol=0.03, atol=1e-3)
+    still = replace(problem, turned=None)
+    flat = linear_transport(still, point, observation, rough, False)
+    _, other = channel_radiance(flat, scene.sky.radiance, albedo.log(), 0, None)
+    assert (other.flatten() - shaded[:, 0]).abs().max() > 0.1  # the frame matters
+
+
+def test_solve_finds_map_and_albedo_under_light_that_turns(photographs):
+    scene = turning(sphere_scene(NODES))
+    cfg = JointConfig(points=800, newton_points=800, rays=512, tracing=1, rounds=3)
+    stage.solve(scene, photographs["turning"], cfg, 0, Steps(300))
+    mesh = extract_mesh(scene)
+    x = mesh.vertices[:, 0]
+    ratio = torch.stack([mesh.albedo[x > 0.1].mean(0) / RED, mesh.albedo[x < -0.1].mean(0) / BLUE])
+    assert (ratio[0] / ratio[1] - 1).abs().max() < 0.2
+    wanted = lamps(NODES).mean(1)
+    found = scene.sky.radiance.detach().mean(1)
+    correlation = torch.corrcoef(torch.stack([wanted.log(), found.log()]))[0, 1]
+    assert correlation > 0.8  # half of the sphere is seen by highlights alone
+
+
+def test_both_renders_follow_the_camera():
+    """What is shown of a point depends on where the camera stands, not on the world."""
+    scene = turning(sphere_scene(NODES)).eval()
+    eye = cameras_around(VIEWS).camera_to_world[:, :, 3]
+    turn = TURNTABLE.turn(eye)
+    here = torch.nn.functional.normalize(torch.tensor([[0.5, 0.2, 0.6]]), dim=1).expand(VIEWS, 3)
+    normal, wo = (
+        TURNTABLE.into_world(x, turn) for x in (here, here)
+    )  # as the first camera sees it
+    depth = torch.full((VIEWS,), 2.0)
+    surface = Surface(
+        position=eye - depth[:, None] * wo,
+        normal=normal,
+        features=torch.zeros(VIEWS, 4),
+        albedo=torch.full((VIEWS, 3), 0.5),
+        roughness=torch.full((VIEWS,), 0.3),
+        opacity=torch.ones(VIEWS),
+        depth=depth,
+    )
+    with torch.no_grad():
+        seen = radiance_of(scene, surface, wo)
+        torch.testing.assert_close(seen, seen[:1].expand_as(seen), atol=1e-4, rtol=0)
+        still = sphere_scene(NODES).eval()
+        assert (radiance_of(still, surface, wo) - radiance_of(still, surface, wo)[:1]).std() > 1e-3
+        place = replace(surface, position=torch.zeros(VIEWS, 3) + surface.position[:1])
+        assert shade(scene, place, wo).isfinite().all()
+
+
+def test_a_checkpoint_keeps_the_axis(tmp_path):
+    scene = turning(sphere_scene(NODES))
+    save_scene(scene, tmp_path, {})
+    assert load_scene(tmp_path).cfg.turntable == TURNTABLE
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"light": EnvmapConfig()}, "needs hybrid or a local light, sg, sh or mlp, got envmap"),
+        ({"varying": "light"}, "cannot vary otherwise too"),
+    ],
+)
+def test_what_does_not_go_with_a_turntable(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        replace(sphere_scene(NODES).cfg, turntable=TURNTABLE, **changes)
