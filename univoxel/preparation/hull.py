@@ -45,7 +45,7 @@ def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
         distance: [V, H, W] from `mask_distances`.
     """
     border = [distance[:, 0], distance[:, -1], distance[:, :, 0], distance[:, :, -1]]
-    whole = torch.stack([b.amin(1) > 0 for b in border]).all(0)
+    uncut = torch.stack([side.amin(1) > 0 for side in border]).all(0)
     sdf = torch.full((len(points),), -torch.inf)
     scale = torch.tensor([2 / cameras.width, 2 / cameras.height])
     for v in range(len(cameras)):
@@ -55,9 +55,9 @@ def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
             distance[v][None, None], uv[None, None], align_corners=False, padding_mode="border"
         )[0, 0, 0]
         seen = (depth > 0) & (uv.abs() <= 1).all(1)
-        here = d.clamp_min(0.5) if whole[v] else torch.full_like(d, -torch.inf)
-        here = torch.where(seen, d, here) * depth.abs() / cameras.focal[v].mean()
-        sdf = torch.maximum(sdf, here)
+        bound = d.clamp_min(0.5) if uncut[v] else torch.full_like(d, -torch.inf)
+        bound = torch.where(seen, d, bound) * depth.abs() / cameras.focal[v].mean()
+        sdf = torch.maximum(sdf, bound)
     return torch.where(sdf.isinf(), torch.inf, sdf)
 
 
@@ -70,9 +70,9 @@ def estimate_bounds(
         UserError: the silhouettes share no volume.
     """
     centre = looked_at(cameras)
-    away = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
+    eye_distance = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
     field_of_view = max(cameras.width, cameras.height) / (2 * cameras.focal.min(1).values)
-    half = float((away * field_of_view).max()) * cfg.first_box
+    half = float((eye_distance * field_of_view).max()) * cfg.first_box
     lower, upper = centre - half, centre + half
     for _ in range(cfg.box_rounds):  # each round sees the hull at a finer grid
         grid = fit_grid(lower, upper, cfg.box_nodes)
