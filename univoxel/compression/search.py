@@ -107,8 +107,8 @@ def channel_basis(scene: Scene, rays: ReferenceRays, probes: int) -> tuple[Tenso
     covariance = centred.T @ (weight * centred)
     m, c = scene.material.channels, scene.cfg.channels
     basis, worth = torch.zeros(c, c, dtype=torch.float64), torch.zeros(c, dtype=torch.float64)
-    for part in (slice(0, m), slice(m, c)):
-        g, v = gram[part, part], covariance[part, part]
+    for group in (slice(0, m), slice(m, c)):
+        g, v = gram[group, group], covariance[group, group]
         if not len(g):
             continue
         floor = 1e-4 * g.diagonal().mean().clamp_min(1e-20)
@@ -119,7 +119,7 @@ def channel_basis(scene: Scene, rays: ReferenceRays, probes: int) -> tuple[Tenso
         scale = v.diagonal().mean().sqrt() / (new * (v @ new)).sum(0).clamp_min(1e-30).sqrt()
         # A channel that is the same everywhere keeps the length of a unit vector
         scale = torch.where(value > 1e-12 * value[0], scale, 1 / new.norm(dim=0))
-        basis[part, part], worth[part] = new * scale, value
+        basis[group, group], worth[group] = new * scale, value
     return basis, worth
 
 
@@ -206,28 +206,28 @@ def fewer_rows_(
     Source: as LeCun et al. 1990, "Optimal Brain Damage", with squared gradients for the Hessian.
     """
     features = scene.field.features
-    whole = features.detach().clone()
-    stored_rows = whole.any(1) & scene.field.rows_near(far)
-    squared = torch.zeros_like(whole)
+    all_features = features.detach().clone()
+    stored_rows = all_features.any(1) & scene.field.rows_near(far)
+    squared = torch.zeros_like(all_features)
     judged = torch.zeros_like(stored_rows)
     for probe in probes:
         rows, slope = _row_gradients(scene, probe)
         squared[rows] += slope.square()
         judged[rows] = True
-    worth = (squared * whole.square()).sum(1)
+    worth = (squared * all_features.square()).sum(1)
     order = (stored_rows & judged).nonzero()[:, 0]
     order = order[worth[order].argsort()]
-    before = held_out.decoded(scene)
+    decoded_before = held_out.decoded(scene)
     losses = {0.0: 0.0}
 
     @torch.no_grad()
     def drop_(share: float) -> None:
-        features.copy_(whole)
+        features.copy_(all_features)
         features[order[: round(share * len(order))]] = 0
 
     def loss_db(share: float) -> float:
         drop_(share)
-        losses[share] = held_out.loss_db(before, held_out.decoded(scene))
+        losses[share] = held_out.loss_db(decoded_before, held_out.decoded(scene))
         return losses[share]
 
     share = last_within_limit(shares, loss_db, limit_db)
@@ -273,16 +273,16 @@ def _reduce_(
     calibration = Baseline.of(scene, criterion.calibration)
     settles = head_share(scene) > criterion.cfg.least_head_share
     limit = criterion.limit_db
-    whole = sizes[0]
-    snapshots = {whole: prune.snapshot(scene)}
-    losses = {whole: 0.0}
+    full_size = sizes[0]
+    snapshots = {full_size: prune.snapshot(scene)}
+    losses = {full_size: 0.0}
 
     def loss_db(size: int) -> float:
         with trial(scene):
             channels = reduce_(size)
             losses[size] = baseline.loss_db(scene, channels)
             if losses[size] > limit and settles:
-                _settle_(scene, snapshots[whole], calibration, channels, criterion.cfg)
+                _settle_(scene, snapshots[full_size], calibration, channels, criterion.cfg)
                 losses[size] = baseline.loss_db(scene, channels)
             snapshots[size] = prune.snapshot(scene)
         return losses[size]
@@ -292,12 +292,12 @@ def _reduce_(
     why = f"costs {losses[size]:.3f} dB"
     if smaller := [k for k in losses if k < size]:
         why += f", {max(smaller)} would cost {losses[max(smaller)]:.3f} dB"
-    return CapacityChoice(kind, whole, size, losses[size], why)
+    return CapacityChoice(kind, full_size, size, losses[size], why)
 
 
 def _settle_(
     scene: Scene,
-    before: prune.Snapshot,
+    snapshot: prune.Snapshot,
     calibration: Baseline,
     channels: Tensor | None,
     cfg: CompressionConfig,
@@ -308,7 +308,7 @@ def _settle_(
         calibration: what the scene gave then along the calibration rays.
         channels: those that features have left [K]; None: all.
     """
-    parameters = [p for network in prune.replaced_networks(before) for p in network.parameters()]
+    parameters = [p for network in prune.replaced_networks(snapshot) for p in network.parameters()]
     optimizer = torch.optim.Adam(parameters, lr=cfg.settle_rate)
     for k in range(cfg.settle_steps):
         optimizer.param_groups[0]["lr"] = cfg.settle_rate * (1 - k / cfg.settle_steps)

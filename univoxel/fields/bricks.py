@@ -54,16 +54,16 @@ class BrickDistances(AbstractDistances):
         """What other distances are near their surface, on another grid."""
         far = BAND * grid.voxel_size
         shape = [-(-n // Bricks.SIDE) for n in grid.size]
-        near = _overlapped(source, grid, far).flatten()
-        inside = torch.cartesian_prod(*[torch.arange(Bricks.SIDE)] * 3)
+        near_source = _overlapped(source, grid, far).flatten()
+        node_offsets = torch.cartesian_prod(*[torch.arange(Bricks.SIDE)] * 3)
         stored = []
-        for part in near.nonzero()[:, 0].split(BRICKS_AT_ONCE):
-            sdf = source.sample(_nodes(grid, part, inside)).sdf.view(-1, Bricks.NODES)
+        for part in near_source.nonzero()[:, 0].split(BRICKS_AT_ONCE):
+            sdf = source.sample(_nodes(grid, part, node_offsets)).sdf.view(-1, Bricks.NODES)
             stored.append(part[(sdf.abs() < far).any(1)])
-        stored = torch.cat(stored) if stored else near.nonzero()[:, 0]
-        table = torch.empty(len(near), dtype=torch.int32)
-        for part in torch.arange(len(near)).split(Bricks.NODES * BRICKS_AT_ONCE):
-            table[part] = (source.sample(_nodes(grid, part, inside[:1])).sdf < 0).int()
+        stored = torch.cat(stored) if stored else near_source.nonzero()[:, 0]
+        table = torch.empty(len(near_source), dtype=torch.int32)
+        for part in torch.arange(len(near_source)).split(Bricks.NODES * BRICKS_AT_ONCE):
+            table[part] = (source.sample(_nodes(grid, part, node_offsets[:1])).sdf < 0).int()
         table[stored] = Bricks.MISSING + torch.arange(len(stored), dtype=torch.int32)
         used = Bricks.MISSING + len(stored)
         place = torch.full((round((1 + SPARE) * used),), -1, dtype=torch.int32)
@@ -76,11 +76,11 @@ class BrickDistances(AbstractDistances):
 
     def _stored_nodes(self) -> Iterator[tuple[slice, Tensor]]:
         """Rows of bricks, some at a time, and the world positions [K, 3] of their nodes."""
-        inside = torch.cartesian_prod(*[torch.arange(Bricks.SIDE)] * 3)
+        node_offsets = torch.cartesian_prod(*[torch.arange(Bricks.SIDE)] * 3)
         begin = Bricks.MISSING * Bricks.NODES
         for part in self.bricks.place[Bricks.MISSING : self.count].long().split(BRICKS_AT_ONCE):
             end = begin + len(part) * Bricks.NODES
-            yield slice(begin, end), _nodes(self.grid, part, inside)
+            yield slice(begin, end), _nodes(self.grid, part, node_offsets)
             begin = end
 
     def sample(self, points: Tensor, values: Tensor | None = None) -> FieldSample:
@@ -134,8 +134,8 @@ class BrickDistances(AbstractDistances):
         for first in range(begin, end, Bricks.SIDE):
             plane = self.bricks.table[first // Bricks.SIDE].long()
             part = pool[plane].permute(order).flatten(3, 4).flatten(1, 2)
-            at = first - begin
-            slab[at : at + Bricks.SIDE] = part[: end - first, :y, :z]
+            offset = first - begin
+            slab[offset : offset + Bricks.SIDE] = part[: end - first, :y, :z]
         return slab
 
     def isosurface(self) -> tuple[Tensor, Tensor]:
@@ -157,34 +157,35 @@ class BrickDistances(AbstractDistances):
 
     @torch.no_grad()
     def values_from(self, source: AbstractDistances, values: Tensor) -> Tensor:
-        own = values.new_zeros(len(self.sdf), values.shape[-1])
+        result = values.new_zeros(len(self.sdf), values.shape[-1])
         for rows, points in self._stored_nodes():
-            own[rows] = source.interpolate(values, points)
-        return own
+            result[rows] = source.interpolate(values, points)
+        return result
 
     def _grow(self) -> bool:
         """Store every brick beside one that the surface comes within a voxel of; False: there is
         none to store."""
         bricks, count = self.bricks, self.count
         low, high = torch.aminmax(self.sdf.detach()[: count * Bricks.NODES].view(count, -1), dim=1)
-        met = (low < self.voxel_size) & (high > -self.voxel_size)
-        met[: Bricks.MISSING] = False
-        beside = torch.cartesian_prod(*[torch.arange(-1, 2)] * 3)
+        reached = (low < self.voxel_size) & (high > -self.voxel_size)
+        reached[: Bricks.MISSING] = False
+        neighbour_offsets = torch.cartesian_prod(*[torch.arange(-1, 2)] * 3)
         shape = torch.tensor(bricks.table.shape)
-        at = (bricks.corners(met.nonzero()[:, 0])[:, None] // Bricks.SIDE + beside).reshape(-1, 3)
-        at = torch.minimum(at.clamp_min(0), shape - 1)
-        flat = (at[:, 0] * shape[1] + at[:, 1]) * shape[2] + at[:, 2]
-        new = flat[bricks.table.flatten()[flat] < Bricks.MISSING].unique()
+        corner = bricks.corners(reached.nonzero()[:, 0])[:, None]
+        cell = (corner // Bricks.SIDE + neighbour_offsets).reshape(-1, 3)
+        cell = torch.minimum(cell.clamp_min(0), shape - 1)
+        flat_cell = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
+        new = flat_cell[bricks.table.flatten()[flat_cell] < Bricks.MISSING].unique()
         if not len(new):
             return False
         table, place = bricks.table.flatten().clone(), bricks.place
-        short = count + len(new) - len(place)
-        if short > 0:  # make room, and some more
-            short += round(SPARE * len(place))
-            place = torch.cat([place, place.new_full((short,), -1)])
-            more = short * Bricks.NODES
+        extra_bricks = count + len(new) - len(place)
+        if extra_bricks > 0:  # make room, and some more
+            extra_bricks += round(SPARE * len(place))
+            place = torch.cat([place, place.new_full((extra_bricks,), -1)])
+            extra_rows = extra_bricks * Bricks.NODES
             sdf = self.sdf.detach()
-            sdf = torch.cat([sdf, sdf.new_full((more,), self.far)])
+            sdf = torch.cat([sdf, sdf.new_full((extra_rows,), self.far)])
             self.sdf = nn.Parameter(sdf, self.sdf.requires_grad)
         else:
             place = place.clone()
@@ -195,31 +196,31 @@ class BrickDistances(AbstractDistances):
         rows = (Bricks.NODES * number[:, None] + torch.arange(Bricks.NODES)).flatten()
         self.sdf[rows] = self.far * sign.repeat_interleave(Bricks.NODES)
         parts = zip(number.split(BRICKS_AT_ONCE), sign.split(BRICKS_AT_ONCE), strict=True)
-        found = torch.cat([self._carried(*part) for part in parts])
-        self.sdf.view(-1, Bricks.NODES)[number] = found
+        carried = torch.cat([self._carried(*part) for part in parts])
+        self.sdf.view(-1, Bricks.NODES)[number] = carried
         return True
 
     def _carried(self, number: Tensor, sign: Tensor) -> Tensor:
         """Distances [N, 64] carried on into new bricks [N], whose nodes have lain at sign [N] times
         far."""
-        around = torch.cartesian_prod(*[torch.arange(-1, Bricks.SIDE + 1)] * 3)
-        node = self.bricks.corners(number)[:, None] + around
+        node_offsets = torch.cartesian_prod(*[torch.arange(-1, Bricks.SIDE + 1)] * 3)
+        node = self.bricks.corners(number)[:, None] + node_offsets
         node = torch.minimum(node.clamp_min(0), torch.tensor(self.grid.size) - 1)
         # In front of the surface seen from here: what is across it is below 0
-        ahead = sign[:, None] * self.sdf.detach()[self.bricks.rows(node)]
-        ahead = ahead.view(-1, *[Bricks.SIDE + 2] * 3)
-        within = ahead[:, 1:-1, 1:-1, 1:-1]
+        signed = sign[:, None] * self.sdf.detach()[self.bricks.rows(node)]
+        signed = signed.view(-1, *[Bricks.SIDE + 2] * 3)
+        inner = signed[:, 1:-1, 1:-1, 1:-1]
         for _ in range(Bricks.SIDE):  # a voxel at a time
             for axis in range(1, 4):
                 for begin in (0, 2):
-                    beside = ahead.narrow(axis, begin, Bricks.SIDE)
-                    for other in {1, 2, 3} - {axis}:
-                        beside = beside.narrow(other, 1, Bricks.SIDE)
-                    torch.minimum(within, beside + self.voxel_size, out=within)
-        return sign[:, None] * within.reshape(len(number), -1)
+                    neighbours = signed.narrow(axis, begin, Bricks.SIDE)
+                    for other_axis in {1, 2, 3} - {axis}:
+                        neighbours = neighbours.narrow(other_axis, 1, Bricks.SIDE)
+                    torch.minimum(inner, neighbours + self.voxel_size, out=inner)
+        return sign[:, None] * inner.reshape(len(number), -1)
 
 
-def _nodes(grid: GridShape, flat: Tensor, inside: Tensor) -> Tensor:
+def _nodes(grid: GridShape, flat: Tensor, node_offsets: Tensor) -> Tensor:
     """World positions [N K, 3] of nodes of bricks.
 
     Args:
@@ -228,7 +229,7 @@ def _nodes(grid: GridShape, flat: Tensor, inside: Tensor) -> Tensor:
     """
     shape = tuple(-(-n // Bricks.SIDE) for n in grid.size)
     node = torch.stack(torch.unravel_index(flat, shape), -1) * Bricks.SIDE
-    node = (node[:, None] + inside).reshape(-1, 3)
+    node = (node[:, None] + node_offsets).reshape(-1, 3)
     origin = torch.tensor(grid.origin, dtype=torch.float64)
     return (origin + grid.voxel_size * node.double()).float()
 
@@ -243,16 +244,16 @@ def _sewn(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.nd
     counts = np.cumsum([0, *(len(v) for v, _ in parts)])
     faces = np.concatenate([f + n for (_, f), n in zip(parts, counts, strict=False)])
     number = np.arange(len(vertices))
-    between = np.flatnonzero(vertices[:, 0] % SLAB == 0)
-    if len(between):
+    on_seam = np.flatnonzero(vertices[:, 0] % SLAB == 0)
+    if len(on_seam):
         # By rounding they lie some 1e-6 apart; others in the plane, where an edge meets none, 1e-3
-        pairs = KDTree(vertices[between]).query_pairs(1e-5, output_type="ndarray")
-        first, second = np.sort(between[pairs], axis=1).T
+        pairs = KDTree(vertices[on_seam]).query_pairs(1e-5, output_type="ndarray")
+        first, second = np.sort(on_seam[pairs], axis=1).T
         number[second] = first
     kept, number = np.unique(number, return_inverse=True)
     faces = number[faces]
-    whole = (faces != np.roll(faces, 1, axis=1)).all(1)
-    return vertices[kept], faces[whole]
+    intact = (faces != np.roll(faces, 1, axis=1)).all(1)
+    return vertices[kept], faces[intact]
 
 
 def _overlapped(source: AbstractDistances, grid: GridShape, far: float) -> Tensor:
@@ -262,10 +263,10 @@ def _overlapped(source: AbstractDistances, grid: GridShape, far: float) -> Tenso
         brick = torch.arange(-(-grid.size[axis] // Bricks.SIDE)) * Bricks.SIDE
         start = (grid.origin[axis] - source.grid.origin[axis]) / source.voxel_size
         scale = grid.voxel_size / source.voxel_size
-        last = near.shape[axis] - 1
+        last_block = near.shape[axis] - 1
         low, high = (
-            ((start + scale * (brick + by)) / Bricks.SIDE).floor().long().clamp(0, last)
-            for by in (-0.01, Bricks.SIDE - 0.99)  # rounding may not lose a neighbour
+            ((start + scale * (brick + offset)) / Bricks.SIDE).floor().long().clamp(0, last_block)
+            for offset in (-0.01, Bricks.SIDE - 0.99)  # rounding may not lose a neighbour
         )
         count = torch.nn.functional.pad(
             near.movedim(axis, -1).to(torch.int32).cumsum(-1, dtype=torch.int32), (1, 0)

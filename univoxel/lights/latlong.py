@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import replace
 
 import torch
@@ -14,16 +15,47 @@ from univoxel.records import Occlusion, Surface
 from univoxel.sphere import latlong_directions, texel_solid_angles
 
 
-def reflected(
-    light: AbstractLight,
-    surface: Surface,
-    wo: Tensor,  # [N, 3]
-    occlusion: Occlusion | None,
-    generator: torch.Generator | None,
-) -> Tensor:
-    """Radiance [N, 3] towards wo, without gradient to normals."""
-    surface = replace(surface, normal=surface.normal.detach())
-    return quadrature.reflected(light, surface, wo, light.directions, occlusion, generator)
+class LatLongConfig(ABC):
+    """What the configurations of both lights have."""
+
+    directions: int  # of the half-sphere, in training, >= 1
+    directions_eval: int  # in evaluation, >= 1
+
+
+class AbstractLatLongLight(AbstractLight):
+    """Light from far away, the same for all points: a lat-long map, interpolated bilinearly.
+
+    Gradients go to the map and the materials, not to normals: the map is no smooth function of
+    direction.
+    """
+
+    traced = True
+    config: LatLongConfig
+
+    @property
+    @abstractmethod
+    def radiance(self) -> Tensor:
+        """The map [H, 2 H, 3] that is interpolated, linear, in the axes of
+        docs/reference/conventions.md."""
+
+    @property
+    def directions(self) -> int:
+        return self.config.directions if self.training else self.config.directions_eval
+
+    def incident(self, surface: Surface, wi: Tensor) -> Tensor:
+        """Radiance [N, D, 3] from unit directions wi [N, D, 3], the same for all points."""
+        return envmap.lookup(envmap.EnvMap(self.radiance), wi)
+
+    def reflected(
+        self,
+        surface: Surface,
+        wo: Tensor,
+        occlusion: Occlusion | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Radiance [N, 3] towards wo; no gradient to normals."""
+        surface = replace(surface, normal=surface.normal.detach())
+        return quadrature.reflected(self, surface, wo, self.directions, occlusion, generator)
 
 
 def chroma(radiance: Tensor) -> Tensor:

@@ -9,10 +9,10 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from univoxel import envmap
-from univoxel.lights import latlong, lobes, priors
-from univoxel.lights.base import AbstractLight, Regularisation
-from univoxel.records import Occlusion, Surface
+from univoxel.lights import lobes, priors
+from univoxel.lights.base import Regularisation
+from univoxel.lights.latlong import AbstractLatLongLight, LatLongConfig
+from univoxel.records import Surface
 from univoxel.sphere import latlong_directions
 from univoxel.validation import check_fields
 
@@ -20,7 +20,7 @@ GAIN = 10.0  # the learning rate of networks moves the lobes that much faster: t
 
 
 @dataclass(frozen=True)
-class EnvmapSGConfig:
+class EnvmapSGConfig(LatLongConfig):
     """An environment map of spherical Gaussians, with traced visibility."""
 
     # name of this light, by which config.json tells it from the others
@@ -38,7 +38,7 @@ class EnvmapSGConfig:
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "max_sharpness")
 
 
-class EnvmapSGLight(AbstractLight):
+class EnvmapSGLight(AbstractLatLongLight):
     """K spherical Gaussians of direction, the same for all points.
 
         L(w) = sum_k amplitude_k exp(sharpness_k (w . axis_k - 1))
@@ -46,11 +46,10 @@ class EnvmapSGLight(AbstractLight):
     N points under D directions would ask for K exponentials each; instead the sum is taken on the
     texels of a small lat-long map and interpolated, which is off by at most
     sharpness (pi / rows)^2 / 4 of a lobe's amplitude: 6 % for the sharpest at its very top. It
-    starts at radiance about 1/2 from everywhere. Gradients go to the lobes and the materials, not
-    to normals. Source: Zhang et al. 2021 (PhySG).
+    starts at radiance about 1/2 from everywhere. Source: Zhang et al. 2021 (PhySG).
     """
 
-    traced = True
+    config: EnvmapSGConfig
 
     def __init__(self, config: EnvmapSGConfig | None = None) -> None:
         super().__init__()
@@ -59,8 +58,8 @@ class EnvmapSGLight(AbstractLight):
         self.raw = nn.Parameter(start / GAIN)  # [K, 7]
 
     @property
-    def directions(self) -> int:
-        return self.config.directions if self.training else self.config.directions_eval
+    def radiance(self) -> Tensor:
+        return self.latlong(self.config.rows)
 
     def lobes(self) -> tuple[Tensor, Tensor, Tensor]:
         """Unit axis [K, 3], sharpness [K] and amplitude [K, 3] >= 0."""
@@ -74,20 +73,6 @@ class EnvmapSGLight(AbstractLight):
         # The floor is nothing beside any light, and spares products too small for normal numbers,
         # over which processors take many times as long
         return (exponent.clamp_min(-40).exp() @ amplitude).view(height, 2 * height, 3)
-
-    def incident(self, surface: Surface, wi: Tensor) -> Tensor:
-        """Radiance [N, D, 3] from unit directions wi [N, D, 3], the same for all points."""
-        return envmap.lookup(envmap.EnvMap(self.latlong(self.config.rows)), wi)
-
-    def reflected(
-        self,
-        surface: Surface,
-        wo: Tensor,
-        occlusion: Occlusion | None = None,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Radiance [N, 3] towards wo; no gradient to normals."""
-        return latlong.reflected(self, surface, wo, occlusion, generator)
 
     def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         _, sharpness, amplitude = self.lobes()

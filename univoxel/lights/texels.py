@@ -9,10 +9,10 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from univoxel import envmap
 from univoxel.lights import latlong, priors
-from univoxel.lights.base import AbstractLight, Regularisation
-from univoxel.records import Occlusion, Surface
+from univoxel.lights.base import Regularisation
+from univoxel.lights.latlong import AbstractLatLongLight, LatLongConfig
+from univoxel.records import Surface
 from univoxel.validation import check_fields
 
 # The learning rate of networks moves log radiance that much faster: it must reach a sun
@@ -21,7 +21,7 @@ COARSEST = 4  # rows of the coarsest level, at least
 
 
 @dataclass(frozen=True)
-class EnvmapConfig:
+class EnvmapConfig(LatLongConfig):
     """An environment map of texels, with traced visibility."""
 
     # name of this light, by which config.json tells it from the others
@@ -34,7 +34,7 @@ class EnvmapConfig:
         check_fields(self, "at least 1", lambda x: x >= 1, "rows", "directions", "directions_eval")
 
 
-class EnvmapLight(AbstractLight):
+class EnvmapLight(AbstractLatLongLight):
     """Radiance at the texels of a lat-long map, interpolated bilinearly between them.
 
         log L = GAIN sum_l up(level_l)
@@ -43,11 +43,9 @@ class EnvmapLight(AbstractLight):
     as a sum of levels, each four times as coarse as the one before and interpolated between its
     texels. A step of Adam moves all parameters about equally far: the coarse ones bring whole parts
     of the sky along, the fine ones what they leave. It starts at radiance 1/2 from everywhere.
-    Gradients go to the map and the materials, not to normals: the map is no smooth function of
-    direction.
     """
 
-    traced = True
+    config: EnvmapConfig
 
     def __init__(self, config: EnvmapConfig | None = None) -> None:
         super().__init__()
@@ -59,10 +57,6 @@ class EnvmapLight(AbstractLight):
         self.levels[-1].data += math.log(0.5) / GAIN
 
     @property
-    def directions(self) -> int:
-        return self.config.directions if self.training else self.config.directions_eval
-
-    @property
     def log_radiance(self) -> Tensor:
         """[H, 2 H, 3], in the axes of docs/reference/conventions.md."""
         fine, *coarse = self.levels
@@ -71,19 +65,9 @@ class EnvmapLight(AbstractLight):
             total = total + _finer(level, len(fine) // len(level))
         return GAIN * total
 
-    def incident(self, surface: Surface, wi: Tensor) -> Tensor:
-        """Radiance [N, D, 3] from unit directions wi [N, D, 3], the same for all points."""
-        return envmap.lookup(envmap.EnvMap(self.log_radiance.exp()), wi)
-
-    def reflected(
-        self,
-        surface: Surface,
-        wo: Tensor,
-        occlusion: Occlusion | None = None,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Radiance [N, 3] towards wo; no gradient to normals."""
-        return latlong.reflected(self, surface, wo, occlusion, generator)
+    @property
+    def radiance(self) -> Tensor:
+        return self.log_radiance.exp()
 
     def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         log_map = self.log_radiance
@@ -94,7 +78,7 @@ class EnvmapLight(AbstractLight):
 
     def latlong(self, height: int) -> Tensor:
         """The map [height, 2 height, 3], linear, in the axes of docs/reference/conventions.md."""
-        return latlong.resampled(self.log_radiance.exp(), height)
+        return latlong.resampled(self.radiance, height)
 
 
 def _finer(level: Tensor, factor: int) -> Tensor:

@@ -93,12 +93,12 @@ def _agreed_nodes(
         depth_maps(colors, cameras, hull_depths, hull, grid, cfg)
     ):
         distance, pixel = _distance_and_pixel(nodes, cameras, view)
-        ahead = depth.flatten()[pixel] - distance  # NaN: the view says nothing
-        through = ahead > 0
-        free_votes += through
-        votes += ahead > -cfg.behind * grid.voxel_size
-        gained = hull_error - error > (cfg.better * hull_error).clamp_min(cfg.visible)
-        better_votes += through & gained.flatten()[pixel]
+        clearance = depth.flatten()[pixel] - distance  # NaN: the view says nothing
+        seen_through = clearance > 0
+        free_votes += seen_through
+        votes += clearance > -cfg.behind * grid.voxel_size
+        better = hull_error - error > (cfg.better * hull_error).clamp_min(cfg.visible)
+        better_votes += seen_through & better.flatten()[pixel]
     agreed = (free_votes > cfg.agree * votes) & (free_votes > cfg.least * len(cameras))
 
     def around(values: Tensor) -> Tensor:
@@ -133,9 +133,9 @@ def _without(carved: Tensor, hull: Tensor, grid: GridShape) -> Tensor:
     outside, inside = (np.asarray(ndimage.distance_transform_edt(s)) for s in (~solid, solid))
     # The surface lies halfway between nodes; half a voxel's blur takes the steps off
     distance = ndimage.gaussian_filter(np.where(solid, 0.5 - inside, outside - 0.5), 0.7)
-    near = torch.from_numpy(ndimage.binary_dilation(carved.numpy(), iterations=3))
+    near_carved = torch.from_numpy(ndimage.binary_dilation(carved.numpy(), iterations=3))
     sdf = torch.from_numpy(distance).float() * grid.voxel_size
-    return torch.where(near, torch.maximum(hull, sdf), hull)
+    return torch.where(near_carved, torch.maximum(hull, sdf), hull)
 
 
 def carve_within_time(
@@ -178,8 +178,8 @@ def carving_pictures(
         premultiplied = torch.cat([linear_to_srgb(color) * alpha[..., None], alpha[..., None]], 2)
         shrunk = avg_pool2d(premultiplied.permute(2, 0, 1), factor)
         pictures.append((255 * shrunk.permute(1, 2, 0)).round().byte())
-    of, sizes = photos.cameras.of(views), sizes_of([(p.shape[1], p.shape[0]) for p in pictures])
-    cameras = Cameras(of.camera_to_world, of.focal / factor, of.centre / factor, *sizes)
+    chosen, sizes = photos.cameras.of(views), sizes_of([(p.shape[1], p.shape[0]) for p in pictures])
+    cameras = Cameras(chosen.camera_to_world, chosen.focal / factor, chosen.centre / factor, *sizes)
     return stacked(pictures), cameras
 
 

@@ -70,23 +70,22 @@ def depth_maps(
         inside = (pictures[view, :, :, 3] >= 128) & hull_depths[view].isfinite()
         rows = torch.where(inside, inside.flatten().cumsum(0).view(inside.shape) - 1, -1)
         rays, hull_depth = image_rays(cameras, view), hull_depths[view][inside]
-        of_rays = cameras.cut(view, inside).flatten()
-        origin, direction = rays.origin[of_rays], rays.direction[of_rays]
-        color = pictures[view][inside].float()
-        of_pixels = color[:, :3] / color[:, 3:], rows
-        lines = pictures, matrix, origin, direction
-        near = similarity[view].topk(min(2 * cfg.neighbours, len(cameras) - 1)).indices
+        inside_picture = cameras.cut(view, inside).flatten()
+        origin, direction = rays.origin[inside_picture], rays.direction[inside_picture]
+        premultiplied = pictures[view][inside].float()
+        color = premultiplied[:, :3] / premultiplied[:, 3:]
+        pixel_rays = pictures, matrix, origin, direction
+        nearest_views = similarity[view].topk(min(2 * cfg.neighbours, len(cameras) - 1)).indices
 
         def difference(start: Tensor, others: Tensor, depths: int) -> Tensor:
             best = min(cfg.best, len(others))
-            return match_cost(*lines, start, *of_pixels, others, step, depths, best=best)  # noqa: B023
+            return match_cost(*pixel_rays, start, color, rows, others, step, depths, best=best)  # noqa: B023
 
-        cost = difference(hull_depth, near[::2], cfg.depths)
+        cost = difference(hull_depth, nearest_views[::2], cfg.depths)
         depth = hull_depth + step * semi_global(cost, rows, cfg.slope, cfg.jump).argmin(1)
         point = origin + depth[:, None] * direction
         depth = torch.where(field.sample(point).sdf > 0.5 * step, hull_depth, depth)
         maps = torch.full((3, *inside.shape), torch.nan)
-        maps[:, inside] = torch.stack(
-            [depth, *(difference(start, near[1::2], 1)[:, 0] for start in (depth, hull_depth))]
-        )
+        checked = (difference(d, nearest_views[1::2], 1)[:, 0] for d in (depth, hull_depth))
+        maps[:, inside] = torch.stack([depth, *checked])
         yield maps[0], maps[1], maps[2]

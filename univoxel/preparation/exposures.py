@@ -44,19 +44,20 @@ def log_gains(
         return gain
     encoded = linear_to_srgb(seen.color)
     usable = (encoded.mean(1) > cfg.dark) & (encoded < CLIPPED).all(1)
-    where = torch.repeat_interleave(seen.offsets.diff())[usable], seen.view[usable]
-    log, there = torch.zeros(2, cfg.points, len(photos), dtype=torch.double)
-    log[where], there[where] = seen.color[usable].mean(1).double().log(), 1.0
-    weight = there
+    point_and_view = torch.repeat_interleave(seen.offsets.diff())[usable], seen.view[usable]
+    log_color, observed = torch.zeros(2, cfg.points, len(photos), dtype=torch.double)
+    log_color[point_and_view] = seen.color[usable].mean(1).double().log()
+    observed[point_and_view] = 1.0
+    weight = observed
     for _ in range(cfg.rounds):
         share = weight / weight.sum(1, keepdim=True).clamp_min(1e-9)
         # The albedos eliminated: a Laplacian of the photographs, tied by the points that they share
         system = torch.diag(weight.sum(0) + cfg.prior) - weight.T @ share
-        right = (weight * (log - (share * log).sum(1, keepdim=True))).sum(0)
-        gain = torch.linalg.solve(system, right)
+        right_side = (weight * (log_color - (share * log_color).sum(1, keepdim=True))).sum(0)
+        gain = torch.linalg.solve(system, right_side)
         gain = gain - gain.mean()
-        albedo = (share * (log - gain)).sum(1, keepdim=True)
-        weight = there / (1 + ((log - gain - albedo) / cfg.cauchy).square())
+        albedo = (share * (log_color - gain)).sum(1, keepdim=True)
+        weight = observed / (1 + ((log_color - gain - albedo) / cfg.cauchy).square())
     return gain.float()
 
 

@@ -55,14 +55,14 @@ def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
         uv = pixel * (2 / torch.tensor(cameras.size(v))) - 1
         shown = cameras.cut(v, distance[v])
         border = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
-        whole = all(float(b.amin()) > 0 for b in border)
+        uncut = all(float(b.amin()) > 0 for b in border)
         d = torch.nn.functional.grid_sample(
             shown[None, None], uv[None, None], align_corners=False, padding_mode="border"
         )[0, 0, 0]
         seen = (depth > 0) & (uv.abs() <= 1).all(1)
-        here = d.clamp_min(0.5) if whole else torch.full_like(d, -torch.inf)
-        here = torch.where(seen, d, here) * depth.abs() / cameras.focal[v].mean()
-        sdf = torch.maximum(sdf, here)
+        bound = d.clamp_min(0.5) if uncut else torch.full_like(d, -torch.inf)
+        bound = torch.where(seen, d, bound) * depth.abs() / cameras.focal[v].mean()
+        sdf = torch.maximum(sdf, bound)
     return torch.where(sdf.isinf(), torch.inf, sdf)
 
 
@@ -75,10 +75,10 @@ def estimate_bounds(
         UserError: the silhouettes share no volume.
     """
     centre = looked_at(cameras)
-    away = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
-    longer = cameras.size_of_each().amax(1)
-    field_of_view = longer / (2 * cameras.focal.min(1).values)
-    half = float((away * field_of_view).max()) * cfg.first_box
+    eye_distance = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
+    longer_side = cameras.size_of_each().amax(1)
+    field_of_view = longer_side / (2 * cameras.focal.min(1).values)
+    half = float((eye_distance * field_of_view).max()) * cfg.first_box
     lower, upper = centre - half, centre + half
     for _ in range(cfg.box_rounds):  # each round sees the hull at a finer grid
         grid = fit_grid(lower, upper, cfg.box_nodes)
