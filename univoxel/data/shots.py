@@ -265,7 +265,7 @@ def resampled(
     if grid is None:  # what a mask hides is black
         top, bottom = _span(alpha.any(1), factor)
         left, right = _span(alpha.any(0), factor)
-    whole = None if grid is None else _premultiplied(color, alpha)
+    whole = color if grid is None else _premultiplied(color, alpha)
     rows = max(1, BAND // (factor * color.shape[1]))  # in bands, to save memory
     for row in range(top, bottom, rows):
         into = slice(row, min(row + rows, bottom)), slice(left, right)
