@@ -60,12 +60,14 @@ def _source_of(run: Path) -> Source:
         raise DataError(f"{path}: expected an object with the configuration, got {config!r:.80}")
     # In runs from before there was a choice
     before = {"downscale": 0, "allow_outside": False}
-    data, downscale, outside = ((before | config).get(f) for f in ("data", *before))
-    kinds = type(data), type(downscale), type(outside)
-    if kinds != (str, int, bool) or not data or "\0" in data or downscale < 0:
-        raise DataError(
-            f"{path}: expected data, a folder, and downscale, at least 0, got {data!r:.80} and "
-            f"{downscale!r:.80}"
-        )
-    # 0 in runs from before a size was chosen for large photographs: those were refused
-    return Source(Path(data), downscale or 1, outside)
+    values = before | config
+    match values:
+        case {"data": str(data), "downscale": int(downscale), "allow_outside": bool(outside)} if (
+            data and "\0" not in data and downscale >= 0 and not isinstance(downscale, bool)
+        ):
+            # 0 in runs from before a size was chosen for large photographs: those were refused
+            return Source(Path(data), downscale or 1, outside)
+    raise DataError(
+        f"{path}: expected data, a folder, and downscale, at least 0, got "
+        f"{values.get('data')!r:.80} and {values.get('downscale')!r:.80}"
+    )

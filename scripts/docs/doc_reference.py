@@ -74,7 +74,7 @@ def _option(parameter: inspect.Parameter, hint: Any) -> tuple[str, str]:
     flag = "--" + parameter.name.replace("_", "-")
     if kinds == [bool]:
         return f"`{flag}`", "a flag"
-    if choices:
+    if choices and metavar is None:
         return f"`{flag}`", ", ".join(f"`{c}`" for c in choices)
     numbers = {int: "a whole number", float: "a number"}
     shown = metavar or next((numbers[k] for k in kinds if k in numbers), "text")

@@ -11,6 +11,7 @@ from safetensors import safe_open
 
 from univoxel.data import keep_photos, load_photos, shots
 from univoxel.data.images import write_exr, write_png
+from univoxel.data.lens import Lens, sources, straightened
 from univoxel.errors import DataError
 
 BENT = {"k1": -0.05, "p2": 0.01}
@@ -56,6 +57,23 @@ def test_pixels_are_decoded_in_bands(data, monkeypatch):
     load_photos(written, downscale=2)
     assert max(rows) == 8
     assert sum(rows) == 2 * 28  # the row that is left over is cut off
+
+
+@pytest.mark.parametrize("window", [(11, 20, 7, 25), (0, 9, 0, 12), (25, 31, 30, 40)])
+@pytest.mark.parametrize("factor", [1, 3])
+def test_only_what_a_mask_shows_is_straightened(monkeypatch, window, factor):
+    top, bottom, left, right = window
+    color = torch.randint(1, 256, (31, 40, 3), dtype=torch.uint8)
+    alpha = torch.zeros(31, 40, dtype=torch.uint8)
+    alpha[top:bottom, left:right] = 255
+    lens = Lens(40, 31, (40.0, 40.0), (20.0, 15.5), (-0.3, 0.0, 0.0), (0.02, 0.01))
+    grid = sources(lens, straightened(lens))
+    found = shots.resampled(color, alpha, factor, grid)
+    monkeypatch.setattr(shots, "_span", lambda there, factor: (0, len(there) // factor))
+    wanted = shots.resampled(color, alpha, factor, grid)
+    assert 0 < (wanted[1] > 0).float().mean() < 0.6
+    assert torch.equal(found[0], wanted[0])
+    assert torch.equal(found[1], wanted[1])
 
 
 def test_only_what_a_mask_shows_is_decoded(monkeypatch):

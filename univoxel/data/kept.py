@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -23,7 +24,6 @@ from univoxel.data.base import Photos
 from univoxel.files import replacing
 
 VERSION = 1  # of what is done to pixels: another one makes all files that are there unfit
-NAMES = ("color", "alpha")
 
 log = logging.getLogger("univoxel")
 # Where photographs may have been kept. Layouts read photographs and need not know of it
@@ -56,7 +56,7 @@ def kept_pixels(origin: str) -> tuple[Tensor, Tensor] | None:
         return None
     try:
         with safe_open(path, "pt") as file:
-            color, alpha = (file.get_tensor(name) for name in NAMES)
+            color, alpha = file.get_tensor("color"), file.get_tensor("alpha")
             if file.metadata().get("checksum") == _checksum(color, alpha):
                 return color, alpha
     except (OSError, SafetensorError):
@@ -73,8 +73,8 @@ def keep_photos(photos: Photos, path: Path) -> None:
     """
     if not photos.origin or _origin_in(path) == photos.origin:
         return
-    tensors = dict(zip(NAMES, (photos.color, photos.alpha), strict=True))
-    facts = {"origin": photos.origin, "checksum": _checksum(*tensors.values())}
+    tensors = {"color": photos.color, "alpha": photos.alpha}
+    facts = {"origin": photos.origin, "checksum": _checksum(photos.color, photos.alpha)}
     try:
         with replacing(path) as temporary:
             save_file(tensors, temporary, facts)
@@ -94,5 +94,5 @@ def _origin_in(path: Path) -> str | None:
 def _checksum(*tensors: Tensor) -> str:
     value = 0
     for tensor in tensors:
-        value = zlib.crc32(memoryview(tensor.contiguous().numpy()).cast("B"), value)
+        value = zlib.crc32(tensor.flatten().view(torch.uint8).numpy().data, value)
     return f"{value:08x}"

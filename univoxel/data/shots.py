@@ -265,11 +265,10 @@ def resampled(
     """Stored colour and alpha, straightened and then shrunk in linear light; stored as before."""
     height, width = (n // factor for n in alpha.shape)
     colors, alphas = color.new_zeros(height, width, 3), alpha.new_zeros(height, width)
-    top, left, bottom, right = 0, 0, height, width
-    if grid is None:  # what a mask hides is black
-        top, bottom = _span(alpha.any(1), factor)
-        left, right = _span(alpha.any(0), factor)
-    whole = None if grid is None else _premultiplied(color, alpha)
+    there = alpha > 0 if grid is None else _looked_up(alpha > 0, grid)
+    top, bottom = _span(there.any(1), factor)  # what a mask hides is black
+    left, right = _span(there.any(0), factor)
+    whole = color if grid is None else _premultiplied(color, alpha)
     rows = max(1, BAND // (factor * color.shape[1]))  # in bands, to save memory
     for row in range(top, bottom, rows):
         into = slice(row, min(row + rows, bottom)), slice(left, right)
@@ -280,6 +279,18 @@ def resampled(
             part = straighten(whole, grid[of])
         colors[into], alphas[into] = _stored(shrink(part, factor), color.dtype, alpha.dtype)
     return colors, alphas
+
+
+def _looked_up(there: Tensor, grid: Tensor) -> Tensor:
+    """Where lookups [H, W, 2] of `straighten` may find what is true in a picture: [H, W]."""
+    inside = torch.ones(grid.shape[:2], dtype=torch.bool)
+    for axis, found in enumerate((there.any(0), there.any(1))):
+        first, end = _span(found, 1)
+        # The centre of a pixel may be one from that of the next. Beyond the border is the border
+        low = 2 * (first - 1) / len(found) - 1 if first else -torch.inf
+        high = 2 * (end + 1) / len(found) - 1 if end < len(found) else torch.inf
+        inside &= (grid[..., axis] > low) & (grid[..., axis] < high)
+    return inside if there.any() else torch.zeros_like(inside)
 
 
 def _span(there: Tensor, factor: int) -> tuple[int, int]:

@@ -113,11 +113,11 @@ def fitted_masks(
     """
     coverage, cameras = photos.coverage(), photos.cameras
     distance = mask_distances(coverage, cameras)
-    of_each = (
+    colors, covered, away = (
         [cameras.cut(v, picture) for v, picture in enumerate(pictures)]
         for pictures in (photos.color, coverage, distance)
     )
-    excess = mask_excess(*of_each, cfg)
+    excess = mask_excess(colors, covered, away, cfg)
     if not excess:
         return photos, distance
     much = f"masks are {excess} {'pixel' if excess == 1 else 'pixels'} too wide"

@@ -99,10 +99,9 @@ def observe(
     order = torch.argsort(index, stable=True)
     counts = torch.bincount(index, minlength=len(position))
     offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-    sorted_ = (torch.cat(parts)[order] for parts in (wo, color, view))
-    return Observations(
-        position, normal, offsets, *sorted_, photos.cameras.camera_to_world[:, :, 3]
-    )
+    by_point = [torch.cat(parts)[order] for parts in (wo, color, view)]
+    eyes = photos.cameras.camera_to_world[:, :, 3]
+    return Observations(position, normal, offsets, *by_point, eye=eyes)
 
 
 def mean_colors(observations: Observations) -> Tensor:
