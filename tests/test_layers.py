@@ -33,7 +33,7 @@ LAYERS = [
     {"compression", "pictures"},
     {"build", "evaluation", "segmentation"},
     {"tasks"},
-    {"tasks.demo"},
+    {"tasks.demo", "tasks.submit"},
     {"experiments.plots", "experiments.record"},
     {"experiments.worker"},
     {"experiments.runner"},
@@ -46,8 +46,8 @@ HELPERS = {
     "fields": {"bricks", "dense", "distances", "features"},
     "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
     "data": {
-        *("base", "foreign", "images", "inside", "kept", "lens", "missing", "orb", "radiance"),
-        *("shots", "tensoir", "transforms"),
+        *("base", "foreign", "images", "inside", "kept", "lens", "maps", "missing", "orb"),
+        *("radiance", "shots", "tensoir", "transforms"),
     },
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
@@ -192,5 +192,6 @@ def test_functions_are_short():
 
 def test_tasks_are_commands():
     names = {path.stem for path in (ROOT / "univoxel" / "tasks").glob("*.py")} - {"__init__"}
-    commands = {"cutout", "train", "eval", "relight", "export", "envmap", "inspect", "info", "demo"}
+    commands = {"cutout", "train", "eval", "relight", "export", "envmap", "submit", "inspect"}
+    commands |= {"info", "demo"}
     assert names - {"evaluate"} | {"eval"} == commands <= set(COMMANDS)
