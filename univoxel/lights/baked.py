@@ -16,6 +16,7 @@ from univoxel.records import Occlusion, Surface
 class BakedConfig:
     """Shading stays in the albedo, as in a photogrammetry mesh with a texture."""
 
+    # name of this light, by which config.json tells it from the others
     kind: Literal["baked"] = field(default="baked", init=False)
 
 
