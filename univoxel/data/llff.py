@@ -2,7 +2,7 @@
 
 poses_bounds.npy            [V, 17]: a row for each photograph, in the order of their names
 images/<name>               photographs, or images_<n>/: shrunk by n
-masks/<name>.png            masks, where there are any; masks_<n>/ for images_<n>/
+masks/<name>.png            masks, where there are any; for images_<n>/ also masks_<n>/
 
 A row is camera-to-world [3, 4] with the camera axes down, right and backwards, beside it a column
 of height, width and focal length, and at the end the nearest and farthest depth, which say nothing
@@ -55,7 +55,8 @@ def load_llff(folder: Path, split: str = "train", downscale: int = 0, masks: boo
         down, right, back, position = camera[:, :4].T
         pose = pose_of(np.stack([right, -down, back, position], 1), where)
         lens = _lens(camera[:, 4], picture, where)
-        mask = find_mask(folder, picture.name, f"masks{ending}")
+        masked = (find_mask(folder, picture.name, place) for place in (f"masks{ending}", "masks"))
+        mask = next((found for found in masked if found), None)
         shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
     shots, remarks = upright(shots)
     shots = listed_split(folder, shots, split)
