@@ -52,8 +52,8 @@ HELPERS = {
     "fields": {"bricks", "dense", "distances", "features"},
     "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
     "data": {
-        *("base", "foreign", "images", "inside", "kept", "lens", "maps", "missing", "orb"),
-        *("radiance", "shots", "tensoir", "transforms"),
+        *("arrays", "base", "foreign", "images", "inside", "kept", "lens", "maps", "missing"),
+        *("orb", "radiance", "shots", "tensoir", "transforms"),
     },
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from univoxel.data.arrays import read_npy
 from univoxel.data.base import Photos
 from univoxel.data.foreign import fitted, listed_split
 from univoxel.data.images import SUFFIXES
@@ -64,11 +65,8 @@ def load_llff(folder: Path, split: str = "train", downscale: int = 0, masks: boo
 
 
 def _rows(path: Path) -> np.ndarray:
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path}: expected an array of NumPy, could not read it: {error}") from None
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != COLUMNS:
+    rows = read_npy(path)
+    if rows.ndim != 2 or rows.shape[1] != COLUMNS:
         raise DataError(f"{path}: expected [V, {COLUMNS}] numbers, got {np.shape(rows)}")
     if rows.dtype.kind not in "fiu" or not len(rows):
         raise DataError(f"{path}: expected [V, {COLUMNS}] numbers, got {len(rows)} of {rows.dtype}")

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from univoxel.camera import Cameras
+from univoxel.data.arrays import read_npy
 from univoxel.data.base import Photos
 from univoxel.data.maps import read_map
 from univoxel.envmap import EnvMap, lookup
@@ -83,10 +84,7 @@ def orb_geometry(path: Path, key: str, camera_to_world: Tensor) -> tuple[Tensor,
     Returns:
         [H, W, 3] or [H, W] float32, 0 where there is nothing, and [H, W] float32 of 0 and 1.
     """
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path}: expected an array of NumPy, could not read it: {error}") from None
+    array = read_npy(path)
     shape = "[H, W, 3]" if key == "normal" else "[H, W]"
     fits = array.ndim == 3 and array.shape[2] == 3 if key == "normal" else array.ndim == 2
     if not fits or array.dtype.kind != "f" or not np.isfinite(array).all():
