@@ -435,6 +435,27 @@ def envmap(
         print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
 
 
+def submit(
+    run: Run,
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    samples: Annotated[int, arg(metavar="N")] = SAMPLES,
+    bounces: Annotated[int, arg(metavar="N")] = BOUNCES,
+) -> None:
+    """Write what the benchmark of Stanford-ORB measures, of a run trained on a scene of it.
+
+    Args:
+        run: folder of a trained run
+        out: folder to write; its submission.json lists the files, as scripts/test.py of the
+            benchmark reads it
+        samples: light samples per pixel of relit pictures
+        bounces: reflections between parts of the object in relit pictures, 0 for none
+    """
+    from univoxel.tasks import submit as task
+
+    print(task.submit(run, out, samples, bounces))
+
+
 def inspect(
     run: Run,
     /,
@@ -616,6 +637,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "relight": relight,
     "export": export,
     "envmap": envmap,
+    "submit": submit,
     "inspect": inspect,
     "info": info,
     "compare": compare,

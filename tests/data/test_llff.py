@@ -5,6 +5,7 @@ import pytest
 from layouts import FOCAL, scene, write_llff
 
 from univoxel.data import load_photos
+from univoxel.data.images import write_png
 from univoxel.errors import DataError
 
 
@@ -19,6 +20,19 @@ def test_the_largest_photographs_are_read(tmp_path):
     write_llff(tmp_path, scene(width=6, height=4), original=8, place="images_8")
     write_llff(tmp_path, scene(), original=4, place="images_4")
     assert load_photos(tmp_path).cameras.width == 12
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+def test_masks_of_the_originals(tmp_path, odd):
+    """images_4 beside masks of four times the size, rows and columns left over cut off."""
+    write_llff(tmp_path, scene(), original=4, place="images_4")
+    (tmp_path / "masks").mkdir()
+    block = np.tile(np.repeat(np.uint8([0, 40, 80, 120]), 1), (4, 1))  # mean 60
+    for path in (tmp_path / "masks_4").iterdir():
+        path.unlink()
+        whole = np.pad(np.tile(block, (8, 12)), ((0, odd), (0, odd)))
+        write_png(tmp_path / "masks" / path.name, whole)
+    assert (load_photos(tmp_path).alpha == 60).all()
 
 
 def change(folder, rows):

@@ -63,7 +63,10 @@ def two_lights(folder):
             lambda f: (f / "train_001" / "metadata.json").write_text("{"),
             "metadata.json: broken JSON",
         ),
-        (lambda f: (f / "train_001" / "rgba_sunset.png").unlink(), "expected rgba_sunset.png"),
+        (
+            lambda f: [(f / f"train_00{v}" / "rgba_sunset.png").unlink() for v in range(5)],
+            r"no picture .*train_000/rgba_sunset\.png, .*, \.\.\.: 5 of 8 are missing",
+        ),
         (two_lights, r"train_000: expected rgba\.png, .* got rgba_a\.png, rgba_b\.png"),
     ],
 )

@@ -12,12 +12,12 @@ Source: Yariv et al. 2020 (IDR) and Wang et al. 2021 (NeuS), the conventions of 
 from __future__ import annotations
 
 import re
-import zipfile
 from pathlib import Path
 
 import numpy as np
 from scipy.linalg import rq
 
+from univoxel.data.arrays import read_npz
 from univoxel.data.base import Photos
 from univoxel.data.foreign import TO_OPENGL, check_skew
 from univoxel.data.images import SUFFIXES, image_size, turn_note
@@ -27,6 +27,8 @@ from univoxel.data.transforms import lens_of, pose_of
 from univoxel.errors import DataError
 
 FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
+PREFIX = "world_mat_"
+KEY = re.compile(r"world_mat_[0-9]{1,9}")
 IMAGES = ("image", "images", "rgb")
 MASKS = ("mask", "masks")
 
@@ -91,12 +93,8 @@ def _file(folder: Path) -> Path | None:
 
 def _matrices(path: Path) -> dict[int, np.ndarray]:
     """[3, 4] from the world to pixels, by number."""
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            keys = [key for key in file.files if re.fullmatch(r"world_mat_\d+", key)]
-            found = {int(key.removeprefix("world_mat_")): file[key] for key in keys}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise DataError(f"{path}: expected an npz file, could not read it: {error}") from None
+    arrays = read_npz(path, PREFIX)
+    found = {int(key.removeprefix(PREFIX)): a for key, a in arrays.items() if KEY.fullmatch(key)}
     if not found:
         raise DataError(f"{path}: expected arrays world_mat_0, world_mat_1 .., got none")
     for number, matrix in found.items():

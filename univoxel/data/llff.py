@@ -2,7 +2,7 @@
 
 poses_bounds.npy            [V, 17]: a row for each photograph, in the order of their names
 images/<name>               photographs, or images_<n>/: shrunk by n
-masks/<name>.png            masks, where there are any; masks_<n>/ for images_<n>/
+masks/<name>.png            masks, where there are any; for images_<n>/ also masks_<n>/
 
 A row is camera-to-world [3, 4] with the camera axes down, right and backwards, beside it a column
 of height, width and focal length, and at the end the nearest and farthest depth, which say nothing
@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from univoxel.data.arrays import read_npy
 from univoxel.data.base import Photos
 from univoxel.data.foreign import fitted, listed_split
 from univoxel.data.images import SUFFIXES
@@ -55,7 +56,8 @@ def load_llff(folder: Path, split: str = "train", downscale: int = 0, masks: boo
         down, right, back, position = camera[:, :4].T
         pose = pose_of(np.stack([right, -down, back, position], 1), where)
         lens = _lens(camera[:, 4], picture, where)
-        mask = find_mask(folder, picture.name, f"masks{ending}")
+        masked = (find_mask(folder, picture.name, place) for place in (f"masks{ending}", "masks"))
+        mask = next((found for found in masked if found), None)
         shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
     shots, remarks = upright(shots)
     shots = listed_split(folder, shots, split)
@@ -63,11 +65,8 @@ def load_llff(folder: Path, split: str = "train", downscale: int = 0, masks: boo
 
 
 def _rows(path: Path) -> np.ndarray:
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path}: expected an array of NumPy, could not read it: {error}") from None
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != COLUMNS:
+    rows = read_npy(path)
+    if rows.ndim != 2 or rows.shape[1] != COLUMNS:
         raise DataError(f"{path}: expected [V, {COLUMNS}] numbers, got {np.shape(rows)}")
     if rows.dtype.kind not in "fiu" or not len(rows):
         raise DataError(f"{path}: expected [V, {COLUMNS}] numbers, got {len(rows)} of {rows.dtype}")

@@ -36,6 +36,7 @@ LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
 # How far +Z may be from the cameras' common up direction in a world that is taken as upright:
 # cameras are held askew and lean over, but worlds that are not upright are turned by much more.
 LEAN = math.radians(30)
+MASK_ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/guide/masks.md"
 
 
@@ -240,7 +241,7 @@ def read_photo(path: Path, mask: Path | None = None, masks: bool = True) -> tupl
     if mask is None and alpha is None:
         mask = next((file for file in beside if file.is_file()), None)
     if mask is not None:
-        alpha = read_image(mask)[..., 0]
+        alpha = _shrunk_to(color, read_image(mask)[..., 0])
         if alpha.shape != color.shape[:2]:
             raise DataError(
                 f"{mask}: expected {size_of(color)} pixels, got {size_of(alpha)}{turn_note(path)}"
@@ -251,6 +252,16 @@ def read_photo(path: Path, mask: Path | None = None, masks: bool = True) -> tupl
             f"{HOW_TO_MASK}"
         )
     return (color.clamp_min(0) if linear else color).contiguous(), alpha.contiguous()
+
+
+def _shrunk_to(color: Tensor, alpha: Tensor) -> Tensor:
+    """A mask of N times the size of its photograph as means over squares of N x N pixels."""
+    (height, width), (high, wide) = color.shape[:2], alpha.shape
+    factor = max(high // height, 1)
+    if factor == 1 or (high // factor, wide // factor) != (height, width):
+        return alpha
+    found = shrink(coverage_of(alpha)[..., None], factor)[..., 0]
+    return (255 * found).round().to(torch.uint8) if alpha.dtype == torch.uint8 else found
 
 
 def _beside(path: Path) -> list[Path]:
@@ -328,13 +339,13 @@ def _stored(picture: Tensor, of_color: torch.dtype, of_alpha: torch.dtype) -> tu
 
 
 def find_mask(folder: Path, image: str, place: str = "masks") -> Path | None:
-    """The mask of a photograph in COLMAP's naming: masks/<image>.png; or with its ending replaced.
+    """The mask of a photograph: in COLMAP's naming, masks/<image>.png; or of the same stem.
 
     Args:
         image: path of the photograph within its folder.
         place: folder of the masks within `folder`.
     """
-    names = f"{image}.png", str(Path(image).with_suffix(".png"))
+    names = [f"{image}.png", *(str(Path(image).with_suffix(ending)) for ending in MASK_ENDINGS)]
     return next((path for n in names if (path := folder / place / n).is_file()), None)
 
 

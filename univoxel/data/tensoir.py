@@ -11,6 +11,7 @@ from pathlib import Path
 
 from univoxel.data.base import Photos
 from univoxel.data.images import image_size
+from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, read_shots
 from univoxel.data.transforms import lens_of, number, pose_of, short
 from univoxel.errors import DataError
@@ -35,16 +36,19 @@ def load_tensoir(
     if not views:
         raise DataError(f"{folder}: expected {split}_000/metadata.json and more, got none")
     picture = photographed(folder)
-    shots = [_shot(view, picture) for view in views]
+    there = [view for view in views if (view / picture).is_file()]
+    missing = [view / picture for view in views if view not in there]
+    remarks = left_out(str(folder), missing, len(views))
+    shots = [_shot(view, picture) for view in there]
     kind = f"TensoIR layout ({picture})"
-    return read_shots(folder, kind, split, shots, downscale, masks=masks)
+    return read_shots(folder, kind, split, shots, downscale, remarks, masks)
 
 
 def photographed(folder: Path) -> str:
     """Name of the pictures that are trained on: rgba.png, rgba_sunset.png or the only one."""
-    first = min(path.parent for path in folder.glob("*_[0-9][0-9][0-9]/metadata.json"))
-    if (train := folder / "train_000").is_dir():
-        first = train
+    views = sorted(path.parent for path in folder.glob("*_[0-9][0-9][0-9]/metadata.json"))
+    views.sort(key=lambda view: not view.name.startswith("train_"))
+    first = next((view for view in views if any(view.glob("rgba*.png"))), views[0])
     names = sorted(path.name for path in first.glob("rgba*.png"))
     for name in ("rgba.png", f"rgba_{LIGHT}.png"):
         if name in names:
@@ -71,8 +75,7 @@ def _shot(view: Path, picture: str) -> Shot:
         ) from None
     if len(values) != 16:
         raise DataError(f"{path}: expected 16 numbers in cam_transform_mat, got {short(text)}")
-    if not (image := view / picture).is_file():
-        raise DataError(f"{view}: expected {picture}, got none")
+    image = view / picture
     angle = number(meta, "cam_angle_x", str(path), 0.0, math.pi)
     camera = {"camera_angle_x": angle}
     camera |= {to: meta[key] for to, key in (("w", "imw"), ("h", "imh")) if key in meta}

@@ -12,7 +12,6 @@ points.npz                                          points on the true surface
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from univoxel.camera import stacked
 from univoxel.color import srgb_to_linear
+from univoxel.data.arrays import read_npz
 from univoxel.data.base import Photos, Truth
 from univoxel.data.images import read_image
 from univoxel.data.lens import shrink
@@ -104,7 +104,7 @@ def load_points(folder: str | Path) -> Tensor | None:
     path = Path(folder) / "points.npz"
     if not path.is_file():
         return None
-    arrays = _read_npz(path)
+    arrays = read_npz(path)
     points = arrays.get("points")
     if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise DataError(f"{path}: expected an array points [P, 3], got {_shapes(arrays)}")
@@ -125,7 +125,7 @@ def _relit(folder: Path, name: str, map: str) -> Path:
 
 
 def _arrays(path: Path, factor: int) -> Truth:
-    arrays = _read_npz(path)
+    arrays = read_npz(path)
     shape = arrays["alpha"].shape if "alpha" in arrays else None
     if shape is None or len(shape) != 2:
         raise DataError(f"{path}: expected an array alpha [H, W], got {_shapes(arrays)}")
@@ -211,14 +211,6 @@ def _shrunk(key: str, value: Tensor, alpha: Tensor, factor: int) -> Tensor:
     if key == "normal":
         flat = torch.nn.functional.normalize(flat, dim=-1)
     return flat if value.dim() == 3 else flat[..., 0]
-
-
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise DataError(f"{path}: expected an npz file, could not read it: {error}") from None
 
 
 def _shapes(arrays: dict[str, np.ndarray]) -> str:

@@ -1,0 +1,164 @@
+"""What Stanford-ORB's benchmark measures of a trained scene, and the list that it reads.
+
+DIR/submission.json                 info.<scene>: view, light, geometry, material: output_* and
+                                    target_* files; shape: output_mesh, target_mesh
+DIR/view/<name>.exr                 test views, linear
+DIR/light/<scene>_<name>.exr        test views of other scenes, in their light
+DIR/normal/<name>.exr               axes of the camera: x right, y up, z backwards
+DIR/depth/<name>.exr                along -Z
+DIR/albedo/<name>.exr               linear
+DIR/mesh.obj
+
+Source: the public code of Kuang et al. 2023 (Stanford-ORB), scripts/test.py and orb/pipelines.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from univoxel.bars import track
+from univoxel.camera import resize
+from univoxel.checkpoint import load_scene
+from univoxel.data import Photos
+from univoxel.data.images import write_exr
+from univoxel.data.orb import orb_light, scene_folders
+from univoxel.data.shots import cameras_of
+from univoxel.data.transforms import read_frames
+from univoxel.envmap import tables
+from univoxel.errors import ExistingFile, UserError
+from univoxel.files import replacing
+from univoxel.names import BOUNCES, SAMPLES
+from univoxel.pictures.layers import Relighting, render_layers
+from univoxel.records import Mesh
+from univoxel.render.pipeline import extract_mesh
+from univoxel.render.relight import Lighting, traced_mesh
+from univoxel.run import photos_of
+from univoxel.scene import Scene
+from univoxel.tasks.export import export
+
+SIZE = 512  # pixels along a side of the benchmark's pictures
+FILE = "submission.json"
+LIGHT = "light"  # name of the only one of a picture
+
+
+@torch.no_grad()
+def submit(
+    run: str | Path, out: str | Path, samples: int = SAMPLES, bounces: int = BOUNCES
+) -> Path:
+    """Write what Stanford-ORB measures of a run that was trained on a scene of it; return its list.
+
+    Views of other scenes are rendered in the light that was measured there, where the data has it.
+
+    Args:
+        run: folder of the trained scene.
+        out: folder to write.
+        samples: light samples per pixel of relit pictures, at least 1.
+        bounces: reflections between parts of the object in relit pictures, 0 for none.
+
+    Raises:
+        DataError: the run or its data cannot be used, or are none of Stanford-ORB.
+        ExistingFile: out is there already.
+        UserError: samples or bounces out of range, or there is no surface.
+        OSError: a file cannot be written.
+    """
+    if samples < 1 or bounces < 0:
+        raise UserError(
+            f"submit: expected samples >= 1 and bounces >= 0, got {samples} and {bounces}",
+            "samples",
+            "bounces",
+        )
+    run, out = Path(run), Path(out)
+    if out.exists():
+        raise ExistingFile(f"{out} is there already: choose another out", "out")
+    photos = photos_of(run)
+    folder, truth = scene_folders(photos.folder)
+    scene = load_scene(run)
+    info: dict[str, object] = _test_views(scene, photos, folder, truth, out)
+    mesh = extract_mesh(scene)
+    info["light"] = _relit_views(scene, mesh, photos, truth, out, samples, bounces)
+    export(run, out / "mesh.obj")
+    target = truth / "mesh_blender" / "mesh.obj"
+    info["shape"] = {"output_mesh": _text(out / "mesh.obj"), "target_mesh": _text(target)}
+    with replacing(out / FILE) as temporary:
+        text = json.dumps({"info": {folder.name: info}}, indent=1)
+        temporary.write_text(text + "\n", encoding="utf-8")
+    return out / FILE
+
+
+def _test_views(
+    scene: Scene, photos: Photos, folder: Path, truth: Path, out: Path
+) -> dict[str, object]:
+    """Render the test views; the lists view, geometry and material."""
+    view, geometry, material = [], [], []
+    cameras = resize(photos.cameras, SIZE)
+    for v in track(range(len(photos)), "rendering test views"):
+        name = photos.names[v]
+        layers = render_layers(scene, cameras, v)
+        normal = layers.normal @ cameras.camera_to_world[v, :, :3]
+        files = {
+            "view": _write(out / "view" / f"{name}.exr", layers.rgb),
+            "normal": _write(out / "normal" / f"{name}.exr", normal),
+            "depth": _write(out / "depth" / f"{name}.exr", layers.depth),
+            "albedo": _write(out / "albedo" / f"{name}.exr", layers.albedo),
+        }
+        mask = {"target_mask": _text(folder / "test_mask" / f"{name}.png")}
+        photo = _text(folder / "test" / f"{name}.exr")
+        view.append({"output_image": files["view"], "target_image": photo})
+        albedo = _text(truth / "pseudo_gt_albedo" / f"{name}.png")
+        material.append({"output_image": files["albedo"], "target_image": albedo, **mask})
+        geometry.append(
+            {
+                "output_depth": files["depth"],
+                "target_depth": _text(truth / "z_depth" / f"{name}.npy"),
+                "output_normal": files["normal"],
+                "target_normal": _text(truth / "surface_normal" / f"{name}.npy"),
+                **mask,
+            }
+        )
+    return {"view": view, "geometry": geometry, "material": material}
+
+
+def _relit_views(
+    scene: Scene,
+    mesh: Mesh,
+    photos: Photos,
+    truth: Path,
+    out: Path,
+    samples: int,
+    bounces: int,
+) -> list[dict[str, str]]:
+    """Render views of other scenes, each in its own light; the list light."""
+    path = photos.folder / "transforms_novel.json"
+    if not path.is_file():
+        return []
+    _, shots, _ = read_frames(path)
+    traced, found = traced_mesh(mesh, scene.field.voxel_size), []
+    for shot in track(shots, "relighting"):
+        there, name = shot.image.parent.parent.name, shot.image.stem
+        camera = resize(cameras_of([shot.pose], [shot.lens]), SIZE)
+        light = orb_light(truth.parent / there / "env_map" / f"{name}.exr", camera)
+        relighting = Relighting(
+            {LIGHT: Lighting(tables(light))}, traced, torch.ones(3), samples, bounces
+        )
+        rgb = render_layers(scene, camera, 0, relighting).relit[LIGHT]
+        file = _write(out / "light" / f"{there}_{name}.exr", rgb)
+        found.append({"output_image": file, "target_image": _text(shot.image)})
+    return found
+
+
+def _write(path: Path, picture: Tensor) -> str:
+    """Write a picture [S, S, 3] or [S, S] as the benchmark reads it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    channels = (
+        {"Z": picture} if picture.dim() == 2 else dict(zip("RGB", picture.unbind(2), strict=True))
+    )
+    write_exr(path, channels, half=False)
+    return _text(path)
+
+
+def _text(path: Path) -> str:
+    return str(path.resolve())
