@@ -254,6 +254,7 @@ def test_pictures_of_differing_sizes_and_linear_ones_are_kept(tmp_path, read):
     assert len(read) == 8
     assert first.color.dtype == torch.float32
     assert same(first, again)
-    assert torch.equal(first.cameras.sizes, again.cameras.sizes)
+    assert torch.equal(first.cameras.size_of_each(), again.cameras.size_of_each())
+    assert first.cameras.sizes is not None
     with safe_open(file, "pt") as opened:
         assert set(opened.keys()) == {"color", "alpha"}

@@ -13,9 +13,11 @@ from scipy.spatial.transform import Rotation
 from univoxel.camera import project
 from univoxel.data import load_cameras, load_photos
 from univoxel.data.images import orientation, write_png
+from univoxel.data.lens import Lens
 from univoxel.data.shots import Shot, upright
 from univoxel.errors import DataError
 
+LENS = Lens(4, 4, (4.0, 4.0), (2.0, 2.0))
 # Of every third photograph: left out at the left and at the top
 CUT = ((0, 0), (5, 0), (2, 3))
 
@@ -163,7 +165,7 @@ def test_up_is_that_of_photographs_as_they_are_looked_at(tmp_path, written):
         held = Rotation.from_rotvec([0, 0, HELD[tag] * np.pi / 2]).as_matrix()
         pose = whole.poses[v, :3].copy()
         pose[:, :3] = pose[:, :3] @ held
-        shots.append(Shot(name, "", path, None, pose, None))
+        shots.append(Shot(name, "", path, None, pose, LENS))
     level = [
         replace(s, pose=whole.poses[v, :3], image=tmp_path / "none") for v, s in enumerate(shots)
     ]

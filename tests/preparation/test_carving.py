@@ -1,5 +1,6 @@
 """Hollows: a ball with a pit is opened, a mirror and a plain ball are left as they are."""
 
+import dataclasses
 from functools import cache
 from pathlib import Path
 
@@ -8,9 +9,10 @@ import torch
 from analytic import cameras_around, look_at
 from cropped import cropped
 
-from univoxel.camera import Cameras, image_rays
+from univoxel.camera import Cameras, image_rays, pixel_rays
 from univoxel.data import Photos
 from univoxel.grid import fit_grid
+from univoxel.preparation import carving
 from univoxel.preparation.carving import carve_concavities, carving_pictures
 from univoxel.preparation.config import CarvingConfig
 from univoxel.preparation.depth_sweep import log_colors
@@ -200,3 +202,12 @@ def test_carving_is_that_of_whole_pictures(factor):
     assert carved.sum() > 100
     # Equal costs that rounding tells apart
     assert ((found > 0) != (wanted > 0)).sum() <= 0.01 * carved.sum()
+
+
+def test_of_points_beyond_a_picture_its_own_nearest_pixel_is_taken():
+    cameras = cameras_around(2, size=SIZE)
+    cameras = dataclasses.replace(cameras, sizes=torch.tensor([[30, 40], [SIZE, SIZE]]))
+    pixel = torch.tensor([[29.5, 39.5], [35.5, 20.5], [-3.0, 60.0]])  # the first lies in it
+    rays = pixel_rays(cameras, torch.tensor(0), pixel)
+    _, found = carving._distance_and_pixel(rays.origin + 2 * rays.direction, cameras, 0)
+    assert found.tolist() == [39 * SIZE + 29, 20 * SIZE + 29, 39 * SIZE]

@@ -349,3 +349,18 @@ def test_sheet_needs_rows_of_one_kind():
     for rows in ([], [("a", [])], [("a", [panel]), ("b", [panel, panel])]):
         with pytest.raises(ValueError, match="rows of the same quantities"):
             contact_sheet(rows)
+
+
+def test_views_of_differing_sizes_stand_on_one_sheet():
+    """Each in its shape, one under another."""
+    shapes = [(160, 80), (80, 160), (40, 40)]
+    rows = []
+    for k, (height, width) in enumerate(shapes):
+        picture = torch.full((height, width, 3), (100 + k) / 255)
+        rows.append((f"r_{k}", [Panel("novel view", picture, picture, None, 1.0)]))
+    sheet = contact_sheet(rows)[18:, 8 + 8 * 3 :]  # without words
+    for k, (height, width) in enumerate(shapes):
+        row, column = (sheet == 100 + k).all(-1).nonzero()
+        assert len(row) == 2 * height * width  # estimate and truth
+        assert np.ptp(row) + 1 == height
+        assert len(np.unique(column)) == 2 * width

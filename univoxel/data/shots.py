@@ -109,8 +109,9 @@ def read_shots(
 def fitting_downscale(shots: Sequence[Shot]) -> int:
     """The side of the squares of pixels whose means are as much as grids and memory can use.
 
-    Half of the photographs are then FINE pixels long or longer, about, and all together are LARGE
-    at most. Those of 1499 pixels and fewer stay as they are, unless they are very many.
+    The longer side of the median photograph is then FINE pixels, about, and all photographs
+    together are LARGE at most. Those of 1499 pixels and fewer stay as they are, unless they are
+    very many.
     """
     sizes = [(shot.lens.width, shot.lens.height) for shot in shots]
     most = min(map(min, sizes))
@@ -184,7 +185,7 @@ def _read_each(
             else resampled(color, alpha, factor, grid)
         )
 
-    pool = ThreadPoolExecutor(min(READERS, len(os.sched_getaffinity(0))))
+    pool = ThreadPoolExecutor(min(READERS, os.cpu_count() or 1))
     try:
         yield from pool.map(read, shots, pinholes)
     finally:
