@@ -18,6 +18,7 @@ import os
 import resource
 import select
 import shutil
+import signal
 import struct
 import subprocess
 import sys
@@ -28,7 +29,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -479,7 +480,7 @@ def outcome_of(name: str, seed: int, sound_ones: Path, said: Path) -> tuple[str,
             outcome, why = "nonsense", str(error)
         except UserError as error:
             outcome, why = "refused", str(error)
-            if str(folder) not in why:
+            if "/" not in why:  # a path: of the file, or of what it names
                 outcome = "nameless"
         except MemoryError as error:
             outcome, why = "memory", repr(error)
@@ -495,8 +496,36 @@ def outcome_of(name: str, seed: int, sound_ones: Path, said: Path) -> tuple[str,
     return outcome, f"{done}: {why}"
 
 
-def work() -> None:
-    """Answer cases on stdin, a line each, on stdout."""
+def nonsense() -> None:
+    sound(np.array([np.nan]))
+
+
+def nameless() -> None:
+    raise UserError("expected something else")
+
+
+def crash() -> None:
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+# How a reader fails that is made to, by the outcome that it should have
+FAILING: dict[str, Callable[[], object]] = {
+    "nonsense": nonsense,
+    "nameless": nameless,
+    "noise": lambda: os.write(2, b"a line of a library"),
+    "traceback": lambda: {}["a"],
+    "memory": lambda: bytearray(MEMORY * 2),
+    "hang": lambda: time.sleep(1000),
+    "signal": crash,
+}
+
+
+def work(failing: str) -> None:
+    """Answer cases on stdin, a line each, on stdout.
+
+    Args:
+        failing: an outcome that all cases are made to have; of none, they have their own.
+    """
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as place:
         said = Path(place) / "said"
@@ -504,12 +533,14 @@ def work() -> None:
         nowhere = os.open(said, os.O_CREAT | os.O_WRONLY | os.O_APPEND)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
-        for name in READERS:  # what they import and start counts for nothing
+        for name in () if failing in FAILING else READERS:  # what they import counts for nothing
             outcome_of(name, 0, Path(place), said)
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         limit = pages * resource.getpagesize() + MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         print(json.dumps(["ready", ""]), file=answers)
+        if fail := FAILING.get(failing):
+            READERS["hdr"] = replace(READERS["hdr"], read=lambda _: fail())
         for line in sys.stdin:
             name, seed = json.loads(line)
             print(json.dumps(outcome_of(name, seed, Path(place), said)), file=answers)
@@ -518,13 +549,19 @@ def work() -> None:
 class Worker:
     """A process for many cases, started anew where one ends it."""
 
-    def __init__(self) -> None:
+    def __init__(self, seconds: float = SECONDS, failing: str | None = None) -> None:
+        """
+        Args:
+            seconds: that a case may take.
+            failing: an outcome that all cases are made to have, to see that it is seen.
+        """
+        self._seconds, self._failing = seconds, failing
         self._process: subprocess.Popen[str] | None = None
 
     def ask(self, name: str, seed: int) -> tuple[str, str]:
         """The outcome of a case, and what there is to say of it."""
         if self._process is None:
-            command = [sys.executable, __file__, "--work"]
+            command = [sys.executable, __file__, "--work", self._failing or "honestly"]
             environment = os.environ | {"OMP_NUM_THREADS": "1"}
             pipe = subprocess.PIPE
             self._process = subprocess.Popen(
@@ -536,14 +573,18 @@ class Worker:
         assert self._process.stdin
         self._process.stdin.write(json.dumps([name, seed]) + "\n")
         self._process.stdin.flush()
-        answer = self._answer(SECONDS)
+        answer = self._answer(self._seconds)
         if answer is not None:
             return answer
         hanging = self._process.poll() is None
         self._process.kill()
         code = self._process.wait()
         self._process = None
-        return ("hang", f"more than {SECONDS:g} s") if hanging else ("signal", f"exit code {code}")
+        return (
+            ("hang", f"more than {self._seconds:g} s")
+            if hanging
+            else ("signal", f"exit code {code}")
+        )
 
     def _answer(self, seconds: float) -> tuple[str, str] | None:
         assert self._process
@@ -590,10 +631,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the first case")
     parser.add_argument("--readers", nargs="*", default=list(READERS), choices=list(READERS))
     parser.add_argument("--case", help="NAME:SEED: this one alone, and all that it says")
-    parser.add_argument("--work", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--work", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.work:
-        work()
+        work(chosen.work)
         return 0
     if chosen.case:
         name, _, seed = chosen.case.rpartition(":")

@@ -14,6 +14,7 @@ Source: Mildenhall et al. 2019 (Local Light Field Fusion), "Using your own poses
 from __future__ import annotations
 
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -65,7 +66,7 @@ def load_llff(folder: Path, split: str = "train", downscale: int = 0, masks: boo
 def _rows(path: Path) -> np.ndarray:
     try:
         rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, SyntaxError, TokenError) as error:
         raise DataError(f"{path}: expected an array of NumPy, could not read it: {error}") from None
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != COLUMNS:
         raise DataError(f"{path}: expected [V, {COLUMNS}] numbers, got {np.shape(rows)}")

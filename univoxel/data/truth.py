@@ -12,7 +12,9 @@ points.npz                                          points on the true surface
 from __future__ import annotations
 
 import zipfile
+import zlib
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import torch
@@ -29,6 +31,9 @@ from univoxel.data.transforms import find_image
 from univoxel.errors import DataError
 
 WHOLE = 250 / 255  # coverage above which a pixel is well inside the object
+# What reading a broken npz may raise; the header of an array is Python's text
+_BROKEN = (OSError, ValueError, EOFError, AttributeError, SyntaxError, TokenError)
+_BROKEN += (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError)
 MAP_ENDINGS = (".hdr", ".exr")
 
 
@@ -106,9 +111,11 @@ def load_points(folder: str | Path) -> Tensor | None:
     points = arrays.get("points")
     if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise DataError(f"{path}: expected an array points [P, 3], got {_shapes(arrays)}")
+    with np.errstate(over="ignore"):
+        points = points.astype(np.float32)
     if not np.isfinite(points).all():
         raise DataError(f"{path}: points hold NaN or infinity")
-    return torch.from_numpy(points.astype(np.float32))
+    return torch.from_numpy(points)
 
 
 def _map(folder: Path, name: str) -> Path | None:
@@ -133,7 +140,8 @@ def _arrays(path: Path, factor: int) -> Truth:
     for key, size in wanted.items():
         if key not in arrays:
             continue
-        value = arrays[key].astype(np.float32)
+        with np.errstate(over="ignore"):  # what is infinite then is refused
+            value = arrays[key].astype(np.float32)
         if value.shape != size or not np.isfinite(value).all():
             raise DataError(
                 f"{path}: expected finite {key} of shape {list(size)}, got {list(value.shape)}"
@@ -202,9 +210,14 @@ def _shrunk(key: str, value: Tensor, alpha: Tensor, factor: int) -> Tensor:
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+            found = {key: file[key] for key in file.files}
+    except _BROKEN as error:
         raise DataError(f"{path}: expected an npz file, could not read it: {error}") from None
+    for key, value in found.items():
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
+            kind = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
+            raise DataError(f"{path}: expected arrays of numbers, got {key} of {kind}")
+    return found
 
 
 def _shapes(arrays: dict[str, np.ndarray]) -> str:
