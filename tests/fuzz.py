@@ -29,7 +29,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -254,12 +254,36 @@ READERS: dict[str, Reader] = {
     "result.json": Reader(write_result, "result.json", load_outcome),
 }
 
+
+def nonsense(_: Path) -> None:
+    sound(np.array([np.nan]))
+
+
+def nameless(_: Path) -> None:
+    raise UserError("expected something else")
+
+
+# Readers that fail, by the outcome that they should have: the fuzzer must see it
+FAILING: dict[str, Reader] = {
+    name: Reader(write_hdr, "map.hdr", read)
+    for name, read in {
+        "nonsense": nonsense,
+        "nameless": nameless,
+        "noise": lambda _: os.write(2, b"a line of a library"),
+        "traceback": lambda _: {}["a"],
+        "memory": lambda _: bytearray(2 * MEMORY),
+        "hang": lambda _: time.sleep(1000),
+        "signal": lambda _: os.kill(os.getpid(), signal.SIGSEGV),
+    }.items()
+}
+
+
 # Damage. Each function takes the bytes of a file and gives other ones
 
 COUNTS = (0, 1, 10**9, 2**31 - 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1)
 NUMBERS = (float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 1e-320, 0.0, -1.0)
 VALUES = (
-    *(None, True, False, "", "a", "../../etc/passwd", "/dev/zero", "\0", "\udcff", "x" * 10**5),
+    *(None, True, False, "", "sub/a", "../../etc/passwd", "/dev/zero", "\0", "\udcff", "x" * 10**5),
     *(0, -1, 1, 7, 10**5, 10**9, 2**31, 2**63, 10**400, [], {}, [[]], [1.0] * 1000),
     *NUMBERS,
 )
@@ -463,7 +487,7 @@ def outcome_of(name: str, seed: int, sound_ones: Path, said: Path) -> tuple[str,
         sound_ones: folder of what readers' `write` made, by reader.
         said: the file that stderr goes to.
     """
-    reader = READERS[name]
+    reader = (READERS | FAILING)[name]
     rng = np.random.default_rng([zlib.crc32(name.encode()), seed])
     kept_in = sound_ones / name
     if not kept_in.exists():
@@ -496,36 +520,8 @@ def outcome_of(name: str, seed: int, sound_ones: Path, said: Path) -> tuple[str,
     return outcome, f"{done}: {why}"
 
 
-def nonsense() -> None:
-    sound(np.array([np.nan]))
-
-
-def nameless() -> None:
-    raise UserError("expected something else")
-
-
-def crash() -> None:
-    os.kill(os.getpid(), signal.SIGSEGV)
-
-
-# How a reader fails that is made to, by the outcome that it should have
-FAILING: dict[str, Callable[[], object]] = {
-    "nonsense": nonsense,
-    "nameless": nameless,
-    "noise": lambda: os.write(2, b"a line of a library"),
-    "traceback": lambda: {}["a"],
-    "memory": lambda: bytearray(MEMORY * 2),
-    "hang": lambda: time.sleep(1000),
-    "signal": crash,
-}
-
-
-def work(failing: str) -> None:
-    """Answer cases on stdin, a line each, on stdout.
-
-    Args:
-        failing: an outcome that all cases are made to have; of none, they have their own.
-    """
+def work() -> None:
+    """Answer cases on stdin, a line each, on stdout."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as place:
         said = Path(place) / "said"
@@ -533,14 +529,12 @@ def work(failing: str) -> None:
         nowhere = os.open(said, os.O_CREAT | os.O_WRONLY | os.O_APPEND)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
-        for name in () if failing in FAILING else READERS:  # what they import counts for nothing
+        for name in READERS:  # what they import and start counts for nothing
             outcome_of(name, 0, Path(place), said)
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         limit = pages * resource.getpagesize() + MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
         print(json.dumps(["ready", ""]), file=answers)
-        if fail := FAILING.get(failing):
-            READERS["hdr"] = replace(READERS["hdr"], read=lambda _: fail())
         for line in sys.stdin:
             name, seed = json.loads(line)
             print(json.dumps(outcome_of(name, seed, Path(place), said)), file=answers)
@@ -549,19 +543,18 @@ def work(failing: str) -> None:
 class Worker:
     """A process for many cases, started anew where one ends it."""
 
-    def __init__(self, seconds: float = SECONDS, failing: str | None = None) -> None:
+    def __init__(self, seconds: float = SECONDS) -> None:
         """
         Args:
             seconds: that a case may take.
-            failing: an outcome that all cases are made to have, to see that it is seen.
         """
-        self._seconds, self._failing = seconds, failing
+        self._seconds = seconds
         self._process: subprocess.Popen[str] | None = None
 
     def ask(self, name: str, seed: int) -> tuple[str, str]:
         """The outcome of a case, and what there is to say of it."""
         if self._process is None:
-            command = [sys.executable, __file__, "--work", self._failing or "honestly"]
+            command = [sys.executable, __file__, "--work"]
             environment = os.environ | {"OMP_NUM_THREADS": "1"}
             pipe = subprocess.PIPE
             self._process = subprocess.Popen(
@@ -576,15 +569,8 @@ class Worker:
         answer = self._answer(self._seconds)
         if answer is not None:
             return answer
-        hanging = self._process.poll() is None
-        self._process.kill()
-        code = self._process.wait()
-        self._process = None
-        return (
-            ("hang", f"more than {self._seconds:g} s")
-            if hanging
-            else ("signal", f"exit code {code}")
-        )
+        hanging, code = self._process.poll() is None, self.close()
+        return ("hang", f"more than {self._seconds:g} s") if hanging else ("signal", f"code {code}")
 
     def _answer(self, seconds: float) -> tuple[str, str] | None:
         assert self._process
@@ -597,11 +583,14 @@ class Worker:
             return None
         return tuple(json.loads(line))
 
-    def close(self) -> None:
-        """End the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
+    def close(self) -> int | None:
+        """End the process, if there is one; its exit code."""
+        process, self._process = self._process, None
+        if process is None:
+            return None
+        process.kill()
+        process.communicate()
+        return process.returncode
 
 
 def run(
@@ -631,10 +620,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the first case")
     parser.add_argument("--readers", nargs="*", default=list(READERS), choices=list(READERS))
     parser.add_argument("--case", help="NAME:SEED: this one alone, and all that it says")
-    parser.add_argument("--work", help=argparse.SUPPRESS)
+    parser.add_argument("--work", action="store_true", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.work:
-        work(chosen.work)
+        work()
         return 0
     if chosen.case:
         name, _, seed = chosen.case.rpartition(":")
