@@ -101,8 +101,6 @@ def load_outcome(folder: Path) -> Outcome | None:
         return None
     try:
         return Outcome(**read_json(path))
-    except DataError:
-        raise
     except (OSError, ValueError, TypeError) as error:
         raise DataError(f"{path}: expected the record of a training: {error}") from None
 
