@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from univoxel.lights import lobes, priors
-from univoxel.lights.base import Regularisation
+from univoxel.lights.base import MOST_DIRECTIONS, MOST_ROWS, Regularisation
 from univoxel.lights.latlong import AbstractLatLongLight, LatLongConfig
 from univoxel.records import Surface
 from univoxel.sphere import latlong_directions
@@ -36,6 +36,9 @@ class EnvmapSGConfig(LatLongConfig):
             self, "at least 1", lambda x: x >= 1, "lobes", "rows", "directions", "directions_eval"
         )
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "max_sharpness")
+        most = f"at most {MOST_DIRECTIONS}"
+        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
+        check_fields(self, f"at most {MOST_ROWS}", lambda x: x <= MOST_ROWS, "rows")
 
 
 class EnvmapSGLight(AbstractLatLongLight):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from univoxel.lights import latlong, priors
-from univoxel.lights.base import Regularisation
+from univoxel.lights.base import MOST_DIRECTIONS, MOST_ROWS, Regularisation
 from univoxel.lights.latlong import AbstractLatLongLight, LatLongConfig
 from univoxel.records import Surface
 from univoxel.validation import check_fields
@@ -32,6 +32,9 @@ class EnvmapConfig(LatLongConfig):
 
     def __post_init__(self):
         check_fields(self, "at least 1", lambda x: x >= 1, "rows", "directions", "directions_eval")
+        most = f"at most {MOST_DIRECTIONS}"
+        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
+        check_fields(self, f"at most {MOST_ROWS}", lambda x: x <= MOST_ROWS, "rows")
 
 
 class EnvmapLight(AbstractLatLongLight):
