@@ -31,7 +31,6 @@ from univoxel.data.transforms import find_image
 from univoxel.errors import DataError
 
 WHOLE = 250 / 255  # coverage above which a pixel is well inside the object
-# What reading a broken npz may raise; the header of an array is Python's text
 MAP_ENDINGS = (".hdr", ".exr")
 
 
