@@ -31,6 +31,7 @@ LAYERS = [
     {"build", "evaluation", "segmentation"},
     {"tasks"},
     {"tasks.demo", "tasks.submit"},
+    {"api"},
     {"experiments.plots", "experiments.record"},
     {"experiments.worker"},
     {"experiments.runner"},

@@ -1,30 +1,63 @@
 """univoxel: from photographs to a relightable object, on a plain CPU.
 
-The tasks of the command line are functions here: `univoxel.cutout(data, out)` for photographs
-without masks, `univoxel.train(config)`, `univoxel.evaluate(run)`,
-`univoxel.relight(run, envmap)`, which returns pictures, and `univoxel.export(run, mesh)`.
+    run = univoxel.train("photos", "runs/mug", preset="fast")
+    pictures = run.relight("studio.hdr", cameras="orbit 36")
+
+`open_run` opens one that is there. The tasks of the command line are functions here too:
+`cutout(data, out)` for photographs without masks, `evaluate(run)`, `relight(run, envmap)`, which
+returns pictures, and `export(run, mesh)`.
 """
 
 from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from univoxel.api import Run as Run
+    from univoxel.api import TrainingProgress as TrainingProgress
+    from univoxel.api import open_run as open_run
+    from univoxel.api import train as train
+    from univoxel.errors import Cancelled as Cancelled
+    from univoxel.errors import UserError as UserError
+    from univoxel.tasks.cutout import cutout as cutout
+    from univoxel.tasks.evaluate import evaluate as evaluate
+    from univoxel.tasks.export import export as export
+    from univoxel.tasks.relight import relight_images as relight
 
 __version__ = "0.1.0"
+__all__ = [
+    "Cancelled",
+    "Run",
+    "TrainingProgress",
+    "UserError",
+    "cutout",
+    "evaluate",
+    "export",
+    "open_run",
+    "relight",
+    "train",
+]
 
 # Imported when asked for: `import univoxel` does not wait for torch.
-_TASKS = {
+_PLACES = {
+    "Cancelled": ("univoxel.errors", "Cancelled"),
+    "Run": ("univoxel.api", "Run"),
+    "TrainingProgress": ("univoxel.api", "TrainingProgress"),
+    "UserError": ("univoxel.errors", "UserError"),
     "cutout": ("univoxel.tasks.cutout", "cutout"),
-    "train": ("univoxel.tasks.train", "train"),
     "evaluate": ("univoxel.tasks.evaluate", "evaluate"),
-    "relight": ("univoxel.tasks.relight", "relight_images"),
     "export": ("univoxel.tasks.export", "export"),
+    "open_run": ("univoxel.api", "open_run"),
+    "relight": ("univoxel.tasks.relight", "relight_images"),
+    "train": ("univoxel.api", "train"),
 }
 
 
-def __getattr__(name: str):
-    if name not in _TASKS:
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, function = _TASKS[name]
-    return getattr(import_module(module), function)
+    module, attribute = _PLACES[name]
+    return getattr(import_module(module), attribute)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_TASKS])
+    return sorted([*globals(), *_PLACES])

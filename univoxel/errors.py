@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 
+class Cancelled(Exception):
+    """Raised in on_progress by a caller of the package: ends a training, which can be resumed."""
+
+
 class UserError(ValueError):
     """A mistake of the user: the message says what was expected and what came.
 

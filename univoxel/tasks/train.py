@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from univoxel.confidence.report import numbers, words
 from univoxel.confidence.survey import survey
 from univoxel.config import TrainConfig, check_same, save_config
 from univoxel.data import Photos, keep_photos, load_photos
-from univoxel.errors import ExistingFile, UserError
+from univoxel.errors import Cancelled, ExistingFile, UserError
 from univoxel.files import replacing
 from univoxel.grid import fit_grid
 from univoxel.joint import stage as joint_stage
@@ -30,18 +31,25 @@ from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
 from univoxel.training.loop import run_stage
 from univoxel.training.pixels import TrainingPixels, split_pixels
-from univoxel.training.progress import LOG, Progress
+from univoxel.training.progress import LOG, Progress, TrainingProgress
 
 log = logging.getLogger("univoxel")
 
 
-def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None = None) -> Path:
+def train(
+    cfg: TrainConfig,
+    resume: bool = False,
+    timelapse: str | Path | None = None,
+    on_progress: Callable[[TrainingProgress], None] | None = None,
+) -> Path:
     """Train a scene; leave model, log, preview, configuration and trust.txt in cfg.out; return it.
 
     Args:
         resume: go on with the run in cfg.out from its last checkpoint; begin where there is none.
         timelapse: .gif, .mp4 or folder for pictures of a view over training time; making them does
             not count as time.
+        on_progress: called every few seconds. Where it raises `Cancelled` the run is saved, and can
+            be resumed.
 
     Raises:
         DataError: input that cannot be used.
@@ -71,11 +79,16 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         (cfg.out / LOG).unlink(missing_ok=True)
     save_config(cfg)
     keep_photos(photos, kept)
-    with Progress(limited, begin - state.get("seconds", 0.0), state) as progress:
+    begin -= state.get("seconds", 0.0)
+    with Progress(limited, begin, state, on_progress) as progress:
         if film:
             progress.clock.watch = lambda: film.take_frame(scene, progress.clock)
-        for index in range(progress.clock.stage, len(cfg.stages)):
-            make_stage_(scene, limited, index, silhouettes.box, pixels, progress)
+        try:
+            for index in range(progress.clock.stage, len(cfg.stages)):
+                make_stage_(scene, limited, index, silhouettes.box, pixels, progress)
+        except Cancelled:
+            save_scene(scene, cfg.out, progress.state())
+            raise
         if film:
             film.finish(scene, progress.clock)
     save_trust(scene, pixels.photos, cfg, progress.troubles)

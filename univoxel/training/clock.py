@@ -192,9 +192,11 @@ class Clock:
     def stopped(self) -> Iterator[None]:
         """A block whose time does not count at all."""
         self._stopped = time.monotonic()
-        yield
-        spent, self._stopped = time.monotonic() - self._stopped, None
-        self.begin += spent
+        try:
+            yield
+        finally:
+            spent, self._stopped = time.monotonic() - self._stopped, None
+            self.begin += spent
 
     def cut(self) -> str:
         """A line about the stages that time ended before their steps; empty if none was."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import resource
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -21,6 +23,20 @@ REPORT_SECONDS = 5.0
 CHECKPOINT_SECONDS = 20.0  # of work that a kill costs, about
 
 log = logging.getLogger("univoxel")
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """How far a training is."""
+
+    stage: int  # from 1
+    stages: int
+    share: float  # of the whole run, in [0, 1]
+    seconds: float  # of training so far
+    remaining: float  # seconds, about
+    losses: dict[str, float]  # weighted, by name
+    held_out_psnr: float | None  # dB, of pixels that are only looked at; None: not measured now
+    rays_per_second: float
 
 
 class Listener(Protocol):
@@ -51,13 +67,21 @@ class Listener(Protocol):
 class Progress:
     """A run on a clock, with a bar and a log in its folder. Used in a `with` block."""
 
-    def __init__(self, cfg: TrainConfig, begin: float, state: dict):
+    def __init__(
+        self,
+        cfg: TrainConfig,
+        begin: float,
+        state: dict,
+        on_progress: Callable[[TrainingProgress], None] | None = None,
+    ):
         """
         Args:
             begin: of training, on time.monotonic's clock.
             state: as `state` gave it; empty at the begin of a run.
+            on_progress: called with each report.
         """
         self.cfg, self.clock = cfg, Clock(cfg, begin, state)
+        self._on_progress = on_progress
         self.chosen = [CapacityChoice.from_json(entry) for entry in state.get("chosen", ())]
         self.troubles: list[str] = list(state.get("troubles", ()))  # what went wrong and was mended
         self._log = cfg.out / LOG
@@ -129,6 +153,10 @@ class Progress:
         append_line(self._log, json.dumps(line))
         done = clock.share_done
         remaining = clock.seconds * (1 - done) / max(done, 1e-3)
+        if self._on_progress is not None:
+            place = clock.stage + 1, len(self.cfg.stages), done, now, remaining
+            with clock.stopped():  # its time is the caller's affair
+                self._on_progress(TrainingProgress(*place, losses, psnr, rate))
         quality = "" if psnr is None else f"held-out {psnr:.1f} dB  "
         if self.troubles:
             quality += f"{len(self.troubles)} troubles  "

@@ -1,0 +1,106 @@
+"""The package as a library: a run from beginning to end, quiet, and cancelled half way."""
+
+import dataclasses
+
+import pytest
+import torch
+from analytic import cameras_around, write_scene
+
+import univoxel
+from univoxel import api
+from univoxel.envmap import EnvMap
+from univoxel.errors import DataError, ExistingFile
+from univoxel.presets import preset
+from univoxel.training import progress as progress_module
+
+SMALL = (
+    *(f"stages.{i}.{field}" for i in (0, 1, 3) for field in ("voxels=0.01", "rays=128")),
+    *("stages.0.iterations=10", "stages.1.iterations=20", "stages.3.iterations=5"),
+    *("stages.2.iterations=10", "stages.2.points=200", "stages.2.newton_points=50"),
+    *("stages.2.rays=64", "scene.sky_nodes=64", "voxel_pixels=0", "hollows=0"),
+)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("ball") / "data")
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("ball") / "run"
+    return univoxel.train(str(data), str(out), minutes=2, changes=SMALL)
+
+
+def test_a_run_and_what_it_can_do(run, tmp_path, capfd):
+    rendered = run.render()
+    assert rendered.shape == (2, 32, 32, 4)
+    assert rendered[..., 3].max() > 0.9
+    relit = run.relight(EnvMap(torch.ones(4, 8, 3)), cameras="orbit 2", resolution=16, samples=4)
+    assert relit.shape == (2, 16, 16, 4)
+    assert run.render(cameras_around(3, 16)).shape == (3, 16, 16, 4)
+    assert run.export(str(tmp_path / "ball.ply")).stat().st_size > 1000
+    assert run.light(8).radiance.shape == (8, 16, 3)
+    assert run.mesh().albedo.shape == run.mesh().vertices.shape
+    assert run.trust.strip()
+    assert {"losses", "held_out_psnr", "seconds"} <= run.log[-1].keys() if run.log else True
+    measures = run.evaluate(samples=2)
+    assert measures["nvs_psnr"] > 10
+    assert capfd.readouterr().out == ""
+
+
+def test_a_run_that_is_there(run):
+    again = univoxel.open_run(str(run.path))
+    assert repr(again) == f"Run({str(run.path)!r})"
+    assert torch.equal(again.mesh().vertices, run.mesh().vertices)
+
+
+def test_a_folder_without_a_run(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no checkpoint in"):
+        univoxel.open_run(tmp_path)
+
+
+def test_cancelled_and_resumed(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(progress_module, "REPORT_SECONDS", 0.0)
+    out, seen = tmp_path / "run", []
+
+    def cancel(now):
+        seen.append(now)
+        if now.stage == 2:
+            raise univoxel.Cancelled
+
+    with pytest.raises(univoxel.Cancelled):
+        univoxel.train(data, out, minutes=2, changes=SMALL, on_progress=cancel)
+    assert [now.stage for now in seen][-1] == 2
+    assert all(0 <= now.share <= 1 and now.stages == 4 and now.losses for now in seen)
+    with pytest.raises(ExistingFile):
+        univoxel.train(data, out, minutes=2, changes=SMALL)
+    again = []
+    run = univoxel.train(data, out, minutes=2, changes=SMALL, on_progress=again.append, resume=True)
+    assert again[0].stage == 2  # what was done is not done again
+    assert run.mesh().vertices.isfinite().all()
+
+
+def test_the_configuration_alone_is_enough_as_before(data, tmp_path, monkeypatch):
+    asked = {}
+    monkeypatch.setattr(
+        api, "train_config", lambda cfg, **options: asked.update(options) or cfg.out
+    )
+    cfg = preset("draft", data, tmp_path / "run")
+    assert univoxel.train(cfg, resume=True) == tmp_path / "run"
+    assert asked["resume"]
+    assert univoxel.train(dataclasses.replace(cfg), True) == tmp_path / "run"
+
+
+def test_what_is_wrong_is_one_line(data, tmp_path):
+    with pytest.raises(TypeError, match="out must be the folder of the run"):
+        univoxel.train(data)
+    with pytest.raises(DataError, match="expected a folder with a scene"):
+        univoxel.train(tmp_path / "nothing", tmp_path / "run")
+    with pytest.raises(AttributeError, match="has no attribute 'trian'"):
+        univoxel.trian  # noqa: B018
+
+
+def test_every_public_name_is_there():
+    assert all(getattr(univoxel, name) is not None for name in univoxel.__all__)
+    assert set(univoxel.__all__) <= set(dir(univoxel))

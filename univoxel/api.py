@@ -1,0 +1,223 @@
+"""The package as a library: `univoxel.train`, `univoxel.open_run`, and what a `Run` can do."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, overload
+
+import torch
+from torch import Tensor
+
+from univoxel.camera import Cameras, stacked
+from univoxel.checkpoint import load_scene
+from univoxel.config import TrainConfig
+from univoxel.envmap import EnvMap
+from univoxel.errors import UserError
+from univoxel.names import ELEVATION, MAP_ROWS, Differing, LightName, PresetOrAuto
+from univoxel.overrides import changed
+from univoxel.pictures.viewpoints import views_of
+from univoxel.presets import chosen
+from univoxel.records import Mesh
+from univoxel.render.pipeline import extract_mesh, shade_hits, surface_of_view
+from univoxel.scene import Scene
+from univoxel.tasks.evaluate import evaluate
+from univoxel.tasks.export import export
+from univoxel.tasks.relight import relight_images
+from univoxel.tasks.train import train as train_config
+from univoxel.training.progress import TrainingProgress
+
+__all__ = ["Run", "TrainingProgress", "open_run", "train"]
+
+
+class Run:
+    """A trained scene, and the folder that it lies in.
+
+    Attributes:
+        path: the folder, as training wrote it.
+        scene: field, materials and light, in evaluation mode.
+    """
+
+    path: Path
+    scene: Scene
+
+    def __init__(self, path: str | Path):
+        """
+        Raises:
+            MissingFile: no trained scene is there.
+            DataError: it cannot be read.
+        """
+        self.path = Path(path)
+        self.scene = load_scene(self.path)
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r})"
+
+    @torch.no_grad()
+    def render(
+        self, cameras: str | Path | Cameras = "test", resolution: int | None = None
+    ) -> Tensor:
+        """Pictures in the light of the photographs: [F, H, W, 4] linear RGBA, premultiplied.
+
+        Args:
+            cameras: "test" for the test views of the data trained on, "orbit" or "orbit N" for N
+                frames around the object, a file in the form of transforms_test.json, or cameras.
+            resolution: pixels along the width; None: as the data's, an orbit's 512.
+
+        Raises:
+            UserError: the cameras cannot be used.
+        """
+        _, views = views_of(self.path, cameras, resolution, ELEVATION, self.mesh())
+        pictures = []
+        for view in range(len(views)):
+            surface, wo = surface_of_view(self.scene, views, view)
+            rgb = shade_hits(self.scene, surface, wo)
+            width, height = views.size(view)
+            rgba = torch.cat([rgb, surface.opacity[:, None]], 1)
+            pictures.append(rgba.reshape(height, width, 4))
+        return stacked(pictures)
+
+    def relight(
+        self,
+        envmap: str | Path | EnvMap | None = None,
+        cameras: str | Path | Cameras = "test",
+        **options: Any,
+    ) -> Tensor:
+        """Pictures under new light: [F, H, W, 4] linear RGBA, premultiplied.
+
+        Args:
+            envmap: a file, a map, or None for suns and point lights alone.
+            cameras, options: fields of `univoxel.tasks.relight.RelightOptions`.
+
+        Raises:
+            UserError: a map or the cameras cannot be used, or a number is out of range.
+        """
+        return relight_images(self.path, envmap, cameras, **options)
+
+    def export(self, path: str | Path, **options: Any) -> Path:
+        """Write the surface with its materials as .glb, .obj or .ply; return the file.
+
+        Args:
+            options: as of `univoxel.tasks.export.export`.
+
+        Raises:
+            UserError: an argument is out of range, or there is no surface.
+            OSError: a file cannot be written.
+        """
+        export(self.path, path, **options)
+        return Path(path)
+
+    @torch.no_grad()
+    def light(self, height: int = MAP_ROWS) -> EnvMap:
+        """The environment map that was recovered, `height` rows of it.
+
+        Raises:
+            UserError: this run has none: it was trained with local light alone.
+        """
+        sky = self.scene.environment()
+        if sky is None:
+            raise UserError(
+                f"{self.path}: this run has no environment map: it was trained with "
+                f"{self.scene.cfg.light.kind} light alone"
+            )
+        return EnvMap(self.scene.exposed(sky.latlong(height)))
+
+    @torch.no_grad()
+    def mesh(self) -> Mesh:
+        """The surface as triangles, with materials at the vertices.
+
+        Raises:
+            NoSurface: there is none.
+        """
+        return extract_mesh(self.scene)
+
+    @property
+    def trust(self) -> str:
+        """What the photographs leave open, in words; empty where the run has no trust.txt."""
+        file = self.path / "trust.txt"
+        return file.read_text(encoding="utf-8") if file.is_file() else ""
+
+    @property
+    def log(self) -> list[dict[str, Any]]:
+        """What training reported, every few seconds: time, losses, held-out quality."""
+        file = self.path / "log.jsonl"
+        if not file.is_file():
+            return []
+        return [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+
+    def evaluate(self, **options: Any) -> dict[str, float | int | None]:
+        """Measures on the test views; options as of `univoxel.tasks.evaluate.evaluate`."""
+        return evaluate(self.path, **options)
+
+
+def open_run(path: str | Path) -> Run:
+    """The run in a folder.
+
+    Raises:
+        MissingFile: no trained scene is there.
+        DataError: it cannot be read.
+    """
+    return Run(path)
+
+
+@overload
+def train(
+    data: TrainConfig, /, resume: bool = False, timelapse: str | Path | None = None
+) -> Path: ...
+
+
+@overload
+def train(
+    data: str | Path,
+    out: str | Path,
+    *,
+    preset: PresetOrAuto = "auto",
+    light: LightName = "hybrid",
+    varying: Differing = "auto",
+    minutes: float | None = None,
+    changes: Sequence[str] = (),
+    on_progress: Callable[[TrainingProgress], None] | None = None,
+    resume: bool = False,
+) -> Run: ...
+
+
+def train(
+    data: str | Path | TrainConfig,
+    out: str | Path | bool | None = None,
+    *,
+    preset: PresetOrAuto = "auto",
+    light: LightName = "hybrid",
+    varying: Differing = "auto",
+    minutes: float | None = None,
+    changes: Sequence[str] = (),
+    on_progress: Callable[[TrainingProgress], None] | None = None,
+    resume: bool = False,
+    timelapse: str | Path | None = None,
+) -> Run | Path:
+    """Recover geometry, materials and light from posed photographs.
+
+    Args:
+        data: folder of the photographs and their cameras; or the whole configuration, in place of
+            all else but resume: then the folder of the run is returned.
+        out: folder that the run is written to.
+        preset: how much work goes in: draft, fast or full; auto is what fits into minutes, or fast.
+        light, varying: as of `univoxel.presets.budget`.
+        minutes: wall-clock limit, above 0; None: the preset's.
+        changes: FIELD=VALUE of the configuration, as of --set.
+        on_progress: called every few seconds of training. Raise `univoxel.Cancelled` in it to end
+            the training: it is saved, and goes on with resume.
+        resume: go on with the run in out from its last checkpoint.
+
+    Raises:
+        UserError: an argument or the data cannot be used.
+        ExistingFile: out holds a run already and resume is False.
+        Cancelled: on_progress raised it.
+        OSError: a file of the run cannot be written; what was there before stays.
+    """
+    if isinstance(data, TrainConfig):
+        return train_config(data, resume=resume or out is True, timelapse=timelapse)
+    if out is None or isinstance(out, bool):
+        raise TypeError("train: out must be the folder of the run, got none")
+    config = chosen(preset, minutes, Path(data), Path(out), light, varying)
+    return Run(train_config(changed(config, changes), resume=resume, on_progress=on_progress))
