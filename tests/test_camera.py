@@ -1,11 +1,12 @@
 """Pixels to rays and back, and the axes of the camera."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from univoxel.camera import Cameras, image_rays, pixel_rays, project
+from univoxel.camera import Cameras, image_rays, pixel_rays, project, resize, sizes_of, stacked
 
 
 def cameras():
@@ -71,3 +72,57 @@ def test_field_of_view():
     edges = torch.tensor([[0.0, 3.0], [8.0, 3.0]])
     left, right = pixel_rays(cameras(), torch.zeros(2, dtype=torch.int64), edges).direction
     assert math.acos(float(left @ right)) == pytest.approx(angle, rel=1e-5)
+
+
+def upright_and_across():
+    """The two cameras with a portrait and a landscape."""
+    width, height, sizes = sizes_of([(6, 8), (8, 4)])
+    assert (width, height) == (8, 8)
+    return replace(cameras(), width=width, height=height, sizes=sizes)
+
+
+def test_pictures_of_differing_sizes_are_stored_from_their_top_left_corner():
+    pictures = [torch.rand(8, 6, 3), torch.rand(4, 8, 3)]
+    stored = stacked(pictures, beyond=7.0)
+    cams = upright_and_across()
+    assert stored.shape == (2, cams.height, cams.width, 3)
+    for view, picture in enumerate(pictures):
+        assert torch.equal(cams.cut(view, stored[view]), picture)
+    assert (stored[0, :, 6:] == 7).all()
+    assert (stored[1, 4:] == 7).all()
+    assert sizes_of([(3, 2), (3, 2)]) == (3, 2, None)
+    alike = [torch.rand(2, 3), torch.rand(2, 3)]
+    assert torch.equal(stacked(alike), torch.stack(alike))
+
+
+def test_rays_of_a_view_are_those_of_its_own_picture():
+    cams = upright_and_across()
+    for view, (width, height) in enumerate([(6, 8), (8, 4)]):
+        rays = image_rays(cams, view)
+        assert cams.size(view) == (width, height)
+        assert len(rays.direction) == width * height
+        last = pixel_rays(cams, torch.tensor(view), torch.tensor([width - 0.5, height - 0.5]))
+        torch.testing.assert_close(rays.direction[-1], last.direction)
+
+
+def test_some_views_keep_their_sizes():
+    cams = upright_and_across()
+    one = cams.of(torch.tensor([1]))
+    assert (len(one), one.size(0), one.width, one.height) == (1, (8, 4), 8, 8)
+    assert torch.equal(one.focal, cams.focal[1:])
+    assert cams.size_of_each().tolist() == [[6, 8], [8, 4]]
+    assert cameras().size_of_each().tolist() == [[8, 6], [8, 6]]
+
+
+def test_resized_pictures_show_the_same():
+    """The width is the widest one's; the lower right corner of each stays where it is."""
+    for cams in (cameras(), upright_and_across()):
+        small = resize(cams, 4)
+        assert small.width == 4
+        for view in range(2):
+            before, after = (
+                pixel_rays(c, torch.tensor(view), torch.tensor([float(n) for n in c.size(view)]))
+                for c in (cams, small)
+            )
+            torch.testing.assert_close(before.direction, after.direction)
+    assert small.size_of_each().tolist() == [[3, 4], [4, 2]]

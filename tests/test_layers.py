@@ -45,7 +45,7 @@ HELPERS = {
     "ops": {"checks", "dense_grid", "grid_sampling", "native", "reflectance", "visibility"},
     "fields": {"bricks", "dense", "distances", "features"},
     "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
-    "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
+    "data": {"base", "images", "kept", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "preparation": {"depth_sweep", "carving", "exposures", "hull", "masks", "registration"},

@@ -28,6 +28,7 @@ from univoxel.names import (
     CamerasFrom,
     CapacityOrAuto,
     Differing,
+    Downscale,
     FieldName,
     Ground,
     LightName,
@@ -71,15 +72,17 @@ def check_minutes(minutes: float | None) -> None:
         raise UserError(f"--minutes must be above 0, got {minutes:g}")
 
 
-def check_downscale(downscale: int | None) -> int:
-    """The side of the squares of pixels that become one; 0 where none is given.
+def check_downscale(downscale: Downscale) -> int:
+    """The side of the squares of pixels that become one; 0 for auto.
 
     Raises:
         UserError: it is below 1.
     """
-    if downscale is not None and downscale < 1:
+    if downscale == "auto":
+        return 0
+    if downscale < 1:
         raise UserError(f"--downscale must be at least 1, got {downscale}")
-    return downscale or 0
+    return downscale
 
 
 def sun_light(values: tuple[float, ...]) -> Sun:
@@ -139,9 +142,7 @@ def train(
     varying: Differing = "auto",
     masks: MasksFrom = "auto",
     cameras: CamerasFrom = "auto",
-    downscale: Annotated[
-        int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
-    ] = None,
+    downscale: Annotated[Downscale, arg(metavar="auto|N")] = "auto",
     field: FieldName = "hash",
     minutes: Annotated[
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
@@ -173,7 +174,8 @@ def train(
         masks: auto takes masks in that end outside of the object, as the photographs show it
         cameras: refined puts the photographs' cameras right, before training and in it; auto does
             so where their silhouettes contradict one another
-        downscale: train on photographs of 1/N of their width and height
+        downscale: train on photographs of 1/N of their width and height; auto is as large as
+            leaves what grids can use, 1 for photographs of 1499 pixels and fewer
         field: hash takes features from a small table of many resolutions; dense stores them at
             every node of the grid, sparse in bricks around the surface alone, for finer grids than
             the presets', such as --set stages.1.voxels=30
@@ -216,9 +218,7 @@ def cutout(
         tuple[float, float, float, float, float, float] | None,
         arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: around what cameras look at)"),
     ] = None,
-    downscale: Annotated[
-        int | None, arg(metavar="N", help_behavior_hint="(default: 1, unless that is very large)")
-    ] = None,
+    downscale: Annotated[Downscale, arg(metavar="auto|N")] = "auto",
 ) -> None:
     """Cut the object out of photographs without masks.
 
@@ -230,7 +230,7 @@ def cutout(
         out: folder to write
         box: lower and upper corner of where the object is, in the world of the cameras; what lies
             in it, such as a table, is part of the object
-        downscale: write photographs of 1/N of their width and height
+        downscale: write photographs of 1/N of their width and height; auto as of train
     """
     from univoxel.tasks import cutout as task
 

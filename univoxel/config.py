@@ -34,8 +34,9 @@ class TrainConfig:
     out: Path  # folder of the run
     stages: tuple[StageConfig | JointConfig, ...]
     minutes: float  # > 0; training ends in time, with what it has
-    # pixels of the photographs along a side of one that is trained on, >= 1; 0: 1, but large
-    # photographs are refused
+    # pixels of the photographs along a side of one that is trained on, >= 1; 0: as many as leave
+    # what grids can use, 1 for photographs of 1499 pixels and fewer. A run's config.json has the
+    # number that was found
     downscale: int = 0
     # pixels of the photographs, where the object is, that a voxel is at least as wide as, >= 0: a
     # finer grid would only learn their noise
@@ -135,10 +136,12 @@ def check_same(cfg: TrainConfig) -> None:
         raise UserError(f"{path}: expected an object with the configuration, got {before!r:.80}")
     began = _completed(before, cfg)
     # of configurations from before there were any
-    since = {"downscale": 0, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
+    since = {"downscale": 1, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
     since |= {"masks": "given", "cameras": "given", "exposures": False}
     began |= {name: value for name, value in since.items() if name not in before}
     now = _as_json(cfg)
+    for one in (began, now):
+        one["downscale"] = one["downscale"] or 1  # 0 was 1 before it was found
     for name in ("stages", "scene", "preparation", "compression", *since):
         if began.get(name) != now[name]:
             raise UserError(

@@ -19,6 +19,7 @@ LIGHTS: tuple[LightName, ...] = get_args(LightName)
 
 Background: TypeAlias = Literal["transparent", "map", "black"]
 Ground: TypeAlias = float | Literal["lowest"] | None  # height of a floor, or at the lowest point
+Downscale: TypeAlias = Literal["auto"] | int  # side of the squares of pixels that become one
 Animation: TypeAlias = Literal["gif", "mp4"]
 ANIMATIONS: tuple[Animation, ...] = get_args(Animation)
 

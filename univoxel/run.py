@@ -5,8 +5,13 @@ from __future__ import annotations
 from json import loads
 from pathlib import Path
 
-from univoxel.data import Photos, load_photos
+from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import DataError
+
+
+def kept_photos(run: Path, split: str) -> Path:
+    """The file of a run that keeps photographs of a split as they were shrunk or straightened."""
+    return run / f"photographs_{split}.safetensors"
 
 
 def trained_on(run: Path) -> Path:
@@ -26,7 +31,12 @@ def photos_of(run: Path, data: Path | None = None, split: str = "test") -> Photo
     if data is not None and not (run / "config.json").is_file():
         return load_photos(data, split)
     folder, downscale = _data_of(run)
-    return load_photos(data or folder, split, downscale)
+    if data is not None and data != folder:
+        return load_photos(data, split, downscale)
+    kept = kept_photos(run, split)
+    photos = load_photos(folder, split, downscale, kept=kept)
+    keep_photos(photos, kept)
+    return photos
 
 
 def _data_of(run: Path) -> tuple[Path, int]:
@@ -34,7 +44,8 @@ def _data_of(run: Path) -> tuple[Path, int]:
     path = run / "config.json"
     try:
         config = loads(path.read_text(encoding="utf-8"))
-        return Path(config["data"]), int(config.get("downscale", 0))
+        # 0 in runs from before a size was chosen for large photographs: those were refused
+        return Path(config["data"]), int(config.get("downscale", 0)) or 1
     except FileNotFoundError:
         raise DataError(f"{run}: expected the folder of a run, got no {path.name}") from None
     except (KeyError, TypeError, AttributeError, ValueError) as error:

@@ -264,10 +264,6 @@ BROKEN = {
     ),
     "a fisheye": (root(is_fisheye=True), "frame 0: expected one of the camera models .* a fisheye"),
     "another camera": (frame(camera_model="EQUIRECTANGULAR"), "models .* got 'EQUIRECTANGULAR'"),
-    "another size": (
-        lambda f: write_png(f / "train" / "r_1.png", rgba(width=5)),
-        r"r_1\.png: expected 6x4 pixels like r_0, got 5x4",
-    ),
     "size unlike the file's": (root(w=60, h=40), r"pictures of 60x40 pixels \(w and h\), got 6x4"),
     "transparent": (transparent, "all 2 pictures are fully transparent"),
     "opaque": (all_opaque, "all 2 pictures are fully opaque: cut the object out"),

@@ -87,7 +87,7 @@ def other_mask(folder):
         (root(test_filenames="p_000"), "expected test_filenames as a list of file_paths"),
         (root(test_filenames=[]), "frames of the file in test_filenames, got an empty list"),
         (root(test_filenames=["x/y.png"]), "frames of the file in test_filenames, got y"),
-        (other_size, r"p_008\.png: expected 12x8 pixels like p_000, got 9x8"),
+        (other_size, r"masks/p_008\.png: expected 9x8 pixels, got 12x8"),
     ],
 )
 def test_broken_files(data, change, message):

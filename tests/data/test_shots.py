@@ -1,5 +1,8 @@
 """What all loaders share: size of photographs, masks, memory."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +12,10 @@ from univoxel.camera import project
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data import load_photos, shots, splits_of
 from univoxel.data.images import write_exr, write_png
+from univoxel.data.lens import Lens
+from univoxel.data.shots import Shot
 from univoxel.errors import DataError
+from univoxel.presets import PRESETS
 
 
 @pytest.mark.parametrize("writer", [write_nerf, write_nerfstudio, write_colmap])
@@ -71,17 +77,33 @@ def test_what_is_hidden_does_not_bleed_in(tmp_path):
     assert photos.alpha[0, 0].tolist() == [0, 191, 255]
 
 
-def test_large_photographs_need_a_size(tmp_path, monkeypatch):
-    written = scene()
-    write_nerf(tmp_path, written)
+@pytest.mark.parametrize(
+    ("width", "factor"), [(800, 1), (1499, 1), (1501, 2), (2499, 2), (4032, 4), (8000, 8)]
+)
+def test_photographs_are_shrunk_to_what_grids_can_use(width, factor):
+    lens = Lens(width, 3 * width // 4, (500.0, 500.0), (0.0, 0.0))
+    across = replace(lens, width=lens.height, height=lens.width)
+    shot = Shot("", "", Path(), None, np.eye(4)[:3], lens)
+    set_ = [replace(shot, lens=lens), replace(shot, lens=across)] * 5
+    assert shots.fitting_downscale(set_) == factor
+
+
+def test_presets_use_no_more_than_photographs_are_shrunk_to():
+    """Even where the object fills no more than half of the longer side."""
+    finest = max(1e6 * work.voxels for work in PRESETS.values())
+    assert finest ** (1 / 3) < shots.FINE / 2
+
+
+def test_very_many_photographs_are_shrunk_further(tmp_path, monkeypatch):
+    write_nerf(tmp_path, scene())
+    monkeypatch.setattr(shots, "LARGE", 8 * WIDTH * HEIGHT)
+    assert load_photos(tmp_path).downscale == 1
     monkeypatch.setattr(shots, "LARGE", 8 * WIDTH * HEIGHT - 1)
-    monkeypatch.setattr(shots, "SUGGESTED", 5)
-    with pytest.raises(DataError, match=r"8 photographs of 12x8 pixels take about .* GB") as caught:
-        load_photos(tmp_path)
-    assert "such as downscale=3 for 4x2, or downscale=1 to keep theirs" in str(caught.value)
+    assert load_photos(tmp_path).downscale == 2
+    assert load_photos(tmp_path, "test").downscale == 1
     assert load_photos(tmp_path, downscale=1).cameras.width == WIDTH
-    assert load_photos(tmp_path, downscale=3).cameras.width == 4
-    assert len(load_photos(tmp_path, "test")) == 2
+    monkeypatch.setattr(shots, "LARGE", 0)
+    assert load_photos(tmp_path).downscale == HEIGHT  # a pixel is left
 
 
 def test_downscales_out_of_range(tmp_path):

@@ -181,3 +181,24 @@ def test_semi_global_refuses(small, large, rows, message):
     cost, known = volume()
     with pytest.raises(ValueError, match=message):
         semi_global(cost, known if rows is None else rows, small, large)
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_pictures_of_differing_sizes_end_where_their_coverage_does(backend):
+    """What a smaller picture has lost counts as not seen, and what it still shows as before."""
+    pictures, matrix, origin, direction, start, color, rows, _ = case(holes=False)
+    smaller = pictures.clone()
+    smaller[1, :, 12:] = 0  # stored in the same tensor, nothing beyond
+    rest = matrix, origin, direction, start, color, rows, torch.tensor([1])
+    options = dict(step=STEP, steps=STEPS, radius=0, best=1)
+    with use_backend(backend):
+        found, wanted = (match_cost(p, *rest, **options) for p in (smaller, pictures))
+    t = start[:, None] + STEP * torch.arange(STEPS)
+    points = origin[:, None] + t[..., None] * direction[:, None]
+    column = project(close_by(), 1, points.reshape(-1, 3))[0][:, 0].view(found.shape)
+    within = column < 11.5  # between pixels that both have
+    beyond = column > 12  # less than half covered
+    torch.testing.assert_close(found[within], wanted[within])
+    torch.testing.assert_close(found[beyond], torch.full_like(found[beyond], 0.2))
+    assert (wanted[within] < 0.19).float().mean() > 0.3
+    assert (wanted[beyond] < 0.19).float().mean() > 0.3

@@ -1,14 +1,17 @@
 """Hollows: a ball with a pit is opened, a mirror and a plain ball are left as they are."""
 
 from functools import cache
+from pathlib import Path
 
 import pytest
 import torch
 from analytic import cameras_around, look_at
+from cropped import cropped
 
 from univoxel.camera import Cameras, image_rays
+from univoxel.data import Photos
 from univoxel.grid import fit_grid
-from univoxel.preparation.carving import carve_concavities
+from univoxel.preparation.carving import carve_concavities, carving_pictures
 from univoxel.preparation.config import CarvingConfig
 from univoxel.preparation.depth_sweep import log_colors
 from univoxel.preparation.hull import mask_distances, visual_hull
@@ -175,3 +178,25 @@ def test_what_few_views_see_through_stays():
 def test_two_views_open_nothing():
     hull, found, _, _ = opened(with_pit, checks, from_above(2))
     assert torch.equal(found, hull)
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_carving_is_that_of_whole_pictures(factor):
+    cameras = from_above()
+    pictures = photographed(with_pit, checks, cameras)
+    alpha = pictures[..., 3].float() / 255
+    color = (pictures[..., :3].float() / 255 / alpha[..., None].clamp_min(1e-3)).clamp_max(1)
+    stored = (255 * color).round().byte()
+    names = [f"{v}" for v in range(len(cameras))]
+    whole = Photos(Path("pit"), names, stored, pictures[..., 3], cameras)
+    cut = cropped(whole, factor, room=2)  # squares of pixels begin at the same ones
+    grid = fit_grid(torch.full((3,), -0.6), torch.full((3,), 0.6), 40_000)
+    hull = visual_hull(mask_distances(whole.coverage()), cameras, grid)
+    made = [carving_pictures(p, factor * 0.03) for p in (cut, whole)]
+    assert made[1][1].width == cameras.width // factor
+    assert len(made[0][1].size_of_each().unique(dim=0)) >= 3
+    found, wanted = (carve_concavities(hull, grid, *m) for m in made)
+    carved = (wanted > 0) & (hull < 0)
+    assert carved.sum() > 100
+    # Equal costs that rounding tells apart
+    assert ((found > 0) != (wanted > 0)).sum() <= 0.01 * carved.sum()

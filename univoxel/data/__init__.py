@@ -5,6 +5,7 @@ from pathlib import Path
 from univoxel.data.base import Photos, Truth
 from univoxel.data.blender import is_blender, load_blender
 from univoxel.data.colmap import is_colmap, load_colmap
+from univoxel.data.kept import keep_photos, looking_in
 from univoxel.data.nerfstudio import is_nerfstudio, load_nerfstudio
 from univoxel.data.tensoir import is_tensoir, load_tensoir
 from univoxel.data.transforms import load_cameras
@@ -15,6 +16,7 @@ __all__ = [
     "DataError",
     "Photos",
     "Truth",
+    "keep_photos",
     "load_cameras",
     "load_photos",
     "load_points",
@@ -34,16 +36,22 @@ _LAYOUTS = (
 
 
 def load_photos(
-    folder: str | Path, split: str = "train", downscale: int = 0, masks: bool = True
+    folder: str | Path,
+    split: str = "train",
+    downscale: int = 0,
+    masks: bool = True,
+    kept: Path | None = None,
 ) -> Photos:
     """Read the photographs of one split in whatever layout the folder has.
 
     Lens distortion is taken out. docs/reference/data-sets.md shows the layouts.
 
     Args:
-        downscale: side of the squares of pixels that become one, >= 1; 0 for 1, refused where the
-            photographs are so large that training them would take gigabytes of memory.
+        downscale: side of the squares of pixels that become one, >= 1; 0: as large as leaves what
+            grids can use, 1 for photographs of 1499 pixels and fewer.
         masks: False for photographs as they are, the whole picture opaque.
+        kept: a file of `keep_photos`, there or not. Where it has these photographs, as their files
+            are now, the pixels come from it.
 
     Raises:
         DataError: one line that names the file, what was expected and what came.
@@ -54,7 +62,8 @@ def load_photos(
         raise DataError(f"{folder}: expected a folder with a scene, got {what}")
     for fits, load in _LAYOUTS:
         if fits(folder, split):
-            return load(folder, split, downscale, masks)
+            with looking_in(kept):
+                return load(folder, split, downscale, masks)
     files = sorted(path.name for path in folder.iterdir())
     came = ", ".join(files[:5]) + (", ..." if len(files) > 5 else "") or "an empty folder"
     raise DataError(

@@ -14,7 +14,7 @@ from univoxel.color import srgb_to_linear
 
 @dataclass(frozen=True)
 class Photos:
-    """Posed photographs of one split, all of one size."""
+    """Posed photographs of one split. Of differing sizes, they are stored as `Cameras` says."""
 
     folder: Path
     names: list[str]  # V, unique within the split, such as r_000
@@ -25,6 +25,7 @@ class Photos:
     cameras: Cameras
     about: str = ""  # what was read and how, for people
     downscale: int = 1  # pixels of the files along a side of one of these
+    origin: str = ""  # of pixels that are not those of the files, as of `kept.origin_of`
 
     def __len__(self) -> int:
         return len(self.names)
@@ -34,21 +35,28 @@ class Photos:
         return decode(self.color[view, row, column], self.alpha[view, row, column])
 
     def coverage(self) -> Tensor:
-        """Alpha of all pixels [V, H, W], float32 in [0, 1]."""
-        return self.alpha.float() / 255 if self.alpha.dtype == torch.uint8 else self.alpha
+        """Alpha of all pixels [V, H, W], float32 in [0, 1]; 0 beyond a picture."""
+        return coverage_of(self.alpha)
 
     def picture(self, view: int) -> tuple[Tensor, Tensor]:
-        """Linear straight colour [H, W, 3] and alpha [H, W] of one view, float32."""
-        return decode(self.color[view], self.alpha[view])
+        """Linear straight colour [h, w, 3] and alpha [h, w] of one view, float32."""
+        return decode(*self.stored(view))
+
+    def stored(self, view: int) -> tuple[Tensor, Tensor]:
+        """Colour [h, w, 3] and alpha [h, w] of one view, in its own size, as they are stored."""
+        return self.cameras.cut(view, self.color[view]), self.cameras.cut(view, self.alpha[view])
 
 
 def decode(color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
     """Stored pixels to linear float32."""
     if color.dtype == torch.uint8:
         color = srgb_to_linear(color.float() / 255)
-    if alpha.dtype == torch.uint8:
-        alpha = alpha.float() / 255
-    return color, alpha
+    return color, coverage_of(alpha)
+
+
+def coverage_of(alpha: Tensor) -> Tensor:
+    """Stored alpha as float32 in [0, 1]."""
+    return alpha.float() / 255 if alpha.dtype == torch.uint8 else alpha
 
 
 @dataclass(frozen=True)

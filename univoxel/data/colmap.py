@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.data.base import Photos
-from univoxel.data.images import image_size
+from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import Lens
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
 from univoxel.errors import DataError
@@ -88,7 +88,7 @@ def load_colmap(
         if (width, height) != (lens.width, lens.height):
             raise DataError(
                 f"{path}: expected {lens.width}x{lens.height} pixels as its camera has in "
-                f"{cameras_file.name}, got {width}x{height}"
+                f"{cameras_file.name}, got {width}x{height}{turn_note(path)}"
             )
         name = Path(image.name).with_suffix("").as_posix().replace("/", "_")
         mask = find_mask(folder, image.name)

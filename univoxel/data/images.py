@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 from torch import Tensor
 
 from univoxel.data.radiance import read_radiance
@@ -73,6 +73,34 @@ def image_size(path: str | Path) -> tuple[int, int]:
     except (OSError, SyntaxError, ValueError, RuntimeError, Image.DecompressionBombError) as error:
         kind = "an OpenEXR file" if path.suffix.lower() == ".exr" else "a PNG or JPEG"
         raise DataError(f"{path}: expected {kind}, could not read it: {error}") from None
+
+
+def orientation(path: Path) -> int:
+    """How a JPEG says it is to be turned before it is looked at: EXIF's 1 to 8; 1 is not at all.
+
+    Nothing here turns it: pixels are those of the file, which the cameras beside it are of.
+    """
+    if path.suffix.lower() not in (".jpg", ".jpeg"):
+        return 1
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path, formats=["JPEG"]) as image:
+                found = image.getexif().get(ExifTags.Base.Orientation, 1)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return 1
+    return found if found in range(1, 9) else 1
+
+
+def turn_note(path: Path) -> str:
+    """What is to be said of a picture whose size is not as expected, where its EXIF may be why."""
+    found = orientation(path)
+    if found < 5:  # no quarter turn
+        return ""
+    return (
+        f"; EXIF orientation {found} of {path.name} is not applied: cameras and masks are those of "
+        "the pixels as they are stored"
+    )
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:

@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from univoxel.camera import Cameras
+from univoxel.camera import Cameras, sizes_of
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.data.base import Photos, decode
-from univoxel.data.images import read_image
+from univoxel.data.base import Photos, coverage_of, decode
+from univoxel.data.images import orientation, read_image, turn_note
+from univoxel.data.kept import kept_pixels, origin_of
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
 from univoxel.errors import DataError, UserError
 
-LARGE = 200_000_000  # pixels in all photographs, from where on their size must be chosen
-TRAINING_BYTES = 25  # of memory that training takes for each of them, about
-SUGGESTED = 1000  # pixels along the longer side
+# Pixels along the longer side that photographs are shrunk to, about. An object that fills half of
+# it is 500 pixels wide, the finest grid of the presets some 160 voxels: pixels stay finer
+FINE = 1000
+LARGE = 200_000_000  # pixels in all photographs, at most: training takes 25 bytes for each, about
+READERS = 4  # photographs that are read at once, at most: each may take 0.4 GB while it is shrunk
+BAND = 1 << 20  # pixels of a file, about, that are shrunk at once
+SIZES_TOLD = 3  # of the photographs, that are named one by one, at most
 TEST_EVERY = 8
 LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
 # How far +Z may be from the cameras' common up direction in a world that is taken as upright:
@@ -50,13 +59,14 @@ def read_shots(
     remarks: Sequence[str] = (),
     masks: bool = True,
 ) -> Photos:
-    """Photographs as pinholes see them, all of one size.
+    """Photographs as pinholes see them, each in its own size.
 
     Distortion is taken out, and pixels are averaged, in linear light with premultiplied alpha.
+    Pixels are those of the file: an orientation in its EXIF is not looked at.
 
     Args:
         kind: of the data set, for people.
-        downscale: means over squares of so many pixels; 0 for 1, refused where that is large.
+        downscale: means over squares of so many pixels; 0: what `fitting_downscale` says.
         remarks: on how the files were read, for people.
         masks: False for photographs as they are, the whole picture opaque.
 
@@ -66,61 +76,138 @@ def read_shots(
     if downscale < 0:
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     _check(folder, shots, downscale)
-    factor = downscale or 1
-    colors: list[Tensor] = []
-    alphas: list[Tensor] = []
-    lenses: list[Lens] = []
-    last, grid = None, None
-    for shot in shots:
-        color, alpha = read_photo(shot.image, shot.mask, masks)
-        if colors and color.dtype != colors[0].dtype:
-            raise DataError(
-                f"{shot.image}: expected the format of {shots[0].name} in all photographs"
-            )
-        if shot.lens != last:  # one lens often took all photographs
-            last, grid = shot.lens, None
-            try:
-                pinhole = straightened(shot.lens)
-            except UserError as error:
-                raise DataError(f"{shot.where}: {error}") from None
-            if shot.lens.bent:
-                grid = sources(shot.lens, pinhole)
-        if grid is not None or factor > 1:
-            color, alpha = resampled(color, alpha, factor, grid)
-        colors.append(color)
-        alphas.append(alpha)
-        lenses.append(shrunk(pinhole, factor))
-    if len({alpha.dtype for alpha in alphas}) > 1:
-        alphas = [a if a.is_floating_point() else a / 255 for a in alphas]
-    if not any(bool(alpha.any()) for alpha in alphas):
-        raise DataError(f"{folder}: all {len(alphas)} pictures are fully transparent")
-    if masks and all(
-        bool((alpha == (1 if alpha.is_floating_point() else 255)).all()) for alpha in alphas
-    ):
-        raise DataError(f"{folder}: all {len(alphas)} pictures are fully opaque: {HOW_TO_MASK}")
+    factor = downscale or fitting_downscale(shots)
+    pinholes = _pinholes(shots)
+    cameras = cameras_of([s.pose for s in shots], [shrunk(lens, factor) for lens in pinholes])
+    origin = ""
+    if factor > 1 or any(shot.lens.bent for shot in shots):
+        lenses = [(shot.lens, pinhole) for shot, pinhole in zip(shots, pinholes, strict=True)]
+        origin = origin_of([f for shot in shots for f in _files(shot)], lenses, factor, masks)
+    pixels = kept_pixels(origin) if origin else None
+    color, alpha = pixels or _read_all(folder, shots, pinholes, cameras, factor, masks)
 
-    told = [f"{len(shots)} photographs of {lenses[0].width}x{lenses[0].height} pixels in {split}"]
+    told = [f"{len(shots)} photographs of {_words(cameras)} pixels in {split}"]
     told += ["lens distortion taken out"] if any(shot.lens.bent for shot in shots) else []
     told += [f"shrunk to 1/{factor}"] if factor > 1 else []
     return Photos(
         folder=folder,
         names=[shot.name for shot in shots],
-        color=torch.stack(colors),
-        alpha=torch.stack(alphas),
-        cameras=cameras_of([shot.pose for shot in shots], lenses),
+        color=color,
+        alpha=alpha,
+        cameras=cameras,
         about=f"{folder}: {kind}, {', '.join([*told, *remarks])}",
         downscale=factor,
+        origin=origin,
     )
 
 
+def fitting_downscale(shots: Sequence[Shot]) -> int:
+    """The side of the squares of pixels whose means are as much as grids and memory can use.
+
+    Half of the photographs are then FINE pixels long or longer, about, and all together are LARGE
+    at most. Those of 1499 pixels and fewer stay as they are, unless they are very many.
+    """
+    sizes = [(shot.lens.width, shot.lens.height) for shot in shots]
+    most = min(map(min, sizes))
+    factor = min(max(1, round(median(map(max, sizes)) / FINE)), most)
+    while factor < most and sum((w // factor) * (h // factor) for w, h in sizes) > LARGE:
+        factor += 1
+    return factor
+
+
+def _pinholes(shots: Sequence[Shot]) -> list[Lens]:
+    """The pinhole that each photograph is turned into."""
+    known: dict[Lens, Lens] = {}  # one lens often took all photographs
+    for shot in shots:
+        try:
+            known[shot.lens] = known.get(shot.lens) or straightened(shot.lens)
+        except UserError as error:
+            raise DataError(f"{shot.where}: {error}") from None
+    return [known[shot.lens] for shot in shots]
+
+
+def _files(shot: Shot) -> list[Path]:
+    """The files that say what a photograph looks like."""
+    masks = _beside(shot.image) if shot.mask is None else [shot.mask]
+    return [shot.image, *(mask for mask in masks if mask.is_file())]
+
+
+def _read_all(
+    folder: Path,
+    shots: Sequence[Shot],
+    pinholes: Sequence[Lens],
+    cameras: Cameras,
+    factor: int,
+    masks: bool,
+) -> tuple[Tensor, Tensor]:
+    """Colour [V, H, W, 3] and alpha [V, H, W] of all photographs as `Photos` has them."""
+    colors = alphas = torch.empty(0)
+    empty = opaque = True
+    for view, (color, alpha) in enumerate(_read_each(shots, pinholes, factor, masks)):
+        if not view:
+            size = len(shots), cameras.height, cameras.width
+            colors, alphas = color.new_zeros(*size, 3), alpha.new_zeros(size)
+        if color.dtype != colors.dtype:
+            raise DataError(
+                f"{shots[view].image}: expected the format of {shots[0].name} in all photographs"
+            )
+        if alpha.dtype != alphas.dtype:
+            alpha, alphas = coverage_of(alpha), coverage_of(alphas)
+        empty &= not alpha.any()
+        opaque &= bool((alpha == (1 if alpha.is_floating_point() else 255)).all())
+        cameras.cut(view, colors[view]).copy_(color)
+        cameras.cut(view, alphas[view]).copy_(alpha)
+    if empty:
+        raise DataError(f"{folder}: all {len(shots)} pictures are fully transparent")
+    if masks and opaque:
+        raise DataError(f"{folder}: all {len(shots)} pictures are fully opaque: {HOW_TO_MASK}")
+    return colors, alphas
+
+
+def _read_each(
+    shots: Sequence[Shot], pinholes: Sequence[Lens], factor: int, masks: bool
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Colour and alpha of each photograph, in order; some are read at once."""
+    grid_of = lru_cache(2)(sources)  # one lens often took all photographs, upright and across
+
+    def read(shot: Shot, pinhole: Lens) -> tuple[Tensor, Tensor]:
+        color, alpha = read_photo(shot.image, shot.mask, masks)
+        grid = grid_of(shot.lens, pinhole) if shot.lens.bent else None
+        return (
+            (color, alpha)
+            if grid is None and factor == 1
+            else resampled(color, alpha, factor, grid)
+        )
+
+    pool = ThreadPoolExecutor(min(READERS, len(os.sched_getaffinity(0))))
+    try:
+        yield from pool.map(read, shots, pinholes)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _words(cameras: Cameras) -> str:
+    """The size of the pictures; of several, how many have which."""
+    sizes, counts = cameras.size_of_each().unique(dim=0, return_counts=True)
+    order = counts.argsort(descending=True, stable=True).tolist()
+    if len(order) == 1:
+        return f"{cameras.width}x{cameras.height}"
+    if len(order) > SIZES_TOLD:
+        return f"{len(order)} sizes up to {cameras.width}x{cameras.height}"
+    *first, last = (f"{sizes[i, 0]}x{sizes[i, 1]} ({counts[i]})" for i in order)
+    return f"{', '.join(first)} and {last}"
+
+
 def cameras_of(poses: Sequence[np.ndarray], lenses: Sequence[Lens]) -> Cameras:
-    """Pinholes of one picture size."""
+    """Pinholes, each with its picture's size."""
+    width, height, sizes = sizes_of([(lens.width, lens.height) for lens in lenses])
     return Cameras(
         camera_to_world=torch.from_numpy(np.stack(poses).astype(np.float32)),
         focal=torch.tensor([lens.focal for lens in lenses], dtype=torch.float32),
         centre=torch.tensor([lens.centre for lens in lenses], dtype=torch.float32),
-        width=lenses[0].width,
-        height=lenses[0].height,
+        width=width,
+        height=height,
+        sizes=sizes,
     )
 
 
@@ -145,14 +232,15 @@ def read_photo(path: Path, mask: Path | None = None, masks: bool = True) -> tupl
         color = torch.where(alpha[..., None] > 0, color / alpha[..., None], 0.0)
     if not masks:
         alpha, mask = torch.full_like(color[..., 0], 1 if linear else 255), None
-    stem = path.stem.removesuffix("_rgb")
-    beside = [path.with_name(f"{stem}_{what}.png") for what in ("mask", "alpha")]
+    beside = _beside(path)
     if mask is None and alpha is None:
         mask = next((file for file in beside if file.is_file()), None)
     if mask is not None:
         alpha = read_image(mask)[..., 0]
         if alpha.shape != color.shape[:2]:
-            raise DataError(f"{mask}: expected {size_of(color)} pixels, got {size_of(alpha)}")
+            raise DataError(
+                f"{mask}: expected {size_of(color)} pixels, got {size_of(alpha)}{turn_note(path)}"
+            )
     if alpha is None:
         raise DataError(
             f"{path}: expected an alpha channel or a mask {beside[0].name}, got neither: "
@@ -161,23 +249,43 @@ def read_photo(path: Path, mask: Path | None = None, masks: bool = True) -> tupl
     return (color.clamp_min(0) if linear else color).contiguous(), alpha.contiguous()
 
 
+def _beside(path: Path) -> list[Path]:
+    """Where the mask of a photograph may lie beside it."""
+    stem = path.stem.removesuffix("_rgb")
+    return [path.with_name(f"{stem}_{what}.png") for what in ("mask", "alpha")]
+
+
 def resampled(
     color: Tensor, alpha: Tensor, factor: int, grid: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Stored colour and alpha, straightened and then shrunk in linear light; stored as before."""
-    encoded = color.dtype == torch.uint8
-    if encoded:  # a table is many times as fast as the curve
+    rows = factor * max(1, BAND // (factor * color.shape[1]))  # of a band, to save memory
+    bands = range(0, color.shape[0] // factor * factor, rows)
+    if grid is None:
+        parts = (_premultiplied(color[i : i + rows], alpha[i : i + rows]) for i in bands)
+    else:
+        whole = _premultiplied(color, alpha)
+        parts = (straighten(whole, grid[i : i + rows]) for i in bands)
+    shrunk_parts = [_stored(shrink(part, factor), color.dtype, alpha.dtype) for part in parts]
+    colors, alphas = zip(*shrunk_parts, strict=True)
+    return torch.cat(colors), torch.cat(alphas)
+
+
+def _premultiplied(color: Tensor, alpha: Tensor) -> Tensor:
+    """Stored colour and alpha as linear light times coverage, and coverage: [H, W, 4] float32."""
+    if color.dtype == torch.uint8:  # a table is many times as fast as the curve
         color = torch.from_numpy(LINEAR[color.numpy()])
     linear, coverage = decode(color, alpha)
-    picture = torch.cat([linear * coverage[..., None], coverage[..., None]], -1)
-    if grid is not None:
-        picture = straighten(picture, grid)
-    picture = shrink(picture, factor)
+    return torch.cat([linear * coverage[..., None], coverage[..., None]], -1)
+
+
+def _stored(picture: Tensor, of_color: torch.dtype, of_alpha: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Straight colour and alpha of a picture from `_premultiplied`, as files have them."""
     linear, coverage = picture[..., :3], picture[..., 3]
     linear = torch.where(coverage[..., None] > 0, linear / coverage[..., None], 0.0)
-    if encoded:
+    if of_color == torch.uint8:
         linear = (255 * linear_to_srgb(linear)).round().to(torch.uint8)
-    if alpha.dtype == torch.uint8:
+    if of_alpha == torch.uint8:
         coverage = (255 * coverage).round().to(torch.uint8)
     return linear.contiguous(), coverage.contiguous()
 
@@ -206,12 +314,13 @@ def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
 def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     """The shots in a world whose +Z is up, and what was done.
 
-    The world of structure from motion has any direction. Cameras are held level, mostly: their
-    right axes then lie in the horizontal plane, and up is what is across to all of them. A world
+    The world of structure from motion has any direction. Cameras are held level, mostly, or a
+    quarter turn from that, as EXIF then says: what is to the right in their photographs lies in the
+    horizontal plane, and up is what is across to all of that. A world
     that is upright already, to within LEAN, stays as it is; and one whose cameras do not agree.
     """
-    axes = np.stack([shot.pose[:, :3] for shot in shots])
-    right, mean_up = axes[:, :, 0], axes[:, :, 1].mean(0)
+    held = np.stack([_right_and_up(shot) for shot in shots])
+    right, mean_up = held[:, 0], held[:, 1].mean(0)
     _, spread, directions = np.linalg.svd(right, full_matrices=True)
     up = directions[2] * (1 if directions[2] @ mean_up >= 0 else -1)
     if len(spread) < 2 or spread[1] < 0.1 * spread[0] or up @ mean_up < math.sin(LEAN):
@@ -226,6 +335,19 @@ def size_of(image: Tensor) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
 
 
+def _right_and_up(shot: Shot) -> np.ndarray:
+    """To the right and up, in the world, of a photograph as it is looked at: [2, 3]."""
+    right, up = shot.pose[:, 0], shot.pose[:, 1]
+    match orientation(shot.image):  # 2, 4, 5 and 7 are mirrored: no camera makes them
+        case 3:
+            right, up = -right, -up
+        case 6:
+            right, up = up, -right
+        case 8:
+            right, up = -up, right
+    return np.stack([right, up])
+
+
 def _turn(up: np.ndarray) -> np.ndarray:
     """The smallest rotation that takes a unit vector to +Z."""
     if up[2] < -1 + 1e-9:
@@ -236,28 +358,14 @@ def _turn(up: np.ndarray) -> np.ndarray:
 
 
 def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
-    """Names, sizes and memory, before anything large is read."""
+    """Names and sizes, before anything large is read."""
     names: set[str] = set()
-    width, height = shots[0].lens.width, shots[0].lens.height
     for shot in shots:
         if shot.name in names:
             raise DataError(f"{shot.where}: the name {shot.name} of {shot.image} came before")
         names.add(shot.name)
-        if (shot.lens.width, shot.lens.height) != (width, height):
+        width, height = shot.lens.width, shot.lens.height
+        if downscale > min(width, height):
             raise DataError(
-                f"{shot.image}: expected {width}x{height} pixels like {shots[0].name}, "
-                f"got {shot.lens.width}x{shot.lens.height}"
+                f"{folder}: downscale={downscale} leaves nothing of {width}x{height}", "downscale"
             )
-    if not downscale and (pixels := len(shots) * width * height) > LARGE:
-        factor = math.ceil(max(width, height) / SUGGESTED)
-        raise DataError(
-            f"{folder}: {len(shots)} photographs of {width}x{height} pixels take about "
-            f"{pixels * TRAINING_BYTES / 1e9:.0f} GB of memory in training: choose a size, such as "
-            f"downscale={factor} for {width // factor}x{height // factor}, or downscale=1 to keep "
-            "theirs",
-            "downscale",
-        )
-    if downscale > min(width, height):
-        raise DataError(
-            f"{folder}: downscale={downscale} leaves nothing of {width}x{height}", "downscale"
-        )

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.camera import Cameras
-from univoxel.data.images import SUFFIXES, image_size
+from univoxel.data.images import SUFFIXES, image_size, turn_note
 from univoxel.data.lens import Lens
 from univoxel.data.shots import Shot, cameras_of
 from univoxel.errors import DataError
@@ -32,7 +32,8 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
     """Names and cameras of a file in the form of transforms_<split>.json, without pictures.
 
     Args:
-        size: pixels, width and height of the pictures to come where the file gives no w and h.
+        size: pixels, width and height of the pictures to come where the file gives no w and h,
+            for all or with a frame.
 
     Returns:
         A name for each frame, from its file_path or its number, and the cameras.
@@ -47,13 +48,13 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
     names = [view_name(str(f.get("file_path", f"{i:04d}"))) for i, f in enumerate(frames)]
     if len(set(names)) != len(names):
         raise DataError(f"{path}: expected every frame under a name of its own")
-    values = {"w": size, "h": size} | root
-    width, height = (int(number(values, key, str(path), 0, math.inf)) for key in ("w", "h"))
     poses, lenses = [], []
     for index, frame in enumerate(frames):
         where = f"{path}: frame {index}"
         poses.append(pose_of(frame.get("transform_matrix"), where))
-        lens = lens_of({"w": width, "h": height} | root | frame, where, width, height)
+        values = {"w": size, "h": size} | root | frame
+        width, height = (int(number(values, key, where, 0, math.inf)) for key in ("w", "h"))
+        lens = lens_of(values, where, width, height)
         if lens.bent:
             raise DataError(f"{where}: expected cameras without lens distortion, got some")
         lenses.append(lens)
@@ -98,7 +99,7 @@ def read_frames(path: Path) -> tuple[dict, list[Shot]]:
                 image=image,
                 mask=_mask(path.parent, frame, where),
                 pose=pose_of(frame.get("transform_matrix"), where),
-                lens=lens_of(root | frame, where, *image_size(image)),
+                lens=lens_of(root | frame, where, *image_size(image), turn_note(image)),
             )
         )
     return root, shots
@@ -144,13 +145,17 @@ def pose_of(matrix: object, where: str) -> np.ndarray:
     return np.concatenate([u @ v, pose[:3, 3:]], 1)
 
 
-def lens_of(values: dict, where: str, width: int, height: int) -> Lens:
-    """The lens that a frame's values describe, for pictures of this size."""
+def lens_of(values: dict, where: str, width: int, height: int, note: str = "") -> Lens:
+    """The lens that a frame's values describe, for pictures of this size.
+
+    Args:
+        note: on the size, added to the message that it is another one.
+    """
     # Focal lengths are in pixels: of these pictures, or all is off.
     if (values.get("w", width), values.get("h", height)) != (width, height):
         raise DataError(
             f"{where}: expected pictures of {values.get('w')}x{values.get('h')} pixels (w and h), "
-            f"got {width}x{height}"
+            f"got {width}x{height}{note}"
         )
     model = values.get("camera_model", "OPENCV")
     if values.get("is_fisheye") or model not in MODELS:

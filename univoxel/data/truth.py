@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from univoxel.camera import stacked
 from univoxel.color import srgb_to_linear
 from univoxel.data.base import Photos, Truth
 from univoxel.data.images import read_image
@@ -81,17 +82,19 @@ def relight_maps(folder: str | Path) -> dict[str, Path]:
 def load_relit(photos: Photos, map: str) -> tuple[Tensor, Tensor]:
     """Test views under another map: colour [V, H, W, 3] and alpha [V, H, W] as in `Photos`."""
     pictures: list[tuple[Tensor, Tensor]] = []
-    for name in photos.names:
+    for view, name in enumerate(photos.names):
         path = _relit(photos.folder, name, map)
         color, alpha = read_photo(path)
+        found = tuple(n // photos.downscale for n in reversed(alpha.shape))
+        if found != (size := photos.cameras.size(view)):
+            raise DataError(
+                f"{path}: expected {size[0]}x{size[1]} pixels like the test view's, "
+                f"got {found[0]}x{found[1]}"
+            )
         if photos.downscale > 1:
             color, alpha = resampled(color, alpha, photos.downscale)
-        if pictures and color.shape != pictures[0][0].shape:
-            raise DataError(
-                f"{path}: expected {size_of(pictures[0][0])} pixels, got {size_of(color)}"
-            )
         pictures.append((color, alpha))
-    return torch.stack([c for c, _ in pictures]), torch.stack([a for _, a in pictures])
+    return stacked([c for c, _ in pictures]), stacked([a for _, a in pictures])
 
 
 def load_points(folder: str | Path) -> Tensor | None:

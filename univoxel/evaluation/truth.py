@@ -59,7 +59,10 @@ def expected_view(photos: Photos, relit: dict[str, tuple[Tensor, Tensor]], view:
     return Expected(
         photo=metrics.on_black(color, alpha),
         albedo=None if truth.albedo is None else metrics.on_black(truth.albedo, alpha),
-        relit={m: metrics.on_black(*decode(c[view], a[view])) for m, (c, a) in relit.items()},
+        relit={
+            name: metrics.on_black(*decode(*(photos.cameras.cut(view, x[view]) for x in stored)))
+            for name, stored in relit.items()
+        },
         truth=truth,
     )
 
@@ -68,24 +71,19 @@ def view_truth(photos: Photos, view: int) -> Truth:
     """The layers of truth of one test view, as far as there are any."""
     truth = load_truth(photos, view)
     if truth.mask is not None:
-        _check_size(photos, truth.mask, f"truth of {photos.names[view]}")
+        _check_size(photos, view, truth.mask, f"truth of {photos.names[view]}")
     return truth
 
 
 def _relit_photos(photos: Photos) -> dict[str, tuple[Tensor, Tensor]]:
     """Stored colour and alpha of the test views, by map."""
-    relit = {}
-    for name in relight_maps(photos.folder):
-        color, alpha = load_relit(photos, name)
-        _check_size(photos, alpha[0], f"pictures in relight/{name}")
-        relit[name] = color, alpha
-    return relit
+    return {name: load_relit(photos, name) for name in relight_maps(photos.folder)}
 
 
-def _check_size(photos: Photos, picture: Tensor, what: str) -> None:
-    width, height = photos.cameras.width, photos.cameras.height
+def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
+    width, height = photos.cameras.size(view)
     if picture.shape != (height, width):
         raise DataError(
             f"{photos.folder}: expected {what} to have {width}x{height} pixels like the test "
-            f"views, got {picture.shape[1]}x{picture.shape[0]}"
+            f"view, got {picture.shape[1]}x{picture.shape[0]}"
         )

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from univoxel.data.images import image_size
 from univoxel.errors import MissingExtra, UserError
 from univoxel.files import replacing
 from univoxel.names import ANIMATIONS
@@ -29,15 +30,18 @@ def require(kind: str) -> None:
 
 
 def write_animation(path: Path, pictures: Sequence[Path], rate: int = FRAMES_PER_SECOND) -> None:
-    """Write pictures of one size, on white where they are transparent, `rate` a second.
+    """Write pictures, on white where they are transparent, `rate` a second.
 
-    Whole or not at all; a GIF runs in a loop; an MP4 is H.264, cut to even sizes.
+    Of differing sizes, they stand in the middle of frames that hold the largest. Whole or not at
+    all; a GIF runs in a loop; an MP4 is H.264, cut to even sizes.
 
     Raises:
         OSError: a file cannot be read or written.
         MissingExtra: an MP4 without imageio-ffmpeg.
     """
-    frames = (_on_white(picture) for picture in pictures)
+    sizes = [image_size(picture) for picture in pictures]
+    width, height = (max(size[i] for size in sizes) for i in (0, 1))
+    frames = (_on_white(picture, width, height) for picture in pictures)
     with replacing(path) as temporary:
         if path.suffix == ".gif":
             first, *rest = (frame.convert("P", palette=Image.Palette.ADAPTIVE) for frame in frames)
@@ -51,7 +55,7 @@ def write_animation(path: Path, pictures: Sequence[Path], rate: int = FRAMES_PER
             )
             return
         first = next(frames)
-        width, height = (size - size % 2 for size in first.size)
+        width, height = width - width % 2, height - height % 2
         writer = _ffmpeg().write_frames(
             str(temporary),
             (width, height),
@@ -66,11 +70,12 @@ def write_animation(path: Path, pictures: Sequence[Path], rate: int = FRAMES_PER
         writer.close()
 
 
-def _on_white(path: Path) -> Image.Image:
+def _on_white(path: Path, width: int, height: int) -> Image.Image:
     with Image.open(path) as image:
         picture = image.convert("RGBA")
-    white = Image.new("RGBA", picture.size, "white")
-    return Image.alpha_composite(white, picture).convert("RGB")
+    white = Image.new("RGBA", (width, height), "white")
+    white.alpha_composite(picture, ((width - picture.width) // 2, (height - picture.height) // 2))
+    return white.convert("RGB")
 
 
 def _ffmpeg():

@@ -52,14 +52,12 @@ def contact_sheet(rows: list[tuple[str, list[Panel]]]) -> np.ndarray:
     titles = [[panel.title for panel in panels] for _, panels in rows]
     if not rows or any(t != titles[0] for t in titles) or not titles[0]:
         raise ValueError(f"contact_sheet: expected rows of the same quantities, got {titles}")
-    first = rows[0][1][0].estimate
-    scale = min(1.0, TILE / max(first.shape[:2]))
-    height, width = (max(1, round(scale * n)) for n in first.shape[:2])
-    cell = max(width, TILE) + GAP  # titles need their room above small pictures, too
+    sizes = [_tile_size(panels[0].estimate) for _, panels in rows]
+    cell = max(TILE, *(width for width, _ in sizes)) + GAP  # titles need their room, too
     margin = 8 + 8 * max(len(name) for name, _ in rows)
     sheet = Image.new(
         "RGB",
-        (margin + 3 * cell * len(titles[0]), LABEL + (height + GAP) * len(rows)),
+        (margin + 3 * cell * len(titles[0]), LABEL + sum(height + GAP for _, height in sizes)),
         (32, 32, 32),
     )
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
@@ -68,8 +66,8 @@ def contact_sheet(rows: list[tuple[str, list[Panel]]]) -> np.ndarray:
         texts = (panel.title, second, f"{third}, 0 to {panel.limit:g}{panel.unit}")
         for k, text in enumerate(texts):
             draw.text((margin + (3 * column + k) * cell, 2), text, "white", font)
-    for row, (name, panels) in enumerate(rows):
-        y = LABEL + row * (height + GAP)
+    y = LABEL
+    for (name, panels), (width, height) in zip(rows, sizes, strict=True):
         draw.text((4, y + height // 2 - 6), name, "white", font)
         for column, panel in enumerate(panels):
             error = None if panel.error is None else heat(panel.error, panel.limit)
@@ -78,6 +76,7 @@ def contact_sheet(rows: list[tuple[str, list[Panel]]]) -> np.ndarray:
                 if tile is not None:
                     x = margin + (3 * column + k) * cell
                     sheet.paste(_tile(np.asarray(tile), width, height), (x, y))
+        y += height + GAP
     return np.asarray(sheet)
 
 
@@ -94,6 +93,13 @@ def shrink(panel: Panel) -> Panel:
         truth=small(panel.truth),
         error=small(panel.error),
     )
+
+
+def _tile_size(picture: Tensor) -> tuple[int, int]:
+    """Width and height that a picture [H, W, 3] is drawn in."""
+    scale = min(1.0, TILE / max(picture.shape[:2]))
+    height, width = (max(1, round(scale * n)) for n in picture.shape[:2])
+    return width, height
 
 
 def _tile(picture: np.ndarray, width: int, height: int) -> Image.Image:

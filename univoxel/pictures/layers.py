@@ -52,12 +52,13 @@ def render_layers(
     """Render one view. Nothing is shaded where the opacity is 0."""
     whole, wo = surface_of_view(scene, cameras, view)
     there = whole.opacity > 0
+    width, height = cameras.size(view)
     surface, wo = at_rays(whole, there), wo[there]
 
     def picture(values: Tensor) -> Tensor:
         out = values.new_zeros(len(there), *values.shape[1:])
         out[there] = values
-        return out.reshape(cameras.height, cameras.width, *values.shape[1:])
+        return out.reshape(height, width, *values.shape[1:])
 
     opacity = surface.opacity[:, None]
     relit, relit_scaled = {}, {}

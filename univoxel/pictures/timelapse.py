@@ -127,8 +127,8 @@ def frame(scene: Scene, cameras, lit: bool, by_map: bool) -> Tensor:
     scene.train(training)
     albedo = linear_to_srgb(surface.albedo * opacity)
     normal = (0.5 + 0.5 * surface.normal) * opacity
-    shape = (cameras.height, cameras.width, 3)
-    return torch.cat([tile.reshape(shape) for tile in (render, albedo, normal)], 1)
+    width, height = cameras.size(0)
+    return torch.cat([tile.reshape(height, width, 3) for tile in (render, albedo, normal)], 1)
 
 
 def labelled(picture: Tensor, time: str) -> np.ndarray:

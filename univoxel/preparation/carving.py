@@ -19,7 +19,7 @@ from skimage import measure
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from univoxel.camera import Cameras, looked_at, pixel_width, project
+from univoxel.camera import Cameras, looked_at, pixel_width, project, sizes_of, stacked
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.grid import GridShape
@@ -42,8 +42,8 @@ def carve_concavities(
     Args:
         hull: [X, Y, Z] world units, negative inside.
         grid: of the hull.
-        pictures: [V, H, W, 4] uint8 sRGB colours times coverage, and coverage.
-        cameras: V, of the pictures' size; three or more, or nothing is carved.
+        pictures: [V, H, W, 4] uint8 sRGB colours times coverage, and coverage; 0 beyond a picture.
+        cameras: V, of the pictures' sizes; three or more, or nothing is carved.
 
     Returns:
         [X, Y, Z], at least hull.
@@ -109,11 +109,12 @@ def _agreed_nodes(
 
 
 def _distance_and_pixel(points: Tensor, cameras: Cameras, view: int) -> tuple[Tensor, Tensor]:
-    """Distance of points [P, 3] from a camera, and number of the pixel that shows them; of points
-    outside the picture, the nearest one's: [P], [P]."""
+    """Distance of points [P, 3] from a camera, and number of the stored pixel that shows them; of
+    points outside the picture, the nearest one's: [P], [P]."""
     pixel, _ = project(cameras, view, points)
-    column = pixel[:, 0].floor().clamp(0, cameras.width - 1).long()
-    row = pixel[:, 1].floor().clamp(0, cameras.height - 1).long()
+    width, height = cameras.size(view)
+    column = pixel[:, 0].floor().clamp(0, width - 1).long()
+    row = pixel[:, 1].floor().clamp(0, height - 1).long()
     distance = (points - cameras.camera_to_world[view, :, 3]).norm(dim=1)
     return distance, row * cameras.width + column
 
@@ -177,10 +178,9 @@ def carving_pictures(
         premultiplied = torch.cat([linear_to_srgb(color) * alpha[..., None], alpha[..., None]], 2)
         shrunk = avg_pool2d(premultiplied.permute(2, 0, 1), factor)
         pictures.append((255 * shrunk.permute(1, 2, 0)).round().byte())
-    height, width = pictures[0].shape[:2]
-    whole = photos.cameras
-    pose, focal, centre = whole.camera_to_world[views], whole.focal[views], whole.centre[views]
-    return torch.stack(pictures), Cameras(pose, focal / factor, centre / factor, width, height)
+    of, sizes = photos.cameras.of(views), sizes_of([(p.shape[1], p.shape[0]) for p in pictures])
+    cameras = Cameras(of.camera_to_world, of.focal / factor, of.centre / factor, *sizes)
+    return stacked(pictures), cameras
 
 
 def _views_and_factor(

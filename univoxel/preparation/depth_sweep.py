@@ -26,7 +26,8 @@ def log_colors(picture: Tensor, cfg: CarvingConfig = CARVING) -> Tensor:
 
 
 def surface_depths(sdf: Tensor, grid: GridShape, cameras: Cameras) -> Iterator[Tensor]:
-    """Distance [H, W] along each pixel's ray to the surface, view after view; infinity: past it.
+    """Distance [H, W] along each pixel's ray to the surface, view after view; infinity: past it,
+    or beyond a picture.
 
     Args:
         sdf: [X, Y, Z] world units.
@@ -36,7 +37,10 @@ def surface_depths(sdf: Tensor, grid: GridShape, cameras: Cameras) -> Iterator[T
     for view in range(len(cameras)):
         rays = image_rays(cameras, view)
         distance = surface.closest_hit(rays.origin, rays.direction).t
-        yield distance.view(cameras.height, cameras.width)
+        stored = torch.full((cameras.height, cameras.width), torch.inf)
+        shown = cameras.cut(view, stored)
+        shown.copy_(distance.view(shown.shape))
+        yield stored
 
 
 def depth_maps(
@@ -53,7 +57,7 @@ def depth_maps(
     What seems to lie beyond the object, as in a flat mirror, is taken for the hull.
 
     Args:
-        pictures: [V, H, W, 4] uint8 from `log_colors`.
+        pictures: [V, H, W, 4] uint8 from `log_colors`; 0 beyond a picture.
         hull_depths: V, [H, W], from `surface_depths`.
         hull: [X, Y, Z] sdf, world units.
         grid: of the hull.
@@ -66,7 +70,8 @@ def depth_maps(
         inside = (pictures[view, :, :, 3] >= 128) & hull_depths[view].isfinite()
         rows = torch.where(inside, inside.flatten().cumsum(0).view(inside.shape) - 1, -1)
         rays, hull_depth = image_rays(cameras, view), hull_depths[view][inside]
-        origin, direction = rays.origin[inside.flatten()], rays.direction[inside.flatten()]
+        of_rays = cameras.cut(view, inside).flatten()
+        origin, direction = rays.origin[of_rays], rays.direction[of_rays]
         color = pictures[view][inside].float()
         of_pixels = color[:, :3] / color[:, 3:], rows
         lines = pictures, matrix, origin, direction

@@ -13,16 +13,21 @@ from univoxel.grid import GridShape, fit_coarse, fit_grid, resample
 from univoxel.preparation.config import HULL, HullConfig
 
 
-def mask_distances(alpha: Tensor) -> Tensor:
+def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
     """Signed distance to the silhouette in pixels, negative inside: [V, H, W] -> the same.
 
-    Sub-pixel: a half-covered pixel lies on the silhouette.
+    Sub-pixel: a half-covered pixel lies on the silhouette. Infinite beyond a picture.
+
+    Args:
+        cameras: V, which know the sizes of the pictures, where these differ.
     """
-    result = np.empty(alpha.shape, np.float32)
-    for v, a in enumerate(alpha.numpy()):
+    result = np.full(alpha.shape, np.inf, np.float32)
+    for v in range(len(alpha)):
+        a = (alpha[v] if cameras is None else cameras.cut(v, alpha[v])).numpy()
+        shown = result[v, : a.shape[0], : a.shape[1]]
         inside = a >= 0.5
         if not inside.any():
-            result[v] = max(a.shape)  # nothing seen: everything is far outside
+            shown[:] = max(a.shape)  # nothing seen: everything is far outside
             continue
         padded = np.pad(inside, 1)  # what leaves the picture ends there
         outside, depth = (ndimage.distance_transform_edt(m) for m in (~padded, padded))
@@ -30,7 +35,7 @@ def mask_distances(alpha: Tensor) -> Tensor:
         # Next to the edge the distance to pixel centres is 1; coverage says where in between.
         edge = np.abs(d) <= 1
         d = d - np.sign(d) * 0.5
-        result[v] = np.where(edge & (a > 0) & (a < 1), 0.5 - a, d)
+        shown[:] = np.where(edge & (a > 0) & (a < 1), 0.5 - a, d)
     return torch.from_numpy(result)
 
 
@@ -44,18 +49,18 @@ def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
     Args:
         distance: [V, H, W] from `mask_distances`.
     """
-    border = [distance[:, 0], distance[:, -1], distance[:, :, 0], distance[:, :, -1]]
-    whole = torch.stack([b.amin(1) > 0 for b in border]).all(0)
     sdf = torch.full((len(points),), -torch.inf)
-    scale = torch.tensor([2 / cameras.width, 2 / cameras.height])
     for v in range(len(cameras)):
         pixel, depth = project(cameras, v, points)
-        uv = pixel * scale - 1
+        uv = pixel * (2 / torch.tensor(cameras.size(v))) - 1
+        shown = cameras.cut(v, distance[v])
+        border = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
+        whole = all(float(b.amin()) > 0 for b in border)
         d = torch.nn.functional.grid_sample(
-            distance[v][None, None], uv[None, None], align_corners=False, padding_mode="border"
+            shown[None, None], uv[None, None], align_corners=False, padding_mode="border"
         )[0, 0, 0]
         seen = (depth > 0) & (uv.abs() <= 1).all(1)
-        here = d.clamp_min(0.5) if whole[v] else torch.full_like(d, -torch.inf)
+        here = d.clamp_min(0.5) if whole else torch.full_like(d, -torch.inf)
         here = torch.where(seen, d, here) * depth.abs() / cameras.focal[v].mean()
         sdf = torch.maximum(sdf, here)
     return torch.where(sdf.isinf(), torch.inf, sdf)
@@ -71,7 +76,8 @@ def estimate_bounds(
     """
     centre = looked_at(cameras)
     away = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
-    field_of_view = max(cameras.width, cameras.height) / (2 * cameras.focal.min(1).values)
+    longer = cameras.size_of_each().amax(1)
+    field_of_view = longer / (2 * cameras.focal.min(1).values)
     half = float((away * field_of_view).max()) * cfg.first_box
     lower, upper = centre - half, centre + half
     for _ in range(cfg.box_rounds):  # each round sees the hull at a finer grid

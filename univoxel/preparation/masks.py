@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -19,20 +20,26 @@ log = logging.getLogger("univoxel")
 
 
 @torch.no_grad()
-def mask_excess(color: Tensor, coverage: Tensor, distance: Tensor, cfg: MaskConfig = MASKS) -> int:
+def mask_excess(
+    color: Sequence[Tensor] | Tensor,
+    coverage: Sequence[Tensor] | Tensor,
+    distance: Sequence[Tensor] | Tensor,
+    cfg: MaskConfig = MASKS,
+) -> int:
     """Pixels by which masks are too wide, all of them alike; 0 where they fit or nothing tells.
 
     Across the edge of a mask, colours change most at the object's outline: in the mean over all
     photographs everything else, the object's pattern or what stands behind it, lies anywhere.
 
     Args:
-        color: [V, H, W, 3] of photographs, uint8 sRGB or linear. What surrounds the object may be
+        color: V photographs [H, W, 3], uint8 sRGB or linear. What surrounds the object may be
             there, or be cut away or covered by colours of the object's edge: then masks have to be
             too wide by 3 pixels to be seen so.
-        coverage: [V, H, W] in [0, 1], by masks.
-        distance: [V, H, W] from `hull.mask_distances`.
+        coverage: V, [H, W] in [0, 1], by masks.
+        distance: V, [H, W] from `hull.mask_distances`.
     """
-    reach = max(cfg.reach_pixels, round(cfg.reach_share * max(distance.shape[1:])))
+    longest = max(max(d.shape) for d in distance)
+    reach = max(cfg.reach_pixels, round(cfg.reach_share * longest))
     step = -(-len(color) // cfg.views)
     near, far = cfg.comparison
     change = _change(color[::step], coverage[::step], distance[::step], reach + far, cfg)
@@ -49,7 +56,11 @@ def mask_excess(color: Tensor, coverage: Tensor, distance: Tensor, cfg: MaskConf
 
 
 def _change(
-    color: Tensor, coverage: Tensor, distance: Tensor, deepest: int, cfg: MaskConfig
+    color: Sequence[Tensor] | Tensor,
+    coverage: Sequence[Tensor] | Tensor,
+    distance: Sequence[Tensor] | Tensor,
+    deepest: int,
+    cfg: MaskConfig,
 ) -> Tensor:
     """How much colours change towards the masks' edges, in the mean over pixels whose depth inside
     is 0, 1, ... deepest: [deepest + 1] sRGB a pixel; NaN where there are few."""
@@ -88,7 +99,7 @@ def _slopes(encoded: Tensor, distance: Tensor, y: Tensor, x: Tensor) -> tuple[Te
 
 
 def eroded(distance: Tensor, pixels: int) -> Tensor:
-    """Coverage [V, H, W] in [0, 1] by masks that end so many pixels further in."""
+    """Coverage [V, H, W] in [0, 1] by masks that end so many pixels further in; 0 beyond."""
     return (0.5 - pixels - distance).clamp(0, 1)
 
 
@@ -100,9 +111,13 @@ def fitted_masks(
     Args:
         wanted: as of the configuration.
     """
-    coverage = photos.coverage()
-    distance = mask_distances(coverage)
-    excess = mask_excess(photos.color, coverage, distance, cfg)
+    coverage, cameras = photos.coverage(), photos.cameras
+    distance = mask_distances(coverage, cameras)
+    of_each = (
+        [cameras.cut(v, picture) for v, picture in enumerate(pictures)]
+        for pictures in (photos.color, coverage, distance)
+    )
+    excess = mask_excess(*of_each, cfg)
     if not excess:
         return photos, distance
     much = f"masks are {excess} {'pixel' if excess == 1 else 'pixels'} too wide"
@@ -112,4 +127,4 @@ def fitted_masks(
     log.info("%s: they are taken in", much)
     coverage = eroded(distance, excess)
     stored = coverage if photos.alpha.is_floating_point() else (255 * coverage).round().byte()
-    return replace(photos, alpha=stored), mask_distances(coverage)
+    return replace(photos, alpha=stored), mask_distances(coverage, cameras)

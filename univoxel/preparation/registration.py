@@ -41,12 +41,13 @@ class Edges:
     ) -> None:
         """
         Args:
-            distance: [V, H, W] from `hull.mask_distances`, pixels.
+            distance: [V, H, W] from `hull.mask_distances`, pixels; infinite beyond a picture.
             box: corners [3], [3] around the object.
         """
         low, high = cfg.edge
         self.ray_samples = cfg.ray_samples
-        self.distance = distance[:, None]
+        self.distance = distance
+        self.extended = _extended(distance)
         self.pixels = ((distance > low) & (distance < high)).nonzero()  # [K, 3] view, row, column
         self.middle = (box[0] + box[1]) / 2
         self.reach = float((box[1] - box[0]).norm()) / 2
@@ -67,11 +68,12 @@ class Edges:
         rays = pixel_rays(cameras, view, centre)
         with torch.no_grad():
             nearest, other = self._nearest(cameras, rays, others)
-        uv, _ = _seen(cameras, rays.origin + nearest[:, None] * rays.direction, other)
+        pixel, _ = _seen(cameras, rays.origin + nearest[:, None] * rays.direction, other)
+        uv = pixel * torch.tensor([2 / cameras.width, 2 / cameras.height]) - 1
         # Views are the slices of a volume, of which each point takes its own
         slice_ = (2 * other + 1) / len(self.distance) - 1
         where = torch.cat([uv, slice_[:, None].to(uv)], 1)[None, None, None]
-        volume = self.distance.movedim(1, 0)[None]
+        volume = self.extended[None, None]
         return grid_sample(volume, where, align_corners=False, padding_mode="border")[0, 0, 0, 0]
 
     def _nearest(self, cameras: Cameras, rays: Rays, others: Tensor) -> tuple[Tensor, Tensor]:
@@ -92,8 +94,10 @@ class Edges:
         most = torch.full((len(points),), -torch.inf)
         worst = torch.full((len(points),), int(others[0]))
         for v in others.tolist():
-            uv, depth = _seen(cameras, points, torch.tensor(v))
-            d = grid_sample(self.distance[v : v + 1], uv[None, None], align_corners=False)[0, 0, 0]
+            pixel, depth = _seen(cameras, points, torch.tensor(v))
+            uv = pixel * (2 / torch.tensor(cameras.size(v))) - 1
+            shown = cameras.cut(v, self.distance[v])
+            d = grid_sample(shown[None, None], uv[None, None], align_corners=False)[0, 0, 0]
             seen = (depth > 0) & (uv.abs() <= 1).all(1)  # beyond its picture a view says nothing
             further = seen & (d > most)
             most[further], worst[further] = d[further], v
@@ -152,13 +156,24 @@ def align_(
         optimizer.step()
 
 
+def _extended(distance: Tensor) -> Tensor:
+    """Distances [V, H, W] with what stands at the border of a picture beyond it too."""
+    known = distance.isfinite()
+    if known.all():
+        return distance
+    extended = distance.clone()
+    for picture, there in zip(extended, known, strict=True):
+        height, width = int(there[:, 0].sum()), int(there[0].sum())
+        picture[:height, width:] = picture[:height, width - 1 : width]
+        picture[height:] = picture[height - 1]
+    return extended
+
+
 def _seen(cameras: Cameras, points: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
-    """Where a view, or views [N], see points [N, 3]: from -1 to 1 across the picture [N, 2], and
-    depth [N]."""
+    """Where a view, or views [N], see points [N, 3]: in pixels [N, 2], and depth [N]."""
     pose = cameras.camera_to_world[view]
     x, y, z = ((points - pose[..., 3])[:, None] @ pose[..., :3])[:, 0].unbind(1)
-    pixel = torch.stack([x, -y], 1) / -z[:, None] * cameras.focal[view] + cameras.centre[view]
-    return pixel * torch.tensor([2 / cameras.width, 2 / cameras.height]) - 1, -z
+    return torch.stack([x, -y], 1) / -z[:, None] * cameras.focal[view] + cameras.centre[view], -z
 
 
 def bounds_and_refinement(

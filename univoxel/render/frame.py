@@ -119,9 +119,10 @@ def render_picture(
         rgb = rgb + clear * env.background(lighting.tables, rays.direction)
     metallic = None if surface.metallic is None else metal_or_none(surface.metallic)
     backward = cameras.camera_to_world[view, :, 2]
+    width, height = cameras.size(view)
 
     def grid(values: Tensor) -> Tensor:
-        return values.reshape(cameras.height, cameras.width, *values.shape[1:])
+        return values.reshape(height, width, *values.shape[1:])
 
     return Picture(
         rgb=grid(rgb),

@@ -15,7 +15,7 @@ from univoxel.scene import Scene
 
 def preview(scene: Scene, photos: Photos, path: Path, view: int = 0) -> None:
     """One photograph beside what the scene says of it: photo, render, albedo, roughness, normal."""
-    height, width = photos.cameras.height, photos.cameras.width
+    width, height = photos.cameras.size(view)
     surface, wo = surface_of_view(scene, photos.cameras, view)
     color, alpha = photos.picture(view)
     opacity = surface.opacity[:, None]

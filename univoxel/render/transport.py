@@ -12,6 +12,7 @@ from torch.nn.functional import grid_sample, normalize
 from univoxel.camera import project
 from univoxel.color import srgb_to_linear
 from univoxel.data import Photos
+from univoxel.data.base import coverage_of
 from univoxel.ops import VisibilityScene
 from univoxel.records import HALF_MAX, Mesh
 
@@ -69,21 +70,22 @@ def observe(
         offset: world units that rays start above the surface.
     """
     point, wo, color, view = [], [], [], []
-    coverage = photos.coverage()
     for v in range(len(photos)):
         eye = photos.cameras.camera_to_world[v, :, 3]
         towards = normalize(eye - position, dim=1)
         pixel, depth = project(photos.cameras, v, position)
-        size = torch.tensor([photos.cameras.width, photos.cameras.height])
+        size = torch.tensor(photos.cameras.size(v))
         inside = ((pixel > 1) & (pixel < size - 1)).all(1) & (depth > 0)
         facing = (inside & ((normal * towards).sum(1) > MIN_COSINE)).nonzero()[:, 0]
-        picture = photos.color[v].movedim(-1, 0)[None].float()
+        stored_color, stored_alpha = photos.stored(v)
+        picture = stored_color.movedim(-1, 0)[None].float()
         uv = (2 * pixel[facing] / size - 1)[None, None]
         # Interpolate as stored, then decode: what is seen between two pixels is their mean colour
         pixel_color = grid_sample(picture, uv, align_corners=False)[0, :, 0].T
         if photos.color.dtype == torch.uint8:
             pixel_color = srgb_to_linear(pixel_color / 255)
-        alpha = grid_sample(coverage[v][None, None], uv, align_corners=False)[0, 0, 0]
+        coverage = coverage_of(stored_alpha)
+        alpha = grid_sample(coverage[None, None], uv, align_corners=False)[0, 0, 0]
         start = position[facing] + offset * (normal[facing] + towards[facing])
         reach = (eye - start).norm(dim=1).max().item() if len(facing) else 0.0
         visible = ~scene.occluded(start, towards[facing], 0.0, reach)

@@ -34,7 +34,7 @@ def surroundings(cameras: Cameras) -> tuple[Tensor, Tensor]:
     """A cube around what the cameras look at, as large as half of their pictures show whole."""
     centre = looked_at(cameras)
     away = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
-    tangent = min(cameras.width, cameras.height) / (2 * cameras.focal.max(1).values)
+    tangent = cameras.size_of_each().amin(1) / (2 * cameras.focal.max(1).values)
     half = float((away * tangent / (1 + tangent.square()).sqrt()).median())
     return centre - half, centre + half
 

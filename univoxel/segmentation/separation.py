@@ -84,7 +84,8 @@ def find_object(
 def mask(scene: Scene, photos: Photos, view: int) -> Tensor:
     """Coverage [H, W] of a photograph by the object, in [0, 1]."""
     surface, _ = surface_of_view(scene, photos.cameras, view)
-    return surface.opacity.view(photos.color.shape[1:3])
+    width, height = photos.cameras.size(view)
+    return surface.opacity.view(height, width)
 
 
 def _ball(radius: float, lower: Tensor, upper: Tensor, cfg: SegmentationConfig) -> _Parts:
@@ -103,6 +104,19 @@ def _ball(radius: float, lower: Tensor, upper: Tensor, cfg: SegmentationConfig) 
     )
     field = dense_field(grid, sizes.channels, ball)
     return _Parts(Scene(sizes, field), field, backdrop)
+
+
+def _random_pixels(photos: Photos, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """View, row and column of pixels, [count] each: as many of each view, wherever in it."""
+    if photos.cameras.sizes is None:
+        view, row, column = (
+            torch.randint(n, (count,)) for n in (len(photos), *photos.color.shape[1:3])
+        )
+        return view, row, column
+    view = torch.randint(len(photos), (count,))
+    width, height = photos.cameras.sizes[view].unbind(1)
+    row, column = ((torch.rand(count) * n).long().clamp_max(n - 1) for n in (height, width))
+    return view, row, column
 
 
 def separate_(
@@ -147,9 +161,7 @@ def separate_(
             redistance_(field, cfg)
         if redistanced or step % REFRESH == 0:
             field.refresh()
-        view, row, column = (
-            torch.randint(n, (stage.rays,)) for n in (len(photos), *photos.color.shape[1:3])
-        )
+        view, row, column = _random_pixels(photos, stage.rays)
         target = linear_to_srgb(photos.pixels(view, row, column)[0])
         rays = pixel_rays(photos.cameras, view, torch.stack([column, row], 1) + 0.5)
         surface = surface_at(scene, rays, torch.rand(stage.rays))

@@ -43,7 +43,7 @@ def cutout(
         out: folder to write.
         box: lower and upper corner of where the object is, world units; by default a cube around
             what the cameras look at, as large as their pictures.
-        downscale: side of the squares of pixels that become one, 0 for 1.
+        downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
         config: how the object is found.
 
     Raises:
@@ -55,8 +55,11 @@ def cutout(
     data, out = Path(data), Path(out)
     if out.exists():
         raise ExistingFile(f"{out} is there already: choose another out", "out")
-    splits = {name: load_photos(data, name, downscale, masks=False) for name in splits_of(data)}
-    photos = splits["train"]
+    photos = load_photos(data, "train", downscale, masks=False)
+    splits = {
+        name: photos if name == "train" else load_photos(data, name, photos.downscale, masks=False)
+        for name in splits_of(data)
+    }
     log.info(photos.about)
     lower, upper = corners(box) if box else surroundings(photos.cameras)
     torch.manual_seed(seed)
@@ -92,7 +95,7 @@ def cutout(
 
 def write_photo(stem: Path, photos: Photos, view: int, alpha: Tensor) -> None:
     """Write a photograph as STEM.png, or STEM.exr where it is linear, with that alpha."""
-    color = photos.color[view]
+    color, _ = photos.stored(view)
     if color.dtype == torch.uint8:
         rgba = torch.cat([color, torch.round(255 * alpha)[..., None].byte()], -1)
         write_png(stem.with_name(f"{stem.name}.png"), rgba)

@@ -180,7 +180,7 @@ def _view(photos: Photos, view: str) -> int:
 
 
 def _ray(photos: Photos, view: int, pixel: tuple[int, int]) -> Rays:
-    size = photos.cameras.width, photos.cameras.height
+    size = photos.cameras.size(view)
     if not all(0 <= p < n for p, n in zip(pixel, size, strict=True)):
         raise UserError(
             f"pixel: expected one of the {size[0]}x{size[1]} pixels, got {pixel[0]},{pixel[1]}",

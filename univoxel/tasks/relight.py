@@ -13,7 +13,7 @@ from torch import Tensor
 
 from univoxel import envmap as env
 from univoxel.bars import bar
-from univoxel.camera import Cameras
+from univoxel.camera import Cameras, stacked
 from univoxel.checkpoint import load_scene
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.maps import read_map
@@ -149,6 +149,9 @@ def relight_images(
 ) -> Tensor:
     """Render a trained scene under new light: [F, H, W, 4] linear RGBA, premultiplied.
 
+    Of cameras with pictures of differing sizes, the smaller ones have nothing but 0 below and to
+    the right of them.
+
     Args:
         run: folder of the trained scene.
         envmap: a file, a map, or None for the suns and point lights alone.
@@ -162,7 +165,7 @@ def relight_images(
     studio = _studio(Path(run), chosen)
     frames = frames_of(studio.names, [NO_MAP], chosen.turn)
     pictures = _pictures(studio, frames, {NO_MAP: light})
-    return torch.stack([rgba(picture) for _, picture in pictures])
+    return stacked([rgba(picture) for _, picture in pictures])
 
 
 def lighting(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -14,7 +15,7 @@ from univoxel.checkpoint import FILE, load_checkpoint, save_scene
 from univoxel.compression import plan
 from univoxel.compression.choices import chosen_reach
 from univoxel.config import TrainConfig, check_same, save_config
-from univoxel.data import Photos, load_photos
+from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import ExistingFile, UserError
 from univoxel.files import replacing
 from univoxel.grid import fit_grid
@@ -23,6 +24,7 @@ from univoxel.joint.config import JointConfig
 from univoxel.pictures.timelapse import Timelapse
 from univoxel.preparation.prepare import Silhouettes, find_silhouettes, prepare
 from univoxel.render.picture import preview
+from univoxel.run import kept_photos
 from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
 from univoxel.training.loop import run_stage
@@ -49,7 +51,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     """
     film = None if timelapse is None else Timelapse(timelapse, cfg)
     torch.manual_seed(cfg.seed)
-    photos = load_photos(cfg.data, "train", cfg.downscale)
+    photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept_photos(cfg.out, "train"))
+    cfg = replace(cfg, downscale=photos.downscale)
     if not resume and (cfg.out / FILE).exists():
         raise ExistingFile(
             f"{cfg.out} holds a run already: pass resume or another out", "resume", "out"
@@ -63,6 +66,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     scene, state = start(silhouettes, cfg, limited, resume)
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
     save_config(cfg)
+    keep_photos(photos, kept_photos(cfg.out, "train"))
     with Progress(limited, begin - state.get("seconds", 0.0), state) as progress:
         if film:
             progress.clock.watch = lambda: film.take_frame(scene, progress.clock)

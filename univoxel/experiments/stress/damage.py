@@ -153,19 +153,12 @@ def clipped(folder: Path) -> float:
 
 
 def _first(photos: Photos, views: int) -> Photos:
-    c = photos.cameras
-    cameras = replace(
-        c,
-        camera_to_world=c.camera_to_world[:views],
-        focal=c.focal[:views],
-        centre=c.centre[:views],
-    )
     return replace(
         photos,
         names=photos.names[:views],
         color=photos.color[:views],
         alpha=photos.alpha[:views],
-        cameras=cameras,
+        cameras=photos.cameras.of(torch.arange(views)),
     )
 
 
