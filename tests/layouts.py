@@ -131,6 +131,24 @@ def write_colmap(
     return folder
 
 
+def write_llff(folder: Path, scene: Scene, original: int = 1, place: str = "images") -> Path:
+    """Photographs without alpha; rows that describe originals `original` times as large."""
+    masks = place.replace("images", "masks")
+    for part in (place, masks):
+        (folder / part).mkdir(parents=True)
+    height, width = scene.pictures.shape[1:3]
+    rows = []
+    for pose, name, picture in zip(scene.poses, scene.names, scene.pictures, strict=True):
+        write_png(folder / place / f"{name}.png", picture[..., :3])
+        write_png(folder / masks / f"{name}.png", picture[..., 3])
+        right, up, back, position = pose[:3].T
+        size_and_focal = original * np.array([height, width, FOCAL])
+        camera = np.stack([-up, right, back, position, size_and_focal], 1)
+        rows.append([*camera.ravel(), 1.0, 9.0])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    return folder
+
+
 def write_tensoir(folder: Path, scene: Scene) -> Path:
     for split in ("train", "test"):
         for i, v in enumerate(scene.split(split)):

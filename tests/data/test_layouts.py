@@ -9,6 +9,7 @@ from layouts import (
     WIDTH,
     scene,
     write_colmap,
+    write_llff,
     write_nerf,
     write_nerfstudio,
     write_tensoir,
@@ -24,6 +25,7 @@ WRITERS = {
     "nerfstudio layout": write_nerfstudio,
     "COLMAP model": write_colmap,
     "COLMAP text": lambda folder, s: write_colmap(folder, s, text=True),
+    "LLFF layout": write_llff,
     "TensoIR layout (rgba_sunset.png)": write_tensoir,
 }
 
@@ -54,7 +56,7 @@ def test_same_photographs_and_same_rays(tmp_path, layout, split):
     )
 
 
-@pytest.mark.parametrize("writer", [write_colmap, write_nerfstudio])
+@pytest.mark.parametrize("writer", [write_colmap, write_nerfstudio, write_llff])
 def test_a_world_in_any_direction_is_turned_upright(tmp_path, writer):
     """Distances between cameras and points stay, and what was up is +Z again."""
     turn = Rotation.from_rotvec([2.0, -0.5, 0.7])
@@ -106,7 +108,7 @@ def test_cameras_on_their_side_do_not_say_what_is_up(tmp_path):
     torch.testing.assert_close(photos.cameras.camera_to_world[:, :, 3], wanted)
 
 
-@pytest.mark.parametrize("writer", [write_colmap, write_nerfstudio])
+@pytest.mark.parametrize("writer", [write_colmap, write_nerfstudio, write_llff])
 def test_splits_that_cannot_be_made(tmp_path, writer):
     writer(tmp_path / "one", scene(views=1))
     with pytest.raises(DataError, match="one: expected two photographs at least, got 1"):

@@ -6,6 +6,7 @@ from univoxel.data.base import Photos, Truth
 from univoxel.data.blender import is_blender, load_blender
 from univoxel.data.colmap import is_colmap, load_colmap
 from univoxel.data.kept import keep_photos, looking_in
+from univoxel.data.llff import is_llff, load_llff
 from univoxel.data.nerfstudio import is_nerfstudio, load_nerfstudio
 from univoxel.data.tensoir import is_tensoir, load_tensoir
 from univoxel.data.transforms import load_cameras
@@ -31,6 +32,7 @@ _LAYOUTS = (
     (is_blender, load_blender),
     (is_nerfstudio, load_nerfstudio),
     (is_colmap, load_colmap),
+    (is_llff, load_llff),
     (is_tensoir, load_tensoir),
 )
 
@@ -69,7 +71,8 @@ def load_photos(
     raise DataError(
         f"{folder}: expected photographs with their cameras, got {came} (looked for "
         f"transforms_{split}.json, transforms.json, cameras and images (.bin or .txt) of COLMAP in "
-        f"sparse/0, sparse, colmap/sparse/0 and here, {split}_000/metadata.json)"
+        f"sparse/0, sparse, colmap/sparse/0 and here, poses_bounds.npy, "
+        f"{split}_000/metadata.json)"
     )
 
 

@@ -11,7 +11,7 @@ import hashlib
 import logging
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 
@@ -61,6 +61,8 @@ def kept_pixels(origin: str) -> tuple[Tensor, Tensor] | None:
                 return color, alpha
     except (OSError, SafetensorError):
         pass
+    with suppress(OSError):  # of no use, and in the way of one that is
+        path.unlink()
     return None
 
 

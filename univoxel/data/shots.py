@@ -290,14 +290,15 @@ def _stored(picture: Tensor, of_color: torch.dtype, of_alpha: torch.dtype) -> tu
     return linear.contiguous(), coverage.contiguous()
 
 
-def find_mask(folder: Path, image: str) -> Path | None:
+def find_mask(folder: Path, image: str, place: str = "masks") -> Path | None:
     """The mask of a photograph in COLMAP's naming: masks/<image>.png; or with its ending replaced.
 
     Args:
         image: path of the photograph within its folder.
+        place: folder of the masks within `folder`.
     """
     names = f"{image}.png", str(Path(image).with_suffix(".png"))
-    return next((path for n in names if (path := folder / "masks" / n).is_file()), None)
+    return next((path for n in names if (path := folder / place / n).is_file()), None)
 
 
 def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:

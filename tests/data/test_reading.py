@@ -1,0 +1,225 @@
+"""Photographs are read at once and in bands, and kept: nothing tells from the result."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+from layouts import HEIGHT, WIDTH, scene, write_nerf, write_nerfstudio
+from PIL import Image
+from safetensors import safe_open
+
+from univoxel.data import keep_photos, load_photos, shots
+from univoxel.data.images import write_exr, write_png
+from univoxel.errors import DataError
+
+BENT = {"k1": -0.05, "p2": 0.01}
+
+
+@pytest.fixture
+def data(tmp_path):
+    return write_nerfstudio(tmp_path / "data", scene(20, width=37, height=29), **BENT)
+
+
+def same(one, other):
+    return torch.equal(one.color, other.color) and torch.equal(one.alpha, other.alpha)
+
+
+@pytest.mark.parametrize("downscale", [1, 2, 3])
+@pytest.mark.parametrize("bent", [False, True])
+def test_readers_and_bands_do_not_matter(tmp_path, monkeypatch, downscale, bent):
+    written = scene(20, width=37, height=29)
+    folder = write_nerfstudio(tmp_path, written, **(BENT if bent else {}))
+    monkeypatch.setattr(shots, "READERS", 1)
+    wanted = load_photos(folder, downscale=downscale)
+    assert wanted.color.shape[1:3] == (29 // downscale, 37 // downscale)
+    for readers, band in ((4, 1 << 20), (4, 1), (1, 200)):
+        monkeypatch.setattr(shots, "READERS", readers)
+        monkeypatch.setattr(shots, "BAND", band)
+        assert same(load_photos(folder, downscale=downscale), wanted)
+    if not bent and downscale == 1:
+        assert np.array_equal(wanted.color[0], written.pictures[1, ..., :3])
+
+
+def test_pixels_are_decoded_in_bands(data, monkeypatch):
+    """No more of a large photograph at once than the constant says, in linear light."""
+    rows = []
+    linear = shots._premultiplied
+
+    def noted(color, alpha):
+        rows.append(len(color))
+        return linear(color, alpha)
+
+    monkeypatch.setattr(shots, "_premultiplied", noted)
+    monkeypatch.setattr(shots, "BAND", 8 * 37)
+    written = write_nerfstudio(data.parent / "plain", scene(3, width=37, height=29))
+    load_photos(written, downscale=2)
+    assert max(rows) == 8
+    assert sum(rows) == 2 * 29
+
+
+def test_the_first_broken_photograph_is_named(data, monkeypatch):
+    """However many are read at once, and whichever fails first."""
+    for name in ("p_003", "p_010", "p_017"):
+        (data / "images" / f"{name}.png").write_bytes((data / "images/p_001.png").read_bytes()[:80])
+    for readers in (1, 4):
+        monkeypatch.setattr(shots, "READERS", readers)
+        with pytest.raises(DataError, match=r"p_003\.png: expected a PNG or JPEG"):
+            load_photos(data)
+
+
+def test_masks_of_16_bits_may_come_later(tmp_path):
+    """Alpha is float32 as soon as one mask is, wherever it stands."""
+    folder = write_nerf(tmp_path, scene(10))
+    before = load_photos(folder)
+    alpha = np.full((HEIGHT, WIDTH), 0.25, np.float32)
+    write_png(folder / "train" / "p_004.png", before.color[3].numpy())
+    Image.fromarray((65535 * alpha).astype(np.uint16)).save(folder / "train" / "p_004_mask.png")
+    after = load_photos(folder)
+    assert after.alpha.dtype == torch.float32
+    torch.testing.assert_close(after.alpha[0], before.alpha[0] / 255)
+    torch.testing.assert_close(after.alpha[3], torch.from_numpy(alpha), atol=2e-5, rtol=0)
+
+
+@pytest.fixture
+def read(monkeypatch):
+    """Counts the photographs that are read from their files."""
+    files = []
+    original = shots.read_photo
+
+    def counted(path, *rest):
+        files.append(path.name)
+        return original(path, *rest)
+
+    monkeypatch.setattr(shots, "read_photo", counted)
+    return files
+
+
+def load_kept(data, file, **options):
+    photos = load_photos(data, kept=file, **options)
+    keep_photos(photos, file)
+    return photos
+
+
+def test_what_was_kept_is_what_was_read(data, tmp_path, read):
+    file = tmp_path / "kept"
+    first = load_kept(data, file, downscale=2)
+    assert len(read) == len(first) == 17
+    stamp = file.stat().st_mtime_ns
+    again = load_kept(data, file, downscale=2)
+    assert len(read) == 17
+    assert same(first, again)
+    assert (again.names, again.about, again.downscale) == (first.names, first.about, 2)
+    assert file.stat().st_mtime_ns == stamp  # not written again
+    load_photos(data, downscale=2)
+    assert len(read) == 2 * 17  # only where it was said
+
+
+def touched(data):
+    os.utime(data / "images" / "p_001.png", ns=(1, 1))
+
+
+def other_mask(data):
+    write_png(data / "masks" / "p_001.png", np.full((29, 37), 255, np.uint8))
+
+
+def another_lens(data):
+    file = data / "transforms.json"
+    file.write_text(file.read_text().replace('"p2": 0.01', '"p2": 0.02'))
+
+
+@pytest.mark.parametrize("change", [touched, other_mask, another_lens])
+def test_what_is_no_longer_so_is_read_again(data, tmp_path, read, change):
+    file = tmp_path / "kept"
+    load_kept(data, file, downscale=2)
+    change(data)
+    load_kept(data, file, downscale=2)
+    assert len(read) == 2 * 17
+    load_kept(data, file, downscale=2)
+    assert len(read) == 2 * 17
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"downscale": 3}, {"downscale": 2, "masks": False}, {"downscale": 2, "split": "test"}],
+)
+def test_what_is_wanted_otherwise_is_read(data, tmp_path, read, options):
+    file = tmp_path / "kept"
+    load_kept(data, file, downscale=2)
+    assert same(load_photos(data, kept=file, **options), load_photos(data, **options))
+
+
+def test_masks_beside_photographs_count(tmp_path, read):
+    folder = write_nerf(tmp_path / "data", scene(10))
+    for v in range(10):
+        name = f"{'test' if v % 8 == 0 else 'train'}/p_{v:03d}"
+        write_png(folder / f"{name}.png", scene(10).pictures[v, ..., :3])
+        write_png(folder / f"{name}_alpha.png", scene(10).pictures[v, ..., 3])
+    file = tmp_path / "kept"
+    load_kept(folder, file, downscale=2)
+    write_png(folder / "train/p_001_mask.png", np.full((HEIGHT, WIDTH), 9, np.uint8))
+    assert load_kept(folder, file, downscale=2).alpha[0].unique().tolist() == [9]
+
+
+def cut_off(file):
+    file.write_bytes(file.read_bytes()[:-7])
+
+
+def no_such_file(file):
+    file.write_bytes(b"something else")
+
+
+def empty(file):
+    file.write_bytes(b"")
+
+
+def a_bit(file):
+    content = bytearray(file.read_bytes())
+    content[-9] ^= 4
+    file.write_bytes(content)
+
+
+@pytest.mark.parametrize("harm", [cut_off, no_such_file, empty, a_bit])
+def test_broken_files_are_passed_over_and_written_anew(data, tmp_path, read, harm):
+    file = tmp_path / "kept"
+    wanted = load_kept(data, file, downscale=2)
+    harm(file)
+    assert same(load_kept(data, file, downscale=2), wanted)
+    assert len(read) == 2 * 17
+    assert same(load_kept(data, file, downscale=2), wanted)
+    assert len(read) == 2 * 17
+
+
+def test_what_cannot_be_written_is_said_and_does_no_harm(data, tmp_path, caplog):
+    caplog.set_level("INFO", "univoxel")
+    photos = load_photos(data, downscale=2)
+    keep_photos(photos, tmp_path / "nowhere" / "kept")
+    assert "photographs are not kept for the next time: " in caplog.text
+    (tmp_path / "kept").mkdir()
+    keep_photos(photos, tmp_path / "kept")
+    assert same(load_photos(data, downscale=2, kept=tmp_path / "kept"), photos)
+    assert [p.name for p in tmp_path.iterdir() if p.name.endswith(".tmp")] == []
+
+
+def test_photographs_as_they_are_are_not_kept(tmp_path):
+    """They are there already."""
+    photos = load_kept(write_nerf(tmp_path / "data", scene()), tmp_path / "kept")
+    assert photos.origin == ""
+    assert not (tmp_path / "kept").exists()
+
+
+def test_pictures_of_differing_sizes_and_linear_ones_are_kept(tmp_path, read):
+    folder = write_nerf(tmp_path / "data", scene(10))
+    for v in range(10):
+        path = folder / ("test" if v % 8 == 0 else "train") / f"p_{v:03d}"
+        path.with_suffix(".png").unlink()
+        values = torch.rand(HEIGHT - v % 2, WIDTH - v % 3, 4) + 0.1
+        write_exr(path.with_suffix(".exr"), dict(zip("RGBA", values.unbind(2), strict=True)))
+    file = tmp_path / "kept"
+    first, again = load_kept(folder, file, downscale=2), load_kept(folder, file, downscale=2)
+    assert len(read) == 8
+    assert first.color.dtype == torch.float32
+    assert same(first, again)
+    assert torch.equal(first.cameras.sizes, again.cameras.sizes)
+    with safe_open(file, "pt") as opened:
+        assert set(opened.keys()) == {"color", "alpha"}
