@@ -9,6 +9,7 @@ from pathlib import Path
 
 import doc_blocks
 import doc_prose
+import doc_reference
 import doc_tables
 import pytest
 import tyro
@@ -32,6 +33,12 @@ def test_every_result_is_shown():
 
 def test_pages_keep_the_rules_of_prose():
     assert doc_prose.faults(ROOT) == []
+
+
+def test_every_field_of_the_configuration_has_a_meaning():
+    rows = re.findall(r"^\| `(\w+)` \|.*\| (.*) \|$", doc_reference.configuration(), re.MULTILINE)
+    assert len(rows) > 100
+    assert [name for name, meaning in rows if not meaning.strip() or "---" in meaning] == []
 
 
 @pytest.fixture

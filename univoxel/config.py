@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from univoxel.compression.config import CompressionConfig
+from univoxel.confidence.config import ConfidenceConfig
 from univoxel.errors import ConfigError, UserError
 from univoxel.fields.features import PER_LEVEL
 from univoxel.files import replacing
@@ -32,6 +33,7 @@ CHOICES = (
 class TrainConfig:
     data: Path  # folder of the data set
     out: Path  # folder of the run
+    # in the order in which they are trained, >= 1: a StageConfig first, which makes the grid
     stages: tuple[StageConfig | JointConfig, ...]
     minutes: float  # > 0; training ends in time, with what it has
     # pixels of the photographs along a side of one that is trained on, >= 1; 0: as many as leave
@@ -41,6 +43,8 @@ class TrainConfig:
     # pixels of the photographs, where the object is, that a voxel is at least as wide as, >= 0: a
     # finer grid would only learn their noise
     voxel_pixels: float = 1.0
+    # of the random numbers of training: first parameters, rays, points. Which rays are held out
+    # does not depend on it
     seed: int = 0
     # auto: masks that end outside of the object, as the photographs show it, are taken in
     masks: MasksFrom = "given"
@@ -58,10 +62,15 @@ class TrainConfig:
     patience: float = 0.0
     capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see compression/plan.py
     budget_mb: float | None = None  # 1e6 bytes that the model's file may have, > 0; adaptive only
+    # sizes of the model, and what light it has
     scene: SceneConfig = field(default_factory=SceneConfig)
-    loss: LossConfig = field(default_factory=LossConfig)
+    loss: LossConfig = field(default_factory=LossConfig)  # weights in each StageConfig
+    # what happens before the first gradient: masks, hull, cameras, exposures, carving
     preparation: PreparationConfig = field(default_factory=PreparationConfig)
+    # how the model's sizes are chosen, where capacity is adaptive
     compression: CompressionConfig = field(default_factory=CompressionConfig)
+    # what is said of the scene afterwards; evaluation reads it from the run's config.json
+    confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
 
     def __post_init__(self):
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")

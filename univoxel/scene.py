@@ -43,14 +43,15 @@ class SceneConfig:
     mirror_levels: int = 5  # of the table of mirrored directions, 29 degrees and finer, [0, 8]
     sky_nodes: int = 512  # directions of the environment map, >= 0; 0: the scene has none
     mirrored: bool = True  # whether a local light gets a network for what is mirrored sharply
+    # the light that photographs are rendered with, and its own sizes
     light: LightConfig = field(default_factory=SGConfig)
     # Of everything, in (0, 1], where it is known and nothing is metal; None: both are learned
     roughness: float | None = None
     varying: Varying = "none"  # what differs from photograph to photograph, see ViewLights
     codes: int = 8  # numbers that tell the light of a view, where that varies, >= 1
-    # Training fills in whether the photographs' cameras are learned too, see PoseSteps, and their
-    # names where something differs from one to another
+    # whether the photographs' cameras are learned too, see PoseSteps; training fills it in
     refined: bool = False
+    # names of the photographs, where something differs from one to another; training fills them in
     views: tuple[str, ...] = ()
 
     def __post_init__(self):

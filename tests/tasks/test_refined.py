@@ -8,9 +8,9 @@ import pytest
 import torch
 from analytic import LIGHTS, RADIUS, cameras_around, write_scene
 
-from univoxel import confidence
 from univoxel.camera import project
 from univoxel.checkpoint import load_scene
+from univoxel.confidence.survey import survey
 from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
@@ -134,9 +134,9 @@ def test_cameras_are_refined_under_every_light(data, tmp_path, light):
 def test_trust_looks_from_where_the_cameras_are(data, run):
     """As it would if they had been put there from the start, and not from where they were."""
     scene, photos = load_scene(run), load_photos(data, "train")
-    refined, moved = confidence.survey(scene, photos, 200), scene.registered(photos)
+    refined, moved = survey(scene, photos, 200), scene.registered(photos)
     scene.poses.steps.data.zero_()
-    there, before = confidence.survey(scene, moved, 200), confidence.survey(scene, photos, 200)
+    there, before = survey(scene, moved, 200), survey(scene, photos, 200)
     torch.testing.assert_close(refined.disagreement, there.disagreement)
     assert (before.disagreement - there.disagreement).abs().mean() > 1e-3
 

@@ -18,6 +18,7 @@ class CompressionConfig:
     """
 
     # --- The grid of a dense field, chosen by rehearsals of the next stage
+
     # Voxels of the coarsest grid that is tried, >= 8. 16^3: below, no object keeps its parts
     fewest_voxels: int = 16**3
     # dB that a coarser grid may end below the best rehearsal, >= 0. Short rehearsals scatter so far
@@ -35,6 +36,7 @@ class CompressionConfig:
     rehearsal_steps: int = 8
 
     # --- Channels, lobes, hidden units and mirror levels, after the first stage with light
+
     # dB that one kind of saving may cost, >= 0. Below what is visible, even a few of them together
     tolerance_db: float = 0.02
     # dB that fewer channels may cost where training goes on, >= 0: it regains most of that
@@ -50,7 +52,8 @@ class CompressionConfig:
     # Steps of Adam in which smaller networks learn what the larger ones gave, >= 0. A trial of one
     # size takes about a second
     settle_steps: int = 20
-    # Their first learning rate, > 0; it falls to 0. That of networks at the begin of training / 3
+    # First learning rate of these steps, > 0; it falls to 0. That of networks at the begin of
+    # training / 3
     settle_rate: float = 1e-3
     # Random mixtures of the outputs whose gradients weigh channels, >= 1: the mean of squares
     # needs no more
@@ -60,6 +63,7 @@ class CompressionConfig:
     ridge: float = 1e-4
 
     # --- What the file of a finished scene stores
+
     # dB that leaving out nodes far from the surface may cost, >= 0
     reach_tolerance_db: float = 0.05
     # Distances from the surface, voxels, up to which nodes are stored: falling, in (0, 4); the
@@ -73,14 +77,16 @@ class CompressionConfig:
     # Rays of the training photographs in a batch whose gradients weigh rows, >= 1: what memory of
     # one backward pass bounds
     row_probe_rays: int = 4096
-    # Such batches, >= 0. A row that none of them meets is kept, so few batches drop fewer rows
+    # Batches of row_probe_rays, >= 0. A row that none of them meets is kept, so few batches drop
+    # fewer rows
     row_probes: int = 8
 
     # --- Under a budget of bytes
-    # Share of it that bounds the rows of the hash table, in (0, 1]: the grid needs the rest
+
+    # Share of the budget that bounds the rows of the hash table, in (0, 1]: the grid needs the rest
     table_share: float = 0.5
-    # Share of it that the table of mirrored directions may have, in (0, 1]: it matters for gloss
-    # alone
+    # Share of the budget that the table of mirrored directions may have, in (0, 1]: it matters for
+    # gloss alone
     mirror_share: float = 0.1
     # Nodes of the next grid over those of the last, in (0, 1), until a finished scene fits. Each
     # try loses detail: small steps come closest to the budget

@@ -115,18 +115,18 @@ def fit_sun_(
     sky, indirect = problem.sky, points.indirect
     irradiance = points.irradiance(sky.radiance)
     mean = irradiance.mean(0)
-    from_sky = (mean - indirect.mean(0)).clamp_min(cfg.min_sky * mean)
-    even = from_sky / points.reach.sum(1).mean()  # [3] radiance of an even sky
-    overcast = points.reach.sum(1, keepdim=True) * even + indirect
-    least = cfg.min_reach * problem.solid_angle / math.pi
-    power = mean / points.reach.mean(0).clamp_min(least)[:, None]  # [D, 3] for all of the light
-    without = points.entropy(torch.stack([irradiance, overcast], 1)).min()
+    mean_from_sky = (mean - indirect.mean(0)).clamp_min(cfg.min_sky * mean)
+    even_radiance = mean_from_sky / points.reach.sum(1).mean()  # [3] radiance of an even sky
+    overcast = points.reach.sum(1, keepdim=True) * even_radiance + indirect
+    min_reach = cfg.min_reach * problem.solid_angle / math.pi
+    power = mean / points.reach.mean(0).clamp_min(min_reach)[:, None]  # [D, 3] for all of the light
+    entropy_without_sun = points.entropy(torch.stack([irradiance, overcast], 1)).min()
     entropy = sun_entropies(points, overcast, power, cfg.sun_shares)
-    if entropy.min() > without - cfg.sun_gain:
+    if entropy.min() > entropy_without_sun - cfg.sun_gain:
         return None
-    best, node = divmod(int(entropy.argmin()), len(power))
-    share = cfg.sun_shares[best]
-    radiance = ((1 - share) * even).repeat(len(power), 1)
+    best_share, node = divmod(int(entropy.argmin()), len(power))
+    share = cfg.sun_shares[best_share]
+    radiance = ((1 - share) * even_radiance).repeat(len(power), 1)
     log_excess = torch.zeros_like(radiance)
     log_excess[node] = (1 + share * power[node] / radiance[node]).log()
     sky.log_radiance.copy_(radiance.log() + log_excess)
@@ -170,18 +170,18 @@ def minimise_entropy_(
     basis = slow_changes(sky, decisions.sun, cfg.degree)
     log_map = sky.log_radiance.detach()
     brightness = points.irradiance(log_map.exp()).log().mean(0)
-    least = first = float(points.entropy(points.irradiance(log_map.exp())[:, None]))
+    lowest = initial = float(points.entropy(points.irradiance(log_map.exp())[:, None]))
     channels = torch.cat([torch.ones(1, 3), torch.eye(3)])
     for step in (s for s in cfg.steps for _ in range(cfg.sweeps)):
         for change in step * basis.T[..., None]:
             candidates = [log_map + sign * c * change for sign in (1, -1) for c in channels]
             irradiance = torch.stack([points.irradiance(m.exp()) for m in candidates], 1)
             entropy, best = points.entropy(irradiance).min(0)
-            if float(entropy) < least - cfg.min_gain:
-                least, log_map = float(entropy), candidates[int(best)]
+            if float(entropy) < lowest - cfg.min_gain:
+                lowest, log_map = float(entropy), candidates[int(best)]
     # Colours do not determine the scale of light against albedo
     sky.log_radiance.copy_(log_map + brightness - points.irradiance(log_map.exp()).log().mean(0))
-    return least < first
+    return lowest < initial
 
 
 def slow_changes(sky: DistantLight, sun: Tensor | None, degree: int) -> Tensor:
@@ -199,24 +199,24 @@ def diffuse_albedo(scene: Scene, problem: JointProblem, cfg: EntropyConfig) -> T
     the specular layer; NaN where none sees a point."""
     observations = problem.observations
     albedo = torch.full_like(observations.position, torch.nan)
-    seen = (observations.offsets.diff() > 0).nonzero()[:, 0]
-    for point in seen.split(POINTS_AT_ONCE):
+    seen_points = (observations.offsets.diff() > 0).nonzero()[:, 0]
+    for point in seen_points.split(POINTS_AT_ONCE):
         normal = observations.normal[point]
         features = scene.field.features_at(observations.position[point])
         roughness = prefiltered_roughness(scene.material(features)[1], problem.nodes)
         black = torch.zeros_like(normal)
-        layer = normal, black, roughness, torch.full_like(black, brdf.F0)
+        specular_layer = normal, black, roughness, torch.full_like(black, brdf.F0)
         reach, indirect = _reach(problem, point)
         irradiance = reach @ problem.sky.radiance + indirect
         total = torch.zeros_like(normal)
         for observation in observations_of(problem, point, cfg.albedo_views).unbind(1):
-            specular = shade_observations(scene, problem, point, observation, *layer)
+            specular = shade_observations(scene, problem, point, observation, *specular_layer)
             exposure = scene.exposed(torch.ones_like(specular), observations.view[observation])
             cosine = (normal * observations.wo[observation]).sum(1)
             factor = 1 - brdf.specular_albedo(cosine, roughness)
             diffuse = (observations.color[observation] - specular) / exposure
-            for_white = (irradiance * factor[:, None]).clamp_min(DARK)
-            total += (diffuse / for_white).clamp(*cfg.albedo)
+            white_radiance = (irradiance * factor[:, None]).clamp_min(DARK)
+            total += (diffuse / white_radiance).clamp(*cfg.albedo)
         albedo[point] = total / cfg.albedo_views
     return albedo
 

@@ -244,22 +244,32 @@ class JointConfig:
     tracing: int = 2  # visibility rays per point and direction, >= 1
     colors: bool = True  # whether the light minimises the entropy of albedo, see entropy
     lr_features: float = 0.03  # at the begin of a round; all rates > 0
+    # at the begin of a round: of the materials' head and the views' gains
     lr_networks: float = 3e-3
     lr_map: float = 0.05  # of the log map
     lr_sdf: float = 0.04  # of the surface, voxels per step, >= 0; 0: it stays
-    albedo_smoothness: float = 0.005  # weights >= 0
+    # weight of the change of the albedo near each point, see AdamConfig.beside; all weights >= 0
+    albedo_smoothness: float = 0.005
+    # weight of the change of the roughness there
     roughness_smoothness: float = 0.02
+    # weight of the cross entropy of metallic and the metal decision
     metallic: float = 0.01
     newton_steps: int = 3  # at the begin of a round, >= 0
     newton_points: int = 4000  # of the points, >= 1
     newton_views: int = 8  # observations of each, >= 2
     newton_roughness: float = 0.1  # standard deviation that roughness follows the map with; 0: none
     newton_smooth: float = 1e-7  # Laplacian on the log map against the mean squared residual, > 0
+    # which points of the surface are traced
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    # what a Newton step on the map weighs and how far it may go
     newton: NewtonConfig = field(default_factory=NewtonConfig)
+    # how points are decided to be metal
     metal: MetalConfig = field(default_factory=MetalConfig)
+    # the prior on few colours, where colors is set
     entropy: EntropyConfig = field(default_factory=EntropyConfig)
+    # hypothesis trials, from which the solve starts
     trials: TrialConfig = field(default_factory=TrialConfig)
+    # rates and weights of the rounds of Adam
     adam: AdamConfig = field(default_factory=AdamConfig)
 
     def __post_init__(self):

@@ -238,10 +238,10 @@ def gram(matrix: Tensor) -> Tensor:
     """matrix.T @ matrix: [N, M] -> [M, M]. Symmetric: five eighths of it are computed."""
     size = matrix.shape[1]
     result = matrix.new_empty(size, size)
-    for first in range(0, size, step := -(-size // 4)):
-        part, rest = slice(first, first + step), slice(first + step, None)
-        result[part, first:] = matrix[:, part].T @ matrix[:, first:]
-        result[rest, part] = result[part, rest].T
+    for begin in range(0, size, step := -(-size // 4)):
+        block, rest = slice(begin, begin + step), slice(begin + step, None)
+        result[block, begin:] = matrix[:, block].T @ matrix[:, begin:]
+        result[rest, block] = result[block, rest].T
     return result
 
 
@@ -268,20 +268,20 @@ def view_equations(
     return hessian, gradient
 
 
-def solve_damped(system: Tensor, right: Tensor) -> Tensor | None:
+def solve_damped(system: Tensor, right_side: Tensor) -> Tensor | None:
     """Solve symmetric systems [..., N, N] x = [..., N], damped as much as they need it.
 
     Rounding, or an unknown that the data do not depend on, can leave a system indefinite. Then
     lambda times the mean of its diagonal is added there (Levenberg 1944), lambda = 1e-6, 1e-4,
     1e-2, 1, until there is a finite solution; None: there is none.
     """
-    matrix, right = system.double(), right.double()[..., None]
+    matrix, right_side = system.double(), right_side.double()[..., None]
     size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None].clamp_min(1e-30)
-    one = torch.eye(matrix.shape[-1], dtype=torch.double)
+    identity = torch.eye(matrix.shape[-1], dtype=torch.double)
     for damping in (0.0, 1e-6, 1e-4, 1e-2, 1.0):
-        factor, failed = torch.linalg.cholesky_ex(matrix + damping * size * one)
+        factor, failed = torch.linalg.cholesky_ex(matrix + damping * size * identity)
         if not failed.any():
-            x = torch.cholesky_solve(right, factor)[..., 0].to(system.dtype)
+            x = torch.cholesky_solve(right_side, factor)[..., 0].to(system.dtype)
             if x.isfinite().all():
                 return x
     return None

@@ -51,8 +51,8 @@ def evidence(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Tensor:
     observation = observations_of(problem, point, cfg.newton_views)
     costs = [residuals(scene, problem, point, observation, cfg, r) for r in metal_cfg.roughness]
     dielectric, metal = torch.stack(costs).amin(0)
-    most = metal_cfg.max_evidence
-    ratio = (metal / dielectric).log().clamp(-most, most)
+    limit = metal_cfg.max_evidence
+    ratio = (metal / dielectric).log().clamp(-limit, limit)
 
     albedo = scene.material(scene.field.features_at(position))[0].clamp_min(1e-2).log()
     scaled = position / (metal_cfg.near * problem.voxel_size), albedo / metal_cfg.alike
@@ -78,47 +78,47 @@ def residuals(
     count, views = observation.shape
     index, flat = point.repeat_interleave(views), observation.flatten()
     normal = problem.observations.normal[index]
-    same = prefiltered_roughness(torch.full((len(flat),), roughness), problem.nodes)
+    filtered = prefiltered_roughness(torch.full((len(flat),), roughness), problem.nodes)
 
     def shaded(diffuse: float, f0: float) -> Tensor:
         white = torch.ones(len(flat), 3)
-        args = scene, problem, index, flat, normal, diffuse * white, same, f0 * white
+        args = scene, problem, index, flat, normal, diffuse * white, filtered, f0 * white
         return shade_observations(*args).view(count, views, 3)
 
     target = problem.target[observation]
     black, mirror = shaded(0.0, 0.0), shaded(0.0, 1.0)  # linear in F0
-    layer = black + F0 * (mirror - black)
-    dielectric = fitted(layer, shaded(1.0, F0) - layer, target, cfg, 0.0)
+    specular = black + F0 * (mirror - black)
+    dielectric = fitted(specular, shaded(1.0, F0) - specular, target, cfg, 0.0)
     metal = fitted(black, mirror - black, target, cfg, cfg.metal.min_reflectance)
     return torch.stack([dielectric, metal])
 
 
 def fitted(
-    constant: Tensor, slope: Tensor, target: Tensor, cfg: JointConfig, least: float
+    constant: Tensor, slope: Tensor, target: Tensor, cfg: JointConfig, min_brightest: float
 ) -> Tensor:
     """Cauchy costs [P] of constant + base * slope [P, V, 3], at the best base colours, against the
     sRGB-encoded target [P, V, 3].
 
     Args:
-        least: of a base's brightest channel.
+        min_brightest: that a base's brightest channel has at least.
     """
     cauchy = cfg.newton.cauchy
 
-    def possible(base: Tensor) -> Tensor:
+    def within_bounds(base: Tensor) -> Tensor:
         base = base.clamp(*cfg.metal.base)
-        return base * (least / base.amax(1, keepdim=True)).clamp_min(1.0)
+        return base * (min_brightest / base.amax(1, keepdim=True)).clamp_min(1.0)
 
-    def compared() -> tuple[Tensor, Tensor, Tensor]:  # residual, its square by the scale, slope
+    def linearised() -> tuple[Tensor, Tensor, Tensor]:  # residual, its square by the scale, slope
         radiance = constant + base[:, None] * slope
         residual = target - linear_to_srgb_unclipped(radiance)
         free = (target <= CLIPPED) | (residual > 0)  # clipped pixels are lower bounds
         return free * residual, (free * residual / cauchy).square(), srgb_slope(radiance) * slope
 
     base = (srgb_to_linear(target) - constant).sum(1) / slope.sum(1).clamp_min(1e-6)
-    base = possible(base)
+    base = within_bounds(base)
     for _ in range(cfg.metal.steps):
-        residual, square, by_base = compared()
+        residual, square, by_base = linearised()
         weighted = by_base / (1 + square)
         step = (weighted * residual).sum(1) / (weighted * by_base).sum(1).clamp_min(1e-6)
-        base = possible(base + step)
-    return cauchy**2 * torch.log1p(compared()[1]).mean((1, 2)) + 1e-6
+        base = within_bounds(base + step)
+    return cauchy**2 * torch.log1p(linearised()[1]).mean((1, 2)) + 1e-6

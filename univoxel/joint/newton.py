@@ -93,11 +93,11 @@ class NewtonPoints:
         """Change albedo and roughness as it belongs to a step of the light [3, D + B]."""
         steps = zip(*(e.back_substituted(light_step) for e in eliminated), strict=True)
         to_albedo, to_roughness = (torch.cat(x) for x in steps)
-        most = self.cfg.max_albedo_change
-        log_albedo = self.log_albedo + to_albedo.clamp(-most, most)
+        limit = self.cfg.max_albedo_change
+        log_albedo = self.log_albedo + to_albedo.clamp(-limit, limit)
         self.log_albedo = log_albedo.clamp(self.cfg.min_log_albedo, 0.0)
-        most = self.cfg.max_roughness_change
-        roughness = self.roughness + to_roughness.clamp(-most, most)
+        limit = self.cfg.max_roughness_change
+        roughness = self.roughness + to_roughness.clamp(-limit, limit)
         self.roughness = roughness.clamp(MaterialHead.min_roughness, 1.0)
 
 
@@ -129,11 +129,12 @@ def newton_round_(
     if points is None:
         return NewtonRound()
     if seconds < math.inf:
-        before = time.monotonic()
+        part_begin = time.monotonic()
         points.equations(points.parts[0], None)
-        now = time.monotonic()
-        room = (seconds - (now - begin)) / (cfg.newton_steps * max(now - before, 1e-6))
-        points.keep_(max(cfg.newton.min_parts, int(room)))
+        part_end = time.monotonic()
+        part_seconds = max(part_end - part_begin, 1e-6)
+        parts_in_time = (seconds - (part_end - begin)) / (cfg.newton_steps * part_seconds)
+        points.keep_(max(cfg.newton.min_parts, int(parts_in_time)))
     laplacian = cfg.newton_smooth * graph_laplacian(problem.sky.direction, cfg.newton.neighbours)
     costs = []
     for _ in range(cfg.newton_steps):
@@ -155,9 +156,9 @@ def choose_points(
     """Random points that are seen often, with the scene's materials; None: there are none."""
     counts = problem.observations.offsets.diff()
     # Points that are seen as often as usual: of few photographs that is less than is wanted
-    usual = float(counts[counts > 0].float().median())
-    least = max(cfg.newton.min_views, min(cfg.newton_views // 2, usual))
-    candidates = (counts >= least).nonzero()[:, 0]
+    usual_count = float(counts[counts > 0].float().median())
+    min_count = max(cfg.newton.min_views, min(cfg.newton_views // 2, usual_count))
+    candidates = (counts >= min_count).nonzero()[:, 0]
     point = candidates[torch.randperm(len(candidates))[: cfg.newton_points]]
     if not len(point):
         return None
@@ -218,23 +219,23 @@ def map_step_(
     if sun is not None:
         log_map = log_map - sun.T
     log_map = torch.nn.functional.pad(log_map, (0, unknowns - nodes))  # no gain is likelier than 1
-    system, right, eliminated = laplacian, -log_map @ laplacian, []
+    system, right_side, eliminated = laplacian, -log_map @ laplacian, []
     coupling = torch.zeros(())  # of the channels, by roughness
     for part in points.parts:  # added up at once: all would take much memory
         hessian, gradient, albedo = points.equations(part, differences)
         if albedo.roughness is not None:
-            from_hessian, from_gradient = roughness_terms(albedo.roughness)
-            coupling, gradient = coupling + from_hessian / count, gradient - from_gradient
-        system, right = system + hessian / count, right + gradient / count
+            hessian_part, gradient_part = roughness_terms(albedo.roughness)
+            coupling, gradient = coupling + hessian_part / count, gradient - gradient_part
+        system, right_side = system + hessian / count, right_side + gradient / count
         eliminated.append(albedo)
     system.diagonal(dim1=1, dim2=2).add_(damping)
     if points.prior_weight:
-        system, right = torch.block_diag(*system) - coupling, right.flatten()
-    step = solve_damped(system, right)
+        system, right_side = torch.block_diag(*system) - coupling, right_side.flatten()
+    step = solve_damped(system, right_side)
     if step is None:
         return None
-    most = points.cfg.max_map_change
-    step = step.view(3, unknowns).clamp(-most, most)
+    limit = points.cfg.max_map_change
+    step = step.view(3, unknowns).clamp(-limit, limit)
     to_map, to_gain = step.split([nodes, unknowns - nodes], 1)
     sky.log_radiance.add_(to_map.T)
     if scene.views is not None:
@@ -258,8 +259,8 @@ def views_step_(
     hessian = gradient = torch.zeros(())
     for part in points.parts:
         state = points.transport(part), sky.radiance, points.log_albedo[part], points.cfg.cauchy
-        h, g = view_equations(*state, differences)
-        hessian, gradient = hessian + h / count, gradient + g / count
+        part_hessian, part_gradient = view_equations(*state, differences)
+        hessian, gradient = hessian + part_hessian / count, gradient + part_gradient / count
     weights = views.sky_weights - views.sky_weights.mean(0)  # [B, R, 3]
     weights = torch.nn.functional.pad(weights.permute(2, 0, 1), (0, 1))
     prior = points.cfg.view_prior * smooth
@@ -267,8 +268,8 @@ def views_step_(
     step = solve_damped(hessian, gradient - prior * weights)
     if step is None:
         return False
-    most = points.cfg.max_map_change
-    step = step.clamp(-most, most).permute(1, 2, 0)
+    limit = points.cfg.max_map_change
+    step = step.clamp(-limit, limit).permute(1, 2, 0)
     sky.log_radiance.add_(views.add(step[:, -1], step[:, :-1]))
     return True
 
@@ -284,18 +285,18 @@ def linear_transport(
     visibility = transport.visibility[point].float()[:, None] / 255
     indirect = transport.indirect[point].float()  # [P, D, 3]
 
-    def layer(f0: float) -> Tensor:  # [P, V, D]
-        of_observations = normal.expand_as(wo).flatten(0, 1), wo.flatten(0, 1)
+    def specular_layer(f0: float) -> Tensor:  # [P, V, D]
+        normal_and_wo = normal.expand_as(wo).flatten(0, 1), wo.flatten(0, 1)
         repeated = roughness.repeat_interleave(views)
         options = transport.direction, problem.solid_angle, f0
-        return specular_response(*of_observations, repeated, *options).view(count, views, -1)
+        return specular_response(*normal_and_wo, repeated, *options).view(count, views, -1)
 
     if metal:
-        specular = layer(0.0)
-        by_base = layer(1.0) - specular  # linear in F0
+        specular = specular_layer(0.0)
+        by_base = specular_layer(1.0) - specular  # linear in F0
         factor = torch.ones(observation.shape)
     else:
-        specular, by_base = layer(brdf.F0), cosine
+        specular, by_base = specular_layer(brdf.F0), cosine
         factor = (1 - brdf.specular_albedo((normal * wo).sum(2), roughness[:, None])) / math.pi
     return LinearTransport(
         by_base * visibility,

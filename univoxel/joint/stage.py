@@ -53,7 +53,7 @@ class Round:
 
     begin: float  # progress of the stage, [0, 1]
     end: float  # the same
-    left: int  # rounds after it
+    rounds_after: int
     solved: bool  # whether Newton has made a step
 
 
@@ -70,17 +70,19 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     decisions = first_decisions(scene, problem, cfg)
     scene.field.sdf.requires_grad_(cfg.lr_sdf > 0)
     guard = Guard(progress)
-    now = Round(begin=0.0, end=-1.0, left=cfg.rounds, solved=False)
+    current_round = Round(begin=0.0, end=-1.0, rounds_after=cfg.rounds, solved=False)
     for done in progress.clock.steps(newton_share(cfg)):
-        if done >= now.end:
+        if done >= current_round.end:
             problem = with_present_normals(scene, problem)
-            decisions, solved = newton_phase_(scene, problem, decisions, cfg, now.left, progress)
+            rounds_left = current_round.rounds_after
+            decisions, solved = newton_phase_(scene, problem, decisions, cfg, rounds_left, progress)
             # On a slow machine fewer and longer rounds
-            left = progress.clock.blocks_that_fit(now.left - 1)
-            now = Round(done, done + (1 - done) / (1 + left), left, solved)
+            rounds_after = progress.clock.blocks_that_fit(rounds_left - 1)
+            end = done + (1 - done) / (1 + rounds_after)
+            current_round = Round(done, end, rounds_after, solved)
             optimizer = adam(scene, problem)
             guard.follow(optimizer)
-        set_rates_(optimizer, cfg, now, done, scene.field.voxel_size, guard.scale)
+        set_rates_(optimizer, cfg, current_round, done, scene.field.voxel_size, guard.scale)
         terms = objective(scene, problem, decisions, cfg)
         loss = torch.stack(list(terms.values())).sum()
         optimizer.zero_grad(set_to_none=True)
@@ -128,17 +130,17 @@ def newton_phase_(
     problem: JointProblem,
     decisions: Decisions,
     cfg: JointConfig,
-    left: int,
+    rounds_left: int,
     progress: Progress,
 ) -> tuple[Decisions, bool]:
     """Change the map by Newton and by the colours of paint; return the decisions under it, and
     whether Newton made a step.
 
     Args:
-        left: rounds that are left, this one among them; before the first the map is initialised.
+        rounds_left: this one among them; before the first the map is initialised.
     """
-    seconds = progress.clock.reserved / left
-    if left == cfg.rounds:
+    seconds = progress.clock.reserved / rounds_left
+    if rounds_left == cfg.rounds:
         with progress.clock.off_pace():
             decisions = start_(scene, problem, decisions, cfg, seconds, progress)
     with progress.clock.off_pace():
@@ -147,7 +149,7 @@ def newton_phase_(
             progress.trouble(trouble)
         if cfg.colors:
             minimise_entropy_(scene, problem, decisions, cfg.entropy)
-        done = 1 - (left - 1) / max(cfg.rounds - 1, 1)
+        done = 1 - (rounds_left - 1) / max(cfg.rounds - 1, 1)
         decisions = replace(decisions, metal=find_metal(scene, problem, cfg, done))
         if decisions.albedo is not None:
             teach_albedo_(scene, problem, decisions, cfg)
@@ -198,7 +200,7 @@ def teach_albedo_(
         return
     position, steps = problem.observations.position, cfg.entropy.teaching_steps
     with torch.no_grad():
-        albedo, *others = scene.material(scene.field.features_at(position))
+        albedo, *other_materials = scene.material(scene.field.features_at(position))
     target = torch.where(diffuse[:, None], target, albedo.clamp_min(1e-3)).log()
     materials = {"params": list(scene.material.parameters())}
     optimizer = RowAdam([{"params": [scene.field.features], "eps": EPS_FEATURES}, materials])
@@ -209,8 +211,8 @@ def teach_albedo_(
         point = torch.randint(len(position), (cfg.rays,))
         material = scene.material(scene.field.features_at(position[point]))
         loss = (material[0].clamp_min(1e-3).log() - target[point]).abs().mean()
-        for value, before in zip(material[1:], others, strict=True):
-            loss = loss + (value - before[point]).abs().mean()
+        for value, value_before in zip(material[1:], other_materials, strict=True):
+            loss = loss + (value - value_before[point]).abs().mean()
         optimizer.zero_grad(set_to_none=True)
         (cfg.entropy.teaching_weight * loss).backward()
         optimizer.step()
@@ -234,22 +236,28 @@ def adam(scene: Scene, problem: JointProblem) -> RowAdam:
 
 
 def set_rates_(
-    optimizer: RowAdam, cfg: JointConfig, now: Round, done: float, voxel_size: float, scale: float
+    optimizer: RowAdam,
+    cfg: JointConfig,
+    current_round: Round,
+    done: float,
+    voxel_size: float,
+    scale: float,
 ) -> None:
     """Set the learning rates of `adam`'s groups: they fall from the begin of a round to its end.
 
     Args:
         scale: factor on all of them.
     """
-    fade = cfg.adam.decay ** ((done - now.begin) / (now.end - now.begin))
-    of_map = cfg.adam.map_after_newton if now.solved else 1.0
-    of_gains = cfg.adam.gains_after_newton if now.solved else 1.0
+    length = current_round.end - current_round.begin
+    fade = cfg.adam.decay ** ((done - current_round.begin) / length)
+    map_factor = cfg.adam.map_after_newton if current_round.solved else 1.0
+    gains_factor = cfg.adam.gains_after_newton if current_round.solved else 1.0
     rates = (
         cfg.lr_features,
         cfg.lr_networks,
-        cfg.lr_map * of_map,
+        cfg.lr_map * map_factor,
         cfg.lr_sdf * voxel_size,
-        cfg.lr_networks * of_gains,
+        cfg.lr_networks * gains_factor,
     )
     for group, rate in zip(optimizer.param_groups, rates, strict=False):
         group["lr"] = rate * fade * scale
@@ -263,25 +271,25 @@ def objective(
     point = index[:: cfg.views]
     position = problem.observations.position[point]
     distance = cfg.adam.beside * problem.voxel_size
-    beside = position + distance * torch.randn_like(position)
+    nearby = position + distance * torch.randn_like(position)
     # One sampling, one gradient: adding up sparse ones costs more than either
-    sample = scene.field.sample(torch.cat([position, beside]))
+    sample = scene.field.sample(torch.cat([position, nearby]))
     parts = (x.chunk(2) for x in scene.material(sample.features))
-    (albedo, albedo_beside), (roughness, roughness_beside), (metallic, _) = parts
+    (albedo, albedo_nearby), (roughness, roughness_nearby), (metallic, _) = parts
     metal = decisions.metal[point].float()
     diffuse, f0 = brdf.split(albedo, metallic * metal)
     assert isinstance(f0, Tensor)
-    repeat = torch.arange(len(point)).repeat_interleave(cfg.views)
-    wide = prefiltered_roughness(roughness, problem.nodes)
+    repeated = torch.arange(len(point)).repeat_interleave(cfg.views)
+    filtered_roughness = prefiltered_roughness(roughness, problem.nodes)
     normal = normalize(sample.gradient[: len(point)], dim=1, eps=1e-6)
-    surface = normal[repeat], diffuse[repeat], wide[repeat], f0[repeat]
+    surface = normal[repeated], diffuse[repeated], filtered_roughness[repeated], f0[repeated]
     rgb = shade_observations(scene, problem, index, observation, *surface)
     encoded, target = linear_to_srgb_unclipped(rgb), problem.target[observation]
-    away = (sample.sdf[: len(point)] / problem.voxel_size).square().mean()
+    squared_distance = (sample.sdf[: len(point)] / problem.voxel_size).square().mean()
     return {
         "joint": losses.photometric(encoded, target, clipped=CLIPPED),
-        "surface": cfg.adam.surface * away,
-        "albedo": cfg.albedo_smoothness * priors.smoothness(albedo, albedo_beside),
-        "roughness": cfg.roughness_smoothness * priors.smoothness(roughness, roughness_beside),
+        "surface": cfg.adam.surface * squared_distance,
+        "albedo": cfg.albedo_smoothness * priors.smoothness(albedo, albedo_nearby),
+        "roughness": cfg.roughness_smoothness * priors.smoothness(roughness, roughness_nearby),
         "metallic": cfg.metallic * binary_cross_entropy(metallic, metal),
     }

@@ -23,6 +23,7 @@ GAIN = 10.0  # the learning rate of networks moves the lobes that much faster: t
 class EnvmapSGConfig:
     """An environment map of spherical Gaussians, with traced visibility."""
 
+    # name of this light, by which config.json tells it from the others
     kind: Literal["envmap-sg"] = field(default="envmap-sg", init=False)
     lobes: int = 128  # of the map, >= 1
     max_sharpness: float = 100.0  # of a lobe, > 0; its half width is about sqrt(2 / sharpness) rad

@@ -25,6 +25,7 @@ _START = 0.5  # radiance from everywhere
 class MLPLightConfig(LocalLightConfig):
     """Local light as two networks."""
 
+    # name of this light, by which config.json tells it from the others
     kind: Literal["mlp"] = field(default="mlp", init=False)
     rank: int = 32  # functions of direction that a point's light is put together of, >= 1
     hidden: int = 64  # width of both networks, >= 1

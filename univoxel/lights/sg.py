@@ -21,6 +21,7 @@ from univoxel.validation import check_fields
 class SGConfig(LocalLightConfig):
     """Local spherical Gaussian light."""
 
+    # name of this light, by which config.json tells it from the others
     kind: Literal["sg"] = field(default="sg", init=False)
     lobes: int = 16  # a point, >= 1
     hidden: int = 64  # width of the head, >= 1

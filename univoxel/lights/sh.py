@@ -24,6 +24,7 @@ _START = 0.5  # radiance from everywhere
 class SHConfig(LocalLightConfig):
     """Local light in spherical harmonics."""
 
+    # name of this light, by which config.json tells it from the others
     kind: Literal["sh"] = field(default="sh", init=False)
     order: int = 3  # the highest degree, >= 0: 3 (order + 1)^2 numbers a point
     hidden: int = 64  # width of the head, >= 1

@@ -24,6 +24,7 @@ COARSEST = 4  # rows of the coarsest level, at least
 class EnvmapConfig:
     """An environment map of texels, with traced visibility."""
 
+    # name of this light, by which config.json tells it from the others
     kind: Literal["envmap"] = field(default="envmap", init=False)
     rows: int = 256  # of the map, twice as wide, >= 1
     directions: int = 64  # of the half-sphere, in training, >= 1

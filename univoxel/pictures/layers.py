@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from univoxel.camera import Cameras
-from univoxel.confidence import Doubts
+from univoxel.confidence.doubts import Doubts
 from univoxel.records import Surface
 from univoxel.render.pipeline import at_rays, shade, surface_of_view
 from univoxel.render.relight import Lighting, TracedMesh, relight_surface

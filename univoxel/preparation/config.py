@@ -193,10 +193,15 @@ class CarvingConfig:
 class PreparationConfig:
     """What happens before the first gradient, in order."""
 
+    # whether masks are too wide
     masks: MaskConfig = field(default_factory=MaskConfig)
+    # the visual hull, and the box of the grid
     hull: HullConfig = field(default_factory=HullConfig)
+    # whether cameras are off, and how they are moved
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    # whether exposures differ, and by what gains
     exposures: ExposureConfig = field(default_factory=ExposureConfig)
+    # where the hull is opened
     carving: CarvingConfig = field(default_factory=CarvingConfig)
 
 

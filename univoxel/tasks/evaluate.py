@@ -13,7 +13,10 @@ from rich.table import Table
 
 from univoxel.bars import track
 from univoxel.checkpoint import FILE, load_checkpoint
-from univoxel.confidence import Doubts, Survey, numbers, survey, words
+from univoxel.confidence.config import confidence_of
+from univoxel.confidence.doubts import Doubts
+from univoxel.confidence.report import numbers, words
+from univoxel.confidence.survey import Survey, survey
 from univoxel.data import Photos
 from univoxel.data.images import write_exr, write_png
 from univoxel.envmap import tables
@@ -75,9 +78,9 @@ def evaluate(
     - relit_psnr: rendered with the albedo times the scale per channel, clipped to 1, on the surface
       and on what it sees of itself; relit_psnr_raw: with the albedo as it is.
     - chamfer: samples of the mesh against points of the true surface.
-    - trust_spearman: of doubt (see `univoxel.confidence`) and error over the pixels of the mask in
-      all views: of the albedo, with a scale per channel, mean absolute difference in sRGB; of the
-      roughness, absolute difference.
+    - trust_spearman: of doubt (see `univoxel.confidence.survey`) and error over the pixels of the
+      mask in all views: of the albedo, with a scale per channel, mean absolute difference in sRGB;
+      of the roughness, absolute difference.
 
     A measure that the data has no truth for is None.
 
@@ -209,7 +212,8 @@ def _measure_views(
 def _survey(scene: Scene, run: Path, data: Path | None) -> Survey | None:
     """What the photographs that were trained on fix; None, with a line, where they are missing."""
     try:
-        return survey(scene, photos_of(run, data, "train"))
+        photos, cfg = photos_of(run, data, "train"), confidence_of(run)
+        return survey(scene, photos, cfg.points, cfg)
     except UserError as error:  # no photographs to train on, or no surface
         log.info("no trust report: %s", error, extra={"arguments": error.arguments})
         return None
@@ -222,7 +226,7 @@ def _say_trust(
     if surveyed is None:
         return {}
     figures = numbers(surveyed)
-    paragraph = words(figures, troubles)
+    paragraph = words(figures, troubles, surveyed.cfg)
     log.info(paragraph)
     if save:
         with replacing(save / "trust.txt") as temporary:

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import torch
 
-from univoxel import confidence
 from univoxel.build import build_scene
 from univoxel.checkpoint import FILE, load_checkpoint, save_scene
 from univoxel.compression import plan
 from univoxel.compression.choices import chosen_reach
+from univoxel.confidence.report import numbers, words
+from univoxel.confidence.survey import survey
 from univoxel.config import TrainConfig, check_same, save_config
 from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import ExistingFile, UserError
@@ -74,7 +75,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
             make_stage_(scene, limited, index, silhouettes.box, pixels, progress)
         if film:
             film.finish(scene, progress.clock)
-    save_trust(scene, pixels.photos, cfg.out, progress.troubles)
+    save_trust(scene, pixels.photos, cfg, progress.troubles)
     return cfg.out
 
 
@@ -137,13 +138,13 @@ def bring_to_grid_(
         scene.field = scene.field.resized(grid)
 
 
-def save_trust(scene: Scene, photos: Photos, out: Path, troubles: list[str]) -> None:
-    """Write to trust.txt, and log, what the photographs leave open."""
+def save_trust(scene: Scene, photos: Photos, cfg: TrainConfig, troubles: list[str]) -> None:
+    """Write to the run's trust.txt, and log, what the photographs leave open."""
     try:
-        survey = confidence.survey(scene, photos, confidence.FEW_POINTS)
-        text = confidence.words(confidence.numbers(survey), troubles)
+        surveyed = survey(scene, photos, cfg.confidence.report_points, cfg.confidence)
+        text = words(numbers(surveyed), troubles, cfg.confidence)
     except UserError as error:
         text = f"No trust report: {error}."
-    with replacing(out / "trust.txt") as temporary:
+    with replacing(cfg.out / "trust.txt") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
     log.info(text)

@@ -19,7 +19,9 @@ class StageConfig:
     rays: int = 2048  # per step, >= 1
     sharpness: tuple[float, float] = (0.5, 0.5)  # s of the NeuS density at begin and end, voxels
     lr_sdf: tuple[float, float] = (0.2, 0.02)  # at begin and end, voxels per step; all rates > 0
+    # at begin and end: of features, and of the table of mirrored directions
     lr_features: tuple[float, float] = (0.1, 0.01)
+    # at begin and end: of the networks, the light, and what differs from view to view
     lr_networks: tuple[float, float] = (3e-3, 3e-4)
     lr_poses: tuple[float, float] = (1e-3, 1e-4)  # radians, radii; of cameras that are refined
     plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.125]
@@ -51,12 +53,14 @@ class StageConfig:
 class LossConfig:
     """Weights >= 0 of the losses; the photometric loss of the physically based render has 1."""
 
-    radiance: float = 1.0
-    silhouette: float = 0.1
-    albedo_smoothness: float = 0.005
-    roughness_smoothness: float = 0.02
+    radiance: float = 1.0  # photometric loss of what the radiance head shows
+    silhouette: float = 0.1  # rays' opacity against the masks
+    albedo_smoothness: float = 0.005  # change of the albedo over about a voxel, L1
+    roughness_smoothness: float = 0.02  # change of the roughness over about a voxel, L1
     metallic: float = 0.01  # what the mean metallic costs: metal is for where nothing else serves
-    light_smoothness: float = 0.1
+    light_smoothness: float = 0.1  # change of a local light over about a voxel, L1
+    # distance of the light from grey on the whole, as a share of it: photographs fix albedo and
+    # light up to a colour only
     white_light: float = 0.01
     map_smoothness: float = 1e-3  # total variation of the log map
 

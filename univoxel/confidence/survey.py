@@ -1,4 +1,4 @@
-"""What the photographs fix of a scene's materials, and what they leave open: maps and words.
+"""Points of the surface, and what the photographs fix of each.
 
 No truth is read: only the photographs that were trained on, and the scene.
 docs/explanation/trust.md explains the terms.
@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from univoxel import brdf
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped
+from univoxel.confidence.config import CONFIDENCE, ConfidenceConfig
 from univoxel.data import Photos
 from univoxel.joint.observations import (
     JointProblem,
@@ -35,27 +35,10 @@ from univoxel.render.transport import (
 from univoxel.scene import Scene
 from univoxel.sphere import fibonacci_sphere
 
-POINTS = 20000  # on the surface, for maps
-FEW_POINTS = 2000  # on the surface, for words alone
-OBSERVATIONS = 8  # of a point that are rendered again, at most
-DIRECTIONS = 64  # that visibility is measured in where the scene has no map with its own
-ROUGHNESS_STEP = 0.05  # of roughness, that the slope of the render is taken over
-ENOUGH = 3.0  # views straight from above that determine an albedo to a doubt of one half
-NOISE = 0.02  # sRGB; disagreement with the photographs that means a doubt of one half
-BLACK = 0.02  # sRGB; darker pixels are noise
-NORMALS = 3.0  # voxels that opposite sides of a thin part lie farther apart, over 2
-NEIGHBOURS = 4  # points that a pixel takes its doubt from
-
-# What is told in words
-FEW = 3  # views; fewer make a guess of the material
-ONE_SIDE = 15.0  # degrees of spread; less is one direction
-SHUT = 0.5  # share of the light; less comes from the object itself
-OFF = 0.05  # sRGB; more is a wrong surface, material or light
-
 
 @dataclass(frozen=True)
 class Survey:
-    """What is known of P points, evenly spread over the surface; everything is [P]."""
+    """What is known of P points, evenly spread over the surface; tensors are [P]."""
 
     position: Tensor  # [P, 3]
     normal: Tensor  # [P, 3]
@@ -68,12 +51,13 @@ class Survey:
     visibility: Tensor  # share of the light's directions, by cosine, that the object leaves open
     disagreement: Tensor  # mean absolute difference of photographs and render, sRGB
     gloss: Tensor  # root of the sum over the views of (change of sRGB by roughness)^2
+    cfg: ConfidenceConfig = CONFIDENCE  # with its scales doubts are computed
 
     @property
     def albedo(self) -> Tensor:
         """Doubt of the albedo, in [0, 1]: 1 - seen * visibility * agreeing."""
-        seen = self.straight / (self.straight + ENOUGH)
-        agreeing = NOISE / (self.disagreement + NOISE)
+        seen = self.straight / (self.straight + self.cfg.enough_views)
+        agreeing = self.cfg.noise / (self.disagreement + self.cfg.noise)
         return torch.where(self.views > 0, 1 - seen * self.visibility * agreeing, 1.0)
 
     @property
@@ -81,15 +65,24 @@ class Survey:
         """Doubt of the roughness, in [0, 1]: 1 - seen * visibility * agreeing * glossy.
 
         glossy^2 is the share by which the photographs narrow what is known of roughness, its
-        variance, when before it could be anything in [0, 1] and each sRGB value has the noise NOISE
+        variance, when before it could be anything in [0, 1].
         """
-        information = (self.gloss / NOISE).square() / 12
+        information = self.information
         return 1 - (1 - self.albedo) * (information / (1 + information)).sqrt()
+
+    @property
+    def information(self) -> Tensor:
+        """That photographs have of roughness, over that of knowing [0, 1] alone, whose variance is
+        1/12: each sRGB value has the noise cfg.noise."""
+        return (self.gloss / self.cfg.noise).square() / 12
 
 
 @torch.no_grad()
-def survey(scene: Scene, photos: Photos, points: int = POINTS) -> Survey:
+def survey(scene: Scene, photos: Photos, points: int, cfg: ConfidenceConfig = CONFIDENCE) -> Survey:
     """What the photographs that were trained on fix of points of the surface.
+
+    Args:
+        points: how many, >= 1, spread evenly.
 
     Raises:
         ValueError: the scene has no surface.
@@ -99,7 +92,7 @@ def survey(scene: Scene, photos: Photos, points: int = POINTS) -> Survey:
     mesh, tracer, offset = extract_mesh(scene), scene.occluder(), scene.field.voxel_size
     position, normal = surface_points(mesh, points, generator)
     observations = observe(position, normal, photos, tracer, offset)
-    direction = scene.sky.direction if scene.sky else fibonacci_sphere(DIRECTIONS)
+    direction = scene.sky.direction if scene.sky else fibonacci_sphere(cfg.directions)
     # What occludes light is as bright as the nearest point is in the photographs
     nearest = KDTree(position.numpy()).query(mesh.vertices.numpy(), workers=-1)[1]
     point_color = mean_colors(without_exposure(scene, observations))
@@ -111,7 +104,7 @@ def survey(scene: Scene, photos: Photos, points: int = POINTS) -> Survey:
     counts = observations.offsets.diff()
     point = torch.repeat_interleave(counts)
     encoded = linear_to_srgb_unclipped(observations.color)
-    clipped, black = (encoded > CLIPPED).any(1), (encoded < BLACK).all(1)
+    clipped, black = (encoded > CLIPPED).any(1), (encoded < cfg.black).all(1)
     usable = ~(clipped | black)
     straight = (observations.wo * normal[point]).sum(1).square()
 
@@ -121,8 +114,8 @@ def survey(scene: Scene, photos: Photos, points: int = POINTS) -> Survey:
     at_least_one = counts.clamp_min(1)
     mean_length = (total(observations.wo).norm(dim=1) / at_least_one).clamp(0, 1)
     spread = torch.where(counts > 0, mean_length.acos().rad2deg(), 0.0)
-    compared = spread_observations(observations, OBSERVATIONS)
-    disagreement, gloss = compare(scene, observations, transport, compared)
+    compared = spread_observations(observations, cfg.observations)
+    disagreement, gloss = compare(scene, observations, transport, compared, cfg.roughness_step)
     return Survey(
         position=position,
         normal=normal,
@@ -135,6 +128,7 @@ def survey(scene: Scene, photos: Photos, points: int = POINTS) -> Survey:
         visibility=visibility,
         disagreement=disagreement,
         gloss=gloss * counts.sqrt(),
+        cfg=cfg,
     )
 
 
@@ -147,7 +141,11 @@ def spread_observations(observations: Observations, most: int) -> tuple[Tensor, 
 
 
 def compare(
-    scene: Scene, observations: Observations, transport: Transport, which: tuple[Tensor, Tensor]
+    scene: Scene,
+    observations: Observations,
+    transport: Transport,
+    which: tuple[Tensor, Tensor],
+    roughness_step: float,
 ) -> tuple[Tensor, Tensor]:
     """Mean absolute difference in sRGB of photographs and render, and root mean square of the
     render's slope by roughness: [P] each, 0 where there is no observation.
@@ -156,11 +154,12 @@ def compare(
 
     Args:
         which: points and numbers of the observations that are compared.
+        roughness_step: that the slope is taken over.
     """
     point, observation = which
     features = scene.field.features_at(observations.position)
     albedo, roughness, metallic = scene.material(features)
-    step = torch.where(roughness > 0.5, -ROUGHNESS_STEP, ROUGHNESS_STEP)
+    step = torch.where(roughness > 0.5, -roughness_step, roughness_step)
     surface = Surface(
         position=observations.position,
         normal=observations.normal,
@@ -214,81 +213,3 @@ def render(
     roughness = prefiltered_roughness(surface.roughness, problem.nodes)
     shaded = observations.normal[point], diffuse[point], roughness[point], f0[point]
     return shade_observations(scene, problem, point, observation, *shaded)
-
-
-class Doubts:
-    """Doubts of a survey, to be looked up anywhere on the surface."""
-
-    def __init__(self, surveyed: Survey):
-        self._scale = NORMALS * surveyed.voxel_size
-        self._values = torch.stack([surveyed.albedo, surveyed.roughness], 1)
-        self._tree = KDTree(self._key(surveyed.position, surveyed.normal))
-
-    def at(self, position: Tensor, normal: Tensor) -> Tensor:
-        """Doubt of albedo and of roughness [N, 2] at points [N, 3] with normals [N, 3]: the mean
-        of the nearest points, weighted by the inverse squared distance."""
-        count = min(NEIGHBOURS, len(self._values))
-        nearest = self._tree.query(self._key(position, normal), k=count, workers=-1)
-        distance, index = (torch.from_numpy(x.reshape(-1, count)) for x in map(np.asarray, nearest))
-        weight = 1 / (distance.square() + 1e-12)
-        weight = (weight / weight.sum(1, keepdim=True)).float()
-        return (self._values[index] * weight[..., None]).sum(1)
-
-    def _key(self, position: Tensor, normal: Tensor) -> np.ndarray:
-        return torch.cat([position, self._scale * normal], 1).numpy()
-
-
-def numbers(surveyed: Survey) -> dict[str, float]:
-    """The survey in figures: means over the surface, shares of it in [0, 1]."""
-
-    def share(where: Tensor) -> float:
-        return where.float().mean().item()
-
-    seen = surveyed.views > 0
-    return {
-        "doubt_albedo": surveyed.albedo.mean().item(),
-        "doubt_roughness": surveyed.roughness.mean().item(),
-        "unseen": share(~seen),
-        "few_views": share(surveyed.views < FEW),
-        "one_side": share(seen & (surveyed.spread < ONE_SIDE)),
-        "clipped": share(surveyed.clipped > 0.5),
-        "black": share(surveyed.black > 0.5),
-        "shut": share(surveyed.visibility < SHUT),
-        "disagreeing": share(surveyed.disagreement > OFF),
-        "dull": share((surveyed.gloss / NOISE).square() / 12 < 1),
-    }
-
-
-def words(figures: dict[str, float], troubles: list[str]) -> str:
-    """The figures as a paragraph, without what is not the case.
-
-    Args:
-        troubles: what went wrong in training, from its state.
-    """
-    sentences = [
-        f"Doubt of albedo {figures['doubt_albedo']:.2f}, of roughness "
-        f"{figures['doubt_roughness']:.2f} in the mean over the surface (0: well determined, 1: a "
-        "guess)."
-    ]
-    shares = {
-        "few_views": f"is seen by fewer than {FEW} cameras: its materials are a guess",
-        "one_side": f"is seen from about one direction, within {ONE_SIDE:g} degrees of it: colour "
-        "and highlight are hard to tell apart there",
-        "clipped": "is clipped in most photographs: shorter exposures would help",
-        "black": "is black in most photographs: more light would help",
-        "shut": "gets less than half of its light from outside: what parts of the object send to "
-        "each other may be left in its albedo",
-        "disagreeing": f"differs from its photographs by more than {OFF:g} in sRGB: its surface, "
-        "material or light is wrong",
-        "dull": "shows no highlight that tells its roughness",
-    }
-    for name, text in shares.items():
-        if figures[name] >= 0.01:
-            sentences.append(f"{figures[name]:.0%} of the surface {text}.")
-    sentences.append(
-        "Albedo and light share a factor that photographs cannot fix: compare albedos with one "
-        "another, not with a colour chart."
-    )
-    if troubles:
-        sentences.append(f"Training met trouble {len(troubles)} times, the last in {troubles[-1]}.")
-    return " ".join(sentences)
