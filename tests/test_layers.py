@@ -54,7 +54,16 @@ HELPERS = {
     "data": {"base", "images", "kept", "lens", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
-    "preparation": {"depth_sweep", "carving", "exposures", "hull", "masks", "registration"},
+    "preparation": {
+        "belief",
+        "carving",
+        "depth_sweep",
+        "exposures",
+        "hull",
+        "masks",
+        "matches",
+        "registration",
+    },
     "training": {"clock", "pixels", "divergence", "plateau", "progress", "surface_update"},
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
     "compression": {"prune", "quality", "search", "sizes", "storage"},
@@ -62,7 +71,7 @@ HELPERS = {
     "pictures": {"animation"},
     "evaluation": {"measures", "truth"},
     "segmentation": {"config", "distances"},
-    "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
+    "experiments.stress": {"axes", "damage", "render", "report", "rough", "scenes", "shapes"},
 }
 # Extras: imported inside the function that needs one
 OPTIONAL = {"drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh"}

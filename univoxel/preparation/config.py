@@ -65,13 +65,18 @@ class HullConfig:
     # share of the views, in [0, 1], that have to carve a node where masks are doubted: one in ten
     # may lack a part, hardly ever the same part. Two views at least
     doubted_votes: float = 0.07
+    # half the width of what a doubted mask lacks or shows too much, in pixels, >= 0: narrower
+    # pieces are its jagged edge
+    rough_pixels: float = 1.5
+    # the same as a share of a picture's larger side, in [0, 1]; the larger of both counts
+    rough_share: float = 0.01
 
     def __post_init__(self) -> None:
         check_fields(self, "at least 8", lambda x: x >= 8, "box_nodes")
         check_fields(self, *_WHOLE, "box_rounds")
         check_fields(self, *_ABOVE, "first_box", "nodes")
-        check_fields(self, *_NOT_BELOW, "margin")
-        check_fields(self, *_SHARE, "doubted_votes")
+        check_fields(self, *_NOT_BELOW, "margin", "rough_pixels")
+        check_fields(self, *_SHARE, "doubted_votes", "rough_share")
 
 
 @dataclass(frozen=True)
