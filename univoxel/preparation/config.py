@@ -246,6 +246,8 @@ class PreparationConfig:
     masks: MaskConfig = field(default_factory=MaskConfig)
     # the visual hull, and the box of the grid
     hull: HullConfig = field(default_factory=HullConfig)
+    # whether cameras or masks are wrong, by points that photographs share
+    matches: MatchesConfig = field(default_factory=MatchesConfig)
     # whether cameras are off, and how they are moved
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     # whether exposures differ, and by what gains
