@@ -25,6 +25,7 @@ from univoxel.preparation.matches import (
     find_matches,
     neighbours,
 )
+from univoxel.training.pixels import MARGIN, split_pixels
 
 VIEWS, SIZE = 8, 200
 FEW = PreparationConfig(matches=MatchesConfig(pairs=8, min_matches=40))  # for time
@@ -202,3 +203,14 @@ def test_one_empty_place_in_masks_is_outvoted_or_refused(photos):
 def test_what_all_masks_show_is_nowhere_doubted(photos, distance):
     box = torch.full((3,), -0.7), torch.full((3,), 0.7)
     assert not doubted_pixels(distance, photos.cameras, Belief(box, False, 2)).any()
+
+
+def test_doubted_pixels_are_not_trained_on(photos, distance):
+    doubted = torch.zeros_like(distance, dtype=torch.bool)
+    doubted[2, : SIZE // 2] = True
+    split = split_pixels(photos, distance, doubted)
+    for pixels in (split.trained, split.held_out):
+        assert not doubted[tuple(pixels.unbind(1))].any()
+    whole = split_pixels(photos, distance)
+    left_out = len(whole.trained) + len(whole.held_out) - len(split.trained) - len(split.held_out)
+    assert left_out == ((distance < MARGIN) & doubted).sum()
