@@ -54,7 +54,7 @@ PARTS = {
     **STAGES,
     "sample": [(Field, n) for n in ("sample", "features_at")],
     "light": [*STAGES["light"], (observations, "shade_map")],
-    "hull": [(prepare, name) for name in ("fitted_masks", "bounds_and_refinement", "visual_hull")],
+    "hull": [(prepare, name) for name in ("fitted_masks", "weighed", "visual_hull")],
     "carving": [(prepare, "carve_within_time")],
     "cameras": [(prepare, "registered_poses")],
     "loading": [(train, "load_photos")],

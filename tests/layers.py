@@ -50,8 +50,8 @@ HELPERS = {
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "preparation": {
-        *("depth_sweep", "carving", "exposures", "hull", "light_frame", "masks"),
-        *("observed_hull", "registration"),
+        *("belief", "depth_sweep", "carving", "exposures", "hull", "light_frame", "masks"),
+        *("matches", "observed_hull", "registration"),
     },
     "training": {"clock", "pixels", "divergence", "plateau", "progress", "surface_update"},
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
@@ -60,7 +60,7 @@ HELPERS = {
     "pictures": {"animation"},
     "evaluation": {"measures", "truth"},
     "segmentation": {"config", "distances"},
-    "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
+    "experiments.stress": {"axes", "damage", "render", "report", "rough", "scenes", "shapes"},
 }
 
 

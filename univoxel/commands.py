@@ -494,6 +494,8 @@ def info(
 ) -> None:
     """Say what a model consists of: parameters and bytes by part, sizes, and what was chosen.
 
+    Also whether points that are matched between the photographs lie where the cameras put them.
+
     Args:
         run: folder of a trained run
         json: file for the numbers

@@ -6,7 +6,13 @@ from analytic import RADIUS, cameras_around, sphere_normals
 
 from univoxel.camera import Cameras
 from univoxel.grid import GridShape, fit_grid, resample
-from univoxel.preparation.hull import estimate_bounds, hull_sdf, mask_distances, visual_hull
+from univoxel.preparation.hull import (
+    estimate_bounds,
+    hull_sdf,
+    mask_distances,
+    visual_hull,
+    votes_needed,
+)
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +34,39 @@ def test_mask_distance_is_signed_and_subpixel():
 
 def test_an_empty_mask_is_far_outside_everywhere():
     assert (mask_distances(torch.zeros(1, 4, 6)) == 6).all()
+
+
+def test_the_edge_of_a_picture_is_no_silhouette():
+    alpha = torch.zeros(3, 8, 12)
+    alpha[0, 3:] = 1  # leaves the picture below, left and right
+    alpha[1] = 1
+    alpha[2, 2:6, 4:8] = 1
+    d = mask_distances(alpha)
+    assert (d[0, 7] == -4.5).all()  # as deep as the one edge is far
+    assert (d[1] == -12).all()
+    assert (d[0].abs() < 1).sum() == 24  # the rows at that edge
+    assert d[2, 3, 5] == -1.5
+
+
+def test_votes_keep_what_one_mask_lacks(silhouettes):
+    distance, cameras = silhouettes
+    bitten = distance.clone()
+    bitten[5] = 64.0  # a view that shows nothing
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.5 * RADIUS]])
+    assert (hull_sdf(bitten, cameras, points) > 0).all()
+    inside, outside = hull_sdf(bitten, cameras, points, votes=2)
+    assert inside < 0 < outside
+    # The second largest of the views' values, by definition
+    each = torch.stack(
+        [hull_sdf(bitten[v : v + 1], cameras.of(torch.tensor([v])), points) for v in range(24)]
+    )
+    torch.testing.assert_close(
+        hull_sdf(bitten, cameras, points, votes=2), each.sort(0, descending=True).values[1]
+    )
+
+
+def test_as_many_votes_are_needed_as_bad_masks_are_outvoted_by():
+    assert [votes_needed(n) for n in (1, 4, 6, 12, 40, 135)] == [1, 1, 2, 2, 3, 9]
 
 
 def test_bounds_enclose_the_sphere_with_little_to_spare(silhouettes):

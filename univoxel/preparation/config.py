@@ -62,12 +62,61 @@ class HullConfig:
     margin: float = 0.03
     # nodes, > 0, at which the hull is evaluated, about; finer grids are interpolated, for time
     nodes: float = 1e6
+    # share of the views, in [0, 1], that have to carve a node where masks are doubted: one in ten
+    # may lack a part, hardly ever the same part. Two views at least
+    doubted_votes: float = 0.07
+    # half the width of what a doubted mask lacks or shows too much, in pixels, >= 0: narrower
+    # pieces are its jagged edge
+    rough_pixels: float = 1.5
+    # the same as a share of a picture's larger side, in [0, 1]; the larger of both counts
+    rough_share: float = 0.01
 
     def __post_init__(self) -> None:
         check_fields(self, "at least 8", lambda x: x >= 8, "box_nodes")
         check_fields(self, *_WHOLE, "box_rounds")
         check_fields(self, *_ABOVE, "first_box", "nodes")
-        check_fields(self, *_NOT_BELOW, "margin")
+        check_fields(self, *_NOT_BELOW, "margin", "rough_pixels")
+        check_fields(self, *_SHARE, "doubted_votes", "rough_share")
+
+
+@dataclass(frozen=True)
+class MatchesConfig:
+    """Cameras against points found again in neighbouring views, see preparation/matches.py."""
+
+    # pairs of neighbouring photographs that are compared, at most, >= 1: a second or two for each
+    # four of them
+    pairs: int = 16
+    # pixels, >= 16, along the longer side of what is searched: larger photographs are shrunk, for
+    # time
+    longest: int = 640
+    # pixels, >= 0, along the longer side up to which they are searched at twice their size
+    small: int = 320
+    # radii of a keypoint, >= 0, that it lies inside of the silhouette: outlines move over a surface
+    clear: float = 2.0
+    # difference of the best match over that of the second best, in (0, 1]: above it, it is a guess
+    ratio: float = 0.75
+    # matches of a pair, >= 9, that a fundamental matrix has to explain together: eight make one
+    fitted: int = 16
+    # pixels, > 0, that a match may be off by what that matrix says
+    residual: float = 1.0
+    # matrices that are tried, >= 1
+    trials: int = 200
+    # matches in all, >= 1, below which nothing is known: plain objects
+    min_matches: int = 60
+    # pixels, > 0, of the median match, up to which cameras can be right: those of structure from
+    # motion are off by 0.2 to 0.7, those that are a pixel off are worth refining
+    max_distance: float = 0.8
+    # how many times further, > 0, silhouettes contradict one another where masks are to blame:
+    # cameras that are off make both large, the contradiction up to twice as much as the distance
+    doubt: float = 4.0
+
+    def __post_init__(self) -> None:
+        check_fields(self, *_WHOLE, "pairs", "trials", "min_matches")
+        check_fields(self, "at least 16", lambda x: x >= 16, "longest")
+        check_fields(self, "at least 9", lambda x: x >= 9, "fitted")
+        check_fields(self, *_NOT_BELOW, "small", "clear")
+        check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "ratio")
+        check_fields(self, *_ABOVE, "residual", "max_distance", "doubt")
 
 
 @dataclass(frozen=True)
@@ -223,6 +272,8 @@ class PreparationConfig:
     masks: MaskConfig = field(default_factory=MaskConfig)
     # the visual hull, and the box of the grid
     hull: HullConfig = field(default_factory=HullConfig)
+    # whether cameras or masks are wrong, by points that photographs share
+    matches: MatchesConfig = field(default_factory=MatchesConfig)
     # whether cameras are off, and how they are moved
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     # whether exposures differ, and by what gains
@@ -234,6 +285,7 @@ class PreparationConfig:
 
 
 MASKS, HULL, REGISTRATION = MaskConfig(), HullConfig(), RegistrationConfig()
+MATCHES = MatchesConfig()
 EXPOSURES, CARVING = ExposureConfig(), CarvingConfig()
 LIGHT_FRAME = LightFrameConfig()
 PREPARATION = PreparationConfig()

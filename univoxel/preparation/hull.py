@@ -16,7 +16,8 @@ from univoxel.preparation.config import HULL, HullConfig
 def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
     """Signed distance to the silhouette in pixels, negative inside: [V, H, W] -> the same.
 
-    Sub-pixel: a half-covered pixel lies on the silhouette. Infinite beyond a picture.
+    Sub-pixel: a half-covered pixel lies on the silhouette. Infinite beyond a picture. Where the
+    object leaves the picture there is no silhouette: the picture's edge is none.
 
     Args:
         cameras: V, which know the sizes of the pictures, where these differ.
@@ -29,9 +30,11 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
         if not inside.any():
             shown[:] = max(a.shape)  # nothing seen: everything is far outside
             continue
-        padded = np.pad(inside, 1)  # what leaves the picture ends there
-        outside, depth = (ndimage.distance_transform_edt(m) for m in (~padded, padded))
-        d = (np.asarray(outside) - np.asarray(depth))[1:-1, 1:-1]
+        if inside.all():
+            shown[:] = -max(a.shape)  # it ends beyond the picture, nobody knows where
+            continue
+        outside, depth = (ndimage.distance_transform_edt(m) for m in (~inside, inside))
+        d = np.asarray(outside) - np.asarray(depth)
         # Next to the edge the distance to pixel centres is 1; coverage says where in between.
         edge = np.abs(d) <= 1
         d = d - np.sign(d) * 0.5
@@ -39,7 +42,7 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
     return torch.from_numpy(result)
 
 
-def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
+def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor, votes: int = 1) -> Tensor:
     """Signed distance to the visual hull, a lower bound of the object's: [P, 3] -> [P].
 
     The largest over views of the silhouette's distance times depth / focal length. Outside a
@@ -48,8 +51,10 @@ def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
 
     Args:
         distance: [V, H, W] from `mask_distances`.
+        votes: views, >= 1, that have to say so before a point is outside; with more than one the
+            hull is somewhat too large, and wrong masks of fewer views do not bite into it.
     """
-    sdf = torch.full((len(points),), -torch.inf)
+    highest = torch.full((votes, len(points)), -torch.inf)  # of the views so far, the largest first
     for v in range(len(cameras)):
         pixel, depth = project(cameras, v, points)
         uv = pixel * (2 / torch.tensor(cameras.size(v))) - 1
@@ -62,14 +67,27 @@ def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor) -> Tensor:
         seen = (depth > 0) & (uv.abs() <= 1).all(1)
         bound = d.clamp_min(0.5) if uncut else torch.full_like(d, -torch.inf)
         bound = torch.where(seen, d, bound) * depth.abs() / cameras.focal[v].mean()
-        sdf = torch.maximum(sdf, bound)
+        for rank in range(votes):
+            highest[rank], bound = (
+                torch.maximum(highest[rank], bound),
+                torch.minimum(highest[rank], bound),
+            )
+    sdf = highest[-1]
     return torch.where(sdf.isinf(), torch.inf, sdf)
 
 
+def votes_needed(views: int, cfg: HullConfig = HULL) -> int:
+    """How many of so many views have to carve a point where their masks are doubted."""
+    return max(1, min(max(2, round(cfg.doubted_votes * views)), views // 3))
+
+
 def estimate_bounds(
-    distance: Tensor, cameras: Cameras, cfg: HullConfig = HULL
+    distance: Tensor, cameras: Cameras, cfg: HullConfig = HULL, votes: int = 1
 ) -> tuple[Tensor, Tensor]:
     """Corners [3], [3] of a box around the visual hull, with a margin.
+
+    Args:
+        votes: see `hull_sdf`.
 
     Raises:
         UserError: the silhouettes share no volume.
@@ -83,7 +101,7 @@ def estimate_bounds(
     for _ in range(cfg.box_rounds):  # each round sees the hull at a finer grid
         grid = fit_grid(lower, upper, cfg.box_nodes)
         nodes = grid.nodes().reshape(-1, 3)
-        inside = nodes[hull_sdf(distance, cameras, nodes) < grid.voxel_size]
+        inside = nodes[hull_sdf(distance, cameras, nodes, votes) < grid.voxel_size]
         if not len(inside):
             raise UserError(
                 "the silhouettes of the photographs share no volume: check masks and cameras"
@@ -95,11 +113,15 @@ def estimate_bounds(
 
 
 def visual_hull(
-    distance: Tensor, cameras: Cameras, grid: GridShape, cfg: HullConfig = HULL
+    distance: Tensor, cameras: Cameras, grid: GridShape, cfg: HullConfig = HULL, votes: int = 1
 ) -> Tensor:
-    """SDF of the visual hull on a grid: [X, Y, Z], world units; at about cfg.nodes evaluated."""
+    """SDF of the visual hull on a grid: [X, Y, Z], world units; at about cfg.nodes evaluated.
+
+    Args:
+        votes: see `hull_sdf`.
+    """
     stride = max(1, round((np.prod(grid.size) / cfg.nodes) ** (1 / 3)))
     coarse = fit_coarse(grid, stride)
-    sdf = hull_sdf(distance, cameras, coarse.nodes().reshape(-1, 3)).reshape(coarse.size)
+    sdf = hull_sdf(distance, cameras, coarse.nodes().reshape(-1, 3), votes).reshape(coarse.size)
     far = sum(n * n for n in grid.size) ** 0.5 * grid.voxel_size
     return resample(sdf.clamp(-far, far), coarse, grid)

@@ -13,12 +13,13 @@ from univoxel.grid import GridShape, fit_grid
 from univoxel.lights.turntable import Turntable
 from univoxel.names import Varying
 from univoxel.poses import PoseSteps
+from univoxel.preparation.belief import doubted_pixels, weighed
 from univoxel.preparation.carving import carve_within_time
 from univoxel.preparation.exposures import varying_and_gains
 from univoxel.preparation.hull import visual_hull
 from univoxel.preparation.light_frame import turntable_of
 from univoxel.preparation.masks import fitted_masks
-from univoxel.preparation.registration import bounds_and_refinement, registered_poses
+from univoxel.preparation.registration import registered_poses
 from univoxel.training.config import StageConfig
 
 
@@ -30,6 +31,8 @@ class Silhouettes:
     distance: Tensor  # [V, H, W] pixels to the silhouette, negative inside
     box: tuple[Tensor, Tensor]  # corners [3], [3] around the object
     refined: bool  # whether the cameras are refined
+    votes: int = 1  # views that have to carve a node of the hull, >= 1
+    doubted: Tensor | None = None  # [V, H, W] bool: nothing is learned there; None: nowhere
 
 
 @dataclass(frozen=True)
@@ -53,10 +56,14 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
     """
     photos, distance = fitted_masks(photos, cfg.masks, cfg.preparation.masks)
     try:
-        box, refined = bounds_and_refinement(distance, photos.cameras, cfg.cameras, cfg.preparation)
+        belief = weighed(photos, distance, cfg.cameras, cfg.masks, cfg.preparation)
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
-    return Silhouettes(photos, distance, box, refined)
+    found = Silhouettes(photos, distance, belief.box, belief.refined, belief.votes)
+    if belief.votes == 1:
+        return found
+    doubted = doubted_pixels(distance, photos.cameras, belief, cfg.preparation.hull)
+    return replace(found, doubted=doubted)
 
 
 def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
@@ -74,7 +81,7 @@ def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
     if silhouettes.refined:
         poses = registered_poses(distance, photos.cameras, box, constants.registration)
         photos = replace(photos, cameras=poses.corrected(photos.cameras))
-    hull = visual_hull(distance, photos.cameras, grid, constants.hull)
+    hull = visual_hull(distance, photos.cameras, grid, constants.hull, silhouettes.votes)
     varying, gains = varying_and_gains(
         photos, hull, grid, cfg.scene.varying, cfg.exposures, constants.exposures
     )

@@ -9,15 +9,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from univoxel.camera import Cameras, pixel_rays
-from univoxel.names import CamerasFrom
 from univoxel.poses import PoseSteps
-from univoxel.preparation.config import (
-    PREPARATION,
-    REGISTRATION,
-    PreparationConfig,
-    RegistrationConfig,
-)
-from univoxel.preparation.hull import estimate_bounds
+from univoxel.preparation.config import REGISTRATION, RegistrationConfig
 from univoxel.records import Rays
 
 log = logging.getLogger("univoxel")
@@ -176,38 +169,6 @@ def _seen(cameras: Cameras, points: Tensor, view: Tensor) -> tuple[Tensor, Tenso
     return torch.stack([x, -y], 1) / -z[:, None] * cameras.focal[view] + cameras.centre[view], -z
 
 
-def bounds_and_refinement(
-    distance: Tensor,
-    cameras: Cameras,
-    wanted: CamerasFrom,
-    cfg: PreparationConfig = PREPARATION,
-) -> tuple[tuple[Tensor, Tensor], bool]:
-    """Corners [3], [3] of a box around the object, and whether its cameras are to be refined.
-
-    Args:
-        distance: [V, H, W] from `hull.mask_distances`.
-        wanted: as of the configuration.
-
-    Raises:
-        UserError: the silhouettes share no volume.
-    """
-    box = estimate_bounds(distance, cameras, cfg.hull)
-    off = contradiction(distance, cameras, box, cfg.registration)
-    limit = cfg.registration.max_contradiction
-    refined = wanted == "refined" or (wanted == "auto" and off > limit)
-    if off > limit:
-        then = "cameras are refined" if refined else "see cameras=refined"
-        log.info(
-            "silhouettes contradict one another by %.1f pixels: %s",
-            off,
-            then,
-            extra={"arguments": ("cameras",)},
-        )
-    if refined and off > 0:  # what the silhouettes share is too small by so much
-        box = estimate_bounds(distance - off, cameras, cfg.hull)
-    return box, refined
-
-
 def registered_poses(
     distance: Tensor,
     cameras: Cameras,
@@ -217,7 +178,7 @@ def registered_poses(
     """Steps to cameras whose silhouettes agree, as far as these tell; logs how far they went.
 
     Args:
-        distance, box: see `bounds_and_refinement`.
+        distance, box: see `Edges`.
     """
     half = (box[1] - box[0]) / 2
     poses = PoseSteps(len(cameras))

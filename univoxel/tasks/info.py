@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as jsonlib
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,12 @@ from univoxel.errors import UserError
 from univoxel.files import replacing
 from univoxel.lights import LocalSG
 from univoxel.pictures.contact_sheet import heat
+from univoxel.preparation.hull import mask_distances
+from univoxel.preparation.matches import agreement, find_matches
+from univoxel.run import photos_of
 from univoxel.scene import Scene
+
+log = logging.getLogger("univoxel")
 
 # Beginning of a tensor's name in the file: the part it belongs to. The first that fits counts.
 PARTS = {
@@ -51,7 +57,7 @@ class Part:
 def info(
     run: str | Path, json: str | Path | None = None, picture: str | Path | None = None
 ) -> dict:
-    """What the model of a run takes up and where.
+    """What the model of a run takes up and where, and whether photographs agree with its cameras.
 
     Parameters are the learned numbers that the file holds: distances and features of the nodes it
     stores, weights, light. Row numbers and directions of the map are bytes, and no parameters.
@@ -64,7 +70,7 @@ def info(
         JSON: `parameters`, `bytes`, `parts` (name: parameters and bytes), `grid` (size, voxel_size,
         nodes, and shares of them: with distances, with features), `channels`,
         `material_channels`, `hidden`, `lobes` (None where there are none), `chosen`: what,
-        before, after, cost in dB and why.
+        before, after, cost in dB and why; `cameras`, see `camera_check`.
 
     Raises:
         UserError: no model there, or one that cannot be read.
@@ -77,6 +83,7 @@ def info(
     scene, state = load_checkpoint(run)
     found = facts(scene, parts(run), state)
     found["bytes"] = (run / FILE).stat().st_size
+    found["cameras"] = camera_check(scene, run)
     for path in (json, picture):
         if path:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -86,6 +93,29 @@ def info(
     if picture:
         write_png(picture, capacity_picture(scene, found))
     return found
+
+
+def camera_check(scene: Scene, run: Path) -> dict | None:
+    """How far points that are matched between the photographs of a run lie from their epipolar
+    lines: `matches`, `refined`, and `given` and `used` (median and 90 %, pixels) for the cameras as
+    they were given and as the scene has them. None where too few points match, or where the
+    photographs cannot be read any more."""
+    try:
+        photos = photos_of(run, split="train")
+        used = scene.registered(photos).cameras
+    except UserError as error:
+        log.info("cameras are not checked: %s", error)
+        return None
+    matches = find_matches(photos, mask_distances(photos.coverage(), photos.cameras))
+    given, after = (agreement(cameras, matches) for cameras in (photos.cameras, used))
+    if given is None or after is None:
+        return None
+    return {
+        "matches": len(matches),
+        "refined": scene.poses is not None,
+        "given": {"median": given.median, "most": given.most},
+        "used": {"median": after.median, "most": after.most},
+    }
 
 
 def parts(run: Path) -> dict[str, Part]:
@@ -149,6 +179,20 @@ def tables(found: dict) -> Iterable[Table]:
     table.add_row("of them for materials", f"{found['material_channels']}")
     table.add_row("hidden units of a layer", f"{found['hidden']}")
     table.add_row("lobes of light", "-" if found["lobes"] is None else f"{found['lobes']}")
+    yield table
+    if found["cameras"] is None:
+        return
+    table = Table(
+        "cameras", "median", "90 %", title="Matched points off their epipolar lines, pixels"
+    )
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, key in (("as given", "given"), ("as refined", "used")):
+        if key == "given" or found["cameras"]["refined"]:
+            off = found["cameras"][key]
+            table.add_row(name, f"{off['median']:.2f}", f"{off['most']:.2f}")
+    table.add_section()
+    table.add_row("matches", f"{found['cameras']['matches']}", "")
     yield table
 
 

@@ -71,7 +71,7 @@ def train(
 
     begin = time.monotonic()  # only now: how long reading takes is the photographs' affair
     silhouettes = find_silhouettes(photos, cfg)
-    pixels = split_pixels(silhouettes.photos, silhouettes.distance)
+    pixels = split_pixels(silhouettes.photos, silhouettes.distance, silhouettes.doubted)
     limited = plan.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
     scene, state = start(silhouettes, cfg, limited, resume)
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used

@@ -22,13 +22,15 @@ class TrainingPixels:
     held_out: Tensor  # only looked at, to follow quality
 
 
-def split_pixels(photos: Photos, distance: Tensor) -> TrainingPixels:
+def split_pixels(photos: Photos, distance: Tensor, doubted: Tensor | None = None) -> TrainingPixels:
     """The pixels in or near silhouettes: those to train on, and some that are held out.
 
     Args:
         distance: [V, H, W] pixels to the silhouette, negative inside.
+        doubted: [V, H, W] bool, where masks are not believed: left out.
     """
-    pixels = (distance < MARGIN).nonzero()
+    near = distance < MARGIN
+    pixels = (near if doubted is None else near & ~doubted).nonzero()
     order = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))
     held = min(HELD_OUT, len(pixels) // 10)
     if not held:  # so few that none can be spared

@@ -29,7 +29,7 @@ class Level:
     def random(self) -> bool:
         """Whether its photographs differ from seed to seed."""
         d = self.damage
-        return bool(d.pose or d.stops or d.light or d.noise)
+        return bool(d.pose or d.stops or d.light or d.noise or d.rough)
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,7 @@ _TURNTABLES = (
     *(("still-2", 2, False), ("turning-2", 2, True)),
     *(("still-1", 1, False), ("turning-1", 1, True)),
 )
+_ROUGH = 0.0, 0.5, 1.0, 2.0
 AXES = {
     axis.name: axis
     for axis in (
@@ -96,6 +97,10 @@ AXES = {
         ),
         replace(
             _photos("masks", "masks too wide, pixels", "dilation", (0.0, 1.0, 3.0, NO_MASK)),
+            quick=(0, 2, 3),
+        ),
+        replace(
+            _photos("rough-masks", "masks drawn by hand, % of the picture", "rough", _ROUGH),
             quick=(0, 2, 3),
         ),
         _scenes("thin", "diameter of rods", "amount", (0.16, 0.08, 0.04, 0.02), shape="rods"),

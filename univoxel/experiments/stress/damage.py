@@ -20,6 +20,7 @@ from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
 from univoxel.errors import NothingFound, UserError
 from univoxel.experiments.stress.render import SPEC
+from univoxel.experiments.stress.rough import rough_masks, shifted
 from univoxel.segmentation.distances import surroundings
 from univoxel.segmentation.separation import find_object, mask
 
@@ -35,6 +36,7 @@ class Damage:
     stops: float = 0.0  # exposures differ by up to so many, from -stops to +stops
     light: float = 0.0  # largest share of the second light in a photograph, in [0, 1]
     dilation: float = 0.0  # of the masks, pixels; NO_MASK: there are none, and `cutout` finds some
+    rough: float = 0.0  # masks as people draw them, see rough.py: percent of the picture
     noise: float = 0.0  # standard deviation, of sRGB in [0, 1]
     exposure: float = 0.0  # stops, of all photographs and of the test views
 
@@ -65,13 +67,15 @@ def damaged(
         share = torch.from_numpy(damage.light * random.uniform(size=damage.views)).float()
         other = load_photos(second, "train").color[: damage.views]
         photos = replace(photos, color=torch.lerp(photos.color, other, share[:, None, None, None]))
+    if damage.rough:
+        photos = shifted(photos, damage.rough, random)
     gain = exposures(damage.views, damage.stops, random) * 2**damage.exposure
     shutil.rmtree(out, ignore_errors=True)
     (out / "train").mkdir(parents=True)
     write_cameras(out, "train", turned(photos.cameras, damage.pose, random), photos.names)
     pictures, alphas = [], []
     for view in range(len(photos)):
-        if damage.dilation:
+        if damage.dilation or damage.rough:
             shown, alpha = masked(photos, view, damage.dilation)
         else:
             shown, alpha = photos.picture(view)
@@ -79,6 +83,8 @@ def damaged(
         alphas.append(alpha)
     if damage.dilation == NO_MASK:
         alphas = cut_out(replace(photos, color=torch.stack(pictures)))
+    if damage.rough:
+        alphas = torch.from_numpy(rough_masks(torch.stack(alphas).numpy(), damage.rough, random))
     for name, picture, alpha in zip(photos.names, pictures, alphas, strict=True):
         rgba = torch.cat([picture, torch.round(255 * alpha)[..., None].byte()], -1)
         write_png(out / "train" / f"{name}.png", rgba.numpy())

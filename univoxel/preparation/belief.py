@@ -1,0 +1,139 @@
+"""Cameras or masks: which are believed where silhouettes contradict one another."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from univoxel.camera import Cameras
+from univoxel.data import Photos
+from univoxel.errors import UserError
+from univoxel.grid import fit_grid
+from univoxel.names import CamerasFrom, MasksFrom
+from univoxel.preparation.config import HULL, PREPARATION, HullConfig, PreparationConfig
+from univoxel.preparation.depth_sweep import surface_depths
+from univoxel.preparation.hull import estimate_bounds, visual_hull, votes_needed
+from univoxel.preparation.matches import Agreement, agreement, find_matches
+from univoxel.preparation.registration import contradiction
+
+log = logging.getLogger("univoxel")
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is made of cameras and masks."""
+
+    box: tuple[Tensor, Tensor]  # corners [3], [3] around the object
+    refined: bool  # whether the cameras are refined
+    votes: int = 1  # views that have to carve a node, >= 1; more than one where masks are doubted
+
+
+def weighed(
+    photos: Photos,
+    distance: Tensor,
+    wanted: CamerasFrom,
+    masks: MasksFrom,
+    cfg: PreparationConfig = PREPARATION,
+) -> Belief:
+    """The box around the object, and which of cameras and masks are believed.
+
+    Where silhouettes contradict one another, points matched between photographs are asked. If they
+    lie much nearer to where the cameras put them than the contradiction is large, it is the masks
+    that are wrong.
+
+    Args:
+        distance: [V, H, W] from `hull.mask_distances`.
+        wanted, masks: as of the configuration.
+
+    Raises:
+        UserError: the silhouettes share no volume.
+    """
+    cameras = photos.cameras
+    try:
+        box, none_shared = estimate_bounds(distance, cameras, cfg.hull), None
+        off = contradiction(distance, cameras, box, cfg.registration)
+    except UserError as error:
+        box, none_shared, off = None, error, math.inf
+    if off <= cfg.registration.max_contradiction and box is not None:
+        return Belief(
+            _widened(box, distance, cameras, off, wanted == "refined", cfg), wanted == "refined"
+        )
+    seen = agreement(cameras, find_matches(photos, distance, cfg.matches), cfg.matches)
+    believed = right(seen, off, cfg)
+    refined = wanted == "refined" or (wanted == "auto" and not believed)
+    if believed or box is not None:
+        _say(seen, off, believed, refined)
+    if believed and masks == "auto":
+        votes = votes_needed(len(cameras), cfg.hull)
+        return Belief(estimate_bounds(distance, cameras, cfg.hull, votes), refined, votes)
+    if box is None:
+        assert none_shared is not None
+        raise none_shared
+    return Belief(_widened(box, distance, cameras, off, refined, cfg), refined)
+
+
+def right(seen: Agreement | None, off: float, cfg: PreparationConfig = PREPARATION) -> bool:
+    """Whether cameras are right and it is the masks that make silhouettes contradict one another by
+    so many pixels."""
+    if seen is None:
+        return False
+    return seen.median <= min(cfg.matches.max_distance, off / cfg.matches.doubt)
+
+
+def _widened(
+    box: tuple[Tensor, Tensor],
+    distance: Tensor,
+    cameras: Cameras,
+    off: float,
+    refined: bool,
+    cfg: PreparationConfig,
+) -> tuple[Tensor, Tensor]:
+    """The box, or that of wider silhouettes: what wrong cameras share is too small."""
+    if not (refined and off > 0):
+        return box
+    return estimate_bounds(distance - off, cameras, cfg.hull)
+
+
+def _say(seen: Agreement | None, off: float, believed: bool, refined: bool) -> None:
+    contradicting = f"silhouettes contradict one another by {off:.1f} pixels"
+    if math.isinf(off):
+        contradicting = "silhouettes share no volume"
+    if seen is not None:
+        lie = f"matched points lie {seen.median:.2f} pixels from where the cameras put them"
+        contradicting = f"{lie}{': cameras are believed' if believed else ''}; {contradicting}"
+    if believed and not refined:
+        then = "the masks are rough"
+    else:
+        then = "cameras are refined" if refined else "see cameras=refined"
+    log.info("%s: %s", contradicting, then, extra={"arguments": ("cameras",)})
+
+
+def doubted_pixels(
+    distance: Tensor, cameras: Cameras, belief: Belief, cfg: HullConfig = HULL
+) -> Tensor:
+    """Where a mask lacks a part that the others show, or shows what they do not: [V, H, W] bool.
+
+    Nothing can be learned there: the photograph may show the object, or be cut away.
+
+    Args:
+        distance: [V, H, W] from `hull.mask_distances`.
+    """
+    grid = fit_grid(*belief.box, cfg.box_nodes)
+    hull = visual_hull(distance, cameras, grid, cfg, belief.votes)
+    doubted = torch.zeros(distance.shape, dtype=torch.bool)
+    for view, depth in enumerate(surface_depths(hull, grid, cameras)):
+        shown = cameras.cut(view, distance[view] < 0)
+        differs = (shown != cameras.cut(view, depth.isfinite())).numpy()
+        reach = max(cfg.rough_pixels, cfg.rough_share * max(shown.shape))
+        deep = np.asarray(ndimage.distance_transform_edt(np.pad(differs, 1)))[1:-1, 1:-1] > reach
+        if not deep.any():
+            continue
+        near = np.asarray(ndimage.distance_transform_edt(~deep)) <= reach + 1
+        cameras.cut(view, doubted[view]).copy_(torch.from_numpy(differs & near))
+    return doubted
