@@ -26,7 +26,9 @@ RAW = (
 # Of one photograph in several formats the first is taken
 ORDER = (".jpg", ".jpeg", *HEIF, ".png", ".tif", ".tiff", ".webp", ".avif", *RAW)
 DIAGONAL_35MM = math.hypot(36, 24)  # millimetres
-SIDEWAYS = (5, 6, 7, 8)  # orientations of EXIF that swap width and height
+T = Image.Transpose
+TURNS = {5: T.TRANSPOSE, 6: T.ROTATE_270, 7: T.TRANSVERSE, 8: T.ROTATE_90}  # to upright, by EXIF
+SIDEWAYS = tuple(TURNS)  # orientations that swap width and height
 MAKE, MODEL, ORIENTATION, DETAILS = 0x010F, 0x0110, 0x0112, 0x8769
 FOCAL, FOCAL_35MM, EXIF_WIDTH, EXIF_HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
 SRGB_GAMMA = (2.4, 12.92)  # of a RAW's development
