@@ -1,7 +1,7 @@
 """Photographs of a textured object on a patterned floor in a furnished room, with known cameras.
 
-Rays meet boxes, balls and the room by formula; colours are noise of several scales in space, so that
-every corner has something to hold on to. Fast and plain: flat light, square pixels.
+Rays meet boxes, balls and the room by formula; colours are noise of several scales in space, so
+that every corner has something to hold on to. Fast and plain: flat light, square pixels.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ def orbit(views: int, width: int = 480, height: int = 360, focal: float = 1.0) -
     found = []
     for v in range(views):
         phi, up = 2 * math.pi * v / views + 0.05 * (v % 3), math.radians((20, 38)[v % 2])
-        place = 2.2 * np.array([math.cos(phi) * math.cos(up), math.sin(phi) * math.cos(up), math.sin(up)])
+        place = 2.2 * np.array(
+            [math.cos(phi) * math.cos(up), math.sin(phi) * math.cos(up), math.sin(up)]
+        )
         target = np.array([0.0, 0.0, 0.45])
         found.append(View(look_at(place + target, target), focal, width, height))
     return found
@@ -84,7 +86,9 @@ def photograph(
     room = which < 0
     own = np.isin(which, OBJECT)
     if still:  # the pattern stands in the picture
-        points = np.stack([column.ravel() / scale * 2, row.ravel() / scale * 2, np.zeros(best.shape)], -1)
+        points = np.stack(
+            [column.ravel() / scale * 2, row.ravel() / scale * 2, np.zeros(best.shape)], -1
+        )
         points[own] = (own_origin + best[:, None] * own_direction)[own]
     else:
         best[room] = _inside(origin[room], direction[room])

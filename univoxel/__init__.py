@@ -11,6 +11,7 @@ __version__ = "0.1.0"
 
 # Imported when asked for: `import univoxel` does not wait for torch.
 _TASKS = {
+    "find_poses": ("univoxel.tasks.poses", "poses"),
     "cutout": ("univoxel.tasks.cutout", "cutout"),
     "train": ("univoxel.tasks.train", "train"),
     "evaluate": ("univoxel.tasks.evaluate", "evaluate"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from univoxel.names import FEATURE_SIZE
 from univoxel.validation import check_fields
 
 
@@ -15,7 +16,7 @@ class CaptureConfig:
         ConfigError: a field is out of range.
     """
 
-    size: int = 1200  # pixels along the longer side in which features are sought, >= 64
+    size: int = FEATURE_SIZE  # pixels along the longer side in which features are sought, >= 64
     features: int = 4096  # largest number of a photograph, >= 64
     # Octave of the scale space that features begin in: -1 doubles the picture first. 0 costs a
     # quarter and loses photographs of smooth objects

@@ -88,7 +88,9 @@ def find_photographs(folder: Path) -> tuple[list[Path], list[str], int]:
         for path in sorted(pictures, key=lambda p: ORDER.index(p.suffix.lower())):
             best.setdefault(path.stem, path)
         return sorted(best.values()), others, len(pictures) - len(best)
-    raise DataError(f"{folder}: expected photographs ({' '.join((*PLAIN, *HEIF))} or RAW), got none")
+    raise DataError(
+        f"{folder}: expected photographs ({' '.join((*PLAIN, *HEIF))} or RAW), got none"
+    )
 
 
 def require_readers(paths: list[Path]) -> None:

@@ -57,6 +57,11 @@ class Folders:
         return self.work / "pairs.txt"
 
     @property
+    def matched(self) -> Path:
+        """There when all pairs are matched."""
+        return self.work / "matched"
+
+    @property
     def models(self) -> Path:
         return self.work / "models"
 
@@ -69,15 +74,9 @@ class Capture:
     groups: list[list[int]]
     masks: list[Path] | None = None  # one for each photograph
 
-    def picture(self, index: int) -> str:
-        """The name of a photograph's picture for structure from motion: without blanks."""
-        return f"{self.camera(index)}/{index:05d}.jpg"
-
-    def camera(self, index: int) -> int:
-        return next(g for g, members in enumerate(self.groups) if index in members)
-
     @property
     def pictures(self) -> list[str]:
+        """Names of the pictures for structure from motion, a folder a camera: without blanks."""
         camera = {i: g for g, members in enumerate(self.groups) for i in members}
         return [f"{camera[i]}/{i:05d}.jpg" for i in range(len(self.photographs))]
 
@@ -150,7 +149,7 @@ def start_over(folders: Folders) -> None:
     """Remove all work but the frames of a video."""
     for path in (folders.pictures, folders.masks, folders.models):
         shutil.rmtree(path, ignore_errors=True)
-    for path in (*folders.work.glob("database.db*"), folders.pairs):
+    for path in (*folders.work.glob("database.db*"), folders.pairs, folders.matched):
         path.unlink(missing_ok=True)
 
 

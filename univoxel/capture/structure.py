@@ -18,6 +18,7 @@ from univoxel.capture.photographs import fitted
 from univoxel.capture.prepare import Capture, Folders
 from univoxel.files import replacing
 
+
 def extract(
     engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig
 ) -> Iterator[int]:
@@ -77,12 +78,15 @@ def match(
     engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig
 ) -> Iterator[int]:
     """Match the chosen pairs and verify them; yields how many are done."""
+    if folders.matched.exists():
+        return
     yield from run(
         engine,
         _request("match", capture, folders, config),
         folders.work / "match.log",
         lambda: database.count(folders.database, "two_view_geometries"),
     )
+    folders.matched.touch()
 
 
 def pair_count(folders: Folders) -> int:
@@ -99,9 +103,7 @@ def place(
         return
     shutil.rmtree(folders.models, ignore_errors=True)
     folders.models.mkdir(parents=True)
-    yield from run(
-        engine, _request("map", capture, folders, config), folders.work / "map.log"
-    )
+    yield from run(engine, _request("map", capture, folders, config), folders.work / "map.log")
     done.touch()
 
 

@@ -26,12 +26,12 @@ from univoxel.capture.scene import Report, own_sizes, write_report, write_scene,
 from univoxel.capture.world import moved, settle
 from univoxel.errors import DataError, ExistingFile
 from univoxel.files import replacing
+from univoxel.names import KEEP_SIZE
 
 log = logging.getLogger("univoxel")
 
 WORK = "sfm"  # folder in the scene that the steps keep their results in
 NAMED = 5  # photographs that a message names at most
-KEEP_SIZE = 2000  # pixels: twice what the grids of the presets can use
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,9 @@ def poses(
     return out
 
 
-def _files(source: Path, folders: Folders, every: float | None) -> tuple[list[Path], list[str], int]:
+def _files(
+    source: Path, folders: Folders, every: float | None
+) -> tuple[list[Path], list[str], int]:
     """Photographs of a folder or frames of a video; other files; how many came twice."""
     if video.is_video(source):
         video.require_ffmpeg()
@@ -168,7 +170,9 @@ def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
         if not same:
             raise ExistingFile(f"{out} holds another scene: choose another out", "out")
         return all(record.get(key) == value for key, value in written.items())
-    foreign = [p.name for p in out.iterdir() if p.name not in (WORK, ".partial")] if out.exists() else []
+    foreign = (
+        [p.name for p in out.iterdir() if p.name not in (WORK, ".partial")] if out.exists() else []
+    )
     if foreign:
         raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
     if not same:
@@ -207,8 +211,8 @@ def _search(
         stands = f"the background stands still in {still} of {matching} pairs"
         if capture.masks is None:
             raise DataError(
-                f"{stands}: the object was turned before a still camera. Only what is on the object "
-                "counts: make masks of it and give them as masks=DIR",
+                f"{stands}: the object was turned before a still camera. Only what is on the "
+                "object counts: make masks of it and give them as masks=DIR",
                 "masks",
             )
         raise DataError(f"{stands}: masks hold a part of it, make them tighter", "masks")
