@@ -280,8 +280,13 @@ def poses(
     from univoxel.capture.config import DEFAULTS, FAST
     from univoxel.tasks import poses as task
 
-    config = FAST if fast else DEFAULTS
-    config = dataclasses.replace(config, size=size, features=features or config.features, seed=seed)
+    if keep_size < 0:
+        raise UserError(f"--keep-size must be at least 0, got {keep_size}")
+    if every is not None and not every > 0:
+        raise UserError(f"--every must be above 0, got {every:g}")
+    config = dataclasses.replace(FAST if fast else DEFAULTS, size=size, seed=seed)
+    if features is not None:
+        config = dataclasses.replace(config, features=features)
     print(task.poses(photographs, out, masks, every, keep_size, keep_weak, config))
 
 
