@@ -4,8 +4,8 @@
         [--out benchmarks/results/preparation/poses.json]
 
 A textured object on a patterned floor in a furnished room (tests/textured_room.py). `plain` are
-JPEG files without EXIF; `heic` HEIC; `turned` has every third held upright and stored lying, as EXIF
-says; `zoom` two zoom settings in EXIF; `mixed` is all of that, with a white picture and a text
+JPEG files without EXIF; `heic` HEIC; `turned` has every third held upright and stored lying, as
+EXIF says; `zoom` two zoom settings in EXIF; `mixed` is all of that, with a white picture and a text
 file. Rotations and centres are compared after a similarity. Pictures and scenes are kept in --work.
 """
 

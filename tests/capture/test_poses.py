@@ -15,8 +15,10 @@ import pytest
 import textured_room
 from PIL import Image
 
-from univoxel.capture import engine
+from univoxel.capture import database, engine, structure
 from univoxel.capture.config import CaptureConfig
+from univoxel.capture.photographs import find_photographs
+from univoxel.capture.prepare import Folders, gather
 from univoxel.data.colmap import read_cameras, read_images
 from univoxel.errors import DataError, ExistingFile, MissingExtra, ProcessFailed
 from univoxel.tasks.poses import poses
@@ -201,6 +203,33 @@ def test_a_search_goes_on_from_what_is_there(scene, photographs, tmp_path, monke
     assert centres.max() < 0.01 * 2.2
 
 
+def test_features_are_found_once_in_the_camera_that_was_begun(scene, photographs, tmp_path):
+    """Killed while features were sought: the rest joins the cameras that are there."""
+    out, _ = scene
+    folders = Folders(tmp_path / "sfm")
+    shutil.copytree(out / "sfm" / "pictures", folders.pictures)
+    files, _, _ = find_photographs(photographs)
+    capture, _ = gather(files, None)
+    later = [folders.pictures / capture.pictures[i] for i in (2, 3, 20)]
+    for path in later:
+        path.rename(path.with_suffix(".later"))
+    list(structure.extract("pycolmap", capture, folders, SMALL))
+    begun = database.images(folders.database)
+    assert len(begun) == VIEWS + 1 - 3
+    for path in later:
+        path.with_suffix(".later").rename(path)
+    list(structure.extract("pycolmap", capture, folders, SMALL))
+    found = database.images(folders.database)
+    assert len(found) == VIEWS + 1
+    assert begun.items() <= found.items()
+    assert len({camera for _, camera in found.values()}) == 2
+    whole = database.images(out / "sfm" / "database.db")
+    counts = database.feature_counts(folders.database)
+    expected = database.feature_counts(out / "sfm" / "database.db")
+    for name, (number, _) in found.items():
+        assert counts[number] == expected[whole[name][0]]
+
+
 @pytest.fixture(scope="module")
 def turntable(tmp_path_factory) -> Path:
     """A still camera before an object that is turned, in front of a wall of its own pattern."""
@@ -250,6 +279,19 @@ def test_too_few_placed_is_one_line(photographs, tmp_path):
     with pytest.raises(DataError, match=r"only \d of 6 photographs could be placed: .*plain0.png"):
         poses(folder, tmp_path / "out", config=SMALL)
     assert not (tmp_path / "out/images").exists()
+
+
+def test_what_is_no_folder_of_photographs_is_one_line(tmp_path):
+    with pytest.raises(DataError, match="expected a folder of photographs or a video"):
+        poses(tmp_path / "none", tmp_path / "out")
+    with pytest.raises(DataError, match="every is for videos"):
+        poses(tmp_path, tmp_path / "out", every=1.0)
+    for name in "ab":
+        Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.jpg")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").touch()
+    with pytest.raises(ExistingFile, match=r"holds other files \(mine.txt\)"):
+        poses(tmp_path, tmp_path / "out")
 
 
 def test_without_any_engine_nothing_is_read(tmp_path, monkeypatch):
@@ -338,8 +380,6 @@ def test_pycolmap_stays_out_of_this_process():
 
 def test_the_database_is_read_as_it_is_written(scene):
     """Against SQLite's own account of it."""
-    from univoxel.capture import database
-
     path = scene[0] / "sfm" / "database.db"
     with sqlite3.connect(path) as db:
         keys = {name: number for number, name in db.execute("SELECT image_id, name FROM images")}

@@ -8,9 +8,11 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+import univoxel.tasks.poses as tasks_poses
 from univoxel.capture import video
+from univoxel.capture.prepare import Folders
 from univoxel.capture.video import is_video, seconds, sharpest, sharpness, write_frames
-from univoxel.errors import DataError
+from univoxel.errors import DataError, MissingExtra
 
 
 def test_the_sharpest_of_each_group():
@@ -77,3 +79,20 @@ def test_what_is_no_video_is_one_line(tmp_path):
         write_frames(path, tmp_path / "frames")
     with pytest.raises(DataError, match=r"a.mp4: expected a video"):
         write_frames(path, tmp_path / "frames", every=1.0)
+
+
+def test_frames_are_chosen_once_and_anew_for_other_wishes(film, tmp_path, monkeypatch):
+    calls = []
+    write = video.write_frames
+    monkeypatch.setattr(video, "write_frames", lambda *args: calls.append(args[2]) or write(*args))
+    folders = Folders(tmp_path)
+    for every, frames in ((0.5, 8), (0.5, 8), (2.0, 2)):
+        files, others, doubles = tasks_poses._files(film, folders, every)
+        assert (len(files), others, doubles) == (frames, [], 0)
+    assert calls == [0.5, 2.0]
+
+
+def test_without_ffmpeg_nothing_is_read(film, tmp_path, monkeypatch):
+    monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MissingExtra, match="a video needs imageio-ffmpeg"):
+        tasks_poses._files(film, Folders(tmp_path), None)

@@ -77,10 +77,10 @@ def gaps(directions: np.ndarray, names: Sequence[str], config: CaptureConfig) ->
     told = []
     order = np.argsort(azimuth)
     steps = np.diff(azimuth[order], append=azimuth[order[0]] + 360)
-    for k in np.argsort(-steps):
+    for k in np.argsort(-steps).tolist():
         if steps[k] < config.gap:
             break
-        begin, end = order[k], order[(k + 1) % len(order)]
+        begin, end = int(order[k]), int(order[(k + 1) % len(order)])
         low = azimuth[begin]
         side = SIDES[math.floor((low + steps[k] / 2) / 45 + 0.5) % 8]
         told.append(

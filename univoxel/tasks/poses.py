@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import platform
+import shutil
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -127,6 +128,7 @@ def _files(
         done = folders.frames / "done"
         if not done.exists() or done.read_text(encoding="utf-8") != stamp:
             log.info(f"{source}: choosing frames")
+            shutil.rmtree(folders.frames, ignore_errors=True)
             video.write_frames(source, folders.frames, every)
             done.write_text(stamp, encoding="utf-8")
         return sorted(folders.frames.glob("*.jpg")), [], 0
