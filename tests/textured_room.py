@@ -23,7 +23,9 @@ BOXES = (  # lower corner, upper corner
 )
 BALLS = (((0.0, 0.0, 0.75), 0.35), ((0.3, 0.2, 0.6), 0.18))  # the object's head
 OBJECT = (0, len(BOXES), len(BOXES) + 1)  # indices of the surfaces that are the object's
+BAND = 12  # rows of pixels at a time
 SCALES = ((3.0, 0.5), (9.0, 0.3), (27.0, 0.2))  # cells a unit, and their weight
+TABLES = np.random.default_rng(3).random((len(SCALES), 32, 32, 32, 3), dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -65,77 +67,74 @@ def photograph(
         still: room and floor move with the camera, as where the object stands on a turntable; the
             background is then far away and has a pattern in the picture.
     """
-    w, h = view.width * samples, view.height * samples
-    scale = view.focal * max(w, h)
-    column, row = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
-    local = np.stack([(column - w / 2) / scale, (h / 2 - row) / scale, -np.ones((h, w))], -1)
-    direction = (local @ view.pose[:, :3].T).reshape(-1, 3)
-    origin = np.broadcast_to(view.pose[:, 3], direction.shape)
-    c, s = math.cos(turn), math.sin(turn)
-    turned = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    own_origin, own_direction = origin @ turned.T, direction @ turned.T
-    best, which = np.full(len(direction), np.inf), np.full(len(direction), -1)
-    surfaces = [_box(*(np.array(x) for x in box)) for box in BOXES]
-    surfaces += [_ball(np.array(centre), radius) for centre, radius in BALLS]
-    for k, surface in enumerate(surfaces):
-        if still and k not in OBJECT:
-            continue
-        own = k in OBJECT
-        t = surface(own_origin if own else origin, own_direction if own else direction)
-        nearer = t < best
-        best[nearer], which[nearer] = t[nearer], k
-    room = which < 0
-    own = np.isin(which, OBJECT)
-    if still:  # the pattern stands in the picture
-        points = np.stack(
-            [column.ravel() / scale * 2, row.ravel() / scale * 2, np.zeros(best.shape)], -1
-        )
-        points[own] = (own_origin + best[:, None] * own_direction)[own]
-    else:
-        best[room] = _inside(origin[room], direction[room])
-        points = origin + best[:, None] * direction
-        points[own] = (own_origin + best[:, None] * own_direction)[own]
-    color = _noise(points + np.where(own, 50.0, 0.0)[:, None])
-    picture = color.reshape(view.height, samples, view.width, samples, 3).mean((1, 3))
-    mask = own.reshape(view.height, samples, view.width, samples).mean((1, 3))
+    bands = [
+        _band(view, samples, turn, still, first, min(first + BAND, view.height))
+        for first in range(0, view.height, BAND)
+    ]
+    color, mask = (np.concatenate(parts) for parts in zip(*bands, strict=True))
     return (
-        Image.fromarray((255 * picture + 0.5).astype(np.uint8)),
+        Image.fromarray((255 * color + 0.5).astype(np.uint8)),
         Image.fromarray((255 * mask + 0.5).astype(np.uint8)),
     )
 
 
-_TABLE = np.random.default_rng(3).random((len(SCALES), 32, 32, 32, 3), dtype=np.float32)
+def _band(
+    view: View, samples: int, turn: float, still: bool, first: int, end: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colour [R, W, 3] and mask [R, W] of some rows of pixels: what fits into the cache."""
+    w, h = view.width * samples, view.height * samples
+    scale = view.focal * max(w, h)
+    row, column = np.mgrid[first * samples : end * samples, :w].reshape(2, -1) + 0.5
+    local = np.stack([(column - w / 2) / scale, (h / 2 - row) / scale, -np.ones(len(row))])
+    direction, origin = view.pose[:, :3] @ local, view.pose[:, 3:]
+    c, s = math.cos(turn), math.sin(turn)
+    turned = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    rays = (origin, direction), (turned @ origin, turned @ direction)
+    best, which = np.full(len(row), np.inf), np.full(len(row), -1)
+    boxes = [(_box, np.array(low)[:, None], np.array(high)[:, None]) for low, high in BOXES]
+    balls = [(_ball, np.array(centre)[:, None], radius) for centre, radius in BALLS]
+    for k, (distance, *shape) in enumerate(boxes + balls):
+        if still and k not in OBJECT:
+            continue
+        t = distance(*shape, *rays[k in OBJECT])
+        nearer = t < best
+        best[nearer], which[nearer] = t[nearer], k
+    own = np.isin(which, OBJECT)
+    room = which < 0
+    if still:  # the pattern stands in the picture
+        points = np.stack([column / scale * 2, row / scale * 2, np.zeros(len(row))])
+    else:
+        best[room] = _inside(origin, direction[:, room])
+        points = origin + best * direction
+    points[:, own] = (rays[1][0] + best[own] * rays[1][1][:, own]) + 50.0
+    shape = (end - first, samples, view.width, samples)
+    color = _noise(points).reshape(*shape, 3)
+    return color.mean((1, 3)), own.reshape(shape).mean((1, 3))
 
 
 def _noise(points: np.ndarray) -> np.ndarray:
-    color = np.zeros_like(points, dtype=np.float32)
-    for table, (cells, weight) in zip(_TABLE, SCALES, strict=True):
-        i, j, k = (np.floor(points * cells + 0.123).astype(np.int64) % 32).T
+    color = np.zeros((points.shape[1], 3), np.float32)
+    for table, (cells, weight) in zip(TABLES, SCALES, strict=True):
+        i, j, k = np.floor(points * cells + 0.123).astype(np.int64) % 32
         color += weight * table[i, j, k]
     return color
 
 
-def _box(lower: np.ndarray, upper: np.ndarray):
-    def distance(origin, direction):
-        with np.errstate(divide="ignore"):
-            a, b = (lower - origin) / direction, (upper - origin) / direction
-        near, far = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
-        return np.where((near < far) & (near > 0), near, np.inf)
-
-    return distance
+def _box(lower, upper, origin, direction) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        a, b = (lower - origin) / direction, (upper - origin) / direction
+    near, far = np.minimum(a, b).max(0), np.maximum(a, b).min(0)
+    return np.where((near < far) & (near > 0), near, np.inf)
 
 
-def _ball(centre: np.ndarray, radius: float):
-    def distance(origin, direction):
-        a, away = (direction**2).sum(1), origin - centre
-        b = (away * direction).sum(1)
-        root = b * b - a * ((away**2).sum(1) - radius**2)
-        return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
-
-    return distance
+def _ball(centre, radius, origin, direction) -> np.ndarray:
+    a, away = (direction**2).sum(0), origin - centre
+    b = (away * direction).sum(0)
+    root = b * b - a * ((away**2).sum() - radius**2)
+    return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.inf)
 
 
 def _inside(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    lower, upper = np.array([-ROOM, -ROOM, 0.0]), np.array([ROOM, ROOM, 3.0])
+    lower, upper = np.array([[-ROOM, -ROOM, 0.0], [ROOM, ROOM, 3.0]])[..., None]
     with np.errstate(divide="ignore"):
-        return np.maximum((lower - origin) / direction, (upper - origin) / direction).min(1)
+        return np.maximum((lower - origin) / direction, (upper - origin) / direction).min(0)
