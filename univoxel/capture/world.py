@@ -31,7 +31,7 @@ def settle(images: Sequence[Placed]) -> tuple[Similarity, bool]:
     """
     axes = np.stack([i.to_camera[:, :3].T * FLIP for i in images])
     centres = np.stack([i.centre for i in images])
-    up = up_direction(axes)
+    up = up_direction(axes[:, :, :2].swapaxes(1, 2))
     known = up is not None
     if up is None:
         mean = axes[:, :, 1].mean(0)

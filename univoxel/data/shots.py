@@ -210,7 +210,8 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     right axes then lie in the horizontal plane, and up is what is across to all of them. A world
     that is upright already, to within LEAN, stays as it is; and one whose cameras do not agree.
     """
-    up = up_direction(np.stack([shot.pose[:, :3] for shot in shots]))
+    held = np.stack([shot.pose[:, :2].T for shot in shots])
+    up = up_direction(held)
     if up is None:
         return list(shots), ["world as in the files: its cameras do not say what is up"]
     if up[2] >= math.cos(LEAN):
@@ -219,18 +220,8 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     return [replace(shot, pose=turn @ shot.pose) for shot in shots], ["world turned to +Z up"]
 
 
-def up_direction(axes: np.ndarray) -> np.ndarray | None:
-    """The unit vector that is across to the right axes of all cameras, None if they say too little.
-
-    Args:
-        axes: [V, 3, 3] camera-to-world, axes as of `Cameras`.
-    """
-    right, mean_up = axes[:, :, 0], axes[:, :, 1].mean(0)
-    _, spread, directions = np.linalg.svd(right, full_matrices=True)
-    up = directions[2] * (1 if directions[2] @ mean_up >= 0 else -1)
-    if len(spread) < 2 or spread[1] < 0.1 * spread[0] or up @ mean_up < math.sin(LEAN):
-        return None
-    return up
+def size_of(image: Tensor) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
 
 
 def turn_to_z(up: np.ndarray) -> np.ndarray:
@@ -242,8 +233,18 @@ def turn_to_z(up: np.ndarray) -> np.ndarray:
     return np.eye(3) + cross + cross @ cross / (1 + z)
 
 
-def size_of(image: Tensor) -> str:
-    return f"{image.shape[1]}x{image.shape[0]}"
+def up_direction(held: np.ndarray) -> np.ndarray | None:
+    """The unit vector that is across to what is to the right in all photographs, if there is one.
+
+    Args:
+        held: [V, 2, 3] to the right and up, in the world, of each photograph as it is looked at.
+    """
+    right, mean_up = held[:, 0], held[:, 1].mean(0)
+    _, spread, directions = np.linalg.svd(right, full_matrices=True)
+    up = directions[2] * (1 if directions[2] @ mean_up >= 0 else -1)
+    if len(spread) < 2 or spread[1] < 0.1 * spread[0] or up @ mean_up < math.sin(LEAN):
+        return None
+    return up
 
 
 def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
