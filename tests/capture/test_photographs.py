@@ -106,13 +106,21 @@ def test_grey_of_sixteen_bits(tmp_path):
     np.testing.assert_allclose(read, array / 257, atol=1)
 
 
-def test_a_wider_colour_space_becomes_srgb(tmp_path):
-    """A made profile whose red and green are swapped would be seen; here: Lab's neutral axis."""
-    lab = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    quarters().save(tmp_path / "a.png", icc_profile=lab)
-    assert corners(read_upright(tmp_path / "a.png")) == ["r", "g", "b", "w"]
-    quarters().save(tmp_path / "b.png", icc_profile=b"no profile")
-    assert corners(read_upright(tmp_path / "b.png")) == ["r", "g", "b", "w"]
+def test_colours_of_another_space_become_srgb(tmp_path):
+    """A space whose red is sRGB's green, and the other way round."""
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    swapped = srgb.replace(b"rXYZ", b"keep").replace(b"gXYZ", b"rXYZ").replace(b"keep", b"gXYZ")
+    for name in ("sRGB", "sRGB".encode("utf-16-be").decode("latin-1")):
+        swapped = swapped.replace(name.encode("latin-1"), name.replace("s", "x").encode("latin-1"))
+    for profile, expected in (
+        (srgb, ["r", "g", "b", "w"]),
+        (swapped, ["g", "r", "b", "w"]),
+        (b"no profile", ["r", "g", "b", "w"]),
+    ):
+        quarters().save(tmp_path / "a.png", icc_profile=profile)
+        read = read_upright(tmp_path / "a.png")
+        assert corners(read) == expected
+        assert "icc_profile" not in read.info  # it would be written again
 
 
 def _with_focal(path, size, stated):

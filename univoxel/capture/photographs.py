@@ -158,6 +158,7 @@ def read_upright(path: Path, longest: int = 0) -> Image.Image:
     except BROKEN as error:
         raise DataError(f"{path}: expected a photograph, could not read it: {error}") from None
     picture = _in_srgb(picture, profile)
+    picture.info.pop("icc_profile", None)
     picture.getexif()[ORIENTATION] = orientation
     return ImageOps.exif_transpose(picture)
 
