@@ -28,7 +28,7 @@ LAYERS = [
     {"joint"},
     {"confidence"},
     {"compression", "pictures"},
-    {"build", "evaluation", "segmentation"},
+    {"build", "capture", "evaluation", "segmentation"},
     {"tasks"},
     {"tasks.demo", "tasks.submit"},
     {"api"},
@@ -60,6 +60,10 @@ HELPERS = {
     "pictures": {"animation"},
     "evaluation": {"measures", "truth"},
     "segmentation": {"config", "distances"},
+    "capture": {
+        *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
+        "prepare",
+    },
     "experiments.stress": {"axes", "damage", "render", "report", "rough", "scenes", "shapes"},
 }
 

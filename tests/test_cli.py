@@ -96,6 +96,7 @@ def calls(monkeypatch):
         return f"table of {found}"
 
     replace("train", Path("run"))
+    replace("poses", Path("scene"))
     replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)
     stand_in("univoxel.tasks.relight", relight_to_files=task("relight", None))
@@ -138,6 +139,33 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     )
     assert capsys.readouterr().out == "run\n"
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
+
+
+def test_poses(calls, capsys):
+    from univoxel.capture.config import DEFAULTS, FAST
+
+    assert main(["poses", "photos", "--out", "scene"]) == 0
+    options = ["--masks", "m", "--every", "0.5", "--keep-size", "900", "--keep-weak", "--fast"]
+    more = ["--size", "800", "--seed", "3"]
+    assert main(["poses", "film.mp4", "--out", "scene", *options, *more]) == 0
+    fast = replace_fields(FAST, size=800, seed=3)
+    out = Path("scene")
+    assert calls.noted == [
+        ("poses", (Path("photos"), out, None, None, 2000, False, DEFAULTS), {}),
+        ("poses", (Path("film.mp4"), out, Path("m"), 0.5, 900, True, fast), {}),
+    ]
+    assert capsys.readouterr().out == "scene\nscene\n"
+
+
+@pytest.mark.parametrize(
+    "option", [("--keep-size", "-1"), ("--every", "0"), ("--size", "10"), ("--features", "0")]
+)
+def test_sizes_of_poses_out_of_range(calls, capsys, option):
+    assert main(["poses", "photos", "--out", "scene", *option]) == 2
+    assert option[0].removeprefix("--").replace("-", "_") in capsys.readouterr().err.replace(
+        "-", "_"
+    )
+    assert calls.noted == []
 
 
 def test_cutout(calls, capsys):
@@ -408,7 +436,7 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "Unrecognized options: sing"),
         (
             [],
-            "Expected one of {cutout, train, eval, relight, export, envmap, inspect, info, "
+            "Expected one of {poses, cutout, train, eval, relight, export, envmap, inspect, info, "
             "compare, chart, stress, demo}",
         ),
     ],

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 
 # Extras: imported inside the function that needs one
 OPTIONAL = {"drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh"}
+OPTIONAL |= {"pillow_heif", "pycolmap", "rawpy"}
 # The one file or folder of csrc/ that includes it; no header of ours passes it on to others.
 INCLUDES = {r"embree\d?/": "visibility.cpp", r"pybind11/": "bindings"}
 
@@ -150,5 +151,16 @@ def test_functions_are_short():
 
 def test_tasks_are_commands():
     names = {path.stem for path in (ROOT / "univoxel" / "tasks").glob("*.py")} - {"__init__"}
-    commands = {"cutout", "train", "eval", "relight", "export", "envmap", "inspect", "info", "demo"}
+    commands = {
+        "poses",
+        "cutout",
+        "train",
+        "eval",
+        "relight",
+        "export",
+        "envmap",
+        "inspect",
+        "info",
+    }
+    commands |= {"demo"}
     assert names - {"evaluate"} | {"eval"} == commands <= set(COMMANDS)

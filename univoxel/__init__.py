@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from univoxel.tasks.cutout import cutout as cutout
     from univoxel.tasks.evaluate import evaluate as evaluate
     from univoxel.tasks.export import export as export
+    from univoxel.tasks.poses import poses as find_poses
     from univoxel.tasks.relight import relight_images as relight
 
 __version__ = "0.1.0"
@@ -32,6 +33,7 @@ __all__ = [
     "cutout",
     "evaluate",
     "export",
+    "find_poses",
     "open_run",
     "relight",
     "train",
@@ -43,6 +45,7 @@ _PLACES = {
     "Run": ("univoxel.api", "Run"),
     "TrainingProgress": ("univoxel.api", "TrainingProgress"),
     "UserError": ("univoxel.errors", "UserError"),
+    "find_poses": ("univoxel.tasks.poses", "poses"),
     "cutout": ("univoxel.tasks.cutout", "cutout"),
     "evaluate": ("univoxel.tasks.evaluate", "evaluate"),
     "export": ("univoxel.tasks.export", "export"),

@@ -19,6 +19,8 @@ from univoxel.errors import ExistingFile, UserError
 from univoxel.names import (
     BOUNCES,
     ELEVATION,
+    FEATURE_SIZE,
+    KEEP_SIZE,
     LIGHTS,
     MAP_ROWS,
     SAMPLES,
@@ -247,6 +249,57 @@ def cutout(
 
     options = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
     print(task.cutout(data, out, box=box, **options))
+
+
+def poses(
+    photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")],
+    /,
+    out: Annotated[Path, arg(metavar="SCENE")],
+    masks: Annotated[
+        Path | None, arg(metavar="DIR", help_behavior_hint="(default: the whole pictures)")
+    ] = None,
+    every: Annotated[
+        float | None, arg(metavar="SECONDS", help_behavior_hint="(default: 80 frames in all)")
+    ] = None,
+    keep_size: Annotated[int, arg(metavar="PIXELS")] = KEEP_SIZE,
+    keep_weak: bool = False,
+    size: Annotated[int, arg(metavar="PIXELS")] = FEATURE_SIZE,
+    features: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: 4096; with --fast: 2048)")
+    ] = None,
+    fast: bool = False,
+    seed: int = 0,
+) -> None:
+    """Find the cameras of photographs, or of the frames of a video.
+
+    Writes them upright, with their cameras, as a new folder to train on, in COLMAP's layout. The
+    same command again goes on after an interruption.
+
+    Args:
+        photographs: folder of JPEG, PNG, TIFF, WebP, HEIC or RAW, held either way; or a video
+        out: folder to write; its folder sfm/ keeps the steps and is of no use afterwards
+        masks: folder with a mask for each photograph, white on the object: features are sought
+            within them alone, as a turntable needs it
+        every: of a video, the sharpest frame of each so many seconds is taken
+        keep_size: most pixels along the longer side of written photographs; 0: as they are
+        keep_weak: write photographs too that hang on few points and may be off by degrees
+        size: pixels along the longer side, in which features are sought
+        features: most of a photograph
+        fast: fewer features, of larger details alone, in a quarter of the time; loses photographs
+            of smooth objects
+        seed: of all random choices
+    """
+    from univoxel.capture.config import DEFAULTS, FAST
+    from univoxel.tasks import poses as task
+
+    if keep_size < 0:
+        raise UserError(f"--keep-size must be at least 0, got {keep_size}")
+    if every is not None and not every > 0:
+        raise UserError(f"--every must be above 0, got {every:g}")
+    config = dataclasses.replace(FAST if fast else DEFAULTS, size=size, seed=seed)
+    if features is not None:
+        config = dataclasses.replace(config, features=features)
+    print(task.poses(photographs, out, masks, every, keep_size, keep_weak, config))
 
 
 def evaluate(
@@ -633,6 +686,7 @@ def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> No
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
+    "poses": poses,
     "cutout": cutout,
     "train": train,
     "eval": evaluate,

@@ -31,3 +31,5 @@ BOUNCES = 2  # reflections between parts of the object in relit pictures
 ELEVATION = 25.0  # degrees, of an orbit's cameras above the object's middle
 MAP_ROWS = 128  # of a written environment map
 TEXTURE_SIZE = 1024  # texels along a side
+FEATURE_SIZE = 1200  # pixels along the longer side in which features of photographs are sought
+KEEP_SIZE = 2000  # and at most of the photographs that are written: twice what grids can use

@@ -174,7 +174,7 @@ def _parameters(path: Path, number: int, model: str) -> int:
     if model not in SUPPORTED:
         raise DataError(
             f"{path}: expected cameras of {', '.join(SUPPORTED)}, camera {number} is {model}: "
-            "run colmap image_undistorter, or map with --ImageReader.camera_model OPENCV"
+            "run colmap image_undistorter, or `univoxel poses` on the photographs"
         )
     return SUPPORTED[model]
 

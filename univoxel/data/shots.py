@@ -370,14 +370,12 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     that is upright already, to within LEAN, stays as it is; and one whose cameras do not agree.
     """
     held = np.stack([_right_and_up(shot) for shot in shots])
-    right, mean_up = held[:, 0], held[:, 1].mean(0)
-    _, spread, directions = np.linalg.svd(right, full_matrices=True)
-    up = directions[2] * (1 if directions[2] @ mean_up >= 0 else -1)
-    if len(spread) < 2 or spread[1] < 0.1 * spread[0] or up @ mean_up < math.sin(LEAN):
+    up = up_direction(held)
+    if up is None:
         return list(shots), ["world as in the files: its cameras do not say what is up"]
     if up[2] >= math.cos(LEAN):
         return list(shots), []
-    turn = _turn(up)
+    turn = turn_to_z(up)
     return [replace(shot, pose=turn @ shot.pose) for shot in shots], ["world turned to +Z up"]
 
 
@@ -398,13 +396,27 @@ def _right_and_up(shot: Shot) -> np.ndarray:
     return np.stack([right, up])
 
 
-def _turn(up: np.ndarray) -> np.ndarray:
+def turn_to_z(up: np.ndarray) -> np.ndarray:
     """The smallest rotation that takes a unit vector to +Z."""
     if up[2] < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
     x, y, z = up
     cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
     return np.eye(3) + cross + cross @ cross / (1 + z)
+
+
+def up_direction(held: np.ndarray) -> np.ndarray | None:
+    """The unit vector that is across to what is to the right in all photographs, if there is one.
+
+    Args:
+        held: [V, 2, 3] to the right and up, in the world, of each photograph as it is looked at.
+    """
+    right, mean_up = held[:, 0], held[:, 1].mean(0)
+    _, spread, directions = np.linalg.svd(right, full_matrices=True)
+    up = directions[2] * (1 if directions[2] @ mean_up >= 0 else -1)
+    if len(spread) < 2 or spread[1] < 0.1 * spread[0] or up @ mean_up < math.sin(LEAN):
+        return None
+    return up
 
 
 def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:

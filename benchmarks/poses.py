@@ -1,0 +1,158 @@
+"""Cameras found by `univoxel poses` against the true ones, on a made scene.
+
+    python benchmarks/poses.py [--width 1200] [--views 40] [--only plain mixed]
+        [--out benchmarks/results/preparation/poses.json]
+
+A textured object on a patterned floor in a furnished room (tests/textured_room.py). `plain` are
+JPEG files without EXIF; `heic` HEIC; `turned` has every third held upright and stored lying, as
+EXIF says; `zoom` two zoom settings in EXIF; `mixed` is all of that, with a white picture and a text
+file. Rotations and centres are compared after a similarity. Pictures and scenes are kept in --work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pillow_heif
+from made import made
+from PIL import Image
+
+from univoxel.data.colmap import read_images
+from univoxel.experiments.record import result_text
+from univoxel.tasks.poses import poses
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent / "tests"))
+
+import textured_room  # noqa: E402  beside the tests that share it
+
+VARIANTS = ("plain", "heic", "turned", "zoom", "mixed")
+ZOOM = 1.3
+FOCAL_OF_35MM = np.hypot(36, 24) / 1.25  # of pictures of 4:3 whose focal length is their width
+MODEL, ORIENTATION, FOCAL, FOCAL_35MM, WIDTH, HEIGHT = (
+    *(0x110, 0x112, 0x920A),
+    *(0xA405, 0xA002, 0xA003),
+)
+
+
+def view(variant: str, v: int, views: int, width: int) -> textured_room.View:
+    """The camera of one photograph."""
+    upright = variant in ("turned", "mixed") and v % 3 == 1
+    zoomed = variant in ("zoom", "mixed") and v >= 3 * views // 4
+    size = (width, width * 3 // 4)[:: -1 if upright else 1]
+    return textured_room.orbit(views, *size, focal=ZOOM if zoomed else 1.0)[v]
+
+
+def photograph(variant: str, folder: Path, views: int, width: int) -> None:
+    """Write the photographs of a variant."""
+    for v in range(views):
+        seen = view(variant, v, views, width)
+        path = folder / f"IMG_{v:03d}.jpg"
+        if path.exists() or path.with_suffix(".heic").exists():
+            continue
+        picture, _ = textured_room.photograph(seen)
+        exif = Image.Exif()
+        if seen.height > seen.width:
+            picture = picture.transpose(Image.Transpose.ROTATE_90)
+            exif[ORIENTATION] = 6
+        if variant in ("zoom", "mixed"):
+            exif[MODEL] = "Phone"
+            exif.get_ifd(0x8769).update(
+                {
+                    FOCAL: 5 * seen.focal,
+                    FOCAL_35MM: round(FOCAL_OF_35MM * seen.focal),
+                    WIDTH: picture.width,
+                    HEIGHT: picture.height,
+                }
+            )
+        if variant == "heic" or (variant == "mixed" and v % 4 == 0):
+            heif = pillow_heif.from_pillow(picture)
+            heif.save(path.with_suffix(".heic"), quality=80, exif=exif.tobytes())
+        else:
+            picture.save(path, quality=92, exif=exif)
+    if variant == "mixed":
+        Image.new("RGB", (width, width * 3 // 4), "white").save(folder / "white.jpg")
+        (folder / "notes.txt").write_text("no photograph")
+
+
+def errors(scene: Path, true: list[textured_room.View]) -> tuple[np.ndarray, np.ndarray]:
+    """Of centres, shares of the orbit's radius, and of rotations, degrees."""
+    found = {int(i.name[4:7]): i.pose for i in read_images(scene / "sparse/0/images.bin")}
+    ours = np.stack([found[v] for v in sorted(found)])
+    wanted = np.stack([true[v].pose for v in sorted(found)])
+    a = ours[:, :, 3] - ours[:, :, 3].mean(0)
+    b = wanted[:, :, 3] - wanted[:, :, 3].mean(0)
+    u, s, v = np.linalg.svd(b.T @ a)
+    mirror = np.array([1, 1, np.linalg.det(u @ v)])
+    turn = u * mirror @ v
+    left = np.einsum("vij,vkj->vik", turn @ ours[:, :, :3], wanted[:, :, :3])
+    cosine = (np.trace(left, axis1=1, axis2=2) - 1) / 2
+    scale = (s * mirror).sum() / (a**2).sum()
+    centres = np.linalg.norm(scale * a @ turn.T - b, axis=1) / textured_room.RADIUS
+    return centres, np.degrees(np.arccos(cosine.clip(-1, 1)))
+
+
+def processor_seconds() -> float:
+    """Of this process and those that it waited for."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in used)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--width", type=int, default=1200)
+    parser.add_argument("--views", type=int, default=40)
+    parser.add_argument("--only", nargs="+", choices=VARIANTS, default=VARIANTS)
+    parser.add_argument("--work", type=Path, default=Path("runs/poses"))
+    parser.add_argument("--out", type=Path, default=HERE / "results/preparation/poses.json")
+    args = parser.parse_args()
+    rows = []
+    for variant in args.only:
+        folder = args.work / f"{variant}-{args.width}"
+        folder.mkdir(parents=True, exist_ok=True)
+        photograph(variant, folder, args.views, args.width)
+        out = args.work / f"{variant}-{args.width}-scene"
+        shutil.rmtree(out, ignore_errors=True)
+        wall, used = time.monotonic(), processor_seconds()
+        poses(folder, out)
+        wall, used = time.monotonic() - wall, processor_seconds() - used
+        true = [view(variant, v, args.views, args.width) for v in range(args.views)]
+        centres, degrees = errors(out, true)
+        report = json.loads((out / "poses.json").read_text(encoding="utf-8"))
+        rows.append(
+            [
+                *(variant, f"{len(centres)} of {args.views}", report["error"]),
+                *(100 * float(centres.max()), float(degrees.max()), used, wall),
+            ]
+        )
+        print(rows[-1], flush=True)
+    columns = [
+        {"name": "photographs"},
+        {"name": "placed"},
+        {"name": "reprojection", "unit": "pixels", "digits": 2},
+        {"name": "centres off at most", "unit": "% of the radius", "digits": 2},
+        {"name": "turned at most", "unit": "degrees", "digits": 3},
+        {"name": "processor", "unit": "s", "digits": 0},
+        {"name": "wall", "unit": "s", "digits": 0},
+    ]
+    record = {
+        "title": f"Cameras of {args.views} photographs, {args.width} pixels wide",
+        **made(),
+        "load_average": os.getloadavg()[0],
+        "columns": columns,
+        "rows": rows,
+    }
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(result_text(record), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,289 @@
+"""Turning, grouping, choosing pairs, judging: the parts of a capture that need no program."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from univoxel.capture.checks import gaps, still, weak, why_not
+from univoxel.capture.config import CaptureConfig
+from univoxel.capture.grouping import group, in_words
+from univoxel.capture.model import (
+    NO_POINT,
+    TRACK,
+    Model,
+    Placed,
+    Points,
+    read_model,
+    read_models,
+    without,
+    write_model,
+)
+from univoxel.capture.pairs import choose, features_each, similarities
+from univoxel.capture.photographs import Photograph
+from univoxel.capture.prepare import Capture
+from univoxel.capture.scene import own_sizes
+from univoxel.capture.turning import points_back, to_camera_back, to_landscape
+from univoxel.capture.world import moved, settle
+from univoxel.data.lens import Lens
+from univoxel.errors import ConfigError
+
+CONFIG = CaptureConfig()
+
+
+def photo(name="a.jpg", width=40, height=30, camera="", focal=(0.0, 0.0)) -> Photograph:
+    return Photograph(Path(name), width, height, camera, focal)
+
+
+def test_a_camera_turned_back_sees_points_where_the_picture_shows_them():
+    """A pixel of a portrait picture is followed through the turned picture and back."""
+    portrait = np.zeros((40, 30), np.uint8)
+    portrait[7, 21] = 255  # row, column
+    landscape = np.asarray(to_landscape(Image.fromarray(portrait)))
+    assert landscape.shape == (30, 40)
+    (row,), (column,) = np.nonzero(landscape)
+    found = points_back(np.array([column + 0.5, row + 0.5]), 30)
+    np.testing.assert_allclose(found, [21.5, 7.5])
+
+    # The ray of that pixel, in world axes, is the same from either picture
+    turn = Rotation.random(random_state=0).as_matrix()
+    focal = 50.0
+    in_landscape = np.array([(column + 0.5 - 20) / focal, (row + 0.5 - 15) / focal, 1])
+    in_portrait = np.array([(21.5 - 15) / focal, (7.5 - 20) / focal, 1])
+    back = to_camera_back(turn)
+    np.testing.assert_allclose(turn.T @ in_landscape, back.T @ in_portrait)
+    assert np.linalg.det(back) == pytest.approx(1)
+
+
+def test_landscape_is_left_as_it_is():
+    picture = Image.new("L", (40, 30))
+    assert to_landscape(picture) is picture
+
+
+def test_one_lens_at_one_zoom_is_one_camera_held_either_way():
+    wide, long = (4.2, 26.0), (9.0, 77.0)
+    photographs = [
+        photo("a", 40, 30, "Phone", wide),
+        photo("b", 30, 40, "Phone", wide),
+        photo("c", 40, 30, "Phone", long),
+        photo("d", 40, 30, "Other", wide),
+        photo("e", 20, 15, "Phone", wide),
+        photo("f", 40, 30, "Phone", long),
+        photo("g", 40, 30, "Phone", wide),
+    ]
+    groups = group(photographs)
+    assert groups == [[0, 1, 6], [2, 5], [3], [4]]
+    said = in_words(photographs, groups)
+    assert said == (
+        "7 photographs of 4 cameras (2 models, 2 zoom settings, 2 sizes), 1 of them portrait"
+    )
+    assert in_words(photographs[:1], [[0]]) == "1 photographs of Phone (40x30)"
+
+
+def _features(seed, count=40):
+    found = np.abs(np.random.default_rng(seed).normal(size=(count, 128))).astype(np.float32)
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def test_similarities_count_mutual_clear_matches():
+    """Against the plain loop over features."""
+    a, b = _features(0), _features(1, 30)
+    b[:12] = a[5:17]  # twelve things that both show
+    for row, step in ((12, 0.05), (13, 0.055)):  # one that the other shows twice: not clear
+        b[row] = a[20] + step * _features(9)[row]
+        b[row] /= np.linalg.norm(b[row])
+    features = [a, b, np.zeros((0, 128), np.float32), _features(2, 25)]
+    found = np.stack(list(similarities(features, 0.8)))
+    expected = np.zeros_like(found)
+    for i, own in enumerate(features):
+        for j, other in enumerate(features):
+            if i == j or len(own) < 2 or len(other) < 2:
+                continue
+            distance = np.linalg.norm(own[:, None] - other, axis=-1)
+            for r, row in enumerate(distance):
+                best, second = np.sort(row)[:2]
+                c = row.argmin()
+                expected[i, j] += best < 0.8 * second and distance[:, c].argmin() == r
+    np.testing.assert_array_equal(found, expected)
+    assert found[0, 1] == 12
+    assert found[1, 0] == 13  # seen from there it is clear which is the better one
+    assert not found[2].any()
+
+
+def test_pairs_are_the_best_partners_and_the_next_by_name():
+    config = CaptureConfig(partners=2, neighbours=1)
+    similar = np.zeros((6, 6), int)
+    similar[0, 3], similar[0, 5], similar[0, 2] = 30, 20, 10
+    pairs = choose(similar, config)
+    assert {(0, 3), (0, 5)} <= set(pairs)
+    assert {(i, i + 1) for i in range(5)} <= set(pairs)
+    assert all(i < j for i, j in pairs)
+    assert len(pairs) == len(set(pairs))
+
+
+def test_the_work_of_choosing_pairs_is_bounded():
+    assert features_each(60, CONFIG) == features_each(150, CONFIG) == 512
+    work = [n**2 * features_each(n, CONFIG) ** 2 for n in (150, 400, 1000)]
+    assert max(work) <= work[0]
+
+
+def test_a_shift_alone_counts_as_still():
+    pairs = [(1, 2, 30, 7), (1, 3, 40, 2), (2, 3, 0, 7), (1, 4, 0, 1), (2, 4, 50, 3)]
+    assert still(pairs) == (1, 3)
+
+
+def test_weak_are_those_below_a_fifth_of_the_median_or_fifty():
+    assert weak({1: 1000, 2: 1000, 3: 1000, 4: 199, 5: 201}, CONFIG) == {4}
+    assert weak({1: 100, 2: 100, 3: 49, 4: 51}, CONFIG) == {3}
+    assert weak({}, CONFIG) == set()
+
+
+def test_reasons_of_photographs_without_a_place():
+    features = {1: 0, 2: 900, 3: 900, 4: 900}
+    pairs = [(2, 3, 12, 2), (3, 4, 80, 2)]
+    assert why_not(None, features, pairs, {}) == "nothing in it to hold on to"
+    assert why_not(1, features, pairs, {}) == "nothing in it to hold on to"
+    assert why_not(2, features, pairs, {}) == "12 matches with its best partner; 15 needed"
+    assert why_not(3, features, pairs, {3: 4}).startswith("with 4 others")
+    assert why_not(4, features, pairs, {}) == (
+        "80 matches with its best partner, which do not fit the others"
+    )
+
+
+def _directions(azimuths, height=40.0):
+    """Counter-clockwise from the first photograph's side, which is -Y."""
+    phi, up = np.radians(np.array(azimuths) - 90.0), np.radians(height)
+    return np.stack([np.cos(phi) * np.cos(up), np.sin(phi) * np.cos(up), 0 * phi + np.sin(up)], 1)
+
+
+def test_gaps_are_told_by_side_and_by_the_photographs_beside():
+    names = [f"{a}.jpg" for a in (0, 50, 150, 200, 250, 305)]
+    directions = _directions([0, 50, 150, 200, 250, 305])
+    # Who stands where the first photograph was taken and looks at the object has +X at the right
+    assert gaps(directions, names, CONFIG) == [
+        "no photograph from the right, 100 degrees between 50.jpg and 150.jpg"
+    ]
+    names = [f"{a}.jpg" for a in (0, 50, 100, 150, 200)]
+    assert gaps(_directions([0, 50, 100, 150, 200]), names, CONFIG) == [
+        "no photograph from the left, 160 degrees between 200.jpg and 0.jpg"
+    ]
+    all_around = list(range(0, 360, 30))
+    assert gaps(_directions(all_around), [""] * 12, CONFIG) == []
+    assert gaps(_directions(all_around, 12.0), [""] * 12, CONFIG) == [
+        "no photograph from above 12 degrees"
+    ]
+
+
+def model(seed=0, views=6) -> Model:
+    """Cameras around a point, which are held level in a world of any direction."""
+    random = np.random.default_rng(seed)
+    world = Rotation.random(random_state=seed).as_matrix()
+    positions = random.normal(size=(40, 3))
+    images = []
+    for v in range(views):
+        phi = 2 * np.pi * v / views
+        place = np.array([5 * np.cos(phi), 5 * np.sin(phi), 2 + 0.3 * (v % 2)])
+        forward = -place / np.linalg.norm(place)
+        right = np.cross(forward, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        turn = np.stack([right, np.cross(forward, right), forward]) @ world.T
+        to_camera = np.concatenate([turn, (-turn @ world @ place)[:, None]], 1)
+        seen = np.where(random.random(40) < 0.8, np.arange(40) + 1, NO_POINT)
+        local = to_camera[:, :3] @ (world @ positions.T) + to_camera[:, 3:]
+        xy = 100 * (local[:2] / local[2]).T + (80, 60)
+        images.append(Placed(v + 1, 1, f"0/{v:05d}.jpg", to_camera, xy, seen))
+    tracks = [
+        np.array([(i.number, p) for i in images if i.point[p] == p + 1], TRACK) for p in range(40)
+    ]
+    points = Points(
+        np.arange(40) + 1,
+        positions @ world.T,
+        random.integers(0, 256, (40, 3)).astype(np.uint8),
+        random.random(40),
+        tracks,
+    )
+    return Model({1: Lens(160, 120, (100.0, 100.0), (80.0, 60.0))}, images, points)
+
+
+def _projected(found: Model, image: Placed) -> np.ndarray:
+    lens = found.cameras[image.camera]
+    x, y, z = image.to_camera[:, :3] @ found.points.position.T + image.to_camera[:, 3:]
+    return np.stack(lens.seen(x / z, y / z), -1)
+
+
+def test_a_model_is_read_as_it_was_written(tmp_path):
+    one = model()
+    write_model(tmp_path / "0", one)
+    two = read_model(tmp_path / "0")
+    assert [(i.number, i.camera, i.name) for i in two.images] == [
+        (i.number, i.camera, i.name) for i in one.images
+    ]
+    for a, b in zip(one.images, two.images, strict=True):
+        np.testing.assert_allclose(b.to_camera, a.to_camera, atol=1e-12)
+        np.testing.assert_array_equal(b.xy, a.xy)
+        np.testing.assert_array_equal(b.point, a.point)
+    np.testing.assert_array_equal(two.points.position, one.points.position)
+    np.testing.assert_array_equal(two.points.color, one.points.color)
+    for a, b in zip(one.points.tracks, two.points.tracks, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert two.cameras == one.cameras
+    assert two.error == pytest.approx(one.error)
+
+
+def test_the_largest_model_comes_first(tmp_path):
+    write_model(tmp_path / "0", model(views=3))
+    write_model(tmp_path / "1", model(views=6))
+    assert [len(m.images) for m in read_models(tmp_path)] == [6, 3]
+
+
+def test_settling_turns_up_centres_and_scales_without_moving_pictures():
+    one = model(3)
+    similarity, known = settle(one.images)
+    two = moved(one, similarity)
+    assert known
+    centres = np.stack([i.centre for i in two.images])
+    assert np.median(np.linalg.norm(centres, axis=1)) == pytest.approx(4)
+    assert centres[0, 0] == pytest.approx(0, abs=1e-9)
+    assert centres[0, 1] < 0
+    expected = np.array([2 + 0.3 * (v % 2) for v in range(6)])
+    scale = 4 / np.median(np.hypot(5, expected))
+    np.testing.assert_allclose(centres[:, 2], scale * expected, atol=1e-2)
+    for a, b in zip(one.images, two.images, strict=True):
+        np.testing.assert_allclose(_projected(one, a), _projected(two, b), atol=1e-9)
+
+
+def test_pictures_of_their_own_size_see_the_same_points():
+    """Landscape is enlarged; portrait is turned back and shrunk: projections fit features."""
+    one = model(1)
+    photographs = [photo(f"{v}.jpg", *((120, 160) if v % 2 else (160, 120))) for v in range(6)]
+    capture = Capture(photographs, [list(range(6))])
+    two = own_sizes(one, capture, 80)
+    assert {(lens.width, lens.height) for lens in two.cameras.values()} == {(80, 60), (60, 80)}
+    for v, image in enumerate(two.images):
+        lens = two.cameras[image.camera]
+        assert (lens.height > lens.width) == bool(v % 2)
+        np.testing.assert_allclose(_projected(two, image), image.xy, atol=1e-9)
+        assert image.name == f"{v}.jpg"
+
+
+def test_left_out_images_leave_no_trace():
+    one = model(2)
+    two = without(one, {1, 2, 3})
+    assert [i.number for i in two.images] == [4, 5, 6]
+    for track in two.points.tracks:
+        assert len(track) >= 2
+        assert set(track["image"]) <= {4, 5, 6}
+    kept = set(two.points.number.tolist())
+    for image in two.images:
+        assert set(image.point.tolist()) <= kept | {NO_POINT}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"size": 10}, {"ratio": 1.0}, {"placed_share": 0.0}, {"partners": 0}, {"gap": 0.0}],
+)
+def test_a_configuration_out_of_range_is_refused(wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        CaptureConfig(**wrong)

@@ -1,0 +1,390 @@
+"""From photographs as they come to cameras: runs of structure from motion on a made scene."""
+
+import json
+import logging
+import shutil
+import sqlite3
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pillow_heif
+import pytest
+import textured_room
+from PIL import Image
+
+from univoxel.capture import database, engine, structure
+from univoxel.capture.config import CaptureConfig
+from univoxel.capture.photographs import find_photographs
+from univoxel.capture.prepare import Folders, gather
+from univoxel.data.colmap import read_cameras, read_images
+from univoxel.errors import DataError, ExistingFile, MissingExtra, ProcessFailed
+from univoxel.tasks.poses import poses
+
+# Enough for pictures of this size, and pairs are chosen as in large sets
+SMALL = CaptureConfig(features=1000, first_octave=0, exhaustive=10, partners=8)
+VIEWS, WIDTH, HEIGHT = 24, 400, 300
+ZOOMED = range(18, 24)  # views with another zoom setting
+MODEL, FOCAL, FOCAL_35MM, EXIF_WIDTH, EXIF_HEIGHT = 0x110, 0x920A, 0xA405, 0xA002, 0xA003
+FOCAL_OF_35MM = np.hypot(36, 24) / 1.25  # of pictures of 4:3 whose focal length is their width
+
+
+def _exif(zoom: float, orientation: int, width: int, height: int) -> Image.Exif:
+    exif = Image.Exif()
+    exif[MODEL], exif[0x112] = "Phone", orientation
+    exif.get_ifd(0x8769).update(
+        {
+            FOCAL: 5.0 * zoom,
+            FOCAL_35MM: round(FOCAL_OF_35MM * zoom),
+            EXIF_WIDTH: width,
+            EXIF_HEIGHT: height,
+        }
+    )
+    return exif
+
+
+def _view(v: int) -> textured_room.View:
+    """Every fourth view is held upright, the last ones are zoomed."""
+    upright = v % 4 == 1
+    size = (HEIGHT, WIDTH) if upright else (WIDTH, HEIGHT)
+    return textured_room.orbit(VIEWS, *size, focal=1.3 if v in ZOOMED else 1.0)[v]
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory) -> Path:
+    """What a phone and its owner leave behind: formats, turns, zooms, and what is no use."""
+    folder = tmp_path_factory.mktemp("photographs")
+    for v in range(VIEWS):
+        view = _view(v)
+        picture, _ = textured_room.photograph(view, samples=2)
+        zoom = 1.3 if v in ZOOMED else 1.0
+        if v % 4 == 1:  # stored lying, as sensors are read out
+            picture = picture.transpose(Image.Transpose.ROTATE_90)
+        exif = _exif(zoom, 6 if v % 4 == 1 else 1, *picture.size)
+        path = folder / f"IMG {v:02d}.jpg"
+        if v % 3 == 2:
+            heif = pillow_heif.from_pillow(picture)
+            heif.save(path.with_suffix(".heic"), quality=90, exif=exif.tobytes())
+        else:
+            picture.save(path, quality=92, exif=exif)
+    Image.new("RGB", (WIDTH, HEIGHT), "white").save(
+        folder / "white.jpg", exif=_exif(1, 1, 400, 300)
+    )
+    (folder / "notes.txt").write_text("taken in the kitchen")
+    (folder / "broken.jpg").write_bytes((folder / "IMG 00.jpg").read_bytes()[:500])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(photographs, tmp_path_factory) -> tuple[Path, list[str]]:
+    said = []
+    handler = logging.Handler()
+    handler.emit = lambda record: said.append(record.getMessage())
+    logger = logging.getLogger("univoxel")
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    out = tmp_path_factory.mktemp("out") / "scene"
+    try:
+        poses(photographs, out, config=SMALL)
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+    return out, said
+
+
+def aligned(out: Path, views: dict[int, textured_room.View]) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of centres, world units, and of rotations, degrees, after a similarity."""
+    found = {int(i.name.split()[1][:2]): i.pose for i in read_images(out / "sparse/0/images.bin")}
+    assert sorted(found) == sorted(views)
+    ours = np.stack([found[v] for v in sorted(found)])
+    true = np.stack([views[v].pose for v in sorted(found)])
+    a, b = ours[:, :, 3] - ours[:, :, 3].mean(0), true[:, :, 3] - true[:, :, 3].mean(0)
+    u, s, v = np.linalg.svd(b.T @ a)
+    mirror = np.diag([1, 1, np.linalg.det(u @ v)])
+    turn = u @ mirror @ v
+    scale = (s * mirror.diagonal()).sum() / (a**2).sum()
+    left = np.einsum("vij,vkj->vik", turn @ ours[:, :, :3], true[:, :, :3])
+    cosine = (np.trace(left, axis1=1, axis2=2) - 1) / 2
+    return np.linalg.norm(scale * a @ turn.T - b, axis=1), np.degrees(np.arccos(cosine.clip(-1, 1)))
+
+
+def test_photographs_as_they_come_are_placed(scene):
+    out, _ = scene
+    centres, degrees = aligned(out, {v: _view(v) for v in range(VIEWS)})
+    assert centres.max() < 0.01 * 2.2  # of the orbit's radius
+    assert degrees.max() < 0.2
+
+
+def test_pictures_are_upright_and_fit_their_cameras(scene):
+    out, _ = scene
+    lenses = read_cameras(out / "sparse/0/cameras.bin")
+    assert len(lenses) == 4  # two zooms, held both ways
+    for image in read_images(out / "sparse/0/images.bin"):
+        v, lens = int(image.name.split()[1][:2]), lenses[image.camera]
+        with Image.open(out / "images" / image.name) as picture:
+            assert picture.size == (lens.width, lens.height) == (_view(v).width, _view(v).height)
+            assert not dict(picture.getexif())
+        # The zoom is solved for within a percent: distortion and focal length trade a little
+        assert lens.focal[0] == pytest.approx(400 * _view(v).focal, rel=0.01)
+        assert lens.centre == (lens.width / 2, lens.height / 2)
+
+
+def test_the_world_is_upright_around_the_object(scene):
+    out, _ = scene
+    pose = np.stack([i.pose for i in read_images(out / "sparse/0/images.bin")])
+    true = np.stack([_view(v).pose for v in range(VIEWS)])
+    np.testing.assert_allclose(pose[:, 2, :3], true[:, 2, :3], atol=0.01)  # heights of all axes
+    assert np.median(np.linalg.norm(pose[:, :, 3], axis=1)) == pytest.approx(4)
+    first = next(i for i in read_images(out / "sparse/0/images.bin") if i.name == "IMG 00.jpg")
+    assert first.pose[0, 3] == pytest.approx(0, abs=1e-6)
+    assert first.pose[1, 3] < 0
+
+
+def test_what_is_left_out_is_named(scene):
+    out, said = scene
+    assert f"{VIEWS + 1} photographs of 2 cameras (2 zoom settings)" in said[0]
+    assert "2 could not be read: broken.jpg, notes.txt" in said[0]
+    assert any(f"{VIEWS} of {VIEWS + 1} placed" in line for line in said)
+    assert any("white.jpg (nothing in it to hold on to)" in line for line in said)
+    report = json.loads((out / "poses.json").read_text())
+    rows = {row["name"]: row for row in report["photographs"]}
+    assert rows["white.jpg"]["written"] == ""
+    assert not rows["white.jpg"]["placed"]
+    assert rows["IMG 02.heic"]["written"] == "IMG 02.jpg"
+    assert all(row["points"] > 100 for name, row in rows.items() if name != "white.jpg")
+    assert report["error"] < 1
+
+
+def test_the_model_holds_together(scene):
+    """What the pictures see of the points is where the cameras project them."""
+    out, _ = scene
+    from univoxel.capture.model import NO_POINT, read_model
+
+    model = read_model(out / "sparse/0")
+    position = dict(zip(model.points.number.tolist(), model.points.position, strict=True))
+    for image in model.images:
+        lens, seen = model.cameras[image.camera], image.point != NO_POINT
+        points = np.stack([position[p] for p in image.point[seen].tolist()])
+        x, y, z = image.to_camera[:, :3] @ points.T + image.to_camera[:, 3:]
+        found = np.stack(lens.seen(x / z, y / z), -1)
+        assert np.median(np.linalg.norm(found - image.xy[seen], axis=1)) < 1  # pixel
+
+
+def test_the_same_again_is_done_and_other_settings_are_refused(scene, photographs, monkeypatch):
+    out, _ = scene
+    monkeypatch.setattr(subprocess, "Popen", None)  # nothing may be run
+    before = (out / "poses.json").stat().st_mtime_ns
+    assert poses(photographs, out, config=SMALL) == out
+    assert (out / "poses.json").stat().st_mtime_ns == before
+    with pytest.raises(ExistingFile, match="holds another scene"):
+        poses(photographs, out)
+
+
+def test_a_search_goes_on_from_what_is_there(scene, photographs, tmp_path, monkeypatch):
+    """Killed while it wrote: the same command only writes."""
+    out, _ = scene
+    again = tmp_path / "again"
+    shutil.copytree(out / "sfm", again / "sfm")
+    ran = []
+    command_of = engine.command_of
+    monkeypatch.setattr(
+        engine, "command_of", lambda e, r, log: ran.append(r.step) or command_of(e, r, log)
+    )
+    poses(photographs, again, keep_size=200, config=SMALL)
+    assert ran == []
+    with Image.open(again / "images" / "IMG 00.jpg") as picture:
+        assert picture.size == (200, 150)
+    lenses = read_cameras(again / "sparse/0/cameras.bin").values()
+    assert {max(lens.width, lens.height) for lens in lenses} == {200}
+    centres, _ = aligned(again, {v: _view(v) for v in range(VIEWS)})
+    assert centres.max() < 0.01 * 2.2
+
+
+def test_features_are_found_once_in_the_camera_that_was_begun(scene, photographs, tmp_path):
+    """Killed while features were sought: the rest joins the cameras that are there."""
+    out, _ = scene
+    folders = Folders(tmp_path / "sfm")
+    shutil.copytree(out / "sfm" / "pictures", folders.pictures)
+    files, _, _ = find_photographs(photographs)
+    capture, _ = gather(files, None)
+    later = [folders.pictures / capture.pictures[i] for i in (2, 3, 20)]
+    for path in later:
+        path.rename(path.with_suffix(".later"))
+    list(structure.extract("pycolmap", capture, folders, SMALL))
+    begun = database.images(folders.database)
+    assert len(begun) == VIEWS + 1 - 3
+    for path in later:
+        path.with_suffix(".later").rename(path)
+    list(structure.extract("pycolmap", capture, folders, SMALL))
+    found = database.images(folders.database)
+    assert len(found) == VIEWS + 1
+    assert begun.items() <= found.items()
+    assert len({camera for _, camera in found.values()}) == 2
+    whole = database.images(out / "sfm" / "database.db")
+    counts = database.feature_counts(folders.database)
+    expected = database.feature_counts(out / "sfm" / "database.db")
+    for name, (number, _) in found.items():
+        assert counts[number] == expected[whole[name][0]]
+
+
+@pytest.fixture(scope="module")
+def turntable(tmp_path_factory) -> Path:
+    """A still camera before an object that is turned, in front of a wall of its own pattern."""
+    folder = tmp_path_factory.mktemp("turntable")
+    (folder / "masks").mkdir()
+    for v in range(14):
+        view = textured_room.orbit(14, WIDTH, HEIGHT, focal=1.4)[0]
+        picture, mask = textured_room.photograph(view, 2, turn=np.pi / 14 * v, still=True)
+        picture.save(folder / f"IMG {v:02d}.png")
+        mask.resize((WIDTH // 2, HEIGHT // 2)).save(folder / "masks" / f"IMG {v:02d}.png")
+    return folder
+
+
+def test_a_turntable_is_recognised_before_mapping(turntable, tmp_path):
+    with pytest.raises(DataError, match=r"background stands still in \d+ of \d+ pairs.*masks=DIR"):
+        poses(turntable, tmp_path / "out", config=SMALL)
+    assert not (tmp_path / "out/sfm/models").exists()
+    assert not (tmp_path / "out/images").exists()
+
+
+def test_a_turntable_with_masks_is_placed(turntable, tmp_path):
+    fine = replace(SMALL, first_octave=-1, exhaustive=20)  # there is less to hold on to
+    poses(turntable, tmp_path / "out", masks=turntable / "masks", config=fine)
+    views = {}
+    for v in range(14):
+        view = textured_room.orbit(14)[0]
+        c, s = np.cos(np.pi / 14 * v), np.sin(np.pi / 14 * v)
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        views[v] = textured_room.View(turn @ view.pose, 1.4, WIDTH, HEIGHT)
+    centres, degrees = aligned(tmp_path / "out", views)
+    assert centres.max() < 0.01 * 2.2
+    # An object in a third of a small picture says less than a whole room, and little of the focal
+    # length: 0.4 degrees, where matches across the background would be off by tens of degrees
+    assert degrees.max() < 1
+    with Image.open(tmp_path / "out/masks/IMG 03.png.png") as mask:
+        assert mask.size == (WIDTH, HEIGHT)
+
+
+def test_too_few_placed_is_one_line(photographs, tmp_path):
+    """From opposite sides, and pictures of nothing."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for v in (0, 12):
+        shutil.copy(photographs / f"IMG {v:02d}.jpg", folder)
+    for k in range(4):
+        Image.new("RGB", (WIDTH, HEIGHT), (60 * k, 0, 0)).save(folder / f"plain{k}.png")
+    with pytest.raises(DataError, match=r"only \d of 6 photographs could be placed: .*plain0.png"):
+        poses(folder, tmp_path / "out", config=SMALL)
+    assert not (tmp_path / "out/images").exists()
+
+
+def test_what_is_no_folder_of_photographs_is_one_line(tmp_path):
+    with pytest.raises(DataError, match="expected a folder of photographs or a video"):
+        poses(tmp_path / "none", tmp_path / "out")
+    with pytest.raises(DataError, match="every is for videos"):
+        poses(tmp_path, tmp_path / "out", every=1.0)
+    for name in "ab":
+        Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.jpg")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").touch()
+    with pytest.raises(ExistingFile, match=r"holds other files \(mine.txt\)"):
+        poses(tmp_path, tmp_path / "out")
+
+
+def test_without_any_engine_nothing_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(MissingExtra, match=r"pip install 'univoxel\[capture\]'"):
+        poses(tmp_path / "not there", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+FAKE = """#!{python}
+import json, shutil, sys
+from pathlib import Path
+command, *rest = sys.argv[1:]
+if rest == ["--help"]:
+    print({helps!r}[command])
+    sys.exit(0)
+options = dict(zip(rest[::2], rest[1::2]))
+with open({log!r}, "a") as file:
+    file.write(json.dumps([command, options]) + "\\n")
+work = Path({work!r})
+if command == "feature_extractor":
+    shutil.copy(work / "database.db", options["--database_path"])
+if command == "mapper":
+    shutil.copytree(work / "models", options["--output_path"], dirs_exist_ok=True)
+"""
+HELPS = {
+    "feature_extractor": "--random_seed --SiftExtraction.use_gpu --SiftExtraction.first_octave "
+    "--SiftExtraction.max_num_features --ImageReader.single_camera --ImageReader.camera_model",
+    "matches_importer": "--random_seed --FeatureMatching.use_gpu --FeatureMatching.num_threads",
+    "mapper": "--Mapper.num_threads",
+}
+
+
+def test_colmap_on_the_path_serves(scene, photographs, tmp_path, monkeypatch):
+    """A stand-in that notes what it is asked and hands out what pycolmap found."""
+    out, _ = scene
+    told = tmp_path / "told"
+    fake = tmp_path / "bin" / "colmap"
+    fake.parent.mkdir()
+    fake.write_text(
+        FAKE.format(python=sys.executable, helps=HELPS, log=str(told), work=str(out / "sfm"))
+    )
+    fake.chmod(0o755)
+    monkeypatch.setenv("PATH", str(fake.parent))
+    find_spec = engine.importlib.util.find_spec
+    monkeypatch.setattr(
+        engine.importlib.util, "find_spec", lambda n: None if n == "pycolmap" else find_spec(n)
+    )
+    engine._options.cache_clear()
+    poses(photographs, tmp_path / "scene", config=SMALL)
+    calls = [json.loads(line) for line in told.read_text().splitlines()]
+    assert [command for command, _ in calls] == ["feature_extractor", "matches_importer", "mapper"]
+    extract, match, place = (options for _, options in calls)
+    assert extract["--SiftExtraction.use_gpu"] == "0"
+    assert extract["--SiftExtraction.max_num_features"] == "1000"
+    assert extract["--ImageReader.camera_model"] == "SIMPLE_RADIAL"
+    assert "--ImageReader.mask_path" not in extract  # this version does not list it
+    assert match["--match_type"] == "pairs"
+    assert match["--FeatureMatching.use_gpu"] == "0"
+    assert place["--Mapper.num_threads"]
+    assert (tmp_path / "scene/sparse/0/images.bin").read_bytes() == (
+        out / "sparse/0/images.bin"
+    ).read_bytes()
+
+
+def test_a_step_that_fails_or_hangs_is_stopped(tmp_path, monkeypatch):
+    request = engine.Request("match", str(tmp_path / "none.db"), "", "", seconds=0.1)
+    log = tmp_path / "match.log"
+    with pytest.raises(ProcessFailed, match=r"match: pycolmap ended with .*match.log"):
+        list(engine.run("pycolmap", engine.Request("match", "/", "/", "/"), log, lambda: 0))
+    monkeypatch.setattr(
+        engine, "command_of", lambda *_: [sys.executable, "-c", "import time; time.sleep(60)"]
+    )
+    with pytest.raises(ProcessFailed, match="was stopped after 0 seconds"):
+        list(engine.run("pycolmap", request, log, lambda: 0))
+
+
+def test_pycolmap_stays_out_of_this_process():
+    code = (
+        "import sys, univoxel, univoxel.cli, univoxel.tasks.poses, univoxel.capture.sfm\n"
+        "assert 'pycolmap' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_database_is_read_as_it_is_written(scene):
+    """Against SQLite's own account of it."""
+    path = scene[0] / "sfm" / "database.db"
+    with sqlite3.connect(path) as db:
+        keys = {name: number for number, name in db.execute("SELECT image_id, name FROM images")}
+    assert {n: i for n, (i, _) in database.images(path).items()} == keys
+    assert database.count(path, "keypoints") == len(keys) == VIEWS + 1
+    features = database.largest_features(path, next(iter(keys.values())), 50)
+    assert features.shape == (50, 128)
+    np.testing.assert_allclose(np.linalg.norm(features, axis=1), 1, rtol=1e-5)

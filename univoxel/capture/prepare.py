@@ -1,0 +1,200 @@
+"""From files of any kind to the pictures, and masks, that structure from motion reads."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy.ndimage import maximum_filter
+
+from univoxel.capture.grouping import group
+from univoxel.capture.photographs import (
+    ORDER,
+    SIDEWAYS,
+    TURNS,
+    Photograph,
+    describe,
+    fitted,
+    read_upright,
+)
+from univoxel.capture.turning import to_landscape
+from univoxel.errors import DataError
+from univoxel.files import replacing
+
+SFM_QUALITY = 95  # of JPEG
+ASPECT = 0.02  # relative difference of sides' ratios up to which a mask is of the same picture
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Where the work of one capture lies, all below one folder."""
+
+    work: Path
+
+    @property
+    def frames(self) -> Path:
+        """Of a video."""
+        return self.work / "frames"
+
+    @property
+    def pictures(self) -> Path:
+        return self.work / "pictures"
+
+    @property
+    def masks(self) -> Path:
+        return self.work / "masks"
+
+    @property
+    def database(self) -> Path:
+        return self.work / "database.db"
+
+    @property
+    def pairs(self) -> Path:
+        return self.work / "pairs.txt"
+
+    @property
+    def matched(self) -> Path:
+        """There when all pairs are matched."""
+        return self.work / "matched"
+
+    @property
+    def models(self) -> Path:
+        return self.work / "models"
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Photographs in order of their names, and which of them share a camera."""
+
+    photographs: list[Photograph]
+    groups: list[list[int]]
+    masks: list[Path] | None = None  # one for each photograph
+
+    @property
+    def pictures(self) -> list[str]:
+        """Names of the pictures for structure from motion, a folder a camera: without blanks."""
+        camera = {i: g for g, members in enumerate(self.groups) for i in members}
+        return [f"{camera[i]}/{i:05d}.jpg" for i in range(len(self.photographs))]
+
+
+def gather(files: Sequence[Path], masks: Path | None) -> tuple[Capture, list[str]]:
+    """What was photographed with what, and names of files that cannot be read.
+
+    Raises:
+        DataError: a photograph without a mask where masks are given, or fewer than two photographs.
+    """
+    photographs, unread = [], []
+    for path in files:
+        try:
+            photographs.append(describe(path))
+        except DataError:
+            unread.append(path.name)
+    if len(photographs) < 2:
+        raise DataError(
+            f"{files[0].parent}: expected two photographs at least, could read {len(photographs)}"
+        )
+    found = None if masks is None else _find_masks(photographs, masks)
+    return Capture(photographs, group(photographs), found), unread
+
+
+def write_pictures(
+    capture: Capture, folders: Folders, size: int, margin: float
+) -> Iterator[tuple[int, str | None]]:
+    """Write pictures and masks for structure from motion, those that are not there.
+
+    Upright, then portrait turned to landscape; masks grown by a margin. Yields the index of each
+    photograph, and why it cannot be read.
+    """
+    jobs = list(enumerate(capture.pictures))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        running = {
+            pool.submit(_write_picture, capture, folders, i, name, size, margin): i
+            for i, name in jobs
+        }
+        try:
+            for job in as_completed(running):
+                yield running[job], job.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def read_mask(capture: Capture, index: int) -> Image.Image:
+    """The mask of a photograph, upright, of its own size, grey.
+
+    Raises:
+        DataError: it cannot be read, or is of another picture.
+    """
+    assert capture.masks is not None
+    path, photograph = capture.masks[index], capture.photographs[index]
+    mask = read_upright(path)
+    # White on the object; or the alpha of a cut-out
+    mask = mask.getchannel("A") if mask.mode == "RGBA" else mask.convert("L")
+    if (mask.width > mask.height) != (photograph.width > photograph.height):
+        if photograph.turned in SIDEWAYS:  # drawn over the pixels as they are stored
+            mask = mask.transpose(TURNS[photograph.turned])
+    ratio = mask.width / mask.height * photograph.height / photograph.width
+    if abs(ratio - 1) > ASPECT:
+        raise DataError(
+            f"{path}: expected the shape of {photograph.path.name}, "
+            f"{photograph.width}x{photograph.height} pixels, got {mask.width}x{mask.height}"
+        )
+    return mask
+
+
+def start_over(folders: Folders) -> None:
+    """Remove all work but the frames of a video."""
+    for path in (folders.pictures, folders.masks, folders.models):
+        shutil.rmtree(path, ignore_errors=True)
+    for path in (*folders.work.glob("database.db*"), folders.pairs, folders.matched):
+        path.unlink(missing_ok=True)
+
+
+def _write_picture(
+    capture: Capture, folders: Folders, index: int, name: str, size: int, margin: float
+) -> str | None:
+    photograph = capture.photographs[index]
+    target = folders.pictures / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if not target.exists():
+        try:
+            picture = to_landscape(read_upright(photograph.path, size).convert("RGB"))
+        except DataError as error:
+            return str(error)
+        with replacing(target) as temporary:
+            picture.save(temporary, format="JPEG", quality=SFM_QUALITY)
+    if capture.masks is not None:
+        target = folders.masks / f"{name}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if not target.exists():
+            mask = read_mask(capture, index)
+            # Of another size it would not be scaled, but laid into the picture's corner
+            mask = mask.resize(fitted(photograph.width, photograph.height, size))
+            object_ = np.asarray(mask) > 127
+            grown = maximum_filter(object_, 2 * round(margin * max(mask.size)) + 1)
+            with replacing(target) as temporary:
+                to_landscape(Image.fromarray(255 * grown.astype(np.uint8))).save(
+                    temporary, format="PNG"
+                )
+    return None
+
+
+def _find_masks(photographs: Sequence[Photograph], folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise DataError(f"masks: expected a folder, got {folder}", "masks")
+    masks = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in ORDER}
+    names = [(p.path.name, p.path.stem, f"{p.path.stem}_mask") for p in photographs]
+    found = [next((masks[n] for n in choice if n in masks), None) for choice in names]
+    missing = [p.path.name for p, mask in zip(photographs, found, strict=True) if mask is None]
+    if missing:
+        raise DataError(
+            f"{folder}: expected a mask for each photograph, such as "
+            f"{Path(missing[0]).stem}.png; {len(missing)} of {len(found)} have none",
+            "masks",
+        )
+    return [mask for mask in found if mask is not None]

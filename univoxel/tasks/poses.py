@@ -1,0 +1,320 @@
+"""Find the cameras of photographs: from a folder of them, or a video, to a scene to train on."""
+
+from __future__ import annotations
+
+import json
+import logging
+import platform
+import shutil
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from univoxel import __version__
+from univoxel.bars import bar
+from univoxel.capture import checks, database, structure, video
+from univoxel.capture.config import DEFAULTS, CaptureConfig
+from univoxel.capture.engine import Engine, find_engine
+from univoxel.capture.grouping import in_words
+from univoxel.capture.model import Model, without
+from univoxel.capture.photographs import find_photographs, require_readers
+from univoxel.capture.prepare import Capture, Folders, gather, start_over, write_pictures
+from univoxel.capture.scene import Report, own_sizes, write_report, write_scene, written_name
+from univoxel.capture.world import moved, settle
+from univoxel.errors import DataError, ExistingFile
+from univoxel.files import replacing
+from univoxel.names import KEEP_SIZE
+
+log = logging.getLogger("univoxel")
+
+WORK = "sfm"  # folder in the scene that the steps keep their results in
+NAMED = 5  # photographs that a message names at most
+
+
+@dataclass(frozen=True)
+class Found:
+    """What structure from motion says, and what is believed of it."""
+
+    model: Model  # the largest, as it is
+    weak: set[int]  # ids of pictures that hang on few points
+    reports: list[Report]  # of all photographs
+
+
+def poses(
+    photographs: str | Path,
+    out: str | Path,
+    masks: str | Path | None = None,
+    every: float | None = None,
+    keep_size: int = KEEP_SIZE,
+    keep_weak: bool = False,
+    config: CaptureConfig = DEFAULTS,
+) -> Path:
+    """Write photographs upright, with the cameras they were taken with, as a scene; return out.
+
+    The world has +Z up, its origin where the cameras look, and the median distance of cameras from
+    it is 4. An interrupted search goes on with the same call.
+
+    Args:
+        photographs: a folder of photographs of any common format, or a video.
+        out: folder to write: images/, masks/, sparse/0 and poses.json, and sfm/ for the steps.
+        masks: folder of a mask for each photograph; features are sought within them alone.
+        every: seconds of a video, of each of which the sharpest frame is taken.
+        keep_size: pixels of written photographs along the longer side, at most; 0 for any.
+        keep_weak: write photographs too that hang on few points.
+        config: how cameras are found.
+
+    Raises:
+        MissingExtra: no pycolmap and no `colmap`, or no reader of a format.
+        DataError: photographs that cannot be used, or too few that can be placed.
+        ExistingFile: out holds something else.
+        ProcessFailed: a step did not end well.
+        OSError: a file cannot be written.
+    """
+    source, out = Path(photographs), Path(out)
+    masks = None if masks is None else Path(masks)
+    engine = find_engine()
+    folders = Folders(out / WORK)
+    files, others, doubles = _files(source, folders, every)
+    require_readers(files)
+    capture, unread = gather(files, masks)
+    unread += others
+    log.info(in_words(capture.photographs, capture.groups) + _aside(unread, doubles))
+    settings = _settings(engine, source, masks, every, config, capture)
+    if _begin(out, folders, settings, {"keep_size": keep_size, "keep_weak": keep_weak}):
+        log.info(f"{out} is done")
+        return out
+    with bar(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeRemainingColumn(),
+    ) as progress:
+        unreadable = _search(engine, capture, folders, config, progress)
+        found = _judge(capture, folders, config, unreadable)
+        _say(capture, found, len(capture.photographs), keep_weak)
+        left_out = set() if keep_weak else found.weak
+        model = without(found.model, left_out) if left_out else found.model
+        index = {name: i for i, name in enumerate(capture.pictures)}
+        ordered = sorted(model.images, key=lambda i: index[i.name])
+        wanted = [index[image.name] for image in ordered]
+        model = own_sizes(Model(model.cameras, ordered, model.points), capture, keep_size)
+        similarity, known = settle(model.images)
+        model = moved(model, similarity)
+        if not known:
+            log.warning("the cameras do not say what is up: the world may be askew")
+        names = [image.name for image in model.images]
+        centres = np.stack([image.centre for image in model.images])
+        for gap in checks.gaps(centres, names, config):
+            log.info(gap)
+        written = write_scene(out, capture, model, wanted, keep_size)
+        _follow(progress, "writing", written, len(wanted))
+    used = {"keep_size": keep_size, "keep_weak": keep_weak}
+    reports = [_written(r, wanted, i, capture) for i, r in enumerate(found.reports)]
+    write_report(out, {**settings, **used, "versions": _versions()}, model, reports)
+    return out
+
+
+def _files(
+    source: Path, folders: Folders, every: float | None
+) -> tuple[list[Path], list[str], int]:
+    """Photographs of a folder or frames of a video; other files; how many came twice."""
+    if video.is_video(source):
+        video.require_ffmpeg()
+        stamp = json.dumps([source.name, source.stat().st_size, source.stat().st_mtime, every])
+        done = folders.frames / "done"
+        if not done.exists() or done.read_text(encoding="utf-8") != stamp:
+            log.info(f"{source}: choosing frames")
+            shutil.rmtree(folders.frames, ignore_errors=True)
+            video.write_frames(source, folders.frames, every)
+            done.write_text(stamp, encoding="utf-8")
+        return sorted(folders.frames.glob("*.jpg")), [], 0
+    if every is not None:
+        raise DataError(f"{source}: every is for videos ({' '.join(video.SUFFIXES)})", "every")
+    if not source.is_dir():
+        raise DataError(f"{source}: expected a folder of photographs or a video")
+    return find_photographs(source)
+
+
+def _settings(
+    engine: Engine,
+    source: Path,
+    masks: Path | None,
+    every: float | None,
+    config: CaptureConfig,
+    capture: Capture,
+) -> dict:
+    """What decides the cameras: the same settings go on with the same work."""
+    files = [p.path for p in capture.photographs] + list(capture.masks or [])
+    return {
+        "engine": engine,
+        "source": str(source.absolute()),
+        "masks": None if masks is None else str(masks.absolute()),
+        "every": every,
+        "config": asdict(config),
+        "files": [[p.name, p.stat().st_size, p.stat().st_mtime] for p in files],
+    }
+
+
+def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
+    """Make the folders; whether all is done already.
+
+    Raises:
+        ExistingFile: out holds what is not of this search.
+    """
+    asked, report = folders.work / "request.json", out / "poses.json"
+    same = asked.exists() and json.loads(asked.read_text(encoding="utf-8")) == settings
+    if report.exists():
+        record = json.loads(report.read_text(encoding="utf-8"))
+        if not same:
+            raise ExistingFile(f"{out} holds another scene: choose another out", "out")
+        return all(record.get(key) == value for key, value in written.items())
+    foreign = (
+        [p.name for p in out.iterdir() if p.name not in (WORK, ".partial")] if out.exists() else []
+    )
+    if foreign:
+        raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
+    if not same:
+        start_over(folders)
+        folders.work.mkdir(parents=True, exist_ok=True)
+        with replacing(asked) as temporary:
+            temporary.write_text(json.dumps(settings), encoding="utf-8")
+    return False
+
+
+def _search(
+    engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig, progress: Progress
+) -> dict[int, str]:
+    """All steps up to the models; returns why photographs could not be read, by index.
+
+    Raises:
+        DataError: the background stands still.
+    """
+    total = len(capture.photographs)
+    unreadable = {}
+    task = progress.add_task("reading", total=total)
+    for index, why in write_pictures(capture, folders, config.size, config.mask_margin):
+        progress.advance(task)
+        if why is not None:
+            unreadable[index] = why
+    if unreadable:
+        names = [capture.photographs[i].path.name for i in unreadable]
+        log.warning(f"{len(names)} could not be read: {_some(names)}")
+    found = structure.extract(engine, capture, folders, config)
+    _follow(progress, "features", found, total)
+    _follow(progress, "choosing pairs", structure.select(capture, folders, config), total)
+    pairs = structure.pair_count(folders)
+    _follow(progress, "matching", structure.match(engine, capture, folders, config), pairs)
+    still, matching = checks.still(database.verified_pairs(folders.database))
+    if still > config.still_share * matching:
+        stands = f"the background stands still in {still} of {matching} pairs"
+        if capture.masks is None:
+            raise DataError(
+                f"{stands}: the object was turned before a still camera. Only what is on the "
+                "object counts: make masks of it and give them as masks=DIR",
+                "masks",
+            )
+        raise DataError(f"{stands}: masks hold a part of it, make them tighter", "masks")
+    _follow(progress, "placing", structure.place(engine, capture, folders, config), total)
+    return unreadable
+
+
+def _follow(progress: Progress, name: str, steps: Iterable[int], total: int) -> None:
+    """Show how far a step is while it runs."""
+    task = progress.add_task(name, total=total)
+    for done in steps:
+        progress.update(task, completed=min(done, total))
+    progress.update(task, completed=total)
+
+
+def _judge(
+    capture: Capture, folders: Folders, config: CaptureConfig, unreadable: dict[int, str]
+) -> Found:
+    """The largest model, and what is known of each photograph.
+
+    Raises:
+        DataError: too few photographs were placed.
+    """
+    models = structure.models(folders)
+    pairs = database.verified_pairs(folders.database)
+    features = database.feature_counts(folders.database)
+    numbers = database.images(folders.database)
+    placed = {i.number: i for i in models[0].images} if models else {}
+    elsewhere = {i.number: len(m.images) - 1 for m in reversed(models[1:]) for i in m.images}
+    weak = checks.weak({n: i.points for n, i in placed.items()}, config)
+    errors = models[0].errors() if models else {}
+    reports = []
+    for index, name in enumerate(capture.pictures):
+        photograph = capture.photographs[index].path.name
+        number = numbers.get(name, (None, None))[0]
+        partners = sum(n >= checks.NEEDED for a, b, n, _ in pairs if number in (a, b))
+        if number in placed:
+            points = placed[number].points
+            reason = f"hangs on {points} points" if number in weak else ""
+            reports.append(
+                Report(photograph, True, points, errors[number], partners, reason=reason)
+            )
+            continue
+        reason = unreadable.get(index) or checks.why_not(number, features, pairs, elsewhere)
+        reports.append(Report(photograph, False, partners=partners, reason=reason))
+    if len(placed) < config.placed_share * len(reports):
+        missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
+        raise DataError(
+            f"only {len(placed)} of {len(reports)} photographs could be placed: take more of them, "
+            f"closer to one another, all of the same still object; not placed: {_some(missing)}"
+        )
+    return Found(models[0], weak, reports)
+
+
+def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
+    """How many were placed, how well, and which not."""
+    model, reports = found.model, found.reports
+    lenses = [model.cameras[c] for c in sorted({i.camera for i in model.images})]
+    shares = [f"{lens.focal[0] / lens.width:.2f}" for lens in lenses[:NAMED]]
+    cameras = "one camera" if len(lenses) == 1 else f"{len(lenses)} cameras"
+    log.info(
+        f"cameras: {len(model.images)} of {total} placed, {model.error:.2f} pixels, focal length "
+        f"{', '.join(shares)} of the longer side ({cameras})"
+    )
+    missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
+    if missing:
+        log.warning(f"not placed: {_some(missing)}")
+    index = {name: i for i, name in enumerate(capture.pictures)}
+    weak = [
+        capture.photographs[index[i.name]].path.name for i in model.images if i.number in found.weak
+    ]
+    if weak:
+        fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
+        log.warning(
+            f"{len(weak)} hang on few points and may be off by degrees, {fate}: {_some(weak)}; "
+            "photograph that side again with more overlap",
+            extra={"arguments": ("keep_weak",)},
+        )
+
+
+def _written(report: Report, wanted: list[int], index: int, capture: Capture) -> Report:
+    name = written_name(capture.photographs[index]) if index in wanted else ""
+    return Report(**{**asdict(report), "written": name})
+
+
+def _aside(unread: list[str], doubles: int) -> str:
+    told = f"; {doubles} came in two formats, one is taken" if doubles else ""
+    return told + (f"; {len(unread)} could not be read: {_some(unread)}" if unread else "")
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(sorted(names)[:NAMED]) + more
+
+
+def _versions() -> dict[str, str]:
+    found = {"univoxel": __version__, "python": platform.python_version()}
+    for package in ("pycolmap", "pillow", "pillow-heif", "rawpy", "imageio-ffmpeg"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
