@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 # helpers named here.
 LAYERS = [
     {"errors"},
-    {"bars", "files", "names", "records", "validation"},
+    {"bars", "files", "installation", "machine", "names", "records", "validation"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "poses"},
@@ -189,5 +189,6 @@ def test_functions_are_short():
 
 def test_tasks_are_commands():
     names = {path.stem for path in (ROOT / "univoxel" / "tasks").glob("*.py")} - {"__init__"}
-    commands = {"cutout", "train", "eval", "relight", "export", "envmap", "inspect", "info", "demo"}
+    commands = {"cutout", "train", "eval", "relight", "export", "envmap", "inspect", "info"}
+    commands |= {"demo", "doctor"}
     assert names - {"evaluate"} | {"eval"} == commands <= set(COMMANDS)

@@ -19,6 +19,7 @@ from univoxel.files import replacing
 from univoxel.records import HALF_MAX
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
+HEIF = (".heic", ".heif", ".avif")  # of telephones
 
 
 def read_image(path: str | Path) -> Tensor:
@@ -35,6 +36,7 @@ def read_image(path: str | Path) -> Tensor:
     """
     path = Path(path)
     suffix = path.suffix.lower()
+    _refuse_heif(path)
     if suffix not in SUFFIXES:
         raise DataError(f"{path}: expected a picture ({' '.join(SUFFIXES)}), got '{path.suffix}'")
     if suffix == ".hdr":
@@ -60,6 +62,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
         DataError: the file is missing, empty, or not what its name says.
     """
     path = Path(path)
+    _refuse_heif(path)
     _require_file(path)
     try:
         if path.suffix.lower() == ".exr":
@@ -151,6 +154,14 @@ def write_exr(
     OpenEXR.File(header, pixels).write(encoded)
     with replacing(path) as temporary:
         temporary.write_bytes(encoded.getbuffer())
+
+
+def _refuse_heif(path: Path) -> None:
+    if path.suffix.lower() in HEIF:
+        raise DataError(
+            f"{path}: expected a picture ({' '.join(SUFFIXES)}), got '{path.suffix}': convert the "
+            "photographs to JPEG, as `univoxel poses` does"
+        )
 
 
 def _require_file(path: Path) -> None:

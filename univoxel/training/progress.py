@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import resource
 from typing import Protocol
 
 import torch
@@ -14,6 +13,7 @@ from univoxel.bars import bar
 from univoxel.compression.choices import CapacityChoice
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
+from univoxel.machine import peak_memory_mb
 from univoxel.training.clock import Clock, CountedSteps, StepClock
 
 REPORT_SECONDS = 5.0
@@ -93,7 +93,7 @@ class Progress:
             "chosen": [choice.as_json() for choice in self.chosen],
             "troubles": self.troubles,
             "threads": torch.get_num_threads(),
-            "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "peak_rss_mb": peak_memory_mb(),
         }
 
     def say(self, what: str) -> None:
