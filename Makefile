@@ -12,7 +12,8 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test fuzz lint format bench docs docs-check docs-write asan clean
+.PHONY: help dev demo test fuzz lint format bench docs docs-check docs-write asan wheel wheel-test \
+	clean
 .DELETE_ON_ERROR:
 
 help:
@@ -25,6 +26,8 @@ help:
 	@echo "make docs-check  compare pages with results and code; docs-write brings them up to date"
 	@echo "make bench   time every op against its peers and draw the charts"
 	@echo "make asan    the ops' tests under address and undefined-behaviour sanitizers"
+	@echo "make wheel   source distribution and wheels of each Python that is here, into dist/"
+	@echo "make wheel-test  install a wheel where there is nothing else, run demo and ops' tests"
 	@echo "make dev     set up only"
 
 dev: build/.installed
@@ -98,5 +101,15 @@ asan: build-asan/.installed
 		OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -q $(TWO) \
 		-c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) -p no:cacheprovider -k "not compile" $(CURDIR)/tests/ops
 
+.venv/.wheel: $(SETUP)
+	scripts/venv.sh $(PYTHON) wheel
+	@touch $@
+
+wheel: .venv/.wheel
+	scripts/wheel.sh
+
+wheel-test: wheel
+	scripts/test_wheel.sh dist/univoxel-*-$$($(PYTHON) -c 'import sys; print("cp%d%d" % sys.version_info[:2])')-*.whl $(PYTHON)
+
 clean:
-	rm -rf build build-asan .deps .venv univoxel/_core
+	rm -rf build build-asan dist .deps .venv univoxel/_core

@@ -1,6 +1,6 @@
 """Renders an exported .glb in Blender under an environment map, as `univoxel relight` does.
 
-    pip install bpy==4.2.0    # for Python 3.11
+    pip install bpy    # each version is made for one Python: pip says which there are
     python render_in_blender.py sneaker.glb studio.hdr transforms_test.json out/
 
 Blender turns glTF back to +Z up, and its world textures have the axes of

@@ -14,7 +14,7 @@ if [ ! -x .venv/bin/python ] || ! .venv/bin/python -m pip --version >/dev/null 2
         PYTHONPATH=${wheels[0]} .venv/bin/python -m pip install -q pip
     fi
 fi
-# torch first and pinned: a bare `torch` would bring gigabytes of CUDA packages.
+# torch first and pinned: a newer one might come with gigabytes of CUDA packages.
 .venv/bin/pip install -q -c constraints.txt torch
 .venv/bin/pip install -q -c constraints.txt -e ".[dev${2:+,$2}]"
 # Of the editable install only the path counts. Its import hook would stand before PYTHONPATH and the

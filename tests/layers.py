@@ -5,7 +5,7 @@ docs/figures/diagrams.py draws them."""
 # helpers named here.
 LAYERS = [
     {"errors"},
-    {"bars", "files", "names", "records", "validation"},
+    {"bars", "files", "installation", "machine", "names", "records", "validation"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "poses"},

@@ -16,6 +16,7 @@ import pytest
 import univoxel
 from univoxel import errors
 from univoxel.cli import SPINS, main
+from univoxel.commands import COMMANDS
 from univoxel.errors import (
     ExistingFile,
     MissingExtra,
@@ -505,3 +506,9 @@ def test_arguments_that_no_command_can_use(calls, capsys, argument, message):
 def test_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("univoxel 0.")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_names_every_default(command, capsys):
+    main([command, "--help"])
+    assert "(default: )" not in " ".join(capsys.readouterr().out.split())

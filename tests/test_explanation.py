@@ -15,7 +15,17 @@ FIELD = re.compile(r"\b([A-Z]\w*Config)\.(\w+)")
 CONSTANT = re.compile(r"(?<![\w/.-])[A-Z][A-Z_]{3,}(?![\w/.-])")
 FILE = re.compile(r"(?<![\w./])(?:univoxel/)?((?:\w+/)*\w+\.(?:py|cpp))\b")
 # Placeholders of commands, and names that are not ours
-WORDS = {"ANGLE", "AZIMUTH", "DATA", "ELEVATION", "FILE", "HEIGHT", "INTENSITY", "IRRADIANCE"}
+WORDS = {
+    "ADDRESS",
+    "ANGLE",
+    "AZIMUTH",
+    "DATA",
+    "ELEVATION",
+    "FILE",
+    "HEIGHT",
+    "INTENSITY",
+    "IRRADIANCE",
+}
 WORDS |= {
     "COLMAP",
     "NAME",

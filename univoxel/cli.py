@@ -61,6 +61,8 @@ def _run(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         print(f"univoxel {__version__}")
         return 0
+    if sorted(arguments) == ["--verbose", "--version"]:
+        arguments = ["doctor"]
     traceback = "--traceback" in arguments
     arguments = [a for a in arguments if a != "--traceback"]
     if (wrong := unusable(arguments)) is not None:

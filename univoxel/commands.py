@@ -360,7 +360,10 @@ def evaluate(
 def relight(
     run: Run,
     /,
-    envmap: Annotated[tuple[Path, ...], arg(metavar="MAP [MAP ...]")] = (),
+    envmap: Annotated[
+        tuple[Path, ...],
+        arg(metavar="MAP [MAP ...]", help_behavior_hint="(default: none)"),
+    ] = (),
     sun: Suns = (),
     point: Points = (),
     out: Annotated[
@@ -380,7 +383,7 @@ def relight(
     bounces: int = BOUNCES,
     background: Background = "transparent",
     ground: Annotated[str | None, arg(metavar="lowest|HEIGHT")] = None,
-    animation: tuple[Animation, ...] = (),
+    animation: Annotated[tuple[Animation, ...], arg(help_behavior_hint="(default: none)")] = (),
     resume: bool = False,
 ) -> None:
     """Render a run under other light: environment maps, suns, points.
@@ -685,6 +688,26 @@ def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> No
     print(task.demo(out))
 
 
+def doctor(
+    json: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: only printed)")
+    ] = None,
+) -> None:
+    """Look at this installation and this machine, and say what to do about what they lack.
+
+    Processor and the kernels built for it, Embree, torch, OpenMP, threads, memory, extras. Ends
+    with exit code 2 where training would be refused.
+
+    Args:
+        json: file for the findings
+    """
+    from univoxel.tasks import doctor as task
+
+    findings = task.doctor(json=json)
+    rich.print(task.table(findings))
+    task.check(findings)
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
     "poses": poses,
     "cutout": cutout,
@@ -700,4 +723,5 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "chart": chart,
     "stress": stress,
     "demo": demo,
+    "doctor": doctor,
 }

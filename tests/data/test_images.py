@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from univoxel.data import images
-from univoxel.data.images import read_exr, read_image, write_exr, write_png
+from univoxel.data.images import image_size, read_exr, read_image, write_exr, write_png
 from univoxel.errors import DataError
 from univoxel.files import replacing
 
@@ -240,6 +240,14 @@ def test_unknown_suffix(tmp_path):
         read_image(tmp_path / "a.tif")
 
 
+@pytest.mark.parametrize("read", [read_image, image_size])
+@pytest.mark.parametrize("name", ["IMG_1.HEIC", "a.heif", "a.avif"])
+def test_pictures_of_telephones(tmp_path, read, name):
+    (tmp_path / name).write_bytes(b"ftypheic")
+    with pytest.raises(DataError, match=rf"{name}: .* got '\.\w+': convert .* `univoxel poses`"):
+        read(tmp_path / name)
+
+
 # Writing
 
 
@@ -331,13 +339,13 @@ def test_size_without_reading(tmp_path, name):
         images.write_exr(path, dict.fromkeys("RGB", np.zeros((3, 5), np.float32)))
     else:
         Image.fromarray(np.zeros((3, 5, 3), np.uint8)).save(path)
-    assert images.image_size(path) == (5, 3)
+    assert image_size(path) == (5, 3)
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(DataError, match=rf"{name}: expected .* could not read it"):
-        images.image_size(path)
+        image_size(path)
     path.write_bytes(b"")
     with pytest.raises(DataError, match=rf"{name}: the file is empty"):
-        images.image_size(path)
+        image_size(path)
     with pytest.raises(DataError, match="none: expected a file, got nothing there"):
         images.image_size(tmp_path / "none")
 

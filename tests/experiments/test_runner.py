@@ -114,10 +114,11 @@ def test_a_killed_training_starts_anew(out, tmp_path, monkeypatch):
 def test_two_processes_do_not_share_a_folder(out, tmp_path):
     folder = tmp_path / "small"
     shutil.copytree(out / "ball" / "small", folder)
-    with (folder / "job.json").open() as file:
-        worker.fcntl.flock(file, worker.fcntl.LOCK_EX)
-        with pytest.raises(RuntimeError, match="small: another process is at work there"):
-            worker.work(folder)
+    with (
+        worker.FileLock(folder / worker.LOCK),
+        pytest.raises(RuntimeError, match="small: another process is at work there"),
+    ):
+        worker.work(folder)
 
 
 def test_a_signal_is_named(tmp_path):

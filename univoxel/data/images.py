@@ -24,6 +24,7 @@ from univoxel.records import HALF_MAX
 _OPENING = Lock()  # of an OpenEXR file: what it prints to is the process's, not the thread's
 EXR_TELLS = "Warning: "  # how its lines begin
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
+HEIF = (".heic", ".heif", ".avif")  # of telephones
 
 
 def read_image(path: str | Path) -> Tensor:
@@ -40,6 +41,7 @@ def read_image(path: str | Path) -> Tensor:
     """
     path = Path(path)
     suffix = path.suffix.lower()
+    _refuse_heif(path)
     if suffix not in SUFFIXES:
         raise DataError(f"{path}: expected a picture ({' '.join(SUFFIXES)}), got '{path.suffix}'")
     if suffix == ".hdr":
@@ -65,6 +67,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
         DataError: the file is missing, empty, or not what its name says.
     """
     path = Path(path)
+    _refuse_heif(path)
     _require_file(path)
     try:
         if path.suffix.lower() == ".exr":
@@ -225,6 +228,14 @@ def _without_stderr() -> Iterator[None]:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
+
+
+def _refuse_heif(path: Path) -> None:
+    if path.suffix.lower() in HEIF:
+        raise DataError(
+            f"{path}: expected a picture ({' '.join(SUFFIXES)}), got '{path.suffix}': convert the "
+            "photographs to JPEG, as `univoxel poses` does"
+        )
 
 
 def _require_file(path: Path) -> None:

@@ -7,23 +7,25 @@ gives each training a fresh peak of memory, and takes nothing down with it when 
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import json
 import logging
-import os
 import shutil
 import sys
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from univoxel.checkpoint import load_checkpoint
 from univoxel.config import TrainConfig, check_same
 from univoxel.errors import ProcessFailed, UserError
 from univoxel.experiments.record import Outcome, Setting, identity
+from univoxel.machine import load
 from univoxel.tasks.envmap import Comparison, envmap
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
 
 JOB = "job.json"
+LOCK = "lock"  # held by the process that is at work in the folder
 RUN = "run"  # the training's own folder
 MAP = "envmap.exr"  # the recovered light, where the run has one
 
@@ -34,32 +36,36 @@ def work(folder: Path) -> None:
     A training that was broken off starts anew: one in several sittings is not what a reader of its
     figures expects. One that was finished is only evaluated.
     """
-    with (folder / JOB).open(encoding="utf-8") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise ProcessFailed(f"{folder}: another process is at work there") from None
-        job = json.load(file)
-        setting = Setting(**job["setting"] | {"changes": tuple(job["setting"]["changes"])})
-        config = setting.config(Path(job["data"]), folder / RUN)
-        load = os.getloadavg()[0]
-        if not finished(config):
-            shutil.rmtree(config.out, ignore_errors=True)
-            train(config)
-        samples = job["samples"]
-        measures = {
-            **evaluate(config.out, samples=samples),
-            "steps_made": steps_made(config),
-            **light_error(config.out, folder / MAP),
-        }
-        Outcome(
-            folder.parent.name,
-            setting.name,
-            identity(config, samples),
-            measures,
-            read_log(config.out / "log.jsonl"),
-            load,
-        ).save(folder)
+    try:
+        with FileLock(folder / LOCK, timeout=0):
+            _work(folder)
+    except Timeout:
+        raise ProcessFailed(f"{folder}: another process is at work there") from None
+
+
+def _work(folder: Path) -> None:
+    """`work`, alone in the folder."""
+    job = json.loads((folder / JOB).read_text(encoding="utf-8"))
+    setting = Setting(**job["setting"] | {"changes": tuple(job["setting"]["changes"])})
+    config = setting.config(Path(job["data"]), folder / RUN)
+    load_average = load()
+    if not finished(config):
+        shutil.rmtree(config.out, ignore_errors=True)
+        train(config)
+    samples = job["samples"]
+    measures = {
+        **evaluate(config.out, samples=samples),
+        "steps_made": steps_made(config),
+        **light_error(config.out, folder / MAP),
+    }
+    Outcome(
+        folder.parent.name,
+        setting.name,
+        identity(config, samples),
+        measures,
+        read_log(config.out / "log.jsonl"),
+        load_average,
+    ).save(folder)
 
 
 def finished(config: TrainConfig) -> bool:

@@ -7,7 +7,7 @@ from univoxel.ops.hash_grid import encode_hash, encode_hash_reference
 from univoxel.ops.integrator import EnvTables, PointLight, Sun, relight
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.mlp import mlp, mlp_reference
-from univoxel.ops.native import use_backend
+from univoxel.ops.native import NativeStatus, native_status, use_backend
 from univoxel.ops.response import specular_response, specular_response_reference
 from univoxel.ops.sg import shade_sg, shade_sg_reference
 from univoxel.ops.shade import (
@@ -31,6 +31,7 @@ Lamp = PointLight  # its name before
 __all__ = [
     "EnvTables",
     "Hit",
+    "NativeStatus",
     "PointLight",
     "Sun",
     "VisibilityScene",
@@ -50,6 +51,7 @@ __all__ = [
     "match_cost_reference",
     "mlp",
     "mlp_reference",
+    "native_status",
     "occluded_reference",
     "relight",
     "sample_dense",

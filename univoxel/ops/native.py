@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import logging
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
@@ -19,18 +21,59 @@ from torch import Tensor
 
 from univoxel.errors import MissingNative
 
+log = logging.getLogger("univoxel")
+
 Backend = Literal["auto", "native", "reference"]
+FOLDER = Path(__file__).parent.parent / "_core"
+VARIANTS = ["default", "avx2", "avx512"]  # each runs what the ones before it run
 
 _backend: Backend = "auto"
+_told: set[str] = set()  # reasons that were told, once each
+
+
+@dataclass(frozen=True)
+class NativeStatus:
+    """What is known of the compiled extension."""
+
+    loaded: bool
+    variant: str | None  # instruction set of the build that is loaded: default, avx2 or avx512
+    reason: str | None  # why none is loaded
+    built: tuple[str, ...]  # variants that are installed
+    usable: tuple[str, ...]  # variants that this processor runs
+    embree: int | None  # version of Embree, which traces rays; None: built without, or not loaded
+
+
+def native_status() -> NativeStatus:
+    """Return what is known of the compiled extension: whether it serves, and if not, why.
+
+    Without it, ops run in eager torch, and `VisibilityScene` is refused.
+    """
+    version = core.embree_version() if core is not None else 0
+    return NativeStatus(
+        loaded=core is not None,
+        variant=variant if core is not None else None,
+        reason=variant if core is None else None,
+        built=tuple(sorted(_built(), key=VARIANTS.index)),
+        usable=tuple(_usable()),
+        embree=version or None,
+    )
+
+
+def _built() -> dict[str, Path]:
+    """Files of the extension by variant."""
+    found = {p.parent.name: p for p in FOLDER.glob("*/_core.*") if p.suffix in (".so", ".pyd")}
+    return {name: path for name, path in found.items() if name in VARIANTS}
+
+
+def _usable() -> list[str]:
+    """Variants that this processor runs, the best last."""
+    capability = torch.backends.cpu.get_cpu_capability().lower()
+    return VARIANTS[: VARIANTS.index(capability) + 1] if capability in VARIANTS else ["default"]
 
 
 def _load() -> tuple[ModuleType | None, str]:
     """The build for this processor, or None and the reason why there is none."""
-    folder = Path(__file__).parent.parent / "_core"
-    built = {p.parent.name: p for p in folder.glob("*/_core.*") if p.suffix in (".so", ".pyd")}
-    capability = torch.backends.cpu.get_cpu_capability().lower()
-    rank = ["default", "avx2", "avx512"]
-    usable = rank[: rank.index(capability) + 1] if capability in rank else ["default"]
+    built, usable = _built(), _usable()
     for variant in reversed(usable):
         if variant not in built:
             continue
@@ -44,7 +87,7 @@ def _load() -> tuple[ModuleType | None, str]:
             return None, f"{built[variant].name} ({variant}): {error}"
         sys.modules["univoxel._core"] = module
         return module, variant
-    return None, f"no extension built under {folder}"
+    return None, f"no extension built under {FOLDER}"
 
 
 core, variant = _load()
@@ -64,7 +107,21 @@ def serves(tensor: Tensor) -> bool:
             f"the native backend serves float32 and float64 on the cpu, got {tensor.dtype} on "
             f"{tensor.device}"
         )
+    if core is None:
+        _tell_once(f"the compiled extension is not loaded: {variant}")
+    elif not fits:
+        _tell_once(
+            f"kernels take float32 and float64 on the cpu, got {tensor.dtype} on {tensor.device}"
+        )
     return core is not None and fits
+
+
+def _tell_once(why: str) -> None:
+    """Warn that an op runs without its kernel, once for each reason."""
+    # A compiled graph would be broken by the logging
+    if why not in _told and not torch.compiler.is_compiling():
+        _told.add(why)
+        log.warning("univoxel.ops runs in eager torch, many times slower: %s", why)
 
 
 def reference_asked() -> bool:
@@ -95,8 +152,27 @@ def use_backend(name: Backend) -> Iterator[None]:
 def require() -> ModuleType:
     """The extension, or an error that says why it is missing."""
     if core is None:
-        raise MissingNative(f"univoxel's compiled extension is not loaded: {variant}")
+        raise MissingNative(
+            f"univoxel's compiled extension is not loaded: {variant}; `univoxel doctor` says what "
+            "to do"
+        )
     return core
+
+
+def require_embree(what: str) -> ModuleType:
+    """The extension with rays, or an error that says what is missing and how to get it.
+
+    Args:
+        what: needs it; begins the message.
+    """
+    found = require()
+    if not found.embree_version():
+        raise MissingNative(
+            f"{what}: univoxel was built without Embree, which traces its rays; install a wheel "
+            "that has it (pip install --only-binary univoxel univoxel), or Embree 3 or 4 (Debian: "
+            "apt-get install libembree-dev) and rebuild (pip install .)"
+        )
+    return found
 
 
 def arrays(*tensors: Tensor) -> list[np.ndarray]:

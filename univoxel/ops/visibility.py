@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from univoxel.errors import MissingNative
 from univoxel.ops import native
 from univoxel.ops.checks import check
 
@@ -188,13 +187,7 @@ def closest_hit_reference(
 
 def _build(vertices: Tensor, faces: Tensor):
     """The native scene, or an error that says what is missing and how to get it."""
-    core = native.require()
-    if not core.embree_version():
-        raise MissingNative(
-            "VisibilityScene: univoxel was built without Embree, which traces its rays; install "
-            "Embree 3 or 4 (Debian: apt-get install libembree-dev) and rebuild (pip install .), or "
-            'ask for the slow reference: with univoxel.ops.use_backend("reference")'
-        )
+    core = native.require_embree('VisibilityScene outside of use_backend("reference")')
     return core.VisibilityScene(*native.arrays(vertices, faces), native.threads())
 
 

@@ -23,6 +23,7 @@ from univoxel.files import replacing
 from univoxel.grid import fit_grid
 from univoxel.joint import stage as joint_stage
 from univoxel.joint.config import JointConfig
+from univoxel.ops import native
 from univoxel.pictures.timelapse import Timelapse
 from univoxel.preparation.prepare import Silhouettes, find_silhouettes, prepare
 from univoxel.render.picture import preview
@@ -52,12 +53,15 @@ def train(
             be resumed.
 
     Raises:
+        MissingNative: the compiled extension is missing or was built without Embree.
         DataError: input that cannot be used.
         ExistingFile: cfg.out holds a run already and resume is False.
         OSError: a file of the run cannot be written; what was there before stays.
         UserError: with resume, the checkpoint cannot be read, or it belongs to another
             configuration.
     """
+    if not native.reference_asked():
+        native.require_embree("train")  # now, and not minutes later
     film = None if timelapse is None else Timelapse(timelapse, cfg)
     torch.manual_seed(cfg.seed)
     kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import resource
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -16,6 +15,7 @@ from univoxel.bars import bar
 from univoxel.compression.choices import CapacityChoice
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
+from univoxel.machine import peak_memory_mb
 from univoxel.training.clock import Clock, CountedSteps, StepClock
 
 LOG = "log.jsonl"  # in the folder of a run
@@ -118,7 +118,7 @@ class Progress:
             "chosen": [choice.as_json() for choice in self.chosen],
             "troubles": self.troubles,
             "threads": torch.get_num_threads(),
-            "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "peak_rss_mb": peak_memory_mb(),
         }
 
     def say(self, what: str) -> None:
