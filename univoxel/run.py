@@ -60,7 +60,7 @@ def _source_of(run: Path) -> Source:
         raise DataError(f"{path}: expected an object with the configuration, got {config!r:.80}")
     # In runs from before there was a choice
     before = {"downscale": 0, "allow_outside": False}
-    data, downscale, outside = ((before | config).get(f) for f in ("data", *before))
+    data, downscale, outside = ((before | config).get(f, "") for f in ("data", *before))
     kinds = type(data), type(downscale), type(outside)
     if kinds != (str, int, bool) or not data or "\0" in data or downscale < 0:
         raise DataError(
