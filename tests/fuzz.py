@@ -31,6 +31,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -152,7 +153,10 @@ def mesh(folder: Path) -> None:
 def write_truth(folder: Path) -> None:
     write_nerf(folder, scene())
     shape = (8, 12)
-    arrays = {"albedo": np.full((*shape, 3), 0.5), "normal": np.full((*shape, 3), 0.577)}
+    arrays: dict[str, Any] = {
+        "albedo": np.full((*shape, 3), 0.5),
+        "normal": np.full((*shape, 3), 0.577),
+    }
     arrays |= {"roughness": np.full(shape, 0.5), "depth": np.full(shape, 3.0)}
     (folder / "test" / "gt").mkdir()
     for name in ("p_000", "p_008"):
@@ -338,7 +342,7 @@ def hostile_json(data: bytes, rng: np.random.Generator) -> bytes:
     return json.dumps(root).encode()
 
 
-def _change(node: object, rng: np.random.Generator) -> None:
+def _change(node: Any, rng: np.random.Generator) -> None:
     """Change a list or an object somewhere within."""
     while True:
         keys = list(node) if isinstance(node, dict) else list(range(len(node)))
@@ -615,7 +619,7 @@ def run(
 
 def main() -> int:
     """Parse, run; 1 where an outcome is bad."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--cases", type=int, default=200, help="of each reader")
     parser.add_argument("--seed", type=int, default=1, help="of the first case")
     parser.add_argument("--readers", nargs="*", default=list(READERS), choices=list(READERS))

@@ -45,7 +45,7 @@ def record(kind: type[T], values: object) -> T:
     name = kind.__name__
     if not isinstance(values, dict):
         raise ConfigError(f"{name}: expected an object, got {values!r:.60}")
-    hints, known = get_type_hints(kind), {f.name: f for f in dataclasses.fields(kind) if f.init}
+    hints, known = get_type_hints(kind), {f.name: f for f in _fields(kind) if f.init}
     if unknown := values.keys() - known.keys():
         raise ConfigError(f"{name}: no field {min(map(str, unknown))!r:.60}")
     found = {}
@@ -64,6 +64,10 @@ def record(kind: type[T], values: object) -> T:
     return kind(**found)
 
 
+def _fields(kind: Any) -> tuple[dataclasses.Field[Any], ...]:
+    return dataclasses.fields(kind)
+
+
 def _typed(hint: Any, value: Any) -> Any:
     """A value of JSON as the annotation has it.
 
@@ -71,7 +75,7 @@ def _typed(hint: Any, value: Any) -> Any:
         TypeError, OverflowError: it is of another type, or an integer that no float holds.
     """
     origin, inner = get_origin(hint), get_args(hint)
-    if dataclasses.is_dataclass(value) and isinstance(value, hint):  # read before
+    if hasattr(value, "__dataclass_fields__") and isinstance(value, hint):  # read before
         return value
     if origin in (Union, types.UnionType):
         if value is None and type(None) in inner:
