@@ -12,12 +12,13 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test lint format bench docs docs-check docs-write asan clean
+.PHONY: help dev demo test fuzz lint format bench docs docs-check docs-write asan clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo    train, evaluate and relight the bundled scene; prints the page to open"
 	@echo "make test    all tests"
+	@echo "make fuzz    thousands of damaged files for every reader; prints a table"
 	@echo "make lint    formatting, lint and types, as CI checks them"
 	@echo "make format  put formatting right"
 	@echo "make docs    build the documentation into build/docs; warnings are errors"
@@ -42,6 +43,9 @@ demo: dev
 
 test: dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(TWO)
+
+fuzz: dev
+	$(BIN)/python tests/fuzz.py --cases 300
 
 lint: $(SETUP)
 	$(BIN)/ruff format --check .

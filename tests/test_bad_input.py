@@ -217,9 +217,100 @@ def test_checkpoints_that_cannot_be_used(run, data, tmp_path, refused, change, m
     before = sorted(run.iterdir()), (run / "config.json").read_bytes()
     refused(message, "eval", run, "--save", tmp_path / "out")
     refused(message, "export", run, "--mesh", tmp_path / "out" / "a.ply")
-    refused(message, "train", data, "--out", run, "--resume")
+    if (run / FILE).exists():  # else training begins
+        refused(message, "train", data, "--out", run, "--resume")
     assert not (tmp_path / "out").exists()
     assert before == (sorted(run.iterdir()), (run / "config.json").read_bytes())
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint(run, data, capsys):
+    """It left a configuration and a log of work that is gone: with --resume it begins."""
+    (run / FILE).unlink()
+    (run / "log.jsonl").write_text("gone\n")
+    assert main(["train", str(data), "--out", str(run), "--resume", *SMALL]) == 0
+    assert f"nothing was saved in {run} yet: training begins\n" in capsys.readouterr().out
+    assert (run / FILE).is_file()
+    assert "gone" not in ((run / "log.jsonl").read_text() if (run / "log.jsonl").exists() else "")
+
+
+def meta(change):
+    def apply(path):
+        with safe_open(path, "pt") as file:
+            meta = json.loads(file.metadata()["univoxel"])
+        change(meta)
+        save_file(load_file(path), path, {"univoxel": json.dumps(meta)})
+
+    return apply
+
+
+def edited_tensor(name, change):
+    def apply(path):
+        with safe_open(path, "pt") as file:
+            meta = file.metadata()
+        tensors = load_file(path)
+        tensors[name] = change(tensors[name])
+        save_file({k: v for k, v in tensors.items() if v is not None}, path, meta)
+
+    return apply
+
+
+def nan(tensor):
+    tensor.view(-1)[0] = np.nan
+    return tensor
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (meta(lambda m: m.update(inv_s="sharp")), "inv_s must be float, got 'sharp'"),
+        (meta(lambda m: m.update(inv_s=10**400)), "inv_s must be float, got 1000"),
+        (meta(lambda m: m.update(inv_s=np.nan)), "inv_s must be above 0, got nan"),
+        (meta(lambda m: m.update(levels=7)), "its own description"),
+        (meta(lambda m: m["levels"][2].append("fine")), "voxel_sizes must be tuple"),
+        (
+            meta(lambda m: m["levels"].__setitem__(3, 3)),
+            "rows must be a power of two",
+        ),
+        (meta(lambda m: m["levels"].__setitem__(3, 2**40)), "is expected with"),
+        (meta(lambda m: m["grid"].update(origin=None)), "origin must be tuple"),
+        (
+            meta(lambda m: m["grid"].update(size=[10**5] * 3)),
+            "size must be 2 or more",
+        ),
+        (meta(lambda m: m["grid"].update(size=[1200] * 3)), "field.sdf is expected"),
+        (meta(lambda m: m.update(scene=[])), "its own description"),
+        (meta(lambda m: m["scene"].update(hidden=10**5)), "is expected as"),
+        (meta(lambda m: m["scene"].update(hidden=True)), "hidden must be int"),
+        (meta(lambda m: m["scene"].update(more=1)), "SceneConfig: no field 'more'"),
+        (meta(lambda m: m["scene"].pop("light")), "its own description"),
+        (meta(lambda m: m["scene"].update(light=[])), "light must be an object"),
+        (
+            meta(lambda m: m["scene"]["light"].update(layers=10**5)),
+            "layers must be at most 32",
+        ),
+        (
+            meta(lambda m: m["scene"]["light"].update(directions_eval=10**9)),
+            "directions_eval must be at most 65536",
+        ),
+        (meta(lambda m: m.update(state=[1])), "its own description"),
+        (meta(lambda m: m["state"].update(stage="last")), "stage must be int"),
+        (
+            meta(lambda m: m["state"].update(progress=2)),
+            r"progress must be in \[0, 1\]",
+        ),
+        (meta(lambda m: m["state"].update(chosen=[{"what": 1}])), "what must be str"),
+        (edited_tensor("material.net.0.weight", nan), "NaN or infinity in material.net.0.weight"),
+        (
+            edited_tensor("material.net.0.weight", lambda t: None),
+            "material.net.0.weight is missing",
+        ),
+        (edited_tensor("field.feature_rows", lambda t: t - 10**6), "field.features is expected"),
+        (edited_tensor("field.feature_values", lambda t: t[:1]), "field.features is expected"),
+    ],
+)
+def test_checkpoints_that_contradict_themselves(run, refused, change, message):
+    change(run / FILE)
+    refused(rf"scene\.safetensors: .*{message}", "info", run)
 
 
 def test_an_environment_map_of_another_shape(run, data, tmp_path, refused):

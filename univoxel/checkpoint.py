@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-from dataclasses import asdict, astuple
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 import torch
@@ -12,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from univoxel.errors import DataError, FileError, MissingFile
+from univoxel.errors import ConfigError, DataError, FileError, MissingFile
 from univoxel.fields.bricks import BrickDistances, pack_bricks, unpack_bricks
 from univoxel.fields.dense import DenseDistances
 from univoxel.fields.features import HashFeatures, Levels, NodeFeatures
@@ -20,9 +21,11 @@ from univoxel.fields.field import Field
 from univoxel.fields.packing import PACKED, pack, unpack
 from univoxel.grid import GridShape
 from univoxel.lights import read_config
+from univoxel.names import FieldName
 from univoxel.networks import DirectionTable
 from univoxel.records import HALF_MAX, Bricks
 from univoxel.scene import Scene, SceneConfig
+from univoxel.validation import check_fields, record
 
 FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
 FILE = "scene.safetensors"
@@ -31,6 +34,11 @@ TABLES = {
     "field.features": ("field.feature_rows", "field.feature_values"),
     "radiance.directions.table": ("radiance.direction_rows", "radiance.direction_values"),
 }
+SDF = tuple(f"field.sdf_{name}" for name in PACKED)  # the same for distances
+LEVELS = "lower", "upper", "voxel_sizes", "rows"
+# Rows of a table for each that a file holds, at most, beyond a small table: a surface of 4 voxels'
+# width in a grid has more, and what claims to have fewer wants memory for nothing
+ROWS_FOR_ONE = 4096
 SHELL = 4.0  # voxels around the surface, beyond which a finished scene needs no features
 
 
@@ -101,8 +109,62 @@ def save_scene(
     return path
 
 
+@dataclass(frozen=True)
+class Choice:
+    """A size that was chosen, as training's state has it."""
+
+    what: str
+    before: float
+    after: float
+    cost: float
+    why: str
+    said: str = ""
+
+
+@dataclass(frozen=True)
+class State:
+    """What of a run's state is known here; a file may have less and more."""
+
+    stage: int = 0
+    progress: float = 0.0  # of the stage, in [0, 1]
+    step: int = 0
+    made: tuple[float, ...] = ()
+    early: tuple[int, ...] = ()
+    stage_steps: int = 0
+    seconds: float = 0.0
+    chosen: tuple[Choice, ...] = ()
+    troubles: tuple[str, ...] = ()
+    threads: int = 1
+    peak_rss_mb: float = 0.0
+
+    def __post_init__(self):
+        counts = "stage", "step", "stage_steps", "seconds"
+        check_fields(self, "finite, at least 0", lambda x: 0 <= x < math.inf, *counts)
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "progress")
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a file says of its tensors."""
+
+    scene: SceneConfig
+    grid: GridShape
+    inv_s: float
+    field: FieldName = "dense"
+    levels: Levels | None = None  # of a hash field
+
+    def __post_init__(self):
+        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "inv_s")
+        if (self.field == "hash") != (self.levels is not None):
+            raise ConfigError(
+                f"Description: levels must be those of a hash field, got {self.field}"
+            )
+
+
 def load_checkpoint(run: str | Path) -> tuple[Scene, dict]:
     """The scene of a run, in evaluation mode, and the state it was saved with.
+
+    Sizes that the file claims are compared with its tensors before memory is taken for them.
 
     Raises:
         MissingFile: no checkpoint there.
@@ -111,57 +173,121 @@ def load_checkpoint(run: str | Path) -> tuple[Scene, dict]:
     path = Path(run) / FILE
     if not path.is_file():
         raise MissingFile(f"no checkpoint in {run} (looked for {FILE}); run `univoxel train` first")
+    meta, tensors = _read(path)
+    state = meta.get("state", {})
+    try:
+        record(State, {k: v for k, v in state.items() if k in State.__dataclass_fields__})
+        about = _description(meta, tensors)
+        bricks = None
+        if "field.place" in tensors:
+            where = tensors.pop("field.place"), tensors.pop("field.inside")
+            bricks = unpack_bricks(*where, about.grid.size)
+        with torch.device("meta"):  # sizes alone
+            _compare(_scene(about, bricks), tensors)
+        scene = _scene(about, bricks)
+        _unpack_(scene, tensors)
+        scene.load_state_dict(tensors)
+        return scene.eval(), state
+    except (RuntimeError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise DataError(f"{path}: does not fit its own description: {error}") from error
+
+
+def _read(path: Path) -> tuple[dict, dict[str, Tensor]]:
+    """What a file says of itself, and its tensors, all finite."""
     try:
         with safe_open(path, "pt") as file:
             meta = json.loads((file.metadata() or {}).get("univoxel", "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: damaged or cut short: {error}") from error
-    if meta.get("format") != FORMAT:
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        came = meta.get("format") if isinstance(meta, dict) else meta
         raise DataError(
-            f"{path}: expected checkpoint format {FORMAT}, got {meta.get('format')}; "
+            f"{path}: expected checkpoint format {FORMAT}, got {came!r:.60}; "
             "it was written by another version of univoxel"
         )
-    try:
-        light = read_config(meta["scene"].pop("light"))
-        views = tuple(meta["scene"].pop("views", ()))
-        if "mirror_levels" not in meta["scene"]:  # a file from before there were any
-            meta["scene"]["mirror_levels"] = 0
-            none = torch.zeros(0, dtype=torch.int32), torch.zeros(0, DirectionTable.per_level)
-            tensors |= zip(TABLES["radiance.directions.table"], none, strict=True)
-        cfg = SceneConfig(**meta["scene"], light=light, views=views)
-        grid = GridShape(
-            tuple(meta["grid"]["origin"]), meta["grid"]["voxel_size"], tuple(meta["grid"]["size"])
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise DataError(f"{path}: damaged: NaN or infinity in {name}")
+    return meta, tensors
+
+
+def _description(meta: dict, tensors: dict[str, Tensor]) -> Description:
+    """The description, also of files from before there were all of its parts, which get them."""
+    scene = dict(meta["scene"])
+    scene["light"] = read_config(scene["light"])
+    if "mirror_levels" not in scene:
+        scene["mirror_levels"] = 0
+        none = torch.zeros(0, dtype=torch.int32), torch.zeros(0, DirectionTable.per_level)
+        tensors |= zip(TABLES["radiance.directions.table"], none, strict=True)
+    known = {k: meta[k] for k in ("grid", "inv_s", "field") if k in meta}
+    if levels := meta.get("levels"):
+        known["levels"] = dict(zip(LEVELS[: len(levels)], levels, strict=True))
+    return record(Description, known | {"scene": scene})
+
+
+def _scene(about: Description, bricks: Bricks | None) -> Scene:
+    """A scene as described, its values yet unknown."""
+    distances = DenseDistances(about.grid) if bricks is None else BrickDistances(about.grid, bricks)
+    if about.levels:
+        encoding = HashFeatures(about.levels)
+    else:
+        encoding = NodeFeatures(torch.zeros(*distances.sdf.shape, about.scene.channels))
+    field = Field(distances, encoding)
+    if field.channels != about.scene.channels:
+        raise ValueError(
+            f"{field.channels} channels in its field, {about.scene.channels} in its networks"
         )
-        kind = meta.get("field", "dense")
-        if "field.place" in tensors:
-            where = tensors.pop("field.place"), tensors.pop("field.inside")
-            distances = BrickDistances(grid, unpack_bricks(*where, grid.size))
-        else:
-            distances = DenseDistances(grid)
-        if kind == "hash":
-            lower, upper, sizes, *rows = meta["levels"]
-            encoding = HashFeatures(Levels(tuple(lower), tuple(upper), tuple(sizes), *rows))
-        else:
-            encoding = NodeFeatures(torch.zeros(*distances.sdf.shape, cfg.channels))
-        field = Field(distances, encoding)
-        if field.channels != cfg.channels:
-            raise ValueError(
-                f"{field.channels} channels in its field, {cfg.channels} in its networks"
-            )
-        scene = Scene(cfg, field, meta["inv_s"])
-        tables = field.features.data, scene.radiance.directions.table.data
-        for (name, stored_as), table in zip(TABLES.items(), tables, strict=True):
-            rows, values = (tensors.pop(k) for k in stored_as)
-            table.flatten(0, -2)[rows.long()] = values.float()
-            tensors[name] = table
-        packed = {n: tensors.pop(k) for n in PACKED if (k := f"field.sdf_{n}") in tensors}
-        if packed:
-            tensors["field.sdf"] = unpack(packed, grid.size, SHELL * grid.voxel_size)
-        scene.load_state_dict(tensors)
-        return scene.eval(), meta["state"]
-    except (RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
-        raise DataError(f"{path}: does not fit its own description: {error}") from error
+    return Scene(about.scene, field, about.inv_s)
+
+
+def _compare(scene: Scene, tensors: dict[str, Tensor]) -> None:
+    """Refuse tensors of a file that are not those of the scene, which need hold no memory."""
+    expected = scene.state_dict()
+    parts: dict[str, tuple[str, ...]] = dict(TABLES)
+    if not tensors.keys().isdisjoint(SDF):
+        parts["field.sdf"] = SDF
+    names = {n for name in expected for n in parts.get(name, (name,))}
+    if different := names ^ tensors.keys():
+        what = "is missing" if min(different) in names else "belongs to no part"
+        raise ValueError(f"{min(different)} {what}")
+    for name, value in expected.items():
+        if name in parts:
+            rows, values, *_ = (tensors[n] for n in parts[name])
+            _compare_rows(name, value, rows, values)
+        elif tensors[name].shape != value.shape:
+            came = list(tensors[name].shape)
+            raise ValueError(f"{name} is expected as {list(value.shape)}, got {came}")
+        elif tensors[name].is_floating_point() != value.is_floating_point():
+            raise ValueError(f"{name} is expected as {value.dtype}, got {tensors[name].dtype}")
+
+
+def _compare_rows(name: str, table: Tensor, rows: Tensor, values: Tensor) -> None:
+    """Refuse rows that are no table's."""
+    channels = [] if name == "field.sdf" else [table.shape[-1]]
+    count = table.numel() // math.prod(channels)
+    if rows.dtype != torch.int32 or list(values.shape) != [*rows.shape, *channels]:
+        raise ValueError(
+            f"{name} is expected as rows and their {channels} values, got {list(rows.shape)} "
+            f"{rows.dtype} and {list(values.shape)}"
+        )
+    if count > ROWS_FOR_ONE * (len(rows) + ROWS_FOR_ONE):
+        raise ValueError(f"{name} is expected with {count} rows, got no more than {len(rows)}")
+    if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
+        raise ValueError(f"{name} is expected with rows below {count}, got others")
+
+
+def _unpack_(scene: Scene, tensors: dict[str, Tensor]) -> None:
+    """Replace what files hold of tables, and of distances, by the whole of them."""
+    tables = scene.field.features.data, scene.radiance.directions.table.data
+    for (name, stored_as), table in zip(TABLES.items(), tables, strict=True):
+        rows, values = (tensors.pop(k) for k in stored_as)
+        table.flatten(0, -2)[rows.long()] = values.float()
+        tensors[name] = table
+    packed = {n: tensors.pop(k) for n, k in zip(PACKED, SDF, strict=True) if k in tensors}
+    if packed:
+        grid = scene.field.grid
+        tensors["field.sdf"] = unpack(packed, grid.size, SHELL * grid.voxel_size)
 
 
 def load_scene(run: str | Path) -> Scene:

@@ -14,7 +14,7 @@ from univoxel.compression.config import CompressionConfig
 from univoxel.confidence.config import ConfidenceConfig
 from univoxel.errors import ConfigError, UserError
 from univoxel.fields.features import PER_LEVEL
-from univoxel.files import replacing
+from univoxel.files import read_json, replacing
 from univoxel.joint.config import JointConfig
 from univoxel.names import CamerasFrom, Capacity, MasksFrom
 from univoxel.preparation.config import PreparationConfig
@@ -149,8 +149,8 @@ def check_same(cfg: TrainConfig) -> None:
     """
     path = cfg.out / "config.json"
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        before = read_json(path)
+    except (OSError, UserError) as error:
         raise UserError(f"{path}: cannot be read, so the run cannot go on: {error}") from None
     if not isinstance(before, dict):
         raise UserError(f"{path}: expected an object with the configuration, got {before!r:.80}")

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from univoxel.validation import check_fields
+
+MOST = 1 << 31  # nodes: files and kernels number them by int32
 
 
 @dataclass(frozen=True)
@@ -14,7 +19,17 @@ class GridShape:
 
     origin: tuple[float, float, float]
     voxel_size: float
-    size: tuple[int, int, int]  # nodes
+    size: tuple[int, int, int]  # nodes, >= 2 along each axis, below 2^31 in all
+
+    def __post_init__(self):
+        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "voxel_size")
+        check_fields(self, "finite", lambda x: all(map(math.isfinite, x)), "origin")
+        check_fields(
+            self,
+            "2 or more each, below 2^31 in all",
+            lambda x: min(x) > 1 and math.prod(x) < MOST,
+            "size",
+        )
 
     @property
     def nodes_count(self) -> int:

@@ -116,7 +116,7 @@ def test_blocks_that_do_not_fit_are_dropped(tmp_path, clock):
 
 
 def test_a_pause_does_not_count(tmp_path, clock):
-    progress = Progress(config(tmp_path, 1.0, iterations=50), clock.now, START)
+    progress = Progress(config(tmp_path, 1.0, iterations=30), clock.now, START)
     for _ in progress.clock.steps():
         clock.now += 0.5
         before = progress.clock.seconds, progress.due(), progress.checkpoint_due()

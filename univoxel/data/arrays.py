@@ -40,10 +40,15 @@ def read_npz(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
     """The arrays in a .npz file whose names begin with the prefix.
 
     Raises:
-        DataError: it cannot be read.
+        DataError: it cannot be read, or holds something else than numbers.
     """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files if key.startswith(prefix)}
+            found = {key: file[key] for key in file.files if key.startswith(prefix)}
     except BROKEN as error:
         raise DataError(f"{path}: expected an npz file, could not read it: {error}") from None
+    for key, value in found.items():
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
+            kind = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
+            raise DataError(f"{path}: expected arrays of numbers, got {key} of {kind}")
+    return found

@@ -144,7 +144,8 @@ def read_images(path: Path) -> list[Registered]:
     rows = _images_text(path) if path.suffix == ".txt" else _images_binary(path)
     images = []
     for quaternion, translation, camera, name in rows:
-        length = np.linalg.norm(quaternion)
+        largest = max(map(abs, quaternion))
+        length = np.linalg.norm(quaternion) if largest < 2 else largest
         if not 0.5 < length < 2 or not np.abs(translation).max() <= FARTHEST:
             raise ValueError(f"the pose of {name} is {quaternion}, {translation}")
         w, x, y, z = np.asarray(quaternion) / length

@@ -6,7 +6,7 @@ import io
 import os
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from threading import Lock
 
@@ -21,7 +21,8 @@ from univoxel.errors import DataError
 from univoxel.files import replacing
 from univoxel.records import HALF_MAX
 
-_STDERR = Lock()
+_OPENING = Lock()  # of an OpenEXR file: what it prints to is the process's, not the thread's
+EXR_TELLS = "Warning: "  # how its lines begin
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
 
 
@@ -67,7 +68,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
     _require_file(path)
     try:
         if path.suffix.lower() == ".exr":
-            with _silenced(), OpenEXR.File(str(path), header_only=True) as file:
+            with _exr(path, header_only=True) as file:
                 low, high = file.header()["dataWindow"]
             return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
         with warnings.catch_warnings():
@@ -117,7 +118,7 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     path = Path(path)
     _require_file(path)
     try:
-        with _silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
+        with _exr(path, separate_channels=True) as file:
             crop = not np.array_equal(file.header()["dataWindow"], file.header()["displayWindow"])
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError) as error:
@@ -186,22 +187,44 @@ def write_exr(
 
 
 @contextmanager
-def _silenced() -> Iterator[None]:
-    """A block whose C code writes nothing to stderr: OpenEXR tells of damage there, and raises."""
-    with _STDERR:  # the descriptor is the process's, not the thread's
-        try:
-            kept = os.dup(2)
-        except OSError:  # there is none
-            yield
-            return
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        try:
-            os.dup2(nowhere, 2)
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            os.close(nowhere)
+def _exr(path: Path, **options: bool) -> Iterator[OpenEXR.File]:
+    """An open OpenEXR file.
+
+    Of damage the library writes lines to stdout, from Python, and to stderr, from C. Here they
+    become the error, and what other threads print meanwhile is passed on.
+
+    Raises:
+        RuntimeError, ValueError, TypeError: as the library raises them; ValueError too where it
+            only tells.
+    """
+    told = io.StringIO()
+    with _OPENING, redirect_stdout(told), _without_stderr():
+        file = OpenEXR.File(str(path), **options)
+    lines = told.getvalue().splitlines(keepends=True)
+    print("".join(line for line in lines if not line.startswith(EXR_TELLS)), end="")
+    damage = [line.strip() for line in lines if line.startswith(EXR_TELLS)]
+    with file:
+        if damage:
+            raise ValueError(damage[0].removeprefix(EXR_TELLS))
+        yield file
+
+
+@contextmanager
+def _without_stderr() -> Iterator[None]:
+    """A block whose C code writes nothing to stderr, nor anything else of the process."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is none
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _require_file(path: Path) -> None:
@@ -228,6 +251,8 @@ def _read_pillow(path: Path) -> np.ndarray:
                 array = np.asarray(
                     image.convert("L" if grey else "RGBA" if transparent else "RGB")
                 ).copy()
+    except AssertionError:  # Pillow's own, of what it takes for granted
+        raise DataError(f"{path}: expected a PNG or JPEG, got one without its palette") from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: expected a PNG or JPEG, could not read it: {error}") from None
     return array[..., None] if grey else array

@@ -32,7 +32,7 @@ def read_radiance(path: Path) -> np.ndarray:
     if form := re.search(rb"^FORMAT=(.*)$", head, re.MULTILINE):
         if form[1].strip() != b"32-bit_rle_rgbe":
             raise DataError(f"{path}: expected FORMAT=32-bit_rle_rgbe, got {form[1].strip()!r}")
-    size = re.fullmatch(rb"-Y (\d+) \+X (\d+)\s*", line)
+    size = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", line)
     if not size or not (int(size[1]) and int(size[2])):
         raise DataError(f"{path}: expected the size as '-Y height +X width', got {line[:40]!r}")
     height, width = int(size[1]), int(size[2])
@@ -57,7 +57,9 @@ def _run_lengths(
     path: Path, body: np.ndarray, marker: bytes, height: int, width: int
 ) -> np.ndarray:
     """Rows that start with the marker and hold each channel as runs (> 128) and literals."""
-    out = np.empty((height, 4, width), np.uint8)
+    shortest = 4 + 8 * -(-width // 127)  # bytes of a row: its marker, 4 channels of runs of 127
+    # Memory for as many rows as there may be, whatever the header says
+    out = np.empty((min(height, len(body) // shortest + 1), 4, width), np.uint8)
     at = 0
     for row in range(height):
         if body[at : at + 4].tobytes() != marker:

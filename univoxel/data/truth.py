@@ -108,9 +108,11 @@ def load_points(folder: str | Path) -> Tensor | None:
     points = arrays.get("points")
     if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise DataError(f"{path}: expected an array points [P, 3], got {_shapes(arrays)}")
+    with np.errstate(over="ignore"):
+        points = points.astype(np.float32)
     if not np.isfinite(points).all():
         raise DataError(f"{path}: points hold NaN or infinity")
-    return torch.from_numpy(points.astype(np.float32))
+    return torch.from_numpy(points)
 
 
 def _map(folder: Path, name: str) -> Path | None:
@@ -135,7 +137,8 @@ def _arrays(path: Path, factor: int) -> Truth:
     for key, size in wanted.items():
         if key not in arrays:
             continue
-        value = arrays[key].astype(np.float32)
+        with np.errstate(over="ignore"):  # what is infinite then is refused
+            value = arrays[key].astype(np.float32)
         if value.shape != size or not np.isfinite(value).all():
             raise DataError(
                 f"{path}: expected finite {key} of shape {list(size)}, got {list(value.shape)}"

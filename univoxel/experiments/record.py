@@ -12,10 +12,11 @@ from typing import Any
 
 from univoxel.config import TrainConfig
 from univoxel.errors import DataError
-from univoxel.files import replacing
+from univoxel.files import read_json, replacing
 from univoxel.names import LightName
 from univoxel.overrides import changed
 from univoxel.presets import chosen
+from univoxel.validation import check_fields
 
 RESULT = "result.json"
 
@@ -54,6 +55,18 @@ class Outcome:
     load_average: float | None = None  # of the machine when it began
     error: str | None = None  # why it failed
 
+    def __post_init__(self):
+        check_fields(self, "text", lambda x: isinstance(x, str), "scene", "setting")
+        check_fields(self, "text or None", lambda x: isinstance(x, str | None), "error")
+        check_fields(self, "an object", lambda x: isinstance(x, dict), "identity")
+        check_fields(self, "a number by name", _is_measures, "measures")
+        check_fields(
+            self,
+            "a list of objects",
+            lambda x: isinstance(x, list) and all(isinstance(line, dict) for line in x),
+            "log",
+        )
+
     def save(self, folder: Path) -> None:
         """Write folder/result.json, whole or not at all.
 
@@ -71,6 +84,12 @@ class Outcome:
         return fields
 
 
+def _is_measures(values: object) -> bool:
+    return isinstance(values, Mapping) and all(
+        isinstance(value, int | float | None) for value in values.values()
+    )
+
+
 def load_outcome(folder: Path) -> Outcome | None:
     """What folder/result.json holds; None where there is none.
 
@@ -81,7 +100,7 @@ def load_outcome(folder: Path) -> Outcome | None:
     if not path.exists():
         return None
     try:
-        return Outcome(**json.loads(path.read_text(encoding="utf-8")))
+        return Outcome(**read_json(path))
     except (OSError, ValueError, TypeError) as error:
         raise DataError(f"{path}: expected the record of a training: {error}") from None
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from operator import le
 
 import torch
 from torch import Tensor, nn
 
+from univoxel.errors import ConfigError
 from univoxel.fields.distances import BAND, AbstractDistances, nodes_within
 from univoxel.ops import encode_hash
 from univoxel.records import FieldSample
+from univoxel.validation import check_fields
 
 PER_LEVEL = 2  # channels; so levels are half as many as channels
 COARSEST = 16  # voxels along the longest side of the box at the coarsest level
@@ -117,7 +120,16 @@ class Levels:
     lower: tuple[float, float, float]  # of the box, world
     upper: tuple[float, float, float]
     voxel_sizes: tuple[float, ...]  # from coarse to fine, world units
-    rows: int = ROWS  # of each level's table
+    rows: int = ROWS  # of each level's table, a power of two
+
+    def __post_init__(self):
+        corners = "lower", "upper"
+        check_fields(self, "finite", lambda x: all(map(math.isfinite, x)), *corners)
+        sizes = "voxel_sizes"
+        check_fields(self, "above 0", lambda x: x and all(0 < v < math.inf for v in x), sizes)
+        check_fields(self, "a power of two", lambda x: x >= 1 and x & (x - 1) == 0, "rows")
+        if not all(map(le, self.lower, self.upper)):
+            raise ConfigError(f"Levels: lower must be at most upper, got {self.lower}")
 
     @classmethod
     def of(cls, box: tuple[Tensor, Tensor], finest: float, count: int, rows: int = ROWS) -> Levels:

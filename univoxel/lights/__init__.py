@@ -16,6 +16,7 @@ from univoxel.lights.mlp import LocalMLP, MLPLightConfig
 from univoxel.lights.sg import LocalSG, SGConfig
 from univoxel.lights.sh import LocalSH, SHConfig
 from univoxel.lights.texels import EnvmapConfig, EnvmapLight
+from univoxel.validation import record
 
 LightConfig: TypeAlias = (
     SGConfig | SHConfig | MLPLightConfig | EnvmapSGConfig | EnvmapConfig | BakedConfig
@@ -77,11 +78,14 @@ def read_config(values: dict[str, Any]) -> LightConfig:
     """The configuration that dataclasses.asdict made a dictionary of.
 
     Raises:
-        ConfigError, TypeError: no such light; a field that it has not; a number outside its range.
+        ConfigError: no such light; a field that it has not, or of another type; a number outside
+            its range.
     """
+    if not isinstance(values, dict):
+        raise ConfigError(f"light must be an object, got {values!r:.60}")
     values = dict(values)
     kind = values.pop("kind", "sg")  # files from before there were others do not say
     kinds = {c.kind: c for c in get_args(LightConfig)}
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         raise ConfigError(f"light must be one of {', '.join(kinds)}, got {kind!r}")
-    return kinds[kind](**values)
+    return record(kinds[kind], values)

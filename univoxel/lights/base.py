@@ -11,6 +11,10 @@ from torch import Tensor, nn
 
 from univoxel.records import Occlusion, Surface
 
+MOST_DIRECTIONS = 1 << 16  # that light is summed up over: memory of a batch grows with them
+MOST_LAYERS = 32  # of a network: without shortcuts deeper ones do not learn
+MOST_ROWS = 1 << 13  # of a map
+
 
 @dataclass(frozen=True)
 class Regularisation:

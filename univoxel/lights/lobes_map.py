@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from univoxel import envmap
 from univoxel.lights import latlong, lobes, priors
-from univoxel.lights.base import AbstractLight, Regularisation
+from univoxel.lights.base import MOST_DIRECTIONS, MOST_ROWS, AbstractLight, Regularisation
 from univoxel.records import Occlusion, Surface
 from univoxel.sphere import latlong_directions
 from univoxel.validation import check_fields
@@ -36,6 +36,9 @@ class EnvmapSGConfig:
             self, "at least 1", lambda x: x >= 1, "lobes", "rows", "directions", "directions_eval"
         )
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "max_sharpness")
+        most = f"at most {MOST_DIRECTIONS}"
+        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
+        check_fields(self, f"at most {MOST_ROWS}", lambda x: x <= MOST_ROWS, "rows")
 
 
 class EnvmapSGLight(AbstractLight):

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from univoxel import sphere
 from univoxel.lights import priors, quadrature
-from univoxel.lights.base import Regularisation
+from univoxel.lights.base import MOST_DIRECTIONS, MOST_LAYERS, Regularisation
 from univoxel.lights.local import AbstractLocalLight, LocalLightConfig, build_head, encode
 from univoxel.networks import MLP, waves
 from univoxel.records import Occlusion, Surface
@@ -29,7 +29,7 @@ class MLPLightConfig(LocalLightConfig):
     kind: Literal["mlp"] = field(default="mlp", init=False)
     rank: int = 32  # functions of direction that a point's light is put together of, >= 1
     hidden: int = 64  # width of both networks, >= 1
-    layers: int = 2  # hidden layers of both, >= 0
+    layers: int = 2  # hidden layers of both, [0, 32]
     frequencies: int = 3  # of the direction: sines of 1, 2, 4 times its parts, >= 0
     directions: int = 256  # over the whole sphere, in training, >= 1
     directions_eval: int = 512  # in evaluation, >= 1
@@ -40,6 +40,9 @@ class MLPLightConfig(LocalLightConfig):
             self, "at least 1", lambda x: x >= 1, "rank", "hidden", "directions", "directions_eval"
         )
         check_fields(self, "at least 0", lambda x: x >= 0, "layers", "frequencies")
+        most = f"at most {MOST_DIRECTIONS}"
+        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
+        check_fields(self, f"at most {MOST_LAYERS}", lambda x: x <= MOST_LAYERS, "layers")
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "scale")
 
 

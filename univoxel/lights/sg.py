@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from univoxel import brdf, ops, sphere
 from univoxel.lights import lobes, priors, quadrature
-from univoxel.lights.base import Regularisation
+from univoxel.lights.base import MOST_DIRECTIONS, MOST_LAYERS, Regularisation
 from univoxel.lights.local import AbstractLocalLight, LocalLightConfig, build_head, encode
 from univoxel.records import Occlusion, Surface
 from univoxel.validation import check_fields
@@ -25,7 +25,7 @@ class SGConfig(LocalLightConfig):
     kind: Literal["sg"] = field(default="sg", init=False)
     lobes: int = 16  # a point, >= 1
     hidden: int = 64  # width of the head, >= 1
-    layers: int = 2  # hidden layers of the head, >= 0
+    layers: int = 2  # hidden layers of the head, [0, 32]
     directions: int = 128  # of the quadrature in training, >= 1
     directions_eval: int = 256  # of the quadrature in evaluation, >= 1
     max_sharpness: float = 30.0  # of a lobe, > 0; its half width is about sqrt(2 / sharpness) rad
@@ -36,6 +36,9 @@ class SGConfig(LocalLightConfig):
             self, "at least 1", lambda x: x >= 1, "lobes", "hidden", "directions", "directions_eval"
         )
         check_fields(self, "at least 0", lambda x: x >= 0, "layers")
+        most = f"at most {MOST_DIRECTIONS}"
+        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
+        check_fields(self, f"at most {MOST_LAYERS}", lambda x: x <= MOST_LAYERS, "layers")
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "max_sharpness", "scale")
 
 

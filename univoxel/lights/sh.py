@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from univoxel import sphere
 from univoxel.lights import priors, quadrature
-from univoxel.lights.base import Regularisation
+from univoxel.lights.base import MOST_DIRECTIONS, MOST_LAYERS, Regularisation
 from univoxel.lights.local import AbstractLocalLight, LocalLightConfig, build_head, encode
 from univoxel.records import Occlusion, Surface
 from univoxel.validation import check_fields
@@ -28,7 +28,7 @@ class SHConfig(LocalLightConfig):
     kind: Literal["sh"] = field(default="sh", init=False)
     order: int = 3  # the highest degree, >= 0: 3 (order + 1)^2 numbers a point
     hidden: int = 64  # width of the head, >= 1
-    layers: int = 2  # hidden layers of the head, >= 0
+    layers: int = 2  # hidden layers of the head, [0, 32]
     directions: int = 256  # over the whole sphere, in training, >= 1
     directions_eval: int = 512  # in evaluation, >= 1
     scale: float = 1.0  # world units: half the extent of what is lit, > 0
@@ -38,6 +38,9 @@ class SHConfig(LocalLightConfig):
             self, "at least 1", lambda x: x >= 1, "hidden", "directions", "directions_eval"
         )
         check_fields(self, "at least 0", lambda x: x >= 0, "order", "layers")
+        most = f"at most {MOST_DIRECTIONS}"
+        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
+        check_fields(self, f"at most {MOST_LAYERS}", lambda x: x <= MOST_LAYERS, "layers")
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "scale")
 
 

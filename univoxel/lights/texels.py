@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from univoxel import envmap
 from univoxel.lights import latlong, priors
-from univoxel.lights.base import AbstractLight, Regularisation
+from univoxel.lights.base import MOST_DIRECTIONS, MOST_ROWS, AbstractLight, Regularisation
 from univoxel.records import Occlusion, Surface
 from univoxel.validation import check_fields
 
@@ -32,6 +32,9 @@ class EnvmapConfig:
 
     def __post_init__(self):
         check_fields(self, "at least 1", lambda x: x >= 1, "rows", "directions", "directions_eval")
+        most = f"at most {MOST_DIRECTIONS}"
+        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
+        check_fields(self, f"at most {MOST_ROWS}", lambda x: x <= MOST_ROWS, "rows")
 
 
 class EnvmapLight(AbstractLight):

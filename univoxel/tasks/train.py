@@ -30,7 +30,7 @@ from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
 from univoxel.training.loop import run_stage
 from univoxel.training.pixels import TrainingPixels, split_pixels
-from univoxel.training.progress import Progress
+from univoxel.training.progress import LOG, Progress
 
 log = logging.getLogger("univoxel")
 
@@ -39,7 +39,7 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     """Train a scene; leave model, log, preview, configuration and trust.txt in cfg.out; return it.
 
     Args:
-        resume: go on with the run in cfg.out from its last checkpoint.
+        resume: go on with the run in cfg.out from its last checkpoint; begin where there is none.
         timelapse: .gif, .mp4 or folder for pictures of a view over training time; making them does
             not count as time.
 
@@ -47,8 +47,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
         DataError: input that cannot be used.
         ExistingFile: cfg.out holds a run already and resume is False.
         OSError: a file of the run cannot be written; what was there before stays.
-        FileNotFoundError, UserError: with resume, there is no checkpoint that can be read, or it
-            belongs to another configuration.
+        UserError: with resume, the checkpoint cannot be read, or it belongs to another
+            configuration.
     """
     film = None if timelapse is None else Timelapse(timelapse, cfg)
     torch.manual_seed(cfg.seed)
@@ -67,6 +67,8 @@ def train(cfg: TrainConfig, resume: bool = False, timelapse: str | Path | None =
     limited = plan.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
     scene, state = start(silhouettes, cfg, limited, resume)
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
+    if not state:  # of a run that was killed before anything was saved
+        (cfg.out / LOG).unlink(missing_ok=True)
     save_config(cfg)
     keep_photos(photos, kept)
     with Progress(limited, begin - state.get("seconds", 0.0), state) as progress:
@@ -89,6 +91,9 @@ def start(
         cfg: as it was asked for.
         limited: the same with grids no finer than the photographs.
     """
+    if resume and not (cfg.out / FILE).is_file():
+        log.info(f"nothing was saved in {cfg.out} yet: training begins")
+        resume = False
     if not resume:
         return build_scene(prepare(silhouettes, limited), limited), {}
     scene, state = load_checkpoint(cfg.out)

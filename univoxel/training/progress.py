@@ -16,8 +16,9 @@ from univoxel.config import TrainConfig
 from univoxel.files import append_line
 from univoxel.training.clock import Clock, CountedSteps, StepClock
 
+LOG = "log.jsonl"  # in the folder of a run
 REPORT_SECONDS = 5.0
-CHECKPOINT_SECONDS = 60.0
+CHECKPOINT_SECONDS = 20.0  # of work that a kill costs, about
 
 log = logging.getLogger("univoxel")
 
@@ -59,7 +60,7 @@ class Progress:
         self.cfg, self.clock = cfg, Clock(cfg, begin, state)
         self.chosen = [CapacityChoice.from_json(entry) for entry in state.get("chosen", ())]
         self.troubles: list[str] = list(state.get("troubles", ()))  # what went wrong and was mended
-        self._log = cfg.out / "log.jsonl"
+        self._log = cfg.out / LOG
         self._reported, self._reported_step = self.clock.seconds, self.clock.step
         self._saved = self.clock.seconds
         self._bar = bar(
