@@ -40,7 +40,7 @@ def read_npz(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
     """The arrays in a .npz file whose names begin with the prefix.
 
     Raises:
-        DataError: it cannot be read.
+        DataError: it cannot be read, or holds something else than numbers.
     """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
