@@ -88,6 +88,8 @@ def test_masks_that_are_too_wide_are_taken_in_alike(bits):
         assert torch.equal(cut.cameras.cut(view, near[view]), far[view][where])
     width, _ = cut.cameras.size(2)
     assert not found.alpha[2, :, width:].any()  # beyond a picture
+    _, as_given = fitted_masks(cut, "given", MaskConfig(min_pixels=5))
+    assert as_given[2, :, width:].isinf().all()
 
 
 def test_contradictions_are_those_of_whole_pictures(whole, cut):

@@ -25,6 +25,7 @@ from univoxel.tasks import train as task
 from univoxel.tasks.info import info
 from univoxel.tasks.train import train
 from univoxel.training import loop, surface_update
+from univoxel.training import pixels as pixels_module
 from univoxel.training.config import StageConfig
 from univoxel.training.loop import batch_at
 from univoxel.training.pixels import split_pixels
@@ -304,6 +305,16 @@ def test_so_few_pixels_that_none_is_spared():
     pixels, held = split.trained, split.held_out
     assert len(pixels) == 4
     assert torch.equal(pixels, held)
+
+
+def test_pixels_are_those_in_and_near_silhouettes():
+    """In the order of views, rows and columns before they are shuffled, a view without any too."""
+    distance = 30 * torch.randn(4, 9, 7, generator=torch.Generator().manual_seed(0))
+    distance[1] = torch.inf
+    wanted = (distance < pixels_module.MARGIN).nonzero()
+    found = pixels_module._nonzero(distance < pixels_module.MARGIN)
+    assert found.dtype == torch.int32  # photographs have many
+    assert torch.equal(found.long(), wanted)
 
 
 def test_unknown_preset(tmp_path):

@@ -232,7 +232,7 @@ def random_batch(photos: Photos, pixels: Tensor, count: int) -> Batch:
 
 
 def batch_at(photos: Photos, pixels: Tensor) -> Batch:
-    view, row, column = pixels.unbind(1)
+    view, row, column = pixels.long().unbind(1)
     color, alpha = photos.pixels(view, row, column)
     centre = torch.stack([column, row], 1) + 0.5
     return Batch(view, pixel_rays(photos.cameras, view, centre), color, alpha)
