@@ -51,7 +51,7 @@ HELPERS = {
     "ops": {"checks", "dense_grid", "grid_sampling", "native", "reflectance", "visibility"},
     "fields": {"bricks", "dense", "distances", "features"},
     "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
-    "data": {"base", "images", "lens", "radiance", "shots", "tensoir", "transforms"},
+    "data": {"base", "images", "lens", "masks", "radiance", "shots", "tensoir", "transforms"},
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "preparation": {"depth_sweep", "carving", "exposures", "hull", "masks", "registration"},
@@ -65,7 +65,15 @@ HELPERS = {
     "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
 }
 # Extras: imported inside the function that needs one
-OPTIONAL = {"drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh"}
+OPTIONAL = {
+    "drjit",
+    "imageio_ffmpeg",
+    "matplotlib",
+    "mitsuba",
+    "onnxruntime",
+    "rembg",
+    "trimesh",
+}
 # The one file or folder of csrc/ that includes it; no header of ours passes it on to others.
 INCLUDES = {r"embree\d?/": "visibility.cpp", r"pybind11/": "bindings"}
 

@@ -34,7 +34,7 @@ _LAYOUTS = (
 
 
 def load_photos(
-    folder: str | Path, split: str = "train", downscale: int = 0, masks: bool = True
+    folder: str | Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
 ) -> Photos:
     """Read the photographs of one split in whatever layout the folder has.
 
@@ -43,7 +43,8 @@ def load_photos(
     Args:
         downscale: side of the squares of pixels that become one, >= 1; 0 for 1, refused where the
             photographs are so large that training them would take gigabytes of memory.
-        masks: False for photographs as they are, the whole picture opaque.
+        masks: False for photographs as they are, the whole picture opaque; or a folder of masks of
+            them, named by their stems.
 
     Raises:
         DataError: one line that names the file, what was expected and what came.

@@ -16,6 +16,7 @@ from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data.base import Photos, decode
 from univoxel.data.images import read_image
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
+from univoxel.data.masks import masks_by_stem, read_mask
 from univoxel.errors import DataError, UserError
 
 LARGE = 200_000_000  # pixels in all photographs, from where on their size must be chosen
@@ -48,7 +49,7 @@ def read_shots(
     shots: Sequence[Shot],
     downscale: int = 0,
     remarks: Sequence[str] = (),
-    masks: bool = True,
+    masks: bool | Path = True,
 ) -> Photos:
     """Photographs as pinholes see them, all of one size.
 
@@ -58,11 +59,16 @@ def read_shots(
         kind: of the data set, for people.
         downscale: means over squares of so many pixels; 0 for 1, refused where that is large.
         remarks: on how the files were read, for people.
-        masks: False for photographs as they are, the whole picture opaque.
+        masks: False for photographs as they are, the whole picture opaque; or a folder of masks,
+            which takes the place of what the layout names.
 
     Raises:
         DataError: one line that names the file, what was expected and what came.
     """
+    if isinstance(masks, Path):
+        found = masks_by_stem(masks, [(shot.name, shot.image) for shot in shots])
+        shots = [replace(shot, mask=mask) for shot, mask in zip(shots, found, strict=True)]
+        masks = True
     if downscale < 0:
         raise ValueError(f"downscale must be at least 1, got {downscale}")
     _check(folder, shots, downscale)
@@ -150,9 +156,7 @@ def read_photo(path: Path, mask: Path | None = None, masks: bool = True) -> tupl
     if mask is None and alpha is None:
         mask = next((file for file in beside if file.is_file()), None)
     if mask is not None:
-        alpha = read_image(mask)[..., 0]
-        if alpha.shape != color.shape[:2]:
-            raise DataError(f"{mask}: expected {size_of(color)} pixels, got {size_of(alpha)}")
+        alpha = read_mask(mask, color.shape[1], color.shape[0])
     if alpha is None:
         raise DataError(
             f"{path}: expected an alpha channel or a mask {beside[0].name}, got neither: "

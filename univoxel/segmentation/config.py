@@ -52,3 +52,39 @@ class SegmentationConfig:
         )
         check_fields(self, "at least 0", lambda x: x >= 0, "near", "margin")
         check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "smallest_part")
+
+
+@dataclass(frozen=True)
+class VoteConfig:
+    """How masks vote for a hull, and which of them it mends.
+
+    Raises:
+        ConfigError: a field is out of range.
+    """
+
+    photographs: int = 12  # at least, for a vote; fewer do not outvote one another
+    pixels: int = 192  # of the longer side of the pictures that are compared, >= 16
+    voxels: int = 96  # along a side of the grid, >= 8; finer ones cost more and mend no better
+    first_voxels: int = 40  # of the grid that only looks where the object is, >= 8
+    room: float = 1.6  # sides of that grid, in those of what half of the pictures show whole, > 0
+    around: float = 0.5  # of its largest vote: what may be the object, in (0, 1)
+    # Share of the photographs that have to see a voxel, in (0, 1]: what few see, few decide on
+    seen_by: float = 0.25
+    # Votes from which on a voxel may belong to the hull, both in (0, 1). The best depends on how
+    # many masks are wrong: it is searched
+    lowest: float = 0.3
+    highest: float = 0.99
+    below: float = 0.08  # IoU below the median's, from where on a mask is wrong, in (0, 1)
+    # IoU with its silhouette below which a mask is wrong whatever the others have, in (0, 1). If
+    # more than half are, it is the hull that is wrong
+    least: float = 0.75
+    band: float = 1.5  # voxels beside the silhouette within which a mended mask is kept, > 0
+
+    def __post_init__(self) -> None:
+        check_fields(self, "at least 2", lambda x: x >= 2, "photographs")
+        check_fields(self, "at least 16", lambda x: x >= 16, "pixels")
+        check_fields(self, "at least 8", lambda x: x >= 8, "voxels", "first_voxels")
+        check_fields(self, "above 0", lambda x: x > 0, "room", "band")
+        check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "seen_by")
+        open_ones = ("around", "lowest", "highest", "below", "least")
+        check_fields(self, "in (0, 1)", lambda x: 0 < x < 1, *open_ones)
