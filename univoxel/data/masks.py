@@ -82,6 +82,12 @@ def read_mask(path: Path, width: int, height: int) -> Tensor:
 
 def _stem(name: str) -> str:
     """The name without endings of pictures, and without those of masks."""
-    while Path(name).suffix.lower() in SUFFIXES:
-        name = str(Path(name).with_suffix(""))
+    while (shorter := _shorter(name)) != name:
+        name = shorter
+    return name
+
+
+def _shorter(name: str) -> str:
+    if Path(name).suffix.lower() in SUFFIXES:
+        return str(Path(name).with_suffix(""))
     return next((name.removesuffix(e) for e in ENDINGS if name.endswith(e)), name)

@@ -7,12 +7,12 @@ are not.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample, interpolate
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 
 from univoxel.bars import track
 from univoxel.camera import Cameras, pixel_rays, project
@@ -42,13 +42,13 @@ class Hull:
 class Verdict:
     """What the hull says about the mask of a photograph."""
 
-    agreement: float  # IoU with its silhouette
+    agreement: float | None  # IoU with its silhouette; None: there was no vote
     fault: str  # BESIDE, MISSING, or nothing
     mask: Tensor  # [H, W] in [0, 1]: mended where there is a fault, else as it was
 
 
 def elect(
-    masks: Sequence[Tensor], cameras: Cameras, cfg: VoteConfig = VOTE
+    masks: Iterable[Tensor], cameras: Cameras, cfg: VoteConfig = VOTE
 ) -> tuple[Hull, list[Tensor]]:
     """The hull that the masks agree on best, and its `largest_votes` in each picture.
 
@@ -76,7 +76,7 @@ def elect(
         for view, mask in enumerate(track(small, "comparing masks"))
     ]
     agreed = [overlaps(one, mask, levels) for one, mask in zip(largest, small, strict=True)]
-    medians = torch.stack(agreed).median(0).values
+    medians = torch.stack(agreed).quantile(0.5, 0)
     best = int(medians.argmax())
     return Hull(grid, vote, float(levels[best]), float(medians[best])), largest
 
@@ -184,17 +184,33 @@ def shrunk(mask: Tensor, pixels: int) -> Tensor:
 def _mended(
     mask: Tensor, silhouette: Tensor, hull: Hull, cameras: Cameras, view: int, cfg: VoteConfig
 ) -> Tensor:
-    """The mask within the grown silhouette, and all of the shrunk one; borders one voxel soft."""
+    """The mask within the grown silhouette, and all of the shrunk one; borders one voxel soft.
+
+    In the band between both the mask is believed where it ends there, full on the inner side and
+    empty on the outer one. Elsewhere, as where the table goes on, the silhouette is.
+    """
     centre = (torch.stack(hull.grid.bounds()).sum(0) / 2)[None]
     depth = project(cameras, view, centre)[1].abs()
     scale = silhouette.shape[1] / _size(cameras, view)[0]
     voxel = float(hull.grid.voxel_size * cameras.focal[view].mean() * scale / depth)  # pixels
-    away = mask_distances(silhouette.float()[None])[:, None]
+    small = shrunk(mask, cfg.pixels)
+    away = mask_distances(silhouette.float()[None])[0] / voxel
+    kernel = 2 * max(1, round(2 * cfg.band * voxel)) + 1
+    sides = [(side >= cfg.band) & (side <= 3 * cfg.band) for side in (-away, away)]
+    inner, outer = (_mean_near(small, side, kernel) for side in sides)
+    believed = ((inner - outer - 0.5) / 0.25).clamp(0, 1)
     shape = (mask.shape[0], mask.shape[1])
-    away = interpolate(away, shape, mode="bilinear")[0, 0] / voxel
-    grown = (0.5 - (away - cfg.band)).clamp(0, 1)
-    core = (0.5 - (away + cfg.band)).clamp(0, 1)
-    return torch.maximum(torch.minimum(mask, grown), core)
+    fine = interpolate(torch.stack([away, believed])[None], shape, mode="bilinear")[0]
+    grown, middle, core = (0.5 - fine[0] + s for s in (cfg.band, 0.0, -cfg.band))
+    within = torch.maximum(torch.minimum(mask, grown.clamp(0, 1)), core.clamp(0, 1))
+    return torch.lerp(middle.clamp(0, 1), within, fine[1])
+
+
+def _mean_near(values: Tensor, where: Tensor, kernel: int) -> Tensor:
+    """Means [H, W] of values over those pixels of a square around each that count; 0 if none do."""
+    counted = torch.stack([values * where, where.float()])[None]
+    total, count = avg_pool2d(counted, kernel, 1, kernel // 2)[0]
+    return total / count.clamp_min(1e-6)
 
 
 def _size(cameras: Cameras, view: int) -> tuple[int, int]:
