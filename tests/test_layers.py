@@ -61,7 +61,7 @@ HELPERS = {
     "confidence": {"survey"},
     "pictures": {"animation"},
     "evaluation": {"measures", "truth"},
-    "segmentation": {"config", "distances"},
+    "segmentation": {"config", "distances", "vote"},
     "experiments.stress": {"axes", "damage", "render", "report", "scenes", "shapes"},
 }
 # Extras: imported inside the function that needs one

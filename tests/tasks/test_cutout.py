@@ -164,3 +164,17 @@ def test_masks_of_a_network(tmp_path, with_masks, monkeypatch):
 def test_a_box_goes_with_colours(tmp_path, with_masks):
     with pytest.raises(UserError, match="box goes with masks from colours alone"):
         task.cutout(with_masks[0], tmp_path / "cut", "rembg", box=(0, 0, 0, 1, 1, 1))
+
+
+def test_plain_surroundings_need_no_room(tmp_path, with_masks, monkeypatch, caplog):
+    """On black the sphere is what edges shut off; a box asks for the other way."""
+    data, _, true = with_masks
+    caplog.set_level("INFO", "univoxel")
+    cut = load_photos(task.cutout(data, tmp_path / "cut", vote=SMALL))
+    assert "plain surroundings" in caplog.text
+    assert f"{VIEWS} of {VIEWS} agree with the hull" in caplog.text
+    assert all(iou(cut.picture(view)[1], true[view]) > 0.9 for view in range(VIEWS))
+    monkeypatch.setattr(task, "_from_edges", lambda *_: pytest.fail("there is a box"))
+    monkeypatch.setattr(task, "find_object", lambda *_: None)
+    monkeypatch.setattr(task, "mask", lambda *_: torch.ones(SIZE, SIZE))
+    task.cutout(data, tmp_path / "other", box=(-1, -1, -1, 1, 1, 1))

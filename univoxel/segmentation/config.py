@@ -88,3 +88,36 @@ class VoteConfig:
         check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "seen_by")
         open_ones = ("around", "lowest", "highest", "below", "least")
         check_fields(self, "in (0, 1)", lambda x: 0 < x < 1, *open_ones)
+
+
+@dataclass(frozen=True)
+class PlainConfig:
+    """How objects before plain surroundings are found.
+
+    Raises:
+        ConfigError: a field is out of range.
+    """
+
+    blur: float = 1.0  # pixels, of the picture whose edges count, > 0; less finds noise
+    # Changes of colour, sRGB a pixel, > 0, that are edges: each is tried, and the one whose masks
+    # agree best is taken. Noise asks for more, an object like the wall for less
+    thresholds: tuple[float, ...] = (0.01, 0.02, 0.04)
+    width: float = 3.0  # pixels, of what an edge covers, >= 0: narrower lines are no object
+    rim: float = 0.7  # of the picture's border that is plain at least, in (0, 1]
+    around: float = 0.2  # of the picture that is reached from there at least, in (0, 1)
+    share: float = 0.75  # of the photographs for which both hold at least, in (0, 1]
+    smallest_part: float = 0.02  # of the largest part's area, in [0, 1]; smaller ones are dropped
+    agree: float = 0.85  # median IoU with the hull from which on the masks are believed, in (0, 1)
+
+    def __post_init__(self) -> None:
+        check_fields(self, "above 0", lambda x: x > 0, "blur")
+        check_fields(
+            self,
+            "one or more numbers above 0",
+            lambda x: len(x) > 0 and min(x) > 0,
+            "thresholds",
+        )
+        check_fields(self, "at least 0", lambda x: x >= 0, "width")
+        check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "rim", "share")
+        check_fields(self, "in (0, 1)", lambda x: 0 < x < 1, "around", "agree")
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "smallest_part")

@@ -1,9 +1,10 @@
 """Cut an object out of photographs without masks.
 
-Masks come from colours alone, from a network, or from a folder. Colours: a coarse surface within a
-box and a backdrop around it explain the photographs together; what cameras all around agree on
-inside the box is the object, and its silhouettes are the masks. Masks of a network or of a folder
-vote for a hull, and those that it contradicts are mended.
+Masks come from colours alone, from a network, or from a folder. Colours: before plain walls and on
+plain desks the object is what edges shut off from the picture's border. Elsewhere a coarse surface
+within a box and a backdrop around it explain the photographs together; what cameras all around
+agree on inside the box is the object, and its silhouettes are the masks. Masks of single
+photographs vote for a hull, and those that it contradicts are mended.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from univoxel.pictures.mask_sheet import MaskTile, darkened, mask_sheet, worst_f
 from univoxel.segmentation.config import SegmentationConfig, VoteConfig
 from univoxel.segmentation.distances import corners, surroundings
 from univoxel.segmentation.network import network
+from univoxel.segmentation.plain import plain_mask, plain_threshold
 from univoxel.segmentation.separation import DEFAULTS, find_object, mask
 from univoxel.segmentation.vote import BESIDE, MISSING, VOTE, Verdict, elect, judge
 
@@ -59,7 +61,8 @@ def cutout(
         source: where masks come from: none, from colours alone; rembg, from a network; else a
             folder of masks with the stems of the photographs.
         box: lower and upper corner of where the object is, world units; by default a cube around
-            what the cameras look at, as large as their pictures. For masks from colours.
+            what the cameras look at, as large as their pictures. For masks from colours; plain
+            surroundings are then not looked for.
         downscale: side of the squares of pixels that become one, 0 for 1.
         config: how the object is found from colours.
         vote: how other masks are judged and mended.
@@ -82,7 +85,11 @@ def cutout(
     folder = False if origin in (COLOURS, REMBG) else Path(origin)
     splits = {name: load_photos(data, name, downscale, masks=folder) for name in splits_of(data)}
     log.info(splits["train"].about)
-    if origin == COLOURS:
+    before_plain = None if box or origin != COLOURS else _from_edges(splits, vote)
+    if before_plain:
+        masks = before_plain
+        verdicts, told = _judged(splits, masks, vote)
+    elif origin == COLOURS:
         masks = _from_colours(splits, box, seed, config)
         verdicts = {name: [Verdict(None, "", m) for m in those] for name, those in masks.items()}
         told = "masks from colours alone"
@@ -116,6 +123,22 @@ def _from_colours(
         )
     return {
         name: [_bytes(mask(scene, split, view)) for view in track(range(len(split)), "masks")]
+        for name, split in splits.items()
+    }
+
+
+def _from_edges(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
+    """Masks of what stands before plain surroundings; None where they are not plain."""
+    train = splits["train"]
+    if len(train) < cfg.photographs:
+        return None
+    photographs = [_encoded(train, view) for view in range(len(train))]
+    threshold = plain_threshold(photographs, train.cameras)
+    if threshold is None:
+        return None
+    log.info("plain surroundings: the object is what edges of %g a pixel shut off", threshold)
+    return {
+        name: [_bytes(plain_mask(_encoded(split, v), threshold)) for v in range(len(split))]
         for name, split in splits.items()
     }
 
