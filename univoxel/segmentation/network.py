@@ -16,7 +16,9 @@ from univoxel.errors import DataError, MissingExtra
 
 NETWORK = "u2netp"  # U^2-Net, small (Qin et al. 2020): a second a photograph on one core
 SIDE = 320  # pixels of the pictures that it sees
-MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of those that it was trained on
+# Of the pictures that it was trained on
+MEAN = np.array([0.485, 0.456, 0.406], np.float32)
+SPREAD = np.array([0.229, 0.224, 0.225], np.float32)
 
 
 def network() -> Callable[[Tensor], Tensor]:
@@ -69,7 +71,7 @@ def _prediction(session: Any, photograph: Tensor) -> Tensor:
     """A mask [H, W] in [0, 1] of a photograph [H, W, 3] uint8."""
     small = Image.fromarray(photograph.numpy()).resize((SIDE, SIDE), Image.Resampling.LANCZOS)
     values = np.asarray(small, np.float32)
-    values = (values / max(values.max(), 1) - np.float32(MEAN)) / np.float32(SPREAD)
+    values = (values / max(values.max(), 1) - MEAN) / SPREAD
     name = session.get_inputs()[0].name
     found = session.run(None, {name: values.transpose(2, 0, 1)[None]})[0][0, 0]
     found = (found - found.min()) / max(found.max() - found.min(), 1e-6)
