@@ -70,7 +70,7 @@ def test_masks_of_another_size(folder):
     assert not larger[:, 36:].any()
     smaller = read_mask(path, 3, 2)
     assert smaller.tolist() == [[255, 128, 0]] * 2  # means
-    with pytest.raises(DataError, match=r"a\.png: expected 40x60 pixels, or their shape, got 6x4"):
+    with pytest.raises(DataError, match=r"a\.png: expected 40x60 pixels, got 6x4"):
         read_mask(path, 40, 60)
 
 

@@ -74,7 +74,7 @@ def read_mask(path: Path, width: int, height: int) -> Tensor:
         return mask
     if abs(mask.shape[1] * height / (mask.shape[0] * width) - 1) > SKEW:
         came = f"{mask.shape[1]}x{mask.shape[0]}"
-        raise DataError(f"{path}: expected {width}x{height} pixels, or their shape, got {came}")
+        raise DataError(f"{path}: expected {width}x{height} pixels, got {came}")
     mode = "area" if mask.shape[1] > width else "bilinear"
     resized = interpolate(mask[None, None].float(), (height, width), mode=mode)[0, 0]
     return resized if mask.is_floating_point() else resized.round().to(torch.uint8)
