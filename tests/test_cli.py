@@ -173,8 +173,14 @@ def test_cutout(calls, capsys):
     options = ["--box", "-1", "-2", "0", "1", "2", "0.5", "--downscale", "2"]
     assert main(["cutout", "photos", "--out", "cut", *options]) == 0
     given = {"box": (-1.0, -2.0, 0.0, 1.0, 2.0, 0.5), "downscale": 2, "allow_outside": False}
-    assert calls.noted == [("cutout", (Path("photos"), Path("cut")), given)]
+    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "none"), given)]
     assert capsys.readouterr().out == "cut\n"
+
+
+def test_cutout_from_masks(calls, capsys):
+    assert main(["cutout", "photos", "--out", "cut", "--from", "masks"]) == 0
+    given = {"box": None, "downscale": 0}
+    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "masks"), given)]
 
 
 @pytest.mark.parametrize("command", ["train", "cutout"])

@@ -27,7 +27,7 @@ MISTAKES = (UserError, OSError, MemoryError)
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 PACKAGE = Path(__file__).resolve().parent
 # Options whose names differ from the arguments of the package's functions
-OPTIONS = {"changes": "--set"}
+OPTIONS = {"changes": "--set", "source": "--from"}
 
 # Turns that a thread waits before it leaves its core to other programs. By default it waits for
 # so long that a training beside one other program took six times as long (docs/research/speed.md)

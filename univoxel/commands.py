@@ -225,6 +225,9 @@ def cutout(
     data: Annotated[Positional[Path], arg(metavar="DATA")],
     /,
     out: Annotated[Path, arg(metavar="DIR")],
+    source: Annotated[
+        str, arg(name="from", metavar="rembg|FOLDER|none", help_behavior_hint="(default: none)")
+    ] = "none",
     box: Annotated[
         tuple[float, float, float, float, float, float] | None,
         arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: around what cameras look at)"),
@@ -234,21 +237,24 @@ def cutout(
 ) -> None:
     """Cut the object out of photographs without masks.
 
-    Writes them with their alpha, and their cameras, as a new folder to train on: look at it, and
-    mend what is wrong in any image editor.
+    Writes them with their alpha, and their cameras, as a new folder to train on: look at its
+    masks.html, worst first, and mend what is wrong in any image editor.
 
     Args:
         data: folder of the photographs and their cameras; masks in it are not looked at
         out: folder to write
-        box: lower and upper corner of where the object is, in the world of the cameras; what lies
-            in it, such as a table, is part of the object
+        source: where masks come from: rembg, a network on single photographs; a folder of masks
+            with the stems of the photographs; or none, colours alone. Masks vote for a hull, and
+            those that it contradicts are mended
+        box: with colours alone: lower and upper corner of where the object is, in the world of the
+            cameras; what lies in it, such as a table, is part of the object
         downscale: write photographs of 1/N of their width and height; auto as of train
         allow_outside: as of train
     """
     from univoxel.tasks import cutout as task
 
     options = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
-    print(task.cutout(data, out, box=box, **options))
+    print(task.cutout(data, out, source, box=box, **options))
 
 
 def poses(

@@ -1,16 +1,20 @@
 """Photographs written with the masks that were found."""
 
+import logging
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from analytic import photograph, write_scene
 from PIL import Image
 from sphere_in_room import SIZE, VIEWS, overlap, photographs, short
+from spoilt_masks import iou
 
 from univoxel.data import load_photos
 from univoxel.data.shots import read_photo
-from univoxel.errors import DataError
+from univoxel.errors import DataError, UserError
+from univoxel.segmentation.config import VoteConfig
 from univoxel.tasks import cutout as task
 
 
@@ -66,4 +70,111 @@ def test_a_data_set_without_test_views(tmp_path):
     data = write_scene(tmp_path / "data", VIEWS, SIZE)
     (data / "transforms_test.json").unlink()
     out = task.cutout(data, tmp_path / "cut", config=short(20))
-    assert sorted(path.name for path in out.iterdir()) == ["train", "transforms_train.json"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "masks.html",
+        "masks.png",
+        "train",
+        "transforms_train.json",
+    ]
+
+
+SMALL = VoteConfig(voxels=40, first_voxels=20)
+
+
+def write_masks(folder, masks, stems):
+    folder.mkdir(exist_ok=True)
+    for stem, mask in zip(stems, masks, strict=True):
+        picture = np.asarray(255 * mask.float()).astype(np.uint8)
+        Image.fromarray(picture).save(folder / f"{stem}.png")
+    return folder
+
+
+@pytest.fixture
+def with_masks(tmp_path):
+    """A scene of a sphere, and the true masks of its photographs by stem; test ones by theirs."""
+    data = write_scene(tmp_path / "data", VIEWS, SIZE)
+    (data / "transforms_test.json").unlink()
+    photos = load_photos(data)
+    return data, photos, [photos.picture(view)[1] for view in range(VIEWS)]
+
+
+def test_masks_of_a_folder_are_mended(tmp_path, with_masks, caplog):
+    data, photos, true = with_masks
+    masks = [mask.clone() for mask in true]
+    masks[2][:] = 0
+    masks[5][SIZE // 2 :] = 1  # what stands below
+    folder, out = write_masks(tmp_path / "masks", masks, photos.names), tmp_path / "cut"
+    caplog.set_level("INFO", "univoxel")
+    assert task.cutout(data, out, folder, vote=SMALL) == out
+    told = f"{VIEWS - 2} of {VIEWS} agree with the hull"
+    assert told in caplog.text
+    assert "1 keep something beside the object (r_5), 1 miss a part (r_2): mended" in caplog.text
+    cut = load_photos(out)
+    for view, mask in enumerate(true):
+        found = cut.picture(view)[1]
+        assert iou(found, mask) > 0.88 if view in (2, 5) else torch.equal(found, masks[view])
+    page = (out / "masks.html").read_text()
+    assert told in page
+    assert page.index("train/r_2") < page.index("train/r_5") < page.index("train/r_0")
+    assert (out / "masks.png").is_file()
+    assert torch.equal(cut.color, photos.color)
+
+
+def test_masks_that_are_mostly_wrong_stay(tmp_path, with_masks, caplog):
+    """Each shows another place: there is no telling what is right."""
+    data, photos, true = with_masks
+    masks = [mask.roll((11 * (v % 3 - 1), 11 * (v % 4 - 1)), (0, 1)) for v, mask in enumerate(true)]
+    folder, out = write_masks(tmp_path / "masks", masks, photos.names), tmp_path / "cut"
+    task.cutout(data, out, folder, vote=SMALL)
+    said = [r for r in caplog.records if r.levelno == logging.WARNING]
+    assert len(said) == 1
+    assert "none is mended" in said[0].getMessage()
+    assert "source=none" in said[0].getMessage()
+    cut = load_photos(out)
+    for view, mask in enumerate(masks):
+        assert torch.equal(cut.picture(view)[1], mask)
+
+
+def test_few_masks_stay_as_they_are(tmp_path, caplog):
+    data = write_scene(tmp_path / "data", 4, 16)
+    (data / "transforms_test.json").unlink()
+    photos = load_photos(data)
+    masks = [photos.picture(view)[1] for view in range(4)]
+    folder = write_masks(tmp_path / "masks", masks, photos.names)
+    task.cutout(data, tmp_path / "cut", folder)
+    assert "a vote needs 12 photographs, there are 4" in caplog.text
+    masks[1][:] = 0
+    write_masks(folder, masks, photos.names)
+    with pytest.raises(DataError, match="the mask of r_1 shows nothing"):
+        task.cutout(data, tmp_path / "other", folder)
+    (folder / "r_2.png").unlink()
+    with pytest.raises(DataError, match=r"got none for 1: r_2\.png"):
+        task.cutout(data, tmp_path / "other", folder)
+    assert not (tmp_path / "other").exists()
+
+
+def test_masks_of_a_network(tmp_path, with_masks, monkeypatch):
+    data, _, true = with_masks
+    monkeypatch.setattr(task, "network", lambda: lambda photo: (photo.sum(-1) > 0).float())
+    out = task.cutout(data, tmp_path / "cut", "rembg", vote=SMALL)
+    cut = load_photos(out)
+    assert all(iou(cut.picture(view)[1], true[view]) > 0.95 for view in range(VIEWS))
+
+
+def test_a_box_goes_with_colours(tmp_path, with_masks):
+    with pytest.raises(UserError, match="box goes with masks from colours alone"):
+        task.cutout(with_masks[0], tmp_path / "cut", "rembg", box=(0, 0, 0, 1, 1, 1))
+
+
+def test_plain_surroundings_need_no_room(tmp_path, with_masks, monkeypatch, caplog):
+    """On black the sphere is what edges shut off; a box asks for the other way."""
+    data, _, true = with_masks
+    caplog.set_level("INFO", "univoxel")
+    cut = load_photos(task.cutout(data, tmp_path / "cut", vote=SMALL))
+    assert "plain surroundings" in caplog.text
+    assert f"{VIEWS} of {VIEWS} agree with the hull" in caplog.text
+    assert all(iou(cut.picture(view)[1], true[view]) > 0.9 for view in range(VIEWS))
+    monkeypatch.setattr(task, "_from_edges", lambda *_: pytest.fail("there is a box"))
+    monkeypatch.setattr(task, "find_object", lambda *_: None)
+    monkeypatch.setattr(task, "mask", lambda *_: torch.ones(SIZE, SIZE))
+    task.cutout(data, tmp_path / "other", box=(-1, -1, -1, 1, 1, 1))

@@ -52,7 +52,7 @@ def load_photos(
     folder: str | Path,
     split: str = "train",
     downscale: int = 0,
-    masks: bool = True,
+    masks: bool | Path = True,
     kept: Path | None = None,
     allow_outside: bool = False,
 ) -> Photos:
@@ -63,7 +63,8 @@ def load_photos(
     Args:
         downscale: side of the squares of pixels that become one, >= 1; 0: as large as leaves what
             grids can use, 1 for photographs of 1499 pixels and fewer.
-        masks: False for photographs as they are, the whole picture opaque.
+        masks: False for photographs as they are, the whole picture opaque; or a folder of masks of
+            them, named by their stems.
         kept: a file of `keep_photos`, there or not. Where it has these photographs, as their files
             are now, the pixels come from it.
         allow_outside: whether what the folder's files and links name may lie outside of it.

@@ -24,7 +24,7 @@ def is_blender(folder: Path, split: str) -> bool:
 
 
 def load_blender(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
 ) -> Photos:
     """Photographs and cameras of one split.
 

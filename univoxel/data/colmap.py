@@ -49,7 +49,7 @@ def is_colmap(folder: Path, split: str) -> bool:
 
 
 def load_colmap(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
 ) -> Photos:
     """Photographs and cameras of one split, as of `listed_split`.
 

@@ -23,7 +23,7 @@ def is_nerfstudio(folder: Path, split: str) -> bool:
 
 
 def load_nerfstudio(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
 ) -> Photos:
     """Photographs and cameras of one split: without one in the file, every eighth is for tests.
 

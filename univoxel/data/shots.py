@@ -22,6 +22,7 @@ from univoxel.data.images import orientation, read_image, turn_note
 from univoxel.data.inside import inside
 from univoxel.data.kept import kept_pixels, origin_of
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
+from univoxel.data.masks import masks_by_stem, read_mask
 from univoxel.errors import DataError, UserError
 
 # Pixels along the longer side that photographs are shrunk to, about. An object that fills half of
@@ -59,7 +60,7 @@ def read_shots(
     shots: Sequence[Shot],
     downscale: int = 0,
     remarks: Sequence[str] = (),
-    masks: bool = True,
+    masks: bool | Path = True,
 ) -> Photos:
     """Photographs as pinholes see them, each in its own size.
 
@@ -70,7 +71,8 @@ def read_shots(
         kind: of the data set, for people.
         downscale: means over squares of so many pixels; 0: what `fitting_downscale` says.
         remarks: on how the files were read, for people.
-        masks: False for photographs as they are, the whole picture opaque.
+        masks: False for photographs as they are, the whole picture opaque; or a folder of masks,
+            which takes the place of what the layout names.
 
     Raises:
         DataError: one line that names the file, what was expected and what came.
@@ -80,6 +82,10 @@ def read_shots(
     for shot in shots:
         for path in _files(shot):
             inside(path, shot.where)
+    if isinstance(masks, Path):  # which the caller has named: they may lie anywhere
+        found = masks_by_stem(masks, [(shot.name, shot.image) for shot in shots])
+        shots = [replace(shot, mask=mask) for shot, mask in zip(shots, found, strict=True)]
+        masks = True
     _check(folder, shots, downscale)
     factor = downscale or fitting_downscale(shots)
     pinholes = _pinholes(shots)
@@ -242,27 +248,13 @@ def read_photo(path: Path, mask: Path | None = None, masks: bool = True) -> tupl
     if mask is None and alpha is None:
         mask = next((file for file in beside if file.is_file()), None)
     if mask is not None:
-        alpha = _shrunk_to(color, read_image(mask)[..., 0])
-        if alpha.shape != color.shape[:2]:
-            raise DataError(
-                f"{mask}: expected {size_of(color)} pixels, got {size_of(alpha)}{turn_note(path)}"
-            )
+        alpha = read_mask(mask, color.shape[1], color.shape[0], turn_note(path))
     if alpha is None:
         raise DataError(
             f"{path}: expected an alpha channel or a mask {beside[0].name}, got neither: "
             f"{HOW_TO_MASK}"
         )
     return (color.clamp_min(0) if linear else color).contiguous(), alpha.contiguous()
-
-
-def _shrunk_to(color: Tensor, alpha: Tensor) -> Tensor:
-    """A mask of N times the size of its photograph as means over squares of N x N pixels."""
-    (height, width), (high, wide) = color.shape[:2], alpha.shape
-    factor = max(high // height, 1)
-    if factor == 1 or (high // factor, wide // factor) != (height, width):
-        return alpha
-    found = shrink(coverage_of(alpha)[..., None], factor)[..., 0]
-    return (255 * found).round().to(torch.uint8) if alpha.dtype == torch.uint8 else found
 
 
 def _beside(path: Path) -> list[Path]:

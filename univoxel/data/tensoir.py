@@ -25,7 +25,7 @@ def is_tensoir(folder: Path, split: str) -> bool:
 
 
 def load_tensoir(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
 ) -> Photos:
     """Photographs and cameras of one split, under the light of the training views.
 

@@ -52,3 +52,74 @@ class SegmentationConfig:
         )
         check_fields(self, "at least 0", lambda x: x >= 0, "near", "margin")
         check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "smallest_part")
+
+
+@dataclass(frozen=True)
+class VoteConfig:
+    """How masks vote for a hull, and which of them it mends.
+
+    Raises:
+        ConfigError: a field is out of range.
+    """
+
+    photographs: int = 12  # at least, for a vote; fewer do not outvote one another
+    pixels: int = 192  # of the longer side of the pictures that are compared, >= 16
+    voxels: int = 96  # along a side of the grid, >= 8; finer ones cost more and mend no better
+    first_voxels: int = 40  # of the grid that only looks where the object is, >= 8
+    room: float = 1.6  # sides of that grid, in those of what half of the pictures show whole, > 0
+    around: float = 0.5  # of its largest vote: what may be the object, in (0, 1)
+    # Share of the photographs that have to see a voxel, in (0, 1]: what few see, few decide on
+    seen_by: float = 0.25
+    # Votes from which on a voxel may belong to the hull, both in (0, 1). The best depends on how
+    # many masks are wrong: it is searched
+    lowest: float = 0.3
+    highest: float = 0.99
+    below: float = 0.08  # IoU below the median's, from where on a mask is wrong, in (0, 1)
+    # IoU with its silhouette below which a mask is wrong whatever the others have, in (0, 1). If
+    # more than half are, it is the hull that is wrong
+    least: float = 0.75
+    band: float = 1.5  # voxels beside the silhouette within which a mended mask is kept, > 0
+
+    def __post_init__(self) -> None:
+        check_fields(self, "at least 2", lambda x: x >= 2, "photographs")
+        check_fields(self, "at least 16", lambda x: x >= 16, "pixels")
+        check_fields(self, "at least 8", lambda x: x >= 8, "voxels", "first_voxels")
+        check_fields(self, "above 0", lambda x: x > 0, "room", "band")
+        check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "seen_by")
+        open_ones = ("around", "lowest", "highest", "below", "least")
+        check_fields(self, "in (0, 1)", lambda x: 0 < x < 1, *open_ones)
+
+
+@dataclass(frozen=True)
+class PlainConfig:
+    """How objects before plain surroundings are found.
+
+    Raises:
+        ConfigError: a field is out of range.
+    """
+
+    blur: float = 1.0  # pixels, of the picture whose edges count, > 0; less finds noise
+    # Changes of colour, sRGB a pixel, > 0, that are edges: each is tried, and the one whose masks
+    # agree best is taken. Noise asks for more, an object like the wall for less
+    thresholds: tuple[float, ...] = (0.01, 0.02, 0.04)
+    width: float = 3.0  # pixels, of what an edge covers, >= 0: narrower lines are no object
+    rim: float = 0.7  # of the picture's border that is plain at least, in (0, 1]
+    around: float = 0.2  # of the picture that is reached from there at least, in (0, 1)
+    share: float = 0.75  # of the photographs for which both hold at least, in (0, 1]
+    smallest_part: float = 0.02  # of the largest part's area, in [0, 1]; smaller ones are dropped
+    # median IoU with the hull from which on the masks are believed, in (0, 1): on a plain desk and in
+    # a plain room it was .94 and more, on a street .91
+    agree: float = 0.93
+
+    def __post_init__(self) -> None:
+        check_fields(self, "above 0", lambda x: x > 0, "blur")
+        check_fields(
+            self,
+            "one or more numbers above 0",
+            lambda x: len(x) > 0 and min(x) > 0,
+            "thresholds",
+        )
+        check_fields(self, "at least 0", lambda x: x >= 0, "width")
+        check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "rim", "share")
+        check_fields(self, "in (0, 1)", lambda x: 0 < x < 1, "around", "agree")
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "smallest_part")

@@ -1,7 +1,10 @@
-"""Cut an object out of photographs without masks: the part of the scene that stands in its place.
+"""Cut an object out of photographs without masks.
 
-A coarse surface within a box and a backdrop around it explain the photographs together. What
-cameras all around agree on inside the box is the object, and its silhouettes are the masks.
+Masks come from colours alone, from a network, or from a folder. Colours: before plain walls and on
+plain desks the object is what edges shut off from the picture's border. Elsewhere a coarse surface
+within a box and a backdrop around it explain the photographs together; what cameras all around
+agree on inside the box is the object, and its silhouettes are the masks. Masks of single
+photographs vote for a hull, and those that it contradicts are mended.
 """
 
 from __future__ import annotations
@@ -9,62 +12,108 @@ from __future__ import annotations
 import functools
 import logging
 import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
-from univoxel.bars import bar
+from univoxel.bars import bar, track
+from univoxel.color import linear_to_srgb
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
-from univoxel.errors import ExistingFile
-from univoxel.segmentation.config import SegmentationConfig
+from univoxel.errors import DataError, ExistingFile, UserError
+from univoxel.pictures.mask_sheet import MaskTile, darkened, mask_sheet, worst_first, write_page
+from univoxel.segmentation.config import SegmentationConfig, VoteConfig
 from univoxel.segmentation.distances import corners, surroundings
+from univoxel.segmentation.network import network
+from univoxel.segmentation.plain import plain_mask, plain_threshold
 from univoxel.segmentation.separation import DEFAULTS, find_object, mask
+from univoxel.segmentation.vote import BESIDE, MISSING, VOTE, Verdict, elect, judge
 
 log = logging.getLogger("univoxel")
+
+COLOURS, REMBG = "none", "rembg"  # where masks come from, if not from a folder
+NAMED = 5  # photographs in a message, at most
+Masks = dict[str, list[Tensor]]  # [H, W] uint8 of each photograph of each split
 
 
 def cutout(
     data: str | Path,
     out: str | Path,
+    source: str | Path = COLOURS,
     box: tuple[float, ...] | None = None,
     downscale: int = 0,
     seed: int = 0,
     config: SegmentationConfig = DEFAULTS,
     allow_outside: bool = False,
+    vote: VoteConfig = VOTE,
 ) -> Path:
     """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
 
-    All splits are written, in the layout of NeRF-synthetic scenes, without lens distortion. The
-    object is found from the training photographs alone.
+    All splits are written, in the layout of NeRF-synthetic scenes, without lens distortion, beside
+    masks.png and masks.html, which show the masks, worst first. The object is found from the
+    training photographs alone.
 
     Args:
         out: folder to write.
+        source: where masks come from: none, from colours alone; rembg, from a network; else a
+            folder of masks with the stems of the photographs.
         box: lower and upper corner of where the object is, world units; by default a cube around
-            what the cameras look at, as large as their pictures.
+            what the cameras look at, as large as their pictures. For masks from colours; plain
+            surroundings are then not looked for.
         downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
-        config: how the object is found.
+        config: how the object is found from colours.
         allow_outside: as of `load_photos`.
+        vote: how other masks are judged and mended.
 
     Raises:
-        DataError: photographs that cannot be used.
+        DataError: photographs or masks that cannot be used.
         ExistingFile: out is there already.
-        UserError: the box is none, or, as NothingFound, no object is in it.
+        MissingExtra: there is no network.
+        UserError: the box is none, or goes with masks; or, as NothingFound, no object is in it.
         OSError: a file cannot be written.
     """
-    data, out = Path(data), Path(out)
+    data, out, origin = Path(data), Path(out), str(source)
     if out.exists():
         raise ExistingFile(f"{out} is there already: choose another out", "out")
-    load = functools.partial(load_photos, data, masks=False, allow_outside=allow_outside)
-    photos = load("train", downscale)
+    if box and origin != COLOURS:
+        raise UserError(
+            f"box goes with masks from colours alone, not with those of {origin}", "box"
+        )
+    masked = network() if origin == REMBG else None
+    load = functools.partial(load_photos, data, allow_outside=allow_outside)
+    photos = load("train", downscale, masks=False)
     splits = {
-        name: photos if name == "train" else load(name, photos.downscale)
+        name: photos if name == "train" else load(name, photos.downscale, masks=False)
         for name in splits_of(data)
     }
     log.info(photos.about)
+    before_plain = None if box or origin != COLOURS else _from_edges(splits, vote)
+    if before_plain:
+        masks = before_plain
+        verdicts, told = _judged(splits, masks, vote)
+    elif origin == COLOURS:
+        masks = _from_colours(splits, box, seed, config)
+        verdicts = {name: [Verdict(None, "", m) for m in those] for name, those in masks.items()}
+        told = "masks from colours alone"
+    elif masked:
+        masks = _from_network(splits, masked)
+        verdicts, told = _judged(splits, masks, vote)
+    else:  # of shrunk photographs those with masks are black outside of them
+        masks = _as_read({n: load(n, photos.downscale, masks=Path(origin)) for n in splits})
+        verdicts, told = _judged(splits, masks, vote)
+    _write(out, splits, masks, verdicts, told)
+    return out
+
+
+def _from_colours(
+    splits: dict[str, Photos], box: tuple[float, ...] | None, seed: int, config: SegmentationConfig
+) -> Masks:
+    photos = splits["train"]
     lower, upper = corners(box) if box else surroundings(photos.cameras)
     torch.manual_seed(seed)
     with bar(
@@ -82,19 +131,158 @@ def cutout(
             lambda db: progress.update(task, advance=1, facts=f"{db:.1f} dB"),
             config,
         )
-        task = progress.add_task("masks", total=sum(map(len, splits.values())), facts="")
-        # Nothing half-written goes by the name of out
-        partial = out.with_name(f".{out.name}.partial")
-        shutil.rmtree(partial, ignore_errors=True)
+    return {
+        name: [_bytes(mask(scene, split, view)) for view in track(range(len(split)), "masks")]
+        for name, split in splits.items()
+    }
+
+
+def _from_edges(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
+    """Masks of what stands before plain surroundings; None where they are not plain."""
+    train = splits["train"]
+    if len(train) < cfg.photographs:
+        return None
+    photographs = [_encoded(train, view) for view in range(len(train))]
+    threshold = plain_threshold(photographs, train.cameras)
+    if threshold is None:
+        return None
+    log.info("plain surroundings: the object is what edges of %g a pixel shut off", threshold)
+    return {
+        name: [_bytes(plain_mask(_encoded(split, v), threshold)) for v in range(len(split))]
+        for name, split in splits.items()
+    }
+
+
+def _from_network(splits: dict[str, Photos], masked: Callable[[Tensor], Tensor]) -> Masks:
+    return {
+        name: [_bytes(masked(_encoded(split, view))) for view in track(range(len(split)), "masks")]
+        for name, split in splits.items()
+    }
+
+
+def _as_read(splits: dict[str, Photos]) -> Masks:
+    return {
+        name: [_bytes(split.picture(view)[1]) for view in range(len(split))]
+        for name, split in splits.items()
+    }
+
+
+def _judged(
+    splits: dict[str, Photos], masks: Masks, cfg: VoteConfig
+) -> tuple[dict[str, list[Verdict]], str]:
+    """What the vote says about each mask, mended if it may be, and what to tell people.
+
+    Raises:
+        DataError: a mask shows nothing, and there are too few for a vote.
+        UserError: the masks have nothing in common.
+    """
+    train, count = splits["train"], len(splits["train"])
+    if count < cfg.photographs:
         for name, split in splits.items():
-            (partial / name).mkdir(parents=True)
-            for view in range(len(split)):
-                stem = partial / name / split.names[view]
-                write_photo(stem, split, view, mask(scene, split, view))
-                progress.advance(task)
-            write_cameras(partial, name, split.cameras, split.names)
-        partial.rename(out)
-    return out
+            for stem, one in zip(split.names, masks[name], strict=True):
+                if not bool((one >= 128).any()):
+                    raise DataError(f"{split.folder}: the mask of {stem} shows nothing")
+        log.warning(
+            "masks are taken as they are: a vote needs %d photographs, there are %d",
+            *(cfg.photographs, count),
+        )
+        verdicts = {name: [Verdict(None, "", m) for m in those] for name, those in masks.items()}
+        return verdicts, "too few photographs for a vote: masks as they came"
+    hull, largest = elect((m.float() / 255 for m in masks["train"]), train.cameras, cfg)
+    verdicts = {}
+    for name, split in splits.items():
+        verdicts[name] = []
+        for view, one in enumerate(track(masks[name], "mending masks")):
+            known = largest[view] if name == "train" else None
+            found = judge(hull, one.float() / 255, split.cameras, view, known, cfg)
+            verdicts[name].append(replace(found, mask=_bytes(found.mask)))
+    wrong = sum(bool(v.fault) for v in verdicts["train"])
+    told = _told(splits, verdicts, hull.usual)
+    if 2 * wrong > count:
+        told += ": none is mended, as it may be the hull that is wrong"
+        log.warning(
+            f"{told}. The masks keep or miss the same everywhere, or the cameras are wrong; "
+            "source=none finds the object without them",
+            extra={"arguments": ("source",)},
+        )
+        for name, those in verdicts.items():
+            kept = zip(those, masks[name], strict=True)
+            verdicts[name] = [replace(verdict, mask=one) for verdict, one in kept]
+        return verdicts, told
+    if any(v.fault for those in verdicts.values() for v in those):
+        told += ": mended from the other photographs; look at masks.html"
+    log.info(told)
+    return verdicts, told
+
+
+def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: float) -> str:
+    """How many masks agree with the hull, and what is wrong with the others."""
+    faults: dict[str, list[str]] = {BESIDE: [], MISSING: []}
+    count = 0
+    for name, split in splits.items():
+        count += len(split)
+        for stem, verdict in zip(split.names, verdicts[name], strict=True):
+            if verdict.fault:
+                faults[verdict.fault].append(stem)
+    wrong = sum(map(len, faults.values()))
+    told = f"masks: {count - wrong} of {count} agree with the hull ({usual:.2f})"
+    if not wrong:
+        return told
+    parts = []
+    for stems, words in (
+        (faults[BESIDE], "keep something beside the object"),
+        (faults[MISSING], "miss a part"),
+    ):
+        if stems:
+            more = ", ..." if len(stems) > NAMED else ""
+            parts.append(f"{len(stems)} {words} ({', '.join(stems[:NAMED])}{more})")
+    return f"{told}; {wrong} do not: {', '.join(parts)}"
+
+
+def _write(
+    out: Path,
+    splits: dict[str, Photos],
+    masks: Masks,
+    verdicts: dict[str, list[Verdict]],
+    told: str,
+) -> None:
+    """The folder, whole or not at all: photographs, cameras, and the sheet of masks."""
+    # Nothing half-written goes by the name of out
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    tiles = []
+    for name, split in splits.items():
+        (partial / name).mkdir(parents=True)
+        for view in track(range(len(split)), f"writing {name}"):
+            before, verdict, stem = masks[name][view], verdicts[name][view], split.names[view]
+            write_photo(partial / name / stem, split, view, verdict.mask.float() / 255)
+            photograph = _encoded(split, view)
+            mended = not torch.equal(before, verdict.mask)
+            tiles.append(
+                MaskTile(
+                    name=f"{name}/{stem}",
+                    agreement=verdict.agreement,
+                    fault=verdict.fault,
+                    before=darkened(photograph, before.float() / 255),
+                    after=darkened(photograph, verdict.mask.float() / 255) if mended else None,
+                )
+            )
+        write_cameras(partial, name, split.cameras, split.names)
+    tiles = worst_first(tiles)
+    write_png(partial / "masks.png", mask_sheet(tiles))
+    write_page(partial / "masks.html", tiles, told)
+    partial.rename(out)
+
+
+def _encoded(photos: Photos, view: int) -> Tensor:
+    """A photograph [H, W, 3] uint8, sRGB."""
+    color, _ = photos.stored(view)
+    return color if color.dtype == torch.uint8 else _bytes(linear_to_srgb(color).clamp(0, 1))
+
+
+def _bytes(values: Tensor) -> Tensor:
+    """Values in [0, 1] as uint8."""
+    return (255 * values).round().to(torch.uint8)
 
 
 def write_photo(stem: Path, photos: Photos, view: int, alpha: Tensor) -> None:
