@@ -188,6 +188,8 @@ def test_a_search_goes_on_from_what_is_there(scene, photographs, tmp_path, monke
     out, _ = scene
     again = tmp_path / "again"
     shutil.copytree(out / "sfm", again / "sfm")
+    (again / "images").mkdir()
+    (again / "images" / "half.jpg").touch()
     ran = []
     command_of = engine.command_of
     monkeypatch.setattr(
@@ -195,6 +197,7 @@ def test_a_search_goes_on_from_what_is_there(scene, photographs, tmp_path, monke
     )
     poses(photographs, again, keep_size=200, config=SMALL)
     assert ran == []
+    assert not (again / "images" / "half.jpg").exists()
     with Image.open(again / "images" / "IMG 00.jpg") as picture:
         assert picture.size == (200, 150)
     lenses = read_cameras(again / "sparse/0/cameras.bin").values()

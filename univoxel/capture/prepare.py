@@ -38,6 +38,11 @@ class Folders:
     work: Path
 
     @property
+    def request(self) -> Path:
+        """What the work was begun with."""
+        return self.work / "request.json"
+
+    @property
     def frames(self) -> Path:
         """Of a video."""
         return self.work / "frames"

@@ -19,6 +19,9 @@ from univoxel.files import replacing
 
 QUALITY = 95  # of written JPEG
 KEEP_PNG = (".png",)
+REPORT = "poses.json"
+WRITTEN = ("images", "masks", "sparse")  # folders of a scene
+PARTIAL = ".partial"  # folder that they are written to at first
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ def write_scene(
         wanted: indices of the photographs to write.
         longest: pixels of the written pictures along the longer side, at most; 0 for any.
     """
-    partial = out / ".partial"
+    partial = out / PARTIAL
     shutil.rmtree(partial, ignore_errors=True)
     (partial / "images").mkdir(parents=True)
     for n, index in enumerate(wanted):
@@ -95,7 +98,7 @@ def write_scene(
             mask.save(partial / "masks" / f"{name}.png")
         yield n + 1
     write_model(partial / "sparse" / "0", model)
-    for folder in ("images", "masks", "sparse"):
+    for folder in WRITTEN:
         shutil.rmtree(out / folder, ignore_errors=True)
         if (partial / folder).exists():
             (partial / folder).rename(out / folder)
@@ -120,7 +123,7 @@ def write_report(out: Path, settings: dict, model: Model, reports: list[Report])
         "cameras": cameras,
         "photographs": [vars(r) for r in reports],
     }
-    with replacing(out / "poses.json") as temporary:
+    with replacing(out / REPORT) as temporary:
         temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 

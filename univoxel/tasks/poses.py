@@ -23,7 +23,16 @@ from univoxel.capture.grouping import in_words
 from univoxel.capture.model import Model, without
 from univoxel.capture.photographs import find_photographs, require_readers
 from univoxel.capture.prepare import Capture, Folders, gather, start_over, write_pictures
-from univoxel.capture.scene import Report, own_sizes, write_report, write_scene, written_name
+from univoxel.capture.scene import (
+    PARTIAL,
+    REPORT,
+    WRITTEN,
+    Report,
+    own_sizes,
+    write_report,
+    write_scene,
+    written_name,
+)
 from univoxel.capture.world import moved, settle
 from univoxel.errors import DataError, ExistingFile
 from univoxel.files import replacing
@@ -78,6 +87,7 @@ def poses(
     masks = None if masks is None else Path(masks)
     engine = find_engine()
     folders = Folders(out / WORK)
+    _check_free(out, folders)
     files, others, doubles = _files(source, folders, every)
     require_readers(files)
     capture, unread = gather(files, masks)
@@ -116,6 +126,21 @@ def poses(
     reports = [_written(r, wanted, i, capture) for i, r in enumerate(found.reports)]
     write_report(out, {**settings, **used, "versions": _versions()}, model, reports)
     return out
+
+
+def _check_free(out: Path, folders: Folders) -> None:
+    """Refuse a folder that holds what is not of a search for cameras.
+
+    Raises:
+        ExistingFile: it does.
+    """
+    if not out.exists() or (out / REPORT).exists():
+        return
+    # Written last, one after the other
+    begun = WRITTEN if folders.request.exists() else ()
+    foreign = [p.name for p in out.iterdir() if p.name not in (WORK, PARTIAL, *begun)]
+    if foreign:
+        raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
 
 
 def _files(
@@ -165,18 +190,13 @@ def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
     Raises:
         ExistingFile: out holds what is not of this search.
     """
-    asked, report = folders.work / "request.json", out / "poses.json"
+    asked, report = folders.request, out / REPORT
     same = asked.exists() and json.loads(asked.read_text(encoding="utf-8")) == settings
     if report.exists():
         record = json.loads(report.read_text(encoding="utf-8"))
         if not same:
             raise ExistingFile(f"{out} holds another scene: choose another out", "out")
         return all(record.get(key) == value for key, value in written.items())
-    foreign = (
-        [p.name for p in out.iterdir() if p.name not in (WORK, ".partial")] if out.exists() else []
-    )
-    if foreign:
-        raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
     if not same:
         start_over(folders)
         folders.work.mkdir(parents=True, exist_ok=True)
