@@ -104,8 +104,8 @@ class MatchesConfig:
     # matches in all, >= 1, below which nothing is known: plain objects
     min_matches: int = 60
     # pixels, > 0, of the median match, up to which cameras can be right: those of structure from
-    # motion are off by 0.2 to 0.7, those that are a pixel off are worth refining
-    max_distance: float = 0.8
+    # motion are off by 0.2 to 0.8, those that are off by more are worth refining
+    max_distance: float = 1.0
     # how many times further, > 0, silhouettes contradict one another where masks are to blame:
     # cameras that are off make both large, the contradiction up to twice as much as the distance
     doubt: float = 4.0

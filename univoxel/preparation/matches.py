@@ -155,11 +155,14 @@ def _keypoints(
     except (RuntimeError, ValueError):  # no keypoints, or fewer pixels than filters need
         return none
     scale = np.array([color.shape[1], color.shape[0]]) / np.array(grey.shape[::-1])
-    place = (sift.positions[:, ::-1] + 0.5) * scale + np.array([left, top])
+    positions, sigmas, descriptors = (
+        np.asarray(found) for found in (sift.positions, sift.sigmas, sift.descriptors)
+    )
+    place = (positions[:, ::-1] + 0.5) * scale + np.array([left, top])
     column, row = np.floor(place).astype(int).T
     inside = depth.numpy()[row.clip(0, depth.shape[0] - 1), column.clip(0, depth.shape[1] - 1)]
-    clear = inside < -cfg.clear * sift.sigmas * scale.mean()
-    return place[clear], sift.descriptors[clear]
+    clear = inside < -cfg.clear * sigmas * scale.mean()
+    return place[clear], descriptors[clear]
 
 
 def _matched(
@@ -181,6 +184,6 @@ def _matched(
             max_trials=cfg.trials,
             rng=0,
         )
-        if inlier is not None and inlier.sum() >= cfg.fitted:
-            explained = inlier
+        if inlier is not None and np.sum(inlier) >= cfg.fitted:
+            explained = np.asarray(inlier, bool)
     return np.concatenate([first, second], 1), explained

@@ -64,7 +64,7 @@ def _drawn(alpha: np.ndarray, percent: float, random: np.random.Generator) -> np
     noise = ndimage.gaussian_filter(random.standard_normal(alpha.shape), max(1.0, 2 * deviation))
     noise *= deviation / max(noise.std(), 1e-12)
     mask = np.asarray(outside) - np.asarray(depth) + noise < 0
-    rows = inside.any(1).nonzero()[0]
+    rows = np.flatnonzero(inside.any(1))
     if len(rows):
         end = random.uniform(0, ENDS * percent) * (rows[-1] + 1 - rows[0])
         mask[round(rows[-1] + 1 - end) :] = False
@@ -72,7 +72,7 @@ def _drawn(alpha: np.ndarray, percent: float, random: np.random.Generator) -> np
 
 
 def _without_a_part(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    place = np.argwhere(mask & ~ndimage.binary_erosion(mask))
+    place = np.argwhere(mask & ~np.asarray(ndimage.binary_erosion(mask)))
     return mask & ~_disc(mask, place[random.integers(len(place))], PART)
 
 
