@@ -13,18 +13,21 @@ house=$PWD/build/wheelhouse/$name root=$PWD/build/wheel-root
 rm -rf "$root" && mkdir -p "$house" "$root"
 
 # What it depends on, and the tests', as files
-"$python" -m pip download -q -d "$house" "$wheel" pytest hypothesis threadpoolctl "$@"
-rm -f "$house"/univoxel-*
-cp "$wheel" "$house"
+[ -e "$house/.complete" ] || "$python" -m pip download -q -d "$house" "$wheel" pytest hypothesis "$@"
+touch "$house/.complete"
+cp "$wheel" "$house" # this build of it
 
 # The root: the interpreter, its standard library and the shared libraries of both
 stdlib=$("$python" -c 'import sysconfig; print(sysconfig.get_path("stdlib"))')
 mkdir -p "$root"/{proc,sys,dev,tmp,house,tests,"$stdlib","$(dirname "$python")"}
 cp "$python" "$root$python"
 stdcxx=$(ldconfig -p | awk '/libstdc\+\+\.so\.6 .*x86-64|libstdc\+\+\.so\.6 .*AArch64/ {print $NF; exit}')
-for file in "$python" "$stdlib"/lib-dynload/*.so "$stdcxx"; do
+# All parts of the C library, and C++'s: every Linux has them, and torch asks for them
+glibc=$(dirname "$(ldd "$python" | awk '/libc\.so\.6/ {print $3}')")
+parts=("$stdcxx" "$glibc"/lib{pthread,dl,m,rt,util}.so.[0-9])
+for file in "$python" "$stdlib"/lib-dynload/*.so "${parts[@]}"; do
     { ldd "$file" || true; } | grep -o '/[^ ]*' || true
-done | sort -u | grep -v '^/tmp' | cat - <(echo "$stdcxx") | while read -r library; do
+done | sort -u | grep -v '^/tmp' | cat - <(printf '%s\n' "${parts[@]}") | while read -r library; do
     mkdir -p "$root$(dirname "$library")" && cp -L "$library" "$root$library"
 done
 cp -r tests pyproject.toml "$root/tests"
@@ -39,7 +42,8 @@ mount --bind "$house" "$root/house"
 found=$(find "$root" -path "$root/proc" -prune -o -path "$root/sys" -prune -o -path "$root/dev" -prune -o \
     \( -name 'libembree*' -o -name 'libtbb*' -o -name 'libgomp*' -o -name 'c++' -o -name 'g++' -o -name gcc -o -name cc -o -name glm \) -print)
 [ -z "$found" ] || { echo "test_wheel.sh: the root is not clean: $found" >&2; exit 1; }
-inside() { env -i HOME=/tmp USER=nobody PATH=/venv/bin LANG=C.UTF-8 ${OMP_NUM_THREADS:+OMP_NUM_THREADS=$OMP_NUM_THREADS} chroot "$root" "$@"; }
+chroot=$(command -v chroot)
+inside() { env -i HOME=/tmp USER=nobody PATH=/venv/bin LANG=C.UTF-8 "$chroot" "$root" "$@"; }
 inside "$python" -m venv /venv
 echo "== pip install univoxel"
 time inside /venv/bin/python -m pip install -q --no-index --find-links /house univoxel
