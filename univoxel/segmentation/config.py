@@ -107,8 +107,8 @@ class PlainConfig:
     around: float = 0.2  # of the picture that is reached from there at least, in (0, 1)
     share: float = 0.75  # of the photographs for which both hold at least, in (0, 1]
     smallest_part: float = 0.02  # of the largest part's area, in [0, 1]; smaller ones are dropped
-    # median IoU with the hull from which on the masks are believed, in (0, 1): on a plain desk and in
-    # a plain room it was .94 and more, on a street .91
+    # median IoU with the hull from which on the masks are believed, in (0, 1): on a plain desk and
+    # in a plain room it was .94 and more, on a street .91
     agree: float = 0.93
 
     def __post_init__(self) -> None:
