@@ -26,7 +26,7 @@ from univoxel.errors import (
     UserError,
 )
 
-KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, Exception)]
+KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, UserError)]
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def test_cutout(calls, capsys):
 
 def test_cutout_from_masks(calls, capsys):
     assert main(["cutout", "photos", "--out", "cut", "--from", "masks"]) == 0
-    given = {"box": None, "downscale": 0}
+    given = {"box": None, "downscale": 0, "allow_outside": False}
     assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "masks"), given)]
 
 
@@ -443,8 +443,8 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "Unrecognized options: sing"),
         (
             [],
-            "Expected one of {poses, cutout, train, eval, relight, export, envmap, inspect, info, "
-            "compare, chart, stress, demo}",
+            "Expected one of {poses, cutout, train, eval, relight, export, envmap, submit, inspect, "
+            "info, compare, chart, stress, demo, doctor}",
         ),
     ],
 )

@@ -196,8 +196,7 @@ def train(
             --capacity adaptive
         allow_outside: read photographs outside of DATA too, where its files or links name such
         resume: go on with the run in --out; where nothing was saved yet, it begins
-        timelapse: picture of a test view over training time, or a folder of its frames; making
-            them does not count as training
+        timelapse: picture of a test view over training time, or a folder of its frames
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
             stages.1.voxels=3; config.json in a run's folder holds them all
     """
@@ -214,8 +213,7 @@ def train(
     config = with_field(config, field)
     if light_frame != "auto":
         config = dataclasses.replace(config, light_frame=light_frame)
-    if budget_mb is not None and capacity == "auto":
-        capacity = "adaptive"
+    capacity = "adaptive" if budget_mb is not None and capacity == "auto" else capacity
     if capacity != "auto":
         config = dataclasses.replace(config, capacity=capacity, budget_mb=budget_mb)
     print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
