@@ -163,13 +163,14 @@ def open_run(path: str | Path) -> Run:
 
 @overload
 def train(
-    data: TrainConfig, /, resume: bool = False, timelapse: str | Path | None = None
+    data: TrainConfig, /, *, resume: bool = False, timelapse: str | Path | None = None
 ) -> Path: ...
 
 
 @overload
 def train(
     data: str | Path,
+    /,
     out: str | Path,
     *,
     preset: PresetOrAuto = "auto",
@@ -184,6 +185,7 @@ def train(
 
 def train(
     data: str | Path | TrainConfig,
+    /,
     out: str | Path | bool | None = None,
     *,
     preset: PresetOrAuto = "auto",

@@ -34,7 +34,9 @@ def is_llff(folder: Path, split: str) -> bool:
     return (folder / FILE).is_file()
 
 
-def load_llff(folder: Path, split: str = "train", downscale: int = 0, masks: bool = True) -> Photos:
+def load_llff(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
     """Photographs and cameras of one split, as of `listed_split`.
 
     The world keeps its scale and origin, and is turned so that +Z is up.
