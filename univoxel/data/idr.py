@@ -37,7 +37,9 @@ def is_idr(folder: Path, split: str) -> bool:
     return _file(folder) is not None
 
 
-def load_idr(folder: Path, split: str = "train", downscale: int = 0, masks: bool = True) -> Photos:
+def load_idr(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
     """Photographs and cameras of one split: every eighth is for tests.
 
     The world is that of world_mat: it keeps its scale and origin, and is turned so that +Z is up.

@@ -35,7 +35,7 @@ def is_neilf(folder: Path, split: str) -> bool:
 
 
 def load_neilf(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
 ) -> Photos:
     """Photographs and cameras of one split: every eighth is for tests.
 

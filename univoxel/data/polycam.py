@@ -36,7 +36,7 @@ def is_polycam(folder: Path, split: str) -> bool:
 
 
 def load_polycam(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
 ) -> Photos:
     """Photographs and cameras of one split: every eighth is for tests.
 

@@ -43,7 +43,7 @@ def is_realitycapture(folder: Path, split: str) -> bool:
 
 
 def load_realitycapture(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool = True
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
 ) -> Photos:
     """Photographs and cameras of one split: every eighth is for tests.
 
