@@ -443,8 +443,8 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "Unrecognized options: sing"),
         (
             [],
-            "Expected one of {poses, cutout, train, eval, relight, export, envmap, submit, inspect, "
-            "info, compare, chart, stress, demo, doctor}",
+            "Expected one of {poses, cutout, train, eval, relight, export, envmap, submit, "
+            "inspect, info, compare, chart, stress, demo, doctor}",
         ),
     ],
 )
