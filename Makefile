@@ -12,8 +12,7 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test network-test fuzz lint format bench docs docs-check docs-write asan \
-	wheel wheel-test clean
+.PHONY: help dev demo test network-test fuzz lint format bench docs docs-check docs-write asan wheel wheel-test clean
 .DELETE_ON_ERROR:
 
 help:

@@ -33,9 +33,10 @@ def test_ground():
 def test_the_package_has_the_tasks_and_stays_cheap():
     code = "import sys, univoxel; dir(univoxel); assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
-    from univoxel.tasks import evaluate, export, relight, train
+    from univoxel import api
+    from univoxel.tasks import evaluate, export, relight
 
-    assert univoxel.train is train.train
+    assert univoxel.train is api.train
     assert univoxel.evaluate is evaluate.evaluate
     assert univoxel.export is export.export
     assert univoxel.relight is relight.relight_images

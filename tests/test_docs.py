@@ -162,7 +162,7 @@ def test_folders_and_files_of_the_tree_are_there():
         assert (ROOT / name).exists() or (ROOT / "univoxel" / name).exists(), name
     named = set(re.findall(r"`(?:univoxel/)?([a-z]+(?:\.py|/))`", tree))
     package = {p.name + "/" * p.is_dir() for p in (ROOT / "univoxel").iterdir()}
-    unnamed = {n for n in package - named if not n.startswith(("_", "example_data"))}
+    unnamed = {n for n in package - named if not n.startswith(("_", "example_data", "py.typed"))}
     assert not unnamed, "add to the tree of CONTRIBUTING.md"
 
 

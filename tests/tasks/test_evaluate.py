@@ -292,7 +292,10 @@ def broken_relit(folders):
             lambda f: (f.run / "config.json").unlink(),
             r"expected the folder of a run, got no config",
         ),
-        (lambda f: (f.run / "config.json").write_text("{}"), "config.json: .* the key data"),
+        (
+            lambda f: (f.run / "config.json").write_text("{}"),
+            "config.json: expected data, a folder",
+        ),
         (lambda f: (f.run / "config.json").write_text("{"), "config.json: .* JSON"),
         (
             lambda f: (f.data / "envmaps" / "dim.hdr").write_bytes(b"#?"),

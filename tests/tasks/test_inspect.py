@@ -1,6 +1,8 @@
 """The light at one point: what is drawn, beside the truth, and what is refused."""
 
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -69,10 +71,7 @@ def test_the_hybrid_has_two_layers(tmp_path, data):
 
 def test_the_truth_goes_beside(tmp_path, data):
     """The true ball under the very map: both layers agree above the horizon."""
-    folder = tmp_path / "data"
-    folder.mkdir()
-    for path in data.iterdir():
-        (folder / path.name).symlink_to(path)
+    folder = Path(shutil.copytree(data, tmp_path / "data"))
     scene = a_run(tmp_path, folder, EnvmapConfig(rows=32))
     map = scene.light.latlong(32).detach() * (1 + latlong_directions(32)[..., 2:])
     (folder / "envmaps").mkdir()
@@ -130,10 +129,7 @@ def test_bad_arguments(tmp_path, data, arguments, message):
 
 
 def test_a_true_mesh_that_is_none(tmp_path, data):
-    folder = tmp_path / "data"
-    folder.mkdir()
-    for path in data.iterdir():
-        (folder / path.name).symlink_to(path)
+    folder = Path(shutil.copytree(data, tmp_path / "data"))
     a_run(tmp_path, folder)
     (folder / "envmaps").mkdir()
     write_exr(folder / "envmaps" / "train.exr", {c: torch.ones(4, 8) for c in "RGB"}, half=False)

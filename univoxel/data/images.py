@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
@@ -204,7 +205,7 @@ def _exr(path: Path, **options: bool) -> Iterator[OpenEXR.File]:
     with _OPENING, redirect_stdout(told), _without_stderr():
         file = OpenEXR.File(str(path), **options)
     lines = told.getvalue().splitlines(keepends=True)
-    print("".join(line for line in lines if not line.startswith(EXR_TELLS)), end="")
+    sys.stdout.write("".join(line for line in lines if not line.startswith(EXR_TELLS)))
     damage = [line.strip() for line in lines if line.startswith(EXR_TELLS)]
     with file:
         if damage:
