@@ -121,3 +121,14 @@ def test_models_that_are_not_supported(tmp_path, number, name):
     (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(data)
     with pytest.raises(DataError, match=f"camera 3 is {name}: run colmap image_undistorter"):
         load_photos(tmp_path)
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_of_several_models_the_largest_is_read(tmp_path, text):
+    """COLMAP's first try may have placed two photographs, and wrongly."""
+    two, all_views = scene(2), scene(10)
+    write_colmap(tmp_path, two, place="sparse/0", text=text)
+    write_colmap(tmp_path, all_views, place="sparse/1", text=text)
+    photos = load_photos(tmp_path)
+    assert len(photos) == 8
+    assert "sparse/1, the largest of 2 models" in photos.about

@@ -45,7 +45,7 @@ class Registered:
 
 
 def is_colmap(folder: Path, split: str) -> bool:
-    return _model(folder) is not None
+    return bool(_models(folder))
 
 
 def load_colmap(
@@ -58,10 +58,10 @@ def load_colmap(
     Raises:
         DataError: one line that names the file, what was expected and what came.
     """
-    found = _model(folder)
-    if found is None:
+    models = _models(folder)
+    if not models:
         raise DataError(f"{folder}: expected a COLMAP model in {', '.join(PLACES)}, got none")
-    model, ending = found
+    model, ending = models[0]
     cameras_file, images_file = model / f"cameras{ending}", model / f"images{ending}"
     try:
         cameras = read_cameras(cameras_file)
@@ -104,6 +104,8 @@ def load_colmap(
     lost = left_out(str(images_file), missing, len(images), note)
     shots, remarks = upright(shots)
     shots = listed_split(folder, shots, split)
+    if len(models) > 1:
+        lost = [f"{model.relative_to(folder)}, the largest of {len(models)} models", *lost]
     return read_shots(folder, "COLMAP model", split, shots, downscale, [*lost, *remarks], masks)
 
 
@@ -157,13 +159,36 @@ def read_images(path: Path) -> list[Registered]:
     return images
 
 
-def _model(folder: Path) -> tuple[Path, str] | None:
-    """The folder of the model and the ending of its files; binary ones first, as COLMAP does."""
+def _models(folder: Path) -> list[tuple[Path, str]]:
+    """The models of the first place that has any: their folders and the ending of their files,
+    binary ones first, as COLMAP does. That of the most photographs comes first: COLMAP numbers
+    models as it begins them, and a first try may have ended with two photographs."""
     for place in PLACES:
-        for ending in (".bin", ".txt"):
-            if all((folder / place / f"{n}{ending}").is_file() for n in ("cameras", "images")):
-                return folder / place, ending
+        several = (folder / place).parent.glob("[0-9]*") if place.endswith("/0") else ()
+        found = [
+            (model, ending)
+            for model in sorted({folder / place, *several}, key=lambda p: (len(p.name), p.name))
+            if (ending := _ending(model))
+        ]
+        if found:
+            return sorted(found, key=lambda one: -_count(one[0] / f"images{one[1]}"))
+    return []
+
+
+def _ending(model: Path) -> str | None:
+    """The ending of a model's files; None where there is no model."""
+    for ending in (".bin", ".txt"):
+        if all((model / f"{name}{ending}").is_file() for name in ("cameras", "images")):
+            return ending
     return None
+
+
+def _count(images: Path) -> int:
+    """Photographs of a model, about, without reading it."""
+    with images.open("rb") as file:
+        if images.suffix == ".bin":
+            return int.from_bytes(file.read(8), "little")
+        return sum(not line.startswith(b"#") for line in file) // 2
 
 
 def _broken(path: Path, error: Exception) -> DataError:
