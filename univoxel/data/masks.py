@@ -62,7 +62,8 @@ def masks_by_stem(folder: Path, photographs: Sequence[tuple[str, Path]]) -> list
 def read_mask(path: Path, width: int, height: int, note: str = "") -> Tensor:
     """A mask [height, width], uint8 or float32 as stored: its alpha, or its first channel.
 
-    One of another size but the same shape is resized.
+    One of another size but the same shape is resized; rows and columns that an original of N times
+    the size has left over are cut off.
 
     Args:
         note: on the size, added to the message that it is another one.
@@ -75,6 +76,9 @@ def read_mask(path: Path, width: int, height: int, note: str = "") -> Tensor:
     mask = image[..., 3 if channels == 4 else 0]
     if mask.shape == (height, width):
         return mask
+    factor = max(mask.shape[0] // height, 1)
+    if (mask.shape[0] // factor, mask.shape[1] // factor) == (height, width):
+        mask = mask[: factor * height, : factor * width]  # what an original has left over
     if abs(mask.shape[1] * height / (mask.shape[0] * width) - 1) > SKEW:
         came = f"{mask.shape[1]}x{mask.shape[0]}"
         raise DataError(f"{path}: expected {width}x{height} pixels, got {came}{note}")
