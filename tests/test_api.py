@@ -43,7 +43,6 @@ def test_a_run_and_what_it_can_do(run, tmp_path, capfd):
     assert run.light(8).radiance.shape == (8, 16, 3)
     assert run.mesh().albedo.shape == run.mesh().vertices.shape
     assert run.trust.strip()
-    assert {"losses", "held_out_psnr", "seconds"} <= run.log[-1].keys() if run.log else True
     measures = run.evaluate(samples=2)
     assert measures["nvs_psnr"] > 10
     assert capfd.readouterr().out == ""
@@ -79,6 +78,8 @@ def test_cancelled_and_resumed(data, tmp_path, monkeypatch):
     run = univoxel.train(data, out, minutes=2, changes=SMALL, on_progress=again.append, resume=True)
     assert again[0].stage == 2  # what was done is not done again
     assert run.mesh().vertices.isfinite().all()
+    assert {"losses", "held_out_psnr", "seconds"} <= run.log[-1].keys()
+    assert len(run.log) == len(seen) + len(again)
 
 
 def test_the_configuration_alone_is_enough_as_before(data, tmp_path, monkeypatch):

@@ -14,7 +14,6 @@ from univoxel.camera import Cameras, stacked
 from univoxel.checkpoint import load_scene
 from univoxel.config import TrainConfig
 from univoxel.envmap import EnvMap
-from univoxel.errors import UserError
 from univoxel.names import ELEVATION, MAP_ROWS, Differing, LightName, PresetOrAuto
 from univoxel.overrides import changed
 from univoxel.pictures.viewpoints import views_of
@@ -22,11 +21,12 @@ from univoxel.presets import chosen
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh, shade_hits, surface_of_view
 from univoxel.scene import Scene
+from univoxel.tasks.envmap import recovered_map
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.export import export
 from univoxel.tasks.relight import relight_images
 from univoxel.tasks.train import train as train_config
-from univoxel.training.progress import TrainingProgress
+from univoxel.training.progress import LOG, TrainingProgress
 
 __all__ = ["Run", "TrainingProgress", "open_run", "train"]
 
@@ -108,20 +108,13 @@ class Run:
         export(self.path, path, **options)
         return Path(path)
 
-    @torch.no_grad()
     def light(self, height: int = MAP_ROWS) -> EnvMap:
         """The environment map that was recovered, `height` rows of it.
 
         Raises:
             UserError: this run has none: it was trained with local light alone.
         """
-        sky = self.scene.environment()
-        if sky is None:
-            raise UserError(
-                f"{self.path}: this run has no environment map: it was trained with "
-                f"{self.scene.cfg.light.kind} light alone"
-            )
-        return EnvMap(self.scene.exposed(sky.latlong(height)))
+        return EnvMap(recovered_map(self.scene, self.path, height))
 
     @torch.no_grad()
     def mesh(self) -> Mesh:
@@ -141,7 +134,7 @@ class Run:
     @property
     def log(self) -> list[dict[str, Any]]:
         """What training reported, every few seconds: time, losses, held-out quality."""
-        file = self.path / "log.jsonl"
+        file = self.path / LOG
         if not file.is_file():
             return []
         return [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
@@ -163,7 +156,12 @@ def open_run(path: str | Path) -> Run:
 
 @overload
 def train(
-    data: TrainConfig, /, *, resume: bool = False, timelapse: str | Path | None = None
+    data: TrainConfig,
+    /,
+    *,
+    resume: bool = False,
+    timelapse: str | Path | None = None,
+    on_progress: Callable[[TrainingProgress], None] | None = None,
 ) -> Path: ...
 
 
@@ -180,6 +178,7 @@ def train(
     changes: Sequence[str] = (),
     on_progress: Callable[[TrainingProgress], None] | None = None,
     resume: bool = False,
+    timelapse: str | Path | None = None,
 ) -> Run: ...
 
 
@@ -200,8 +199,8 @@ def train(
     """Recover geometry, materials and light from posed photographs.
 
     Args:
-        data: folder of the photographs and their cameras; or the whole configuration, in place of
-            all else but resume: then the folder of the run is returned.
+        data: folder of the photographs and their cameras; or the whole configuration, which says
+            all but resume, timelapse and on_progress: then the folder of the run is returned.
         out: folder that the run is written to.
         preset: how much work goes in: draft, fast or full; auto is what fits into minutes, or fast.
         light, varying: as of `univoxel.presets.budget`.
@@ -210,6 +209,7 @@ def train(
         on_progress: called every few seconds of training. Raise `univoxel.Cancelled` in it to end
             the training: it is saved, and goes on with resume.
         resume: go on with the run in out from its last checkpoint.
+        timelapse: .gif, .mp4 or folder for pictures of a view over training time.
 
     Raises:
         UserError: an argument or the data cannot be used.
@@ -217,9 +217,10 @@ def train(
         Cancelled: on_progress raised it.
         OSError: a file of the run cannot be written; what was there before stays.
     """
+    watched = {"timelapse": timelapse, "on_progress": on_progress}
     if isinstance(data, TrainConfig):
-        return train_config(data, resume=resume or out is True, timelapse=timelapse)
+        return train_config(data, resume=resume or out is True, **watched)
     if out is None or isinstance(out, bool):
         raise TypeError("train: out must be the folder of the run, got none")
     config = chosen(preset, minutes, Path(data), Path(out), light, varying)
-    return Run(train_config(changed(config, changes), resume=resume, on_progress=on_progress))
+    return Run(train_config(changed(config, changes), resume=resume, **watched))

@@ -19,6 +19,7 @@ from univoxel.envmap import EnvMap, lookup
 from univoxel.errors import UserError
 from univoxel.names import MAP_ROWS
 from univoxel.run import trained_on
+from univoxel.scene import Scene
 from univoxel.sphere import fibonacci_sphere, latlong_directions, texel_solid_angles
 
 GREY = 0.5  # albedo of the ball
@@ -69,13 +70,7 @@ def envmap(
         raise UserError(f"out: expected a name that ends in .exr, got {out}", "out")
     scene = load_scene(run)
     scene.show_light_of(light_of)
-    sky = scene.environment()
-    if sky is None:
-        raise UserError(
-            f"{run}: this run has no environment map: it was trained with {scene.cfg.light.kind} "
-            "light alone"
-        )
-    recovered, true = scene.exposed(sky.latlong(height)), true_map(trained_on(run))
+    recovered, true = recovered_map(scene, run, height), true_map(trained_on(run))
     out.parent.mkdir(parents=True, exist_ok=True)
     write_exr(out, dict(zip("RGB", recovered.unbind(2), strict=True)), half=False)
     rows, result = [recovered], None
@@ -86,6 +81,25 @@ def envmap(
     picture = [torch.cat(_tiles(row * exposure, height), 1) for row in rows]
     write_png(out.with_suffix(".png"), linear_to_srgb(torch.cat(picture)))
     return result
+
+
+@torch.no_grad()
+def recovered_map(scene: Scene, run: Path, height: int) -> Tensor:
+    """The map of a scene [height, 2 height, 3], in the light that it shows.
+
+    Args:
+        run: its folder, for the message.
+
+    Raises:
+        UserError: the scene has none.
+    """
+    sky = scene.environment()
+    if sky is None:
+        raise UserError(
+            f"{run}: this run has no environment map: it was trained with {scene.cfg.light.kind} "
+            "light alone"
+        )
+    return scene.exposed(sky.latlong(height))
 
 
 def compare(recovered: Tensor, true: Tensor) -> Comparison:

@@ -60,7 +60,7 @@ def damaged(
     if len(photos) < damage.views:
         raise UserError(f"{scene}: expected {damage.views} photographs, got {len(photos)}")
     random = np.random.default_rng(seed)
-    photos = _first(photos, damage.views)
+    photos = photos.of(torch.arange(damage.views))
     if damage.light:
         if second is None:
             raise ValueError("damaged: light above 0 needs a scene in a second light")
@@ -156,16 +156,6 @@ def clipped(folder: Path) -> float:
     """
     rgba = np.stack([read_image(path).numpy() for path in sorted((folder / "train").glob("*.png"))])
     return float((rgba[..., :3] == 255).any(-1)[rgba[..., 3] > 127].mean())
-
-
-def _first(photos: Photos, views: int) -> Photos:
-    return replace(
-        photos,
-        names=photos.names[:views],
-        color=photos.color[:views],
-        alpha=photos.alpha[:views],
-        cameras=photos.cameras.of(torch.arange(views)),
-    )
 
 
 def _copy_tests(scene: Path, out: Path, gain: float) -> None:
