@@ -163,13 +163,13 @@ def test_both_renders_follow_the_camera():
         opacity=torch.ones(VIEWS),
         depth=depth,
     )
+    still = sphere_scene(NODES).eval()
     with torch.no_grad():
-        seen = radiance_of(scene, surface, wo)
-        torch.testing.assert_close(seen, seen[:1].expand_as(seen), atol=1e-4, rtol=0)
-        still = sphere_scene(NODES).eval()
-        assert (radiance_of(still, surface, wo) - radiance_of(still, surface, wo)[:1]).std() > 1e-3
-        place = replace(surface, position=torch.zeros(VIEWS, 3) + surface.position[:1])
-        assert shade(scene, place, wo).isfinite().all()
+        for render in (radiance_of, shade):
+            seen, other = render(scene, surface, wo), render(still, surface, wo)
+            # All lie in one frame of the light, but for the rounding of their turns
+            torch.testing.assert_close(seen, seen[:1].expand_as(seen), atol=1e-4, rtol=0)
+            assert (other - other[:1]).abs().max() > 1e-2
 
 
 def test_a_checkpoint_keeps_the_axis(tmp_path):
