@@ -5,7 +5,7 @@ docs/figures/diagrams.py draws them."""
 # helpers named here.
 LAYERS = [
     {"errors"},
-    {"bars", "files", "installation", "machine", "names", "records", "validation"},
+    {"bars", "files", "installation", "machine", "names", "records", "threads", "validation"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "poses"},

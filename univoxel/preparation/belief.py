@@ -21,6 +21,7 @@ from univoxel.preparation.depth_sweep import surface_depths
 from univoxel.preparation.hull import estimate_bounds, visual_hull, votes_needed
 from univoxel.preparation.matches import Agreement, agreement, find_matches
 from univoxel.preparation.registration import contradiction
+from univoxel.threads import side_by_side
 
 log = logging.getLogger("univoxel")
 
@@ -127,13 +128,17 @@ def doubted_pixels(
     grid = fit_grid(*belief.box, cfg.box_nodes)
     hull = visual_hull(distance, cameras, grid, cfg, belief.votes)
     doubted = torch.zeros(distance.shape, dtype=torch.bool)
-    for view, depth in enumerate(surface_depths(hull, grid, cameras)):
+
+    def doubt_(view_and_depth: tuple[int, Tensor]) -> None:
+        view, depth = view_and_depth
         shown = cameras.cut(view, distance[view] < 0)
         differs = (shown != cameras.cut(view, depth.isfinite())).numpy()
         reach = max(cfg.rough_pixels, cfg.rough_share * max(shown.shape))
         deep = np.asarray(ndimage.distance_transform_edt(np.pad(differs, 1)))[1:-1, 1:-1] > reach
         if not deep.any():
-            continue
+            return
         near = np.asarray(ndimage.distance_transform_edt(~deep)) <= reach + 1
         cameras.cut(view, doubted[view]).copy_(torch.from_numpy(differs & near))
+
+    side_by_side(doubt_, enumerate(surface_depths(hull, grid, cameras)))
     return doubted

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from univoxel.camera import Cameras, image_rays, looked_at, projection_matrices
+from univoxel.camera import Cameras, image_rays, looked_at, pixel_rays, project, projection_matrices
 from univoxel.fields.dense import DenseDistances
 from univoxel.grid import GridShape
 from univoxel.ops import VisibilityScene, match_cost, semi_global
@@ -33,14 +33,30 @@ def surface_depths(sdf: Tensor, grid: GridShape, cameras: Cameras) -> Iterator[T
         sdf: [X, Y, Z] world units.
         grid: of the sdf.
     """
-    surface = VisibilityScene(*DenseDistances(grid, sdf).isosurface())
+    vertices, triangles = DenseDistances(grid, sdf).isosurface()
+    surface = VisibilityScene(vertices, triangles)
     for view in range(len(cameras)):
-        rays = image_rays(cameras, view)
-        distance = surface.closest_hit(rays.origin, rays.direction).t
         stored = torch.full((cameras.height, cameras.width), torch.inf)
-        shown = cameras.cut(view, stored)
-        shown.copy_(distance.view(shown.shape))
+        rows, columns = _shown_in(cameras, view, vertices)
+        pixel = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).reshape(-1, 2) + 0.5
+        rays = pixel_rays(cameras, torch.tensor(view), pixel)
+        distance = surface.closest_hit(rays.origin, rays.direction).t
+        stored[rows[:, None], columns] = distance.view(len(rows), len(columns))
         yield stored
+
+
+def _shown_in(cameras: Cameras, view: int, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows and columns of a view's pixels, int64, outside of which it shows no point of [P, 3]."""
+    width, height = cameras.size(view)
+    pixel, depth = project(cameras, view, points)
+    if not len(points) or not (depth > 0).all():  # some beside the camera: they may be anywhere
+        return torch.arange(height), torch.arange(width)
+    low, high = pixel.amin(0).floor().tolist(), pixel.amax(0).ceil().tolist()
+    columns, rows = (
+        torch.arange(max(0, int(low[i])), max(0, min(n, int(high[i]))))
+        for i, n in enumerate((width, height))
+    )
+    return rows, columns
 
 
 def depth_maps(

@@ -11,6 +11,11 @@ from univoxel.camera import Cameras, looked_at, project
 from univoxel.errors import UserError
 from univoxel.grid import GridShape, fit_coarse, fit_grid, resample
 from univoxel.preparation.config import HULL, HullConfig
+from univoxel.threads import side_by_side
+
+PIECE = (
+    2**15
+)  # points that a thread works on at a time: what is computed of them stays in its cache
 
 
 def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
@@ -23,23 +28,28 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
         cameras: V, which know the sizes of the pictures, where these differ.
     """
     result = np.full(alpha.shape, np.inf, np.float32)
-    for v in range(len(alpha)):
-        a = (alpha[v] if cameras is None else cameras.cut(v, alpha[v])).numpy()
-        shown = result[v, : a.shape[0], : a.shape[1]]
-        inside = a >= 0.5
-        if not inside.any():
-            shown[:] = max(a.shape)  # nothing seen: everything is far outside
-            continue
-        if inside.all():
-            shown[:] = -max(a.shape)  # it ends beyond the picture, nobody knows where
-            continue
-        outside, depth = (ndimage.distance_transform_edt(m) for m in (~inside, inside))
-        d = np.asarray(outside) - np.asarray(depth)
-        # Next to the edge the distance to pixel centres is 1; coverage says where in between.
-        edge = np.abs(d) <= 1
-        d = d - np.sign(d) * 0.5
-        shown[:] = np.where(edge & (a > 0) & (a < 1), 0.5 - a, d)
+
+    def fill_(view: int) -> None:
+        a = (alpha[view] if cameras is None else cameras.cut(view, alpha[view])).numpy()
+        result[view, : a.shape[0], : a.shape[1]] = _mask_distance(a)
+
+    side_by_side(fill_, range(len(alpha)))
     return torch.from_numpy(result)
+
+
+def _mask_distance(alpha: np.ndarray) -> np.ndarray | float:
+    """That of one picture [H, W], or of all its pixels."""
+    inside = alpha >= 0.5
+    if not inside.any():
+        return max(alpha.shape)  # nothing seen: everything is far outside
+    if inside.all():
+        return -max(alpha.shape)  # it ends beyond the picture, nobody knows where
+    outside, depth = (ndimage.distance_transform_edt(m) for m in (~inside, inside))
+    d = np.asarray(outside) - np.asarray(depth)
+    # Next to the edge the distance to pixel centres is 1; coverage says where in between.
+    edge = np.abs(d) <= 1
+    d = d - np.sign(d) * 0.5
+    return np.where(edge & (alpha > 0) & (alpha < 1), 0.5 - alpha, d)
 
 
 def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor, votes: int = 1) -> Tensor:
@@ -54,6 +64,11 @@ def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor, votes: int = 1)
         votes: views, >= 1, that have to say so before a point is outside; with more than one the
             hull is somewhat too large, and wrong masks of fewer views do not bite into it.
     """
+    pieces = side_by_side(lambda p: _hull_sdf(distance, cameras, p, votes), points.split(PIECE))
+    return torch.cat(pieces)
+
+
+def _hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor, votes: int) -> Tensor:
     highest = torch.full((votes, len(points)), -torch.inf)  # of the views so far, the largest first
     for v in range(len(cameras)):
         pixel, depth = project(cameras, v, points)

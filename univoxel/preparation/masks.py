@@ -15,6 +15,7 @@ from univoxel.data import Photos
 from univoxel.names import MasksFrom
 from univoxel.preparation.config import MASKS, MaskConfig
 from univoxel.preparation.hull import mask_distances
+from univoxel.threads import side_by_side
 
 log = logging.getLogger("univoxel")
 
@@ -64,8 +65,9 @@ def _change(
 ) -> Tensor:
     """How much colours change towards the masks' edges, in the mean over pixels whose depth inside
     is 0, 1, ... deepest: [deepest + 1] sRGB a pixel; NaN where there are few."""
-    total, count = torch.zeros(2, deepest + 1)
-    for c, covered, d in zip(color, coverage, distance, strict=True):
+
+    def of_view(view: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        c, covered, d = view
         encoded = c.float() / 255 if c.dtype == torch.uint8 else linear_to_srgb(c)
         around = encoded[covered < 0.01]
         same = (around == around.median(0).values).all(1) if len(around) else torch.ones(1)
@@ -75,8 +77,13 @@ def _change(
         depth = (0.5 - d).floor().long()
         y, x = (~hidden & (depth >= 0) & (depth <= deepest)).nonzero(as_tuple=True)
         inward, _ = _slopes(encoded, d, y, x)
-        total += torch.bincount(depth[y, x], inward, deepest + 1)
-        count += torch.bincount(depth[y, x], minlength=deepest + 1)
+        at = depth[y, x]
+        return torch.bincount(at, inward, deepest + 1), torch.bincount(at, minlength=deepest + 1)
+
+    total, count = torch.zeros(2, deepest + 1)
+    for change, pixels in side_by_side(of_view, zip(color, coverage, distance, strict=True)):
+        total += change
+        count += pixels
     return torch.where(count >= cfg.min_pixels, total / count, torch.nan)
 
 
