@@ -159,7 +159,7 @@ def browser():
     ours_in, from_browser = os.pipe()
     with tempfile.TemporaryDirectory() as profile:
         # The browser reads from descriptor 3 and writes to 4
-        inherited = f"exec 3<&{to_browser} 4>&{from_browser}; exec \"$@\""
+        inherited = f'exec 3<&{to_browser} 4>&{from_browser}; exec "$@"'
         process = subprocess.Popen(
             ["bash", "-c", inherited, "bash", installed(), *FLAGS, f"--user-data-dir={profile}"],
             pass_fds=(to_browser, from_browser),

@@ -40,7 +40,7 @@ RECOVERED = "recovered"  # name of the light that the photographs were taken in
 JPEG_QUALITY = 92  # of textures
 START = (30.0, 18.0)  # azimuth and elevation of the first view, degrees, where photographs lack
 ELEVATIONS = (5.0, 40.0)  # that a first view is brought to, degrees
-TEXTURED_FACES = 20_000  # most triangles: the texture holds what they are too coarse for
+FACES = 12_000  # most triangles: the texture holds what they are too coarse for
 LICENCE = "Drawn with three.js, \u00a9 three.js authors, MIT licence, in the page's source."
 SOURCES = {name: f"Map {name!r}: Greg Zaal, Poly Haven, CC0." for name in PHOTOGRAPHED}
 KEYS = """1 to 5: layers
@@ -59,8 +59,9 @@ class PageOptions:
 
     title: str | None = None  # None: the run folder's name
     envmaps: Sequence[str | Path] = ()  # maps to offer before the usual ones
+    notes: str = ""  # what to tell first
     measures: Mapping[str, str] = field(default_factory=dict)  # what to tell, by what it is
-    faces: int = TEXTURED_FACES  # most triangles
+    faces: int = FACES  # most triangles
     texture_size: int = TEXTURE_SIZE  # texels along a side, a power of 2
 
     def __post_init__(self) -> None:
@@ -111,7 +112,7 @@ def page_text(run: Path, scene: Scene, options: PageOptions = PageOptions()) -> 
     parts = {
         "title": html.escape(title),
         "facts": html.escape(" \u00b7 ".join(facts)),
-        "about": about(run, {**dict(options.measures)}, [light.name for light in lights]),
+        "about": about(run, options, [light.name for light in lights]),
         "generator": f"univoxel {__version__}",
         "model": base64.b64encode(model(scene, options)).decode(),
         "scene": json.dumps(described, separators=(",", ":")).replace("</", "<\\/"),
@@ -170,13 +171,13 @@ def facts_of(run: Path) -> list[str]:
     return said + ([f"held-out pixels {quality[-1]:.1f} dB"] if quality else [])
 
 
-def about(run: Path, measures: Mapping[str, str], lights: Sequence[str]) -> str:
-    """The page's panel: measures, what photographs leave open, where all comes from."""
-    parts = []
-    if measures:
+def about(run: Path, options: PageOptions, lights: Sequence[str]) -> str:
+    """The page's panel: notes, measures, what photographs leave open, where all comes from."""
+    parts = [f"<p>{html.escape(options.notes)}</p>"] if options.notes else []
+    if options.measures:
         rows = "".join(
             f"<tr><td>{html.escape(what)}<td>{html.escape(value)}"
-            for what, value in measures.items()
+            for what, value in options.measures.items()
         )
         parts.append(f"<h2>Measures on the test views</h2><table>{rows}</table>")
     trust = run / "trust.txt"
