@@ -95,16 +95,17 @@ class Tab:
             case "Page.loadEventFired":
                 self._events.append(event)
 
+    def window(self, width, height, phone=False):
+        """Give the window a size, and a finger in place of the mouse."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": phone}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
+        still = [{"name": "prefers-reduced-motion", "value": "reduce"}]
+        self.call("Emulation.setEmulatedMedia", features=still)
+        self.call("Emulation.setTouchEmulationEnabled", enabled=phone)
+
     def open(self, url, width=1280, height=800, phone=False):
         """Open a page in a window of some size; wait until it has loaded."""
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=2 if phone else 1,
-            mobile=phone,
-        )
-        self.call("Emulation.setTouchEmulationEnabled", enabled=phone)
+        self.window(width, height, phone)
         self._events.clear()
         self.call("Page.navigate", url=url)
         while not self._events:

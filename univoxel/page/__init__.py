@@ -37,6 +37,7 @@ from univoxel.training.progress import LOG
 
 FOLDER = Path(__file__).parent
 RECOVERED = "recovered"  # name of the light that the photographs were taken in
+OFFSET = 0.1  # voxels, from the surface, where rays start
 JPEG_QUALITY = 92  # of textures
 START = (30.0, 18.0)  # azimuth and elevation of the first view, degrees, where photographs lack
 ELEVATIONS = (5.0, 40.0)  # that a first view is brought to, degrees
@@ -127,7 +128,7 @@ def model(scene: Scene, options: PageOptions) -> bytes:
     """The scene's surface as GLB with what light reaches its vertices; textures as JPEG."""
     surface = simplify(clean(Mesh(*scene.field.isosurface())), options.faces)
     mesh = bake(scene, surface, options.texture_size)
-    return glb(mesh, JPEG_QUALITY, attributes(transfer(mesh, scene.field.voxel_size)))
+    return glb(mesh, JPEG_QUALITY, attributes(transfer(mesh, OFFSET * scene.field.voxel_size)))
 
 
 def attributes(found: Transfer) -> dict[str, Tensor]:
@@ -165,10 +166,10 @@ def facts_of(run: Path) -> list[str]:
         lines = [json.loads(line) for line in (run / LOG).read_text("utf-8").splitlines()]
         seconds = [line["seconds"] for line in lines]
         quality = [line["held_out_psnr"] for line in lines if line["held_out_psnr"] is not None]
+        said = [f"trained in {seconds[-1]:.0f} s on the CPU"] if seconds else []
+        return said + ([f"held-out pixels {quality[-1]:.1f} dB"] if quality else [])
     except (OSError, ValueError, LookupError, TypeError):  # only told of where it can be read
         return []
-    said = [f"trained in {seconds[-1]:.0f} s on the CPU"] if seconds else []
-    return said + ([f"held-out pixels {quality[-1]:.1f} dB"] if quality else [])
 
 
 def about(run: Path, options: PageOptions, lights: Sequence[str]) -> str:

@@ -30,7 +30,7 @@
   const world = new THREE.Scene();
   const camera = new THREE.PerspectiveCamera(FIELD_OF_VIEW, 1, 0.1, 100);
   const orbit = new THREE.OrbitControls(camera, renderer.domElement);
-  orbit.enableDamping = true;
+  orbit.enableDamping = !matchMedia("(prefers-reduced-motion: reduce)").matches;
   orbit.dampingFactor = 0.12;
   const prefilter = new THREE.PMREMGenerator(renderer);
 
@@ -174,7 +174,6 @@
     const [azimuth, elevation] = scene.view.map((degrees) => (degrees * Math.PI) / 180);
     const across = Math.cos(elevation);
     const back = [across * Math.cos(azimuth), Math.sin(elevation), -across * Math.sin(azimuth)];
-    const tall = Math.min(1, innerHeight / innerWidth);
     const room = innerWidth < 640 ? 1.0 : 1.12; // for the dock
     const distance = (room * ball.radius) / Math.sin((FIELD_OF_VIEW * Math.PI) / 360);
     orbit.target.copy(ball.center);
@@ -182,7 +181,6 @@
     orbit.minDistance = 0.3 * ball.radius;
     orbit.maxDistance = 4 * distance;
     draw();
-    return tall;
   }
 
   function resize() {
@@ -388,5 +386,8 @@
 
   const ready = start();
   ready.catch((error) => say(`The object could not be shown: ${error.message}`));
-  window.univoxel = { ready, set, picture, state, layers: LAYERS, lights: lights.map((light) => light.name) };
+  window.univoxel = {
+    ready, set, picture, state, layers: LAYERS, lights: lights.map((light) => light.name),
+    eye: () => camera.position.toArray(),
+  };
 })();
