@@ -18,6 +18,7 @@ from browser import browser
 
 DESK, PHONE = (1160, 720), (360, 720)
 GAP = 12  # pixels between them
+SCALE = 0.75  # of what is written
 
 
 def main(page: Path, out: Path) -> None:
@@ -32,7 +33,8 @@ def main(page: Path, out: Path) -> None:
     picture = Image.new("RGB", (DESK[0] + GAP + PHONE[0], DESK[1]), "white")
     picture.paste(shots[0], (0, 0))
     picture.paste(shots[1], (DESK[0] + GAP, 0))
-    picture.quantize(256, dither=Image.Dither.FLOYDSTEINBERG).save(out / "page.png", optimize=True)
+    size = [round(SCALE * side) for side in picture.size]
+    picture.resize(size, Image.Resampling.LANCZOS).save(out / "page.png", optimize=True)
 
 
 if __name__ == "__main__":
