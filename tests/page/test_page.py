@@ -289,11 +289,15 @@ def test_mistakes_are_named(tmp_path):
 
 
 def test_a_page_is_written_whole(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(page, "load_scene", lambda run: scene)
+    monkeypatch.setattr(page, "load_checkpoint", lambda run: (scene, {"seconds": 61.0}))
+    line = {"seconds": 55.0, "held_out_psnr": None}
+    (tmp_path / "log.jsonl").write_text(json.dumps(line) + "\n")
     target = tmp_path / "new" / "mug.html"
     assert page.write_page(tmp_path, target, **vars(SMALL)) == target
     assert [path.name for path in target.parent.iterdir()] == ["mug.html"]
-    assert target.read_text(encoding="utf-8").startswith("<!doctype html>")
+    text = target.read_text(encoding="utf-8")
+    assert text.startswith("<!doctype html>")
+    assert "trained in 61 s" in text  # the log ends before the training
 
 
 def test_training_ends_well_without_a_page(tmp_path, monkeypatch, caplog):

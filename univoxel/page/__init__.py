@@ -24,7 +24,7 @@ from univoxel.assets.bake import bake
 from univoxel.assets.gltf import glb
 from univoxel.assets.topology import clean, simplify
 from univoxel.camera import looked_at
-from univoxel.checkpoint import load_scene
+from univoxel.checkpoint import load_checkpoint
 from univoxel.errors import UserError
 from univoxel.files import replacing
 from univoxel.names import MAP_ROWS, TEXTURE_SIZE
@@ -89,7 +89,8 @@ def write_page(run: str | Path, path: str | Path, **options: Any) -> Path:
     run, path = Path(run), Path(path)
     if path.suffix.lower() not in (".html", ".htm"):
         raise UserError(f"html: expected a file that ends in .html, got {path}", "html")
-    text = page_text(run, load_scene(run), PageOptions(**options))
+    scene, state = load_checkpoint(run)
+    text = page_text(run, scene, PageOptions(**options), state.get("seconds"))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -97,15 +98,21 @@ def write_page(run: str | Path, path: str | Path, **options: Any) -> Path:
 
 
 @torch.no_grad()
-def page_text(run: Path, scene: Scene, options: PageOptions = PageOptions()) -> str:
+def page_text(
+    run: Path,
+    scene: Scene,
+    options: PageOptions = PageOptions(),
+    seconds: float | None = None,
+) -> str:
     """The page of a scene as HTML; errors as of `write_page`.
 
     Args:
         run: the scene's folder; what is missing of log, trust report and photographs is left out.
+        seconds: of training; None: as the log has it, which ends a little earlier.
     """
     lights = lights_of(scene, options)
     title = options.title or run.resolve().name or "univoxel"
-    facts = facts_of(run)
+    facts = facts_of(run, seconds)
     described = {
         "view": first_view(run),
         "lights": [as_json(light) for light in lights],
@@ -160,13 +167,18 @@ def first_view(run: Path) -> tuple[float, float]:
     return round(math.degrees(math.atan2(y, x)), 2), round(min(max(elevation, low), high), 2)
 
 
-def facts_of(run: Path) -> list[str]:
-    """What the run's log tells of it, in a few words each; empty where there is none."""
+def facts_of(run: Path, total: float | None = None) -> list[str]:
+    """What the run's log tells of it, in a few words each; empty where there is none.
+
+    Args:
+        total: seconds of training; None: up to the log's last line.
+    """
     try:
         lines = [json.loads(line) for line in (run / LOG).read_text("utf-8").splitlines()]
         seconds = [line["seconds"] for line in lines]
         quality = [line["held_out_psnr"] for line in lines if line["held_out_psnr"] is not None]
-        said = [f"trained in {seconds[-1]:.0f} s on the CPU"] if seconds else []
+        took = total or seconds[-1]
+        said = [f"trained in {took:.0f} s on the CPU"]
         return said + ([f"held-out pixels {quality[-1]:.1f} dB"] if quality else [])
     except (OSError, ValueError, LookupError, TypeError):  # only told of where it can be read
         return []
