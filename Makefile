@@ -12,12 +12,13 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test network-test fuzz lint format bench docs docs-check docs-write asan wheel wheel-test clean
+.PHONY: help dev demo test page-test network-test fuzz lint format bench docs docs-check docs-write asan wheel wheel-test clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo    train, evaluate and relight the bundled scene; prints the page to open"
 	@echo "make test    all tests"
+	@echo "make page-test  the page in a browser; brings in Debian's chromium where none is"
 	@echo "make fuzz    thousands of damaged files for every reader; prints a table"
 	@echo "make network-test  masks of the real network; fetches its weights, 4.5 MB"
 	@echo "make lint    formatting, lint and types, as CI checks them"
@@ -46,6 +47,10 @@ demo: dev
 
 test: dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(TWO)
+
+page-test: dev
+	scripts/browser.sh
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/page
 
 fuzz: dev
 	$(BIN)/python tests/fuzz.py --cases 300

@@ -28,7 +28,7 @@ LAYERS = [
     {"joint"},
     {"confidence"},
     {"compression", "pictures"},
-    {"build", "capture", "evaluation", "segmentation"},
+    {"build", "capture", "evaluation", "page", "segmentation"},
     {"tasks"},
     {"tasks.demo", "tasks.submit"},
     {"api"},
@@ -60,6 +60,7 @@ HELPERS = {
     "pictures": {"animation"},
     "evaluation": {"measures", "truth"},
     "segmentation": {"config", "distances", "vote"},
+    "page": {"maps", "transfer"},
     "capture": {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
         "prepare",

@@ -106,6 +106,7 @@ def calls(monkeypatch):
     found = {"chosen": [{"said": "lobes 24 -> 12"}]}
     replace("info", found, tables=lambda found: ["parts", "sizes"])
     replace("demo", Path("demo/index.html"))
+    replace("view", Path("mug.html"), with_page=lambda run: run)
     return types.SimpleNamespace(noted=noted, replace=replace, stand_in=stand_in, task=task)
 
 
@@ -256,9 +257,10 @@ def test_eval(calls, capsys):
     ]
 
 
-def test_relight_export_and_demo(calls, capsys):
+def test_relight_export_view_and_demo(calls, capsys):
     assert main(["relight", "run", "--envmap", "maps/hall.exr", "--rotate", "90"]) == 0
     assert main(["export", "run", "--mesh", "out.ply"]) == 0
+    assert main(["view", "run", "--html", "mug.html", "--envmap", "maps/hall.exr"]) == 0
     assert main(["demo", "--out", "demo"]) == 0
     paths = (Path("run"), Path("maps/hall.exr"), Path("run/relight/hall"))
     options = {"faces": None, "texture_size": 1024, "watertight": False}
@@ -266,10 +268,11 @@ def test_relight_export_and_demo(calls, capsys):
     assert (name, given, chosen["cameras"], chosen["rotate"]) == ("relight", paths, "test", 90.0)
     assert others == [
         ("export", (Path("run"), Path("out.ply")), options),
+        ("view", (Path("run"), Path("mug.html")), {"envmap": (paths[1],), "title": None}),
         ("demo", (Path("demo"),), {}),
     ]
     printed = capsys.readouterr().out.split()
-    assert printed == ["run/relight/hall", "out.ply", "demo/index.html"]
+    assert printed == ["run/relight/hall", "out.ply", "mug.html", "demo/index.html"]
 
 
 def test_envmap(calls, capsys):
@@ -443,8 +446,8 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "Unrecognized options: sing"),
         (
             [],
-            "Expected one of {poses, cutout, train, eval, relight, export, envmap, submit, "
-            "inspect, info, compare, chart, stress, demo, doctor}",
+            "Expected one of {poses, cutout, train, eval, relight, export, view, envmap, "
+            "submit, inspect, info, compare, chart, stress, demo, doctor}",
         ),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,8 +15,10 @@ from univoxel.camera import Cameras, stacked
 from univoxel.checkpoint import load_scene
 from univoxel.config import TrainConfig
 from univoxel.envmap import EnvMap
+from univoxel.errors import UserError
 from univoxel.names import ELEVATION, MAP_ROWS, Differing, LightName, PresetOrAuto
 from univoxel.overrides import changed
+from univoxel.page import SMALL, page_text, write_page
 from univoxel.pictures.viewpoints import views_of
 from univoxel.presets import chosen
 from univoxel.records import Mesh
@@ -53,6 +56,15 @@ class Run:
 
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r})"
+
+    def _repr_html_(self) -> str | None:
+        """The page of `univoxel view` in a frame, for notebooks; None where there is no surface."""
+        try:
+            text = page_text(self.path, self.scene, SMALL)
+        except UserError:
+            return None
+        style = "width: 100%; height: 600px; border: 0"
+        return f'<iframe srcdoc="{html.escape(text)}" style="{style}"></iframe>'
 
     @torch.no_grad()
     def render(
@@ -107,6 +119,18 @@ class Run:
         """
         export(self.path, path, **options)
         return Path(path)
+
+    def page(self, path: str | Path, **options: Any) -> Path:
+        """Write one web page to look at it, to light it and to send it; return the file.
+
+        Args:
+            options: fields of `univoxel.page.PageOptions`.
+
+        Raises:
+            UserError: a map cannot be used, or there is no surface.
+            OSError: a file cannot be read or written.
+        """
+        return write_page(self.path, path, **options)
 
     def light(self, height: int = MAP_ROWS) -> EnvMap:
         """The environment map that was recovered, `height` rows of it.

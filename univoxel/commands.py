@@ -203,20 +203,20 @@ def train(
     from univoxel.overrides import changed
     from univoxel.presets import chosen, with_field
     from univoxel.tasks import train as task
+    from univoxel.tasks.view import with_page
 
     check_minutes(minutes)
     if not resume and (out / "scene.safetensors").exists():
         raise ExistingFile(f"{out} holds a run already: add --resume, or choose another --out")
     config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
     options = {"masks": masks, "cameras": cameras, "allow_outside": allow_outside}
+    options |= {} if light_frame == "auto" else {"light_frame": light_frame}
     config = dataclasses.replace(config, downscale=check_downscale(downscale), **options)
     config = with_field(config, field)
-    if light_frame != "auto":
-        config = dataclasses.replace(config, light_frame=light_frame)
     capacity = "adaptive" if budget_mb is not None and capacity == "auto" else capacity
     if capacity != "auto":
         config = dataclasses.replace(config, capacity=capacity, budget_mb=budget_mb)
-    print(task.train(changed(config, set), resume=resume, timelapse=timelapse))
+    print(with_page(task.train(changed(config, set), resume=resume, timelapse=timelapse)))
 
 
 def cutout(
@@ -469,6 +469,31 @@ def export(
     print(mesh)
 
 
+def view(
+    run: Run,
+    /,
+    html: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="(required)")] = None,
+    envmap: Annotated[
+        tuple[Path, ...],
+        arg(metavar="MAP [MAP ...]", help_behavior_hint="(default: the usual ones alone)"),
+    ] = (),
+    title: Annotated[
+        str | None, arg(metavar="TEXT", help_behavior_hint="(default: the folder's name)")
+    ] = None,
+) -> None:
+    """Write a run as one web page to look at, to light and to send; it needs no network.
+
+    Args:
+        run: folder of a trained run
+        html: the page to write
+        envmap: equirectangular maps to offer, before the usual ones
+        title: what stands above the object
+    """
+    from univoxel.tasks import view as task
+
+    print(task.view(run, html, envmap=envmap, title=title))
+
+
 def envmap(
     run: Run,
     /,
@@ -719,6 +744,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "eval": evaluate,
     "relight": relight,
     "export": export,
+    "view": view,
     "envmap": envmap,
     "submit": submit,
     "inspect": inspect,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pygltflib as gltf
 import torch
 from PIL import Image
+from torch import Tensor
 
 from univoxel import __version__
 from univoxel.assets.base import (
@@ -27,11 +29,26 @@ Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 def write_glb(path: Path, mesh: TexturedMesh) -> None:
     """Write a textured mesh as GLB, turned to +Y up, whole or not at all.
 
+    Raises:
+        OSError: the file cannot be written; nothing is left behind.
+    """
+    data = glb(mesh)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def glb(
+    mesh: TexturedMesh, jpeg: int | None = None, extra: Mapping[str, Tensor] | None = None
+) -> bytes:
+    """A textured mesh as GLB, turned to +Y up.
+
     One mesh with one metallic-roughness material: base colour (sRGB), roughness in green and
     metallic in blue (linear), and a normal map for the tangents that are written beside it.
 
-    Raises:
-        OSError: the file cannot be written; nothing is left behind.
+    Args:
+        jpeg: quality of textures as JPEG, 1 to 95; None: PNG, which loses nothing.
+        extra: more attributes of vertices, [P, 4] float in [-1, 1], stored in 16 bits; names
+            begin with an underscore.
 
     Source: Khronos Group, glTF 2.0 Specification, sections 3.7, 3.9 and 4.4.
     """
@@ -76,6 +93,10 @@ def write_glb(path: Path, mesh: TexturedMesh) -> None:
         NORMAL=_accessor(file, blob, mesh.normals @ Y_UP.T, gltf.VEC3),
         TANGENT=_accessor(file, blob, tangents, gltf.VEC4),
         TEXCOORD_0=_accessor(file, blob, uv, gltf.VEC2),
+        **{
+            name: _accessor(file, blob, (32767 * values).round().short(), gltf.VEC4)
+            for name, values in (extra or {}).items()
+        },
     )
     indices = _accessor(file, blob, mesh.faces.reshape(-1), gltf.SCALAR)
     primitive = gltf.Primitive(attributes=attributes, indices=indices, material=0)
@@ -85,14 +106,22 @@ def write_glb(path: Path, mesh: TexturedMesh) -> None:
         ("occlusion roughness metallic", packed),
         ("normal", relief_picture(mesh)),
     ):
-        encoded = io.BytesIO()
-        Image.fromarray(picture).save(encoded, format="PNG")
-        view = _view(file, blob, encoded.getvalue(), None)
-        file.images.append(gltf.Image(name=name, mimeType="image/png", bufferView=view))
+        view = _view(file, blob, _encoded(picture, jpeg), None)
+        kind = "image/png" if jpeg is None else "image/jpeg"
+        file.images.append(gltf.Image(name=name, mimeType=kind, bufferView=view))
     file.buffers = [gltf.Buffer(byteLength=len(blob))]
     file.set_binary_blob(bytes(blob))
-    with replacing(path) as temporary:
-        temporary.write_bytes(b"".join(file.save_to_bytes()))
+    return b"".join(file.save_to_bytes())
+
+
+def _encoded(picture: np.ndarray, jpeg: int | None) -> bytes:
+    """A picture as the bytes of a PNG file, or of a JPEG file of some quality."""
+    file = io.BytesIO()
+    if jpeg is None:
+        Image.fromarray(picture).save(file, format="PNG")
+    else:  # 4:4:4: channels of these are no colours
+        Image.fromarray(picture).save(file, format="JPEG", quality=jpeg, subsampling=0)
+    return file.getvalue()
 
 
 def _view(file: gltf.GLTF2, blob: bytearray, data: bytes, target: int | None) -> int:
@@ -105,17 +134,23 @@ def _view(file: gltf.GLTF2, blob: bytearray, data: bytes, target: int | None) ->
 
 
 def _accessor(
-    file: gltf.GLTF2, blob: bytearray, values: torch.Tensor, kind: str, bounds: bool = False
+    file: gltf.GLTF2, blob: bytearray, values: Tensor, kind: str, bounds: bool = False
 ) -> int:
-    """Append values to the buffer, floats of vertices or integers of indices; their index."""
+    """Append values to the buffer; their index.
+
+    Floats and 16-bit integers, which stand for [-1, 1], are of vertices, other integers indices.
+    """
     array = values.numpy()
-    index = not values.is_floating_point()
+    short = values.dtype == torch.int16
+    index = not short and not values.is_floating_point()
     target = gltf.ELEMENT_ARRAY_BUFFER if index else gltf.ARRAY_BUFFER
-    array = array.astype("<u4" if index else "<f4")
+    array = array.astype("<i2" if short else "<u4" if index else "<f4")
+    stored = gltf.SHORT if short else gltf.UNSIGNED_INT if index else gltf.FLOAT
     file.accessors.append(
         gltf.Accessor(
             bufferView=_view(file, blob, array.tobytes(), target),
-            componentType=gltf.UNSIGNED_INT if index else gltf.FLOAT,
+            componentType=stored,
+            normalized=short,
             count=len(array),
             type=kind,
             min=array.min(0).tolist() if bounds else None,
