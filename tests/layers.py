@@ -31,6 +31,7 @@ LAYERS = [
     {"build", "capture", "evaluation", "segmentation"},
     {"tasks"},
     {"tasks.demo", "tasks.submit"},
+    {"tasks.capture"},
     {"api"},
     {"experiments.plots", "experiments.record"},
     {"experiments.worker"},
@@ -62,7 +63,7 @@ HELPERS = {
     "segmentation": {"config", "distances", "vote"},
     "capture": {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
-        "prepare",
+        *("prepare", "video"),
     },
     "experiments.stress": {"axes", "damage", "render", "report", "rough", "scenes", "shapes"},
 }

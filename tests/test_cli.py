@@ -98,6 +98,8 @@ def calls(monkeypatch):
 
     replace("train", Path("run"))
     replace("poses", Path("scene"))
+    made = types.SimpleNamespace(page=Path("mug/index.html"), mesh=Path("mug/mug.glb"))
+    replace("capture", made)
     replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)
     stand_in("univoxel.tasks.relight", relight_to_files=task("relight", None))
@@ -443,8 +445,8 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "Unrecognized options: sing"),
         (
             [],
-            "Expected one of {poses, cutout, train, eval, relight, export, envmap, submit, "
-            "inspect, info, compare, chart, stress, demo, doctor}",
+            "Expected one of {capture, poses, cutout, train, eval, relight, export, envmap, "
+            "submit, inspect, info, compare, chart, stress, demo, doctor}",
         ),
     ],
 )
