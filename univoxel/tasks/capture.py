@@ -257,11 +257,12 @@ def _find_masks(project: Project, scene: Path, masks: str | Path) -> Path:
             )
         _skip("masks", project.cut)
         return project.cut
-    if asked == AUTO and _have_masks(project, scene):
+    turned = bool(facts.get("turned"))
+    if asked == AUTO and not turned and _have_masks(project, scene):
         _skip("masks", scene)
         return scene
     project.remember(masks=asked)
-    if facts.get("turned"):
+    if turned:
         source = scene / "masks"  # those that the cameras were found with
     elif asked == AUTO:
         source = _best_source()
@@ -313,7 +314,7 @@ def _train(wanted: TrainConfig, on_progress: Callable[[TrainingProgress], None] 
         _check_trained(wanted, done)
     if not done:
         _say("training", "goes on" if begun else f"on {data}")
-        return train(wanted, resume=True, on_progress=on_progress)
+        return train(wanted, resume=begun, on_progress=on_progress)
     _skip("training", run)
     newest = max((p.stat().st_mtime_ns for p in data.rglob("*.png")), default=0)
     if newest > (run / FILE).stat().st_mtime_ns:
