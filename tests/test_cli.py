@@ -144,6 +144,20 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
 
 
+def test_capture(calls, capsys):
+    options = ["--masks", "rembg", "--preset", "draft", "--light", "sg", "--minutes", "2"]
+    assert main(["capture", "photos", "--out", "mug", *options, "--set=seed=3"]) == 0
+    assert capsys.readouterr().out == "mug/index.html\nmug/mug.glb\n"
+    told = {"masks": "rembg", "preset": "draft", "light": "sg", "minutes": 2.0}
+    expected = {**told, "changes": ("seed=3",)}
+    assert calls.noted == [("capture", (Path("photos"), Path("mug")), expected)]
+    assert main(["capture", "photos", "--out", "mug", "--minutes", "0"]) == 2
+    assert "--minutes must be above 0" in capsys.readouterr().err
+    calls.replace("capture", KeyboardInterrupt())
+    assert main(["capture", "photos", "--out", "mug"]) == 130
+    assert "mug keeps the steps that are done: the same command" in capsys.readouterr().err
+
+
 def test_poses(calls, capsys):
     from univoxel.capture.config import DEFAULTS, FAST
 
