@@ -11,6 +11,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from univoxel.capture import structure
 from univoxel.capture.config import CaptureConfig
@@ -27,9 +28,10 @@ CHANGES = tuple(
 )
 
 
-def make(photographs: Path, masks: Path, out: Path) -> task.Captured:
-    """A capture of little work."""
-    options = {"preset": "draft", "light": "baked", "changes": CHANGES}
+def make(given: tuple[Path, Path], out: Path) -> task.Captured:
+    """A capture of little work, of photographs and a folder of masks."""
+    photographs, masks = given
+    options: Any = {"preset": "draft", "light": "baked", "changes": CHANGES}
     return task.capture(photographs, out, masks=masks, **options, config=CONFIG, pictures=PICTURES)
 
 
@@ -72,7 +74,7 @@ def _kill_writing(suffix: str) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         replace(source, target)
 
-    os.replace = call
+    os.replace = call  # pyright: ignore[reportAttributeAccessIssue]
 
 
 if __name__ == "__main__":
@@ -81,7 +83,7 @@ if __name__ == "__main__":
         child = os.fork()
         if not child:
             kill_in(name)
-            make(PHOTOGRAPHS, MASKS, OUT)
+            make((PHOTOGRAPHS, MASKS), OUT)
             os._exit(0)
         _, status = os.waitpid(child, 0)
         files = sorted(p.relative_to(OUT).as_posix() for p in OUT.rglob("*") if p.is_file())

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import capturing
 import numpy as np
@@ -37,7 +38,7 @@ def photographs(tmp_path_factory) -> tuple[Path, Path]:
 
 @pytest.fixture(scope="module")
 def captured(photographs, tmp_path_factory) -> task.Captured:
-    return capturing.make(*photographs, tmp_path_factory.mktemp("out") / "mug")
+    return capturing.make(photographs, tmp_path_factory.mktemp("out") / "mug")
 
 
 def files_of(out: Path) -> dict[str, int]:
@@ -73,7 +74,7 @@ def test_the_same_again_only_says_what_is_there(captured, photographs, caplog):
     out = captured.page.parent
     before = files_of(out)
     with caplog.at_level(logging.INFO, "univoxel"):
-        capturing.make(*photographs, out)
+        capturing.make(photographs, out)
     said = [r.getMessage() for r in caplog.records]
     there = ("cameras", "masks", "training", "mesh", "pictures")
     for n, step in enumerate(there, 1):
@@ -98,7 +99,7 @@ def test_killed_in_each_step_the_same_call_goes_on(captured, photographs, tmp_pa
         assert not {*made[n:]} & {*files}  # not whole, so not there
         if step == "training":  # it goes on from there
             assert "run/scene.safetensors" in files
-    finished = capturing.make(*photographs, out)
+    finished = capturing.make(photographs, out)
     reference = captured.page.parent
     assert finished.mesh == out / "mug.glb"
     assert files_of(out).keys() == files_of(reference).keys()  # nothing half-written among them
@@ -124,25 +125,26 @@ def test_other_photographs_are_refused(captured, photographs, tmp_path):
         (other, "IMG_04.jpg is another file now"),
     ):
         with pytest.raises(ExistingFile, match=f"holds a capture of IMG_00.jpg and 10 .*{why}"):
-            capturing.make(folder, masks, out)
+            capturing.make((folder, masks), out)
     moved = tmp_path / "moved"
     shutil.copytree(photos, moved)  # the same photographs elsewhere
-    capturing.make(moved, masks, out)
+    capturing.make((moved, masks), out)
     before.pop("index.html")
     assert before.items() <= files_of(out).items()
 
 
 def test_what_other_options_made_is_refused(captured, photographs):
     out, (photos, masks) = captured.page.parent, photographs
-    options = {"config": capturing.CONFIG, "pictures": capturing.PICTURES}
+    options: dict[str, Any] = {"config": capturing.CONFIG, "pictures": capturing.PICTURES}
     with pytest.raises(ExistingFile, match=r"cut holds photographs with masks=.*remove it and"):
         task.capture(photos, out, **options)
     options |= {"masks": masks, "changes": capturing.CHANGES}
-    for choice in (
+    choices: list[dict[str, Any]] = [
         {"preset": "fast", "light": "baked"},
         {"preset": "draft", "light": "sg"},
         {"preset": "draft", "light": "baked", "minutes": 3.0},
-    ):
+    ]
+    for choice in choices:
         with pytest.raises(ExistingFile, match=r"run was trained with another preset, minutes"):
             task.capture(photos, out, **options, **choice)
 
@@ -154,7 +156,7 @@ def test_a_mask_that_was_mended_is_told(captured, photographs, caplog):
     try:
         os.utime(edited)
         with caplog.at_level(logging.WARNING, "univoxel"):
-            capturing.make(*photographs, out)
+            capturing.make(photographs, out)
     finally:
         os.utime(edited, ns=times)
     assert f"photographs in {(out / 'cut').absolute()} have changed since" in caplog.text
@@ -177,7 +179,7 @@ def test_a_newer_run_makes_mesh_and_pictures_anew(captured, photographs, tmp_pat
 
     monkeypatch.setattr(task, "evaluate", measures)
     assert not list((out / "pictures").rglob("*.xyz"))
-    capturing.make(*photographs, out)
+    capturing.make(photographs, out)
     assert called == ["export", "relight", "evaluate"]
     assert not any(p.is_file() for p in (out / "pictures").rglob("*"))
     assert "Measures" not in (out / "index.html").read_text("utf-8")
@@ -380,7 +382,7 @@ def test_a_turntable_without_anything_for_masks_is_one_line(steps, pictures, tmp
 
 def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypatch):
     out = tmp_path / "mug"
-    for photographs, options, error, message in (
+    cases: list[tuple[Path, dict[str, Any], type[Exception], str]] = [
         (tmp_path / "none", {}, DataError, "expected a folder of photographs or a video, got not"),
         (pictures / "0.png", {}, DataError, "got a file of another kind"),
         (pictures, {"masks": "nothing here"}, DataError, "masks: expected rembg, none or a folder"),
@@ -388,7 +390,8 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
         (pictures, {"preset": "best"}, UserError, "preset must be draft, fast or full"),
         (pictures, {"minutes": -1.0}, UserError, "minutes must be above 0"),
         (pictures, {"changes": ["colour=red"]}, UserError, "no field 'colour'"),
-    ):
+    ]
+    for photographs, options, error, message in cases:
         with pytest.raises(error, match=message):
             task.capture(photographs, out, **options)
         assert not out.exists()
