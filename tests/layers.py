@@ -31,6 +31,7 @@ LAYERS = [
     {"build", "capture", "evaluation", "page", "segmentation"},
     {"tasks"},
     {"tasks.demo", "tasks.submit"},
+    {"tasks.capture"},
     {"api"},
     {"experiments.plots", "experiments.record"},
     {"experiments.worker"},
@@ -63,7 +64,7 @@ HELPERS = {
     "page": {"maps", "transfer"},
     "capture": {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
-        "prepare",
+        *("prepare", "video"),
     },
     "experiments.stress": {"axes", "damage", "render", "report", "rough", "scenes", "shapes"},
 }

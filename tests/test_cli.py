@@ -98,6 +98,8 @@ def calls(monkeypatch):
 
     replace("train", Path("run"))
     replace("poses", Path("scene"))
+    made = types.SimpleNamespace(page=Path("mug/index.html"), mesh=Path("mug/mug.glb"))
+    replace("capture", made)
     replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)
     stand_in("univoxel.tasks.relight", relight_to_files=task("relight", None))
@@ -141,6 +143,20 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     )
     assert capsys.readouterr().out == "run\n"
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
+
+
+def test_capture(calls, capsys):
+    options = ["--masks", "rembg", "--preset", "draft", "--light", "sg", "--minutes", "2"]
+    assert main(["capture", "photos", "--out", "mug", *options, "--set=seed=3"]) == 0
+    assert capsys.readouterr().out == "mug/index.html\nmug/mug.glb\n"
+    told = {"masks": "rembg", "preset": "draft", "light": "sg", "minutes": 2.0}
+    expected = {**told, "changes": ("seed=3",)}
+    assert calls.noted == [("capture", (Path("photos"), Path("mug")), expected)]
+    assert main(["capture", "photos", "--out", "mug", "--minutes", "0"]) == 2
+    assert "--minutes must be above 0" in capsys.readouterr().err
+    calls.replace("capture", KeyboardInterrupt())
+    assert main(["capture", "photos", "--out", "mug"]) == 130
+    assert "mug keeps the steps that are done: the same command" in capsys.readouterr().err
 
 
 def test_poses(calls, capsys):
@@ -446,7 +462,7 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "Unrecognized options: sing"),
         (
             [],
-            "Expected one of {poses, cutout, train, eval, relight, export, view, envmap, "
+             "Expected one of {capture, poses, cutout, train, eval, relight, export, view, envmap, "
             "submit, inspect, info, compare, chart, stress, demo, doctor}",
         ),
     ],

@@ -4,8 +4,9 @@
     pictures = run.relight("studio.hdr", cameras="orbit 36")
 
 `open_run` opens one that is there. The tasks of the command line are functions here too:
-`cutout(data, out)` for photographs without masks, `evaluate(run)`, `relight(run, envmap)`, which
-returns pictures, and `export(run, mesh)`.
+`capture_object(photographs, out)`, all from photographs to a mesh and a page; `find_poses(
+photographs, out)`; `cutout(data, out)` for photographs without masks; `evaluate(run)`;
+`relight(run, envmap)`, which returns pictures; and `export(run, mesh)`.
 """
 
 from importlib import import_module
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from univoxel.api import train as train
     from univoxel.errors import Cancelled as Cancelled
     from univoxel.errors import UserError as UserError
+    from univoxel.tasks.capture import capture as capture_object
     from univoxel.tasks.cutout import cutout as cutout
     from univoxel.tasks.evaluate import evaluate as evaluate
     from univoxel.tasks.export import export as export
@@ -30,6 +32,7 @@ __all__ = [
     "Run",
     "TrainingProgress",
     "UserError",
+    "capture_object",
     "cutout",
     "evaluate",
     "export",
@@ -45,6 +48,7 @@ _PLACES = {
     "Run": ("univoxel.api", "Run"),
     "TrainingProgress": ("univoxel.api", "TrainingProgress"),
     "UserError": ("univoxel.errors", "UserError"),
+    "capture_object": ("univoxel.tasks.capture", "capture"),
     "find_poses": ("univoxel.tasks.poses", "poses"),
     "cutout": ("univoxel.tasks.cutout", "cutout"),
     "evaluate": ("univoxel.tasks.evaluate", "evaluate"),

@@ -17,7 +17,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff
 
 from univoxel import __version__
-from univoxel.commands import COMMANDS, chart, compare, poses, stress, train
+from univoxel.commands import COMMANDS, capture, chart, compare, poses, stress, train
 from univoxel.errors import UserError
 
 # What a command may raise for a mistake of its user, see `is_mistake`; all else is a bug and keeps
@@ -196,7 +196,7 @@ def _kept(call: functools.partial[None]) -> str:
     out = call.keywords.get("out")
     if call.func in (compare, chart, stress):
         return f"; {out} keeps the trainings that are done: the same command goes on"
-    if call.func is poses:
+    if call.func in (capture, poses):
         return f"; {out} keeps the steps that are done: the same command goes on"
     if call.func is not train or not isinstance(out, Path):
         return ""

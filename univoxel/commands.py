@@ -306,6 +306,52 @@ def poses(
     print(task.poses(photographs, out, masks, every, keep_size, keep_weak, config))
 
 
+def capture(
+    photographs: Annotated[Positional[Path], arg(metavar="PHOTOS")],
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    masks: Annotated[str, arg(metavar="auto|rembg|FOLDER|none")] = "auto",
+    preset: PresetOrAuto = "auto",
+    light: LightName = "hybrid",
+    minutes: Annotated[
+        float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
+    ] = None,
+    set: Changes = (),
+) -> None:
+    """From photographs to a mesh with materials and a page, in one command.
+
+    Finds cameras, makes masks, trains, exports DIR/DIR.glb, lights the object anew and writes
+    DIR/index.html: poses, cutout, train, export, relight and eval, one after another. What is there
+    is not made again: the same command goes on after an interruption.
+
+    Args:
+        photographs: what to begin with: a folder of photographs or a video; photographs with
+            cameras, as train reads them; or the folder of a trained run
+        out: folder to write: scene/, cut/, run/, pictures/, the mesh and the page
+        masks: where masks come from: rembg, a network; a folder of masks; none, colours alone; auto
+            takes those that the photographs bring, else the network, if it is installed, else
+            colours
+        preset: as of train
+        light: as of train
+        minutes: of training, above 0; as of train
+        set: as of train
+    """
+    from univoxel.tasks import capture as task
+
+    check_minutes(minutes)
+    made = task.capture(
+        photographs,
+        out,
+        masks=masks,
+        preset=preset,
+        minutes=minutes,
+        light=light,
+        changes=set,
+    )
+    print(made.page)
+    print(made.mesh)
+
+
 def evaluate(
     run: Run,
     /,
@@ -738,6 +784,7 @@ def doctor(
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
+    "capture": capture,
     "poses": poses,
     "cutout": cutout,
     "train": train,

@@ -31,6 +31,26 @@ class DataError(UserError):
     """Input that cannot be used: the message names the file, what was expected and what came."""
 
 
+class WithoutMasks(DataError):
+    """Photographs that nothing says of which pixels show the object."""
+
+
+class StillBackground(DataError):
+    """Photographs of an object that was turned before a still camera, and no masks of it.
+
+    Args:
+        seen: how that was seen.
+    """
+
+    def __init__(self, seen: str):
+        super().__init__(
+            f"{seen}: the object was turned before a still camera. Only what is on the object "
+            "counts: make masks of it and give them as masks=DIR",
+            "masks",
+        )
+        self.seen = seen
+
+
 class NoSurface(UserError):
     """A scene without a surface, or none of it in any photograph."""
 

@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -371,6 +372,39 @@ def test_a_step_that_fails_or_hangs_is_stopped(tmp_path, monkeypatch):
     )
     with pytest.raises(ProcessFailed, match="was stopped after 0 seconds"):
         list(engine.run("pycolmap", request, log, lambda: 0))
+
+
+ALONE = """
+import sys
+from pathlib import Path
+from univoxel.capture import engine
+step = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
+engine.command_of = lambda *_: [sys.executable, "-c", step]
+list(engine.run("pycolmap", engine.Request("match", "/", "/", "/"), Path(sys.argv[1])))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs prctl")
+def test_a_step_ends_with_who_began_it(tmp_path):
+    """Killed, it would otherwise go on alone, beside the step that is begun again."""
+    log = tmp_path / "match.log"
+    log.touch()
+    with subprocess.Popen([sys.executable, "-c", ALONE, log]) as parent:
+        while not log.read_text().endswith("\n"):
+            assert parent.poll() is None
+            time.sleep(0.05)
+        running = Path("/proc") / log.read_text().strip()
+        assert running.exists()
+        parent.kill()
+    for _ in range(600):  # it ends in an instant, on a machine with nothing else to do
+        try:
+            ended = "\nState:\tZ" in (running / "status").read_text()
+        except (FileNotFoundError, ProcessLookupError):
+            ended = True
+        if ended:
+            return
+        time.sleep(0.05)
+    pytest.fail("the step goes on")
 
 
 def test_pycolmap_stays_out_of_this_process():

@@ -66,7 +66,7 @@ def find_engine() -> Engine:
 def run(
     engine: Engine, request: Request, log: Path, done: Callable[[], int] | None = None
 ) -> Iterator[int]:
-    """Run one step and yield, while it runs, how much of it is done.
+    """Run one step and yield, while it runs, how much of it is done. It ends with this process.
 
     Args:
         log: file for what the process says.
@@ -79,8 +79,10 @@ def run(
     begin = time.monotonic()
     grace = GRACE if request.step == "map" else 0.0
     with log.open("wb") as file:
+        child = [sys.executable, "-m", "univoxel.capture.child", str(os.getpid())]
         process = subprocess.Popen(
-            command_of(engine, request, log), stdin=subprocess.DEVNULL, stdout=file, stderr=file
+            [*child, *command_of(engine, request, log)],
+            **{"stdin": subprocess.DEVNULL, "stdout": file, "stderr": file},
         )
         try:
             while process.poll() is None:

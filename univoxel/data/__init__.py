@@ -23,6 +23,7 @@ __all__ = [
     "DataError",
     "Photos",
     "Truth",
+    "has_cameras",
     "keep_photos",
     "load_cameras",
     "load_photos",
@@ -89,6 +90,11 @@ def load_photos(
         f"inputs/sfm_scene.json, keyframes/corrected_cameras, XML of Metashape, CSV of "
         f"RealityCapture, {split}_000/metadata.json)"
     )
+
+
+def has_cameras(folder: Path) -> bool:
+    """Whether a folder has one of the layouts: photographs whose cameras are known."""
+    return folder.is_dir() and any(fits(folder, "train") for fits, _ in _LAYOUTS)
 
 
 def splits_of(folder: Path) -> list[str]:

@@ -23,7 +23,7 @@ from univoxel.data.inside import inside
 from univoxel.data.kept import kept_pixels, origin_of
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
 from univoxel.data.masks import masks_by_stem, read_mask
-from univoxel.errors import DataError, UserError
+from univoxel.errors import DataError, UserError, WithoutMasks
 
 # Pixels along the longer side that photographs are shrunk to, about. An object that fills half of
 # it is 500 pixels wide, the finest grid of the presets some 160 voxels: pixels stay finer
@@ -172,7 +172,7 @@ def _read_all(
     if empty:
         raise DataError(f"{folder}: all {len(shots)} pictures are fully transparent")
     if masks and opaque:
-        raise DataError(f"{folder}: all {len(shots)} pictures are fully opaque: {HOW_TO_MASK}")
+        raise WithoutMasks(f"{folder}: all {len(shots)} pictures are fully opaque: {HOW_TO_MASK}")
     return colors, alphas
 
 
@@ -250,7 +250,7 @@ def read_photo(path: Path, mask: Path | None = None, masks: bool = True) -> tupl
     if mask is not None:
         alpha = read_mask(mask, color.shape[1], color.shape[0], turn_note(path))
     if alpha is None:
-        raise DataError(
+        raise WithoutMasks(
             f"{path}: expected an alpha channel or a mask {beside[0].name}, got neither: "
             f"{HOW_TO_MASK}"
         )

@@ -34,7 +34,7 @@ from univoxel.capture.scene import (
     written_name,
 )
 from univoxel.capture.world import moved, settle
-from univoxel.errors import DataError, ExistingFile
+from univoxel.errors import DataError, ExistingFile, StillBackground
 from univoxel.files import replacing
 from univoxel.names import KEEP_SIZE
 
@@ -78,7 +78,9 @@ def poses(
 
     Raises:
         MissingExtra: no pycolmap and no `colmap`, or no reader of a format.
-        DataError: photographs that cannot be used, or too few that can be placed.
+        DataError: photographs that cannot be used, or too few that can be placed; as
+            StillBackground where an object was turned before a still camera, and there are no
+            masks.
         ExistingFile: out holds something else.
         ProcessFailed: a step did not end well.
         OSError: a file cannot be written.
@@ -88,7 +90,7 @@ def poses(
     engine = find_engine()
     folders = Folders(out / WORK)
     _check_free(out, folders)
-    files, others, doubles = _files(source, folders, every)
+    files, others, doubles = photographs_of(source, folders, every)
     require_readers(files)
     capture, unread = gather(files, masks)
     unread += others
@@ -143,8 +145,8 @@ def _check_free(out: Path, folders: Folders) -> None:
         raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
 
 
-def _files(
-    source: Path, folders: Folders, every: float | None
+def photographs_of(
+    source: Path, folders: Folders, every: float | None = None
 ) -> tuple[list[Path], list[str], int]:
     """Photographs of a folder or frames of a video; other files; how many came twice."""
     if video.is_video(source):
@@ -211,7 +213,8 @@ def _search(
     """All steps up to the models; returns why photographs could not be read, by index.
 
     Raises:
-        DataError: the background stands still.
+        StillBackground: the background stands still, and there are no masks.
+        DataError: the masks hold a part of it.
     """
     total = len(capture.photographs)
     unreadable = {}
@@ -232,11 +235,7 @@ def _search(
     if still > config.still_share * matching:
         stands = f"the background stands still in {still} of {matching} pairs"
         if capture.masks is None:
-            raise DataError(
-                f"{stands}: the object was turned before a still camera. Only what is on the "
-                "object counts: make masks of it and give them as masks=DIR",
-                "masks",
-            )
+            raise StillBackground(stands)
         raise DataError(f"{stands}: masks hold a part of it, make them tighter", "masks")
     _follow(progress, "placing", structure.place(engine, capture, folders, config), total)
     return unreadable

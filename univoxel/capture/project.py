@@ -1,0 +1,160 @@
+"""The folder of a capture: what it is made of, and where its parts lie."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from univoxel.capture import video
+from univoxel.capture.photographs import find_photographs
+from univoxel.checkpoint import FILE
+from univoxel.data import has_cameras
+from univoxel.errors import DataError, ExistingFile
+from univoxel.files import read_json, replacing
+
+Kind = Literal["photographs", "scene", "run"]
+RECORD = "capture.json"
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a capture begins with."""
+
+    path: Path
+    kind: Kind  # a folder or a video; photographs with cameras; a trained run
+    files: list[tuple[str, int]]  # names and bytes of photographs; else the folder alone
+
+    @property
+    def words(self) -> str:
+        return _words(self.files)
+
+
+@dataclass(frozen=True)
+class Project:
+    """Where the parts of a capture lie, all below one folder."""
+
+    out: Path
+
+    @property
+    def record(self) -> Path:
+        """What the capture is made of, and what was found out on the way."""
+        return self.out / RECORD
+
+    @property
+    def scene(self) -> Path:
+        """Photographs and their cameras, as `univoxel poses` writes them."""
+        return self.out / "scene"
+
+    @property
+    def masks(self) -> Path:
+        """Of single photographs, of a turntable, made before there are cameras."""
+        return self.out / "masks"
+
+    @property
+    def cut(self) -> Path:
+        """Photographs with masks, as `univoxel cutout` writes them: what is trained on."""
+        return self.out / "cut"
+
+    @property
+    def run(self) -> Path:
+        return self.out / "run"
+
+    @property
+    def pictures(self) -> Path:
+        return self.out / "pictures"
+
+    @property
+    def mesh(self) -> Path:
+        return self.out / f"{self.out.absolute().name}.glb"
+
+    @property
+    def page(self) -> Path:
+        return self.out / "index.html"
+
+    def recorded(self) -> dict[str, Any]:
+        """What the record says; nothing where there is none."""
+        return read_json(self.record) if self.record.exists() else {}
+
+    def remember(self, **facts: Any) -> None:
+        """Write facts into the record, whole or not at all."""
+        known = self.recorded() | facts
+        with replacing(self.record) as temporary:
+            temporary.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+
+
+def look_at(path: Path) -> Given:
+    """What a capture can begin with there.
+
+    Raises:
+        DataError: nothing that it can begin with.
+    """
+    if (path / FILE).is_file():
+        return Given(path, "run", [(str(path.absolute()), 0)])
+    if has_cameras(path):
+        return Given(path, "scene", [(str(path.absolute()), 0)])
+    if video.is_video(path):
+        files = [path]
+    elif path.is_dir():
+        files, _, _ = find_photographs(path)
+    else:
+        came = "a file of another kind" if path.exists() else "nothing there"
+        raise DataError(f"{path}: expected a folder of photographs or a video, got {came}")
+    return Given(path, "photographs", [(file.name, file.stat().st_size) for file in files])
+
+
+def begin(project: Project, given: Given) -> None:
+    """Make the folder of a capture, or go on with it.
+
+    Raises:
+        ExistingFile: it holds the capture of something else, or other files.
+    """
+    out = project.out
+    if project.record.exists():
+        files = [tuple(file) for file in project.recorded().get("files", [])]
+        if files != given.files:
+            raise ExistingFile(
+                f"{out} holds a capture of {_words(files)}; {_difference(files, given.files)}: "
+                "choose another out",
+                "out",
+            )
+    elif out.exists():
+        if not out.is_dir():
+            raise ExistingFile(f"{out} is a file: choose another out", "out")
+        foreign = sorted(p.name for p in out.iterdir() if p.suffix != ".tmp")
+        if foreign:
+            raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
+    out.mkdir(parents=True, exist_ok=True)
+    for path in out.rglob(".*.tmp"):  # of `files.replacing`, whose process was killed
+        path.unlink()
+    if not project.record.exists():
+        project.remember(kind=given.kind, files=given.files)
+
+
+def discard_older(folder: Path, than: Path) -> None:
+    """Remove the files below a folder that are older than a file."""
+    for path in folder.rglob("*"):
+        if path.is_file() and path.stat().st_mtime_ns < than.stat().st_mtime_ns:
+            path.unlink()
+
+
+def _difference(before: Sequence[tuple[str, int]], now: Sequence[tuple[str, int]]) -> str:
+    """The first file that tells them apart."""
+    old, new = dict(before), dict(now)
+    for name in sorted(old.keys() | new.keys()):
+        if name not in old:
+            return f"{name} was not part of it"
+        if name not in new:
+            return f"{name} is not there now"
+        if old[name] != new[name]:
+            return f"{name} is another file now"
+    return "they came in another order"
+
+
+def _words(files: Sequence[tuple[str, int]]) -> str:
+    if not files:
+        return "none"
+    more = f" and {len(files) - 1} others" if len(files) > 1 else ""
+    return f"{files[0][0]}{more}"

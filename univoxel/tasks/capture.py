@@ -1,0 +1,415 @@
+"""From photographs to an object that can be lit anew, in one go: cameras, masks, training, mesh."""
+
+from __future__ import annotations
+
+import html
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from univoxel.bars import track
+from univoxel.capture.config import DEFAULTS, CaptureConfig
+from univoxel.capture.engine import find_engine
+from univoxel.capture.photographs import read_upright, require_readers
+from univoxel.capture.prepare import Folders
+from univoxel.capture.project import Given, Project, begin, discard_older, look_at
+from univoxel.capture.scene import REPORT
+from univoxel.checkpoint import FILE
+from univoxel.config import TrainConfig, check_same
+from univoxel.data import keep_photos, load_photos
+from univoxel.errors import (
+    DataError,
+    ExistingFile,
+    MissingExtra,
+    StillBackground,
+    UserError,
+    WithoutMasks,
+)
+from univoxel.evaluation.measures import MEASURES
+from univoxel.files import read_json, replacing
+from univoxel.names import KEEP_SIZE, SAMPLES, LightName, PresetOrAuto
+from univoxel.ops import native
+from univoxel.overrides import changed
+from univoxel.pictures import gallery
+from univoxel.presets import chosen
+from univoxel.run import kept_photos, trained_on
+from univoxel.segmentation.network import network
+from univoxel.tasks.cutout import COLOURS, REMBG, cutout
+from univoxel.tasks.demo import MAPS, SCENE
+from univoxel.tasks.evaluate import evaluate
+from univoxel.tasks.export import export
+from univoxel.tasks.poses import WORK, photographs_of, poses
+from univoxel.tasks.relight import relight_to_files
+from univoxel.tasks.train import train
+from univoxel.training.progress import TrainingProgress
+
+log = logging.getLogger("univoxel")
+
+AUTO = "auto"  # masks that the photographs have, or else of a network, or else of colours
+STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
+
+
+@dataclass(frozen=True)
+class PicturesConfig:
+    """The pictures of a capture."""
+
+    frames: int = 8  # of an orbit around the object, under each map
+    resolution: int = 512  # pixels of their sides
+    samples: int = SAMPLES  # of the light, per pixel
+
+
+PICTURES = PicturesConfig()
+
+
+@dataclass(frozen=True)
+class Captured:
+    """What a capture leaves: the pages and files to open."""
+
+    page: Path
+    mesh: Path  # .glb
+    run: Path  # for `univoxel.open_run`
+
+
+def capture(
+    photographs: str | Path,
+    out: str | Path,
+    *,
+    masks: str | Path = AUTO,
+    preset: PresetOrAuto = "auto",
+    minutes: float | None = None,
+    light: LightName = "hybrid",
+    changes: Sequence[str] = (),
+    on_progress: Callable[[TrainingProgress], None] | None = None,
+    config: CaptureConfig = DEFAULTS,
+    pictures: PicturesConfig = PICTURES,
+) -> Captured:
+    """Make an object that can be lit anew from photographs, in steps that are each kept.
+
+    Below `out`: scene/ holds photographs and cameras, cut/ those with masks, run/ the training,
+    pictures/ the object under other light and measures, then the mesh and index.html. What is
+    there is not made again, so the same call goes on after an interruption. What is of one's own
+    takes the place of a step: photographs with cameras, masks, a run.
+
+    Args:
+        photographs: a folder of photographs or a video; or photographs with cameras, of any layout
+            that `train` reads; or a trained run.
+        out: folder to write.
+        masks: a folder of masks; rembg, a network; none, colours alone; auto: what the photographs
+            bring, else a network where there is one, else colours.
+        preset, minutes, light, changes, on_progress: as of `univoxel.train`.
+        config: how cameras are found.
+        pictures: how many are made, and how large.
+
+    Raises:
+        ExistingFile: out holds another capture, or what other options made.
+        MissingExtra: a package that finds cameras, reads a format or makes masks is missing.
+        MissingNative: the compiled extension is missing or was built without Embree.
+        DataError: photographs, cameras or masks that cannot be used.
+        UserError: an argument cannot be used, or there is no surface.
+        ProcessFailed: finding cameras did not end well.
+        Cancelled: on_progress raised it.
+        OSError: a file cannot be written.
+    """
+    given = look_at(Path(photographs))
+    project = Project(Path(out))
+    training = chosen(preset, minutes, project.cut, project.run, light)
+    training = changed(training, changes)
+    if given.kind == "run":
+        _check_unused(given, masks, training)
+    _check_machine(given, masks)
+    begin(project, given)
+    if given.kind == "run":
+        run = given.path
+        for step in STEPS[:3]:
+            _skip(step, run)
+    else:
+        scene = _find_cameras(project, given, masks, config)
+        data = _find_masks(project, scene, masks)
+        run = _train(replace(training, data=data.absolute(), out=project.run), on_progress)
+    _export(project, run)
+    _picture(project, run, pictures)
+    _say("page", str(project.page))
+    _write_page(project, given, run)
+    return Captured(project.page, project.mesh, run)
+
+
+def _say(step: str, what: str) -> None:
+    log.info(f"step {STEPS.index(step) + 1} of {len(STEPS)}, {step}: {what}")
+
+
+def _skip(step: str, what: Path) -> None:
+    _say(step, f"there already, {what}")
+
+
+def _check_unused(given: Given, masks: str | Path, training: TrainConfig) -> None:
+    """Refuse options of steps that a run has behind it.
+
+    Raises:
+        UserError: there are such.
+    """
+    usual = chosen("auto", None, training.data, training.out)
+    if str(masks) != AUTO or training != usual:
+        raise UserError(
+            f"{given.path} is a trained run: masks, preset, minutes, light and set come too late",
+            *("masks", "preset", "minutes", "light", "set"),
+        )
+
+
+def _check_machine(given: Given, masks: str | Path) -> None:
+    """Refuse now what would fail after minutes.
+
+    Raises:
+        DataError: no folder of masks.
+        MissingExtra, MissingNative: something is not installed.
+    """
+    if not native.reference_asked():
+        native.require_embree("capture")
+    if given.kind == "photographs":
+        find_engine()
+    if str(masks) == REMBG:
+        network()
+    elif str(masks) not in (AUTO, COLOURS) and not Path(masks).is_dir():
+        raise DataError(
+            f"masks: expected {REMBG}, {COLOURS} or a folder of masks, got {masks}", "masks"
+        )
+
+
+def _find_cameras(project: Project, given: Given, masks: str | Path, config: CaptureConfig) -> Path:
+    """The folder of photographs with cameras.
+
+    Raises:
+        DataError, ProcessFailed, MissingExtra: as of `poses`.
+    """
+    done = given.path if given.kind == "scene" else project.scene
+    if given.kind == "scene" or (done / REPORT).exists():
+        _skip("cameras", done)
+        return done
+    if not project.recorded().get("turned"):
+        _say("cameras", f"of {given.path}")
+        try:
+            return poses(given.path, done, config=config)
+        except StillBackground as error:
+            log.info(f"{error.seen}: the object was turned before a still camera, so masks first")
+            project.remember(turned=True)
+    first = _masks_before_cameras(project, given, masks)
+    _say("cameras", f"of what masks show of {given.path}")
+    return poses(given.path, done, masks=first, config=config)
+
+
+def _masks_before_cameras(project: Project, given: Given, masks: str | Path) -> Path:
+    """A folder of masks of single photographs.
+
+    Raises:
+        UserError: there is nothing to make them with.
+    """
+    if str(masks) not in (AUTO, REMBG, COLOURS):
+        return Path(masks)
+    if project.masks.exists():
+        _skip("masks", project.masks)
+        return project.masks
+    if str(masks) == COLOURS:
+        raise UserError(
+            f"{given.path}: the object was turned before a still camera, and colours alone make no "
+            f"masks before there are cameras: expected masks={REMBG} or a folder, got {masks}",
+            "masks",
+        )
+    _say("masks", "of single photographs, from a network")
+    masked = network()
+    files, _, _ = photographs_of(given.path, Folders(project.scene / WORK))
+    require_readers(files)
+    # Nothing half-made goes by its name
+    partial = project.masks.with_name(f".{project.masks.name}.partial")
+    partial.mkdir(exist_ok=True)
+    for file in track(files, "masks"):
+        path = partial / f"{file.stem}.png"
+        if path.exists():
+            continue
+        try:
+            picture = read_upright(file, KEEP_SIZE).convert("RGB")
+        except DataError:  # which `poses` counts and names
+            continue
+        mask = (255 * masked(torch.from_numpy(np.array(picture)))).round().byte()
+        with replacing(path) as temporary:
+            Image.fromarray(mask.numpy()).save(temporary, format="PNG")
+    partial.rename(project.masks)
+    return project.masks
+
+
+def _find_masks(project: Project, scene: Path, masks: str | Path) -> Path:
+    """The folder of photographs with masks and cameras.
+
+    Raises:
+        ExistingFile: those that are there were made with another choice of masks.
+        DataError, MissingExtra, UserError: as of `cutout`.
+    """
+    facts, asked = project.recorded(), str(masks)
+    if project.cut.exists():
+        if facts.get("masks", asked) != asked:
+            raise ExistingFile(
+                f"{project.cut} holds photographs with masks={facts['masks']}: to make them anew, "
+                f"remove it and {project.run}",
+                "masks",
+            )
+        _skip("masks", project.cut)
+        return project.cut
+    turned = bool(facts.get("turned"))
+    if asked == AUTO and not turned and _have_masks(project, scene):
+        _skip("masks", scene)
+        return scene
+    project.remember(masks=asked)
+    if turned:
+        source = scene / "masks"  # those that the cameras were found with
+    elif asked == AUTO:
+        source = _best_source()
+    else:
+        source = masks
+    words = {REMBG: "from a network", COLOURS: "from colours alone"}
+    _say("masks", words.get(str(source), f"from {source}"))
+    return cutout(scene, project.cut, source)
+
+
+def _have_masks(project: Project, scene: Path) -> bool:
+    """Whether photographs bring masks.
+
+    Raises:
+        DataError: they cannot be read.
+    """
+    if (project.run / "config.json").is_file():  # without reading them
+        return trained_on(project.run) == scene.absolute()
+    kept = kept_photos(project.run, "train")
+    try:
+        photos = load_photos(scene, "train", kept=kept)
+    except WithoutMasks:
+        return False
+    kept.parent.mkdir(exist_ok=True)
+    keep_photos(photos, kept)  # training need not read them again
+    return True
+
+
+def _best_source() -> str:
+    """A network where there is one."""
+    try:
+        network()
+    except (MissingExtra, DataError) as error:
+        log.info(f"{error}; without, masks come from colours")
+        return COLOURS
+    return REMBG
+
+
+def _train(wanted: TrainConfig, on_progress: Callable[[TrainingProgress], None] | None) -> Path:
+    """The folder of the run, trained to its end.
+
+    Raises:
+        ExistingFile: a run is there that other options made.
+        UserError, OSError, Cancelled: as of `train`.
+    """
+    run, data = wanted.out, wanted.data
+    done, begun = (run / "trust.txt").exists(), (run / FILE).exists()
+    if done or begun:
+        _check_trained(wanted, done)
+    if not done:
+        _say("training", "goes on" if begun else f"on {data}")
+        return train(wanted, resume=begun, on_progress=on_progress)
+    _skip("training", run)
+    newest = max((p.stat().st_mtime_ns for p in data.rglob("*.png")), default=0)
+    if newest > (run / FILE).stat().st_mtime_ns:
+        log.warning(f"photographs in {data} have changed since: to train anew, remove {run}")
+    return run
+
+
+def _check_trained(wanted: TrainConfig, done: bool) -> None:
+    """Refuse a run that other options began.
+
+    Raises:
+        ExistingFile: they are others.
+    """
+    try:
+        before = read_json(wanted.out / "config.json")
+        check_same(replace(wanted, downscale=before["downscale"]))
+        same = not done or before["minutes"] == wanted.minutes
+    except (UserError, OSError, KeyError, TypeError):
+        same = False
+    if not same:
+        raise ExistingFile(
+            f"{wanted.out} was trained with another preset, minutes, light or set: to train anew, "
+            "remove it, or choose another out",
+            *("preset", "minutes", "light", "set", "out"),
+        )
+
+
+def _export(project: Project, run: Path) -> None:
+    if _up_to_date(project.mesh, run):
+        return _skip("mesh", project.mesh)
+    _say("mesh", str(project.mesh))
+    export(run, project.mesh)
+    return None
+
+
+def _up_to_date(file: Path, run: Path) -> bool:
+    """Whether a file was made since the run was trained."""
+    return file.exists() and file.stat().st_mtime_ns >= (run / FILE).stat().st_mtime_ns
+
+
+def _picture(project: Project, run: Path, config: PicturesConfig) -> None:
+    """Write the object under other light, and measures; what is there of this run stays."""
+    folder = project.pictures
+    measures = folder / "measures.json"
+    if _up_to_date(measures, run):
+        return _skip("pictures", folder)
+    _say("pictures", str(folder))
+    discard_older(folder, than=run / FILE)
+    relight_to_files(
+        run,
+        [SCENE / "envmaps" / f"{name}.hdr" for name in MAPS],
+        folder,
+        resume=True,
+        cameras=f"orbit {config.frames}",
+        resolution=config.resolution,
+        samples=config.samples,
+    )
+    try:
+        evaluate(run, save=folder / "test", json=measures)
+    except DataError as error:  # such as a run whose photographs are elsewhere now
+        log.warning(f"no measures: {error}")
+    return None
+
+
+def _write_page(project: Project, given: Given, run: Path) -> None:
+    """Write the page with all pictures."""
+    shown = [
+        ("Masks, worst first", project.cut / "masks.html"),
+        ("Mesh with materials", project.mesh),
+        ("Pictures with layers", project.pictures),
+    ]
+    links = [
+        f'<li><a href="{html.escape(path.relative_to(project.out).as_posix())}">{words}</a>'
+        for words, path in shown
+        if path.exists()
+    ]
+    parts = [f"<p>Made of {html.escape(given.words)}.</p>", f"<ul>{''.join(links)}</ul>"]
+    if (run / "preview.png").exists():
+        parts += [
+            "<h2>A view</h2><p>Photograph, render, albedo, roughness, normal.</p>",
+            gallery.image(run / "preview.png", "wide"),
+        ]
+    parts.append("<h2>Under other light</h2>")
+    for name in MAPS:
+        frames = sorted((project.pictures / name).glob("*.png"))
+        parts.append(gallery.row(name, frames, "small"))
+    measures, contact = project.pictures / "measures.json", project.pictures / "test"
+    if measures.exists():
+        values = read_json(measures)
+        known = {k: m for k, m in MEASURES.items() if values.get(k) is not None}
+        parts += ["<h2>Measures on the test views</h2>", gallery.table(known, values)]
+        parts += ["<h2>Test views</h2>", gallery.sheet(contact / "contact_sheet.png")]
+    trust = run / "trust.txt"
+    if trust.is_file():
+        parts += ["<h2>What the photographs leave open</h2>"]
+        parts += [f"<pre>{html.escape(trust.read_text(encoding='utf-8'))}</pre>"]
+    name = project.out.absolute().name
+    gallery.write_gallery(project.page, name, f"{name}, ready to be lit anew", parts)
