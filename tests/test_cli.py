@@ -462,7 +462,7 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "Unrecognized options: sing"),
         (
             [],
-             "Expected one of {capture, poses, cutout, train, eval, relight, export, view, envmap, "
+            "Expected one of {capture, poses, cutout, train, eval, relight, export, view, envmap, "
             "submit, inspect, info, compare, chart, stress, demo, doctor}",
         ),
     ],

@@ -257,11 +257,28 @@ class LightFrameConfig:
     better: float = 1.0
     # share of the cost, in [0, 1], that it has to explain at least, over `better`
     least: float = 0.03
+    # the same two where the surroundings do not say whether they stood still. Objects on rings of
+    # cameras under a still light: up to 3 times, up to 14 % of the cost. Under one that turned: 60
+    # times and 70 %; a shiny ball, 3.2 times and 30 %
+    better_alone: float = 3.0
+    least_alone: float = 0.07
+    # pixels, >= 8, along the longer side of the pictures whose surroundings are compared
+    small: int = 128
+    # of those pixels, >= 1, by which a camera that stands still may wobble, or be turned a little
+    wobble: int = 3
+    # by which surroundings are shifted, >= 1, to see whether that fits better: less than a camera
+    # sees them shift that goes some 5 degrees around the object
+    shift: int = 10
+    # correlation, in [0, 1], that surroundings which stood still have at least
+    alike: float = 0.85
+    # correlation, in [0, 1], of a picture with itself shifted, above which it is too plain to tell
+    plain: float = 0.95
 
     def __post_init__(self) -> None:
-        check_fields(self, *_WHOLE, "points", "rounds")
-        check_fields(self, *_SHARE, "dark", "least")
-        check_fields(self, *_ABOVE, "cauchy", "better")
+        check_fields(self, *_WHOLE, "points", "rounds", "wobble", "shift")
+        check_fields(self, "at least 8", lambda x: x >= 8, "small")
+        check_fields(self, *_SHARE, "dark", "least", "least_alone", "alike", "plain")
+        check_fields(self, *_ABOVE, "cauchy", "better", "better_alone")
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from univoxel.lights.turntable import Turntable
 from univoxel.names import LightFrameOrAuto
 from univoxel.preparation.config import LIGHT_FRAME, LightFrameConfig
 from univoxel.preparation.observed_hull import observe_hull
+from univoxel.preparation.surroundings import surroundings_stand_still
 from univoxel.render.transport import Observations
 from univoxel.sphere import real_harmonics
 
@@ -71,7 +72,13 @@ def turntable_of(
         return None
     found = explained(observations, turntable, cfg)
     log.debug("light frame: %s", found)
-    if found.by_turning_light < cfg.better * max(found.by_still_light, cfg.least):
+    still_around = surroundings_stand_still(photos, cfg)
+    if still_around is False:  # the camera went around the object
+        return None
+    better, least = cfg.better, cfg.least
+    if still_around is None:
+        better, least = cfg.better_alone, cfg.least_alone
+    if found.by_turning_light < better * max(found.by_still_light, least):
         return None
     log.info(
         "the light turns with the camera, as on a turntable: that explains %.0f %% of how points "
