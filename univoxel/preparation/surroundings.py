@@ -21,7 +21,8 @@ def surroundings_stand_still(photos: Photos, cfg: LightFrameConfig = LIGHT_FRAME
     stand_still = []
     for one, other in neighbours(photos.cameras):
         if photos.cameras.size(one) == photos.cameras.size(other):
-            stand_still.append(_same(*(_shrunk(photos, v, cfg) for v in (one, other)), cfg))
+            first, second = _shrunk(photos, one, cfg), _shrunk(photos, other, cfg)
+            stand_still.append(_same(first, second, cfg))
     known = [same for same in stand_still if same is not None]
     if 2 * len(known) <= len(stand_still):
         return None
