@@ -86,9 +86,11 @@ def _likeness(
     how clearly; both in [0, 1]."""
     pixels, colors = np.argwhere(band), color[band]
     unlike, known = [], np.ones(len(pixels), bool)
-    for side, count in ((inside, cfg.object_samples), (around, cfg.other_samples)):
+    for side, most in ((inside, cfg.object_samples), (around, cfg.other_samples)):
         places = np.argwhere(side)
-        away, index = KDTree(places).query(pixels, k=np.arange(1, min(count, len(places)) + 1))
+        count = min(most, len(places))
+        found = KDTree(places).query(pixels, k=count)
+        away, index = (np.asarray(x).reshape(-1, count) for x in found)  # of one sample it is [N]
         unlike.append(_least_difference(colors, color[side], index))
         known &= away[:, 0] <= known_within
     tells = (unlike[1] - unlike[0]) / (2 * cfg.noise)
