@@ -52,7 +52,7 @@ HELPERS = {
     "assets": {"atlas", "base"},
     "preparation": {
         *("belief", "depth_sweep", "carving", "exposures", "hull", "light_frame", "masks"),
-        *("matches", "observed_hull", "registration", "surroundings"),
+        *("matches", "observed_hull", "outlines", "registration", "surroundings"),
     },
     "training": {"clock", "pixels", "divergence", "plateau", "progress", "surface_update"},
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},

@@ -33,6 +33,7 @@ class Belief:
     box: tuple[Tensor, Tensor]  # corners [3], [3] around the object
     refined: bool  # whether the cameras are refined
     votes: int = 1  # views that have to carve a node, >= 1; more than one where masks are doubted
+    off: float = 0.0  # pixels, >= 0, that doubted masks contradict one another by; may be infinite
 
 
 def weighed(
@@ -72,7 +73,7 @@ def weighed(
         _say(seen, off, believed, refined)
     if believed and masks == "auto":
         votes = votes_needed(len(cameras), cfg.hull)
-        return Belief(estimate_bounds(distance, cameras, cfg.hull, votes), refined, votes)
+        return Belief(estimate_bounds(distance, cameras, cfg.hull, votes), refined, votes, off)
     if box is None:
         assert none_shared is not None
         raise none_shared

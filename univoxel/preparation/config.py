@@ -80,6 +80,42 @@ class HullConfig:
 
 
 @dataclass(frozen=True)
+class OutlineConfig:
+    """Where edges of rough masks are moved to, see preparation/outlines.py."""
+
+    # share of a picture's larger side, in (0, 1], by which edges are moved at most
+    most: float = 0.04
+    # pixels, > 0, beyond what a mask may be off by, in which colours of the object and of what is
+    # around are taken
+    samples_within: float = 6.0
+    # how many times so far, > 0, a pixel may be from the nearest of these: others say nothing
+    known_within: float = 2.0
+    # colours of the object, >= 1, that a pixel is compared with, the nearest ones: it has patterns
+    object_samples: int = 200
+    # the same of what is around
+    other_samples: int = 24
+    # sRGB, > 0, that colours of one thing differ by
+    noise: float = 0.06
+    # how much colours count that tell clearly, > 0
+    colors: float = 4.0
+    # how much the mask counts, > 0
+    given: float = 0.5
+    # how much a neighbour of the same colour counts, >= 0
+    smooth: float = 3.0
+    # how many times steeper the edge is made than the equations for it leave it, >= 1: they draw
+    # it out
+    steeper: float = 3.0
+
+    def __post_init__(self) -> None:
+        check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "most")
+        check_fields(self, *_WHOLE, "object_samples", "other_samples")
+        above = ("samples_within", "known_within", "noise", "colors", "given")
+        check_fields(self, *_ABOVE, *above)
+        check_fields(self, *_NOT_BELOW, "smooth")
+        check_fields(self, "at least 1", lambda x: 1 <= x < math.inf, "steeper")
+
+
+@dataclass(frozen=True)
 class MatchesConfig:
     """Cameras against points found again in neighbouring views, see preparation/matches.py."""
 
@@ -291,6 +327,8 @@ class PreparationConfig:
     hull: HullConfig = field(default_factory=HullConfig)
     # whether cameras or masks are wrong, by points that photographs share
     matches: MatchesConfig = field(default_factory=MatchesConfig)
+    # where edges of rough masks are moved to
+    outlines: OutlineConfig = field(default_factory=OutlineConfig)
     # whether cameras are off, and how they are moved
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     # whether exposures differ, and by what gains
@@ -302,7 +340,7 @@ class PreparationConfig:
 
 
 MASKS, HULL, REGISTRATION = MaskConfig(), HullConfig(), RegistrationConfig()
-MATCHES = MatchesConfig()
+MATCHES, OUTLINES = MatchesConfig(), OutlineConfig()
 EXPOSURES, CARVING = ExposureConfig(), CarvingConfig()
 LIGHT_FRAME = LightFrameConfig()
 PREPARATION = PreparationConfig()

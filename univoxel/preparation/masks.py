@@ -68,11 +68,9 @@ def _change(
 
     def of_view(view: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         c, covered, d = view
-        encoded = c.float() / 255 if c.dtype == torch.uint8 else linear_to_srgb(c)
-        around = encoded[covered < 0.01]
-        same = (around == around.median(0).values).all(1) if len(around) else torch.ones(1)
-        cut_away = float(same.float().mean()) > cfg.one_color or repeats_edge(encoded, d, cfg)
-        hidden = (covered < 0.99) if cut_away else torch.zeros_like(covered, dtype=torch.bool)
+        encoded = as_srgb(c)
+        away = cut_away(encoded, covered, d, cfg)
+        hidden = (covered < 0.99) if away else torch.zeros_like(covered, dtype=torch.bool)
         hidden = max_pool2d(hidden[None].float(), 3, 1, 1)[0] > 0
         depth = (0.5 - d).floor().long()
         y, x = (~hidden & (depth >= 0) & (depth <= deepest)).nonzero(as_tuple=True)
@@ -85,6 +83,18 @@ def _change(
         total += change
         count += pixels
     return torch.where(count >= cfg.min_pixels, total / count, torch.nan)
+
+
+def as_srgb(stored: Tensor) -> Tensor:
+    """Stored colours, uint8 sRGB or linear, as sRGB in [0, 1]."""
+    return stored.float() / 255 if stored.dtype == torch.uint8 else linear_to_srgb(stored)
+
+
+def cut_away(encoded: Tensor, covered: Tensor, distance: Tensor, cfg: MaskConfig = MASKS) -> bool:
+    """Whether a photograph [H, W, 3] sRGB no longer shows what stands around the object."""
+    around = encoded[covered < 0.01]
+    same = (around == around.median(0).values).all(1) if len(around) else torch.ones(1)
+    return float(same.float().mean()) > cfg.one_color or repeats_edge(encoded, distance, cfg)
 
 
 def repeats_edge(encoded: Tensor, distance: Tensor, cfg: MaskConfig = MASKS) -> bool:
@@ -132,6 +142,10 @@ def fitted_masks(
         log.info("%s: see masks=auto", much, extra={"arguments": ("masks",)})
         return photos, distance
     log.info("%s: they are taken in", much)
-    coverage = eroded(distance, excess)
+    return with_masks(photos, eroded(distance, excess))
+
+
+def with_masks(photos: Photos, coverage: Tensor) -> tuple[Photos, Tensor]:
+    """The photographs with masks of such coverage [V, H, W], and `mask_distances`."""
     stored = coverage if photos.alpha.is_floating_point() else (255 * coverage).round().byte()
-    return replace(photos, alpha=stored), mask_distances(coverage, cameras)
+    return replace(photos, alpha=stored), mask_distances(coverage, photos.cameras)

@@ -16,9 +16,10 @@ from univoxel.poses import PoseSteps
 from univoxel.preparation.belief import doubted_pixels, weighed
 from univoxel.preparation.carving import carve_within_time
 from univoxel.preparation.exposures import varying_and_gains
-from univoxel.preparation.hull import visual_hull
+from univoxel.preparation.hull import estimate_bounds, visual_hull
 from univoxel.preparation.light_frame import turntable_of
-from univoxel.preparation.masks import fitted_masks
+from univoxel.preparation.masks import fitted_masks, with_masks
+from univoxel.preparation.outlines import drawn_again
 from univoxel.preparation.registration import registered_poses
 from univoxel.training.config import StageConfig
 
@@ -62,8 +63,14 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
     found = Silhouettes(photos, distance, belief.box, belief.refined, belief.votes)
     if belief.votes == 1:
         return found
-    doubted = doubted_pixels(distance, photos.cameras, belief, cfg.preparation.hull)
-    return replace(found, doubted=doubted)
+    constants = cfg.preparation
+    doubted = doubted_pixels(distance, photos.cameras, belief, constants.hull)
+    coverage = drawn_again(
+        photos, distance, belief.off, doubted, constants.outlines, constants.masks
+    )
+    photos, distance = with_masks(photos, coverage)
+    box = estimate_bounds(distance, photos.cameras, constants.hull, belief.votes)
+    return replace(found, photos=photos, distance=distance, box=box, doubted=doubted)
 
 
 def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:

@@ -1,0 +1,140 @@
+"""Rough masks: their edges are moved to where the object's colours end and those around it begin.
+
+A pixel near the edge looks like what is surely the object, further in, or like what surely is not,
+further out. Where both are alike nothing tells, and the mask stays about as it is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from univoxel.data import Photos
+from univoxel.preparation.config import MASKS, OUTLINES, MaskConfig, OutlineConfig
+from univoxel.preparation.masks import as_srgb, cut_away
+
+
+def drawn_again(
+    photos: Photos,
+    distance: Tensor,
+    off: float,
+    doubted: Tensor,
+    cfg: OutlineConfig = OUTLINES,
+    masks: MaskConfig = MASKS,
+) -> Tensor:
+    """Coverage [V, H, W] in [0, 1] by masks whose edges lie where colours change.
+
+    Photographs of which nothing but the object is left keep theirs.
+
+    Args:
+        distance: [V, H, W] from `hull.mask_distances`.
+        off: pixels, > 0, that edges may be off by; at most cfg.most are moved.
+        doubted: [V, H, W] bool, where a mask is not believed at all: it stays, and tells nothing.
+    """
+    coverage, cut = photos.coverage(), photos.cameras.cut
+    for view in range(len(photos)):
+        color, covered = as_srgb(photos.stored(view)[0]), cut(view, coverage[view])
+        away = cut(view, distance[view])
+        if cut_away(color, covered, away, masks):
+            continue
+        reach = min(off, cfg.most * max(covered.shape))
+        believed = ~cut(view, doubted[view]).numpy()
+        picture, mask, far = (x.numpy().astype(np.float64) for x in (color, covered, away))
+        covered.copy_(torch.from_numpy(outlined(picture, mask, far, believed, reach, cfg)))
+    return coverage
+
+
+def outlined(
+    color: np.ndarray,
+    coverage: np.ndarray,
+    distance: np.ndarray,
+    believed: np.ndarray,
+    reach: float,
+    cfg: OutlineConfig = OUTLINES,
+) -> np.ndarray:
+    """Coverage [H, W] in [0, 1] by a mask whose edge is moved, at most `reach` pixels.
+
+    Args:
+        color: [H, W, 3] sRGB, in [0, 1].
+        coverage, distance, believed: [H, W], of the mask.
+
+    Source: the equations are those of Grady 2005, "Multilabel Random Walker Image Segmentation
+    Using Prior Models".
+    """
+    ring = reach + cfg.samples_within
+    band = (np.abs(distance) <= reach) & believed
+    inside, around = (believed & (d > reach) & (d <= ring) for d in (-distance, distance))
+    if not (band.any() and inside.any() and around.any()):
+        return coverage
+    share, tells = _likeness(color, band, inside, around, cfg.known_within * ring, cfg)
+    return _smoothed(color, coverage, band, share, cfg.colors * tells, cfg)
+
+
+def _likeness(
+    color: np.ndarray,
+    band: np.ndarray,
+    inside: np.ndarray,
+    around: np.ndarray,
+    known_within: float,
+    cfg: OutlineConfig,
+) -> tuple[np.ndarray, np.ndarray]:
+    """How much pixels of the band [N] look like the object rather than like what is around, and
+    how clearly; both in [0, 1]."""
+    pixels, colors = np.argwhere(band), color[band]
+    unlike, known = [], np.ones(len(pixels), bool)
+    for side, most in ((inside, cfg.object_samples), (around, cfg.other_samples)):
+        places = np.argwhere(side)
+        count = min(most, len(places))
+        found = KDTree(places).query(pixels, k=count)
+        away, index = (np.asarray(x).reshape(-1, count) for x in found)  # of one sample it is [N]
+        unlike.append(_least_difference(colors, color[side], index))
+        known &= away[:, 0] <= known_within
+    tells = (unlike[1] - unlike[0]) / (2 * cfg.noise)
+    share = 1 / (1 + np.exp(-4 * tells.clip(-10, 10)))
+    return share, np.where(known, np.minimum(np.abs(tells), 1) ** 2, 0)
+
+
+def _least_difference(colors: np.ndarray, samples: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Of colours [N, 3], to the most alike of samples [S, 3] of their own [N, K]: [N]."""
+    least = np.full(len(colors), np.inf)
+    for column in index.T:  # [N, K, 3] would be large
+        least = np.minimum(least, ((colors - samples[column]) ** 2).sum(1))
+    return np.sqrt(least)
+
+
+def _smoothed(
+    color: np.ndarray,
+    given: np.ndarray,
+    band: np.ndarray,
+    share: np.ndarray,
+    weight: np.ndarray,
+    cfg: OutlineConfig,
+) -> np.ndarray:
+    """Coverage [H, W] that follows shares [N] of the band, by weights, and the mask, and changes
+    where colours do."""
+    index = np.full(band.shape, -1)
+    index[band] = np.arange(len(share))
+    diagonal, right = weight + cfg.given, weight * share + cfg.given * given[band]
+    rows, columns, entries = [], [], []
+    for axis in (0, 1):
+        i, c, g = (np.moveaxis(x, axis, 0) for x in (index, color, given))
+        alike = ((c[1:] - c[:-1]) ** 2).sum(-1) / (2 * cfg.noise**2)
+        alike = cfg.smooth * np.exp(-alike)
+        for here, there, beside in ((i[:-1], i[1:], g[1:]), (i[1:], i[:-1], g[:-1])):
+            own, both = here >= 0, (here >= 0) & (there >= 0)
+            fixed = own & ~both
+            diagonal += np.bincount(here[own], alike[own], len(share))
+            right += np.bincount(here[fixed], (alike * beside)[fixed], len(share))
+            rows.append(here[both])
+            columns.append(there[both])
+            entries.append(-alike[both])
+    places = np.concatenate(rows), np.concatenate(columns)
+    matrix = sparse.csc_matrix((np.concatenate(entries), places), shape=2 * share.shape)
+    found = np.asarray(spsolve(matrix + sparse.diags(diagonal, format="csc"), right))
+    result = given.copy()
+    result[band] = ((found - 0.5) * cfg.steeper + 0.5).clip(0, 1)
+    return result
