@@ -94,6 +94,9 @@ class OutlineConfig:
     object_samples: int = 200
     # the same of what is around
     other_samples: int = 24
+    # pixels that a mask may be off by, > 0, for each pixel between the colours that are taken: of
+    # a wide band fewer are enough, for time
+    spacing: float = 3.0
     # sRGB, > 0, that colours of one thing differ by
     noise: float = 0.06
     # how much colours count that tell clearly, > 0
@@ -109,7 +112,7 @@ class OutlineConfig:
     def __post_init__(self) -> None:
         check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "most")
         check_fields(self, *_WHOLE, "object_samples", "other_samples")
-        above = ("samples_within", "known_within", "noise", "colors", "given")
+        above = ("samples_within", "known_within", "spacing", "noise", "colors", "given")
         check_fields(self, *_ABOVE, *above)
         check_fields(self, *_NOT_BELOW, "smooth")
         check_fields(self, "at least 1", lambda x: 1 <= x < math.inf, "steeper")

@@ -16,6 +16,7 @@ from torch import Tensor
 from univoxel.data import Photos
 from univoxel.preparation.config import MASKS, OUTLINES, MaskConfig, OutlineConfig
 from univoxel.preparation.masks import as_srgb, cut_away
+from univoxel.threads import side_by_side
 
 
 def drawn_again(
@@ -36,15 +37,18 @@ def drawn_again(
         doubted: [V, H, W] bool, where a mask is not believed at all: it stays, and tells nothing.
     """
     coverage, cut = photos.coverage(), photos.cameras.cut
-    for view in range(len(photos)):
+
+    def draw_(view: int) -> None:
         color, covered = as_srgb(photos.stored(view)[0]), cut(view, coverage[view])
         away = cut(view, distance[view])
         if cut_away(color, covered, away, masks):
-            continue
+            return
         reach = min(off, cfg.most * max(covered.shape))
         believed = ~cut(view, doubted[view]).numpy()
         picture, mask, far = (x.numpy().astype(np.float64) for x in (color, covered, away))
         covered.copy_(torch.from_numpy(outlined(picture, mask, far, believed, reach, cfg)))
+
+    side_by_side(draw_, range(len(photos)))
     return coverage
 
 
@@ -70,7 +74,8 @@ def outlined(
     inside, around = (believed & (d > reach) & (d <= ring) for d in (-distance, distance))
     if not (band.any() and inside.any() and around.any()):
         return coverage
-    share, tells = _likeness(color, band, inside, around, cfg.known_within * ring, cfg)
+    apart = max(1, int(reach / cfg.spacing))
+    share, tells = _likeness(color, band, inside, around, apart, cfg.known_within * ring, cfg)
     return _smoothed(color, coverage, band, share, cfg.colors * tells, cfg)
 
 
@@ -79,19 +84,22 @@ def _likeness(
     band: np.ndarray,
     inside: np.ndarray,
     around: np.ndarray,
+    apart: int,
     known_within: float,
     cfg: OutlineConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
     """How much pixels of the band [N] look like the object rather than like what is around, and
-    how clearly; both in [0, 1]."""
+    how clearly; both in [0, 1]. Colours of either side are taken so many pixels apart, >= 1."""
     pixels, colors = np.argwhere(band), color[band]
     unlike, known = [], np.ones(len(pixels), bool)
     for side, most in ((inside, cfg.object_samples), (around, cfg.other_samples)):
         places = np.argwhere(side)
-        count = min(most, len(places))
+        fewer = places[(places % apart == 0).all(1)]
+        places = fewer if len(fewer) else places
+        count = min(max(1, most // apart**2), len(places))
         found = KDTree(places).query(pixels, k=count)
         away, index = (np.asarray(x).reshape(-1, count) for x in found)  # of one sample it is [N]
-        unlike.append(_least_difference(colors, color[side], index))
+        unlike.append(_least_difference(colors, color[tuple(places.T)], index))
         known &= away[:, 0] <= known_within
     tells = (unlike[1] - unlike[0]) / (2 * cfg.noise)
     share = 1 / (1 + np.exp(-4 * tells.clip(-10, 10)))
