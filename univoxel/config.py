@@ -12,15 +12,16 @@ from typing import Any, get_args
 
 from univoxel.compression.config import CompressionConfig
 from univoxel.confidence.config import ConfidenceConfig
-from univoxel.errors import ConfigError, UserError
+from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.fields.features import PER_LEVEL
 from univoxel.files import read_json, replacing
 from univoxel.joint.config import JointConfig
+from univoxel.lights import read_config
 from univoxel.names import CamerasFrom, Capacity, LightFrameOrAuto, MasksFrom
 from univoxel.preparation.config import PreparationConfig
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
-from univoxel.validation import check_fields
+from univoxel.validation import check_fields, record
 
 # Arguments that a configuration is made of
 CHOICES = (
@@ -155,6 +156,28 @@ def save_config(cfg: TrainConfig) -> None:
     text = json.dumps(dataclasses.asdict(cfg), indent=2, default=str)
     with replacing(cfg.out / "config.json") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def load_config(path: Path) -> TrainConfig:
+    """The configuration in a file, as `save_config` wrote it: config.json of a run.
+
+    Raises:
+        MissingFile: there is no such file.
+        ConfigError: it holds something else; the message names file and field.
+    """
+    if not path.is_file():
+        raise MissingFile(f"{path}: expected a configuration, such as config.json of a run")
+    values = read_json(path)
+    try:
+        if not isinstance(values, dict):
+            raise ConfigError(f"expected an object with the configuration, got {values!r:.60}")
+        values = dict(values)
+        if isinstance(values.get("scene"), dict):
+            values["scene"] = dict(values["scene"])
+            values["scene"]["light"] = read_config(values["scene"].get("light", {}))
+        return record(TrainConfig, values)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def check_same(cfg: TrainConfig) -> None:

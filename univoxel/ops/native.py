@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
 
 import numpy as np
 import torch  # first: the extension then shares torch's OpenMP runtime
@@ -193,6 +193,8 @@ def operator(name: str, mutates_args: tuple[str, ...] = ()) -> Callable[[Callabl
     """
 
     def define(kernel: Callable) -> Any:
+        # torch before 2.6 takes no annotations that are text, as `from __future__` makes them
+        kernel.__annotations__ = get_type_hints(kernel)
         qualified = f"univoxel::{name}"
         defined = torch.library.custom_op(
             qualified, kernel, mutates_args=mutates_args, device_types=()
