@@ -36,6 +36,7 @@ LAYERS = [
     {"experiments.worker"},
     {"experiments.runner"},
     {"experiments"},
+    {"parsing"},
     {"commands"},
     {"cli"},
 ]

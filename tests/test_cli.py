@@ -542,11 +542,14 @@ def test_threads(calls, monkeypatch):
 def test_threads_are_known_before_torch_is_imported():
     code = (
         "import sys\nfrom univoxel.cli import main\n"
-        "main(['doctor', '--threads', '3', '--json', '-'])"
+        "sys.exit(main(['doctor', '--threads', '1', '--json', '-']))"
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    env = os.environ | {"OMP_NUM_THREADS": "2"}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert run.returncode == 0, run.stderr
     found = {one["what"]: one["found"] for one in json.loads(run.stdout)}
-    assert found["threads"].startswith("3 on ")
+    assert found["threads"].startswith("1 on ")
+    assert found["threads"].endswith("OMP_NUM_THREADS=1")
 
 
 @pytest.mark.parametrize("command", ["info", "eval"])

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, get_type_hints
+from typing import Any, List, Literal, get_args, get_origin, get_type_hints  # noqa: UP035
 
 import numpy as np
 import torch  # first: the extension then shares torch's OpenMP runtime
@@ -193,8 +193,9 @@ def operator(name: str, mutates_args: tuple[str, ...] = ()) -> Callable[[Callabl
     """
 
     def define(kernel: Callable) -> Any:
-        # torch before 2.6 takes no annotations that are text, as `from __future__` makes them
-        kernel.__annotations__ = get_type_hints(kernel)
+        # torch 2.4 reads neither text, which `from __future__` makes of them, nor list[float]
+        hints = get_type_hints(kernel).items()
+        kernel.__annotations__ = {name: _spelt_out(hint) for name, hint in hints}
         qualified = f"univoxel::{name}"
         defined = torch.library.custom_op(
             qualified, kernel, mutates_args=mutates_args, device_types=()
@@ -203,3 +204,10 @@ def operator(name: str, mutates_args: tuple[str, ...] = ()) -> Callable[[Callabl
         return defined
 
     return define
+
+
+def _spelt_out(hint: Any) -> Any:
+    """An annotation as every torch since 2.4 reads it."""
+    if hint is type(None):
+        return None
+    return List[get_args(hint)] if get_origin(hint) is list else hint  # noqa: UP006
