@@ -18,7 +18,7 @@ from univoxel.parsing import LAB, Usage, parse
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted(doc_blocks.pages(ROOT))
-COMMAND = re.compile(r"^(?:    |)univoxel +([a-z-].*)$", re.MULTILINE)
+COMMAND = re.compile(r"^    univoxel +(.+)$|^univoxel +([a-z]+ (?:\S*/|-).*)$", re.MULTILINE)
 
 
 def test_pages_agree_with_results_and_code():
@@ -125,8 +125,8 @@ def commands() -> list[tuple[str, str]]:
     for page in PAGES:
         name = page.relative_to(ROOT).as_posix()
         text = re.sub(r" *\\\n *", " ", page.read_text(encoding="utf-8"))
-        found += [(name, m.group(1)) for m in COMMAND.finditer(text)]
-    return found
+        found += [(name, m[1] or m[2]) for m in COMMAND.finditer(text)]
+    return [(name, line) for name, line in found if "[--" not in line and "COMMAND" not in line]
 
 
 def understood(line: str) -> None:
@@ -135,7 +135,7 @@ def understood(line: str) -> None:
     Raises:
         Usage: they make no command.
     """
-    arguments = shlex.split(line, comments=True)
+    arguments = [a for a in shlex.split(line, comments=True) if a != "--traceback"]
     if sorted(arguments) in (["--version"], ["--verbose", "--version"]):
         return
     if help_screen(arguments) is None:
@@ -159,7 +159,8 @@ def spans() -> list[tuple[str, str]]:
     for page in PAGES:
         text = " ".join(page.read_text(encoding="utf-8").split())
         for span in re.findall(r"`univoxel ([^`]+)`", text):
-            found.append((page.relative_to(ROOT).as_posix(), span))
+            if not span.startswith("was built"):  # a message
+                found.append((page.relative_to(ROOT).as_posix(), span))
     return found
 
 

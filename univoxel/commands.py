@@ -66,6 +66,18 @@ Points: TypeAlias = Annotated[
     UseAppendAction[tuple[tuple[float, float, float, float], ...]],
     arg(metavar="X Y Z INTENSITY"),
 ]
+Minutes: TypeAlias = Annotated[
+    float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
+]
+TimelapseFile: TypeAlias = Annotated[
+    str | None, arg(metavar="FILE.gif|FILE.mp4|DIR/", help_behavior_hint="(default: none)")
+]
+Seed: TypeAlias = Annotated[
+    int | None, arg(metavar="N", help_behavior_hint="(default: 0, or that of --config)")
+]
+ConfigFile: TypeAlias = Annotated[
+    Path | None, arg(metavar="FILE", help_behavior_hint="(default: what --preset says)")
+]
 JsonFile: TypeAlias = Annotated[
     Path | None, arg(metavar="FILE|-", help_behavior_hint="(default: none)")
 ]
@@ -220,24 +232,16 @@ def train(
     cameras: CamerasFrom = "auto",
     downscale: Annotated[Downscale, arg(metavar="auto|N")] = "auto",
     field: FieldName = "hash",
-    minutes: Annotated[
-        float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
-    ] = None,
+    minutes: Minutes = None,
     capacity: CapacityOrAuto = "auto",
     budget_mb: Annotated[
         float | None, arg(metavar="MB", help_behavior_hint="(default: no limit)")
     ] = None,
     allow_outside: bool = False,
     resume: bool = False,
-    timelapse: Annotated[
-        str | None, arg(metavar="FILE.gif|FILE.mp4|DIR/", help_behavior_hint="(default: none)")
-    ] = None,
-    seed: Annotated[
-        int | None, arg(metavar="N", help_behavior_hint="(default: 0, or that of --config)")
-    ] = None,
-    config: Annotated[
-        Path | None, arg(metavar="FILE", help_behavior_hint="(default: what --preset says)")
-    ] = None,
+    timelapse: TimelapseFile = None,
+    seed: Seed = None,
+    config: ConfigFile = None,
     set: Changes = (),
 ) -> None:
     """Recover geometry, materials and light from posed photographs.
@@ -663,9 +667,7 @@ def compare(
     out: Annotated[Path, arg(metavar="DIR")],
     preset: PresetOrAuto = "auto",
     light: Annotated[tuple[str, ...], arg(metavar="LIGHT [LIGHT ...]")] = LIGHTS,
-    minutes: Annotated[
-        float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
-    ] = None,
+    minutes: Minutes = None,
     samples: int = SAMPLES,
     set: Changes = (),
 ) -> None:
