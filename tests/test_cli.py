@@ -144,6 +144,36 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
 
 
+def test_train_as_another_run_was_trained(calls, tmp_path, capsys):
+    from univoxel.config import TrainConfig, save_config
+    from univoxel.training.config import StageConfig
+
+    (tmp_path / "before").mkdir()
+    stages = (StageConfig(voxels=1.0, iterations=10, share=1.0),)
+    before = TrainConfig(Path("cup"), tmp_path / "before", stages, 1.0, downscale=2, seed=3)
+    save_config(before)
+    file = str(tmp_path / "before/config.json")
+    options = ["--config", file, "--seed", "7", "--minutes", "2", "--set", "loss.radiance=2"]
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), *options]) == 0
+    expected = replace_fields(
+        before,
+        data=Path("photos"),
+        out=tmp_path / "run",
+        downscale=0,  # these photographs are of another size
+        seed=7,
+        minutes=2.0,
+        loss=replace_fields(before.loss, radiance=2.0),
+    )
+    assert calls.noted[-1][1] == (expected,)
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), "--config", file]) == 0
+    assert calls.noted[-1][1][0].seed == 3
+    both = ["--config", file, "--light", "sh"]
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), *both]) == 2
+    assert "expected --config or --light sh, got both" in capsys.readouterr().err
+    assert main(["train", "photos", "--out", "x", "--config", str(tmp_path / "none.json")]) == 2
+    assert "none.json: expected a configuration" in capsys.readouterr().err
+
+
 def test_poses(calls, capsys):
     from univoxel.capture.config import DEFAULTS, FAST
 
