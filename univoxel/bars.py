@@ -18,13 +18,13 @@ T = TypeVar("T")
 
 LINE_SECONDS = 10.0  # between lines, where there is no bar
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 class _Lines(Progress):
     """Progress as lines of the log, of the columns that are text."""
 
-    def __init__(self, *columns: ProgressColumn, console: Console):
+    def __init__(self, *columns: ProgressColumn, console: Console) -> None:
         super().__init__(*columns, console=console, disable=True, auto_refresh=False)
         self._told = monotonic()
 

@@ -180,7 +180,7 @@ def with_options(message: str, arguments: Sequence[str]) -> str:
 class _Plain(logging.Handler):
     """Prints what the package says, as it is; progress on stderr."""
 
-    def __init__(self, common: Common, results_alone: bool):
+    def __init__(self, common: Common, results_alone: bool) -> None:
         super().__init__()
         self._begin = time.monotonic() if common.verbose else None
         self._results_alone = results_alone

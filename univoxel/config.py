@@ -89,7 +89,7 @@ class TrainConfig:
     # what is said of the scene afterwards; evaluation reads it from the run's config.json
     confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")
         check_fields(self, "a path in UTF-8", _is_utf8, "data", "out")
         check_fields(
@@ -238,7 +238,7 @@ def _as_json(value: Any) -> Any:
     return json.loads(json.dumps(value, default=str))
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     """Where presets were before they had a module of their own."""
     if name in ("budget", "chosen", "preset", "with_field"):
         return getattr(import_module("univoxel.presets"), name)

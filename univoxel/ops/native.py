@@ -21,7 +21,7 @@ from torch import Tensor
 
 from univoxel.errors import MissingNative
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 Backend = Literal["auto", "native", "reference"]
 FOLDER = Path(__file__).parent.parent / "_core"
@@ -90,6 +90,8 @@ def _load() -> tuple[ModuleType | None, str]:
     return None, f"no extension built under {FOLDER}"
 
 
+core: ModuleType | None
+variant: str
 core, variant = _load()
 
 

@@ -22,7 +22,7 @@ from univoxel.preparation.hull import estimate_bounds, visual_hull, votes_needed
 from univoxel.preparation.matches import Agreement, agreement, find_matches
 from univoxel.preparation.registration import contradiction
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from univoxel.preparation.observed_hull import observe_hull
 from univoxel.render.transport import Observations
 from univoxel.sphere import real_harmonics
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)

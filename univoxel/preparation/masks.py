@@ -16,7 +16,7 @@ from univoxel.names import MasksFrom
 from univoxel.preparation.config import MASKS, MaskConfig
 from univoxel.preparation.hull import mask_distances
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @torch.no_grad()
