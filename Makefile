@@ -73,6 +73,8 @@ lint: $(SETUP)
 	$(BIN)/ruff check .
 	$(BIN)/clang-format --dry-run -Werror csrc/*.* csrc/*/*
 	$(BIN)/pyright
+	mkdir -p build && cd build && PATH="$(CURDIR)/$(BIN):$$PATH" PYTHONPATH="$(CURDIR)" \
+		pyright --verifytypes univoxel --ignoreexternal >types.log || { grep -A1 error types.log; exit 1; }
 
 format: $(SETUP)
 	$(BIN)/ruff format .

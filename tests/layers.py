@@ -37,6 +37,7 @@ LAYERS = [
     {"experiments.worker"},
     {"experiments.runner"},
     {"experiments"},
+    {"parsing"},
     {"commands"},
     {"cli"},
 ]

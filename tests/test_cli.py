@@ -2,8 +2,10 @@
 
 import errno
 import importlib
+import json
 import logging
 import os
+import re
 import subprocess
 import sys
 import types
@@ -16,7 +18,7 @@ import pytest
 import univoxel
 from univoxel import errors
 from univoxel.cli import SPINS, main
-from univoxel.commands import COMMANDS
+from univoxel.commands import COMMANDS, EVERYDAY, LABORATORY
 from univoxel.errors import (
     ExistingFile,
     MissingExtra,
@@ -159,6 +161,36 @@ def test_capture(calls, capsys):
     assert "mug keeps the steps that are done: the same command" in capsys.readouterr().err
 
 
+def test_train_as_another_run_was_trained(calls, tmp_path, capsys):
+    from univoxel.config import TrainConfig, save_config
+    from univoxel.training.config import StageConfig
+
+    (tmp_path / "before").mkdir()
+    stages = (StageConfig(voxels=1.0, iterations=10, share=1.0),)
+    before = TrainConfig(Path("cup"), tmp_path / "before", stages, 1.0, downscale=2, seed=3)
+    save_config(before)
+    file = str(tmp_path / "before/config.json")
+    options = ["--config", file, "--seed", "7", "--minutes", "2", "--set", "loss.radiance=2"]
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), *options]) == 0
+    expected = replace_fields(
+        before,
+        data=Path("photos"),
+        out=tmp_path / "run",
+        downscale=0,  # these photographs are of another size
+        seed=7,
+        minutes=2.0,
+        loss=replace_fields(before.loss, radiance=2.0),
+    )
+    assert calls.noted[-1][1] == (expected,)
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), "--config", file]) == 0
+    assert calls.noted[-1][1][0].seed == 3
+    both = ["--config", file, "--light", "sh"]
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), *both]) == 2
+    assert "expected --config or --light sh, got both" in capsys.readouterr().err
+    assert main(["train", "photos", "--out", "x", "--config", str(tmp_path / "none.json")]) == 2
+    assert "none.json: expected a configuration" in capsys.readouterr().err
+
+
 def test_poses(calls, capsys):
     from univoxel.capture.config import DEFAULTS, FAST
 
@@ -187,16 +219,17 @@ def test_sizes_of_poses_out_of_range(calls, capsys, option):
 
 
 def test_cutout(calls, capsys):
-    options = ["--box", "-1", "-2", "0", "1", "2", "0.5", "--downscale", "2"]
+    options = ["--box", "-1", "-2", "0", "1", "2", "0.5", "--downscale", "2", "--seed", "5"]
     assert main(["cutout", "photos", "--out", "cut", *options]) == 0
     given = {"box": (-1.0, -2.0, 0.0, 1.0, 2.0, 0.5), "downscale": 2, "allow_outside": False}
+    given |= {"seed": 5}
     assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "none"), given)]
     assert capsys.readouterr().out == "cut\n"
 
 
 def test_cutout_from_masks(calls, capsys):
     assert main(["cutout", "photos", "--out", "cut", "--from", "masks"]) == 0
-    given = {"box": None, "downscale": 0, "allow_outside": False}
+    given = {"box": None, "downscale": 0, "allow_outside": False, "seed": 0}
     assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "masks"), given)]
 
 
@@ -451,30 +484,164 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "message", "see"),
     [
-        (["train"], "Missing from univoxel train: DATA "),
+        (["train"], "Missing from univoxel train: DATA ", "univoxel train"),
         (
             ["train", "x", "--out", "y", "--preset", "z"],
             "invalid choice 'z' for argument '--preset'. Expected one of ('auto', 'draft', ",
+            "univoxel train",
         ),
-        (["train", "x", "--out", "y", "--minutes", "a"], "Error parsing --minutes: "),
-        (["sing"], "Unrecognized options: sing"),
+        (["train", "x", "--out", "y", "--minutes", "a"], "Error parsing --minutes: ", "train"),
         (
-            [],
-            "Expected one of {capture, poses, cutout, train, eval, relight, export, view, envmap, "
-            "submit, inspect, info, compare, chart, stress, demo, doctor}",
+            ["relight", "x", "--sampels", "3"],
+            "Unrecognized options: --sampels, 3; perhaps you meant --samples; see ",
+            "univoxel relight",
         ),
+        (["sing"], "no command 'sing'; see ", "univoxel"),
+        (["trian", "x"], "no command 'trian'; perhaps you meant train; see ", "univoxel"),
+        (["lab", "comapre"], "no command 'comapre'; perhaps you meant compare", "univoxel lab"),
+        (["compare"], "Missing from univoxel lab compare: --out ", "univoxel lab compare"),
+        (["doctor", "--threads", "0"], "--threads must be at least 1, got 0", "univoxel doctor"),
+        (["doctor", "--quiet", "--verbose"], "expected --quiet or --verbose, got both", "doctor"),
     ],
 )
-def test_wrong_usage_is_one_line(calls, capsys, arguments, message):
+def test_wrong_usage_is_one_line(calls, capsys, arguments, message, see):
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert err.startswith(f"univoxel: {message}")
-    assert err.endswith("; see univoxel --help\n")
+    assert err.endswith(f"{see} --help\n")
     assert err.count("\n") == 1
     assert not out
     assert calls.noted == []
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"], ["help"]])
+def test_help_is_one_screen_in_the_order_of_work(capsys, arguments):
+    assert main(arguments) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 24
+    assert max(map(len, lines)) < 80
+    named = [line.split()[0] for line in lines if line.startswith("  ")]
+    assert set(named) == {*EVERYDAY, "lab"}
+    order = ["poses", "cutout", "train", "eval", "relight", "export", "demo", "doctor", "lab"]
+    assert [name for name in named if name in order] == order
+    assert all(line.strip() != line.split()[0] for line in lines[2:-1])  # each says what it does
+
+
+def test_the_laboratory_has_a_screen_of_its_own(capsys):
+    assert main(["lab"]) == 0
+    named = [line.split()[0] for line in capsys.readouterr().out.splitlines()[2:-1]]
+    assert named == list(LABORATORY)
+    assert "compare" not in EVERYDAY
+
+
+@pytest.mark.parametrize("word", [["lab"], []])
+def test_commands_of_the_laboratory_have_their_old_names_too(calls, word):
+    calls.stand_in("univoxel.experiments.stress.suite", stress=calls.task("stress", "breaks"))
+    assert main([*word, "stress", "--out", "out"]) == 0
+    assert calls.noted == [("stress", (Path("out"), (), (), None, False, ()), {})]
+
+
+def said(capsys, calls, *options):
+    """What a command that logs at every level prints: stdout and stderr."""
+
+    def info(*_, **__):
+        logger = logging.getLogger("univoxel")
+        for level in ("debug", "info", "warning"):
+            getattr(logger, level)(level)
+        logger.info("half", extra={"progress": True})
+        return {"chosen": []}
+
+    calls.stand_in("univoxel.tasks.info", info=info, tables=lambda found: ["the table"])
+    assert main(["info", "run", *options]) == 0
+    return [stream.split("\n")[:-1] for stream in capsys.readouterr()]
+
+
+def test_quiet_leaves_results_and_warnings(capsys, calls):
+    assert said(capsys, calls) == [["info", "warning", "the table"], ["half"]]
+    assert said(capsys, calls, "--quiet") == [["warning", "the table"], []]
+
+
+def test_verbose_says_when(capsys, calls):
+    out, err = said(capsys, calls, "--verbose")
+    assert [line.split("s  ")[-1] for line in out] == ["debug", "info", "warning", "the table"]
+    assert all(float(line.split()[0]) >= 0 for line in [*out[:-1], *err])
+
+
+def test_verbose_shows_where_a_mistake_came_from(calls):
+    calls.replace("evaluate", UserError("wrong"))
+    with pytest.raises(UserError):
+        main(["eval", "run", "--verbose"])
+
+
+def test_threads(calls, monkeypatch):
+    import torch
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    before = torch.get_num_threads()
+    try:
+        assert main(["info", "run", "--threads", "1"]) == 0
+        assert os.environ["OMP_NUM_THREADS"] == "1"
+        assert torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_threads_are_known_before_torch_is_imported():
+    code = (
+        "import sys\nfrom univoxel.cli import main\n"
+        "sys.exit(main(['doctor', '--threads', '1', '--json', '-']))"
+    )
+    env = os.environ | {"OMP_NUM_THREADS": "2"}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert run.returncode == 0, run.stderr
+    found = {one["what"]: one["found"] for one in json.loads(run.stdout)}
+    assert found["threads"].startswith("1 on ")
+    assert found["threads"].endswith("OMP_NUM_THREADS=1")
+
+
+@pytest.mark.parametrize("command", ["info", "eval"])
+def test_json_alone_on_stdout(capsys, calls, command):
+    def write(*_, json, **__):
+        logging.getLogger("univoxel").info("a remark")
+        json.write_text('{"psnr": 30}\n')
+        return {"chosen": []}
+
+    task = {"info": "info", "eval": "evaluate"}[command]
+    table = {"tables": lambda found: ["t"], "table": lambda found: "t"}
+    calls.stand_in(f"univoxel.tasks.{task}", **{task: write}, **table)
+    assert main([command, "run", "--json", "-"]) == 0
+    assert capsys.readouterr() == ('{"psnr": 30}\n', "a remark\n")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_names_commands_options_and_choices(capsys, shell):
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    for word in ("relight", "compare", "lab", "--orbit", "--budget-mb", "--quiet", "draft"):
+        assert word.removeprefix("--") in script, word
+
+
+def test_bash_completes(capsys, tmp_path):
+    assert main(["completion", "bash"]) == 0
+    (tmp_path / "script").write_text(capsys.readouterr().out)
+
+    def completed(*words):
+        code = (
+            'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); '
+            f'{entry} univoxel; printf "%s\\n" "${{COMPREPLY[@]}}"'
+        )
+        command = ["bash", "-c", code, "bash", str(tmp_path / "script"), "univoxel", *words]
+        run = subprocess.run(command, capture_output=True, text=True, check=True)
+        return {line.strip() for line in run.stdout.splitlines()}
+
+    script = (tmp_path / "script").read_text()
+    entry = re.search(r"^complete -o default -F (\S+) univoxel$", script, re.MULTILINE)[1]
+    assert {"relight", "export"} <= completed("re") | completed("ex")
+    assert "--preset" in completed("train", "--pre")
+    assert {"draft", "fast", "full"} <= completed("train", "--preset", "")
+    assert "compare" in completed("lab", "com")
 
 
 def test_an_interrupt_says_what_was_kept(calls, tmp_path, capsys):

@@ -1,13 +1,14 @@
 """Configurations: presets, their file, and every range that is checked."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from univoxel.config import TrainConfig, check_same, save_config
-from univoxel.errors import ConfigError
+from univoxel.config import TrainConfig, check_same, load_config, save_config
+from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.joint.config import JointConfig
 from univoxel.lights.sg import SGConfig
 from univoxel.names import LIGHTS
@@ -261,3 +262,34 @@ def test_a_run_does_not_go_on_under_other_constants_of_compression(tmp_path):
     cfg = saved(tmp_path, lambda content: content["compression"].update(rehearsal_steps=99))
     with pytest.raises(ValueError, match="the run began with other compression"):
         check_same(cfg)
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+def test_a_configuration_is_read_back_as_it_was_written(tmp_path, light):
+    config = preset("draft", Path("photos"), tmp_path, light)
+    save_config(config)
+    assert load_config(tmp_path / "config.json") == config
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[]", "expected an object with the configuration"),
+        ('{"data": "a"}', "TrainConfig: out is missing"),
+        ('{"data": "a", "out": "b", "minutes": 1, "stages": [{"voxels": "many"}]}', "voxels must"),
+        ('{"data": "a", "out": "b", "minutes": 1, "stages": [], "sead": 1}', "no field 'sead'"),
+        ('{"scene": {"light": {"kind": "lamp"}}}', "light must be one of"),
+        ("{", "config.json"),
+    ],
+)
+def test_a_file_that_is_no_configuration(tmp_path, text, message):
+    path = tmp_path / "config.json"
+    path.write_text(text)
+    with pytest.raises(UserError, match=f"config.json.*{re.escape(message)}|{message}") as caught:
+        load_config(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_configuration_that_is_not_there(tmp_path):
+    with pytest.raises(MissingFile, match="expected a configuration"):
+        load_config(tmp_path / "config.json")

@@ -45,7 +45,7 @@ class Run:
     path: Path
     scene: Scene
 
-    def __init__(self, path: str | Path):
+    def __init__(self, path: str | Path) -> None:
         """
         Raises:
             MissingFile: no trained scene is there.

@@ -1,20 +1,59 @@
-"""Progress bars: on stderr, and only where that is a terminal."""
+"""Progress for who asked for it: whose logger `univoxel` is enabled for INFO.
+
+A bar on stderr where that is a terminal; elsewhere a line of the log now and then.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
+from time import monotonic
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import Progress, ProgressColumn
+from rich.progress import Progress, ProgressColumn, TaskID
+from rich.text import Text
 
 T = TypeVar("T")
+
+LINE_SECONDS = 10.0  # between lines, where there is no bar
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+
+class _Lines(Progress):
+    """Progress as lines of the log, of the columns that are text."""
+
+    def __init__(self, *columns: ProgressColumn, console: Console) -> None:
+        super().__init__(*columns, console=console, disable=True, auto_refresh=False)
+        self._told = monotonic()
+
+    def update(self, task_id: TaskID, **changes) -> None:
+        super().update(task_id, **changes)
+        self._tell(task_id)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        super().advance(task_id, advance)
+        self._tell(task_id)
+
+    def _tell(self, task_id: TaskID) -> None:
+        if monotonic() - self._told < LINE_SECONDS:
+            return
+        self._told = monotonic()
+        task = next(task for task in self.tasks if task.id == task_id)
+        cells = [column(task) for column in self.columns if isinstance(column, ProgressColumn)]
+        line = "  ".join(cell.plain.strip() for cell in cells if isinstance(cell, Text))
+        log.info("%s", line, extra={"progress": True})
 
 
 def bar(*columns: ProgressColumn, shown: bool = True) -> Progress:
     """A bar of these columns, or rich's own."""
     console = Console(stderr=True)
-    return Progress(*columns, console=console, disable=not (shown and console.is_terminal))
+    if not (shown and log.isEnabledFor(logging.INFO)):
+        return Progress(*columns, console=console, disable=True, auto_refresh=False)
+    if not console.is_terminal:
+        return _Lines(*columns, console=console)
+    return Progress(*columns, console=console)
 
 
 def track(items: Sequence[T], description: str) -> Iterator[T]:

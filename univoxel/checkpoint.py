@@ -7,6 +7,7 @@ import math
 import os
 from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -74,7 +75,7 @@ def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict
 
 
 def save_scene(
-    scene: Scene, run: Path, state: dict, slim: bool = False, reach: float | None = None
+    scene: Scene, run: Path, state: dict[str, Any], slim: bool = False, reach: float | None = None
 ) -> Path:
     """Write run/scene.safetensors whole or not at all; `state` (JSON) travels in its metadata.
 
@@ -137,7 +138,7 @@ class State:
     threads: int = 1
     peak_rss_mb: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         counts = "stage", "step", "stage_steps", "seconds"
         check_fields(self, "finite, at least 0", lambda x: 0 <= x < math.inf, *counts)
         check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "progress")
@@ -153,7 +154,7 @@ class Description:
     field: FieldName = "dense"
     levels: Levels | None = None  # of a hash field
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "inv_s")
         if (self.field == "hash") != (self.levels is not None):
             raise ConfigError(
@@ -161,7 +162,7 @@ class Description:
             )
 
 
-def load_checkpoint(run: str | Path) -> tuple[Scene, dict]:
+def load_checkpoint(run: str | Path) -> tuple[Scene, dict[str, Any]]:
     """The scene of a run, in evaluation mode, and the state it was saved with.
 
     Sizes that the file claims are compared with its tensors before memory is taken for them.
@@ -192,7 +193,7 @@ def load_checkpoint(run: str | Path) -> tuple[Scene, dict]:
         raise DataError(f"{path}: does not fit its own description: {error}") from error
 
 
-def _read(path: Path) -> tuple[dict, dict[str, Tensor]]:
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """What a file says of itself, and its tensors, all finite."""
     try:
         with safe_open(path, "pt") as file:
@@ -212,7 +213,7 @@ def _read(path: Path) -> tuple[dict, dict[str, Tensor]]:
     return meta, tensors
 
 
-def _description(meta: dict, tensors: dict[str, Tensor]) -> Description:
+def _description(meta: dict[str, Any], tensors: dict[str, Tensor]) -> Description:
     """The description, also of files from before there were all of its parts, which get them."""
     scene = dict(meta["scene"])
     scene["light"] = read_config(scene["light"])

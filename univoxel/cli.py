@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import functools
-import io
 import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import tyro
-from tyro.conf import FlagCreatePairsOff
-
 from univoxel import __version__
-from univoxel.commands import COMMANDS, capture, chart, compare, poses, stress, train
+from univoxel.commands import (
+    EVERYDAY,
+    LABORATORY,
+    STDOUT,
+    capture,
+    chart,
+    compare,
+    poses,
+    stress,
+    train,
+)
 from univoxel.errors import UserError
+from univoxel.parsing import LAB, Call, Command, Common, Usage, overview, parse
 
 # What a command may raise for a mistake of its user, see `is_mistake`; all else is a bug and keeps
 # its traceback
@@ -45,8 +52,7 @@ def main(argv: list[str] | None = None) -> int:
         os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        with spoken():
-            code = _run(arguments)
+        code = _run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # such as `univoxel --help | head`
         # Python flushes once more at its end: into nothing
@@ -68,37 +74,70 @@ def _run(arguments: list[str]) -> int:
     if (wrong := unusable(arguments)) is not None:
         print(f"univoxel: {wrong}; see univoxel --help", file=sys.stderr)
         return 2
-    # Parse alone first: what a command raises must not pass for an error of its arguments.
-    said = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(said):
-            call = tyro.extras.subcommand_cli_from_dict(
-                {name: _deferred(command) for name, command in COMMANDS.items()},
-                prog="univoxel",
-                description="From posed photographs to a relightable object, on a plain CPU.",
-                args=arguments,
-                config=(FlagCreatePairsOff,),
-            )
-    except SystemExit as end:
-        if end.code:
-            print(f"univoxel: {_gist(said.getvalue())}; see univoxel --help", file=sys.stderr)
-            return 2
+    if (screen := help_screen(arguments)) is not None:
+        print(screen)
         return 0
+    # Parse alone first: what a command raises must not pass for an error of its arguments.
     try:
-        call()
+        call = parse(arguments, EVERYDAY, LABORATORY)
+    except Usage as wrong:
+        print(f"univoxel: {wrong}", file=sys.stderr)
+        return 2
+    if call is None:
+        return 0
+    take_threads(call.common.threads)
+    try:
+        with spoken(call.common, results_alone=call.run.keywords.get("json") == STDOUT):
+            call.run()
     except KeyboardInterrupt:
-        print(f"univoxel {arguments[0]}: interrupted{_kept(call)}", file=sys.stderr)
+        print(f"univoxel {call.name}: interrupted{_kept(call)}", file=sys.stderr)
         return 130
     except (*MISTAKES, RuntimeError) as error:
-        if traceback or not is_mistake(error):
+        if traceback or call.common.verbose or not is_mistake(error):
             raise
         message = " ".join(str(error).split()) or type(error).__name__
         if isinstance(error, UserError):
             message = with_options(message, error.arguments)
-        message = message.removeprefix(f"{arguments[0]}: ")
-        print(f"univoxel {arguments[0]}: {message}", file=sys.stderr)
+        message = message.removeprefix(f"{call.name.split()[-1]}: ")
+        print(f"univoxel {call.name}: {message}", file=sys.stderr)
         return 2
     return 0
+
+
+def help_screen(arguments: Sequence[str]) -> str | None:
+    """The overview that arguments ask for; None: they ask for something else."""
+    match arguments:
+        case [] | ["-h" | "--help" | "help"]:
+            title = f"univoxel {__version__}: from photographs to a relightable object, on any CPU"
+            return overview(title, groups(), "univoxel COMMAND --help says what a command takes.")
+        case ["lab"] | ["lab", "-h" | "--help" | "help"]:
+            end = f"univoxel {LAB} COMMAND --help says what a command takes."
+            return overview("Commands of the laboratory", {f"univoxel {LAB}": LABORATORY}, end)
+    return None
+
+
+def groups() -> dict[str, dict[str, Command]]:
+    """Commands in the order of work; what no group names is of a run."""
+    first = ("capture", "poses", "cutout", "train")
+    last = ("demo", "doctor", "completion")
+    run = [name for name in EVERYDAY if name not in first + last]
+    named = {"From photographs": first, "Of a run": run, "Of the package": last}
+    found = {g: {n: EVERYDAY[n] for n in names if n in EVERYDAY} for g, names in named.items()}
+    found["Of the package"][LAB] = laboratory
+    return found
+
+
+def laboratory() -> None:
+    """Many trainings, compared and charted; submissions to benchmarks."""
+
+
+def take_threads(threads: int | None) -> None:
+    """Let kernels, torch and processes begun from here run on so many threads."""
+    if threads is None:
+        return
+    os.environ["OMP_NUM_THREADS"] = str(threads)  # read when a command imports torch
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.set_num_threads(threads)
 
 
 def unusable(arguments: Sequence[str]) -> str | None:
@@ -149,19 +188,33 @@ def with_options(message: str, arguments: Sequence[str]) -> str:
 
 
 class _Plain(logging.Handler):
-    """Prints what the package says, as it is."""
+    """Prints what the package says, as it is; progress on stderr."""
+
+    def __init__(self, common: Common, results_alone: bool) -> None:
+        super().__init__()
+        self._begin = time.monotonic() if common.verbose else None
+        self._results_alone = results_alone
 
     def emit(self, record: logging.LogRecord) -> None:
-        print(with_options(record.getMessage(), getattr(record, "arguments", ())), flush=True)
+        said = with_options(record.getMessage(), getattr(record, "arguments", ()))
+        if self._begin is not None:
+            said = f"{time.monotonic() - self._begin:7.1f} s  {said}"
+        aside = self._results_alone or getattr(record, "progress", False)
+        print(said, file=sys.stderr if aside else sys.stdout, flush=True)
 
 
 @contextlib.contextmanager
-def spoken() -> Iterator[None]:
-    """Print what the package logs, from INFO on, while a command runs."""
-    logger, handler = logging.getLogger("univoxel"), _Plain()
+def spoken(common: Common, results_alone: bool) -> Iterator[None]:
+    """Print what the package logs while a command runs.
+
+    Args:
+        results_alone: on stdout; all else goes to stderr.
+    """
+    logger, handler = logging.getLogger("univoxel"), _Plain(common, results_alone)
     level = logger.level
     logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
+    chosen = logging.WARNING if common.quiet else logging.DEBUG if common.verbose else logging.INFO
+    logger.setLevel(chosen)
     try:
         yield
     finally:
@@ -169,36 +222,14 @@ def spoken() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _deferred(command: Callable[..., None]) -> Callable[..., functools.partial[None]]:
-    """A function of the same signature that returns the call instead of making it."""
-
-    @functools.wraps(command)
-    def prepare(*args, **kwargs):
-        return functools.partial(command, *args, **kwargs)
-
-    return prepare
-
-
-def _gist(box: str) -> str:
-    """The message alone, on one line, of the box that tyro draws around an error.
-
-    The box has a title, the message and hints, with rules between them.
-    """
-    lines = [line.strip("│╰╯ ") for line in box.splitlines()][1:]
-    ruled = [bool(line) and not line.strip("─-") for line in lines]
-    begin = ruled[:1] == [True]  # without UTF-8 there is a rule under the title
-    message = lines[begin : ruled.index(True, begin)] if True in ruled[begin:] else lines
-    return " ".join(" ".join(message).split()).rstrip(".")
-
-
-def _kept(call: functools.partial[None]) -> str:
+def _kept(call: Call) -> str:
     """What an interrupted command left behind."""
-    out = call.keywords.get("out")
-    if call.func in (compare, chart, stress):
+    out = call.run.keywords.get("out")
+    if call.run.func in (compare, chart, stress):
         return f"; {out} keeps the trainings that are done: the same command goes on"
-    if call.func in (capture, poses):
+    if call.run.func in (capture, poses):
         return f"; {out} keeps the steps that are done: the same command goes on"
-    if call.func is not train or not isinstance(out, Path):
+    if call.run.func is not train or not isinstance(out, Path):
         return ""
     if (out / "scene.safetensors").exists():
         return f"; {out} keeps the last saved state: go on with --resume"

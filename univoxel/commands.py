@@ -5,9 +5,12 @@ Tasks are imported by the command that runs them: `univoxel --help` does not wai
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Callable
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
@@ -40,8 +43,10 @@ from univoxel.names import (
     PresetName,
     PresetOrAuto,
 )
+from univoxel.parsing import Command, Shell
 
 if TYPE_CHECKING:
+    from univoxel.config import TrainConfig
     from univoxel.ops import PointLight, Sun
 
 Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
@@ -61,9 +66,39 @@ Points: TypeAlias = Annotated[
     UseAppendAction[tuple[tuple[float, float, float, float], ...]],
     arg(metavar="X Y Z INTENSITY"),
 ]
+Minutes: TypeAlias = Annotated[
+    float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
+]
+TimelapseFile: TypeAlias = Annotated[
+    str | None, arg(metavar="FILE.gif|FILE.mp4|DIR/", help_behavior_hint="(default: none)")
+]
+Seed: TypeAlias = Annotated[
+    int | None, arg(metavar="N", help_behavior_hint="(default: 0, or that of --config)")
+]
+ConfigFile: TypeAlias = Annotated[
+    Path | None, arg(metavar="FILE", help_behavior_hint="(default: what --preset says)")
+]
+JsonFile: TypeAlias = Annotated[
+    Path | None, arg(metavar="FILE|-", help_behavior_hint="(default: none)")
+]
 LightOf: TypeAlias = Annotated[
     str | None, arg(metavar="VIEW", help_behavior_hint="(default: the mean of all)")
 ]
+
+
+STDOUT = Path("-")  # as a file for JSON: print it, and it alone
+
+
+@contextlib.contextmanager
+def json_file(asked: Path | None) -> Iterator[Path | None]:
+    """The file for a task to write; what was asked to be printed is, at the end."""
+    if asked != STDOUT:
+        yield asked
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "printed.json"
+        yield file
+        print(file.read_text(encoding="utf-8"), end="")
 
 
 def check_minutes(minutes: float | None) -> None:
@@ -87,6 +122,54 @@ def check_downscale(downscale: Downscale) -> int:
     if downscale < 1:
         raise UserError(f"--downscale must be at least 1, got {downscale}")
     return downscale
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Options of train that a preset is made into a configuration with."""
+
+    preset: PresetOrAuto = "auto"
+    light: LightName = "hybrid"
+    varying: Differing = "auto"
+    light_frame: LightFrameOrAuto = "auto"
+    masks: MasksFrom = "auto"
+    cameras: CamerasFrom = "auto"
+    field: FieldName = "hash"
+    capacity: CapacityOrAuto = "auto"
+    budget_mb: float | None = None
+
+    def configuration(self, minutes: float | None, data: Path, out: Path) -> TrainConfig:
+        """What they amount to."""
+        from univoxel.presets import chosen, with_field
+
+        config = chosen(self.preset, minutes, data, out, self.light, self.varying)
+        config = dataclasses.replace(config, masks=self.masks, cameras=self.cameras)
+        config = with_field(config, self.field)
+        if self.light_frame != "auto":
+            config = dataclasses.replace(config, light_frame=self.light_frame)
+        fits = self.budget_mb is not None and self.capacity == "auto"
+        capacity = "adaptive" if fits else self.capacity
+        if capacity == "auto":
+            return config
+        return dataclasses.replace(config, capacity=capacity, budget_mb=self.budget_mb)
+
+
+def configuration_of(
+    file: Path, choices: Choices, minutes: float | None, data: Path, out: Path
+) -> TrainConfig:
+    """The configuration in a file, for other photographs.
+
+    Raises:
+        UserError: the file cannot be read, or a choice was made that it makes itself.
+    """
+    from univoxel.config import load_config
+
+    for field in dataclasses.fields(choices):
+        if (value := getattr(choices, field.name)) != field.default:
+            option = f"--{field.name.replace('_', '-')} {value}"
+            raise UserError(f"expected --config or {option}, got both: {file} says it")
+    config = dataclasses.replace(load_config(file), data=data, out=out)
+    return config if minutes is None else dataclasses.replace(config, minutes=minutes)
 
 
 def sun_light(values: tuple[float, ...]) -> Sun:
@@ -149,18 +232,16 @@ def train(
     cameras: CamerasFrom = "auto",
     downscale: Annotated[Downscale, arg(metavar="auto|N")] = "auto",
     field: FieldName = "hash",
-    minutes: Annotated[
-        float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
-    ] = None,
+    minutes: Minutes = None,
     capacity: CapacityOrAuto = "auto",
     budget_mb: Annotated[
         float | None, arg(metavar="MB", help_behavior_hint="(default: no limit)")
     ] = None,
     allow_outside: bool = False,
     resume: bool = False,
-    timelapse: Annotated[
-        str | None, arg(metavar="FILE.gif|FILE.mp4|DIR/", help_behavior_hint="(default: none)")
-    ] = None,
+    timelapse: TimelapseFile = None,
+    seed: Seed = None,
+    config: ConfigFile = None,
     set: Changes = (),
 ) -> None:
     """Recover geometry, materials and light from posed photographs.
@@ -197,26 +278,28 @@ def train(
         allow_outside: read photographs outside of DATA too, where its files or links name such
         resume: go on with the run in --out; where nothing was saved yet, it begins
         timelapse: picture of a test view over training time, or a folder of its frames
+        seed: of all random choices
+        config: config.json of another run, to train these photographs alike: it says all that
+            --preset, --light and such would; --minutes, --seed, --downscale and --set go before it
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
             stages.1.voxels=3; config.json in a run's folder holds them all
     """
     from univoxel.overrides import changed
-    from univoxel.presets import chosen, with_field
     from univoxel.tasks import train as task
     from univoxel.tasks.view import with_page
 
     check_minutes(minutes)
     if not resume and (out / "scene.safetensors").exists():
         raise ExistingFile(f"{out} holds a run already: add --resume, or choose another --out")
-    config = chosen(preset, minutes, data=data, out=out, light=light, varying=varying)
-    options = {"masks": masks, "cameras": cameras, "allow_outside": allow_outside}
-    options |= {} if light_frame == "auto" else {"light_frame": light_frame}
-    config = dataclasses.replace(config, downscale=check_downscale(downscale), **options)
-    config = with_field(config, field)
-    capacity = "adaptive" if budget_mb is not None and capacity == "auto" else capacity
-    if capacity != "auto":
-        config = dataclasses.replace(config, capacity=capacity, budget_mb=budget_mb)
-    print(with_page(task.train(changed(config, set), resume=resume, timelapse=timelapse)))
+    of_preset = Choices(preset, light, varying, light_frame, masks, cameras, field)
+    of_preset = dataclasses.replace(of_preset, capacity=capacity, budget_mb=budget_mb)
+    if config is None:
+        asked = of_preset.configuration(minutes, data, out)
+    else:
+        asked = configuration_of(config, of_preset, minutes, data, out)
+    given = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
+    asked = dataclasses.replace(asked, **given, **({} if seed is None else {"seed": seed}))
+    print(with_page(task.train(changed(asked, set), resume=resume, timelapse=timelapse)))
 
 
 def cutout(
@@ -232,6 +315,7 @@ def cutout(
     ] = None,
     downscale: Annotated[Downscale, arg(metavar="auto|N")] = "auto",
     allow_outside: bool = False,
+    seed: int = 0,
 ) -> None:
     """Cut the object out of photographs without masks.
 
@@ -248,10 +332,12 @@ def cutout(
             cameras; what lies in it, such as a table, is part of the object
         downscale: write photographs of 1/N of their width and height; auto as of train
         allow_outside: as of train
+        seed: of all random choices
     """
     from univoxel.tasks import cutout as task
 
     options = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
+    options["seed"] = seed
     print(task.cutout(data, out, source, box=box, **options))
 
 
@@ -361,9 +447,7 @@ def evaluate(
     save: Annotated[
         Path | None, arg(metavar="DIR", help_behavior_hint="(default: none are written)")
     ] = None,
-    json: Annotated[
-        Path | None, arg(metavar="FILE", help_behavior_hint="(default: only printed)")
-    ] = None,
+    json: JsonFile = None,
     samples: int = SAMPLES,
     bounces: int = BOUNCES,
     light_of: LightOf = None,
@@ -379,7 +463,7 @@ def evaluate(
         run: folder of a trained run
         data: folder of the photographs
         save: folder for the rendered pictures
-        json: file for the measures
+        json: file for the measures; - prints them in place of the table
         samples: of the light, per pixel of relit pictures
         bounces: reflections between parts of the object in relit pictures, 0 for none
         light_of: training view, by name or number, in whose light novel views are rendered, where
@@ -392,19 +476,21 @@ def evaluate(
     """
     from univoxel.tasks import evaluate as task
 
-    measures = task.evaluate(
-        run,
-        data=data,
-        save=save,
-        json=json,
-        samples=samples,
-        bounces=bounces,
-        light_of=light_of,
-        test_every=test_every,
-        background=background,
-        fit_light=fit_light,
-    )
-    rich.print(task.table(measures))
+    with json_file(json) as file:
+        measures = task.evaluate(
+            run,
+            data=data,
+            save=save,
+            json=file,
+            samples=samples,
+            bounces=bounces,
+            light_of=light_of,
+            test_every=test_every,
+            background=background,
+            fit_light=fit_light,
+        )
+    if json != STDOUT:
+        rich.print(task.table(measures))
 
 
 def relight(
@@ -547,7 +633,7 @@ def envmap(
     height: Annotated[int, arg(metavar="ROWS")] = MAP_ROWS,
     light_of: LightOf = None,
 ) -> None:
-    """Write the light that the photographs were taken in, as an environment map.
+    """Write the light of the photographs as an environment map.
 
     Args:
         run: folder of a trained run
@@ -573,7 +659,9 @@ def submit(
     samples: Annotated[int, arg(metavar="N")] = SAMPLES,
     bounces: Annotated[int, arg(metavar="N")] = BOUNCES,
 ) -> None:
-    """Write what the benchmark of Stanford-ORB measures, of a run trained on a scene of it.
+    """Write what the benchmark of Stanford-ORB measures, of a run.
+
+    The run was trained on a scene of it.
 
     Args:
         run: folder of a trained run
@@ -598,7 +686,9 @@ def inspect(
     ] = None,
     light_of: LightOf = None,
 ) -> None:
-    """Draw the light that falls on one point of the surface, beside the truth where it is known.
+    """Draw the light that falls on one point of the surface.
+
+    The truth stands beside it where it is known.
 
     Args:
         run: folder of a trained run
@@ -616,25 +706,27 @@ def inspect(
 def info(
     run: Run,
     /,
-    json: Annotated[
-        Path | None, arg(metavar="FILE", help_behavior_hint="(default: only printed)")
-    ] = None,
+    json: JsonFile = None,
     picture: Annotated[
         Path | None, arg(metavar="FILE.png", help_behavior_hint="(default: none)")
     ] = None,
 ) -> None:
-    """Say what a model consists of: parameters and bytes by part, sizes, and what was chosen.
+    """Say what a model consists of, and what was chosen for it.
 
-    Also whether points that are matched between the photographs lie where the cameras put them.
+    Parameters and bytes by part, and sizes. Also whether points that are matched between the
+    photographs lie where the cameras put them.
 
     Args:
         run: folder of a trained run
-        json: file for the numbers
+        json: file for the numbers; - prints them in place of tables
         picture: where the grid's nodes are that hold features, and a bar of bytes by part
     """
     from univoxel.tasks import info as task
 
-    found = task.info(run, json=json, picture=picture)
+    with json_file(json) as file:
+        found = task.info(run, json=file, picture=picture)
+    if json == STDOUT:
+        return
     for table in task.tables(found):
         rich.print(table)
     for choice in found["chosen"]:
@@ -647,13 +739,11 @@ def compare(
     out: Annotated[Path, arg(metavar="DIR")],
     preset: PresetOrAuto = "auto",
     light: Annotated[tuple[str, ...], arg(metavar="LIGHT [LIGHT ...]")] = LIGHTS,
-    minutes: Annotated[
-        float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
-    ] = None,
+    minutes: Minutes = None,
     samples: int = SAMPLES,
     set: Changes = (),
 ) -> None:
-    """Train scenes with every model of light and put their measures side by side.
+    """Train scenes with every model of light, side by side.
 
     Writes DIR/compare.md, compare.json, compare.png and compare.svg. Every training is kept in
     DIR/SCENE/LIGHT with all its measures (result.json); the same command again goes on after an
@@ -689,7 +779,7 @@ def chart(
     samples: int = SAMPLES,
     set: Changes = (),
 ) -> None:
-    """Draw quality against training time: presets, and single knobs around one of them.
+    """Draw quality against training time, of presets and knobs.
 
     Trains draft, fast, full, and --preset with one knob turned: voxels-x0.5 (half the voxels of the
     finest grid), voxels-x2, rays-x0.5 (half the rays of a step), rays-x2, steps-, directions- and
@@ -731,10 +821,11 @@ def stress(
     ] = None,
     set: Changes = (),
 ) -> None:
-    """Find out where the method breaks: scenes of known truth, made harder along one axis each.
+    """Find out where the method breaks, on scenes of known truth.
 
-    Renders small scenes with Mitsuba 3, spoils their photographs, trains and measures. Writes
-    DIR/stress.md with the breaking point of each axis, stress.json, stress.png and stress.svg.
+    Renders small scenes with Mitsuba 3, made harder along one axis each, spoils their photographs,
+    trains and measures. Writes DIR/stress.md with the breaking point of each axis, stress.json,
+    stress.png and stress.svg.
     Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, thin, turntable,
     noise, placement, dark, bright; light-varying is trained with --varying light. A training that
     fails is a result. What is done is kept: the same command goes on.
@@ -753,7 +844,7 @@ def stress(
 
 
 def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> None:
-    """Train, evaluate and relight the small scene that comes with the package, in minutes.
+    """Train, evaluate and relight the bundled scene, in minutes.
 
     Args:
         out: folder for everything it writes; the page to open is DIR/index.html
@@ -764,26 +855,39 @@ def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> No
 
 
 def doctor(
-    json: Annotated[
-        Path | None, arg(metavar="FILE", help_behavior_hint="(default: only printed)")
-    ] = None,
+    json: JsonFile = None,
 ) -> None:
-    """Look at this installation and this machine, and say what to do about what they lack.
+    """Look at this installation and machine, and say what they lack.
 
     Processor and the kernels built for it, Embree, torch, OpenMP, threads, memory, extras. Ends
     with exit code 2 where training would be refused.
 
     Args:
-        json: file for the findings
+        json: file for the findings; - prints them in place of the table
     """
     from univoxel.tasks import doctor as task
 
-    findings = task.doctor(json=json)
-    rich.print(task.table(findings))
+    with json_file(json) as file:
+        findings = task.doctor(json=file)
+    if json != STDOUT:
+        rich.print(task.table(findings))
     task.check(findings)
 
 
-COMMANDS: dict[str, Callable[..., None]] = {
+def completion(shell: Annotated[Positional[Shell], arg(metavar="bash|zsh|fish")], /) -> None:
+    """Print what makes a shell complete commands, options and choices.
+
+    For bash, in ~/.bashrc: eval "$(univoxel completion bash)"
+
+    Args:
+        shell: that reads it
+    """
+    from univoxel import parsing
+
+    print(parsing.completion(shell, EVERYDAY, LABORATORY), end="")
+
+
+COMMANDS: dict[str, Command] = {
     "capture": capture,
     "poses": poses,
     "cutout": cutout,
@@ -793,12 +897,17 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "export": export,
     "view": view,
     "envmap": envmap,
-    "submit": submit,
     "inspect": inspect,
     "info": info,
+    "submit": submit,
     "compare": compare,
     "chart": chart,
     "stress": stress,
     "demo": demo,
     "doctor": doctor,
+    "completion": completion,
 }
+
+# Written `univoxel lab NAME`; without the word, as they once were, they work too
+LABORATORY = {name: COMMANDS[name] for name in ("compare", "chart", "stress", "submit")}
+EVERYDAY = {name: command for name, command in COMMANDS.items() if name not in LABORATORY}

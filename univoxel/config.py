@@ -12,15 +12,16 @@ from typing import Any, get_args
 
 from univoxel.compression.config import CompressionConfig
 from univoxel.confidence.config import ConfidenceConfig
-from univoxel.errors import ConfigError, UserError
+from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.fields.features import PER_LEVEL
 from univoxel.files import read_json, replacing
 from univoxel.joint.config import JointConfig
+from univoxel.lights import read_config
 from univoxel.names import CamerasFrom, Capacity, LightFrameOrAuto, MasksFrom
 from univoxel.preparation.config import PreparationConfig
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
-from univoxel.validation import check_fields
+from univoxel.validation import check_fields, record
 
 # Arguments that a configuration is made of
 CHOICES = (
@@ -88,7 +89,7 @@ class TrainConfig:
     # what is said of the scene afterwards; evaluation reads it from the run's config.json
     confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")
         check_fields(self, "a path in UTF-8", _is_utf8, "data", "out")
         check_fields(
@@ -157,6 +158,28 @@ def save_config(cfg: TrainConfig) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
+def load_config(path: Path) -> TrainConfig:
+    """The configuration in a file, as `save_config` wrote it: config.json of a run.
+
+    Raises:
+        MissingFile: there is no such file.
+        ConfigError: it holds something else; the message names file and field.
+    """
+    if not path.is_file():
+        raise MissingFile(f"{path}: expected a configuration, such as config.json of a run")
+    values = read_json(path)
+    try:
+        if not isinstance(values, dict):
+            raise ConfigError(f"expected an object with the configuration, got {values!r:.60}")
+        values = dict(values)
+        if isinstance(values.get("scene"), dict):
+            values["scene"] = dict(values["scene"])
+            values["scene"]["light"] = read_config(values["scene"].get("light", {}))
+        return record(TrainConfig, values)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
 def check_same(cfg: TrainConfig) -> None:
     """Refuse to go on with the run in cfg.out under stages or a model that it did not begin with.
 
@@ -215,7 +238,7 @@ def _as_json(value: Any) -> Any:
     return json.loads(json.dumps(value, default=str))
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     """Where presets were before they had a module of their own."""
     if name in ("budget", "chosen", "preset", "with_field"):
         return getattr(import_module("univoxel.presets"), name)

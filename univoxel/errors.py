@@ -18,7 +18,7 @@ class UserError(ValueError):
         arguments: names in the message that the command line replaces by its options.
     """
 
-    def __init__(self, message: str = "", *arguments: str):
+    def __init__(self, message: str = "", *arguments: str) -> None:
         super().__init__(message)
         self.arguments = arguments
 
@@ -58,7 +58,7 @@ class NoSurface(UserError):
 class NothingFound(UserError):
     """There is no surface in the box."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__(
             "no object was found where the cameras look: say where it is with box, or make masks",
             "box",

@@ -21,7 +21,7 @@ class GridShape:
     voxel_size: float
     size: tuple[int, int, int]  # nodes, >= 2 along each axis, below 2^31 in all
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "voxel_size")
         check_fields(self, "finite", lambda x: all(map(math.isfinite, x)), "origin")
         check_fields(

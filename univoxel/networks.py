@@ -66,14 +66,14 @@ class DirectionTable(nn.Module):
     Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", on the sphere.
     """
 
-    coarsest = 0.5  # side of a cell, of a box of 2 around the sphere
+    coarsest: float = 0.5  # side of a cell, of a box of 2 around the sphere
     rows = 2**14  # of a level; of those from the fourth on several nodes share one
     per_level = 2
     felt = 3  # levels that the direction gets gradients from
 
-    def __init__(self, levels: int):
+    def __init__(self, levels: int) -> None:
         super().__init__()
-        self.table = nn.Parameter(torch.zeros(levels * self.rows, self.per_level))
+        self.table: nn.Parameter = nn.Parameter(torch.zeros(levels * self.rows, self.per_level))
 
     @property
     def levels(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,14 +35,14 @@ class RowAdam(torch.optim.Optimizer):
 
     def __init__(
         self,
-        params: Iterable[Tensor] | Iterable[dict],
+        params: Iterable[Tensor] | Iterable[dict[str, Any]],
         lr: float = 1e-3,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
     ) -> None:
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
 
-    def add_param_group(self, param_group: dict) -> None:
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add a group, with the optimizer's lr, betas and eps where it has none of its own."""
         group = self.defaults | param_group
         for name in ("lr", "eps"):
@@ -85,7 +86,7 @@ class RowAdam(torch.optim.Optimizer):
             self._step_dense(dense, group)
         return loss
 
-    def _step_rows(self, param: Tensor, group: dict) -> None:
+    def _step_rows(self, param: Tensor, group: dict[str, Any]) -> None:
         if not param.is_contiguous():
             raise ValueError(
                 "RowAdam: a parameter with a sparse gradient must be contiguous, got strides "
@@ -117,7 +118,7 @@ class RowAdam(torch.optim.Optimizer):
             step=int(state["step"]),
         )
 
-    def _step_dense(self, params: list[Tensor], group: dict) -> None:
+    def _step_dense(self, params: list[Tensor], group: dict[str, Any]) -> None:
         states = [self._state_of(p) for p in params]
         beta1, beta2 = group["betas"]
         adam(
@@ -136,7 +137,7 @@ class RowAdam(torch.optim.Optimizer):
             maximize=False,
         )
 
-    def _state_of(self, param: Tensor) -> dict:
+    def _state_of(self, param: Tensor) -> dict[str, Any]:
         """Step and moments, zero at first; in torch.optim.Adam's names and types."""
         state = self.state[param]
         if not state:

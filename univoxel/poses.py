@@ -31,7 +31,7 @@ class PoseSteps(nn.Module):
     def __init__(self, count: int) -> None:
         """For so many cameras, V; `about` says where the object is."""
         super().__init__()
-        self.steps = nn.Parameter(torch.zeros(count, 6))  # r in radians, u
+        self.steps: nn.Parameter = nn.Parameter(torch.zeros(count, 6))  # r in radians, u
         self.register_buffer("pivot", torch.zeros(3))
         self.register_buffer("radius", torch.tensor(1.0))
         self.register_buffer("away", torch.zeros(count, 3))

@@ -60,7 +60,7 @@ class Bricks:
     NODES: ClassVar[int] = 64  # in a brick
     MISSING: ClassVar[int] = 2  # bricks that stand for missing ones
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         shape = tuple(-(-n // self.SIDE) for n in self.size)
         for name, tensor, wanted in (
             ("table", self.table, shape),

@@ -16,6 +16,7 @@ from univoxel.fields.distances import SurfaceVersion
 from univoxel.fields.field import Field
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.lights import (
+    AbstractLight,
     AbstractLocalLight,
     EnvmapLight,
     EnvmapSGLight,
@@ -57,7 +58,7 @@ class SceneConfig:
     # names of the photographs, where something differs from one to another; training fills them in
     views: tuple[str, ...] = ()
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         counts = ("channels", "material_channels", "hidden", "codes")
         check_fields(self, "at least 1", lambda x: x >= 1, *counts)
         check_fields(self, "in [0, 8]", lambda x: 0 <= x <= 8, "mirror_levels")
@@ -89,26 +90,28 @@ class SceneConfig:
 class Scene(nn.Module):
     """Everything that is learned of an object and of the light it stood in."""
 
-    def __init__(self, cfg: SceneConfig, field: Field, inv_s: float = 1.0):
+    def __init__(self, cfg: SceneConfig, field: Field, inv_s: float = 1.0) -> None:
         super().__init__()
         self.cfg = cfg
         self.inv_s = inv_s  # sharpness of the NeuS density, 1 / world units
         self.field = field
-        self.material = MaterialHead(cfg.material_channels, cfg.hidden, cfg.roughness)
+        self.material: MaterialHead = MaterialHead(cfg.material_channels, cfg.hidden, cfg.roughness)
         codes = cfg.codes if cfg.varying == "light" else 0
         inputs = cfg.channels + codes  # of what draws photographs: features and the view's code
-        self.radiance = RadianceHead(inputs, cfg.hidden, cfg.mirror_levels)
-        self.light = build(inputs, cfg.light)
-        self.sky = DistantLight(cfg.sky_nodes) if cfg.sky_nodes else None
+        self.radiance: RadianceHead = RadianceHead(inputs, cfg.hidden, cfg.mirror_levels)
+        self.light: AbstractLight = build(inputs, cfg.light)
+        self.sky: DistantLight | None = DistantLight(cfg.sky_nodes) if cfg.sky_nodes else None
         self.mirrored = None
         if cfg.mirrored and isinstance(cfg.light, LocalLightConfig):
             known = self.radiance.directions.channels
-            self.mirrored = MirroredLight(inputs, cfg.hidden, cfg.light.scale, known)
+            self.mirrored: MirroredLight | None = MirroredLight(
+                inputs, cfg.hidden, cfg.light.scale, known
+            )
         self.views = None
         if cfg.varying != "none":
             directions = self.sky.direction if codes and self.sky else None
-            self.views = ViewLights(cfg.views, codes, directions)
-        self.poses = PoseSteps(len(cfg.views)) if cfg.refined else None
+            self.views: ViewLights | None = ViewLights(cfg.views, codes, directions)
+        self.poses: PoseSteps | None = PoseSteps(len(cfg.views)) if cfg.refined else None
         if codes:  # at first they change nothing
             assert isinstance(self.light, AbstractLocalLight)
             nets = [self.radiance.net, self.light.head]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import types
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from univoxel.errors import ConfigError
@@ -36,7 +37,8 @@ def check_fields(config: object, wanted: str, holds: Callable[[Any], bool], *nam
 def record(kind: type[T], values: object) -> T:
     """A dataclass from JSON: what dataclasses.asdict made of one and a file held.
 
-    Tuples are lists in JSON; dataclasses are objects or, where they were read before, instances.
+    Tuples are lists in JSON, and paths are text; dataclasses are objects or, where they were read
+    before, instances.
 
     Raises:
         ConfigError: names class and field: one that is missing or unknown, or a value of another
@@ -80,7 +82,7 @@ def _typed(hint: Any, value: Any) -> Any:
     if origin in (Union, types.UnionType):
         if value is None and type(None) in inner:
             return None
-        for one in inner:
+        for one in [kind for kind in inner if _has_fields(kind, value)] or inner:
             try:
                 return _typed(one, value)
             except (TypeError, OverflowError):
@@ -93,8 +95,17 @@ def _typed(hint: Any, value: Any) -> Any:
         if many or len(inner) == len(value):
             each = inner[:1] * len(value) if many else inner
             return tuple(_typed(one, v) for one, v in zip(each, value, strict=True))
+    elif hint is Path and isinstance(value, str):
+        return Path(value)
     elif hint is float and type(value) in (int, float):
         return float(value)
     elif isinstance(hint, type) and (type(value) is hint or dataclasses.is_dataclass(hint)):
         return record(hint, value) if dataclasses.is_dataclass(hint) else value
     raise TypeError
+
+
+def _has_fields(kind: Any, value: Any) -> bool:
+    """Whether a type is no dataclass, or one with all fields that an object of JSON has."""
+    if not dataclasses.is_dataclass(kind) or not isinstance(value, dict):
+        return True
+    return value.keys() <= {f.name for f in _fields(kind)}

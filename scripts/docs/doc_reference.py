@@ -17,9 +17,17 @@ from typing import Any
 
 def command_line() -> str:
     """A section for each command: what it does, and a table of its options."""
-    from univoxel.commands import COMMANDS
+    from univoxel.commands import EVERYDAY, LABORATORY
 
-    return "\n\n".join(_command(name, function) for name, function in COMMANDS.items())
+    named = EVERYDAY | {f"lab {name}": function for name, function in LABORATORY.items()}
+    return "\n\n".join(_command(name, function) for name, function in named.items())
+
+
+def help_screen() -> str:
+    """What `univoxel` alone prints."""
+    from univoxel import cli
+
+    return f"```text\n{cli.help_screen([])}\n```"
 
 
 def configuration() -> str:
@@ -43,6 +51,7 @@ def ops() -> str:
 
 GENERATORS: dict[str, Callable[[], str]] = {
     "command-line": command_line,
+    "help-screen": help_screen,
     "configuration": configuration,
     "ops": ops,
     "ops-table": ops_table,

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
@@ -105,7 +106,7 @@ def write_scene(
     partial.rmdir()
 
 
-def write_report(out: Path, settings: dict, model: Model, reports: list[Report]) -> None:
+def write_report(out: Path, settings: dict[str, Any], model: Model, reports: list[Report]) -> None:
     """Write poses.json: how the cameras were found, and what is known of each photograph."""
     cameras = {
         str(number): {

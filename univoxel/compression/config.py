@@ -92,7 +92,7 @@ class CompressionConfig:
     # try loses detail: small steps come closest to the budget
     budget_step: float = 0.8
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         shares = ("grid_stride", "grid_step", "rehearsal_share", "budget_step")
         check_fields(self, "in (0, 1)", lambda x: 0 < x < 1, *shares)
         check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "table_share", "mirror_share")

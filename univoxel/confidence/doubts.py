@@ -13,7 +13,7 @@ from univoxel.confidence.survey import Survey
 class Doubts:
     """Doubts of a survey, to be looked up anywhere on the surface."""
 
-    def __init__(self, surveyed: Survey):
+    def __init__(self, surveyed: Survey) -> None:
         self._scale = surveyed.cfg.normal_scale * surveyed.voxel_size
         self._neighbours = surveyed.cfg.neighbours
         self._values = torch.stack([surveyed.albedo, surveyed.roughness], 1)

@@ -25,7 +25,7 @@ from univoxel.files import replacing
 
 VERSION = 1  # of what is done to pixels: another one makes all files that are there unfit
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 # Where photographs may have been kept. Layouts read photographs and need not know of it
 _place: ContextVar[Path | None] = ContextVar("kept photographs", default=None)
 

@@ -11,7 +11,7 @@ FEWEST = 3  # photographs that must be there where one is missing: a shape needs
 SHARE = 0.5  # of those listed that must be there: with less, it is the names that are wrong
 NAMED = 3  # missing pictures that messages name, at most
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 def left_out(where: str, missing: Sequence[object], listed: int, note: str = "") -> list[str]:

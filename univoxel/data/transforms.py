@@ -14,6 +14,7 @@ import math
 import reprlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
     return names, cameras_of(poses, lenses)
 
 
-def read_transforms(path: Path) -> tuple[dict, list[dict]]:
+def read_transforms(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The root of the file, and its frames."""
     root = read_json(path)
     if not isinstance(root, dict):
@@ -89,7 +90,7 @@ def read_transforms(path: Path) -> tuple[dict, list[dict]]:
     return root, frames
 
 
-def read_frames(path: Path) -> tuple[dict, list[Shot], list[str]]:
+def read_frames(path: Path) -> tuple[dict[str, Any], list[Shot], list[str]]:
     """The root of the file, its frames with their pictures, which lie relative to it, and remarks.
 
     Frames without a picture are left out, as `left_out` says.
@@ -124,13 +125,13 @@ def read_frames(path: Path) -> tuple[dict, list[Shot], list[str]]:
     return root, shots, left_out(str(path), missing, len(frames), f" ({LOOKED_FOR})")
 
 
-def _name(frame: dict) -> str:
+def _name(frame: dict[str, Any]) -> str:
     """Unique within a file: Stanford-ORB's novel views are of several scenes."""
     name = view_name(frame["file_path"])
     return f"{scene}_{name}" if isinstance(scene := frame.get("scene_name"), str) else name
 
 
-def _folder(path: Path, frame: dict, where: str) -> Path:
+def _folder(path: Path, frame: dict[str, Any], where: str) -> Path:
     """What a frame's file_path is relative to: the file's folder, or that of another scene."""
     scene = frame.get("scene_name")
     if scene is None:
@@ -199,7 +200,7 @@ def pose_of(matrix: object, where: str) -> np.ndarray:
     return np.concatenate([u @ v, pose[:3, 3:]], 1)
 
 
-def lens_of(values: dict, where: str, width: int, height: int, note: str = "") -> Lens:
+def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: str = "") -> Lens:
     """The lens that a frame's values describe, for pictures of this size.
 
     Args:
@@ -240,7 +241,7 @@ def lens_of(values: dict, where: str, width: int, height: int, note: str = "") -
         raise DataError(f"{where}: {error}") from None
 
 
-def number(values: dict, key: str, where: str, low: float, high: float) -> float:
+def number(values: dict[str, Any], key: str, where: str, low: float, high: float) -> float:
     """A number of a frame that lies between two others.
 
     Raises:
@@ -283,7 +284,7 @@ def write_cameras(folder: Path, split: str, cameras: Cameras, names: Sequence[st
         temporary.write_text(json.dumps({"frames": frames}, indent=1), encoding="utf-8")
 
 
-def _mask(folder: Path, frame: dict, where: str) -> Path | None:
+def _mask(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
     named = frame.get("mask_path")
     if named is None:
         return None

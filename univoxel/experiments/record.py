@@ -47,15 +47,17 @@ class Outcome:
 
     scene: str
     setting: str
-    identity: dict  # what a later call must agree with to take this for its own; JSON
+    identity: dict[str, Any]  # what a later call must agree with to take this for its own; JSON
     # By the keys of evaluation.measures.MEASURES, steps_made (share of the planned ones), and
     # map_*, the fields of tasks.envmap.Comparison
     measures: Mapping[str, float | int | None] = dataclasses.field(default_factory=dict)
-    log: list[dict] = dataclasses.field(default_factory=list)  # seconds, stage, held_out_psnr
+    log: list[dict[str, Any]] = dataclasses.field(
+        default_factory=list
+    )  # seconds, stage, held_out_psnr
     load_average: float | None = None  # of the machine when it began
     error: str | None = None  # why it failed
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, "text", lambda x: isinstance(x, str), "scene", "setting")
         check_fields(self, "text or None", lambda x: isinstance(x, str | None), "error")
         check_fields(self, "an object", lambda x: isinstance(x, dict), "identity")
@@ -77,7 +79,7 @@ class Outcome:
             text = json.dumps(dataclasses.asdict(self), indent=1)
             temporary.write_text(text + "\n", encoding="utf-8")
 
-    def summary(self) -> dict:
+    def summary(self) -> dict[str, Any]:
         """All but the identity, which result.json keeps."""
         fields = dataclasses.asdict(self)
         del fields["identity"]
@@ -105,14 +107,14 @@ def load_outcome(folder: Path) -> Outcome | None:
         raise DataError(f"{path}: expected the record of a training: {error}") from None
 
 
-def identity(config: TrainConfig, samples: int) -> dict:
+def identity(config: TrainConfig, samples: int) -> dict[str, Any]:
     """Everything that decides what comes out, as JSON has it; not where it lies."""
     fields = dataclasses.asdict(config) | {"data": str(config.data.resolve())}
     del fields["out"]
     return json.loads(json.dumps({"samples": samples, "config": fields}, default=str))
 
 
-def result_text(record: dict) -> str:
+def result_text(record: dict[str, Any]) -> str:
     """A record of measurements as JSON text, with one entry a line and six digits a number.
 
     Each key of the record begins a line. Where its value is a list or a dict of records, each of

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
@@ -23,7 +24,7 @@ from univoxel.experiments import worker
 from univoxel.experiments.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.files import replacing
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 OUTPUT = "output.txt"  # what the process said
 NAME = re.compile(r"[\w.+=-]*\w[\w.+=-]*")
@@ -40,7 +41,7 @@ class Job:
     data: Path
     setting: Setting
     samples: int
-    identity: dict
+    identity: dict[str, Any]
     seconds: float  # that it may take, a guess
 
 
@@ -190,7 +191,7 @@ def _reason(code: int, output: Path) -> str:
 class _Bar:
     """How far the trainings are, and the time that is left."""
 
-    def __init__(self, jobs: Sequence[Job], total: int):
+    def __init__(self, jobs: Sequence[Job], total: int) -> None:
         self._left = sum(job.seconds for job in jobs)
         self._spent, self._expected = 0.0, 0.0  # seconds of what was done in this sitting
         self._now = 0.0

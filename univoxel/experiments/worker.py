@@ -12,6 +12,7 @@ import logging
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -93,7 +94,7 @@ def light_error(run: Path, file: Path) -> dict[str, float | None]:
     return {f"map_{name}": None if found is None else getattr(found, name) for name in names}
 
 
-def read_log(path: Path) -> list[dict]:
+def read_log(path: Path) -> list[dict[str, Any]]:
     """What a chart needs of a training's log."""
     if not path.exists():  # over before the first report
         return []

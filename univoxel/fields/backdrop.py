@@ -23,16 +23,18 @@ class Backdrop(nn.Module):
     does (multi-sphere images, Attal et al. 2020).
     """
 
-    def __init__(self, centre: Tensor, radius: float):
+    def __init__(self, centre: Tensor, radius: float) -> None:
         """
         Args:
             centre, radius: [3], of the innermost sphere.
         """
         super().__init__()
         self.centre = centre
-        self.radii = [radius * 2.0**k for k in range(SHELLS - 1)]
-        self.color = nn.Parameter(torch.zeros(SHELLS, 3, *SIZE))  # logits, sRGB-encoded
-        self.opaque = nn.Parameter(torch.full((SHELLS - 1, 1, *SIZE), CLEAR))
+        self.radii: list[float] = [radius * 2.0**k for k in range(SHELLS - 1)]
+        self.color: nn.Parameter = nn.Parameter(
+            torch.zeros(SHELLS, 3, *SIZE)
+        )  # logits, sRGB-encoded
+        self.opaque: nn.Parameter = nn.Parameter(torch.full((SHELLS - 1, 1, *SIZE), CLEAR))
 
     def forward(self, rays: Rays) -> Tensor:
         """sRGB-encoded colour [N, 3] behind everything."""

@@ -28,7 +28,7 @@ class BrickDistances(AbstractDistances):
     time grow with the surface. `refresh` adds bricks where the surface comes near.
     """
 
-    def __init__(self, grid: GridShape, bricks: Bricks):
+    def __init__(self, grid: GridShape, bricks: Bricks) -> None:
         far = BAND * grid.voxel_size
         sdf = torch.full((Bricks.NODES * len(bricks.place),), far)
         sdf[Bricks.NODES : 2 * Bricks.NODES] = -far
@@ -186,13 +186,13 @@ class BrickDistances(AbstractDistances):
             extra_rows = extra_bricks * Bricks.NODES
             sdf = self.sdf.detach()
             sdf = torch.cat([sdf, sdf.new_full((extra_rows,), self.far)])
-            self.sdf = nn.Parameter(sdf, self.sdf.requires_grad)
+            self.sdf: nn.Parameter = nn.Parameter(sdf, self.sdf.requires_grad)
         else:
             place = place.clone()
         sign = 1 - 2 * table[new].float()  # before there was a brick
         number = torch.arange(count, count + len(new))
         table[new], place[number] = number.int(), new.int()
-        self.bricks = Bricks(table.view(bricks.table.shape), place, bricks.size)
+        self.bricks: Bricks = Bricks(table.view(bricks.table.shape), place, bricks.size)
         rows = (Bricks.NODES * number[:, None] + torch.arange(Bricks.NODES)).flatten()
         self.sdf[rows] = self.far * sign.repeat_interleave(Bricks.NODES)
         parts = zip(number.split(BRICKS_AT_ONCE), sign.split(BRICKS_AT_ONCE), strict=True)

@@ -16,7 +16,7 @@ from univoxel.records import FieldSample, Rays, Samples
 class DenseDistances(AbstractDistances):
     """SDF [X, Y, Z] as a parameter."""
 
-    def __init__(self, grid: GridShape, sdf: Tensor | None = None):
+    def __init__(self, grid: GridShape, sdf: Tensor | None = None) -> None:
         """
         Args:
             sdf: [X, Y, Z] world units; 0 everywhere when left out.

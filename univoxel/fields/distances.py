@@ -49,7 +49,7 @@ class AbstractDistances(nn.Module, ABC):
     voxel_size: float  # of the grid, world units
     sdf: nn.Parameter
 
-    def __init__(self, grid: GridShape, sdf: Tensor):
+    def __init__(self, grid: GridShape, sdf: Tensor) -> None:
         super().__init__()
         self.grid, self.voxel_size = grid, grid.voxel_size
         self.sdf = nn.Parameter(sdf)

@@ -72,7 +72,7 @@ class AbstractFeatures(nn.Module, ABC):
 class NodeFeatures(AbstractFeatures):
     """Features at the nodes of the distances: values are as the sdf, and C."""
 
-    def __init__(self, values: Tensor):
+    def __init__(self, values: Tensor) -> None:
         super().__init__()
         self.values = nn.Parameter(values)
 
@@ -101,7 +101,7 @@ class NodeFeatures(AbstractFeatures):
         values = self.values.detach()
         if more := len(distances.sdf) - len(values):
             values = torch.cat([values, values.new_zeros(more, *values.shape[1:])])
-            self.values = nn.Parameter(values, self.values.requires_grad)
+            self.values: nn.Parameter = nn.Parameter(values, self.values.requires_grad)
 
     def occupied(self, distances: AbstractDistances) -> Tensor:
         return distances.on_grid(self.values.detach().any(-1))
@@ -122,7 +122,7 @@ class Levels:
     voxel_sizes: tuple[float, ...]  # from coarse to fine, world units
     rows: int = ROWS  # of each level's table, a power of two
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         corners = "lower", "upper"
         check_fields(self, "finite", lambda x: all(map(math.isfinite, x)), *corners)
         sizes = "voxel_sizes"
@@ -150,10 +150,12 @@ class HashFeatures(AbstractFeatures):
     they are marched through, smoothed and cut at zero.
     """
 
-    def __init__(self, levels: Levels):
+    def __init__(self, levels: Levels) -> None:
         super().__init__()
         self.levels = levels
-        self.values = nn.Parameter(torch.zeros(len(levels.voxel_sizes) * levels.rows, PER_LEVEL))
+        self.values: nn.Parameter = nn.Parameter(
+            torch.zeros(len(levels.voxel_sizes) * levels.rows, PER_LEVEL)
+        )
 
     @property
     def channels(self) -> int:

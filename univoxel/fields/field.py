@@ -26,13 +26,14 @@ class Field(nn.Module):
     In `state_dict` the parameters are `sdf` and `features`, as files have them.
     """
 
-    def __init__(self, distances: AbstractDistances, encoding: AbstractFeatures):
+    def __init__(self, distances: AbstractDistances, encoding: AbstractFeatures) -> None:
         """
         Args:
             encoding: made for these distances.
         """
         super().__init__()
-        self.distances, self.encoding = distances, encoding
+        self.distances: AbstractDistances = distances
+        self.encoding: AbstractFeatures = encoding
         self._register_state_dict_hook(_outward)
         self._register_load_state_dict_pre_hook(_inward)
 

@@ -14,16 +14,17 @@ class MaterialHead(nn.Module):
     Albedo is the base colour of glTF: of a metal, what it reflects at normal incidence.
     """
 
-    min_roughness = 0.05  # below, a highlight is narrower than the light's own detail
+    min_roughness: float = 0.05  # below, a highlight is narrower than the light's own detail
 
-    def __init__(self, channels: int, hidden: int, roughness: float | None = None):
+    def __init__(self, channels: int, hidden: int, roughness: float | None = None) -> None:
         """
         Args:
             roughness: of everything, if it is known: then nothing is metal. None: both are learned.
         """
         super().__init__()
-        self.channels, self.roughness = channels, roughness
-        self.net = MLP([channels, hidden, hidden, 5])
+        self.channels: int = channels
+        self.roughness: float | None = roughness
+        self.net: MLP = MLP([channels, hidden, hidden, 5])
         last = self.net.linear[-1]
         # Start mid-grey, glossy and no metal, whatever the features. Glossy: what is rough becomes
         # so, but for what starts rough the light makes itself sharp enough, and too bright.
@@ -56,14 +57,14 @@ class RadianceHead(nn.Module):
     as the eye is.
     """
 
-    def __init__(self, channels: int, hidden: int, levels: int = 0):
+    def __init__(self, channels: int, hidden: int, levels: int = 0) -> None:
         """
         Args:
             levels: of the table of mirrored directions, >= 0.
         """
         super().__init__()
-        self.directions = DirectionTable(levels)
-        self.net = MLP([channels + 3 + 9 + 1 + self.directions.channels, hidden, hidden, 3])
+        self.directions: DirectionTable = DirectionTable(levels)
+        self.net: MLP = MLP([channels + 3 + 9 + 1 + self.directions.channels, hidden, hidden, 3])
 
     def forward(self, features: Tensor, normal: Tensor, wo: Tensor) -> Tensor:
         cosine = (normal * wo).sum(1, keepdim=True)

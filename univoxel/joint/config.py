@@ -26,7 +26,7 @@ class SurfaceConfig:
     # larger mesh take that of the nearest, for memory. Meshes of the presets have fewer
     vertices: int = 300_000
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, *_WHOLE, "min_points", "vertices")
 
 
@@ -61,7 +61,7 @@ class NewtonConfig:
     # trials and the search for metals. Only a first guess of the time to reserve
     cost: float = 6.5
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, "at least 2", lambda x: x >= 2, "min_views")
         check_fields(self, *_WHOLE, "neighbours", "min_parts")
         changes = ("max_map_change", "max_albedo_change", "max_roughness_change")
@@ -97,7 +97,7 @@ class MetalConfig:
     # next one
     threshold: tuple[float, float] = (-0.4, -0.15)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, *_FROM_ZERO, "metallic_before", "min_reflectance")
         wanted = "numbers in (0, 1]"
         check_fields(
@@ -157,7 +157,7 @@ class EntropyConfig:
     # weight, > 0, of their loss, against the epsilon of Adam; no other was tried
     teaching_weight: float = 0.1
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         counts = ("points", "min_points", "min_views", "degree", "sweeps", "albedo_views")
         check_fields(self, *_WHOLE, *counts, "teaching_steps")
         check_fields(self, *_NOT_BELOW, "min_color", "sun_gain", "min_gain")
@@ -193,7 +193,7 @@ class TrialConfig:
     # share, [0, 1], of the points that are most of them
     majority: float = 0.5
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, *_WHOLE, "points", "deciding", "steps")
         wanted = "numbers in (0, 1)"
         check_fields(self, wanted, lambda x: all(0 < v < 1 for v in x), "roughness")
@@ -224,7 +224,7 @@ class AdamConfig:
     # voxels, > 0: standard deviation of where materials are compared, for their smoothness
     beside: float = 2.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, *_SHARE, "decay")
         after = ("map_after_newton", "gains_after_newton")
         check_fields(self, *_NOT_BELOW, *after, "sdf_passes", "surface")
@@ -272,7 +272,7 @@ class JointConfig:
     # rates and weights of the rounds of Adam
     adam: AdamConfig = field(default_factory=AdamConfig)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         counts = ("iterations", "views", "rounds", "points", "tracing", "newton_points")
         check_fields(self, *_WHOLE, *counts)
         check_fields(self, *_SHARE, "share")

@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +25,7 @@ class Hypothesis:
     lowest: float  # residual with the metal that was assumed, on TrialConfig.points
     decisive: float  # residual with the metal as found, on more points; inf: nothing was solved
     metal: Tensor  # [P] bool, as found
-    states: list[dict]  # of the scene's parts
+    states: list[dict[str, Any]]  # of the scene's parts
 
 
 @dataclass(frozen=True)
@@ -37,13 +38,13 @@ class Trials:
     seconds: float  # of a round on TrialConfig.points
     seed: int  # of the points: the trials differ in nothing but the hypothesis
     parts: Sequence[nn.Module]  # of the scene, that a trial changes
-    before: list[dict]  # their states
+    before: list[dict[str, Any]]  # their states
     troubles: list[str]
 
-    def states(self) -> list[dict]:
+    def states(self) -> list[dict[str, Any]]:
         return [copy.deepcopy(part.state_dict()) for part in self.parts]
 
-    def restore_(self, states: list[dict]) -> None:
+    def restore_(self, states: list[dict[str, Any]]) -> None:
         """Bring the scene's parts back to these states."""
         for part, state in zip(self.parts, states, strict=True):
             part.load_state_dict(state)

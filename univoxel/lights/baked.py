@@ -32,7 +32,7 @@ class BakedLight(AbstractLight):
 
     def __init__(self, config: BakedConfig | None = None) -> None:
         super().__init__()
-        self.config = config or BakedConfig()
+        self.config: BakedConfig = config or BakedConfig()
 
     @property
     def directions(self) -> int:

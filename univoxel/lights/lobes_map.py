@@ -31,7 +31,7 @@ class EnvmapSGConfig(LatLongConfig):
     directions: int = 64  # of the half-sphere, in training, >= 1
     directions_eval: int = 256  # in evaluation, >= 1
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(
             self, "at least 1", lambda x: x >= 1, "lobes", "rows", "directions", "directions_eval"
         )
@@ -58,7 +58,7 @@ class EnvmapSGLight(AbstractLatLongLight):
         super().__init__()
         self.config = config = config or EnvmapSGConfig()
         start = lobes.white_light(config.lobes, config.max_sharpness)
-        self.raw = nn.Parameter(start / GAIN)  # [K, 7]
+        self.raw: nn.Parameter = nn.Parameter(start / GAIN)  # [K, 7]
 
     @property
     def radiance(self) -> Tensor:

@@ -22,7 +22,7 @@ class MirroredLight(nn.Module):
     can hold (Liu et al. 2023, NeRO). Signed, for it corrects the lobes; at first it is 0.
     """
 
-    def __init__(self, features: int, hidden: int, scale: float, known: int = 0):
+    def __init__(self, features: int, hidden: int, scale: float, known: int = 0) -> None:
         """
         Args:
             features: C of Surface.features.
@@ -33,7 +33,7 @@ class MirroredLight(nn.Module):
         super().__init__()
         self.scale = scale
         inputs = features + 3 + 6 * local.FREQUENCIES + 6 * _OCTAVES + 2 + known
-        self.net = MLP([inputs, hidden, hidden, 3])
+        self.net: MLP = MLP([inputs, hidden, hidden, 3])
         last = self.net.linear[-1]
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)

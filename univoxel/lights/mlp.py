@@ -35,7 +35,7 @@ class MLPLightConfig(LocalLightConfig):
     directions_eval: int = 512  # in evaluation, >= 1
     scale: float = 1.0  # world units: half the extent of what is lit, > 0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(
             self, "at least 1", lambda x: x >= 1, "rank", "hidden", "directions", "directions_eval"
         )
@@ -77,12 +77,12 @@ class LocalMLP(AbstractLocalLight):
         super().__init__()
         self.config = config = config or MLPLightConfig()
         outputs = 3 * (config.rank + 1)
-        self.head = build_head(features, config.hidden, config.layers, outputs, generator)
+        self.head: MLP = build_head(features, config.hidden, config.layers, outputs, generator)
         sizes = [3 + 6 * config.frequencies, *[config.hidden] * config.layers, config.rank]
-        self.basis_net = MLP(sizes, generator or torch.default_generator)
+        self.basis_net: MLP = MLP(sizes, generator or torch.default_generator)
         base = torch.zeros(config.rank + 1, 3)
         base[0] = math.log(math.expm1(_START))
-        self.base = nn.Parameter(base)  # [rank + 1, 3]
+        self.base: nn.Parameter = nn.Parameter(base)  # [rank + 1, 3]
 
     @property
     def directions(self) -> int:

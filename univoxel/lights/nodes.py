@@ -16,9 +16,11 @@ class DistantLight(nn.Module):
 
     direction: Tensor
 
-    def __init__(self, count: int, radiance: float = 1.0):
+    def __init__(self, count: int, radiance: float = 1.0) -> None:
         super().__init__()
-        self.log_radiance = nn.Parameter(torch.full((count, 3), radiance).log())  # [D, 3]
+        self.log_radiance: nn.Parameter = nn.Parameter(
+            torch.full((count, 3), radiance).log()
+        )  # [D, 3]
         self.register_buffer("direction", sphere.fibonacci_sphere(count))  # [D, 3]
 
     @property

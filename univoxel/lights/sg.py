@@ -13,6 +13,7 @@ from univoxel import brdf, ops, sphere
 from univoxel.lights import lobes, priors, quadrature
 from univoxel.lights.base import MOST_DIRECTIONS, MOST_LAYERS, Regularisation
 from univoxel.lights.local import AbstractLocalLight, LocalLightConfig, build_head, encode
+from univoxel.networks import MLP
 from univoxel.records import Occlusion, Surface
 from univoxel.validation import check_fields
 
@@ -31,7 +32,7 @@ class SGConfig(LocalLightConfig):
     max_sharpness: float = 30.0  # of a lobe, > 0; its half width is about sqrt(2 / sharpness) rad
     scale: float = 1.0  # world units: half the extent of what is lit, > 0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(
             self, "at least 1", lambda x: x >= 1, "lobes", "hidden", "directions", "directions_eval"
         )
@@ -67,8 +68,12 @@ class LocalSG(AbstractLocalLight):
         """
         super().__init__()
         self.config = config = config or SGConfig()
-        self.head = build_head(features, config.hidden, config.layers, 7 * config.lobes, generator)
-        self.base = nn.Parameter(lobes.white_light(config.lobes, config.max_sharpness))  # [K, 7]
+        self.head: MLP = build_head(
+            features, config.hidden, config.layers, 7 * config.lobes, generator
+        )
+        self.base: nn.Parameter = nn.Parameter(
+            lobes.white_light(config.lobes, config.max_sharpness)
+        )  # [K, 7]
 
     @property
     def directions(self) -> int:

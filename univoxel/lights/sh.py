@@ -13,6 +13,7 @@ from univoxel import sphere
 from univoxel.lights import priors, quadrature
 from univoxel.lights.base import MOST_DIRECTIONS, MOST_LAYERS, Regularisation
 from univoxel.lights.local import AbstractLocalLight, LocalLightConfig, build_head, encode
+from univoxel.networks import MLP
 from univoxel.records import Occlusion, Surface
 from univoxel.validation import check_fields
 
@@ -33,7 +34,7 @@ class SHConfig(LocalLightConfig):
     directions_eval: int = 512  # in evaluation, >= 1
     scale: float = 1.0  # world units: half the extent of what is lit, > 0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(
             self, "at least 1", lambda x: x >= 1, "hidden", "directions", "directions_eval"
         )
@@ -74,10 +75,10 @@ class LocalSH(AbstractLocalLight):
         super().__init__()
         self.config = config = config or SHConfig()
         count = (config.order + 1) ** 2
-        self.head = build_head(features, config.hidden, config.layers, 3 * count, generator)
+        self.head: MLP = build_head(features, config.hidden, config.layers, 3 * count, generator)
         base = torch.zeros(count, 3)
         base[0] = math.log(math.expm1(_START)) * math.sqrt(4 * math.pi)  # Y_00 is 1 / sqrt(4 pi)
-        self.base = nn.Parameter(base)  # [(order + 1)^2, 3]
+        self.base: nn.Parameter = nn.Parameter(base)  # [(order + 1)^2, 3]
 
     @property
     def directions(self) -> int:

@@ -30,7 +30,7 @@ class EnvmapConfig(LatLongConfig):
     directions: int = 64  # of the half-sphere, in training, >= 1
     directions_eval: int = 256  # in evaluation, >= 1
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, "at least 1", lambda x: x >= 1, "rows", "directions", "directions_eval")
         most = f"at most {MOST_DIRECTIONS}"
         check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
@@ -56,7 +56,9 @@ class EnvmapLight(AbstractLatLongLight):
         rows = [config.rows]
         while rows[-1] % 4 == 0 and rows[-1] >= 4 * COARSEST:
             rows.append(rows[-1] // 4)
-        self.levels = nn.ParameterList(torch.zeros(r, 2 * r, 3) for r in rows)  # fine to coarse
+        self.levels: nn.ParameterList = nn.ParameterList(
+            torch.zeros(r, 2 * r, 3) for r in rows
+        )  # fine to coarse
         self.levels[-1].data += math.log(0.5) / GAIN
 
     @property

@@ -27,7 +27,7 @@ class Turntable:
     axis: Vec3  # unit
     start: Vec3  # unit, across the axis: from it to the camera
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         axis, start = torch.tensor(self.axis), torch.tensor(self.start)
         lengths = float((axis.norm() - 1).abs().maximum((start.norm() - 1).abs()))
         if not max(lengths, float((axis @ start).abs())) < 1e-3:

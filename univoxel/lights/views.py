@@ -53,15 +53,19 @@ class ViewLights(nn.Module):
         self.names = names
         self.chosen: int | None = None  # whose light is shown where no view is named; None: mean
         self.shown: ShownLight | None = None  # in place of the mean
-        self.gain_steps = nn.Parameter(torch.zeros(len(names), 3))
+        self.gain_steps: nn.Parameter = nn.Parameter(torch.zeros(len(names), 3))
         self.raw_codes = None
         if codes:
-            self.raw_codes = nn.Parameter(torch.randn(len(names), codes, generator=generator))
+            self.raw_codes: nn.Parameter | None = nn.Parameter(
+                torch.randn(len(names), codes, generator=generator)
+            )
         self.sky_weights = self.sky_basis = None
         if directions is not None:
             basis = real_harmonics(DEGREE, directions)[:, 1:].T  # the first is constant: the gain
-            self.sky_weights = nn.Parameter(torch.zeros(len(names), len(basis), 3))
-            self.sky_basis = nn.Parameter(basis.contiguous())  # [R, D]
+            self.sky_weights: nn.Parameter | None = nn.Parameter(
+                torch.zeros(len(names), len(basis), 3)
+            )
+            self.sky_basis: nn.Parameter | None = nn.Parameter(basis.contiguous())  # [R, D]
 
     def __len__(self) -> int:
         return len(self.names)

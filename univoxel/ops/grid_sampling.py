@@ -38,12 +38,12 @@ class SparseGrad(torch.autograd.Function):
     own gradient is dense."""
 
     @staticmethod
-    def forward(ctx, values, dims):
+    def forward(ctx: Any, values: Tensor, dims: int) -> Tensor:
         ctx.dims = dims
         return values.view_as(values)
 
     @staticmethod
-    def backward(ctx, grad):
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         return grad.to_sparse(ctx.dims), None
 
 

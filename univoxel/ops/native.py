@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any, List, Literal, get_args, get_origin, get_type_hints  # noqa: UP035
 
 import numpy as np
 import torch  # first: the extension then shares torch's OpenMP runtime
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from univoxel.errors import MissingNative
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 Backend = Literal["auto", "native", "reference"]
 FOLDER = Path(__file__).parent.parent / "_core"
@@ -90,6 +90,8 @@ def _load() -> tuple[ModuleType | None, str]:
     return None, f"no extension built under {FOLDER}"
 
 
+core: ModuleType | None
+variant: str
 core, variant = _load()
 
 
@@ -193,6 +195,9 @@ def operator(name: str, mutates_args: tuple[str, ...] = ()) -> Callable[[Callabl
     """
 
     def define(kernel: Callable) -> Any:
+        # torch 2.4 reads neither text, which `from __future__` makes of them, nor list[float]
+        hints = get_type_hints(kernel).items()
+        kernel.__annotations__ = {name: _spelt_out(hint) for name, hint in hints}
         qualified = f"univoxel::{name}"
         defined = torch.library.custom_op(
             qualified, kernel, mutates_args=mutates_args, device_types=()
@@ -201,3 +206,10 @@ def operator(name: str, mutates_args: tuple[str, ...] = ()) -> Callable[[Callabl
         return defined
 
     return define
+
+
+def _spelt_out(hint: Any) -> Any:
+    """An annotation as every torch since 2.4 reads it."""
+    if hint is type(None):
+        return None
+    return List[get_args(hint)] if get_origin(hint) is list else hint  # noqa: UP006

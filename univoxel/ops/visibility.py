@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -56,8 +57,8 @@ class VisibilityScene:
                 f"{row}"
             )
         _check_indices(faces, vertices)
-        self.vertices = vertices.detach().clone().contiguous()  # [P, 3]
-        self.faces = faces.detach().clone().contiguous()  # [F, 3]
+        self.vertices: Tensor = vertices.detach().clone().contiguous()  # [P, 3]
+        self.faces: Tensor = faces.detach().clone().contiguous()  # [F, 3]
         self._native = None
         self.native()
 
@@ -123,7 +124,7 @@ class VisibilityScene:
         )
         return hit
 
-    def native(self):
+    def native(self) -> Any:
         """The native scene, or None where the reference is asked for; for ops that trace rays."""
         if native.reference_asked():
             return None

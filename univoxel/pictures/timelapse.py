@@ -10,7 +10,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from univoxel.camera import resize
+from univoxel.camera import Cameras, resize
 from univoxel.color import linear_to_srgb
 from univoxel.config import TrainConfig
 from univoxel.data import load_photos
@@ -36,7 +36,7 @@ MAP_ROWS, SAMPLES, BOUNCES = 64, 16, 1  # of light from the map
 class Timelapse:
     """Takes frames by the clock of training, and makes one file of them."""
 
-    def __init__(self, path: str | Path, cfg: TrainConfig):
+    def __init__(self, path: str | Path, cfg: TrainConfig) -> None:
         """
         Args:
             path: .gif or .mp4, or a folder for PNG files: a name without an ending, or with / at
@@ -56,15 +56,15 @@ class Timelapse:
             )
         if not folder:
             require(kind[1:])
-        self.file = None if folder else Path(path)
-        self.folder = Path(path) if folder else cfg.out / "timelapse"
+        self.file: Path | None = None if folder else Path(path)
+        self.folder: Path = Path(path) if folder else cfg.out / "timelapse"
         size, outside = cfg.downscale, cfg.allow_outside
         try:
             cameras = load_photos(cfg.data, "test", size, allow_outside=outside).cameras
         except DataError:
             cameras = load_photos(cfg.data, "train", size, allow_outside=outside).cameras
-        self.cameras = resize(cameras, min(cameras.width, SIZE))
-        self.every = 60 * cfg.minutes / FRAMES  # seconds
+        self.cameras: Cameras = resize(cameras, min(cameras.width, SIZE))
+        self.every: float = 60 * cfg.minutes / FRAMES  # seconds
         self._next = 0.0
 
     def take_frame(self, scene: Scene, clock: Clock, last: bool = False) -> None:
@@ -103,7 +103,7 @@ def shown(clock: Clock) -> tuple[bool, bool]:
 
 
 @torch.no_grad()
-def frame(scene: Scene, cameras, lit: bool, by_map: bool) -> Tensor:
+def frame(scene: Scene, cameras: Cameras, lit: bool, by_map: bool) -> Tensor:
     """Render, albedo and normal of the first view [H, 3 W, 3], sRGB on black.
 
     Args:

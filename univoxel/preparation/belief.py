@@ -23,7 +23,7 @@ from univoxel.preparation.matches import Agreement, agreement, find_matches
 from univoxel.preparation.registration import contradiction
 from univoxel.threads import side_by_side
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)

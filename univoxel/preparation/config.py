@@ -296,10 +296,11 @@ class LightFrameConfig:
     better: float = 1.0
     # share of the cost, in [0, 1], that it has to explain at least, over `better`
     least: float = 0.03
-    # the same two where the surroundings do not say whether they stood still. Objects on rings of
-    # cameras under a still light: up to 3 times, up to 14 % of the cost. Under one that turned: 60
-    # times and 70 %; a shiny ball, 3.2 times and 30 %
+    # `better` where the surroundings do not say whether they stood still. Of objects on rings of
+    # cameras it was up to 3 under a still light, and 60 under one that turned; of a shiny ball, 3.2
     better_alone: float = 3.0
+    # `least` there, in [0, 1]: times `better_alone` it is above the 14 % of the cost that a light
+    # taken to turn explained under a still one, and below the 30 and 70 % under one that turned
     least_alone: float = 0.07
     # pixels, >= 8, along the longer side of the pictures whose surroundings are compared
     small: int = 128

@@ -15,7 +15,7 @@ from univoxel.names import Varying
 from univoxel.preparation.config import EXPOSURES, ExposureConfig
 from univoxel.preparation.observed_hull import observe_hull
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @torch.no_grad()

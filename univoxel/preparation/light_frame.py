@@ -28,7 +28,7 @@ from univoxel.preparation.surroundings import surroundings_stand_still
 from univoxel.render.transport import Observations
 from univoxel.sphere import real_harmonics
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)

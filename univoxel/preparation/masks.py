@@ -17,7 +17,7 @@ from univoxel.preparation.config import MASKS, MaskConfig
 from univoxel.preparation.hull import mask_distances
 from univoxel.threads import side_by_side
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @torch.no_grad()

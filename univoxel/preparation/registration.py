@@ -13,7 +13,7 @@ from univoxel.poses import PoseSteps
 from univoxel.preparation.config import REGISTRATION, RegistrationConfig
 from univoxel.records import Rays
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 class Edges:
@@ -38,12 +38,14 @@ class Edges:
             box: corners [3], [3] around the object.
         """
         low, high = cfg.edge
-        self.ray_samples = cfg.ray_samples
+        self.ray_samples: int = cfg.ray_samples
         self.distance = distance
-        self.extended = _extended(distance)
-        self.pixels = ((distance > low) & (distance < high)).nonzero()  # [K, 3] view, row, column
-        self.middle = (box[0] + box[1]) / 2
-        self.reach = float((box[1] - box[0]).norm()) / 2
+        self.extended: Tensor = _extended(distance)
+        self.pixels: Tensor = (
+            (distance > low) & (distance < high)
+        ).nonzero()  # [K, 3] view, row, column
+        self.middle: Tensor = (box[0] + box[1]) / 2
+        self.reach: float = float((box[1] - box[0]).norm()) / 2
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
         """So many edge pixels [count, 3], drawn with replacement."""

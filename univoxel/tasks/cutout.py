@@ -34,7 +34,7 @@ from univoxel.segmentation.plain import plain_mask, plain_threshold
 from univoxel.segmentation.separation import DEFAULTS, find_object, mask
 from univoxel.segmentation.vote import BESIDE, MISSING, VOTE, Verdict, elect, judge
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 COLOURS, REMBG = "none", "rembg"  # where masks come from, if not from a folder
 NAMED = 5  # photographs in a message, at most

@@ -46,7 +46,7 @@ from univoxel.scene import Scene
 
 SHEET_ROWS = 12  # views on the contact sheet, at most
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)

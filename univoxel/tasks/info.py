@@ -7,6 +7,7 @@ import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -24,7 +25,7 @@ from univoxel.preparation.matches import agreement, find_matches
 from univoxel.run import photos_of
 from univoxel.scene import Scene
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 # Beginning of a tensor's name in the file: the part it belongs to. The first that fits counts.
 PARTS = {
@@ -56,7 +57,7 @@ class Part:
 
 def info(
     run: str | Path, json: str | Path | None = None, picture: str | Path | None = None
-) -> dict:
+) -> dict[str, Any]:
     """What the model of a run takes up and where, and whether photographs agree with its cameras.
 
     Parameters are the learned numbers that the file holds: distances and features of the nodes it
@@ -95,7 +96,7 @@ def info(
     return found
 
 
-def camera_check(scene: Scene, run: Path) -> dict | None:
+def camera_check(scene: Scene, run: Path) -> dict[str, Any] | None:
     """How far points that are matched between the photographs of a run lie from their epipolar
     lines: `matches`, `refined`, and `given` and `used` (median and 90 %, pixels) for the cameras as
     they were given and as the scene has them. None where too few points match, or where the
@@ -132,7 +133,7 @@ def parts(run: Path) -> dict[str, Part]:
     return dict(sorted(found.items(), key=lambda item: -item[1].bytes))
 
 
-def facts(scene: Scene, parts: dict[str, Part], state: dict) -> dict:
+def facts(scene: Scene, parts: dict[str, Part], state: dict[str, Any]) -> dict[str, Any]:
     """The numbers, see `info`."""
     grid, cfg = scene.field.grid, scene.cfg
     features = scene.field.occupied()
@@ -155,7 +156,7 @@ def facts(scene: Scene, parts: dict[str, Part], state: dict) -> dict:
     }
 
 
-def tables(found: dict) -> Iterable[Table]:
+def tables(found: dict[str, Any]) -> Iterable[Table]:
     """The facts as the command prints them."""
     table = Table("part", "parameters", "bytes", "share", title="Model")
     for column in table.columns[1:]:
@@ -196,7 +197,7 @@ def tables(found: dict) -> Iterable[Table]:
     yield table
 
 
-def capacity_picture(scene: Scene, found: dict) -> np.ndarray:
+def capacity_picture(scene: Scene, found: dict[str, Any]) -> np.ndarray:
     """Where the capacity went: [H, W, 3] in [0, 1].
 
     Nodes with features, counted along each axis of the grid, the brightest where there are most;

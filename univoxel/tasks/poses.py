@@ -38,7 +38,7 @@ from univoxel.errors import DataError, ExistingFile, StillBackground
 from univoxel.files import replacing
 from univoxel.names import KEEP_SIZE
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 WORK = "sfm"  # folder in the scene that the steps keep their results in
 NAMED = 5  # photographs that a message names at most

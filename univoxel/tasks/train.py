@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -34,7 +35,7 @@ from univoxel.training.loop import run_stage
 from univoxel.training.pixels import TrainingPixels, split_pixels
 from univoxel.training.progress import LOG, Progress, TrainingProgress
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 def train(
@@ -101,7 +102,7 @@ def train(
 
 def start(
     silhouettes: Silhouettes, cfg: TrainConfig, limited: TrainConfig, resume: bool
-) -> tuple[Scene, dict]:
+) -> tuple[Scene, dict[str, Any]]:
     """The scene that training begins or goes on with, and the state of its run.
 
     Args:

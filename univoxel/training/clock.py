@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any, Protocol
 
 from univoxel.config import TrainConfig
 
@@ -51,20 +51,21 @@ class Clock:
     that is short of time is short in all its stages.
     """
 
-    def __init__(self, cfg: TrainConfig, begin: float, state: dict):
+    def __init__(self, cfg: TrainConfig, begin: float, state: dict[str, Any]) -> None:
         """
         Args:
             begin: of training, on time.monotonic's clock.
             state: as `state` gave it; empty at the begin of a run.
         """
-        self.cfg, self.begin = cfg, begin
+        self.cfg: TrainConfig = cfg
+        self.begin: float = begin
         self.stage: int = state.get("stage", 0)
         self.done: float = state.get("progress", 0.0)  # of the present stage, in [0, 1]
         self.step: int = state.get("step", 0)
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
         self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
         self.watch: Callable[[], None] | None = None  # called between steps; its time is no time
-        self.reserved = 0.0  # seconds of this stage that are kept for blocks off the pace
+        self.reserved: float = 0.0  # seconds of this stage that are kept for blocks off the pace
         self._stopped: float | None = None  # when the clock was, see `stopped`
         self._stage_steps: int = state.get("stage_steps", 0)  # made in the present stage
         self._planned, self._count = 0, 0  # steps of the stage in this sitting
@@ -72,7 +73,7 @@ class Clock:
         self._stage_end = 0.0  # when its time is over
         self._off_pace, self._last_block = 0.0, 0.0  # seconds, see `off_pace`
 
-    def state(self) -> dict:
+    def state(self) -> dict[str, Any]:
         """What a later sitting needs to go on; JSON."""
         return {
             "stage": self.stage,
@@ -215,8 +216,10 @@ class Clock:
 class CountedSteps:
     """A clock of a few steps through the whole schedule of a stage, whatever time they take."""
 
-    def __init__(self, count: int):
-        self.stage, self.step, self._count = 0, 0, count
+    def __init__(self, count: int) -> None:
+        self.stage: int = 0
+        self.step: int = 0
+        self._count = count
 
     def steps(self) -> Iterator[float]:
         while self.step < self._count:

@@ -32,7 +32,7 @@ class StageConfig:
     # sparse: only bricks around the surface are stored; hash: features come from a hash table
     field: FieldName = "dense"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "voxels")
         check_fields(self, "at least 1", lambda x: x >= 1, "iterations", "rays")
         check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "share")
@@ -64,6 +64,6 @@ class LossConfig:
     white_light: float = 0.01
     map_smoothness: float = 1e-3  # total variation of the log map
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         names = [f.name for f in fields(self)]
         check_fields(self, "at least 0", lambda x: 0 <= x < math.inf, *names)

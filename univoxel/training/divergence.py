@@ -31,8 +31,8 @@ class Guard:
         restored: called when parameters have gone back, for what is derived from them.
     """
 
-    def __init__(self, progress: Listener, restored: Callable[[], None] = lambda: None):
-        self.scale = 1.0  # on the step size
+    def __init__(self, progress: Listener, restored: Callable[[], None] = lambda: None) -> None:
+        self.scale: float = 1.0  # on the step size
         self._progress, self._restored = progress, restored
         self._best, self._kind = -math.inf, False
         self._failures, self._sound = 0, 0  # in a row; steps since the last

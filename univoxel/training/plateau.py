@@ -13,7 +13,7 @@ class Plateau:
         patience: dB that held-out rays must gain over WINDOW looks, >= 0; 0: nothing is looked at.
     """
 
-    def __init__(self, patience: float):
+    def __init__(self, patience: float) -> None:
         self.patience = patience
         self._seen: list[float] = []  # dB, of one kind
         self._kind, self._next, self._over = False, CHECK, patience == 0

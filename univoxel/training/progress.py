@@ -6,7 +6,7 @@ import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
@@ -22,7 +22,7 @@ LOG = "log.jsonl"  # in the folder of a run
 REPORT_SECONDS = 5.0
 CHECKPOINT_SECONDS = 20.0  # of work that a kill costs, about
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Listener(Protocol):
         """Whether a checkpoint is due, for a run that may be killed."""
         ...
 
-    def state(self) -> dict:
+    def state(self) -> dict[str, Any]:
         """What a checkpoint holds beside the scene; JSON."""
         ...
 
@@ -71,7 +71,7 @@ class Progress:
         self,
         cfg: TrainConfig,
         begin: float,
-        state: dict,
+        state: dict[str, Any],
         on_progress: Callable[[TrainingProgress], None] | None = None,
     ):
         """
@@ -80,9 +80,12 @@ class Progress:
             state: as `state` gave it; empty at the begin of a run.
             on_progress: called with each report.
         """
-        self.cfg, self.clock = cfg, Clock(cfg, begin, state)
+        self.cfg: TrainConfig = cfg
+        self.clock: Clock = Clock(cfg, begin, state)
         self._on_progress = on_progress
-        self.chosen = [CapacityChoice.from_json(entry) for entry in state.get("chosen", ())]
+        self.chosen: list[CapacityChoice] = [
+            CapacityChoice.from_json(entry) for entry in state.get("chosen", ())
+        ]
         self.troubles: list[str] = list(state.get("troubles", ()))  # what went wrong and was mended
         self._log = cfg.out / LOG
         self._reported, self._reported_step = self.clock.seconds, self.clock.step
@@ -99,7 +102,7 @@ class Progress:
         self._bar.start()
         return self
 
-    def __exit__(self, kind: type | None, *_) -> None:
+    def __exit__(self, kind: type | None, *_: object) -> None:
         self._bar.stop()
         if kind is not None:
             return
@@ -112,7 +115,7 @@ class Progress:
                 f"before you trust it; the last was in {self.troubles[-1]}"
             )
 
-    def state(self) -> dict:
+    def state(self) -> dict[str, Any]:
         """What a later sitting needs to go on, and what evaluation reports; JSON."""
         return self.clock.state() | {
             "chosen": [choice.as_json() for choice in self.chosen],
@@ -172,8 +175,8 @@ class Progress:
 class Rehearsal:
     """A few steps of a stage off the record, in place of a run's progress."""
 
-    def __init__(self, steps: int):
-        self.clock = CountedSteps(steps)
+    def __init__(self, steps: int) -> None:
+        self.clock: CountedSteps = CountedSteps(steps)
 
     def due(self) -> bool:
         return False
@@ -184,7 +187,7 @@ class Rehearsal:
     def checkpoint_due(self) -> bool:
         return False
 
-    def state(self) -> dict:
+    def state(self) -> dict[str, Any]:
         return {}
 
     def trouble(self, what: str) -> None:

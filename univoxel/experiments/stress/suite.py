@@ -20,7 +20,7 @@ from univoxel.experiments.stress.scenes import Spec
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 SHOWN: tuple[LightName, ...] = ("hybrid", "sg", "sh", "envmap")
 SEEDS = 3
