@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -48,6 +49,19 @@ MEASURES = {
     "parameters": "parameters",
     "model_bytes": "size of the model file, bytes",
 }
+
+
+def in_words(measures: Mapping[str, float | int | None]) -> dict[str, str]:
+    """What people read of measures by key: their texts, by what they are. None is a dash."""
+    return {meaning: _text(measures[key]) for key, meaning in MEASURES.items() if key in measures}
+
+
+def _text(value: float | int | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else f"{value:,}"
+
+
 SURFACE_POINTS = 100_000  # samples of the mesh for the Chamfer distance, at most
 
 Pairs: TypeAlias = tuple[Tensor, Tensor] | None  # doubts and errors, [N] each

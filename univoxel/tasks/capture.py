@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -30,12 +29,12 @@ from univoxel.errors import (
     UserError,
     WithoutMasks,
 )
-from univoxel.evaluation.measures import MEASURES
+from univoxel.evaluation.measures import in_words
 from univoxel.files import read_json, replacing
 from univoxel.names import KEEP_SIZE, SAMPLES, LightName, PresetOrAuto
 from univoxel.ops import native
 from univoxel.overrides import changed
-from univoxel.pictures import gallery
+from univoxel.page import write_page
 from univoxel.presets import chosen
 from univoxel.run import kept_photos, trained_on
 from univoxel.segmentation.network import network
@@ -380,36 +379,24 @@ def _picture(project: Project, run: Path, config: PicturesConfig) -> None:
 
 
 def _write_page(project: Project, given: Given, run: Path) -> None:
-    """Write the page with all pictures."""
-    shown = [
-        ("Masks, worst first", project.cut / "masks.html"),
-        ("Mesh with materials", project.mesh),
-        ("Pictures with layers", project.pictures),
+    """Write the page of the object, which also says what lies beside it."""
+    beside = [
+        ("the mesh with its materials", project.mesh),
+        ("pictures with their layers", project.pictures),
+        ("the masks, worst first", project.cut / "masks.html"),
     ]
-    links = [
-        f'<li><a href="{html.escape(path.relative_to(project.out).as_posix())}">{words}</a>'
-        for words, path in shown
+    named = [
+        f"{what} ({path.relative_to(project.out).as_posix()})"
+        for what, path in beside
         if path.exists()
     ]
-    parts = [f"<p>Made of {html.escape(given.words)}.</p>", f"<ul>{''.join(links)}</ul>"]
-    if (run / "preview.png").exists():
-        parts += [
-            "<h2>A view</h2><p>Photograph, render, albedo, roughness, normal.</p>",
-            gallery.image(run / "preview.png", "wide"),
-        ]
-    parts.append("<h2>Under other light</h2>")
-    for name in MAPS:
-        frames = sorted((project.pictures / name).glob("*.png"))
-        parts.append(gallery.row(name, frames, "small"))
-    measures, contact = project.pictures / "measures.json", project.pictures / "test"
-    if measures.exists():
-        values = read_json(measures)
-        known = {k: m for k, m in MEASURES.items() if values.get(k) is not None}
-        parts += ["<h2>Measures on the test views</h2>", gallery.table(known, values)]
-        parts += ["<h2>Test views</h2>", gallery.sheet(contact / "contact_sheet.png")]
-    trust = run / "trust.txt"
-    if trust.is_file():
-        parts += ["<h2>What the photographs leave open</h2>"]
-        parts += [f"<pre>{html.escape(trust.read_text(encoding='utf-8'))}</pre>"]
-    name = project.out.absolute().name
-    gallery.write_gallery(project.page, name, f"{name}, ready to be lit anew", parts)
+    measures = project.pictures / "measures.json"
+    values = read_json(measures) if measures.exists() else {}
+    known = {key: value for key, value in values.items() if value is not None}
+    write_page(
+        run,
+        project.page,
+        title=project.out.absolute().name,
+        notes=f"Made of {given.words}. Beside this page lie {', '.join(named)}.",
+        measures=in_words(known),
+    )

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from univoxel.checkpoint import FILE
-from univoxel.evaluation.measures import MEASURES
+from univoxel.evaluation.measures import in_words
 from univoxel.page import write_page
 from univoxel.presets import preset
 from univoxel.tasks.evaluate import evaluate
@@ -60,11 +60,5 @@ def demo(out: str | Path) -> Path:
         out / "index.html",
         title=TITLE,
         notes=NOTES.format(photos=photos),
-        measures={meaning: _text(measures[key]) for key, meaning in MEASURES.items()},
+        measures=in_words(measures),
     )
-
-
-def _text(value: float | int | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else f"{value:,}"
