@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -27,8 +27,11 @@ def split_pixels(photos: Photos, distance: Tensor, doubted: Tensor | None = None
 
     Args:
         distance: [V, H, W] pixels to the silhouette, negative inside; infinite beyond a picture.
-        doubted: [V, H, W] bool, where masks are not believed: left out.
+        doubted: [V, H, W] bool, where masks are not believed: left out, here and, as if there were
+            no object, wherever the photographs are looked at later.
     """
+    if doubted is not None:
+        photos = replace(photos, alpha=photos.alpha.masked_fill(doubted, 0))
     near = distance < MARGIN
     pixels = _nonzero(near if doubted is None else near & ~doubted)
     order = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))
