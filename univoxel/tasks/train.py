@@ -32,6 +32,7 @@ from univoxel.run import kept_photos
 from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
 from univoxel.training.loop import run_stage
+from univoxel.training.memory import check_memory
 from univoxel.training.pixels import TrainingPixels, split_pixels
 from univoxel.training.progress import LOG, Progress, TrainingProgress
 
@@ -59,7 +60,7 @@ def train(
         ExistingFile: cfg.out holds a run already and resume is False.
         OSError: a file of the run cannot be written; what was there before stays.
         UserError: with resume, the checkpoint cannot be read, or it belongs to another
-            configuration.
+            configuration; or training needs more memory than there is.
     """
     if not native.reference_asked():
         native.require_embree("train")  # now, and not minutes later
@@ -73,6 +74,7 @@ def train(
             f"{cfg.out} holds a run already: pass resume or another out", "resume", "out"
         )
     log.info(photos.about)
+    check_memory(photos, cfg)
 
     begin = time.monotonic()  # only now: how long reading takes is the photographs' affair
     silhouettes = find_silhouettes(photos, cfg)
