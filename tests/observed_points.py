@@ -93,7 +93,7 @@ class Steps:
 
     def __init__(self, count: int, rooms: Sequence[int] = ()):
         self.count, self.rooms, self.asked = count, list(rooms), []
-        self.troubles, self.said, self.abandoned = [], [], False
+        self.troubles, self.said, self.abandoned, self.within = [], [], False, None
 
     def steps(self, apart):
         assert 0 <= apart < 1
@@ -115,6 +115,9 @@ class Steps:
         return self.rooms.pop(0) if self.rooms else blocks
 
     def due(self) -> bool:
+        return False
+
+    def checkpoint_due(self) -> bool:
         return False
 
     def trouble(self, what: str) -> None:

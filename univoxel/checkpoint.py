@@ -123,6 +123,20 @@ class Choice:
 
 
 @dataclass(frozen=True)
+class Within:
+    """Where in a stage of rounds a run is, as `univoxel.joint.stage` has it."""
+
+    begin: float
+    end: float
+    rounds_after: int
+    solved: bool
+
+    def __post_init__(self) -> None:
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "begin", "end")
+        check_fields(self, "at least 0", lambda x: x >= 0, "rounds_after")
+
+
+@dataclass(frozen=True)
 class State:
     """What of a run's state is known here; a file may have less and more."""
 
@@ -132,6 +146,7 @@ class State:
     made: tuple[float, ...] = ()
     early: tuple[int, ...] = ()
     stage_steps: int = 0
+    within: Within | None = None  # None: at the begin of a stage, or in one without rounds
     seconds: float = 0.0
     chosen: tuple[Choice, ...] = ()
     troubles: tuple[str, ...] = ()

@@ -22,6 +22,7 @@ from observed_points import (
 from torch.nn.functional import normalize
 
 from univoxel import brdf
+from univoxel.checkpoint import load_checkpoint
 from univoxel.color import linear_to_srgb_unclipped
 from univoxel.config import TrainConfig
 from univoxel.joint import equations, newton, stage
@@ -39,6 +40,7 @@ from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig
 from univoxel.sphere import fibonacci_sphere
 from univoxel.tasks import train as train_task
+from univoxel.training import progress
 from univoxel.training.config import StageConfig
 
 CAUCHY = NewtonConfig().cauchy
@@ -619,6 +621,51 @@ def test_newton_starts_from_the_albedo_that_it_is_given():
         newton.choose_points(scene, problem, nothing, cfg).log_albedo,
         torch.full((20, 3), 0.5).log(),
     )
+
+
+def test_a_solve_that_was_killed_goes_on_in_its_round(tmp_path, monkeypatch):
+    """Map, materials and round are those of the checkpoint; nothing before is done again."""
+    data = write_scene(tmp_path / "data", views=8, size=24)
+    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
+    stages = (
+        StageConfig(voxels=0.01, iterations=10, share=0.4, rays=256, physical_from=0.5),
+        JointConfig(iterations=30, rounds=3, points=300, newton_points=100, rays=256, tracing=1),
+    )
+    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, sky_nodes=32, light=light)
+    cfg = TrainConfig(data, tmp_path / "run", stages, minutes=5.0, scene=sizes)
+    started, newtons, steps = [], [], []
+    initialise_, newton_round, objective = stage.initialise_, stage.newton_round_, stage.objective
+
+    def killed(*arguments):
+        steps.append(arguments[0].sky.log_radiance.detach().clone())
+        if len(steps) == 15:  # of 10 in a round
+            raise KeyboardInterrupt
+        return objective(*arguments)
+
+    monkeypatch.setattr(progress, "CHECKPOINT_SECONDS", 0.0)  # after each step
+    monkeypatch.setattr(stage, "objective", killed)
+    monkeypatch.setattr(
+        stage, "initialise_", lambda *a: started.append(len(steps)) or initialise_(*a)
+    )
+    monkeypatch.setattr(
+        stage, "newton_round_", lambda *a: newtons.append(len(steps)) or newton_round(*a)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        train_task.train(cfg)
+    _, saved = load_checkpoint(cfg.out)
+    assert saved["stage"] == 1
+    assert saved["stage_steps"] == 13  # saved before its step was counted
+    assert saved["within"]["rounds_after"] == 1
+    train_task.train(cfg, resume=True)
+    assert started == [0]
+    assert newtons[:2] == [0, 10]  # that of the second round is not made again
+    assert newtons[2:] in (
+        [15 + 7],
+        [15 + 8],
+    )  # what is left of its 10 steps, or by rounding one more
+    assert len(steps) == 15 + 30 - 13
+    assert torch.equal(steps[15], steps[14])  # the map goes on where it was
+    assert load_checkpoint(cfg.out)[1]["within"] is None
 
 
 def test_a_refit_leaves_materials_bit_for_bit(tmp_path, monkeypatch):

@@ -9,13 +9,14 @@ and highlights determine better than silhouettes and colours did.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, normalize
 
 from univoxel import brdf, losses
+from univoxel.checkpoint import save_scene
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped
 from univoxel.data import Photos
 from univoxel.errors import NoSurface
@@ -61,16 +62,24 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     """Fit scene.sky, the materials and the normals to the photographs; other heads stay.
 
     What a point sees, and is seen by, is traced once: the surface turns, and hardly moves. Where
-    time is over, or there is nothing to see, all stays.
+    time is over, or there is nothing to see, all stays. A run that was saved within the stage goes
+    on there, on points of the surface as it is then.
     """
     problem = traced_problem(scene, photos, cfg, seed, progress)
     if problem is None:
+        progress.within = None
         progress.clock.skip()
         return
     decisions = first_decisions(scene, problem, cfg)
     scene.field.sdf.requires_grad_(cfg.lr_sdf > 0)
     guard = Guard(progress)
     current_round = Round(begin=0.0, end=-1.0, rounds_after=cfg.rounds, solved=False)
+    if progress.within is not None:
+        current_round = Round(**progress.within)
+        metal = find_metal(scene, problem, cfg, rounds_done(cfg, current_round.rounds_after))
+        decisions = replace(decisions, metal=metal)
+        optimizer = adam(scene, problem)
+        guard.follow(optimizer)
     for done in progress.clock.steps(newton_share(cfg)):
         if done >= current_round.end:
             problem = with_present_normals(scene, problem)
@@ -80,6 +89,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             rounds_after = progress.clock.blocks_that_fit(rounds_left - 1)
             end = done + (1 - done) / (1 + rounds_after)
             current_round = Round(done, end, rounds_after, solved)
+            progress.within = asdict(current_round)
             optimizer = adam(scene, problem)
             guard.follow(optimizer)
         set_rates_(optimizer, cfg, current_round, done, scene.field.voxel_size, guard.scale)
@@ -95,6 +105,9 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         if progress.due():
             progress.report({k: v.item() for k, v in terms.items()}, None)
             guard.keep()
+        if progress.checkpoint_due():
+            save_scene(scene, progress.cfg.out, progress.state())
+    progress.within = None
     scene.field.refresh()
 
 
@@ -149,12 +162,17 @@ def newton_phase_(
             progress.trouble(trouble)
         if cfg.colors:
             minimise_entropy_(scene, problem, decisions, cfg.entropy)
-        done = 1 - (rounds_left - 1) / max(cfg.rounds - 1, 1)
+        done = rounds_done(cfg, rounds_left - 1)
         decisions = replace(decisions, metal=find_metal(scene, problem, cfg, done))
         if decisions.albedo is not None:
             teach_albedo_(scene, problem, decisions, cfg)
             decisions = replace(decisions, albedo=None)
     return decisions, bool(newton.costs)
+
+
+def rounds_done(cfg: JointConfig, rounds_after: int) -> float:
+    """How far a round is among all, in [0, 1], by those that come after it."""
+    return 1 - rounds_after / max(cfg.rounds - 1, 1)
 
 
 def start_(

@@ -87,6 +87,8 @@ class Progress:
             CapacityChoice.from_json(entry) for entry in state.get("chosen", ())
         ]
         self.troubles: list[str] = list(state.get("troubles", ()))  # what went wrong and was mended
+        # Where a stage of rounds is in them; JSON, None in others
+        self.within: dict[str, Any] | None = state.get("within")
         self._log = cfg.out / LOG
         self._reported, self._reported_step = self.clock.seconds, self.clock.step
         self._saved = self.clock.seconds
@@ -118,6 +120,7 @@ class Progress:
     def state(self) -> dict[str, Any]:
         """What a later sitting needs to go on, and what evaluation reports; JSON."""
         return self.clock.state() | {
+            "within": self.within,
             "chosen": [choice.as_json() for choice in self.chosen],
             "troubles": self.troubles,
             "threads": torch.get_num_threads(),
