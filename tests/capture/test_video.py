@@ -87,7 +87,7 @@ def test_frames_are_chosen_once_and_anew_for_other_wishes(film, tmp_path, monkey
     monkeypatch.setattr(video, "write_frames", lambda *args: calls.append(args[2]) or write(*args))
     folders = Folders(tmp_path)
     for every, frames in ((0.5, 8), (0.5, 8), (2.0, 2)):
-        files, others, doubles = tasks_poses._files(film, folders, every)
+        files, others, doubles = tasks_poses.photographs_of(film, folders, every)
         assert (len(files), others, doubles) == (frames, [], 0)
     assert calls == [0.5, 2.0]
 
@@ -95,4 +95,4 @@ def test_frames_are_chosen_once_and_anew_for_other_wishes(film, tmp_path, monkey
 def test_without_ffmpeg_nothing_is_read(film, tmp_path, monkeypatch):
     monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtra, match="a video needs imageio-ffmpeg"):
-        tasks_poses._files(film, Folders(tmp_path), None)
+        tasks_poses.photographs_of(film, Folders(tmp_path), None)

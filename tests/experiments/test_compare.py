@@ -106,7 +106,10 @@ def test_without_matplotlib_nothing_is_trained(passed, tmp_path, monkeypatch, ca
     monkeypatch.setattr(builtins, "__import__", without)
     assert main(["compare", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
-    assert said == "univoxel compare: the pictures need matplotlib: pip install 'univoxel[chart]'\n"
+    assert (
+        said
+        == "univoxel lab compare: the pictures need matplotlib: pip install 'univoxel[chart]'\n"
+    )
     assert not passed
 
 

@@ -176,7 +176,7 @@ def test_quick_is_hybrid_and_one_seed(stood_in, tmp_path):
 def test_mistakes_are_one_line(stood_in, tmp_path, capsys, options, message):
     assert main(["stress", "--out", str(tmp_path / "out"), "--quick", *options]) == 2
     err = capsys.readouterr().err
-    assert err.startswith(f"univoxel stress: {message}")
+    assert err.startswith(f"univoxel lab stress: {message}")
     assert err.count("\n") == 1
     assert not stood_in["trained"]
 
@@ -188,7 +188,9 @@ def test_without_mitsuba_one_line_names_the_extra(tmp_path, capsys, monkeypatch)
     )
     assert main(["stress", "--out", str(tmp_path / "out"), "--quick"]) == 2
     said = capsys.readouterr().err
-    assert said == "univoxel stress: the scenes need Mitsuba 3: pip install 'univoxel[stress]'\n"
+    assert (
+        said == "univoxel lab stress: the scenes need Mitsuba 3: pip install 'univoxel[stress]'\n"
+    )
     assert not (tmp_path / "out").exists()
 
 
