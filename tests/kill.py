@@ -1,6 +1,6 @@
 """Commands that are ended at any moment: what is there afterwards is whole, and the rest is made.
 
-    python tests/kill.py [--kills N] [--only COMMAND ..] [--seed FIRST] [--keep DIR]
+    python tests/kill.py [--kills N] [--only COMMAND ..] [--seed FIRST]
 
 A command runs in a process of its own and gets SIGKILL, SIGTERM or SIGINT at a random moment. Then
 all files that it left are read, and the same command, with --resume where it has that, has to end
@@ -26,6 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 from PIL import Image
 from safetensors import safe_open
 
@@ -87,7 +88,7 @@ def commands(place: Path, run: Path) -> dict[str, Command]:
     cutout = ("cutout", str(masked), "--out", str(place / "cut"), "--from", str(masked / "masks"))
     return {
         "train": Command(train, (*train, "--resume"), trained / "trust.txt"),
-        "cutout": Command(cutout, cutout, place / "cut/transforms.json"),
+        "cutout": Command(cutout, cutout, place / "cut/masks.html"),
         "eval": Command(evaluate, evaluate, place / "measures.json"),
         "relight": Command(relight, (*relight, "--resume"), place / "relit/orbit_0011.png"),
         "export": Command(export, export, place / "mesh.glb"),
@@ -114,13 +115,13 @@ def start(arguments: Sequence[str]) -> subprocess.Popen[str]:
 
 def ended(arguments: Sequence[str], after: float, what: signal.Signals) -> bool:
     """Start a command and end it after so many seconds; whether it was still running."""
-    process = start(arguments)
-    try:
-        process.communicate(timeout=after)
-    except subprocess.TimeoutExpired:
-        process.send_signal(what)
-        process.communicate(timeout=60)
-        return True
+    with start(arguments) as process:
+        try:
+            process.communicate(timeout=after)
+        except subprocess.TimeoutExpired:
+            process.send_signal(what)
+            process.communicate(timeout=60)
+            return True
     return False
 
 
@@ -147,8 +148,11 @@ def _read(path: Path) -> None:
             lines = path.read_text(encoding="utf-8").splitlines()
             for line in lines:
                 json.loads(line)
-        case ".png" | ".exr":
+        case ".png":
             read_image(path)
+        case ".exr":
+            with OpenEXR.File(str(path)) as file:
+                file.channels()
         case ".glb":
             data = path.read_bytes()
             assert data[:4] == b"glTF", "no GLB"
@@ -218,7 +222,7 @@ def kill(name: str, kills: int, first: int, run: Path, place: Path, quality: flo
             if not ended(arguments, draw.uniform(0.0, length), what):
                 break
             toll.kills += 1
-            if name == "train":
+            if name == "train":  # the moment of the kill, from here on by less than a second
                 toll.lost = max(toll.lost, lost_seconds(folder / "run", time.time()))
             toll.broken += [f"{what.name}: {line}" for line in broken_files(folder)]
             arguments = command.again
