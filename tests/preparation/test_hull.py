@@ -10,6 +10,7 @@ from univoxel.preparation.hull import (
     estimate_bounds,
     hull_sdf,
     mask_distances,
+    views_needed,
     visual_hull,
     votes_needed,
 )
@@ -130,3 +131,21 @@ def test_resampling_keeps_a_linear_function():
     torch.testing.assert_close(
         resample(two, source, target)[..., 1], 3 * (target.nodes() @ weights)
     )
+
+
+def test_what_few_views_see_is_carved_by_half_of_them_and_ends_where_too_few_do(silhouettes):
+    """Beyond the pictures of most, as with masks that are cut off by their edges."""
+    distance, cameras = silhouettes
+    few = cameras.of(torch.tensor([0, 1, 2]))
+    above = torch.tensor([[0.0, 0.0, 1.5 * RADIUS]])  # in the pictures of all
+    ball = torch.zeros(1, 3)
+    assert (hull_sdf(distance[:3], few, above, votes=8) > 0).all()  # eight there are not
+    assert (hull_sdf(distance[:3], few, ball, votes=8) < 0).all()
+    assert (hull_sdf(distance[:3], few, ball, votes=8, seen_by=3) < 0).all()
+    assert hull_sdf(distance[:3], few, ball, votes=8, seen_by=4).isposinf().all()
+
+
+def test_where_masks_are_believed_one_view_is_enough():
+    assert views_needed(100, 1) == 1
+    assert views_needed(100, 7) == 25
+    assert views_needed(2, 2) == 1

@@ -65,6 +65,9 @@ class HullConfig:
     # share of the views, in [0, 1], that have to carve a node where masks are doubted: one in ten
     # may lack a part, hardly ever the same part. Two views at least
     doubted_votes: float = 0.07
+    # share of the views, in [0, 1], that have to see a node where masks are doubted. Orbits have
+    # the whole object in nearly all of their pictures
+    doubted_seen: float = 0.25
     # half the width of what a doubted mask lacks or shows too much, in pixels, >= 0: narrower
     # pieces are its jagged edge
     rough_pixels: float = 1.5
@@ -76,7 +79,7 @@ class HullConfig:
         check_fields(self, *_WHOLE, "box_rounds")
         check_fields(self, *_ABOVE, "first_box", "nodes")
         check_fields(self, *_NOT_BELOW, "margin", "rough_pixels")
-        check_fields(self, *_SHARE, "doubted_votes", "rough_share")
+        check_fields(self, *_SHARE, "doubted_votes", "doubted_seen", "rough_share")
 
 
 @dataclass(frozen=True)

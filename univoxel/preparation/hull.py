@@ -52,24 +52,34 @@ def _mask_distance(alpha: np.ndarray) -> np.ndarray | float:
     return np.where(edge & (alpha > 0) & (alpha < 1), 0.5 - alpha, d)
 
 
-def hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor, votes: int = 1) -> Tensor:
+def hull_sdf(
+    distance: Tensor, cameras: Cameras, points: Tensor, votes: int = 1, seen_by: int = 1
+) -> Tensor:
     """Signed distance to the visual hull, a lower bound of the object's: [P, 3] -> [P].
 
     The largest over views of the silhouette's distance times depth / focal length. Outside a
     picture there is nothing where its silhouette stays clear of the border; where the silhouette
-    is cut off by it, the view says nothing. Points that no view sees are outside.
+    is cut off by it, the view says nothing.
 
     Args:
         distance: [V, H, W] from `mask_distances`.
-        votes: views, >= 1, that have to say so before a point is outside; with more than one the
-            hull is somewhat too large, and wrong masks of fewer views do not bite into it.
+        votes: views, >= 1, that have to say so before a point is outside, or half of those that
+            can say anything of it, if these are fewer; with more than one the hull is somewhat too
+            large, and wrong masks of fewer views do not bite into it.
+        seen_by: views, >= 1, that have to be able to say anything of a point; others are outside.
     """
-    pieces = side_by_side(lambda p: _hull_sdf(distance, cameras, p, votes), points.split(PIECE))
-    return torch.cat(pieces)
+
+    def of_piece(piece: Tensor) -> Tensor:
+        return _hull_sdf(distance, cameras, piece, votes, seen_by)
+
+    return torch.cat(side_by_side(of_piece, points.split(PIECE)))
 
 
-def _hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor, votes: int) -> Tensor:
+def _hull_sdf(
+    distance: Tensor, cameras: Cameras, points: Tensor, votes: int, seen_by: int
+) -> Tensor:
     highest = torch.full((votes, len(points)), -torch.inf)  # of the views so far, the largest first
+    voters = torch.zeros(len(points), dtype=torch.int64)
     for v in range(len(cameras)):
         pixel, depth = project(cameras, v, points)
         uv = pixel * (2 / torch.tensor(cameras.size(v))) - 1
@@ -82,18 +92,32 @@ def _hull_sdf(distance: Tensor, cameras: Cameras, points: Tensor, votes: int) ->
         seen = (depth > 0) & (uv.abs() <= 1).all(1)
         bound = d.clamp_min(0.5) if uncut else torch.full_like(d, -torch.inf)
         bound = torch.where(seen, d, bound) * depth.abs() / cameras.focal[v].mean()
+        voters += bound > -torch.inf
         for rank in range(votes):
             highest[rank], bound = (
                 torch.maximum(highest[rank], bound),
                 torch.minimum(highest[rank], bound),
             )
-    sdf = highest[-1]
-    return torch.where(sdf.isinf(), torch.inf, sdf)
+    enough = ((voters + 1) // 2).clamp(1, votes)
+    sdf = highest.gather(0, enough[None] - 1)[0]
+    return torch.where(voters < seen_by, torch.inf, sdf)
 
 
 def votes_needed(views: int, cfg: HullConfig = HULL) -> int:
     """How many of so many views have to carve a point where their masks are doubted."""
     return max(1, min(max(2, round(cfg.doubted_votes * views)), views // 3))
+
+
+def views_needed(views: int, votes: int, cfg: HullConfig = HULL) -> int:
+    """How many of so many views have to see a point of the object.
+
+    Where masks are doubted, some end where the pictures do, or each at another place of what the
+    object stands on: what lies out there is seen by few, and these are no proof.
+
+    Args:
+        votes: see `hull_sdf`; with one, masks are believed.
+    """
+    return 1 if votes == 1 else max(1, min(round(cfg.doubted_seen * views), views))
 
 
 def estimate_bounds(
@@ -116,7 +140,8 @@ def estimate_bounds(
     for _ in range(cfg.box_rounds):  # each round sees the hull at a finer grid
         grid = fit_grid(lower, upper, cfg.box_nodes)
         nodes = grid.nodes().reshape(-1, 3)
-        inside = nodes[hull_sdf(distance, cameras, nodes, votes) < grid.voxel_size]
+        seen_by = views_needed(len(cameras), votes, cfg)
+        inside = nodes[hull_sdf(distance, cameras, nodes, votes, seen_by) < grid.voxel_size]
         if not len(inside):
             raise UserError(
                 "the silhouettes of the photographs share no volume: check masks and cameras"
@@ -137,6 +162,8 @@ def visual_hull(
     """
     stride = max(1, round((np.prod(grid.size) / cfg.nodes) ** (1 / 3)))
     coarse = fit_coarse(grid, stride)
-    sdf = hull_sdf(distance, cameras, coarse.nodes().reshape(-1, 3), votes).reshape(coarse.size)
+    seen_by = views_needed(len(cameras), votes, cfg)
+    sdf = hull_sdf(distance, cameras, coarse.nodes().reshape(-1, 3), votes, seen_by)
+    sdf = sdf.reshape(coarse.size)
     far = sum(n * n for n in grid.size) ** 0.5 * grid.voxel_size
     return resample(sdf.clamp(-far, far), coarse, grid)
