@@ -7,7 +7,7 @@ import pytest
 import torch
 from analytic import photos_of
 
-from univoxel.color import linear_to_srgb
+from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.grid import fit_grid
 from univoxel.names import Varying
 from univoxel.preparation import exposures as task
@@ -132,3 +132,20 @@ def test_what_differs(
 def test_nothing_is_looked_for_that_was_not_asked_for(photos, hull, monkeypatch):
     monkeypatch.setattr(task, "log_gains", None)
     assert varying_and_gains(photos, *hull, "none", look=False) == ("none", None)
+
+
+@pytest.mark.parametrize(("gain", "told"), [(1.0, False), (64.0, True)])
+def test_much_that_is_overexposed_is_said(photos, caplog, gain, told):
+    caplog.set_level("INFO", "univoxel")
+    encoded = (255 * linear_to_srgb(gain * photos.color)).round().byte()
+    eight_bits = replace(photos, color=encoded, alpha=(255 * photos.alpha).round().byte())
+    task.say_clipped(eight_bits)
+    assert ("of the object's pixels are overexposed" in caplog.text) == told
+    seen = eight_bits.color[eight_bits.alpha > 127]
+    expected = (seen > 255 * CLIPPED).any(1).float().mean()
+    assert task.clipped_share(eight_bits) == pytest.approx(float(expected), abs=1e-6)
+    assert (expected > 0.5) == told
+
+
+def test_linear_photographs_are_not_clipped(photos):
+    assert task.clipped_share(replace(photos, color=100 * photos.color)) == 0

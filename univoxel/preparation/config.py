@@ -215,6 +215,8 @@ class ExposureConfig:
     rounds: int = 20
     # points that speak for a gain of 1, > 0: of a photograph that shares none with others
     prior: float = 1e-3
+    # share of the object's pixels, in [0, 1], that are clipped, above which it is said
+    much_clipped: float = 0.03
     # stops, root mean square, >= 0, above which exposures differ. Where they are alike, reflections
     # and a hull that is too large look like 0.01 to 0.16 stops. Metal or light that changes looks
     # like 0.25: gains do no harm there
@@ -222,7 +224,7 @@ class ExposureConfig:
 
     def __post_init__(self) -> None:
         check_fields(self, *_WHOLE, "points", "rounds")
-        check_fields(self, *_SHARE, "dark")
+        check_fields(self, *_SHARE, "dark", "much_clipped")
         check_fields(self, *_ABOVE, "cauchy", "prior")
         check_fields(self, *_NOT_BELOW, "min_stops")
 

@@ -61,6 +61,33 @@ def log_gains(
     return gain.float()
 
 
+def clipped_share(photos: Photos) -> float:
+    """Share of the object's pixels of which a channel is clipped: they were at least so bright.
+
+    Linear photographs have none.
+    """
+    if photos.color.dtype != torch.uint8:
+        return 0.0
+    clipped = shown = 0
+    for view in range(len(photos)):
+        color, alpha = photos.stored(view)
+        object_ = alpha > 0.5 * (1 if alpha.is_floating_point() else 255)
+        shown += int(object_.sum())
+        clipped += int((color[object_] > 255 * CLIPPED).any(1).sum())
+    return clipped / max(shown, 1)
+
+
+def say_clipped(photos: Photos, cfg: ExposureConfig = EXPOSURES) -> None:
+    """Say so where much of the object is clipped."""
+    share = clipped_share(photos)
+    if share > cfg.much_clipped:
+        log.info(
+            "%.0f %% of the object's pixels are overexposed: they count as at least so bright; "
+            "shorter exposures would tell more",
+            100 * share,
+        )
+
+
 def varying_and_gains(
     photos: Photos,
     hull: Tensor,

@@ -15,7 +15,7 @@ from univoxel.names import Varying
 from univoxel.poses import PoseSteps
 from univoxel.preparation.belief import doubted_pixels, weighed
 from univoxel.preparation.carving import carve_within_time
-from univoxel.preparation.exposures import varying_and_gains
+from univoxel.preparation.exposures import say_clipped, varying_and_gains
 from univoxel.preparation.hull import estimate_bounds, visual_hull
 from univoxel.preparation.light_frame import turntable_of
 from univoxel.preparation.masks import fitted_masks, with_masks
@@ -89,6 +89,7 @@ def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
         poses = registered_poses(distance, photos.cameras, box, constants.registration)
         photos = replace(photos, cameras=poses.corrected(photos.cameras))
     hull = visual_hull(distance, photos.cameras, grid, constants.hull, silhouettes.votes)
+    say_clipped(photos, constants.exposures)
     varying, gains = varying_and_gains(
         photos, hull, grid, cfg.scene.varying, cfg.exposures, constants.exposures
     )
