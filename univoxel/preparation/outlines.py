@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import cg
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -126,23 +126,27 @@ def _smoothed(
     where colours do."""
     index = np.full(band.shape, -1)
     index[band] = np.arange(len(share))
+    pixels = np.argwhere(band)
     diagonal, right = weight + cfg.given, weight * share + cfg.given * given[band]
     rows, columns, entries = [], [], []
-    for axis in (0, 1):
-        i, c, g = (np.moveaxis(x, axis, 0) for x in (index, color, given))
-        alike = ((c[1:] - c[:-1]) ** 2).sum(-1) / (2 * cfg.noise**2)
-        alike = cfg.smooth * np.exp(-alike)
-        for here, there, beside in ((i[:-1], i[1:], g[1:]), (i[1:], i[:-1], g[:-1])):
-            own, both = here >= 0, (here >= 0) & (there >= 0)
-            fixed = own & ~both
-            diagonal += np.bincount(here[own], alike[own], len(share))
-            right += np.bincount(here[fixed], (alike * beside)[fixed], len(share))
-            rows.append(here[both])
-            columns.append(there[both])
-            entries.append(-alike[both])
+    for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+        beside = pixels + step
+        here = ((beside >= 0) & (beside < band.shape)).all(1).nonzero()[0]
+        own, other = tuple(pixels[here].T), tuple(beside[here].T)
+        unlike = ((color[own] - color[other]) ** 2).sum(-1) / (2 * cfg.noise**2)
+        alike = cfg.smooth * np.exp(-unlike)
+        there = index[other]
+        fixed = there < 0  # beyond the band, where the mask stays
+        diagonal[here] += alike
+        right[here[fixed]] += alike[fixed] * given[other][fixed]
+        rows.append(here[~fixed])
+        columns.append(there[~fixed])
+        entries.append(-alike[~fixed])
     places = np.concatenate(rows), np.concatenate(columns)
-    matrix = sparse.csc_matrix((np.concatenate(entries), places), shape=2 * share.shape)
-    found = np.asarray(spsolve(matrix + sparse.diags(diagonal, format="csc"), right))
+    matrix = sparse.csr_matrix((np.concatenate(entries), places), shape=2 * share.shape)
+    system = matrix + sparse.diags(diagonal, format="csr")
+    # Well conditioned, since each pixel has a say of its own: some tens of products are enough
+    found, _ = cg(system, right, given[band], rtol=1e-4, M=sparse.diags(1 / diagonal))
     result = given.copy()
     result[band] = ((found - 0.5) * cfg.steeper + 0.5).clip(0, 1)
     return result
