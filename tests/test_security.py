@@ -110,7 +110,7 @@ stage = StageConfig(0.004, 10, 1.0, 64, physical_from=0.5)
 univoxel.train(TrainConfig(here / "data", here / "run", (stage,), minutes=1.0, scene=scene))
 lit = ["--point", "0", "0", "3", "9", "--samples", "1", "--out", str(here / "lit")]
 assert main(["info", run]) == 0
-assert main(["export", run, str(here / "a.ply")]) == 0
+assert main(["export", run, "--mesh", str(here / "a.ply")]) == 0
 assert main(["relight", run, *lit]) == 0
 """
 
