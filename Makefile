@@ -122,7 +122,8 @@ build-asan/.installed: $(SETUP) scripts/build.sh $(CXX_SOURCES)
 asan: build-asan/.installed
 	ln -sf $(addprefix $(CURDIR)/,$(filter-out univoxel/_core,$(wildcard univoxel/*))) \
 		build-asan/site/univoxel/
-	cd build-asan/site && ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+	cd build-asan/site && ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
+		UBSAN_OPTIONS=print_stacktrace=1 \
 		LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libubsan.so)" \
 		OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -q $(TWO) \
 		-c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) -p no:cacheprovider -k "not compile" $(CURDIR)/tests/ops
@@ -139,8 +140,8 @@ tsan: build-tsan/.installed
 	ln -sf $(addprefix $(CURDIR)/,$(filter-out univoxel/_core,$(wildcard univoxel/*))) \
 		build-tsan/site/univoxel/
 	cd build-tsan/site && LD_PRELOAD="$$(c++ -print-file-name=libtsan.so)" \
-		TSAN_OPTIONS=ignore_noninstrumented_modules=1:halt_on_error=1:exitcode=66 \
-		setarch -R $(CURDIR)/$(BIN)/python -m pytest -q -n 0 \
+		TSAN_OPTIONS=ignore_noninstrumented_modules=1:allocator_may_return_null=1:halt_on_error=1:exitcode=66 \
+		setarch -R $(CURDIR)/$(BIN)/python -m pytest -q -n 0 --capture=sys \
 		-c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) -p no:cacheprovider -k "not compile" $(TSAN_TESTS)
 
 # In an environment of its own: its packages are not what is looked at
