@@ -12,7 +12,7 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test page-test network-test fuzz kill-test lint format bench docs docs-check docs-write asan wheel wheel-test clean
+.PHONY: help dev demo test page-test network-test fuzz kill-test lint format bench docs docs-check docs-write asan tsan audit wheel wheel-test clean
 .DELETE_ON_ERROR:
 
 help:
@@ -28,6 +28,8 @@ help:
 	@echo "make docs-check  compare pages with results and code; docs-write brings them up to date"
 	@echo "make bench   time every op against its peers and draw the charts"
 	@echo "make asan    the ops' tests under address and undefined-behaviour sanitizers"
+	@echo "make tsan    the ops' tests under the thread sanitizer"
+	@echo "make audit   ask the package index for known holes of what is installed; needs its network"
 	@echo "make wheel   source distribution and wheels of each Python that is here, into dist/"
 	@echo "make wheel-test  install a wheel where there is nothing else, run demo and ops' tests"
 	@echo "make dev     set up only"
@@ -114,16 +116,42 @@ docs-write: dev
 # The instrumented build stands in a package of its own, of links to the Python sources. Inductor's
 # own compiler runs are no business of the sanitizers; Python itself leaks by design.
 build-asan/.installed: $(SETUP) scripts/build.sh $(CXX_SOURCES)
-	scripts/build.sh build-asan build-asan/site -DUNIVOXEL_SANITIZE=ON
+	scripts/build.sh build-asan build-asan/site -DUNIVOXEL_SANITIZE=address
 	@touch $@
 
 asan: build-asan/.installed
 	ln -sf $(addprefix $(CURDIR)/,$(filter-out univoxel/_core,$(wildcard univoxel/*))) \
 		build-asan/site/univoxel/
-	cd build-asan/site && ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+	cd build-asan/site && ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
+		UBSAN_OPTIONS=print_stacktrace=1 \
 		LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libubsan.so)" \
 		OMP_NUM_THREADS=1 $(CURDIR)/$(BIN)/python -m pytest -q $(TWO) \
 		-c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) -p no:cacheprovider -k "not compile" $(CURDIR)/tests/ops
+
+# Threads of the kernels are std::thread in this build: csrc/parallel.h. torch, Embree and Python are
+# not instrumented: what they do alone is not looked at. Without address layout randomisation, for
+# which the sanitizer of older compilers has no place.
+build-tsan/.installed: $(SETUP) scripts/build.sh $(CXX_SOURCES)
+	scripts/build.sh build-tsan build-tsan/site -DUNIVOXEL_SANITIZE=thread
+	@touch $@
+
+TSAN_TESTS ?= $(CURDIR)/tests/ops
+tsan: build-tsan/.installed
+	ln -sf $(addprefix $(CURDIR)/,$(filter-out univoxel/_core,$(wildcard univoxel/*))) \
+		build-tsan/site/univoxel/
+	cd build-tsan/site && LD_PRELOAD="$$(c++ -print-file-name=libtsan.so)" \
+		TSAN_OPTIONS=ignore_noninstrumented_modules=1:allocator_may_return_null=1:halt_on_error=1:exitcode=66 \
+		setarch -R $(CURDIR)/$(BIN)/python -m pytest -q -n 0 --capture=sys \
+		-c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) -p no:cacheprovider -k "not compile" $(TSAN_TESTS)
+
+# In an environment of its own: its packages are not what is looked at
+build/audit/bin/pip-audit: $(SETUP)
+	$(BIN)/python -m venv build/audit
+	build/audit/bin/pip install -q pip-audit
+	@touch $@
+
+audit: build/audit/bin/pip-audit
+	$(BIN)/python scripts/audit.py build/audit/bin/pip-audit
 
 .venv/.wheel: $(SETUP)
 	scripts/venv.sh $(PYTHON) wheel
@@ -136,4 +164,4 @@ wheel-test: wheel
 	scripts/test_wheel.sh dist/univoxel-*-$$($(PYTHON) -c 'import sys; print("cp%d%d" % sys.version_info[:2])')-*.whl $(PYTHON)
 
 clean:
-	rm -rf build build-asan dist .deps .venv univoxel/_core
+	rm -rf build build-asan build-tsan dist .deps .venv univoxel/_core

@@ -22,6 +22,7 @@ function(add_core_variants)
         pybind11::module univoxel_embree univoxel_warnings univoxel_sanitizers glm::glm)
     if(UNIVOXEL_SANITIZE)  # instrumented templates of pybind11 take minutes to optimise
         target_compile_options(univoxel_bindings PRIVATE -O1)
+        set(extras NO_EXTRAS)  # not stripped: reports name functions and lines
     endif()
     foreach(variant IN LISTS UNIVOXEL_VARIANTS)
         add_library(kernels_${variant} STATIC ${ARG_KERNELS})
@@ -31,7 +32,7 @@ function(add_core_variants)
         # No -ffast-math: at link time it would flush denormals in the whole process, torch included.
         target_compile_options(kernels_${variant} PRIVATE
             -O3 -fno-math-errno -fno-trapping-math ${UNIVOXEL_FLAGS_${variant}})
-        pybind11_add_module(core_${variant} $<TARGET_OBJECTS:univoxel_bindings>)
+        pybind11_add_module(core_${variant} ${extras} $<TARGET_OBJECTS:univoxel_bindings>)
         set_target_properties(core_${variant} PROPERTIES
             OUTPUT_NAME _core
             LIBRARY_OUTPUT_DIRECTORY ${CMAKE_CURRENT_BINARY_DIR}/_core/${variant})

@@ -8,7 +8,32 @@
 
 #include "dcheck.h"
 
+#ifdef UNIVOXEL_STD_THREADS
+#include <thread>
+#include <vector>
+#endif
+
 namespace univoxel {
+
+/// Call f(c) for each c in [0, n), one after another as threads are free. f must not throw.
+///
+/// With UNIVOXEL_STD_THREADS the team is one of std::thread, dealt out in turns: the thread
+/// sanitizer follows those, not OpenMP's runtime, and sees races of threads that had any work.
+template <class F>
+void share_out(int64_t n, int team, F&& f) {
+#ifdef UNIVOXEL_STD_THREADS
+    const auto work = [&](int64_t first) {
+        for (int64_t c = first; c < n; c += team) f(c);
+    };
+    std::vector<std::thread> others;
+    for (int i = 1; i < team; ++i) others.emplace_back(work, i);
+    work(0);
+    for (std::thread& other : others) other.join();
+#else
+#pragma omp parallel for schedule(dynamic, 1) num_threads(team)
+    for (int64_t c = 0; c < n; ++c) f(c);
+#endif
+}
 
 /// Call f(begin, end) over [0, n) in chunks of `grain`, on up to `threads` threads.
 ///
@@ -27,15 +52,14 @@ void parallel_for(int64_t n, int64_t grain, int threads, F&& f) {
     }
     std::exception_ptr error;
     std::atomic<bool> failed{false};
-#pragma omp parallel for schedule(dynamic, 1) num_threads(team)
-    for (int64_t c = 0; c < chunks; ++c) {
-        if (failed.load(std::memory_order_relaxed)) continue;
+    share_out(chunks, team, [&](int64_t c) {
+        if (failed.load(std::memory_order_relaxed)) return;
         try {
             f(c * grain, std::min(n, (c + 1) * grain));
         } catch (...) {
             if (!failed.exchange(true)) error = std::current_exception();
         }
-    }
+    });
     if (error) std::rethrow_exception(error);
 }
 

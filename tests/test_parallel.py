@@ -57,11 +57,47 @@ int main() {
 """
 
 
+RACE = r"""
+#include <cstdio>
+#include "parallel.h"
+
+int main(int argc, char**) {
+    int64_t sum = 0, sums[100] = {};
+    univoxel::parallel_for(700, 7, 4, [&](int64_t begin, int64_t end) {
+        for (int64_t i = begin; i < end; ++i) (argc > 1 ? sum : sums[begin / 7]) += i;
+    });
+    for (int64_t part : sums) sum += part;  // after the team, whose writes are seen here
+    std::printf("%d\n", sum > 0);
+}
+"""
+TEAMS = {"OpenMP": ["-fopenmp"], "std::thread": ["-DUNIVOXEL_STD_THREADS=1", "-pthread"]}
+
+
+def compiled(folder: Path, program: str, options: list[str]) -> Path:
+    (folder / "main.cpp").write_text(program)
+    compile_ = ["c++", "-std=c++17", "-O1", *options, "-I", CSRC, "main.cpp", "-o", "main"]
+    subprocess.run(compile_, cwd=folder, check=True)
+    return folder / "main"
+
+
 @pytest.mark.skipif(not shutil.which("c++"), reason="no C++ compiler")
-def test_chunks_and_exceptions(tmp_path):
-    (tmp_path / "main.cpp").write_text(PROGRAM)
-    compile_ = ["c++", "-std=c++17", "-O1", "-fopenmp", "-I", CSRC, "main.cpp", "-o", "main"]
-    subprocess.run(compile_, cwd=tmp_path, check=True)
-    run = subprocess.run([tmp_path / "main"], capture_output=True, text=True, timeout=60)
+@pytest.mark.parametrize("team", TEAMS)
+def test_chunks_and_exceptions(tmp_path, team):
+    main = compiled(tmp_path, PROGRAM, TEAMS[team])
+    run = subprocess.run([main], capture_output=True, text=True, timeout=60)
     assert run.stdout == "ok\n", run.stderr
     assert run.returncode == 0
+
+
+@pytest.mark.skipif(not shutil.which("setarch"), reason="without setarch")
+def test_the_thread_sanitizer_sees_races_and_no_others(tmp_path):
+    """What `make tsan` rests on."""
+    try:
+        main = compiled(tmp_path, RACE, [*TEAMS["std::thread"], "-fsanitize=thread"])
+    except (subprocess.CalledProcessError, OSError):
+        pytest.skip("no thread sanitizer")
+    for options in ([], ["race"]):
+        command = ["setarch", "-R", main, *options]
+        run = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        assert run.stdout == "1\n", run.stderr
+        assert ("data race" in run.stderr) == bool(options)

@@ -303,3 +303,18 @@ def test_one_photograph_is_too_few(tmp_path):
     quarters().save(tmp_path / "a.jpg")
     with pytest.raises(DataError, match="two photographs at least, could read 1"):
         gather([tmp_path / "a.jpg"], None)
+
+
+def test_only_formats_of_photographs_are_opened(tmp_path, monkeypatch):
+    """Pillow goes by what a file holds, and starts Ghostscript for PostScript."""
+    path = tmp_path / "a.jpg"
+    quarters().save(path, format="EPS")
+    assert path.read_bytes().startswith(b"%!PS")
+
+    def started(*_, **__):
+        raise AssertionError("a program was started")
+
+    monkeypatch.setattr("subprocess.Popen", started)
+    for read in (describe, read_upright):
+        with pytest.raises(DataError, match=r"a\.jpg: expected a photograph, could not read it"):
+            read(path)

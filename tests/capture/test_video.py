@@ -96,3 +96,24 @@ def test_without_ffmpeg_nothing_is_read(film, tmp_path, monkeypatch):
     monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtra, match="a video needs imageio-ffmpeg"):
         tasks_poses.photographs_of(film, Folders(tmp_path), None)
+
+
+@pytest.mark.parametrize(
+    "text", ["ffconcat version 1.0\nfile {}\n", "#EXTM3U\n#EXTINF:1,\n{}\n#EXT-X-ENDLIST\n"]
+)
+def test_lists_of_other_files_are_no_videos(film, tmp_path, text):
+    """ffmpeg goes by what a file holds, and reads the files that lists name."""
+    (tmp_path / "secret.mp4").write_bytes(film.read_bytes())
+    path = tmp_path / "list.mp4"
+    path.write_text(text.format("secret.mp4"))
+    with pytest.raises(DataError, match=r"list\.mp4: expected a video, could not read it"):
+        write_frames(path, tmp_path / "frames")
+    with pytest.raises(DataError, match=r"list\.mp4: expected a video, could not read it"):
+        write_frames(path, tmp_path / "frames", every=0.5)
+
+
+def test_a_name_is_no_protocol(film, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "concat:film.mp4"
+    path.write_bytes(film.read_bytes())
+    assert seconds(path.relative_to(tmp_path)) == pytest.approx(4, abs=0.2)

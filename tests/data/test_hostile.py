@@ -4,6 +4,7 @@ import json
 import struct
 from pathlib import Path
 
+import layouts
 import numpy as np
 import pytest
 from layouts import scene, write_colmap, write_nerf, write_nerfstudio, write_tensoir
@@ -181,3 +182,59 @@ def test_names_of_colmap_out_of_the_folder(tmp_path):
     path.write_text(path.read_text().replace("p_004.png", "../../p_004.png"))
     with pytest.raises(DataError, match=r"images\.txt: expected files in .*data, got .*p_004\.png"):
         load_photos(data)
+
+
+LAYOUTS = ["nerf", "nerfstudio", "colmap", "llff", "idr", "neilf", "polycam", "metashape"]
+LAYOUTS += ["realitycapture", "tensoir"]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_cameras_that_are_a_link_out_of_the_folder(tmp_path, layout):
+    """Messages quote what they cannot read: it has to be the data set's own."""
+    getattr(layouts, f"write_{layout}")(tmp_path / "data", scene())
+    data, elsewhere = tmp_path / "data", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    described = [p for p in data.rglob("*") if p.is_file() and p.suffix not in (".png", ".jpg")]
+    assert described
+    for number, path in enumerate(described):
+        path.rename(elsewhere / f"{number}{path.suffix}")
+        path.symlink_to(elsewhere / f"{number}{path.suffix}")
+    with pytest.raises(DataError, match=r"expected files in .*data, got .*elsewhere.*allow_out"):
+        load_photos(data)
+    assert len(load_photos(data, allow_outside=True)) == 8
+
+
+@pytest.mark.parametrize(
+    ("file_path", "file", "name"),
+    [("..", "...png", ".."), ("images/..", "images/...png", ".."), ("_rgba.png", "_rgba.png", "")],
+)
+def test_names_that_mean_another_folder(data, file_path, file, name):
+    """Results are written under the names of views: `relight` wrote OUT.png beside OUT."""
+    edit(data / "transforms.json", lambda r: r["frames"][1].update(file_path=file_path))
+    (data / "images" / "p_008.png").rename(data / file)
+    message = f"frame 1: expected names that files can have, got '{name}'"
+    with pytest.raises(DataError, match=message):
+        load_photos(data, "test")  # it is the first by name
+    with pytest.raises(DataError, match=message):
+        load_cameras(data / "transforms.json", 64)
+
+
+@pytest.mark.parametrize("file_path", ["../../x.png", "/tmp/x", "a/../../x.exr"])
+def test_names_of_views_are_those_of_files(data, file_path):
+    """Whatever folders stand before them."""
+    edit(data / "transforms.json", lambda r: r["frames"][1].update(file_path=file_path))
+    names, _ = load_cameras(data / "transforms.json", 64)
+    assert names[1] == "x"
+
+
+def test_folders_in_names_of_colmap_become_part_of_them(tmp_path):
+    data = write_colmap(tmp_path / "data", scene(), text=True)
+    (data / "images" / "left").mkdir()
+    (data / "images" / "p_004.png").rename(data / "images" / "left" / "p_004.png")
+    mask = data / "masks" / "p_004.png.png"
+    if mask.exists():
+        (data / "masks" / "left").mkdir()
+        mask.rename(data / "masks" / "left" / mask.name)
+    path = data / "sparse/0/images.txt"
+    path.write_text(path.read_text().replace("p_004.png", "left/../left/p_004.png"))
+    assert load_photos(data, "test").names[0] == "left_.._left_p_004"

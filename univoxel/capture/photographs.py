@@ -19,6 +19,8 @@ from univoxel.errors import DataError, MissingExtra
 
 PLAIN = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif")
 HEIF = (".heic", ".heif", ".hif")
+# What Pillow may take a file for, whatever its name says: it would start Ghostscript for PostScript
+FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "WEBP", "AVIF", "HEIF")
 RAW = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2"),
     *(".pef", ".srw", ".3fr", ".iiq", ".erf", ".mrw", ".x3f"),
@@ -183,9 +185,10 @@ def _open(path: Path) -> Image.Image:
         import pillow_heif  # pyright: ignore[reportMissingImports]  the extra `capture`
 
         pillow_heif.register_heif_opener()
+    Image.init()  # builds of Pillow differ in formats, and it knows none before
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        return Image.open(path)
+        return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
 
 
 def _eight_bits(image: Image.Image) -> Image.Image:

@@ -12,6 +12,8 @@ import numpy as np
 from univoxel.errors import DataError, MissingExtra
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
+# What SUFFIXES hold. Formats that only name other files, such as lists of them, are not among these
+FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,avi,matroska,webm,mpegts"
 LOOKS = 5  # frames that are looked at for each that is kept
 KEPT = 80  # frames of a video, unless it is told otherwise
 FASTEST = 6.0  # frames a second to keep at most, by default
@@ -89,7 +91,7 @@ def seconds(video: Path) -> float:
         DataError: it does not say.
     """
     told = subprocess.run(
-        [_program(), "-hide_banner", "-i", str(video)], capture_output=True, check=False
+        [_program(), "-hide_banner", *_opened(video)], capture_output=True, check=False
     ).stderr.decode("utf-8", "replace")
     found = re.search(r"Duration: (\d+):(\d+):(\d+\.?\d*)", told)
     if not found:
@@ -99,12 +101,18 @@ def seconds(video: Path) -> float:
 
 
 def _ffmpeg(video: Path, filters: str, *output: str) -> bytes:
-    command = [_program(), "-v", "error", "-nostdin", "-i", str(video), "-vf", filters, *output]
+    command = [_program(), "-v", "error", "-nostdin", *_opened(video), "-vf", filters, *output]
     done = subprocess.run(command, capture_output=True, check=False)
     if done.returncode:
         said = done.stderr.decode("utf-8", "replace").strip().splitlines() or ["no reason given"]
         raise DataError(f"{video}: expected a video, could not read it: {said[-1]}")
     return done.stdout
+
+
+def _opened(video: Path) -> list[str]:
+    """Arguments that open a video alone: no file that it names, nothing over a network."""
+    allowed = ["-protocol_whitelist", "file", "-format_whitelist", FORMATS]
+    return [*allowed, "-i", f"file:{video}"]
 
 
 def _program() -> str:

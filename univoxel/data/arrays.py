@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from univoxel.data.inside import inside
 from univoxel.errors import DataError
 
 # What NumPy and zipfile raise of bytes that are none of theirs, or are broken
@@ -26,6 +27,7 @@ def read_npy(path: Path) -> np.ndarray:
     Raises:
         DataError: it cannot be read.
     """
+    inside(path, str(path))
     try:
         with path.open("rb") as stream:
             array = np.load(stream, allow_pickle=False)
@@ -42,6 +44,7 @@ def read_npz(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
     Raises:
         DataError: it cannot be read, or holds something else than numbers.
     """
+    inside(path, str(path))
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             found = {key: file[key] for key in file.files if key.startswith(prefix)}

@@ -19,6 +19,7 @@ import numpy as np
 from univoxel.data.base import Photos
 from univoxel.data.foreign import TO_OPENGL, find_photo, listed_split
 from univoxel.data.images import image_size, turn_note
+from univoxel.data.inside import inside
 from univoxel.data.lens import FARTHEST, Lens, checked
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, find_mask, read_shots, upright
@@ -63,6 +64,8 @@ def load_colmap(
         raise DataError(f"{folder}: expected a COLMAP model in {', '.join(PLACES)}, got none")
     model, ending = models[0]
     cameras_file, images_file = model / f"cameras{ending}", model / f"images{ending}"
+    for file in (cameras_file, images_file):
+        inside(file, str(file))
     try:
         cameras = read_cameras(cameras_file)
     except BROKEN as error:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.data.images import image_size, turn_note
+from univoxel.data.inside import inside
 from univoxel.data.lens import Lens, checked
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth
@@ -35,7 +36,8 @@ def listed_split(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
     if split not in files or not all(file.is_file() for file in files.values()):
         return every_eighth(folder, shots, split)
     path, by_name = files[split], {shot.image.stem: shot for shot in shots}
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    text = inside(path, str(path)).read_text(encoding="utf-8", errors="replace")
+    lines = text.splitlines()
     names = [line.strip() for line in lines if line.strip()]
     found = [by_name[stem] for name in names if (stem := Path(name).stem) in by_name]
     missing = [name for name in names if Path(name).stem not in by_name]

@@ -24,6 +24,7 @@ import numpy as np
 
 from univoxel.data.base import Photos
 from univoxel.data.foreign import TO_OPENGL, check_skew, find_photo, fitted, near_origin, parsed
+from univoxel.data.inside import inside
 from univoxel.data.lens import Lens
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
@@ -99,7 +100,7 @@ def _file(folder: Path) -> Path | None:
 
 
 def _chunk(path: Path) -> ET.Element:
-    data = path.read_bytes()
+    data = inside(path, str(path)).read_bytes()
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # which may grow without bound
         raise DataError(f"{path}: expected XML of Metashape, got one with definitions of its own")
     try:

@@ -18,6 +18,7 @@ import numpy as np
 
 from univoxel.data.base import Photos
 from univoxel.data.foreign import TO_OPENGL, fitted
+from univoxel.data.inside import inside
 from univoxel.data.lens import Lens
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
@@ -73,7 +74,7 @@ def load_neilf(
 def _read(path: Path) -> tuple[dict[str, str], dict]:
     """Names of photographs and what is said of them, both by index."""
     try:
-        root = read_json(path)
+        root = read_json(inside(path, str(path)))
         names = (root["image_path"] if "image_path" in root else root["image_list"])["file_paths"]
         images = root["camera_track_map"]["images"]
         if isinstance(names, list):

@@ -20,6 +20,7 @@ import numpy as np
 
 from univoxel.data.base import Photos
 from univoxel.data.foreign import fitted
+from univoxel.data.inside import inside
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots
 from univoxel.data.transforms import lens_of, listed_image, number, pose_of, short
@@ -77,7 +78,7 @@ def _place(folder: Path) -> str | None:
 
 def _read(path: Path) -> dict:
     """Intrinsics in the words of `lens_of`, width, height and the pose [3, 4]."""
-    root = read_json(path)
+    root = read_json(inside(path, str(path)))
     if not isinstance(root, dict):
         raise DataError(f"{path}: expected a JSON object, got {short(root)}")
     found = {key: number(root, key, str(path), 0, math.inf) for key in ("width", "height")}

@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from univoxel.data.base import Photos
 from univoxel.data.foreign import find_photo, near_origin, parsed
 from univoxel.data.images import image_size, turn_note
+from univoxel.data.inside import inside
 from univoxel.data.lens import Lens
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
@@ -93,7 +94,7 @@ def _columns(line: str) -> list[str]:
 def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
     """Rows by the names of their columns, each with the number of its line."""
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = inside(path, str(path)).read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: expected text in UTF-8, got {error.reason}") from None
     start = next(i for i, line in enumerate(lines) if set(REQUIRED) <= set(_columns(line)))

@@ -411,10 +411,21 @@ def up_direction(held: np.ndarray) -> np.ndarray | None:
     return up
 
 
+def check_name(name: str, where: str) -> None:
+    """Refuse names of views that files made of them would not stay in their folder with.
+
+    Raises:
+        DataError: no name, or one that means another folder.
+    """
+    if name in ("", "..") or Path(name).name != name:
+        raise DataError(f"{where}: expected names that files can have, got {name!r}")
+
+
 def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
     """Names and sizes, before anything large is read."""
     names: set[str] = set()
     for shot in shots:
+        check_name(shot.name, shot.where)
         if shot.name in names:
             raise DataError(f"{shot.where}: the name {shot.name} of {shot.image} came before")
         names.add(shot.name)

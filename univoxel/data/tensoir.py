@@ -11,6 +11,7 @@ from pathlib import Path
 
 from univoxel.data.base import Photos
 from univoxel.data.images import image_size
+from univoxel.data.inside import inside
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, read_shots
 from univoxel.data.transforms import lens_of, number, pose_of, short
@@ -64,7 +65,7 @@ def photographed(folder: Path) -> str:
 def _shot(view: Path, picture: str) -> Shot:
     path = view / "metadata.json"
     try:
-        meta = read_json(path)
+        meta = read_json(inside(path, str(path)))
         text = meta["cam_transform_mat"]
         values = [float(value) for value in text.split(",")]
     except DataError:

@@ -23,7 +23,7 @@ from univoxel.data.images import SUFFIXES, image_size, turn_note
 from univoxel.data.inside import inside
 from univoxel.data.lens import FARTHEST, Lens, checked
 from univoxel.data.missing import left_out
-from univoxel.data.shots import Shot, cameras_of
+from univoxel.data.shots import Shot, cameras_of, check_name
 from univoxel.errors import DataError, UserError
 from univoxel.files import read_json, replacing
 
@@ -61,6 +61,8 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
         raise DataError(f"{path}: expected a file of cameras, got nothing there")
     root, frames = read_transforms(path)
     names = [view_name(str(f.get("file_path", f"{i:04d}"))) for i, f in enumerate(frames)]
+    for index, name in enumerate(names):
+        check_name(name, f"{path}: frame {index}")
     if len(set(names)) != len(names):
         raise DataError(f"{path}: expected every frame under a name of its own")
     poses, lenses = [], []
@@ -78,7 +80,7 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
 
 def read_transforms(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The root of the file, and its frames."""
-    root = read_json(path)
+    root = read_json(inside(path, str(path)))
     if not isinstance(root, dict):
         raise DataError(f"{path}: expected a JSON object, got {short(root)}")
     frames = root.get("frames")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import logging
+import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ FOLDER = Path(__file__).parent.parent / "_core"
 VARIANTS = ["default", "avx2", "avx512"]  # each runs what the ones before it run
 
 _backend: Backend = "auto"
+_forked = False  # whether this process is a fork of one that had loaded this
 _told: set[str] = set()  # reasons that were told, once each
 
 
@@ -183,8 +185,18 @@ def arrays(*tensors: Tensor) -> list[np.ndarray]:
 
 
 def threads() -> int:
-    """torch.set_num_threads rules the kernels too."""
-    return torch.get_num_threads()
+    """torch.set_num_threads rules the kernels too; a forked process runs them on one thread."""
+    return 1 if _forked else torch.get_num_threads()
+
+
+def _serial_from_now_on() -> None:
+    # GNU's OpenMP waits for ever for a team that was left in the parent. The bits are the same
+    global _forked
+    _forked = True
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_serial_from_now_on)
 
 
 def operator(name: str, mutates_args: tuple[str, ...] = ()) -> Callable[[Callable], Any]:

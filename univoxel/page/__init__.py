@@ -123,7 +123,7 @@ def page_text(
         "about": about(run, options, [light.name for light in lights]),
         "generator": f"univoxel {__version__}",
         "model": base64.b64encode(model(scene, options)).decode(),
-        "scene": json.dumps(described, separators=(",", ":")).replace("</", "<\\/"),
+        "scene": json.dumps(described, separators=(",", ":")).replace("<", "\\u003c"),
         "style": _source("page.css"),
         "three": f"/*! {_source('vendor/LICENSE').strip()} */\n{_source('vendor/three.min.js')}",
         "viewer": _source("viewer.js"),

@@ -1,0 +1,137 @@
+"""What no module does: unpickle, unpack, run what data say, start a shell, open a connection."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from analytic import write_scene
+
+import univoxel
+
+PACKAGE = Path(univoxel.__file__).parent
+MODULES = sorted(PACKAGE.rglob("*.py"))
+# Of them only the errors of broken archives are used
+NAMES_ONLY = {"data/arrays.py": {"zipfile"}}
+FORBIDDEN = {
+    *("pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"),
+    *("tarfile", "zipfile", "yaml"),
+    *("socket", "socketserver", "http", "urllib", "requests", "ftplib", "ssl", "asyncio"),
+}
+CALLS = {"eval", "exec", "compile", "__import__"}
+STARTS = {f"subprocess.{name}" for name in ("run", "Popen", "call", "check_call", "check_output")}
+METHODS = {
+    *("os.system", "os.popen", "shutil.unpack_archive", "torch.load", "torch.hub.load"),
+    *("subprocess.getoutput", "subprocess.getstatusoutput"),
+}
+
+
+def faults(source: str, allowed: frozenset[str] | set[str] = frozenset()) -> list[str]:
+    """What a module does that none may, in words."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.Import(names=names):
+                found += [a.name for a in names if a.name.partition(".")[0] in FORBIDDEN - allowed]
+            case ast.ImportFrom(module=str(module)):
+                found += [module] if module.partition(".")[0] in FORBIDDEN - allowed else []
+            case ast.Call(func=ast.Name(id=name)) if name in CALLS:
+                found.append(name)
+            case ast.Call(func=ast.Attribute() as called, args=args, keywords=keywords):
+                name, given = ast.unparse(called), {k.arg: k.value for k in keywords}
+                found += [name] if name in METHODS else []
+                if name == "np.load" and ast.unparse(given.get("allow_pickle", node)) != "False":
+                    found.append("np.load without allow_pickle=False")
+                if name in STARTS:
+                    found += [f"{name} with a shell"] if "shell" in given else []
+                    text = args and isinstance(args[0], ast.Constant | ast.JoinedStr)
+                    found += [f"{name} of text"] if text else []
+    return found
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: p.relative_to(PACKAGE).as_posix())
+def test_no_module_trusts_data(path):
+    allowed = NAMES_ONLY.get(path.relative_to(PACKAGE).as_posix(), set())
+    assert faults(path.read_text(encoding="utf-8"), allowed) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import pickle",
+        "from urllib.request import urlopen",
+        "import http.server",
+        "eval(text)",
+        "os.system(text)",
+        "torch.load(path)",
+        "np.load(path)",
+        "np.load(path, allow_pickle=True)",
+        "subprocess.run(command, shell=True)",
+        "subprocess.run('ls')",
+        "subprocess.Popen(f'ls {path}')",
+    ],
+)
+def test_a_module_that_does_is_found(line):
+    assert len(faults(line)) == 1
+
+
+def test_archives_of_numpy_are_the_only_ones():
+    """`zipfile` serves to name what NumPy raises."""
+    tree = ast.parse((PACKAGE / "data" / "arrays.py").read_text(encoding="utf-8"))
+    used = {
+        ast.unparse(n)
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Attribute) and ast.unparse(n).startswith("zipfile.")
+    }
+    assert used == {"zipfile.BadZipFile"}
+
+
+OFFLINE = """
+import socket, sys
+def refused(*_, **__):
+    raise AssertionError("a connection was opened")
+for name in ("connect", "connect_ex", "bind", "sendto"):
+    setattr(socket.socket, name, refused)
+socket.create_connection = socket.getaddrinfo = refused
+"""
+COMMANDS = """
+from pathlib import Path
+import univoxel
+from univoxel.cli import main
+from univoxel.config import TrainConfig
+from univoxel.lights import SGConfig
+from univoxel.scene import SceneConfig
+from univoxel.training.config import StageConfig
+here, run = Path(sys.argv[1]), str(Path(sys.argv[1]) / "run")
+light = SGConfig(lobes=1, hidden=4, directions=8, directions_eval=8)
+scene = SceneConfig(channels=2, material_channels=1, hidden=4, light=light, sky_nodes=0)
+stage = StageConfig(0.004, 10, 1.0, 64, physical_from=0.5)
+univoxel.train(TrainConfig(here / "data", here / "run", (stage,), minutes=1.0, scene=scene))
+lit = ["--point", "0", "0", "3", "9", "--samples", "1", "--out", str(here / "lit")]
+assert main(["info", run]) == 0
+assert main(["export", run, "--mesh", str(here / "a.ply")]) == 0
+assert main(["relight", run, *lit]) == 0
+"""
+
+
+def offline(script: str, *arguments: str) -> subprocess.CompletedProcess:
+    """A script in a process whose sockets refuse; it has no other."""
+    command = [sys.executable, "-c", OFFLINE + script, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    "script", ["socket.socket().bind(('127.0.0.1', 0))", "socket.create_connection(('::1', 9))"]
+)
+def test_a_connection_is_seen(script):
+    assert "a connection was opened" in offline(script).stderr
+
+
+def test_commands_open_no_connection(tmp_path):
+    """Imports, a training of a few steps, and what is done with a run."""
+    write_scene(tmp_path / "data", views=6, size=16)
+    done = offline(COMMANDS, str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "a.ply").is_file()
+    assert len(list((tmp_path / "lit").glob("*.png"))) == 2
