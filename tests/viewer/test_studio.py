@@ -1,8 +1,13 @@
 """Who gets pictures, with viewers that are lists; and what the server refuses."""
 
+import os
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -134,6 +139,60 @@ def test_other_sites_are_refused():
     assert not same_site("http://example.org:8080", "example.org:8080", "127.0.0.1")
     assert same_site("http://studio:8080", "studio:8080", "0.0.0.0")
     assert not same_site("null", "studio:8080", "0.0.0.0")
+
+
+def test_a_socket_of_another_site_is_closed(subject):
+    viser = pytest.importorskip("viser")
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    with serving(subject, port=0) as address:
+        where, protocol = address.replace("http", "ws"), f"viser-v{viser.__version__}"
+        with connect(where, origin=address, subprotocols=[protocol]) as own:
+            assert own.recv(timeout=PATIENCE)
+        with connect(where, origin="https://example.org", subprotocols=[protocol]) as other:
+            with pytest.raises(ConnectionClosed) as closed:
+                other.recv(timeout=PATIENCE)
+            assert closed.value.rcvd.code == 1008
+
+
+SCRIPT = """
+import logging, sys
+from asymmetric_scene import lopsided
+from univoxel.render.relight import traced_mesh
+from univoxel.tasks.view import view
+from univoxel.viewer import subject
+
+logging.basicConfig(level=logging.INFO, stream=sys.stderr)
+scene = lopsided(24**3)
+traced = traced_mesh(subject.mesh_of(scene), scene.field.voxel_size)
+subject.subject_of = lambda run: subject.Subject(scene, traced)
+view("run", port=0)
+"""
+
+
+def test_interrupting_ends_it(tmp_path):
+    """Ctrl-C: a line, no traceback, nothing on stdout, exit code 0."""
+    pytest.importorskip("viser")
+    log = tmp_path / "log"
+    path = f"{Path(__file__).parents[1]}{os.pathsep}{Path(__file__).parents[2]}"
+    with log.open("w") as err:
+        process = subprocess.Popen(
+            [sys.executable, "-c", SCRIPT],
+            env=os.environ | {"PYTHONPATH": path},
+            stdout=subprocess.PIPE,
+            stderr=err,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+    end = time.monotonic() + PATIENCE
+    while "in a browser: http://localhost" not in log.read_text():
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, out) == (0, b""), log.read_text()
+    assert "Traceback" not in log.read_text()
 
 
 def test_a_map_that_was_sent(tmp_path):
