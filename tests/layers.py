@@ -29,6 +29,7 @@ LAYERS = [
     {"confidence"},
     {"compression", "pictures"},
     {"build", "capture", "evaluation", "page", "segmentation"},
+    {"viewer"},
     {"tasks"},
     {"tasks.demo", "tasks.submit"},
     {"tasks.capture"},
@@ -63,6 +64,7 @@ HELPERS = {
     "evaluation": {"measures", "truth"},
     "segmentation": {"config", "distances", "vote"},
     "page": {"maps", "transfer"},
+    "viewer": {"subject", "frames", "studio"},
     "capture": {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
         *("prepare", "video"),

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent
 
 # Extras: imported inside the function that needs one
 OPTIONAL = {"drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh"}
-OPTIONAL |= {"onnxruntime", "pillow_heif", "pycolmap", "rawpy", "rembg"}
+OPTIONAL |= {"onnxruntime", "pillow_heif", "pycolmap", "rawpy", "rembg", "viser"}
 # The one file or folder of csrc/ that includes it; no header of ours passes it on to others.
 INCLUDES = {r"embree\d?/": "visibility.cpp", r"pybind11/": "bindings"}
 

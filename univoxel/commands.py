@@ -604,7 +604,9 @@ def export(
 def view(
     run: Run,
     /,
-    html: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="(required)")] = None,
+    html: Annotated[
+        Path | None, arg(metavar="FILE.html", help_behavior_hint="(default: a server)")
+    ] = None,
     envmap: Annotated[
         tuple[Path, ...],
         arg(metavar="MAP [MAP ...]", help_behavior_hint="(default: the usual ones alone)"),
@@ -612,18 +614,24 @@ def view(
     title: Annotated[
         str | None, arg(metavar="TEXT", help_behavior_hint="(default: the folder's name)")
     ] = None,
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1",
+    port: Annotated[int, arg(metavar="N")] = 8080,
 ) -> None:
-    """Write a run as one web page to look at, to light and to send; it needs no network.
+    """Look at a run in a browser and turn its light; or write it as one web page to send.
 
     Args:
         run: folder of a trained run
-        html: the page to write
+        html: write this page, which needs no network, instead of serving
         envmap: equirectangular maps to offer, before the usual ones
         title: what stands above the object
+        host: address to listen on; the default is reached from this machine alone
+        port: port to listen on; 0 is any free one
     """
     from univoxel.tasks import view as task
 
-    print(task.view(run, html, envmap=envmap, title=title))
+    page = task.view(run, html, envmap=envmap, title=title, host=host, port=port)
+    if page is not None:
+        print(page)
 
 
 def envmap(

@@ -1,0 +1,83 @@
+"""The live viewer in a real browser: frames come, controls change them, two at once.
+
+Without a browser or viser these tests are skipped; `make page-test` brings a browser in.
+"""
+
+import time
+
+import numpy as np
+import pytest
+from asymmetric_scene import lopsided
+from browser import browser, installed
+
+from univoxel.page import PageOptions
+from univoxel.render.relight import traced_mesh
+from univoxel.viewer.server import serving
+from univoxel.viewer.subject import Subject, mesh_of
+
+pytest.importorskip("viser")
+pytestmark = pytest.mark.skipif(
+    installed() is None, reason="needs a browser, such as Debian's package chromium"
+)
+PATIENCE = 120.0  # seconds, on a loaded machine
+LEFT = (slice(100, 400), slice(100, 330))  # of the window, where nothing lies over the object
+
+
+@pytest.fixture(scope="module")
+def address():
+    scene = lopsided(24**3)
+    subject = Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size))
+    with serving(subject, PageOptions(title="Balls"), port=0) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def tab(address):
+    with browser() as tab:
+        tab.open(address, 760, 500)
+        until(lambda: seen(tab).std() > 20)
+        yield tab
+
+
+def until(true):
+    end = time.monotonic() + PATIENCE
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def seen(tab):
+    return tab.screenshot()[LEFT].astype(float)
+
+
+def rested(tab):
+    """The picture after it has not changed for a while."""
+    last, same = seen(tab), 0
+    end = time.monotonic() + PATIENCE
+    while same < 3 and time.monotonic() < end:
+        time.sleep(0.3)
+        now = seen(tab)
+        same = same + 1 if np.abs(now - last).mean() < 0.3 else 0
+        last = now
+    return last
+
+
+def test_dragging_shows_another_side(tab):
+    before = rested(tab)
+    tab.drag((200, 250), (300, 260))
+    assert np.abs(rested(tab) - before).mean() > 3
+
+
+def test_nothing_is_asked_of_others(tab, address):
+    hosts = {u for u in tab.requests if not u.startswith((address, "data:", f"blob:{address}"))}
+    assert hosts == set()
+
+
+def test_two_at_once_and_one_goes(address, tab):
+    with browser() as other:
+        other.open(address, 760, 500)
+        until(lambda: seen(other).std() > 20)
+        other.drag((200, 250), (260, 250))  # and away in the middle of its frames
+    before = rested(tab)
+    tab.drag((200, 250), (300, 260))
+    assert np.abs(rested(tab) - before).mean() > 3

@@ -1,0 +1,166 @@
+"""Frames of the viewer against the pictures of `univoxel relight` and the scene's own layers."""
+
+import math
+from dataclasses import replace
+from itertools import islice
+
+import pytest
+import torch
+from asymmetric_scene import lopsided
+
+from univoxel.camera import Cameras
+from univoxel.color import linear_to_srgb
+from univoxel.envmap import EnvMap
+from univoxel.errors import UserError
+from univoxel.metrics import psnr
+from univoxel.ops import Sun
+from univoxel.render.pipeline import surface_of_view
+from univoxel.render.relight import traced_mesh
+from univoxel.sphere import latlong_directions
+from univoxel.tasks import relight as relighting
+from univoxel.viewer.frames import LAYERS, Look, quick_picture, refined_pictures
+from univoxel.viewer.subject import Subject, mesh_of
+
+SIZE = 40
+
+
+class Metals(torch.nn.Module):
+    """The features are the materials; metal where the albedo is reddest."""
+
+    def forward(self, features):
+        metal = torch.sigmoid(40 * (features[:, 0] - 0.65))
+        return features[:, :3], features[:, 3], metal
+
+
+@pytest.fixture(scope="module")
+def scene():
+    scene = lopsided()
+    scene.material = Metals()
+    scene.inv_s = 600.0  # silhouettes as sharp as after a training
+    return scene
+
+
+@pytest.fixture(scope="module")
+def subject(scene):
+    return Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size))
+
+
+@pytest.fixture(scope="module")
+def lamp():
+    """A wide warm light at +X, dim blue all round."""
+    direction = latlong_directions(32)
+    towards = torch.tensor([math.cos(0.5), 0.0, math.sin(0.5)])
+    power = 6 * ((direction @ towards - 1) / 0.15).exp()
+    radiance = power[..., None] * torch.tensor([1.0, 0.9, 0.7]) + torch.tensor([0.1, 0.12, 0.2])
+    return EnvMap(radiance)
+
+
+@pytest.fixture
+def camera():
+    phi, up = math.radians(25), math.radians(30)
+    back = torch.tensor([math.cos(up) * math.cos(phi), math.cos(up) * math.sin(phi), math.sin(up)])
+    right = torch.tensor([-math.sin(phi), math.cos(phi), 0.0])
+    position = torch.tensor([0.08, 0.0, 0.08]) + 3.0 * back
+    pose = torch.stack([right, torch.linalg.cross(back, right), back, position], -1)[None]
+    return Cameras(pose, torch.full((1, 2), 2.0 * SIZE), torch.full((1, 2), SIZE / 2), SIZE, SIZE)
+
+
+def straight(picture):
+    """Linear premultiplied RGBA as sRGB with straight alpha."""
+    alpha = picture[..., 3:]
+    return torch.cat([linear_to_srgb(picture[..., :3] / alpha.clamp_min(1e-6)), alpha], -1)
+
+
+def on_black(picture):
+    return picture[..., :3] * picture[..., 3:]
+
+
+def relit(monkeypatch, scene, lamp, camera, **options):
+    monkeypatch.setattr(relighting, "load_scene", lambda run: scene)
+    return straight(relighting.relight_images("run", lamp, camera, samples=1024, **options)[0])
+
+
+def shown(pictures):
+    return [picture for picture in pictures if picture is not None]
+
+
+@pytest.mark.parametrize("backdrop", [False, True])
+def test_at_rest_it_becomes_the_relit_picture(monkeypatch, scene, subject, lamp, camera, backdrop):
+    """38 dB, which a picture of 64 samples reaches; the exposure and the turn are light's."""
+    options = {"rotate": 70.0, "exposure": 0.5, "suns": [Sun((1, 1, 2), (1.0, 0.9, 0.8), 5.0)]}
+    background = "map" if backdrop else "transparent"
+    ground = None if backdrop else "lowest"
+    expected = relit(
+        monkeypatch, scene, lamp, camera, ground=ground, background=background, **options
+    )
+    lighting = relighting.lighting(lamp, relighting.RelightOptions(**options | {"exposure": 1.0}))
+    look = Look(lighting, exposure=-1.0, ground=not backdrop, backdrop=backdrop)
+    found = shown(refined_pictures(subject, camera, look, samples=64))
+    quality = [float(psnr(on_black(p), on_black(expected))) for p in found]
+    assert quality[-1] >= 38
+    assert quality == sorted(quality)  # no pass makes it worse
+    assert (found[-1][..., 3] - expected[..., 3]).abs().mean() < 0.01  # alpha holds the shadow
+
+
+def test_a_quick_picture_is_about_the_same(monkeypatch, scene, subject, lamp, camera):
+    """Of few samples: noise, and the silhouette of triangles."""
+    expected = relit(monkeypatch, scene, lamp, camera)
+    look = Look(relighting.lighting(lamp))
+    assert psnr(on_black(quick_picture(subject, camera, look)), on_black(expected)) >= 20
+
+
+def test_layers_are_the_materials(scene, subject, lamp, camera):
+    surface, wo = surface_of_view(scene, camera, 0)
+    depth = surface.depth * (wo @ camera.camera_to_world[0, :, 2])
+    inside = surface.opacity > 0.999
+    ends = (camera.camera_to_world[0, :, 3] - subject.traced.mesh.vertices) @ (
+        camera.camera_to_world[0, :, 2]
+    )
+    near, far = ends.min(), ends.max()
+    expected = {
+        "albedo": linear_to_srgb(surface.albedo),
+        "roughness": surface.roughness[:, None].expand(-1, 3),
+        "metal": surface.metallic[:, None].expand(-1, 3),
+        "normal": 0.5 * surface.normal + 0.5,
+        "depth": (1 - (depth - near) / (far - near))[:, None].expand(-1, 3),
+    }
+    assert set(expected) == set(LAYERS) - {"render", "doubt"}
+    for layer, values in expected.items():
+        look = Look(relighting.lighting(lamp), layer)
+        quick, *_, last = shown(refined_pictures(subject, camera, look))
+        exact = (last.reshape(-1, 4)[:, :3] - values.clamp(0, 1)).abs()[inside]
+        assert exact.max() < 1e-4, layer
+        difference = (quick.reshape(-1, 4)[:, :3] - values).abs()[inside]
+        assert difference.mean() < 0.02, layer  # triangles in place of the field
+
+
+def test_doubts_are_those_at_the_vertices(scene, subject, lamp, camera):
+    """Black where nothing is doubted, near white where all is; a plane of doubt is kept."""
+    height = subject.traced.mesh.vertices[:, 2]
+    known = replace(subject)
+    vars(known)["doubt"] = (height > 0).float()
+    look = Look(relighting.lighting(lamp), "doubt")
+    (found,) = shown(refined_pictures(known, camera, look))
+    surface, _ = surface_of_view(scene, camera, 0)
+    up = surface.position[:, 2].reshape(SIZE, SIZE)
+    solid = (surface.opacity > 0.999).reshape(SIZE, SIZE)
+    assert found[solid & (up > 0.05)][:, :3].mean() > 0.8
+    assert found[solid & (up < -0.05)][:, :3].mean() < 0.1
+
+
+def test_doubts_need_photographs(subject, lamp, camera):
+    with pytest.raises(UserError, match="photographs"):
+        quick_picture(subject, camera, Look(relighting.lighting(lamp), "doubt"))
+
+
+def test_a_mesh_may_be_coarser(scene):
+    assert len(mesh_of(scene, 500).faces) <= 500
+    assert mesh_of(scene, 500).albedo is not None
+
+
+def test_a_caller_can_leave_between_steps(subject, lamp, camera):
+    """Steps are short: a picture of many samples comes in many of them."""
+    look = Look(relighting.lighting(lamp))
+    steps = list(islice(refined_pictures(subject, camera, look), 6))
+    assert steps[0] is not None
+    assert steps[1] is None

@@ -1,0 +1,216 @@
+"""Pictures of a subject: a quick one while something moves, better and better ones at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal, TypeAlias, get_args
+
+import torch
+from torch import Tensor
+
+from univoxel import envmap as env
+from univoxel.brdf import metal_or_none
+from univoxel.camera import Cameras, image_rays
+from univoxel.color import linear_to_srgb
+from univoxel.names import BOUNCES
+from univoxel.pictures.contact_sheet import heat
+from univoxel.records import Rays, Surface
+from univoxel.render.pipeline import at_rays, surface_at
+from univoxel.render.relight import Lighting, ground_shadow, relight_surface
+from univoxel.viewer.subject import Subject, at_hits, mesh_surface
+
+Layer: TypeAlias = Literal["render", "albedo", "roughness", "metal", "normal", "depth", "doubt"]
+LAYERS: tuple[Layer, ...] = get_args(Layer)
+
+QUICK_SAMPLES = 2  # of the light a pixel, while something moves
+QUICK_BOUNCES = 1
+FLOOR_SAMPLES = 4  # of the light for the floor's shadow, while something moves
+PASSES = (4, 4, 8, 16, 32)  # samples of the passes at rest; the last one again and again
+MOST_SAMPLES = 1024  # per pixel at rest: no eye sees the noise that is left
+STEP_RAYS = 4096  # that are marched in one step, some 0.05 s
+STEP_PATHS = 2**15  # that are traced in one step, likewise
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a subject is shown."""
+
+    lighting: Lighting
+    layer: Layer = "render"
+    exposure: float = 0.0  # stops
+    ground: bool = False  # whether a floor under the object catches its shadow
+    backdrop: bool = False  # whether the map stands behind
+
+
+@torch.no_grad()
+def quick_picture(subject: Subject, cameras: Cameras, look: Look) -> Tensor:
+    """View 0 with few samples, from the mesh alone: [H, W, 4] sRGB with straight alpha.
+
+    Raises:
+        UserError: doubts are asked for, and the photographs are not there.
+    """
+    surface, wo, hit = mesh_surface(subject, cameras)
+    if look.layer == "doubt":
+        return _doubts(cameras, surface, at_hits(subject.traced.mesh, hit, subject.doubt))
+    if look.layer != "render":
+        return _layer(subject, cameras, look.layer, surface)
+    rgb = relight_surface(
+        surface, wo, subject.traced, look.lighting, samples=QUICK_SAMPLES, bounces=QUICK_BOUNCES
+    )
+    shadow = None
+    if look.ground:
+        rays = image_rays(cameras, 0)
+        hidden = surface.opacity > 0
+        shadow = _shadow(subject, look, rays, hidden, FLOOR_SAMPLES, QUICK_BOUNCES, 0)
+    return _composed(cameras, look, surface, rgb, shadow)
+
+
+@torch.no_grad()
+def refined_pictures(
+    subject: Subject, cameras: Cameras, look: Look, samples: int = MOST_SAMPLES
+) -> Iterator[Tensor | None]:
+    """View 0 as `univoxel relight` renders it, better with every pass: [H, W, 4] as above.
+
+    Between pictures comes None, after every step of about 0.1 s: a caller who has something more
+    urgent to do leaves then.
+
+    Args:
+        samples: of the light per pixel, after which it ends.
+    """
+    yield quick_picture(subject, cameras, look)
+    if look.layer == "doubt":
+        return
+    rays = image_rays(cameras, 0)
+    steps = []
+    for index in torch.arange(len(rays.origin)).split(STEP_RAYS):
+        steps.append(surface_at(subject.scene, Rays(rays.origin[index], rays.direction[index])))
+        yield None
+    surface, wo = _joined(steps), -rays.direction
+    if look.layer != "render":
+        yield _layer(subject, cameras, look.layer, surface)
+        return
+    rgb, shadow = torch.zeros_like(wo), wo.new_zeros(len(wo)) if look.ground else None
+    hit = (surface.opacity > 0).nonzero()[:, 0]
+    floor = (surface.opacity <= 0.999).nonzero()[:, 0] if look.ground else hit[:0]
+    done, number = 0, 0
+    while done < samples:
+        more = min(PASSES[min(number, len(PASSES) - 1)], samples - done)
+
+        def traced(index: Tensor, done: int = done, more: int = more) -> Tensor:
+            return relight_surface(
+                at_rays(surface, index),
+                wo[index],
+                subject.traced,
+                look.lighting,
+                samples=more,
+                bounces=BOUNCES,
+                first=done,
+                seed=int(index[0]),  # other noise than in other steps
+            )
+
+        def darkened(index: Tensor, more: int = more, number: int = number) -> Tensor:
+            some, hidden = _at(rays, index), torch.zeros(len(index), dtype=torch.bool)
+            seed = (int(index[0]) + 0x9E3779B9 * number) % 2**32
+            return _shadow(subject, look, some, hidden, more, BOUNCES, seed)
+
+        share = more / (done + more)
+        yield from _accumulated_(rgb, hit, traced, share, more)
+        if shadow is not None:
+            yield from _accumulated_(shadow, floor, darkened, share, 2 * more)
+        done, number = done + more, number + 1
+        yield _composed(cameras, look, surface, rgb, shadow)
+
+
+def _accumulated_(
+    mean: Tensor, index: Tensor, render: Callable[[Tensor], Tensor], share: float, samples: int
+) -> Iterator[None]:
+    """Take another pass into the mean of some pixels, in steps; None after each."""
+    for some in index.split(max(1, STEP_PATHS // samples)):
+        if len(some):
+            mean[some] += share * (render(some) - mean[some])
+        yield None
+
+
+def _joined(parts: list[Surface]) -> Surface:
+    names = [name for name, x in vars(parts[0]).items() if x is not None]
+    return Surface(**{name: torch.cat([vars(part)[name] for part in parts]) for name in names})
+
+
+def _at(rays: Rays, index: Tensor) -> Rays:
+    return Rays(rays.origin[index], rays.direction[index])
+
+
+def _shadow(
+    subject: Subject,
+    look: Look,
+    rays: Rays,
+    hidden: Tensor,
+    samples: int,
+    bounces: int,
+    seed: int,
+) -> Tensor:
+    """What a floor under the object loses of its light: [N]."""
+    return ground_shadow(
+        rays,
+        subject.ground,
+        subject.traced,
+        look.lighting,
+        samples=samples,
+        bounces=bounces,
+        hidden=hidden,
+        seed=seed,
+    )
+
+
+def _composed(
+    cameras: Cameras, look: Look, surface: Surface, rgb: Tensor, shadow: Tensor | None
+) -> Tensor:
+    """Object, floor and backdrop together: [H, W, 4] sRGB with straight alpha."""
+    opacity = surface.opacity[:, None]
+    rgb, clear = rgb * opacity, 1 - opacity
+    if shadow is not None:
+        clear = clear * (1 - shadow[:, None])
+    alpha = 1 - clear
+    if look.backdrop:
+        sky = env.background(look.lighting.tables, image_rays(cameras, 0).direction)
+        rgb, alpha = rgb + clear * sky, torch.ones_like(alpha)
+    straight = 2**look.exposure * rgb / alpha.clamp_min(1e-6)
+    return _grid(cameras, torch.cat([linear_to_srgb(straight), alpha.clamp(0, 1)], 1))
+
+
+def _layer(subject: Subject, cameras: Cameras, layer: Layer, surface: Surface) -> Tensor:
+    """A layer but for render and doubt: [H, W, 4] sRGB with straight alpha."""
+    match layer:
+        case "albedo":
+            values = linear_to_srgb(surface.albedo)
+        case "normal":
+            values = 0.5 * surface.normal + 0.5
+        case "roughness":
+            values = surface.roughness[:, None].expand(-1, 3)
+        case "metal":
+            metal = None if surface.metallic is None else metal_or_none(surface.metallic)
+            metal = torch.zeros_like(surface.depth) if metal is None else metal
+            values = metal[:, None].expand(-1, 3)
+        case _:
+            values = _nearness(subject, cameras, surface)[:, None].expand(-1, 3)
+    return _grid(cameras, torch.cat([values.clamp(0, 1), surface.opacity[:, None]], 1))
+
+
+def _nearness(subject: Subject, cameras: Cameras, surface: Surface) -> Tensor:
+    """Depth along -Z [N] as brightness: 1 at the object's nearest point, 0 at its farthest."""
+    pose = cameras.camera_to_world[0]
+    ends = -(subject.traced.mesh.vertices - pose[:, 3]) @ pose[:, 2]
+    depth = -(surface.position - pose[:, 3]) @ pose[:, 2]
+    return 1 - (depth - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)
+
+
+def _doubts(cameras: Cameras, surface: Surface, doubt: Tensor) -> Tensor:
+    """Doubts [N] as colours, as in the pictures of `univoxel eval`: [H, W, 4]."""
+    colors = torch.from_numpy(heat(doubt, 1.0)).float()
+    return _grid(cameras, torch.cat([colors, surface.opacity[:, None]], 1))
+
+
+def _grid(cameras: Cameras, values: Tensor) -> Tensor:
+    width, height = cameras.size(0)
+    return values.reshape(height, width, -1)

@@ -1,0 +1,397 @@
+"""A run in browsers: viser's page around our pictures. Each client has a view and light of its own.
+
+viser draws the controls and moves the camera; the picture stands behind its empty scene.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import math
+import socket
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from univoxel import envmap as env
+from univoxel.assets.bake import bake
+from univoxel.assets.gltf import glb
+from univoxel.assets.topology import simplify
+from univoxel.camera import Cameras, image_rays, looked_at, project, resize
+from univoxel.color import linear_to_srgb
+from univoxel.errors import MissingExtra, UserError
+from univoxel.names import TEXTURE_SIZE
+from univoxel.ops import Sun
+from univoxel.page import FACES, JPEG_QUALITY, PageOptions, lights_of
+from univoxel.page.maps import Light, light_of_file
+from univoxel.pictures.viewpoints import VIEW_ANGLE, orbit
+from univoxel.render.relight import Lighting, rotated
+from univoxel.viewer.frames import LAYERS, Look
+from univoxel.viewer.studio import Studio, Viewer
+from univoxel.viewer.subject import Subject
+
+HOST = "127.0.0.1"
+PORT = 8080
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+DARK = "no map"  # the light that leaves the sun alone
+PLAIN = 0.16  # sRGB, behind a transparent picture
+JPEG = 90  # quality of pictures that are sent
+MAPS = (".hdr", ".exr")
+
+log = logging.getLogger("univoxel")
+
+
+@contextlib.contextmanager
+def serving(
+    subject: Subject,
+    options: PageOptions | None = None,
+    host: str = HOST,
+    port: int = PORT,
+) -> Iterator[str]:
+    """A block in which a viewer answers; gives its address. Nothing of it is left afterwards.
+
+    Raises:
+        MissingExtra: viser is not installed.
+        UserError: the port is taken, or a map cannot be used.
+    """
+    try:
+        import viser
+    except ImportError:
+        raise MissingExtra("the viewer needs viser: pip install 'univoxel[view]'") from None
+    options = options or PageOptions()
+    _require_port(host, port)
+    lights = lights_of(subject.scene, options)
+    studio = Studio(subject)
+    with _silent():
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    try:
+        if port and server.get_port() != port:  # taken in between; viser goes on to the next
+            raise _taken(host, port)
+        _guard(server, host)
+        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        title = options.title or (subject.run.resolve().name if subject.run else "univoxel")
+        server.gui.set_panel_label(title)
+        _start_camera(server, subject)
+        clients: dict[int, Viewer] = {}
+
+        @server.on_client_connect
+        def _(client: Any) -> None:
+            clients[client.client_id] = Panel(client, subject, studio, lights, title).viewer
+
+        @server.on_client_disconnect
+        def _(client: Any) -> None:
+            if viewer := clients.pop(client.client_id, None):
+                studio.leave(viewer)
+
+        yield f"http://{'localhost' if host in LOOPBACK else host}:{server.get_port()}"
+    finally:
+        studio.stop()
+        with _silent():
+            server.stop()
+
+
+class Panel:
+    """A client's controls, and what they ask the studio for."""
+
+    def __init__(
+        self, client: Any, subject: Subject, studio: Studio, lights: list[Light], title: str
+    ) -> None:
+        self._client, self._subject, self._studio = client, subject, studio
+        self._lights, self._title = {light.name: light for light in lights}, title
+        self._tables: dict[str, env.EnvTables] = {}
+        self._lock = threading.Lock()
+        self._last: Tensor | None = None
+        self.viewer = Viewer(self._show, self._complain)
+        self._controls(client.gui)
+        self._photographs(client.gui)
+        studio.join(self.viewer)
+        client.camera.on_update(lambda camera: self._ask())
+        self._ask()
+
+    def _controls(self, gui: Any) -> None:
+        names = [*self._lights, DARK]
+        self._layer = gui.add_dropdown("layer", LAYERS, initial_value=LAYERS[0])
+        self._light = gui.add_dropdown("light", names, initial_value=names[0])
+        self._map = gui.add_upload_button("map from a file", hint="an .hdr or .exr file")
+        self._turn = gui.add_slider("turn", -180.0, 180.0, 1.0, 0.0)
+        self._exposure = gui.add_slider("exposure", -5.0, 5.0, 0.1, 0.0)
+        self._sun = gui.add_slider("sun", 0.0, 10.0, 0.1, 0.0)
+        self._azimuth = gui.add_slider("sun azimuth", -180.0, 180.0, 1.0, 45.0)
+        self._elevation = gui.add_slider("sun elevation", 0.0, 90.0, 1.0, 45.0)
+        self._ground = gui.add_checkbox("ground", False)
+        self._backdrop = gui.add_checkbox("backdrop", False)
+        for control in (
+            *(self._layer, self._light, self._turn, self._exposure, self._sun),
+            *(self._azimuth, self._elevation, self._ground, self._backdrop),
+        ):
+            control.on_update(lambda event: self._ask())
+        self._map.on_upload(lambda event: self._guarded(self._take_map))
+        gui.add_button("PNG").on_click(lambda event: self._guarded(self._send_png))
+        gui.add_button("GLB").on_click(lambda event: self._guarded(self._send_glb))
+
+    def _photographs(self, gui: Any) -> None:
+        """Their frusta, and a slider that lays one over the render; nothing where they lack."""
+        self._shown: int | None = None
+        self._overlay = None
+        try:
+            photos = self._subject.photos
+        except (UserError, OSError) as error:
+            log.info("no photographs to show: %s", error)
+            return
+        self._overlay = gui.add_slider("photograph", 0.0, 1.0, 0.05, 0.0)
+        self._overlay.on_update(lambda event: self._again())
+        choice = gui.add_dropdown("go to", ["", *photos.names], initial_value="")
+        choice.on_update(
+            lambda event: choice.value and self._go_to(photos.names.index(choice.value))
+        )
+        frusta = gui.add_checkbox("frusta", False)
+        handles = []
+        extent = float((self._subject.traced.mesh.vertices.abs()).max())
+        for view, name in enumerate(photos.names):
+            wxyz, position, angle, aspect = pose_for_viser(photos.cameras, view)
+            handle = self._client.scene.add_camera_frustum(
+                f"/photographs/{name}",
+                fov=angle,
+                aspect=aspect,
+                scale=0.1 * extent,
+                wxyz=wxyz,
+                position=position,
+                visible=False,
+            )
+            handle.on_click(lambda event, view=view: self._go_to(view))
+            handles.append(handle)
+
+        @frusta.on_update
+        def _(event: Any) -> None:
+            for handle in handles:
+                handle.visible = frusta.value
+
+    def _go_to(self, view: int) -> None:
+        """Move the client's camera to where a photograph was taken."""
+        cameras = self._subject.photos.cameras
+        pose, middle = cameras.camera_to_world[view], looked_at(cameras)
+        forward = -pose[:, 2]
+        distance = ((middle - pose[:, 3]) @ forward).clamp_min(1e-3)
+        self._shown = view
+        with self._client.atomic():
+            self._client.camera.position = pose[:, 3].numpy()
+            self._client.camera.look_at = (pose[:, 3] + distance * forward).numpy()
+            self._client.camera.up_direction = pose[:, 1].numpy()
+            self._client.camera.fov = pose_for_viser(cameras, view)[2]
+
+    def _ask(self) -> None:
+        camera = self._client.camera
+        width, height = max(camera.image_width, 1), max(camera.image_height, 1)
+        cameras = camera_of(camera.wxyz, camera.position, camera.fov, width, height)
+        with self._lock:
+            look = Look(
+                self._lighting(),
+                self._layer.value,
+                self._exposure.value,
+                self._ground.value,
+                self._backdrop.value,
+            )
+        self._cameras = cameras
+        self._studio.ask(self.viewer, cameras, look)
+
+    def _lighting(self) -> Lighting:
+        name = self._light.value
+        if name not in self._tables:
+            dark = torch.zeros(1, 2, 3)
+            radiance = dark if name == DARK else self._lights[name].radiance
+            self._tables[name] = env.tables(env.EnvMap(radiance))
+        turned = rotated(Lighting(self._tables[name]), self._turn.value)
+        if not self._sun.value:
+            return turned
+        phi, up = math.radians(self._azimuth.value), math.radians(self._elevation.value)
+        flat = math.cos(up)
+        direction = (flat * math.cos(phi), flat * math.sin(phi), math.sin(up))
+        return replace(turned, suns=(Sun(direction, (self._sun.value,) * 3),))
+
+    def _show(self, picture: Tensor) -> None:
+        self._last = picture
+        rgb = picture[..., :3] * picture[..., 3:] + PLAIN * (1 - picture[..., 3:])
+        share = self._overlay.value if self._overlay else 0.0
+        if share and self._shown is not None:
+            rgb = laid_over(rgb, self._subject.photos, self._shown, self._cameras, share)
+        values = (255 * rgb + 0.5).clamp(0, 255).byte().numpy()
+        self._client.scene.set_background_image(values, format="jpeg", jpeg_quality=JPEG)
+
+    def _again(self) -> None:
+        if self._last is not None:
+            self._show(self._last)
+
+    def _complain(self, line: str) -> None:
+        log.warning(line)
+        self._client.add_notification("univoxel", line, color="red")
+
+    def _guarded(self, do: Callable[[], None]) -> None:
+        """Do something for the client; a mistake becomes one line for it."""
+        try:
+            do()
+        except (UserError, OSError) as error:
+            self._complain(str(error))
+
+    def _take_map(self) -> None:
+        sent = self._map.value
+        light = light_of_bytes(sent.name, sent.content)
+        with self._lock:
+            self._lights[light.name] = light
+            self._tables.pop(light.name, None)
+        self._light.options = [*self._lights, DARK]
+        self._light.value = light.name
+        self._ask()
+
+    def _send_png(self) -> None:
+        if self._last is None:
+            return
+        values = (255 * self._last + 0.5).clamp(0, 255).byte().numpy()
+        held = io.BytesIO()
+        Image.fromarray(values).save(held, "png")
+        self._client.send_file_download(f"{self._title}.png", held.getvalue())
+
+    def _send_glb(self) -> None:
+        mesh = bake(self._subject.scene, simplify(self._subject.traced.mesh, FACES), TEXTURE_SIZE)
+        self._client.send_file_download(f"{self._title}.glb", glb(mesh, JPEG_QUALITY))
+
+
+def light_of_bytes(name: str, content: bytes) -> Light:
+    """A map that was sent, as file `name` holds it; the light goes by that name.
+
+    Raises:
+        UserError: it cannot be used as a map; the message names it.
+    """
+    plain = Path(name.replace("\\", "/").replace("\0", "")).name or "map"
+    if Path(plain).suffix.lower() not in MAPS:
+        raise UserError(f"{plain}: expected an environment map as .hdr or .exr")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"map{Path(plain).suffix.lower()}"
+        path.write_bytes(content)
+        try:
+            return Light(Path(plain).stem, light_of_file(path).radiance)
+        except (UserError, OSError) as error:
+            raise UserError(str(error).replace(str(path), plain)) from None
+
+
+def camera_of(wxyz: Any, position: Any, angle: float, width: int, height: int) -> Cameras:
+    """viser's camera (+X right, +Y down, +Z ahead; vertical angle in radians) as one of ours."""
+    w, x, y, z = (float(v) for v in wxyz)
+    turn = torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    turn = turn * torch.tensor([1.0, -1.0, -1.0])
+    place = torch.tensor([float(v) for v in position])
+    focal = height / 2 / math.tan(angle / 2)
+    centre = torch.tensor([[width / 2, height / 2]])
+    pose = torch.cat([turn, place[:, None]], 1)[None]
+    return Cameras(pose, torch.full((1, 2), focal), centre, width, height)
+
+
+def pose_for_viser(cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """wxyz, position, vertical angle in radians and aspect of a view, as viser takes them."""
+    pose = cameras.camera_to_world[view]
+    turn = (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])).double().numpy()
+    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    width, height = cameras.size(view)
+    angle = 2 * math.atan(height / 2 / float(cameras.focal[view, 1]))
+    return np.array([w, x, y, z]), pose[:, 3].numpy(), angle, width / height
+
+
+def laid_over(rgb: Tensor, photos: Any, view: int, cameras: Cameras, share: float) -> Tensor:
+    """A picture [H, W, 3] with a photograph over it, by its share, where the camera stands at it.
+
+    Both look from one point, so pixels of the one lie in the other whichever way they are turned.
+    """
+    taken = photos.cameras.camera_to_world[view, :, 3]
+    extent = taken.norm().clamp_min(1e-6)
+    if (cameras.camera_to_world[0, :, 3] - taken).norm() > 1e-2 * extent:
+        return rgb
+    rays = image_rays(resize(cameras, rgb.shape[1]), 0)
+    pixel, depth = project(photos.cameras, view, taken + rays.direction)
+    row, column = pixel[:, 1].floor().long(), pixel[:, 0].floor().long()
+    columns, rows = photos.cameras.size(view)
+    inside = (depth > 0) & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    where = inside.nonzero()[:, 0]
+    color, alpha = photos.pixels(torch.tensor(view), row[where], column[where])
+    flat = rgb.reshape(-1, 3).clone()
+    over = share * alpha[:, None]
+    flat[where] = (1 - over) * flat[where] + over * linear_to_srgb(color)
+    return flat.reshape(rgb.shape)
+
+
+def _start_camera(server: Any, subject: Subject) -> None:
+    cameras = orbit(subject.traced.mesh, 8, 512)
+    pose = cameras.camera_to_world[1]
+    low, high = subject.traced.mesh.vertices.amin(0), subject.traced.mesh.vertices.amax(0)
+    server.initial_camera.position = pose[:, 3].numpy()
+    server.initial_camera.look_at = ((low + high) / 2).numpy()
+    server.initial_camera.fov = math.radians(VIEW_ANGLE)
+
+
+def _guard(server: Any, host: str) -> None:
+    """Answer pages of this server alone, and tell nobody outside of it."""
+
+    def refused(*args: Any, **options: Any) -> None:
+        log.warning("a page asked to share the viewer with the network: refused")
+
+    server.request_share_url = refused  # would open a tunnel to a host outside
+    inner = server._websock_server
+
+    @inner.on_client_connect
+    async def _(connection: Any) -> None:
+        websocket = inner._live_connections[connection.client_id]
+        headers = websocket.request.headers
+        if not same_site(headers.get("Origin"), headers.get("Host"), host):
+            log.warning("a page of %s asked for the viewer: refused", headers.get("Origin"))
+            await websocket.close(1008, "another site")
+
+
+def same_site(origin: str | None, asked: str | None, host: str) -> bool:
+    """Whether a page that a browser names as `origin` is our own, reached as `asked`.
+
+    A program that is no browser names none. On the loopback only its own names count: another
+    site's name may have been made to lead here.
+    """
+    if host in LOOPBACK and urlsplit(f"//{asked}").hostname not in LOOPBACK:
+        return False
+    return origin is None or urlsplit(origin).netloc == asked
+
+
+def _require_port(host: str, port: int) -> None:
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family[0], socket.SOCK_STREAM) as tried:
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            tried.bind(family[4])
+    except (OSError, OverflowError):
+        raise _taken(host, port) from None
+
+
+def _taken(host: str, port: int) -> UserError:
+    return UserError(
+        f"view: {host}:{port} is taken or cannot be listened on; give another port, or 0 for a "
+        "free one",
+        "port",
+    )
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """A block in which viser's own lines are dropped."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield

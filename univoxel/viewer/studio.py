@@ -1,0 +1,149 @@
+"""Who gets the next picture: one thread renders for all clients, those who move first."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from univoxel.camera import Cameras, resize
+from univoxel.errors import UserError
+from univoxel.viewer.frames import Look, quick_picture, refined_pictures
+from univoxel.viewer.subject import Subject
+
+QUICK_SECONDS = 0.07  # that a picture may take while something moves: 10 a second, sent and all
+QUICK_WIDTHS = (64, 384)  # pixels, between which its width is chosen
+FIRST_WIDTH = 160  # pixels, before any was timed
+REST_WIDTH = 640  # most pixels along the width at rest
+REST_SECONDS = 0.25  # without a change, after which a view rests
+
+log = logging.getLogger("univoxel")
+
+
+@dataclass
+class Viewer:
+    """One client's view; changed by `Studio.ask` alone."""
+
+    show: Callable[[Tensor], None]  # takes a picture [H, W, 4], sRGB with straight alpha
+    complain: Callable[[str], None]  # takes one line for people
+    width: int = FIRST_WIDTH  # of quick pictures
+    wanted: tuple[Cameras, Look] | None = None
+    changed: float = 0.0  # when it was last asked for something
+    stale: bool = False  # whether a quick picture is due
+    refining: Iterator[Tensor | None] | None = None
+    gone: bool = False
+
+
+class Studio:
+    """Renders for any number of viewers in a thread of its own, until `stop`."""
+
+    def __init__(self, subject: Subject) -> None:
+        self._subject = subject
+        self._viewers: list[Viewer] = []
+        self._news = threading.Condition()
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="univoxel studio", daemon=True)
+        self._thread.start()
+
+    def join(self, viewer: Viewer) -> None:
+        """Take a viewer in."""
+        with self._news:
+            self._viewers.append(viewer)
+
+    def leave(self, viewer: Viewer) -> None:
+        """Let a viewer go; a picture that is being made for it is dropped."""
+        with self._news:
+            viewer.gone = True
+            self._viewers = [other for other in self._viewers if other is not viewer]
+
+    def ask(self, viewer: Viewer, cameras: Cameras, look: Look) -> None:
+        """Show a viewer view 0 of cameras as large as its window, from now on."""
+        with self._news:
+            viewer.wanted, viewer.stale = (cameras, look), True
+            viewer.refining, viewer.changed = None, time.monotonic()
+            self._news.notify()
+
+    def stop(self) -> None:
+        """End the thread after the step that it is in."""
+        with self._news:
+            self._ended = True
+            self._news.notify()
+        self._thread.join(10)
+
+    def _run(self) -> None:
+        turn = 0
+        while True:
+            with self._news:
+                viewer = None
+                while not self._ended and (viewer := self._next(turn)) is None:
+                    waiting = any(v.wanted and v.refining is None for v in self._viewers)
+                    self._news.wait(REST_SECONDS / 4 if waiting else None)
+                if viewer is None:
+                    return
+                turn += 1
+                assert viewer.wanted is not None
+                (cameras, look), quick = viewer.wanted, viewer.stale
+                viewer.stale = False
+            try:
+                if quick:
+                    self._quick(viewer, cameras, look)
+                else:
+                    self._refine(viewer, cameras, look)
+            except (UserError, OSError) as error:
+                self._give_up(viewer, str(error))
+            except Exception:
+                log.exception("a picture failed")  # a fault of the program: its traceback
+                self._give_up(viewer, "a picture failed: the program's log says more")
+
+    def _next(self, turn: int) -> Viewer | None:
+        """The viewer whose turn it is; None: all are served."""
+        for viewer in self._viewers:
+            if viewer.stale:
+                return viewer
+        rested = time.monotonic() - REST_SECONDS
+        able = [v for v in self._viewers if v.wanted and v.changed <= rested]
+        return able[turn % len(able)] if able else None
+
+    def _quick(self, viewer: Viewer, cameras: Cameras, look: Look) -> None:
+        begin = time.monotonic()
+        picture = quick_picture(self._subject, resize(cameras, viewer.width), look)
+        self._show(viewer, picture)
+        share = QUICK_SECONDS / max(time.monotonic() - begin, 1e-3)
+        low, high = QUICK_WIDTHS
+        viewer.width = round(min(max(viewer.width * min(max(share, 0.5), 1.2) ** 0.5, low), high))
+
+    def _refine(self, viewer: Viewer, cameras: Cameras, look: Look) -> None:
+        pictures = viewer.refining
+        if pictures is None:
+            at_rest = resize(cameras, min(cameras.width, REST_WIDTH))
+            pictures = refined_pictures(self._subject, at_rest, look)
+            with self._news:
+                if viewer.stale:
+                    return
+                viewer.refining = pictures
+        try:
+            picture = next(pictures)
+        except StopIteration:
+            with self._news:
+                if not viewer.stale:
+                    viewer.wanted = None
+            return
+        if picture is not None:
+            self._show(viewer, picture)
+
+    def _show(self, viewer: Viewer, picture: Tensor) -> None:
+        with self._news:
+            if viewer.gone or (viewer.stale and viewer.refining is not None):
+                return
+        viewer.show(picture)
+
+    def _give_up(self, viewer: Viewer, line: str) -> None:
+        with self._news:
+            viewer.wanted, viewer.refining = None, None
+            if viewer.gone:
+                return
+        viewer.complain(line)
