@@ -313,11 +313,12 @@ def test_relight_export_view_and_demo(calls, capsys):
     assert main(["demo", "--out", "demo"]) == 0
     paths = (Path("run"), Path("maps/hall.exr"), Path("run/relight/hall"))
     options = {"faces": None, "texture_size": 1024, "watertight": False}
+    served = {"host": "127.0.0.1", "port": 8080}
     (name, given, chosen), *others = calls.noted
     assert (name, given, chosen["cameras"], chosen["rotate"]) == ("relight", paths, "test", 90.0)
     assert others == [
         ("export", (Path("run"), Path("out.ply")), options),
-        ("view", (Path("run"), Path("mug.html")), {"envmap": (paths[1],), "title": None}),
+        ("view", (Path("run"), Path("mug.html")), {"envmap": (paths[1],), "title": None} | served),
         ("demo", (Path("demo"),), {}),
     ]
     printed = capsys.readouterr().out.split()

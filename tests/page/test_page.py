@@ -274,8 +274,8 @@ def test_own_maps_take_the_place_of_usual_ones(scene, tmp_path):
 
 
 def test_mistakes_are_named(tmp_path):
-    with pytest.raises(UserError, match=r"expected html=FILE\.html"):
-        view(tmp_path)
+    with pytest.raises(MissingFile, match=r"scene\.safetensors"):
+        view(tmp_path)  # before it listens to anybody
     with pytest.raises(UserError, match=r"expected a file that ends in \.html, got .*mug\.png"):
         view(tmp_path, tmp_path / "mug.png")
     with pytest.raises(MissingFile, match=r"scene\.safetensors"):

@@ -13,6 +13,7 @@ import pytest
 import torch
 from asymmetric_scene import lopsided
 
+from univoxel.data import Photos
 from univoxel.data.images import write_exr
 from univoxel.envmap import EnvMap
 from univoxel.errors import MissingExtra, UserError
@@ -21,7 +22,14 @@ from univoxel.render.relight import traced_mesh
 from univoxel.tasks.relight import lighting
 from univoxel.viewer import server as serving_module
 from univoxel.viewer.frames import Look
-from univoxel.viewer.server import camera_of, light_of_bytes, pose_for_viser, same_site, serving
+from univoxel.viewer.server import (
+    camera_of,
+    laid_over,
+    light_of_bytes,
+    pose_for_viser,
+    same_site,
+    serving,
+)
 from univoxel.viewer.studio import Studio, Viewer
 from univoxel.viewer.subject import Subject, mesh_of
 
@@ -226,3 +234,20 @@ def test_without_viser(subject, monkeypatch):
     with pytest.raises(MissingExtra, match=r"univoxel\[view\]"):
         serving(subject).__enter__()
     assert serving_module.HOST == "127.0.0.1"
+
+
+def test_a_photograph_lies_over_the_render_where_it_was_taken(subject):
+    """All of it at share 1, half of it at 0.5; elsewhere, or out of its frame, nothing."""
+    cameras = orbit(subject.traced.mesh, 2, 16)
+    color = (255 * torch.rand(2, 16, 16, 3)).byte()
+    alpha = torch.full((2, 16, 16), 255, dtype=torch.uint8)
+    alpha[:, :4] = 0
+    photos = Photos(Path("photographs"), ["a", "b"], color, alpha, cameras)
+    render = torch.rand(16, 16, 3)
+    seen = color[1] / 255
+    for share in (1.0, 0.5):
+        found = laid_over(render, photos, 1, cameras.of(torch.tensor([1])), share)
+        expected = share * seen + (1 - share) * render
+        assert torch.allclose(found[4:], expected[4:], atol=1e-4)
+        assert torch.equal(found[:4], render[:4])
+    assert torch.equal(laid_over(render, photos, 1, cameras.of(torch.tensor([0])), 1.0), render)

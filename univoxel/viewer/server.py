@@ -30,6 +30,7 @@ from univoxel.assets.gltf import glb
 from univoxel.assets.topology import simplify
 from univoxel.camera import Cameras, image_rays, looked_at, project, resize
 from univoxel.color import linear_to_srgb
+from univoxel.data import Photos
 from univoxel.errors import MissingExtra, UserError
 from univoxel.names import TEXTURE_SIZE
 from univoxel.ops import Sun
@@ -312,7 +313,7 @@ def pose_for_viser(cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray,
     return np.array([w, x, y, z]), pose[:, 3].numpy(), angle, width / height
 
 
-def laid_over(rgb: Tensor, photos: Any, view: int, cameras: Cameras, share: float) -> Tensor:
+def laid_over(rgb: Tensor, photos: Photos, view: int, cameras: Cameras, share: float) -> Tensor:
     """A picture [H, W, 3] with a photograph over it, by its share, where the camera stands at it.
 
     Both look from one point, so pixels of the one lie in the other whichever way they are turned.
