@@ -12,8 +12,11 @@ import univoxel
 
 PACKAGE = Path(univoxel.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
-# Of them only the errors of broken archives are used
-NAMES_ONLY = {"data/arrays.py": {"zipfile"}}
+# What is used of them all the same
+NAMES_ONLY = {
+    "data/arrays.py": {"zipfile"},  # the errors of broken archives
+    "viewer/server.py": {"socket", "urllib"},  # is a port free; of what host is a page
+}
 FORBIDDEN = {
     *("pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"),
     *("tarfile", "zipfile", "yaml"),
