@@ -53,7 +53,7 @@ test: dev
 
 page-test: dev
 	scripts/browser.sh
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/page
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/page tests/viewer
 
 fuzz: dev
 	$(BIN)/python tests/fuzz.py --cases 300
