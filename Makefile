@@ -141,7 +141,7 @@ tsan: build-tsan/.installed
 		build-tsan/site/univoxel/
 	cd build-tsan/site && LD_PRELOAD="$$(c++ -print-file-name=libtsan.so)" \
 		TSAN_OPTIONS=ignore_noninstrumented_modules=1:allocator_may_return_null=1:halt_on_error=1:exitcode=66 \
-		setarch -R $(CURDIR)/$(BIN)/python -m pytest -q -n 0 --capture=sys \
+		OMP_NUM_THREADS=1 setarch -R $(CURDIR)/$(BIN)/python -m pytest -q -n 0 --capture=sys \
 		-c $(CURDIR)/pyproject.toml --rootdir $(CURDIR) -p no:cacheprovider -k "not compile" $(TSAN_TESTS)
 
 # In an environment of its own: its packages are not what is looked at

@@ -344,3 +344,13 @@ def test_the_bundle_is_the_one_that_was_checked():
     assert hashlib.sha256(bundle).hexdigest() == said[1]
     assert b"</script" not in bundle  # it stands in one
     assert (VENDOR / "LICENSE").read_text("utf-8").startswith("The MIT License")
+
+
+def test_names_of_maps_begin_no_comment(scene, tmp_path):
+    """After <!--<script a browser does not see where a script ends."""
+    path = tmp_path / "<!--<script>.exr"
+    write_exr(path, dict.fromkeys("RGB", np.ones((4, 8), np.float32)))
+    options = page.PageOptions(**vars(SMALL) | {"envmaps": (path,)})
+    held = embedded(page.page_text(tmp_path, scene, options), "scene")
+    assert "<" not in held
+    assert path.stem in [light["name"] for light in json.loads(held)["lights"]]
