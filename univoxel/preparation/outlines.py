@@ -131,7 +131,7 @@ def _smoothed(
     rows, columns, entries = [], [], []
     for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
         beside = pixels + step
-        here = ((beside >= 0) & (beside < band.shape)).all(1).nonzero()[0]
+        here = np.flatnonzero(((beside >= 0) & (beside < band.shape)).all(1))
         own, other = tuple(pixels[here].T), tuple(beside[here].T)
         unlike = ((color[own] - color[other]) ** 2).sum(-1) / (2 * cfg.noise**2)
         alike = cfg.smooth * np.exp(-unlike)
