@@ -47,7 +47,7 @@ from univoxel.tasks.relight import relight_to_files
 from univoxel.tasks.train import train
 from univoxel.training.progress import TrainingProgress
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 AUTO = "auto"  # masks that the photographs have, or else of a network, or else of colours
 STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")

@@ -12,7 +12,7 @@ from univoxel.page import PageOptions, write_page
 
 PAGE = "index.html"  # in the folder of a run, written at the end of `univoxel train`
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 def view(

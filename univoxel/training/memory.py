@@ -16,7 +16,7 @@ PER_PIXEL = 21  # distances, masks and orders of pixels, besides the photographs
 PER_VOXEL = 100  # distances and features with gradients and moments, hulls, meshes
 PER_RAY = 40_000  # of a step: samples and what is between them
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 def needed(photos: Photos, cfg: TrainConfig) -> int:

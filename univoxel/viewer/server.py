@@ -50,7 +50,7 @@ PLAIN = 0.16  # sRGB, behind a transparent picture
 JPEG = 90  # quality of pictures that are sent
 MAPS = (".hdr", ".exr")
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @contextlib.contextmanager
@@ -113,7 +113,7 @@ class Panel:
         self._tables: dict[str, env.EnvTables] = {}
         self._lock = threading.Lock()
         self._last: Tensor | None = None
-        self.viewer = Viewer(self._show, self._complain)
+        self.viewer: Viewer = Viewer(self._show, self._complain)
         self._controls(client.gui)
         self._photographs(client.gui)
         studio.join(self.viewer)

@@ -21,7 +21,7 @@ FIRST_WIDTH = 160  # pixels, before any was timed
 REST_WIDTH = 640  # most pixels along the width at rest
 REST_SECONDS = 0.25  # without a change, after which a view rests
 
-log = logging.getLogger("univoxel")
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass
