@@ -182,7 +182,7 @@ void encode_hash_forward(const HashGrid<T>& in, T* out, int threads) {
 
 template <class T>
 void encode_hash_backward(const HashGrid<T>& in, const T* grad_out, T* grad_table,
-                          const HashRows* touched, T* grad_points, int threads) {
+                          const HashRows* touched, T* grad_points, int64_t felt, int threads) {
     const int64_t width = in.n_levels() * in.n_features;
     if (grad_table) {
         with_features(in.n_features, [&](auto constant) {
@@ -210,7 +210,7 @@ void encode_hash_backward(const HashGrid<T>& in, const T* grad_out, T* grad_tabl
     if (!grad_points) return;
     parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
         std::fill(grad_points + 3 * begin, grad_points + 3 * end, T(0));
-        for (int64_t l = 0; l < in.n_levels(); ++l) {
+        for (int64_t l = 0; l < felt; ++l) {
             const RowLookup rows(in.levels[l], in.rows);
             for (int64_t i = begin; i < end; ++i) {
                 const T* p = in.points + 3 * i;
@@ -227,8 +227,8 @@ template HashRows HashRows::touched(const HashGrid<double>&, int);
 template void encode_hash_forward(const HashGrid<float>&, float*, int);
 template void encode_hash_forward(const HashGrid<double>&, double*, int);
 template void encode_hash_backward(const HashGrid<float>&, const float*, float*, const HashRows*,
-                                   float*, int);
+                                   float*, int64_t, int);
 template void encode_hash_backward(const HashGrid<double>&, const double*, double*, const HashRows*,
-                                   double*, int);
+                                   double*, int64_t, int);
 
 }  // namespace univoxel

@@ -54,12 +54,12 @@ class HashRows {
 template <class T>
 void encode_hash_forward(const HashGrid<T>& in, T* out, int threads);
 
-/// Gradients: grad_table [L * R, F], or [touched->count(), F]; grad_points [M, 3]; null: not
-/// wanted.
+/// Gradients: grad_table [L * R, F], or [touched->count(), F]; grad_points [M, 3], from the first
+/// `felt` levels; null: not wanted.
 ///
 /// A level is summed by one thread, in the points' order: the same bits for any number of threads.
 template <class T>
 void encode_hash_backward(const HashGrid<T>& in, const T* grad_out, T* grad_table,
-                          const HashRows* touched, T* grad_points, int threads);
+                          const HashRows* touched, T* grad_points, int64_t felt, int threads);
 
 }  // namespace univoxel

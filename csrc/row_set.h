@@ -13,7 +13,7 @@ namespace univoxel {
 /// `number` them. A bit per row: costs 16 bytes for 64 rows of the table.
 class RowSet {
   public:
-    explicit RowSet(int64_t n_rows) : words_((n_rows + 63) / 64, Word{0, 0}) {}
+    explicit RowSet(int64_t n_rows) : words_((n_rows + 63) / 64, Word{0, 0}), n_rows_(n_rows) {}
 
     void mark(int64_t row) { mark(row >> 6, uint64_t(1) << (row & 63)); }
     /// Mark those of rows 64 word .. 64 word + 63 whose bit is set.
@@ -30,6 +30,13 @@ class RowSet {
         }
     }
     int64_t count() const { return count_; }
+    /// Of the table.
+    int64_t n_rows() const { return n_rows_; }
+    /// Marked rows before this one: a multiple of 64, or the table's end.
+    int64_t before(int64_t row) const {
+        DCHECK(row == n_rows_ || row % 64 == 0);
+        return row == n_rows_ ? count_ : words_[row >> 6].first;
+    }
 
     bool has(int64_t row) const { return words_[row >> 6].bits >> (row & 63) & 1; }
     /// Slot of a marked row.
@@ -52,6 +59,30 @@ class RowSet {
         });
     }
 
+    /// Write the place of every slot's row in an array of this shape to indices [dims, count].
+    void write_indices(const std::vector<int64_t>& shape, int64_t* indices, int threads) const {
+        const int64_t n = static_cast<int64_t>(words_.size());
+        const int dims = static_cast<int>(shape.size());
+        parallel_for(n, kWordsPerChunk, threads, [&](int64_t begin, int64_t end) {
+            for (int64_t w = begin; w < end; ++w) {
+                int64_t slot = words_[w].first;
+                for (uint64_t bits = words_[w].bits; bits; bits &= bits - 1, ++slot) {
+                    // Rows are fewer than 2^32 where an array has them in memory; 64 bits divide
+                    // slowly
+                    uint64_t row = 64 * w + __builtin_ctzll(bits);
+                    for (int d = dims - 1; d > 0; --d) {
+                        const uint64_t size = shape[d];
+                        const bool small = row <= UINT32_MAX;
+                        const uint64_t next = small ? uint32_t(row) / uint32_t(size) : row / size;
+                        indices[d * count_ + slot] = row - next * size;
+                        row = next;
+                    }
+                    indices[slot] = row;
+                }
+            }
+        });
+    }
+
   private:
     static constexpr int64_t kWordsPerChunk = 4096;
 
@@ -60,6 +91,7 @@ class RowSet {
         int64_t first;  // marked rows before this word
     };
     std::vector<Word> words_;
+    int64_t n_rows_;
     int64_t count_ = 0;
 };
 

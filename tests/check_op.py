@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from univoxel.ops.native import Operator
+
 # Largest relative L2 error of a float32 op against the reference in float64, value and gradient.
 # float32 carries 6e-8 per operation; sums of some hundred terms and one division keep below these.
 RTOL = {torch.float32: 1e-5, torch.float64: 1e-12}
@@ -17,7 +19,7 @@ def check_op(
     reference: Op,
     cases: Sequence[tuple],
     rtol: dict[torch.dtype, float] = RTOL,
-    custom_op: torch.library.CustomOpDef | None = None,
+    custom_op: Operator | None = None,
 ) -> None:
     """Hold an op against its reference on every case (a tuple of float64 arguments).
 
@@ -46,7 +48,7 @@ def check_op(
         if any(isinstance(t, Tensor) and t.requires_grad and t.numel() for t in inputs):
             assert torch.autograd.gradcheck(op, inputs)
         if custom_op is not None:
-            torch.library.opcheck(custom_op, _arguments(case, torch.float32))
+            torch.library.opcheck(custom_op.defined, _arguments(case, torch.float32))
 
 
 def _arguments(case: tuple, dtype: torch.dtype) -> tuple:

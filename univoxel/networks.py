@@ -90,14 +90,7 @@ class DirectionTable(nn.Module):
 
     def forward(self, direction: Tensor) -> Tensor:
         sizes = [self.coarsest / 2**k for k in range(self.levels)]
-        n = self.felt
-        parts = (
-            self._encode(direction, self.table[: n * self.rows], sizes[:n]),
-            self._encode(direction.detach(), self.table[n * self.rows :], sizes[n:]),
-        )
-        return torch.cat(parts, 1)
-
-    def _encode(self, direction: Tensor, table: Tensor, sizes: list[float]) -> Tensor:
         if not sizes:
             return direction[:, :0]
-        return ops.encode_hash(table, direction, (-1.0,) * 3, (1.0,) * 3, sizes)
+        box = (-1.0,) * 3, (1.0,) * 3
+        return ops.encode_hash(self.table, direction, *box, sizes, felt=self.felt)

@@ -119,6 +119,8 @@ class RowAdam(torch.optim.Optimizer):
         )
 
     def _step_dense(self, params: list[Tensor], group: dict[str, Any]) -> None:
+        if not params:
+            return
         states = [self._state_of(p) for p in params]
         beta1, beta2 = group["betas"]
         adam(
@@ -135,6 +137,7 @@ class RowAdam(torch.optim.Optimizer):
             weight_decay=0.0,
             eps=group["eps"],
             maximize=False,
+            fused=True,
         )
 
     def _state_of(self, param: Tensor) -> dict[str, Any]:
@@ -145,6 +148,11 @@ class RowAdam(torch.optim.Optimizer):
             state["exp_avg"] = torch.zeros_like(param)
             state["exp_avg_sq"] = torch.zeros_like(param)
         return state
+
+
+def parameters_of(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+    """All that it optimises, group after group."""
+    return [p for group in optimizer.param_groups for p in group["params"]]
 
 
 def rows_of(grad: Tensor) -> Tensor:

@@ -36,13 +36,15 @@ void bind_hash_grid(py::module_& m) {
             return HashRows::touched(in, threads);
         });
     def(m, "encode_hash_backward",
-        "table points grad_out grad_table touched grad_points sizes origin voxel_sizes threads",
+        "table points grad_out grad_table touched grad_points sizes origin voxel_sizes felt "
+        "threads",
         [](In<T> table, In<T> points, In<T> grad_out, OptionalOut<T> grad_table,
            const HashRows* touched, OptionalOut<T> grad_points, Sizes sizes, const Vec3& origin,
-           Numbers voxel_sizes, int threads) {
+           Numbers voxel_sizes, int64_t felt, int threads) {
             const auto in = hash_grid_of(table, points, sizes, origin, voxel_sizes);
+            require(felt >= 0 && felt <= in.n_levels(), "encode_hash: felt out of range");
             encode_hash_backward(in, grad_out.data(), raw(grad_table), touched, raw(grad_points),
-                                 threads);
+                                 felt, threads);
         });
 }
 

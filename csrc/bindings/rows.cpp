@@ -1,7 +1,11 @@
+#include <functional>
+#include <numeric>
+
 #include "adam.h"
 #include "bindings/grids.h"
 #include "diffuse.h"
 #include "smooth.h"
+#include "sum_rows.h"
 
 namespace univoxel {
 namespace {
@@ -15,11 +19,11 @@ bool inside(In<int64_t> rows, int64_t end) {
     return all_of<int64_t>(rows, [=](int64_t row) { return row >= 0 && row < end; });
 }
 
-void require_ascending(In<int64_t> rows, int64_t first, int64_t end) {
+void require_ascending(const std::string& op, In<int64_t> rows, int64_t first, int64_t end) {
     const int64_t *r = rows.data(), n = rows.size();
     const bool inside = n == 0 || (r[0] >= first && r[n - 1] < end);
     require(inside && std::adjacent_find(r, r + n, std::greater_equal<>()) == r + n,
-            "diffuse_rows_: rows must ascend in " + range(first, end));
+            op + ": rows must ascend in " + range(first, end));
 }
 
 /// Whether the bricks of these rows stand somewhere.
@@ -70,7 +74,7 @@ void bind_diffuse(py::module_& m) {
     def(m, "diffuse_rows", "values size rows amount passes threads",
         [](Out<T> values, const Size3& size, In<int64_t> rows, double amount, int passes,
            int threads) {
-            require_ascending(rows, 0, size[0] * size[1] * size[2]);
+            require_ascending("diffuse_rows_", rows, 0, size[0] * size[1] * size[2]);
             diffuse_rows(values.mutable_data(), size.data(), rows.data(), rows.size(), T(amount),
                          passes, threads);
         });
@@ -78,12 +82,42 @@ void bind_diffuse(py::module_& m) {
         [](Out<T> values, In<int32_t> table, In<int32_t> place, const Size3& size, In<int64_t> rows,
            double amount, int passes, int threads) {
             const int64_t end = place.size() * kBrickNodes;
-            require_ascending(rows, kMissingRows, end);
+            require_ascending("diffuse_rows_", rows, kMissingRows, end);
             require(stand(rows, place),
                     "diffuse_rows_: rows must be of bricks that stand somewhere");
             diffuse_brick_rows(values.mutable_data(), size.data(), brick_nodes_of(table, size),
                                place.data(), end, rows.data(), rows.size(), T(amount), passes,
                                threads);
+        });
+}
+
+using ManyRows = const std::vector<array<int64_t>>&;
+
+template <class T>
+std::vector<RowList<T>> lists_of(ManyRows rows, const std::vector<array<T>>& values) {
+    std::vector<RowList<T>> lists;
+    for (size_t i = 0; i < rows.size(); ++i)
+        lists.push_back({rows[i].data(), values[i].data(), rows[i].size()});
+    return lists;
+}
+
+template <class T>
+void bind_sums(py::module_& m) {
+    def(m, "union_rows", "rows values n_rows threads",
+        [](ManyRows rows, const std::vector<array<T>>& values, int64_t n_rows, int threads) {
+            for (const auto& list : rows) require_ascending("sum_rows", list, 0, n_rows);
+            return union_rows(lists_of(rows, values), n_rows, threads);
+        });
+    def(m, "sum_rows", "rows values set out indices shape threads",
+        [](ManyRows rows, const std::vector<array<T>>& values, const RowSet& set, Out<T> out,
+           Out<int64_t> indices, const std::vector<int64_t>& shape, int threads) {
+            const int64_t dims = static_cast<int64_t>(shape.size());
+            const bool fits = std::accumulate(shape.begin(), shape.end(), int64_t(1),
+                                              std::multiplies<>()) == set.n_rows() &&
+                              out.shape(0) == set.count() && indices.size() == dims * set.count();
+            require(fits, "sum_rows: out, indices or shape of another size");
+            sum_rows(lists_of(rows, values), set, out.shape(1), out.mutable_data(), threads);
+            set.write_indices(shape, indices.mutable_data(), threads);
         });
 }
 
@@ -96,6 +130,8 @@ void bind_rows_ops(py::module_& m) {
     bind_smooth<double>(m);
     bind_diffuse<float>(m);
     bind_diffuse<double>(m);
+    bind_sums<float>(m);
+    bind_sums<double>(m);
 }
 
 }  // namespace univoxel

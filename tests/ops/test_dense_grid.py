@@ -201,12 +201,12 @@ def test_far_origin_keeps_the_fraction_of_a_float32_point():
 
 def test_opcheck():
     arguments = case((4, 4, 4))
-    torch.library.opcheck(_sample_dense, (*arguments, False))
+    torch.library.opcheck(_sample_dense.defined, (*arguments, False))
     sdf, features, points = (a.detach() for a in arguments[:3])
     *pulls, order = _sample_dense(sdf, features, points, ORIGIN, H, False)
     for needs in ([True, True, True], [True, False, False]):
         torch.library.opcheck(
-            _sample_dense_backward, (sdf, features, points, order, *pulls, ORIGIN, H, needs)
+            _sample_dense_backward.defined, (sdf, features, points, order, *pulls, ORIGIN, H, needs)
         )
 
 
@@ -236,7 +236,7 @@ def test_second_order_raises():
     sdf, features, points, *place = case()
     value, gradient, _ = sample_dense(sdf, features, points, *place)
     (first,) = torch.autograd.grad(value.sum() + gradient.square().sum(), points, create_graph=True)
-    with pytest.raises(RuntimeError, match=r"does not require grad|no autograd"):
+    with pytest.raises(RuntimeError, match=r"differentiate twice"):
         first.sum().backward()
 
 

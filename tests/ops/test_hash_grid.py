@@ -115,6 +115,27 @@ def test_gradient_of_one_argument(needed):
         torch.testing.assert_close(got.to_dense(), wanted)
 
 
+@pytest.mark.parametrize(
+    ("backend", "felt"),
+    [("native", 0), *((b, n) for b in ("native", "reference") for n in (1, 2, 5))],
+)
+def test_only_the_levels_that_are_felt_move_points(backend, felt):
+    arguments = case((0.5, 0.2, 0.1))
+    with use_backend(backend):
+        table, points = grads_of(arguments, felt=felt)
+        wanted = grads_of(arguments)
+    assert torch.equal(table, wanted[0])
+    # By parts: a level's own output, with the gradient that the whole has there
+    pull = torch.randn(30, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    total = torch.zeros_like(points)
+    for level in range(min(felt, 3)):
+        rows = arguments[0][32 * level : 32 * level + 32]
+        out = encode_hash(rows, arguments[1], LOWER, UPPER, [arguments[4][level]])
+        (alone,) = torch.autograd.grad(out, arguments[1], pull[:, 2 * level : 2 * level + 2])
+        total += alone
+    torch.testing.assert_close(points, total)
+
+
 @pytest.mark.parametrize("backend", ["native", "reference"])
 @pytest.mark.parametrize("sparse", [False, True])
 def test_nan_and_infinite_points(backend, sparse):
@@ -136,11 +157,13 @@ def test_nan_and_infinite_points(backend, sparse):
 
 def test_opcheck():
     arguments = case((0.5,), rows=8, m=5)
-    torch.library.opcheck(_encode_hash, (*arguments, False))
+    torch.library.opcheck(_encode_hash.defined, (*arguments, False, 1))
     table, points = (a.detach() for a in arguments[:2])
-    pull = _encode_hash(table, points, *arguments[2:], False)
+    pull = _encode_hash(table, points, *arguments[2:], False, 1)
     for needs in ([True, True], [False, True]):
-        torch.library.opcheck(_encode_hash_backward, (table, points, pull, *arguments[2:], needs))
+        torch.library.opcheck(
+            _encode_hash_backward.defined, (table, points, pull, *arguments[2:], 1, needs)
+        )
 
 
 def test_whole_graph_compiles():
@@ -159,7 +182,7 @@ def test_second_order_raises():
     arguments = case()
     out = encode_hash(*arguments)
     (first,) = torch.autograd.grad(out.square().sum(), arguments[1], create_graph=True)
-    with pytest.raises(RuntimeError, match=r"does not require grad|no autograd"):
+    with pytest.raises(RuntimeError, match=r"differentiate twice"):
         first.sum().backward()
 
 
@@ -177,6 +200,7 @@ def test_second_order_raises():
         ({"lower": (9.0, 0.0, 0.0)}, ValueError, "lower must be at most upper"),
         ({"voxel_sizes": ()}, ValueError, "voxel_sizes must be numbers above 0, at least one"),
         ({"voxel_sizes": (0.5, 0.0)}, ValueError, "voxel_sizes must be numbers above 0"),
+        ({"felt": -1}, ValueError, "felt must be at least 0, got -1"),
     ],
 )
 def test_bad_arguments(change, error, message):

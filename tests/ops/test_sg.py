@@ -89,8 +89,8 @@ def test_eye_behind_the_surface_and_light_below():
 
 def test_opcheck():
     *tensors, f0 = points(3, 2, 16)
-    torch.library.opcheck(_shade_sg, (*tensors, torch.tensor(f0, dtype=torch.float64)))
-    torch.library.opcheck(_shade_sg, metals(points(3, 2, 16)))
+    torch.library.opcheck(_shade_sg.defined, (*tensors, torch.tensor(f0, dtype=torch.float64)))
+    torch.library.opcheck(_shade_sg.defined, metals(points(3, 2, 16)))
 
 
 def test_many_points_cross_the_chunks():

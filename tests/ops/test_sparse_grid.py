@@ -173,12 +173,14 @@ def test_gradient_of_one_argument(needed):
 def test_opcheck():
     pool, features, bricks, points, *place = case((5, 4, 4))
     place = (list(bricks.size), *place)
-    torch.library.opcheck(_sample_sparse, (pool, features, bricks.table, points, *place, False))
+    torch.library.opcheck(
+        _sample_sparse.defined, (pool, features, bricks.table, points, *place, False)
+    )
     pool, features, points = (a.detach() for a in (pool, features, points))
     *pulls, order = _sample_sparse(pool, features, bricks.table, points, *place, False)
     for needs in ([True, True, True], [True, False, False]):
         torch.library.opcheck(
-            _sample_sparse_backward,
+            _sample_sparse_backward.defined,
             (pool, features, bricks.table, points, order, *pulls, *place, needs),
         )
 

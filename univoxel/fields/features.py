@@ -41,8 +41,14 @@ class AbstractFeatures(nn.Module, ABC):
         """SDF, its spatial gradient and features at world points [M, 3]."""
 
     @abstractmethod
-    def at(self, distances: AbstractDistances, points: Tensor) -> Tensor:
-        """The features [M, C] alone: no gradient to the sdf, not even one of zeros."""
+    def at(
+        self, distances: AbstractDistances, points: Tensor, values: Tensor | None = None
+    ) -> Tensor:
+        """The features [M, C] alone: no gradient to the sdf, not even one of zeros.
+
+        Args:
+            values: read in place of its own.
+        """
 
     @abstractmethod
     def hold_channels_(self, count: int) -> None:
@@ -83,8 +89,10 @@ class NodeFeatures(AbstractFeatures):
     def sample(self, distances: AbstractDistances, points: Tensor) -> FieldSample:
         return distances.sample(points, self.values)
 
-    def at(self, distances: AbstractDistances, points: Tensor) -> Tensor:
-        return distances.interpolate(self.values, points)
+    def at(
+        self, distances: AbstractDistances, points: Tensor, values: Tensor | None = None
+    ) -> Tensor:
+        return distances.interpolate(self.values if values is None else values, points)
 
     def hold_channels_(self, count: int) -> None:
         assert self.values.grad is not None
@@ -164,15 +172,20 @@ class HashFeatures(AbstractFeatures):
     def sample(self, distances: AbstractDistances, points: Tensor) -> FieldSample:
         return replace(distances.sample(points), features=self.at(distances, points))
 
-    def at(self, distances: AbstractDistances, points: Tensor) -> Tensor:
-        by_level = self.encode(points).view(len(points), len(self.levels.voxel_sizes), PER_LEVEL)
+    def at(
+        self, distances: AbstractDistances, points: Tensor, values: Tensor | None = None
+    ) -> Tensor:
+        by_level = self.encode(points, values).view(
+            len(points), len(self.levels.voxel_sizes), PER_LEVEL
+        )
         return by_level.transpose(1, 2).reshape(len(points), self.channels)
 
-    def encode(self, points: Tensor) -> Tensor:
-        """The features [M, C], those of a level together."""
+    def encode(self, points: Tensor, values: Tensor | None = None) -> Tensor:
+        """The features [M, C], those of a level together; values as in `at`."""
         levels = self.levels
         place = levels.lower, levels.upper, levels.voxel_sizes
-        return encode_hash(self.values, points, *place, sparse_grad=True)
+        table = self.values if values is None else values
+        return encode_hash(table, points, *place, sparse_grad=True)
 
     def hold_channels_(self, count: int) -> None:
         grad = self.values.grad

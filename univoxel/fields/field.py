@@ -82,9 +82,13 @@ class Field(nn.Module):
         """SDF, its spatial gradient and features at world points [M, 3]."""
         return self.encoding.sample(self.distances, points)
 
-    def features_at(self, points: Tensor) -> Tensor:
-        """The features [M, C] alone: no gradient to the sdf, not even one of zeros."""
-        return self.encoding.at(self.distances, points)
+    def features_at(self, points: Tensor, values: Tensor | None = None) -> Tensor:
+        """The features [M, C] alone: no gradient to the sdf, not even one of zeros.
+
+        Args:
+            values: as `features`, read in their place.
+        """
+        return self.encoding.at(self.distances, points, values)
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         """The samples along rays that matter under density sharpness 1 / s; no gradients."""

@@ -24,6 +24,7 @@ from univoxel.ops.smooth import (
 )
 from univoxel.ops.sparse_grid import sample_sparse, sample_sparse_reference
 from univoxel.ops.stereo import match_cost, match_cost_reference, semi_global, semi_global_reference
+from univoxel.ops.sum_rows import sum_rows, sum_rows_reference
 from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference, occluded_reference
 
 Lamp = PointLight  # its name before
@@ -70,5 +71,7 @@ __all__ = [
     "smooth_rows_reference_",
     "specular_response",
     "specular_response_reference",
+    "sum_rows",
+    "sum_rows_reference",
     "use_backend",
 ]

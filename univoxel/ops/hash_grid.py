@@ -22,6 +22,7 @@ def encode_hash(
     upper: Sequence[float],
     voxel_sizes: Sequence[float],
     sparse_grad: bool = False,
+    felt: int | None = None,
 ) -> Tensor:
     """Encode points of a box by L lattices whose nodes share tables of R rows.
 
@@ -46,6 +47,8 @@ def encode_hash(
         sparse_grad: the gradient of table comes back as a coalesced ``sparse_coo`` tensor that
             holds only the rows some point touched: what ``RowAdam`` takes. Eager only: under
             torch.compile ask for dense gradients.
+        felt: levels, from the first on, that pass gradients on to points, at least 0; None: all.
+            Where points come from a surface, fine levels are noise to it.
 
     Returns:
         [M, L * F], level after level.
@@ -78,11 +81,14 @@ def encode_hash(
             f"{sizes['N']} in all"
         )
     place = ([float(x) for x in lower], [float(x) for x in upper], [float(h) for h in voxel_sizes])
+    felt = levels if felt is None else min(felt, levels)
+    if felt < 0:
+        raise ValueError(f"encode_hash: felt must be at least 0, got {felt}")
     if native.serves(table):
-        return _encode_hash(table.contiguous(), points.contiguous(), *place, sparse_grad)
+        return _encode_hash(table.contiguous(), points.contiguous(), *place, sparse_grad, felt)
     if sparse_grad:
         table = SparseGrad.apply(table, 1)
-    return encode_hash_reference(table, points, *place)
+    return encode_hash_reference(table, points, *place, felt)
 
 
 def lattice_sizes(
@@ -100,6 +106,7 @@ def encode_hash_reference(
     lower: Sequence[float],
     upper: Sequence[float],
     voxel_sizes: Sequence[float],
+    felt: int | None = None,
 ) -> Tensor:
     """The same in eager torch: level by level, corner by corner."""
     rows = len(table) // len(voxel_sizes)
@@ -110,6 +117,7 @@ def encode_hash_reference(
         zip(voxel_sizes, lattice_sizes(lower, upper, voxel_sizes), strict=True)
     ):
         size = torch.tensor(shape, device=points.device)
+        points = points.detach() if level == felt else points
         # Locate in double, so that a float32 point far from the box's corner keeps its fraction.
         at = (torch.where(lost, 0.0, points).double() - start) * (1 / h)
         at = torch.minimum(at.clamp_min(0.0), (size - 1).double())
@@ -136,6 +144,7 @@ def _encode_hash(
     upper: list[float],
     voxel_sizes: list[float],
     sparse_grad: bool,
+    felt: int,
 ) -> Tensor:
     out = points.new_empty(len(points), len(voxel_sizes) * table.shape[1])
     native.require().encode_hash_forward(
@@ -157,12 +166,13 @@ def _encode_hash_backward(
     lower: list[float],
     upper: list[float],
     voxel_sizes: list[float],
+    felt: int,
     needs: list[bool],
 ) -> tuple[Tensor, Tensor]:
     grads = _empty_grads(table, points, needs)
     into = [g if need else None for g, need in zip(grads, needs, strict=True)]
     place = _place(lower, upper, voxel_sizes)
-    _backward_into(table, points, grad_out, into[0], None, into[1], place)
+    _backward_into(table, points, grad_out, into[0], None, into[1], place, felt)
     return grads
 
 
@@ -182,6 +192,7 @@ def _backward_into(
     touched,
     grad_points: Tensor | None,
     place: tuple,
+    felt: int,
 ) -> None:
     native.require().encode_hash_backward(
         *native.arrays(table, points, grad_out),
@@ -189,23 +200,24 @@ def _backward_into(
         touched,
         None if grad_points is None else grad_points.numpy(),
         *place,
+        felt,
         native.threads(),
     )
 
 
 def _sparse_backward(
-    table: Tensor, points: Tensor, grad_out: Tensor, place: tuple, needs: list[bool]
+    table: Tensor, points: Tensor, grad_out: Tensor, place: tuple, felt: int, needs: list[bool]
 ) -> tuple[Tensor | None, Tensor | None]:
     """The backward into touched rows; no op: how many there are depends on data."""
     grad_points = torch.empty_like(points) if needs[1] else None
     if not needs[0]:
-        _backward_into(table, points, grad_out, None, None, grad_points, place)
+        _backward_into(table, points, grad_out, None, None, grad_points, place, felt)
         return None, grad_points
     touched = native.require().hash_rows(*native.arrays(table, points), *place, native.threads())
     rows = torch.empty(len(touched), dtype=torch.int64)
     touched.write(rows.numpy(), native.threads())
     values = table.new_empty(len(touched), table.shape[1])
-    _backward_into(table, points, grad_out, values, touched, grad_points, place)
+    _backward_into(table, points, grad_out, values, touched, grad_points, place, felt)
     # The rows are distinct, in order and inside by construction: checking costs more than they do.
     grad = torch.sparse_coo_tensor(
         rows[None], values, table.shape, is_coalesced=True, check_invariants=False
@@ -214,17 +226,17 @@ def _sparse_backward(
 
 
 @_encode_hash.register_fake
-def _(table, points, lower, upper, voxel_sizes, sparse_grad):
+def _(table, points, lower, upper, voxel_sizes, sparse_grad, felt):
     return points.new_empty(len(points), len(voxel_sizes) * table.shape[1])
 
 
 @_encode_hash_backward.register_fake
-def _(table, points, grad_out, lower, upper, voxel_sizes, needs):
+def _(table, points, grad_out, lower, upper, voxel_sizes, felt, needs):
     return _empty_grads(table, points, needs)
 
 
 def _save(ctx, inputs, output):
-    table, points, ctx.lower, ctx.upper, ctx.voxel_sizes, ctx.sparse_grad = inputs
+    table, points, ctx.lower, ctx.upper, ctx.voxel_sizes, ctx.sparse_grad, ctx.felt = inputs
     ctx.save_for_backward(table, points)
 
 
@@ -233,11 +245,11 @@ def _backward(ctx, grad_out):
     needs, grad_out = list(ctx.needs_input_grad[:2]), grad_out.contiguous()
     place = (ctx.lower, ctx.upper, ctx.voxel_sizes)
     if ctx.sparse_grad:
-        grads = _sparse_backward(table, points, grad_out, _place(*place), needs)
+        grads = _sparse_backward(table, points, grad_out, _place(*place), ctx.felt, needs)
     else:
-        dense = _encode_hash_backward(table, points, grad_out, *place, needs)
+        dense = _encode_hash_backward(table, points, grad_out, *place, ctx.felt, needs)
         grads = [g if need else None for g, need in zip(dense, needs, strict=True)]
-    return *grads, None, None, None, None
+    return *grads, None, None, None, None, None
 
 
 _encode_hash.register_autograd(_backward, setup_context=_save)

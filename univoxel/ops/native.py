@@ -19,6 +19,7 @@ from typing import Any, List, Literal, get_args, get_origin, get_type_hints  # n
 import numpy as np
 import torch  # first: the extension then shares torch's OpenMP runtime
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from univoxel.errors import MissingNative
 
@@ -26,6 +27,7 @@ log: logging.Logger = logging.getLogger("univoxel")
 
 Backend = Literal["auto", "native", "reference"]
 FOLDER = Path(__file__).parent.parent / "_core"
+PLAIN = (Tensor, torch.nn.Parameter)
 VARIANTS = ["default", "avx2", "avx512"]  # each runs what the ones before it run
 
 _backend: Backend = "auto"
@@ -199,25 +201,59 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_serial_from_now_on)
 
 
-def operator(name: str, mutates_args: tuple[str, ...] = ()) -> Callable[[Callable], Any]:
-    """``torch.library.custom_op`` of a kernel for the CPU.
+class Operator:
+    """A kernel as an op of torch, and a short way to it.
 
-    Kernels that custom_op registers itself import the compiler when first called: a second, and
-    70 MB, of every command.
+    `torch.library` makes it known to compilers, transforms and tensors of other kinds; through it a
+    call costs a fifth of a millisecond, as much as the kernels of a small batch. Where none of
+    these is there, calls go to the kernel itself, or to an autograd function of it.
     """
 
-    def define(kernel: Callable) -> Any:
+    def __init__(self, name: str, kernel: Callable, mutates_args: tuple[str, ...]) -> None:
         # torch 2.4 reads neither text, which `from __future__` makes of them, nor list[float]
         hints = get_type_hints(kernel).items()
         kernel.__annotations__ = {name: _spelt_out(hint) for name, hint in hints}
         qualified = f"univoxel::{name}"
-        defined = torch.library.custom_op(
+        self.defined: torch.library.CustomOpDef = torch.library.custom_op(
             qualified, kernel, mutates_args=mutates_args, device_types=()
         )
+        # Kernels that custom_op registers itself import the compiler when first called: a second,
+        # and 70 MB, of every command
         torch.library.impl(qualified, "cpu", kernel)
-        return defined
+        self.register_fake: Callable = self.defined.register_fake
+        self._kernel = kernel
+        self._direct: Callable = self.defined if mutates_args else kernel
 
-    return define
+    def __call__(self, *arguments: Any) -> Any:
+        if torch.compiler.is_compiling() or _watched(arguments):
+            return self.defined(*arguments)
+        return self._direct(*arguments)
+
+    def register_autograd(self, backward: Callable, *, setup_context: Callable) -> None:
+        """As of `torch.library.custom_op`."""
+        self.defined.register_autograd(backward, setup_context=setup_context)
+        if List[Tensor] in self._kernel.__annotations__.values():  # noqa: UP006
+            self._direct = self.defined
+            return
+        parts = {
+            "forward": self._kernel,
+            "setup_context": setup_context,
+            "backward": once_differentiable(backward),
+        }
+        methods = {name: staticmethod(part) for name, part in parts.items()}
+        self._direct = type(self._kernel.__name__, (torch.autograd.Function,), methods).apply
+
+
+def _watched(arguments: tuple) -> bool:
+    """Whether something else than plain tensors, computed at once, goes through an op."""
+    if torch._C._len_torch_dispatch_stack() or torch._C._are_functorch_transforms_active():
+        return True
+    return any(isinstance(a, Tensor) and type(a) not in PLAIN for a in arguments)
+
+
+def operator(name: str, mutates_args: tuple[str, ...] = ()) -> Callable[[Callable], Operator]:
+    """Make an `Operator` of a kernel for the CPU."""
+    return lambda kernel: Operator(name, kernel, mutates_args)
 
 
 def _spelt_out(hint: Any) -> Any:

@@ -107,7 +107,7 @@ def shade(
         surface, wo = in_light_frame(scene, surface, wo)
         surface = replace(surface, features=scene.coded(surface.features, view))
         rgb = light.reflected(surface, wo, generator=generator)
-        if scene.mirrored is not None:
+        if scene.mirrored is not None and not scene.mirrored.silent:
             rgb = (rgb + scene.mirrored(surface, wo, scene.radiance.directions)).clamp_min(0)
         return scene.exposed(rgb, view)
     parts = []

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from univoxel.optim import parameters_of
 from univoxel.training.progress import Listener
 
 FAR = 6.0  # dB below its best at which held-out quality has collapsed: four times the error
@@ -72,13 +73,11 @@ class Guard:
         Args:
             loss: [] what was differentiated.
         """
-        total = loss.detach()
-        for parameter in self._parameters():
-            if (gradient := parameter.grad) is not None:
-                values = gradient._values() if gradient.is_sparse else gradient
-                # The root of the sum of squares: Adam's moments must not overflow either
-                total = total + torch.linalg.vector_norm(values)
-        if bool(torch.isfinite(total)):
+        gradients = [p.grad for p in self._parameters() if p.grad is not None]
+        values = [g._values() if g.is_sparse else g for g in gradients]
+        # The root of the sum of squares: Adam's moments must not overflow either
+        norms = torch._foreach_norm(values)
+        if bool(torch.isfinite(torch.stack([loss.detach(), *norms]).sum())):
             self._sound += 1
             if self._sound >= PROOF:
                 self._failures = 0
@@ -108,7 +107,7 @@ class Guard:
 
     def _parameters(self) -> list[Tensor]:
         assert self._optimizer is not None
-        return [p for group in self._optimizer.param_groups for p in group["params"]]
+        return parameters_of(self._optimizer)
 
     def _fits(self, parameters: list[Tensor]) -> bool:
         return [p.shape for p in parameters] == [c.shape for c in self._copy]

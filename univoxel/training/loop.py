@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,15 +18,17 @@ from univoxel.data import Photos
 from univoxel.lights import priors
 from univoxel.lights.base import Regularisation
 from univoxel.metrics import psnr
-from univoxel.optim import RowAdam
+from univoxel.optim import RowAdam, parameters_of
 from univoxel.records import Rays, Surface
 from univoxel.render.pipeline import at_rays, radiance_of, shade, surface_at
 from univoxel.scene import Scene
+from univoxel.threads import Team, team
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
 from univoxel.training.pixels import TrainingPixels
 from univoxel.training.plateau import Plateau
 from univoxel.training.progress import Listener, Rehearsal
+from univoxel.training.step import PARTS, Descent, Part, descent, parts_of, summed_terms, total
 from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
@@ -70,7 +73,8 @@ def run_stage(
     plateau = Plateau(cfg.patience)
     guard = Guard(progress, restored=lambda: restore_surface_(scene))
     guard.follow(optimizer)
-    with scene.surface_held():
+    parameters = parameters_of(optimizer)
+    with scene.surface_held(), team(PARTS) as work:
         for done in progress.clock.steps():
             physical = done >= stage.physical_from
             rates = learning_rates(stage, done, field.voxel_size)
@@ -83,16 +87,13 @@ def run_stage(
                     guard.forget()
                 optimizer.follow(before[0], field.sdf)
                 optimizer.follow(before[1], field.features)
+                parameters = parameters_of(optimizer)
             if progress.clock.step % RETRACE == 0 and not stage.refit:
                 scene.release_surface()
 
-            batch = random_batch(scene.registered(pixels.photos), pixels.trained, stage.rays)
-            surface = surface_at(scene, batch.rays, torch.rand(stage.rays))
-            terms = objective(scene, cfg.loss, surface, batch, physical)
-            loss = torch.stack(list(terms.values())).sum()
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            if not guard.sound(loss):
+            parts = parts_of(pixels.trained, stage.rays)
+            terms = descend_(scene, cfg.loss, pixels, parts, physical, parameters, work)
+            if not guard.sound(torch.stack(list(terms.values())).sum()):
                 continue
             if stage.refit:
                 field.encoding.hold_channels_(scene.material.channels)
@@ -113,6 +114,51 @@ def run_stage(
                 save_scene(scene, cfg.out, progress.state())
     field.refresh()
     scene.eval()
+
+
+def descend_(
+    scene: Scene,
+    weight: LossConfig,
+    pixels: TrainingPixels,
+    parts: Sequence[Part],
+    physical: bool,
+    parameters: Sequence[Tensor],
+    work: Team,
+) -> dict[str, Tensor]:
+    """Give every parameter the gradient of the loss of all parts; the terms, weighted."""
+    features = scene.field.features
+    wanted = [p for p in parameters if p.requires_grad]
+    if physical and scene.light.traced:
+        scene.occluder()  # for all parts
+
+    def one(part: Part) -> Descent:
+        # What is read beside the surface has a gradient of its own: torch adds sparse ones slowly
+        beside = features.detach().requires_grad_()
+        terms = part_terms(scene, weight, pixels.photos, part, physical, beside)
+        return descent(terms, part.share, [*wanted, beside])
+
+    descents = work(one, parts)
+    for i, parameter in enumerate(wanted):
+        gradients = [d.gradients[i] for d in descents]
+        if parameter is features:
+            gradients += [d.gradients[-1] for d in descents]
+        parameter.grad = total(gradients)
+    return summed_terms(parts, descents)
+
+
+def part_terms(
+    scene: Scene,
+    weight: LossConfig,
+    photos: Photos,
+    part: Part,
+    physical: bool,
+    beside: Tensor | None = None,
+) -> dict[str, Tensor]:
+    """`objective` of a part of a step; beside as there."""
+    draw = torch.Generator().manual_seed(part.seed)
+    batch = batch_at(scene.registered(photos), part.pixels)
+    surface = surface_at(scene, batch.rays, torch.rand(len(batch.view), generator=draw))
+    return objective(scene, weight, surface, batch, physical, draw, beside)
 
 
 def restore_surface_(scene: Scene) -> None:
@@ -180,12 +226,24 @@ def rehearsal(
 
 
 def objective(
-    scene: Scene, weight: LossConfig, surface: Surface, batch: Batch, physical: bool
+    scene: Scene,
+    weight: LossConfig,
+    surface: Surface,
+    batch: Batch,
+    physical: bool,
+    draw: torch.Generator,
+    features: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Every term that is minimised, weighted."""
+    """Every term that is minimised, weighted.
+
+    Args:
+        draw: of all that is random.
+        features: the field's, read beside the surface: for a gradient apart from that at the
+            surface. The field's own when left out.
+    """
     opacity, alpha = surface.opacity[:, None], batch.alpha[:, None]
     # A random background: otherwise a surface of the background's colour explains empty space.
-    behind = torch.rand_like(batch.color)
+    behind = torch.rand(batch.color.shape, generator=draw)
     target = linear_to_srgb(batch.color * alpha + behind * (1 - alpha))
     radiance = radiance_of(scene, surface, batch.wo, batch.view)
     drawn = radiance * opacity + linear_to_srgb(behind) * (1 - opacity)
@@ -199,10 +257,11 @@ def objective(
 
     met, view = at_rays(surface, hit), batch.view[hit]
     opacity, behind, target = opacity[hit], behind[hit], target[hit]
-    shaded = shade(scene, met, batch.wo[hit], torch.default_generator, view)
+    shaded = shade(scene, met, batch.wo[hit], draw, view)
     encoded = linear_to_srgb_unclipped(shaded * opacity + behind * (1 - opacity))
-    beside = met.position.detach() + scene.field.voxel_size * torch.randn_like(met.position)
-    near = scene.field.features_at(beside)
+    away = scene.field.voxel_size * torch.randn(met.position.shape, generator=draw)
+    beside = met.position.detach() + away
+    near = scene.field.features_at(beside, features)
     albedo, roughness, _ = scene.material(near)
     assert met.metallic is not None
     here = replace(met, features=scene.coded(met.features, view))
@@ -224,11 +283,6 @@ def weighted(prior: Regularisation, weight: LossConfig) -> dict[str, Tensor]:
         "white_light": (weight.white_light, prior.white_light),
     }
     return {name: factor * term for name, (factor, term) in terms.items() if term is not None}
-
-
-def random_batch(photos: Photos, pixels: Tensor, count: int) -> Batch:
-    """`count` of the pixels, drawn with replacement."""
-    return batch_at(photos, pixels[torch.randint(len(pixels), (count,))])
 
 
 def batch_at(photos: Photos, pixels: Tensor) -> Batch:

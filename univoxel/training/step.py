@@ -1,0 +1,83 @@
+"""A step's gradients, from rays in parts that are worked on side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from univoxel.ops import sum_rows
+from univoxel.optim import rows_of
+
+# Of a step's rays, each a forward and backward pass of its own. The number is fixed: sums must not
+# depend on how many threads there are. Each part costs its small operations anew.
+PARTS = 2
+
+
+@dataclass(frozen=True)
+class Part:
+    """What a part of a step is given: the same on any number of threads."""
+
+    pixels: Tensor  # [N, 3] of the photographs: view, row, column
+    seed: int  # of all that it draws
+    share: float  # of the step's rays
+
+
+@dataclass(frozen=True)
+class Descent:
+    """What a part comes to."""
+
+    terms: dict[str, Tensor]  # of the loss, weighted
+    gradients: Sequence[Tensor | None]  # of the loss, times the part's share
+
+
+def parts_of(pixels: Tensor, rays: int) -> list[Part]:
+    """Draw a step's rays among pixels [P, 3], with replacement."""
+    drawn = pixels[torch.randint(len(pixels), (rays,))]
+    seeds = torch.randint(2**62, (PARTS,)).tolist()
+    chunks = drawn.tensor_split(PARTS) if rays >= PARTS else [drawn]
+    return [
+        Part(chunk, seed, len(chunk) / rays) for chunk, seed in zip(chunks, seeds, strict=False)
+    ]
+
+
+def descent(terms: dict[str, Tensor], share: float, inputs: Sequence[Tensor]) -> Descent:
+    """Differentiate a part's loss by each of the inputs; None where it does not depend on it."""
+    loss = share * torch.stack(list(terms.values())).sum()
+    gradients = torch.autograd.grad(loss, inputs, allow_unused=True)
+    return Descent({name: term.detach() for name, term in terms.items()}, gradients)
+
+
+def summed_terms(parts: Sequence[Part], descents: Sequence[Descent]) -> dict[str, Tensor]:
+    """The loss's terms over all parts, each the mean of theirs."""
+    total: dict[str, Tensor] = {}
+    for part, descent in zip(parts, descents, strict=True):
+        for name, term in descent.terms.items():
+            total[name] = total.get(name, torch.zeros(())) + part.share * term
+    return total
+
+
+def total(gradients: Sequence[Tensor | None]) -> Tensor | None:
+    """The sum of gradients of one parameter, all sparse or all dense."""
+    given = [g for g in gradients if g is not None]
+    if len(given) < 2:
+        return given[0] if given else None
+    if not given[0].is_sparse:
+        return torch.stack(given).sum(0) if len(given) > 2 else given[0] + given[1]
+    first = given[0]
+    dims, shape = first.sparse_dim(), first.shape
+    channels = shape[dims:].numel()
+    indices, values = sum_rows(
+        [rows_of(g) for g in given],
+        [g._values().reshape(len(g._values()), channels) for g in given],
+        shape[:dims],
+    )
+    return torch.sparse_coo_tensor(
+        indices,
+        values.view(-1, *shape[dims:]),
+        shape,
+        is_coalesced=True,
+        check_invariants=False,  # ascending and inside by construction
+    )
