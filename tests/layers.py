@@ -56,7 +56,9 @@ HELPERS = {
         *("belief", "depth_sweep", "carving", "exposures", "hull", "light_frame", "masks"),
         *("matches", "observed_hull", "outlines", "registration", "surroundings"),
     },
-    "training": {"clock", "pixels", "divergence", "plateau", "progress", "surface_update"},
+    "training": {
+        *("clock", "pixels", "divergence", "plateau", "progress", "step", "surface_update"),
+    },
     "joint": {"albedo_entropy", "equations", "initialise", "metals", "newton", "observations"},
     "compression": {"prune", "quality", "search", "sizes", "storage"},
     "confidence": {"survey"},

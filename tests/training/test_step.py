@@ -82,6 +82,16 @@ def test_bits_do_not_depend_on_threads(scene, pixels):
         assert torch.equal(one, two)
 
 
+def test_what_is_held_keeps_no_gradient_of_before(scene, pixels):
+    parts = parts_of(pixels.trained, 64)
+    gradients(scene, pixels, parts, 1)
+    assert scene.material.net[0].weight.grad is not None
+    parameters = parameters_of(build_optimizer(scene, refit=True))
+    with team(1) as work, scene.surface_held():
+        descend_(scene, LossConfig(), pixels, parts, True, parameters, work)
+    assert scene.material.net[0].weight.grad is None
+
+
 def test_parts_share_out_the_rays(pixels):
     parts = parts_of(pixels.trained, 301)
     assert sum(len(p.pixels) for p in parts) == 301

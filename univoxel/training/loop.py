@@ -138,6 +138,8 @@ def descend_(
         return descent(terms, part.share, [*wanted, beside])
 
     descents = work(one, parts)
+    for parameter in parameters:  # of one that no longer is trained an old gradient may be there
+        parameter.grad = None
     for i, parameter in enumerate(wanted):
         gradients = [d.gradients[i] for d in descents]
         if parameter is features:
