@@ -28,6 +28,7 @@ from univoxel.tasks.envmap import recovered_map
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.export import export
 from univoxel.tasks.relight import relight_images
+from univoxel.tasks.report import report
 from univoxel.tasks.train import train as train_config
 from univoxel.training.progress import LOG, TrainingProgress
 
@@ -131,6 +132,19 @@ class Run:
             OSError: a file cannot be read or written.
         """
         return write_page(self.path, path, **options)
+
+    def report(self, path: str | Path | None = None, **options: Any) -> Path:
+        """Write one web page that says how good it is and what to photograph next; return the file.
+
+        Args:
+            path: .html file; report.html in the run's folder when left out.
+            options: fields of `univoxel.report.ReportOptions`.
+
+        Raises:
+            UserError: an option is out of range, or there is no surface.
+            OSError: a file cannot be read or written.
+        """
+        return report(self.path, path, **options)
 
     def light(self, height: int = MAP_ROWS) -> EnvMap:
         """The environment map that was recovered, `height` rows of it.

@@ -660,6 +660,37 @@ def envmap(
         print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
 
 
+def report(
+    run: Run,
+    /,
+    html: Annotated[
+        Path | None, arg(metavar="FILE.html", help_behavior_hint="(default: RUN/report.html)")
+    ] = None,
+    data: Annotated[
+        Path | None, arg(metavar="DATA", help_behavior_hint="(default: the data trained on)")
+    ] = None,
+    views: Annotated[int, arg(metavar="N")] = 4,
+    title: Annotated[
+        str | None, arg(metavar="TEXT", help_behavior_hint="(default: the folder's name)")
+    ] = None,
+) -> None:
+    """Say how good a run is, and what to photograph next, on one web page.
+
+    Photographs beside their render, doubt painted on the object, materials, light, the course of
+    training, and directions from which more photographs would help. It needs no truth.
+
+    Args:
+        run: folder of a trained run
+        html: the page to write, which needs no network
+        data: folder of the photographs, where they were moved
+        views: photographs beside their render, the worst first
+        title: what stands above it
+    """
+    from univoxel.tasks import report as task
+
+    print(task.report(run, html, data=data, views=views, title=title))
+
+
 def submit(
     run: Run,
     /,
@@ -904,6 +935,7 @@ COMMANDS: dict[str, Command] = {
     "relight": relight,
     "export": export,
     "view": view,
+    "report": report,
     "envmap": envmap,
     "inspect": inspect,
     "info": info,

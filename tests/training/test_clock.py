@@ -166,6 +166,27 @@ def test_a_stage_in_two_sittings_is_counted_whole(tmp_path, clock):
     assert later.clock.made == [1.0]
 
 
+def test_how_long_stages_took_over_two_sittings(tmp_path, clock):
+    """What is done between stages counts for the next; preparation, before the clock, for none."""
+    cfg, begin = config(tmp_path, 0.5, 0.5), clock.now
+    clock.now += 3.0  # preparation
+    progress = Progress(cfg, begin, START)
+    steps(progress, clock, 0.1)
+    clock.now += 2.0
+    for _ in progress.clock.steps():
+        if progress.clock.step == 15:
+            break
+        clock.now += 0.1
+    state = json.loads(json.dumps(progress.state()))
+    assert state["took"] == pytest.approx([1.0])
+    assert state["stage_took"] == pytest.approx(2.5)
+    clock.now += 100.0
+    later = Progress(cfg, clock.now - state["seconds"], state)
+    steps(later, clock, 0.2)
+    assert later.state()["took"] == pytest.approx([1.0, 3.5])
+    assert later.state()["stage_took"] == 0.0
+
+
 def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, caplog):
     caplog.set_level("INFO", "univoxel")
     with Progress(config(tmp_path, 1.0, iterations=1000), clock.now, START) as progress:

@@ -66,6 +66,7 @@ class Advice:
     front_name: str  # the photograph that says so
     weighed: Tensor  # [C, 3]
     worth: Tensor  # [C] in [0, 1], before any was taken
+    least: float  # worth from which on a direction is advised
     gap: Tensor  # [C] bool: no photograph is near
     chosen: Tensor  # [K, 3]
     gains: Tensor  # [K] worth of each, with those before it taken
@@ -127,6 +128,7 @@ def advise(
         front_name=names[front],
         weighed=weighed,
         worth=first,
+        least=cfg.least,
         gap=gap,
         chosen=weighed[chosen],
         gains=torch.tensor(gains),

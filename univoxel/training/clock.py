@@ -64,12 +64,14 @@ class Clock:
         self.step: int = state.get("step", 0)
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
         self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
+        self.took: list[float] = list(state.get("took", ()))  # seconds, by ended stage
         self.watch: Callable[[], None] | None = None  # called between steps; its time is no time
         self.reserved: float = 0.0  # seconds of this stage that are kept for blocks off the pace
         self._stopped: float | None = None  # when the clock was, see `stopped`
         self._stage_steps: int = state.get("stage_steps", 0)  # made in the present stage
         self._planned, self._count = 0, 0  # steps of the stage in this sitting
         self._stage_begin = self.seconds  # of the stage in this sitting
+        self._stage_before: float = state.get("stage_took", 0.0)  # seconds of it in earlier ones
         self._stage_end = 0.0  # when its time is over
         self._off_pace, self._last_block = 0.0, 0.0  # seconds, see `off_pace`
 
@@ -82,6 +84,8 @@ class Clock:
             "made": self.made,
             "early": self.early,
             "stage_steps": self._stage_steps,
+            "took": self.took,
+            "stage_took": self.stage_took,
             "seconds": self.seconds,
         }
 
@@ -90,6 +94,12 @@ class Clock:
         """Training time so far, over all sittings."""
         now = time.monotonic() if self._stopped is None else self._stopped
         return now - self.begin
+
+    @property
+    def stage_took(self) -> float:
+        """Seconds of the present stage so far, over all sittings, with what came before its steps:
+        the choice of sizes after the stage before."""
+        return self._stage_before + self.seconds - self._stage_begin
 
     @property
     def over(self) -> bool:
@@ -154,8 +164,9 @@ class Clock:
     def skip(self) -> None:
         """Leave the present stage as it is for the next."""
         self.made.append(self._stage_steps / self.cfg.stages[self.stage].iterations)
+        self.took.append(self.stage_took)
         self.stage, self.done, self._stage_steps = self.stage + 1, 0.0, 0
-        self._stage_begin = self.seconds
+        self._stage_begin, self._stage_before = self.seconds, 0.0
 
     def count_as_done(self, share: float) -> None:
         """Count a share of the coming stage's steps as made."""
