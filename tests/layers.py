@@ -65,7 +65,7 @@ HELPERS = {
     "segmentation": {"config", "distances", "vote"},
     "page": {"maps", "transfer"},
     "report": {"drawing", "light", "photographs", "sides", "training"},
-    "viewer": {"subject", "frames", "studio"},
+    "viewer": {"subject", "frames", "hosting", "studio"},
     "capture": {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
         *("prepare", "video"),

@@ -23,11 +23,11 @@ from univoxel.color import linear_to_srgb
 from univoxel.confidence.advice import azimuths
 from univoxel.errors import DataError, MissingFile, NoSurface, UserError
 from univoxel.lights import LocalSG, SGConfig
+from univoxel.pictures.charts import chart
 from univoxel.presets import preset
 from univoxel.render.pipeline import extract_mesh
 from univoxel.report import (
     ReportOptions,
-    drawing,
     light,
     photographs,
     report_text,
@@ -235,12 +235,12 @@ def test_curves_of_a_log(tmp_path):
     loss, quality = training.curves(tmp_path)
     assert loss.pieces == [[(1.0, 4.0), (2.0, 2.0)], [(3.0, 8.0), (4.0, 1.0)]]
     assert quality.pieces == [[(1.0, 20.0)], [(3.0, 22.0), (4.0, 23.0)]]
-    drawn = drawing.chart(loss, [2.5])
+    drawn = chart(loss, [2.5])
     assert drawn.count("<polyline") == 2
     assert drawn.count('class="stage"') == 1
     ys = [float(y) for y in re.findall(r",([\d.]+)[ \"]", re.search(r"<polyline.*", drawn)[0])]
     assert ys[0] < ys[1]  # less loss is drawn lower
-    assert len(re.findall(r'class="point"', drawing.chart(quality, []))) == 1
+    assert len(re.findall(r'class="point"', chart(quality, []))) == 1
     for broken in ("", "{", '{"seconds": 1}', "[1]"):
         (tmp_path / "log.jsonl").write_text(broken)
         assert training.curves(tmp_path) == []

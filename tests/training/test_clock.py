@@ -8,7 +8,7 @@ import pytest
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
 from univoxel.training import clock as clock_module
-from univoxel.training.clock import RESERVE_SECONDS, REST
+from univoxel.training.clock import HURRY, RESERVE_SECONDS, REST
 from univoxel.training.config import StageConfig
 from univoxel.training.progress import Progress
 
@@ -185,6 +185,53 @@ def test_how_long_stages_took_over_two_sittings(tmp_path, clock):
     steps(later, clock, 0.2)
     assert later.state()["took"] == pytest.approx([1.0, 3.5])
     assert later.state()["stage_took"] == 0.0
+
+
+def test_a_training_that_is_stopped_hurries_through_what_is_left(tmp_path, clock, caplog):
+    caplog.set_level("INFO", "univoxel")
+    cfg, begin = config(tmp_path, 0.2, 0.4, 0.4, iterations=1000, minutes=10.0), clock.now
+    with Progress(cfg, begin, START) as progress:
+        for _ in progress.clock.steps():
+            clock.now += 1.0
+            if progress.clock.step == 15:
+                progress.clock.finish()
+                progress.clock.finish()  # once more changes nothing
+        assert progress.clock.stage == 1
+        assert progress.clock.pace == pytest.approx(0.016)
+        left = 600 - RESERVE_SECONDS - 16
+        for k in (1, 2):
+            schedule = steps(progress, clock, 1.0)
+            assert schedule[-1] > 0.9  # the whole of it
+            over = clock.now - begin - 16
+            assert over == pytest.approx(k / 2 * HURRY * left, abs=2)
+    assert progress.clock.over
+    assert "this training was stopped early: of the planned steps it made 2% in stage 1" in (
+        caplog.text
+    )
+    assert "more minutes" not in caplog.text
+    assert progress.state()["finished"]
+    assert Progress(cfg, clock.now, progress.state()).clock.finished
+
+
+def test_stopped_in_the_last_stage_it_ends(tmp_path, clock):
+    progress = Progress(config(tmp_path, 0.5, 0.5, iterations=100, minutes=10.0), clock.now, START)
+    steps(progress, clock, 0.1)
+    for _ in progress.clock.steps():
+        clock.now += 0.1
+        progress.clock.finish()
+    assert (progress.clock.stage, progress.clock.made) == (2, [1.0, 0.01])
+    assert progress.clock.over
+
+
+def test_little_time_is_not_made_longer_by_a_stop(tmp_path, clock):
+    progress = Progress(config(tmp_path, 0.5, 0.5, iterations=1000, minutes=0.2), clock.now, START)
+    limit = progress.clock.limit
+    for _ in progress.clock.steps():
+        clock.now += 0.1
+        progress.clock.finish()
+    assert progress.clock.limit <= limit
+    steps(progress, clock, 0.1)
+    assert progress.clock.seconds <= 12 - RESERVE_SECONDS + 0.2
 
 
 def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, caplog):

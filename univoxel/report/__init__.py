@@ -31,6 +31,7 @@ from univoxel.confidence.survey import Survey, survey
 from univoxel.errors import UserError
 from univoxel.files import replacing
 from univoxel.page import START, facts_of
+from univoxel.pictures.charts import chart
 from univoxel.pictures.inline import inline
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh
@@ -268,7 +269,7 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
     """Curves, times of the stages, and what time cut."""
     parts = []
     ends = training.ends(state)
-    drawn = [drawing.chart(curve, ends) for curve in training.curves(run)]
+    drawn = [chart(curve, ends) for curve in training.curves(run)]
     if any(drawn):
         parts.append(f'<div class="charts">{"".join(drawn)}</div>')
         parts.append(paragraph(CHARTS))

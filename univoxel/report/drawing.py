@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,18 +15,6 @@ from univoxel.pictures.contact_sheet import heat
 RADIUS = 200.0  # of the drawn sphere
 ROOM = 34.0  # around it, for words
 RINGS = (-60, -30, 0, 30, 60)  # elevations, degrees
-WIDTH, HEIGHT = 560.0, 190.0  # of a chart
-LEFT, BOTTOM, TOP = 56.0, 24.0, 12.0  # of it, for numbers
-TICKS = 4  # numbers along an axis, about
-
-
-@dataclass(frozen=True)
-class Curve:
-    """A measure over time, in pieces: what lies between two of them is not joined."""
-
-    title: str
-    pieces: Sequence[Sequence[tuple[float, float]]]  # (seconds, value)
-    logarithmic: bool = False
 
 
 def sphere(advice: Advice) -> str:
@@ -81,62 +68,6 @@ def sphere(advice: Advice) -> str:
 def _away(elevation: float) -> float:
     """Distance from the middle that keeps areas: 0 at the zenith, 1 at the nadir."""
     return math.sqrt((1 - math.sin(math.radians(elevation))) / 2)
-
-
-def chart(curve: Curve, ends: Sequence[float]) -> str:
-    """A curve over the seconds of training, with lines where stages end."""
-    points = [point for piece in curve.pieces for point in piece]
-    if not points:
-        return ""
-    values = [_scaled(curve, y) for _, y in points]
-    low, high = min(values), max(values)
-    margin = 0.06 * (high - low) or 0.5
-    low, high = low - margin, high + margin
-    last = max([x for x, _ in points] + list(ends)) or 1.0
-
-    def place(x: float, y: float) -> str:
-        across = LEFT + (WIDTH - LEFT - 8) * x / last
-        down = TOP + (HEIGHT - TOP - BOTTOM) * (high - _scaled(curve, y)) / (high - low)
-        return f"{across:.1f},{down:.1f}"
-
-    parts = [f'<text x="{LEFT:.0f}" y="10" class="title">{html.escape(curve.title)}</text>']
-    floor = HEIGHT - BOTTOM
-    for value in _ticks(low, high):
-        shown = 10**value if curve.logarithmic else value
-        y = place(0.0, shown).split(",")[1]
-        parts.append(f'<path d="M{LEFT:.0f} {y}H{WIDTH - 8:.0f}" class="grid"/>')
-        parts.append(f'<text x="{LEFT - 6:.0f}" y="{y}" dy="4" class="end">{shown:.2g}</text>')
-    for end in ends:
-        x = place(end, points[0][1]).split(",")[0]
-        parts.append(f'<path d="M{x} {TOP}V{floor}" class="stage"/>')
-    for x in _ticks(0.0, last):
-        across = place(x, points[0][1]).split(",")[0]
-        parts.append(f'<text x="{across}" y="{HEIGHT - 8:.0f}">{x:g} s</text>')
-    for piece in curve.pieces:
-        if len(piece) == 1:
-            x, y = place(*piece[0]).split(",")
-            parts.append(f'<circle cx="{x}" cy="{y}" r="2.5" class="point"/>')
-        elif piece:
-            line = " ".join(place(x, y) for x, y in piece)
-            parts.append(f'<polyline points="{line}" class="curve"/>')
-    label = html.escape(curve.title)
-    box = f"0 0 {WIDTH:.0f} {HEIGHT:.0f}"
-    return (
-        f'<svg class="chart" viewBox="{box}" role="img" aria-label="{label}">{_join(parts)}</svg>'
-    )
-
-
-def _scaled(curve: Curve, value: float) -> float:
-    return math.log10(max(value, 1e-9)) if curve.logarithmic else value
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers within a range."""
-    raw = max(high - low, 1e-9) / TICKS
-    unit = 10 ** math.floor(math.log10(raw))
-    step = next(unit * k for k in (1, 2, 5, 10) if unit * k >= raw)
-    first = math.ceil(low / step)
-    return [step * k for k in range(first, math.floor(high / step) + 1)]
 
 
 def _join(parts: Sequence[str]) -> str:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from univoxel.bars import track
 from univoxel.camera import resize
@@ -15,6 +14,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.metrics import psnr
 from univoxel.pictures.contact_sheet import heat
+from univoxel.pictures.shrunk import shrunk
 from univoxel.render.pipeline import shade_hits, surface_of_view
 from univoxel.scene import Scene
 
@@ -86,13 +86,11 @@ def worst(scene: Scene, splits: list[Split], count: int, size: int) -> tuple[lis
 def compared(scene: Scene, split: Split, view: int, size: int) -> Compared:
     """One view, at most `size` pixels along its longer side."""
     photos = split.photos
-    color, alpha = photos.picture(view)
     longest = max(*photos.cameras.size(view))
     share = min(1.0, size / longest)
     cameras = resize(photos.cameras, max(1, round(share * photos.cameras.width)))
     width, height = cameras.size(view)
-    premultiplied = torch.cat([color * alpha[..., None], alpha[..., None]], -1).movedim(-1, 0)
-    small = interpolate(premultiplied[None], (height, width), mode="area")[0].movedim(0, -1)
+    small = shrunk(photos, view, width, height)
     surface, wo = surface_of_view(scene, cameras, view)
     rgb = shade_hits(scene, surface, wo, view if split.trained else None)
     opacity = surface.opacity.reshape(height, width)

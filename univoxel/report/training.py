@@ -12,7 +12,7 @@ from typing import Any
 from univoxel.config import TrainConfig, load_config
 from univoxel.errors import UserError
 from univoxel.joint.config import JointConfig
-from univoxel.report.drawing import Curve
+from univoxel.pictures.charts import Curve
 from univoxel.training.clock import ALL, Clock
 from univoxel.training.progress import LOG
 
@@ -78,7 +78,7 @@ def stages(cfg: TrainConfig, state: dict[str, Any]) -> list[StageFacts]:
         elif k in early:
             fate = "ended early: nothing was left to gain"
         elif share < ALL:
-            fate = "cut by the time limit"
+            fate = "stopped early" if state.get("finished") else "cut by the time limit"
         else:
             fate = "whole"
         seconds = took[k] if k < len(took) else None

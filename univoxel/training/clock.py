@@ -14,6 +14,8 @@ RESERVE_SECONDS = 4.0  # of the budget, kept for the last checkpoint and the pre
 PACE = 0.1  # weight of the newest step in the mean time of a step
 UNSURE = 4  # first steps of a stage, whose time is no measure for the others
 REST = 0.3  # of the steps that are left to a stage that is shortened: for its rates to fall
+HURRY = 0.1  # of its time that is left to a training that is stopped: for the stages to come
+HURRY_SECONDS = 8.0  # and at least so much, if it is left: for some light and materials
 ALL = 0.995  # share of the planned steps from which on a stage was not cut
 
 
@@ -59,6 +61,8 @@ class Clock:
         """
         self.cfg: TrainConfig = cfg
         self.begin: float = begin
+        self.limit: float = 60 * cfg.minutes  # seconds
+        self.finished: bool = state.get("finished", False)  # by hand, see `finish`
         self.stage: int = state.get("stage", 0)
         self.done: float = state.get("progress", 0.0)  # of the present stage, in [0, 1]
         self.step: int = state.get("step", 0)
@@ -86,6 +90,7 @@ class Clock:
             "stage_steps": self._stage_steps,
             "took": self.took,
             "stage_took": self.stage_took,
+            "finished": self.finished,
             "seconds": self.seconds,
         }
 
@@ -104,7 +109,7 @@ class Clock:
     @property
     def over(self) -> bool:
         """Whether the time is up."""
-        return self.seconds >= 60 * self.cfg.minutes - RESERVE_SECONDS
+        return self.seconds >= self.limit - RESERVE_SECONDS
 
     @property
     def pace(self) -> float:
@@ -117,7 +122,7 @@ class Clock:
         """Of the whole run, in [0, 1], by stages or by time, whichever is further along."""
         shares = [stage.share for stage in self.cfg.stages]
         by_stage = sum(shares[: self.stage]) + shares[self.stage] * self.done
-        return max(by_stage / sum(shares), min(self.seconds / (60 * self.cfg.minutes), 1.0))
+        return max(by_stage / sum(shares), min(self.seconds / self.limit, 1.0))
 
     def steps(self, off_pace: float = 0.0) -> Iterator[float]:
         """Progress through the present stage in [0, 1), once a step; then the next stage is on.
@@ -156,7 +161,7 @@ class Clock:
             (1 - self.done) * stage.share,
             *(s.share for s in self.cfg.stages[self.stage + 1 :]),
         ]
-        left = max(60 * self.cfg.minutes - RESERVE_SECONDS - self._stage_begin, 0.0)
+        left = max(self.limit - RESERVE_SECONDS - self._stage_begin, 0.0)
         allowed = left * shares[0] / sum(shares)
         self._planned, self._count = max(1, round((1 - self.done) * stage.iterations)), 0
         self._stage_end, self.reserved = self._stage_begin + allowed, off_pace * allowed
@@ -182,6 +187,17 @@ class Clock:
         """Leave the present stage, between steps, with what it has."""
         self.done = 1.0
         self.early.append(self.stage)
+
+    def finish(self) -> None:
+        """Leave the present stage after this step, and run through those to come in a fraction of
+        the time that is left: without them materials and light would lack."""
+        if self.finished:
+            return
+        left = max(self.limit - RESERVE_SECONDS - self.seconds, 0.0)
+        last = self.stage + 1 == len(self.cfg.stages)
+        hurried = 0.0 if last else min(left, max(HURRY * left, HURRY_SECONDS))
+        self.limit = self.seconds + hurried + RESERVE_SECONDS
+        self.done, self.finished = 1.0, True
 
     @contextmanager
     def off_pace(self) -> Iterator[None]:
@@ -211,13 +227,16 @@ class Clock:
             self.begin += spent
 
     def cut(self) -> str:
-        """A line about the stages that time ended before their steps; empty if none was."""
+        """A line about the stages that ended before their steps, by time or by hand; empty if none
+        did."""
         short = [
             (i + 1, made) for i, made in enumerate(self.made) if made < ALL and i not in self.early
         ]
         if not short:
             return ""
         stages = ", ".join(f"{made:.0%} in stage {i}" for i, made in short)
+        if self.finished:
+            return f"this training was stopped early: of the planned steps it made {stages}"
         return (
             f"time ended this training early: of the planned steps it made {stages}; "
             "more minutes give more quality"
