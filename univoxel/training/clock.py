@@ -14,7 +14,7 @@ RESERVE_SECONDS = 4.0  # of the budget, kept for the last checkpoint and the pre
 PACE = 0.1  # weight of the newest step in the mean time of a step
 UNSURE = 4  # first steps of a stage, whose time is no measure for the others
 REST = 0.3  # of the steps that are left to a stage that is shortened: for its rates to fall
-HURRY = 0.1  # of its time that is left to a training that is stopped: for the stages to come
+HURRY = 0.15  # of the time that is left to a training that is stopped, for the rest of its schedule
 HURRY_SECONDS = 8.0  # and at least so much, if it is left: for some light and materials
 ALL = 0.995  # share of the planned steps from which on a stage was not cut
 
@@ -78,6 +78,7 @@ class Clock:
         self._stage_before: float = state.get("stage_took", 0.0)  # seconds of it in earlier ones
         self._stage_end = 0.0  # when its time is over
         self._off_pace, self._last_block = 0.0, 0.0  # seconds, see `off_pace`
+        self._in_rounds = False  # whether the present stage has blocks off the pace
 
     def state(self) -> dict[str, Any]:
         """What a later sitting needs to go on; JSON."""
@@ -157,14 +158,16 @@ class Clock:
     def _plan(self, off_pace: float) -> None:
         """How many steps are left of the stage, and when its time is over."""
         stage = self.cfg.stages[self.stage]
-        shares = [
-            (1 - self.done) * stage.share,
-            *(s.share for s in self.cfg.stages[self.stage + 1 :]),
-        ]
-        left = max(self.limit - RESERVE_SECONDS - self._stage_begin, 0.0)
-        allowed = left * shares[0] / sum(shares)
+        allowed = self._allowed(max(self.limit - RESERVE_SECONDS - self._stage_begin, 0.0))
         self._planned, self._count = max(1, round((1 - self.done) * stage.iterations)), 0
         self._stage_end, self.reserved = self._stage_begin + allowed, off_pace * allowed
+        self._in_rounds = off_pace > 0
+
+    def _allowed(self, left: float) -> float:
+        """Of so many seconds, those for the rest of the present stage."""
+        stages = self.cfg.stages[self.stage :]
+        shares = [(1 - self.done) * stages[0].share, *(s.share for s in stages[1:])]
+        return left * shares[0] / max(sum(shares), 1e-9)
 
     def skip(self) -> None:
         """Leave the present stage as it is for the next."""
@@ -189,15 +192,16 @@ class Clock:
         self.early.append(self.stage)
 
     def finish(self) -> None:
-        """Leave the present stage after this step, and run through those to come in a fraction of
-        the time that is left: without them materials and light would lack."""
+        """Run through the rest of the schedule in a fraction of the time that is left: without the
+        stages to come materials and light would lack. A stage of rounds is left as it is."""
         if self.finished:
             return
         left = max(self.limit - RESERVE_SECONDS - self.seconds, 0.0)
-        last = self.stage + 1 == len(self.cfg.stages)
-        hurried = 0.0 if last else min(left, max(HURRY * left, HURRY_SECONDS))
-        self.limit = self.seconds + hurried + RESERVE_SECONDS
-        self.done, self.finished = 1.0, True
+        hurried = min(left, max(HURRY * left, HURRY_SECONDS))
+        self.limit, self.finished = self.seconds + hurried + RESERVE_SECONDS, True
+        if self._in_rounds:  # one may take longer than all that is left
+            self.done = 1.0
+        self._stage_end = self.seconds + self._allowed(hurried)
 
     @contextmanager
     def off_pace(self) -> Iterator[None]:
