@@ -173,6 +173,7 @@ def truth(folder: Path) -> None:
 
 STATE = {
     **{"stage": 1, "progress": 0.5, "step": 7, "made": [1.0], "early": [0], "seconds": 3.0},
+    **{"took": [2.0], "stage_took": 1.0, "finished": True},
     "chosen": [{"what": "rows", "before": 9, "after": 4, "cost": 0.1, "why": "few", "said": "so"}],
     "troubles": ["a step"],
 }

@@ -144,7 +144,9 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
         stages=stages,
     )
     assert capsys.readouterr().out == "run\n"
-    assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
+    assert calls.noted == [
+        ("train", (expected,), {"resume": False, "timelapse": None, "view": None})
+    ]
 
 
 def test_capture(calls, capsys):
@@ -279,10 +281,10 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
     assert main(["train", "photos", "--out", str(tmp_path)]) == 2
     assert "holds a run already: add --resume" in capsys.readouterr().err
     assert main(["train", "photos", "--out", str(tmp_path), "--resume"]) == 0
-    assert calls.noted[0][2] == {"resume": True, "timelapse": None}
+    assert calls.noted[0][2] == {"resume": True, "timelapse": None, "view": None}
     film = ["--timelapse", "frames/"]
     assert main(["train", "photos", "--out", str(tmp_path), "--resume", *film]) == 0
-    assert calls.noted[1][2] == {"resume": True, "timelapse": "frames/"}
+    assert calls.noted[1][2] == {"resume": True, "timelapse": "frames/", "view": None}
 
 
 def test_eval(calls, capsys):

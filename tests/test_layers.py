@@ -152,5 +152,5 @@ def test_functions_are_short():
 def test_tasks_are_commands():
     names = {path.stem for path in (ROOT / "univoxel" / "tasks").glob("*.py")} - {"__init__"}
     commands = {"poses", "cutout", "train", "eval", "relight", "export", "envmap", "inspect"}
-    commands |= {"capture", "info", "submit", "demo", "doctor", "view"}
+    commands |= {"capture", "info", "submit", "demo", "doctor", "view", "report"}
     assert names - {"evaluate"} | {"eval"} == commands <= set(COMMANDS)

@@ -15,7 +15,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # What is used of them all the same
 NAMES_ONLY = {
     "data/arrays.py": {"zipfile"},  # the errors of broken archives
-    "viewer/server.py": {"socket", "urllib"},  # is a port free; of what host is a page
+    "viewer/hosting.py": {"socket", "urllib"},  # is a port free; of what host is a page
 }
 FORBIDDEN = {
     *("pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"),

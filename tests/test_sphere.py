@@ -1,7 +1,8 @@
-"""Every map of directions: round trips, solid angles, poles."""
+"""Every map of directions: round trips, solid angles, poles; and sides in words."""
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -99,3 +100,31 @@ def test_texel_solid_angles():
     v = (torch.arange(600).double() + 0.5) / 600
     row = 2 * math.pi / 12 * (torch.sin(math.pi * v) * math.pi / 600).reshape(6, 100).sum(1)
     torch.testing.assert_close(area[:, 0].double(), row, rtol=1e-4, atol=0)
+
+
+def _directions(azimuths, height=40.0):
+    """Counter-clockwise from the first photograph's side, which is -Y."""
+    phi, up = np.radians(np.array(azimuths) - 90.0), np.radians(height)
+    return np.stack([np.cos(phi) * np.cos(up), np.sin(phi) * np.cos(up), 0 * phi + np.sin(up)], 1)
+
+
+def test_gaps_are_told_by_side_and_by_the_photographs_beside():
+    names = [f"{a}.jpg" for a in (0, 50, 150, 200, 250, 305)]
+    directions = _directions([0, 50, 150, 200, 250, 305])
+    # Who stands where the first photograph was taken and looks at the object has +X at the right
+    assert sphere.gaps(directions, names, 60.0) == [
+        "no photograph from the right, 100 degrees between 50.jpg and 150.jpg"
+    ]
+    names = [f"{a}.jpg" for a in (0, 50, 100, 150, 200)]
+    assert sphere.gaps(_directions([0, 50, 100, 150, 200]), names, 60.0) == [
+        "no photograph from the left, 160 degrees between 200.jpg and 0.jpg"
+    ]
+    all_around = list(range(0, 360, 30))
+    assert sphere.gaps(_directions(all_around), [""] * 12, 60.0) == []
+    assert sphere.gaps(_directions(all_around, 12.0), [""] * 12, 60.0) == [
+        "no photograph from above 12 degrees"
+    ]
+    turned = [(a + 70) % 360 for a in (0, 50, 100, 150, 200)]
+    assert sphere.gaps(_directions(turned), names, 60.0, front=-20.0)[0].startswith(
+        "no photograph from the left, 160 degrees"
+    )

@@ -28,6 +28,7 @@ from univoxel.tasks.envmap import recovered_map
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.export import export
 from univoxel.tasks.relight import relight_images
+from univoxel.tasks.report import report
 from univoxel.tasks.train import train as train_config
 from univoxel.training.progress import LOG, TrainingProgress
 
@@ -132,6 +133,19 @@ class Run:
         """
         return write_page(self.path, path, **options)
 
+    def report(self, path: str | Path | None = None, **options: Any) -> Path:
+        """Write one web page that says how good it is and what to photograph next; return the file.
+
+        Args:
+            path: .html file; report.html in the run's folder when left out.
+            options: fields of `univoxel.report.ReportOptions`.
+
+        Raises:
+            UserError: an option is out of range, or there is no surface.
+            OSError: a file cannot be read or written.
+        """
+        return report(self.path, path, **options)
+
     def light(self, height: int = MAP_ROWS) -> EnvMap:
         """The environment map that was recovered, `height` rows of it.
 
@@ -186,6 +200,7 @@ def train(
     resume: bool = False,
     timelapse: str | Path | None = None,
     on_progress: Callable[[TrainingProgress], None] | None = None,
+    view: tuple[str, int] | None = None,
 ) -> Path: ...
 
 
@@ -203,6 +218,7 @@ def train(
     on_progress: Callable[[TrainingProgress], None] | None = None,
     resume: bool = False,
     timelapse: str | Path | None = None,
+    view: tuple[str, int] | None = None,
 ) -> Run: ...
 
 
@@ -219,12 +235,13 @@ def train(
     on_progress: Callable[[TrainingProgress], None] | None = None,
     resume: bool = False,
     timelapse: str | Path | None = None,
+    view: tuple[str, int] | None = None,
 ) -> Run | Path:
     """Recover geometry, materials and light from posed photographs.
 
     Args:
         data: folder of the photographs and their cameras; or the whole configuration, which says
-            all but resume, timelapse and on_progress: then the folder of the run is returned.
+            all but resume, timelapse, on_progress and view: then the folder of the run is returned.
         out: folder that the run is written to.
         preset: how much work goes in: draft, fast or full; auto is what fits into minutes, or fast.
         light, varying: as of `univoxel.presets.budget`.
@@ -234,6 +251,7 @@ def train(
             the training: it is saved, and goes on with resume.
         resume: go on with the run in out from its last checkpoint.
         timelapse: .gif, .mp4 or folder for pictures of a view over training time.
+        view: host and port that browsers may look at the training at, such as ("127.0.0.1", 8080).
 
     Raises:
         UserError: an argument or the data cannot be used.
@@ -241,7 +259,7 @@ def train(
         Cancelled: on_progress raised it.
         OSError: a file of the run cannot be written; what was there before stays.
     """
-    watched = {"timelapse": timelapse, "on_progress": on_progress}
+    watched = {"timelapse": timelapse, "on_progress": on_progress, "view": view}
     if isinstance(data, TrainConfig):
         return train_config(data, resume=resume or out is True, **watched)
     if out is None or isinstance(out, bool):

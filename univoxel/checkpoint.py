@@ -146,6 +146,9 @@ class State:
     made: tuple[float, ...] = ()
     early: tuple[int, ...] = ()
     stage_steps: int = 0
+    took: tuple[float, ...] = ()
+    stage_took: float = 0.0
+    finished: bool = False
     within: Within | None = None  # None: at the begin of a stage, or in one without rounds
     seconds: float = 0.0
     chosen: tuple[Choice, ...] = ()

@@ -78,6 +78,13 @@ Seed: TypeAlias = Annotated[
 ConfigFile: TypeAlias = Annotated[
     Path | None, arg(metavar="FILE", help_behavior_hint="(default: what --preset says)")
 ]
+Megabytes: TypeAlias = Annotated[
+    float | None, arg(metavar="MB", help_behavior_hint="(default: no limit)")
+]
+Host: TypeAlias = Annotated[
+    str | None, arg(metavar="ADDRESS", help_behavior_hint="(default: 127.0.0.1)")
+]
+Port: TypeAlias = Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 8080)")]
 JsonFile: TypeAlias = Annotated[
     Path | None, arg(metavar="FILE|-", help_behavior_hint="(default: none)")
 ]
@@ -155,13 +162,17 @@ class Choices:
 
 
 def configuration_of(
-    file: Path, choices: Choices, minutes: float | None, data: Path, out: Path
+    file: Path | None, choices: Choices, minutes: float | None, data: Path, out: Path
 ) -> TrainConfig:
-    """The configuration in a file, for other photographs.
+    """The configuration in a file, for other photographs; without one, what the choices amount to.
 
     Raises:
-        UserError: the file cannot be read, or a choice was made that it makes itself.
+        UserError: the file cannot be read, or a choice was made that it makes itself; or minutes
+            are not above 0.
     """
+    check_minutes(minutes)
+    if file is None:
+        return choices.configuration(minutes, data, out)
     from univoxel.config import load_config
 
     for field in dataclasses.fields(choices):
@@ -220,6 +231,20 @@ def parse_ground(text: str | None) -> Ground:
         raise UserError(f"--ground: expected lowest or a height, got {text!r}") from None
 
 
+def view_at(view: bool, host: str | None, port: int | None) -> tuple[str, int] | None:
+    """Host and port that a training is looked at, if at all.
+
+    Raises:
+        UserError: one is given, and it is not.
+    """
+    if view:
+        return "127.0.0.1" if host is None else host, 8080 if port is None else port
+    if host is not None or port is not None:
+        option = f"--host {host}" if host is not None else f"--port {port}"
+        raise UserError(f"expected --view with {option}, got that alone")
+    return None
+
+
 def train(
     data: Annotated[Positional[Path], arg(metavar="DATA")],
     /,
@@ -234,12 +259,13 @@ def train(
     field: FieldName = "hash",
     minutes: Minutes = None,
     capacity: CapacityOrAuto = "auto",
-    budget_mb: Annotated[
-        float | None, arg(metavar="MB", help_behavior_hint="(default: no limit)")
-    ] = None,
+    budget_mb: Megabytes = None,
     allow_outside: bool = False,
     resume: bool = False,
     timelapse: TimelapseFile = None,
+    view: bool = False,
+    host: Host = None,
+    port: Port = None,
     seed: Seed = None,
     config: ConfigFile = None,
     set: Changes = (),
@@ -278,6 +304,9 @@ def train(
         allow_outside: read photographs outside of DATA too, where its files or links name such
         resume: go on with the run in --out; where nothing was saved yet, it begins
         timelapse: picture of a test view over training time, or a folder of its frames
+        view: look at the training in a browser while it goes, and end it early there
+        host: address that --view listens on, as of view
+        port: port that --view listens on, as of view
         seed: of all random choices
         config: config.json of another run, to train these photographs alike: it says all that
             --preset, --light and such would; --minutes, --seed, --downscale and --set go before it
@@ -288,18 +317,14 @@ def train(
     from univoxel.tasks import train as task
     from univoxel.tasks.view import with_page
 
-    check_minutes(minutes)
+    watched = {"timelapse": timelapse, "view": view_at(view, host, port)}
     if not resume and (out / "scene.safetensors").exists():
         raise ExistingFile(f"{out} holds a run already: add --resume, or choose another --out")
-    of_preset = Choices(preset, light, varying, light_frame, masks, cameras, field)
-    of_preset = dataclasses.replace(of_preset, capacity=capacity, budget_mb=budget_mb)
-    if config is None:
-        asked = of_preset.configuration(minutes, data, out)
-    else:
-        asked = configuration_of(config, of_preset, minutes, data, out)
+    chosen = preset, light, varying, light_frame, masks, cameras, field, capacity, budget_mb
+    asked = configuration_of(config, Choices(*chosen), minutes, data, out)
     given = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
     asked = dataclasses.replace(asked, **given, **({} if seed is None else {"seed": seed}))
-    print(with_page(task.train(changed(asked, set), resume=resume, timelapse=timelapse)))
+    print(with_page(task.train(changed(asked, set), resume=resume, **watched)))
 
 
 def cutout(
@@ -660,6 +685,37 @@ def envmap(
         print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
 
 
+def report(
+    run: Run,
+    /,
+    html: Annotated[
+        Path | None, arg(metavar="FILE.html", help_behavior_hint="(default: RUN/report.html)")
+    ] = None,
+    data: Annotated[
+        Path | None, arg(metavar="DATA", help_behavior_hint="(default: the data trained on)")
+    ] = None,
+    views: Annotated[int, arg(metavar="N")] = 4,
+    title: Annotated[
+        str | None, arg(metavar="TEXT", help_behavior_hint="(default: the folder's name)")
+    ] = None,
+) -> None:
+    """Say how good a run is, and what to photograph next, on one web page.
+
+    Photographs beside their render, doubt painted on the object, materials, light, the course of
+    training, and directions from which more photographs would help. It needs no truth.
+
+    Args:
+        run: folder of a trained run
+        html: the page to write, which needs no network
+        data: folder of the photographs, where they were moved
+        views: photographs beside their render, the worst first
+        title: what stands above it
+    """
+    from univoxel.tasks import report as task
+
+    print(task.report(run, html, data=data, views=views, title=title))
+
+
 def submit(
     run: Run,
     /,
@@ -904,6 +960,7 @@ COMMANDS: dict[str, Command] = {
     "relight": relight,
     "export": export,
     "view": view,
+    "report": report,
     "envmap": envmap,
     "inspect": inspect,
     "info": info,

@@ -1,13 +1,23 @@
-"""Directions: point sets on the sphere, frames around a normal, the lat-long mapping, harmonics."""
+"""Directions: point sets on the sphere, frames around a normal, the lat-long mapping, harmonics;
+and the sides of an object, in words."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+# Of an azimuth from the front, counter-clockwise seen from above: eighths of a turn. Left and right
+# are those of whoever stands in front.
+SIDES = (
+    *("front", "front right", "right", "back right"),
+    *("back", "back left", "left", "front left"),
+)
+HIGH = 30.0  # degrees: without a photograph from so far above, tops are not seen
 
 
 def fibonacci_hemisphere(count: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -158,3 +168,39 @@ def real_harmonics(order: int, direction: Tensor) -> Tensor:
         diagonal *= 2 * m + 1
         real, imaginary = x * real - y * imaginary, x * imaginary + y * real
     return torch.stack([found[k] for k in sorted(found)], -1)
+
+
+def side_of(azimuth: float) -> str:
+    """The name of a side, from its azimuth in degrees from the front, see SIDES."""
+    return SIDES[math.floor(azimuth / 45 + 0.5) % 8]
+
+
+def gaps(
+    directions: np.ndarray, names: Sequence[str], gap: float, front: float = -90.0
+) -> list[str]:
+    """Where photographs are missing around the object, for people.
+
+    Args:
+        directions: [V, 3] from the object to each camera, +Z up.
+        gap: degrees between neighbouring azimuths that are worth a word.
+        front: azimuth of the front, degrees from +X.
+    """
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    azimuth = (np.degrees(np.arctan2(unit[:, 1], unit[:, 0])) - front) % 360
+    height = np.degrees(np.arcsin(unit[:, 2].clip(-1, 1)))
+    told = []
+    order = np.argsort(azimuth)
+    steps = np.diff(azimuth[order], append=azimuth[order[0]] + 360)
+    for k in np.argsort(-steps).tolist():
+        if steps[k] < gap:
+            break
+        begin, end = int(order[k]), int(order[(k + 1) % len(order)])
+        low = azimuth[begin]
+        side = side_of(low + steps[k] / 2)
+        told.append(
+            f"no photograph from the {side}, {steps[k]:.0f} degrees between {names[begin]} and "
+            f"{names[end]}"
+        )
+    if height.max() < HIGH:
+        told.append(f"no photograph from above {height.max():.0f} degrees")
+    return told

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from univoxel.capture.checks import gaps, still, weak, why_not
+from univoxel.capture.checks import still, weak, why_not
 from univoxel.capture.config import CaptureConfig
 from univoxel.capture.grouping import group, in_words
 from univoxel.capture.model import (
@@ -150,30 +150,6 @@ def test_reasons_of_photographs_without_a_place():
     assert why_not(4, features, pairs, {}) == (
         "80 matches with its best partner, which do not fit the others"
     )
-
-
-def _directions(azimuths, height=40.0):
-    """Counter-clockwise from the first photograph's side, which is -Y."""
-    phi, up = np.radians(np.array(azimuths) - 90.0), np.radians(height)
-    return np.stack([np.cos(phi) * np.cos(up), np.sin(phi) * np.cos(up), 0 * phi + np.sin(up)], 1)
-
-
-def test_gaps_are_told_by_side_and_by_the_photographs_beside():
-    names = [f"{a}.jpg" for a in (0, 50, 150, 200, 250, 305)]
-    directions = _directions([0, 50, 150, 200, 250, 305])
-    # Who stands where the first photograph was taken and looks at the object has +X at the right
-    assert gaps(directions, names, CONFIG) == [
-        "no photograph from the right, 100 degrees between 50.jpg and 150.jpg"
-    ]
-    names = [f"{a}.jpg" for a in (0, 50, 100, 150, 200)]
-    assert gaps(_directions([0, 50, 100, 150, 200]), names, CONFIG) == [
-        "no photograph from the left, 160 degrees between 200.jpg and 0.jpg"
-    ]
-    all_around = list(range(0, 360, 30))
-    assert gaps(_directions(all_around), [""] * 12, CONFIG) == []
-    assert gaps(_directions(all_around, 12.0), [""] * 12, CONFIG) == [
-        "no photograph from above 12 degrees"
-    ]
 
 
 def model(seed=0, views=6) -> Model:

@@ -12,8 +12,9 @@ from univoxel.checkpoint import save_scene
 from univoxel.data.images import read_image, write_exr
 from univoxel.errors import DataError
 from univoxel.lights import EnvmapConfig, EnvmapSGConfig
+from univoxel.pictures.balls import GREY, grey_ball
 from univoxel.sphere import fibonacci_sphere
-from univoxel.tasks.envmap import GREY, brightest, compare, envmap, grey_ball
+from univoxel.tasks.envmap import brightest, compare, envmap
 
 LAMP = normalize(torch.tensor([1.0, -0.5, 0.7]), dim=0)
 

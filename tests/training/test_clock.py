@@ -8,7 +8,7 @@ import pytest
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
 from univoxel.training import clock as clock_module
-from univoxel.training.clock import RESERVE_SECONDS, REST
+from univoxel.training.clock import HURRY, RESERVE_SECONDS, REST
 from univoxel.training.config import StageConfig
 from univoxel.training.progress import Progress
 
@@ -164,6 +164,87 @@ def test_a_stage_in_two_sittings_is_counted_whole(tmp_path, clock):
     later = Progress(cfg, clock.now, progress.state())
     steps(later, clock, 0.01)
     assert later.clock.made == [1.0]
+
+
+def test_how_long_stages_took_over_two_sittings(tmp_path, clock):
+    """What is done between stages counts for the next; preparation, before the clock, for none."""
+    cfg, begin = config(tmp_path, 0.5, 0.5), clock.now
+    clock.now += 3.0  # preparation
+    progress = Progress(cfg, begin, START)
+    steps(progress, clock, 0.1)
+    clock.now += 2.0
+    for _ in progress.clock.steps():
+        if progress.clock.step == 15:
+            break
+        clock.now += 0.1
+    state = json.loads(json.dumps(progress.state()))
+    assert state["took"] == pytest.approx([1.0])
+    assert state["stage_took"] == pytest.approx(2.5)
+    clock.now += 100.0
+    later = Progress(cfg, clock.now - state["seconds"], state)
+    steps(later, clock, 0.2)
+    assert later.state()["took"] == pytest.approx([1.0, 3.5])
+    assert later.state()["stage_took"] == 0.0
+
+
+def test_a_training_that_is_stopped_hurries_through_what_is_left(tmp_path, clock, caplog):
+    caplog.set_level("INFO", "univoxel")
+    cfg, begin = config(tmp_path, 0.2, 0.4, 0.4, iterations=1000, minutes=10.0), clock.now
+    with Progress(cfg, begin, START) as progress:
+        schedule = []
+        for x in progress.clock.steps():
+            schedule.append(x)
+            clock.now += 1.0
+            if progress.clock.step == 15:
+                progress.clock.finish()
+                progress.clock.finish()  # once more changes nothing
+        assert schedule[14] < 0.2
+        assert schedule[-1] > 0.9  # the whole of it
+        assert progress.clock.stage == 1
+        assert progress.clock.pace < 0.04  # the next stage knows how little was made
+        left = HURRY * (600 - RESERVE_SECONDS - 16)
+        assert clock.now - begin - 16 == pytest.approx(0.17 * left, abs=3)
+        for k in (1, 2):
+            assert steps(progress, clock, 1.0)[-1] > 0.9
+            spent = clock.now - begin - 16
+            assert spent == pytest.approx((0.17 + 0.415 * k) * left, abs=3)
+    assert progress.clock.over
+    told = "this training was stopped early: of the planned steps it made 3% in stage 1"
+    assert told in caplog.text
+    assert "more minutes" not in caplog.text
+    assert progress.state()["finished"]
+    assert Progress(cfg, clock.now, progress.state()).clock.finished
+
+
+def test_stopped_in_the_last_stage_it_ends_soon(tmp_path, clock):
+    progress = Progress(config(tmp_path, 0.5, 0.5, iterations=1000, minutes=10.0), clock.now, START)
+    steps(progress, clock, 0.01)
+    begin = clock.now
+    for _ in progress.clock.steps():
+        clock.now += 1.0
+        progress.clock.finish()
+    assert progress.clock.stage == 2
+    assert clock.now - begin == pytest.approx(HURRY * (600 - RESERVE_SECONDS - 10), abs=2)
+    assert progress.clock.over
+
+
+def test_stopped_in_a_stage_of_rounds_it_leaves_that(tmp_path, clock):
+    progress = Progress(config(tmp_path, 0.5, 0.5, iterations=100, minutes=10.0), clock.now, START)
+    for _ in progress.clock.steps(0.3):
+        clock.now += 1.0
+        progress.clock.finish()
+    assert (progress.clock.stage, progress.clock.made) == (1, [0.01])
+
+
+def test_little_time_is_not_made_longer_by_a_stop(tmp_path, clock):
+    progress = Progress(config(tmp_path, 0.5, 0.5, iterations=1000, minutes=0.2), clock.now, START)
+    limit = progress.clock.limit
+    for _ in progress.clock.steps():
+        clock.now += 0.1
+        progress.clock.finish()
+    assert progress.clock.limit <= limit
+    steps(progress, clock, 0.1)
+    assert progress.clock.seconds <= 12 - RESERVE_SECONDS + 0.2
 
 
 def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, caplog):

@@ -22,12 +22,12 @@ from univoxel.render.relight import traced_mesh
 from univoxel.tasks.relight import lighting
 from univoxel.viewer import server as serving_module
 from univoxel.viewer.frames import Look
+from univoxel.viewer.hosting import same_site
 from univoxel.viewer.server import (
     camera_of,
     laid_over,
     light_of_bytes,
     pose_for_viser,
-    same_site,
     serving,
 )
 from univoxel.viewer.studio import Studio, Viewer

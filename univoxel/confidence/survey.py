@@ -57,9 +57,17 @@ class Survey:
     @property
     def albedo(self) -> Tensor:
         """Doubt of the albedo, in [0, 1]: 1 - seen * visibility * agreeing."""
-        seen = self.straight / (self.straight + self.cfg.enough_views)
-        agreeing = self.cfg.noise / (self.disagreement + self.cfg.noise)
-        return torch.where(self.views > 0, 1 - seen * self.visibility * agreeing, 1.0)
+        seen = self.seen_with(self.straight)
+        return torch.where(self.views > 0, 1 - seen * self.visibility * self.agreeing, 1.0)
+
+    def seen_with(self, straight: Tensor) -> Tensor:
+        """How well points are seen, [..., P] in [0, 1], with such sums of squared cosines."""
+        return straight / (straight + self.cfg.enough_views)
+
+    @property
+    def agreeing(self) -> Tensor:
+        """How well render and photographs agree, in (0, 1]."""
+        return self.cfg.noise / (self.disagreement + self.cfg.noise)
 
     @property
     def roughness(self) -> Tensor:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from univoxel.files import replacing
+from univoxel.pictures.inline import inline
 
 TILE = 240  # pixels of the longer side
 GAP, LABEL = 6, 34  # pixels
@@ -113,7 +112,7 @@ def write_page(path: Path, tiles: Sequence[MaskTile], about: str) -> None:
     figures = []
     for tile in tiles:
         words = html.escape(f"{tile.name}{_number(tile)} {tile.fault}")
-        images = [_image(picture) for picture in (tile.before, tile.after) if picture is not None]
+        images = [inline(picture) for picture in (tile.before, tile.after) if picture is not None]
         kind = ' class="wrong"' if tile.fault else ""
         mended = "" if tile.after is None else "; mended on the right"
         caption = f"<figcaption>{words}{mended}</figcaption>"
@@ -129,10 +128,3 @@ def _number(tile: MaskTile) -> str:
 
 def _bytes(picture: Tensor) -> np.ndarray:
     return (picture.numpy() * 255 + 0.5).astype(np.uint8)
-
-
-def _image(picture: Tensor) -> str:
-    encoded = io.BytesIO()
-    Image.fromarray(_bytes(picture)).save(encoded, format="JPEG", quality=85)
-    data = base64.b64encode(encoded.getbuffer()).decode()
-    return f'<img alt="" src="data:image/jpeg;base64,{data}">'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ FRAMES = 60  # in the whole time of a training
 FRAMES_PER_SECOND = 10
 SIZE = 256  # pixels along a picture, at most
 LABEL = 18  # pixels above the pictures
+LAYERS = ("render", "albedo", "normal")  # of a frame
 MAP_ROWS, SAMPLES, BOUNCES = 64, 16, 1  # of light from the map
 
 
@@ -76,7 +78,7 @@ class Timelapse:
         with torch.random.fork_rng(devices=[]):
             picture = frame(scene, self.cameras, *shown(clock))
         path = self.folder / f"step_{clock.step:06d}.png"
-        write_png(path, labelled(picture, f"{clock.seconds:.1f} s"))
+        write_png(path, labelled(picture, (f"{clock.seconds:.1f} s", *LAYERS[1:])))
 
     def finish(self, scene: Scene, clock: Clock) -> None:
         """Take the last frame, and make the file of all.
@@ -103,13 +105,16 @@ def shown(clock: Clock) -> tuple[bool, bool]:
 
 
 @torch.no_grad()
-def frame(scene: Scene, cameras: Cameras, lit: bool, by_map: bool) -> Tensor:
-    """Render, albedo and normal of the first view [H, 3 W, 3], sRGB on black.
+def frame(
+    scene: Scene, cameras: Cameras, lit: bool, by_map: bool, photograph: int | None = None
+) -> Tensor:
+    """LAYERS of the first of some cameras [H, 3 W, 3], sRGB on black.
 
     Args:
         lit: by the physically based render, not by the radiance head.
         by_map: light is the distant map, by tracing paths: while it is solved for, the local light
             does not follow the materials.
+        photograph: that was trained on, in whose light and exposure it is shown; None: the mean.
     """
     training = scene.training
     scene.eval()
@@ -122,9 +127,9 @@ def frame(scene: Scene, cameras: Cameras, lit: bool, by_map: bool) -> Tensor:
         sent = relight_surface(surface, wo, traced, lighting, samples=SAMPLES, bounces=BOUNCES)
         render = linear_to_srgb(sent * opacity)
     elif lit:
-        render = linear_to_srgb(shade_hits(scene, surface, wo))
+        render = linear_to_srgb(shade_hits(scene, surface, wo, photograph))
     else:
-        render = radiance_of(scene, surface, wo) * opacity
+        render = radiance_of(scene, surface, wo, photograph) * opacity
     scene.train(training)
     albedo = linear_to_srgb(surface.albedo * opacity)
     normal = (0.5 + 0.5 * surface.normal) * opacity
@@ -132,13 +137,13 @@ def frame(scene: Scene, cameras: Cameras, lit: bool, by_map: bool) -> Tensor:
     return torch.cat([tile.reshape(height, width, 3) for tile in (render, albedo, normal)], 1)
 
 
-def labelled(picture: Tensor, time: str) -> np.ndarray:
-    """[H + LABEL, W, 3] uint8: three tiles [H, W, 3] under their names and the time."""
+def labelled(picture: Tensor, names: Sequence[str]) -> np.ndarray:
+    """[H + LABEL, W, 3] uint8: tiles beside one another, a picture [H, W, 3], under their names."""
     height, width, _ = picture.shape
     pixels = (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
     image = Image.new("RGB", (width, height + LABEL), (32, 32, 32))
     image.paste(Image.fromarray(pixels), (0, LABEL))
     drawing, font = ImageDraw.Draw(image), ImageFont.load_default(12)
-    for k, text in enumerate((time, "albedo", "normal")):
-        drawing.text((4 + k * width // 3, 2), text, "white", font)
+    for k, text in enumerate(names):
+        drawing.text((4 + k * width // len(names), 2), text, "white", font)
     return np.asarray(image)

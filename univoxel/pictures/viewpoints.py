@@ -48,13 +48,19 @@ def frames_of(names: list[str], lights: Iterable[str], turn: int | None) -> list
     ]
 
 
-def orbit(mesh: Mesh, frames: int, size: int, elevation: float = ELEVATION) -> Cameras:
-    """Cameras on a circle around a mesh that see all of it, starting at +X, counter-clockwise."""
+def orbit(
+    mesh: Mesh, frames: int, size: int, elevation: float = ELEVATION, start: float = 0.0
+) -> Cameras:
+    """Cameras on a circle around a mesh that see all of it, counter-clockwise.
+
+    Args:
+        start: azimuth of the first, degrees from +X.
+    """
     low, high = mesh.vertices.amin(0), mesh.vertices.amax(0)
     middle = (low + high) / 2
     radius = MARGIN * (mesh.vertices - middle).norm(dim=1).max()
     half = math.radians(VIEW_ANGLE / 2)
-    phi = 2 * math.pi * torch.arange(frames) / frames
+    phi = math.radians(start) + 2 * math.pi * torch.arange(frames) / frames
     up = torch.full_like(phi, math.radians(elevation))
     back = torch.stack([up.cos() * phi.cos(), up.cos() * phi.sin(), up.sin()], -1)
     right = torch.stack([-phi.sin(), phi.cos(), torch.zeros_like(phi)], -1)

@@ -8,22 +8,19 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d
 
 from univoxel import metrics
 from univoxel.checkpoint import load_scene
 from univoxel.color import linear_to_srgb, luminance
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.maps import true_map
-from univoxel.envmap import EnvMap, lookup
 from univoxel.errors import UserError
 from univoxel.names import MAP_ROWS
+from univoxel.pictures.balls import grey_ball, map_and_balls, summed_light
 from univoxel.run import trained_on
 from univoxel.scene import Scene
-from univoxel.sphere import fibonacci_sphere, latlong_directions, texel_solid_angles
+from univoxel.sphere import fibonacci_sphere
 
-GREY = 0.5  # albedo of the ball
-TEXELS = 64  # rows of the map that light is summed over
 BLUR = math.radians(10.0)  # before the brightest direction is looked for: a light, not a texel
 NORMALS = 2048  # on the whole ball
 
@@ -78,7 +75,7 @@ def envmap(
         recovered = recovered * _scale(recovered, true)
         rows, result = [recovered, true], compare(recovered, true)
     exposure = 1 / luminance(rows[-1]).quantile(0.9).clamp_min(1e-6)
-    picture = [torch.cat(_tiles(row * exposure, height), 1) for row in rows]
+    picture = [torch.cat(map_and_balls(row * exposure, height), 1) for row in rows]
     write_png(out.with_suffix(".png"), linear_to_srgb(torch.cat(picture)))
     return result
 
@@ -113,27 +110,12 @@ def compare(recovered: Tensor, true: Tensor) -> Comparison:
     return Comparison(psnr, float(angle.rad2deg()))
 
 
-def grey_ball(map: Tensor, normal: Tensor) -> Tensor:
-    """Radiance [N, 3] of a Lambertian ball of albedo GREY at unit normals [N, 3]."""
-    direction, light = _light(map)
-    return GREY / math.pi * (normal @ direction.T).clamp_min(0) @ light
-
-
 def brightest(map: Tensor) -> Tensor:
     """Unit direction [3] of the brightest place after a Gaussian blur."""
-    direction, light = _light(map)
+    direction, light = summed_light(map)
     place = fibonacci_sphere(2 * NORMALS)
     near = ((place @ direction.T - 1) / BLUR**2).exp()
     return place[(near @ luminance(light)).argmax()]
-
-
-def _light(map: Tensor) -> tuple[Tensor, Tensor]:
-    """Directions [M, 3] and radiance times solid angle [M, 3] of a map, pooled to few texels."""
-    height, width, _ = map.shape
-    rows = min(height, TEXELS)
-    light = (map * texel_solid_angles(height, width)[..., None]).movedim(2, 0)
-    pooled = adaptive_avg_pool2d(light, (rows, 2 * rows)).flatten(1).T
-    return latlong_directions(rows).flatten(0, 1), pooled * (light[0].numel() / len(pooled))
 
 
 def _scale(recovered: Tensor, true: Tensor) -> Tensor:
@@ -141,16 +123,3 @@ def _scale(recovered: Tensor, true: Tensor) -> Tensor:
     normal = fibonacci_sphere(NORMALS)
     truth, ball = grey_ball(true, normal), grey_ball(recovered, normal)
     return metrics.albedo_scale(truth, ball, torch.ones(NORMALS, dtype=torch.bool))
-
-
-def _tiles(map: Tensor, height: int) -> list[Tensor]:
-    """A map, and a grey and a mirror ball under it; linear, `height` rows each."""
-    y, z = torch.meshgrid(*2 * [(2 * torch.arange(height) + 1) / height - 1], indexing="xy")
-    z = -z
-    inside = y * y + z * z < 1
-    normal = torch.stack([(1 - y * y - z * z).clamp_min(0).sqrt(), y, z], -1)
-    mirrored = 2 * normal[..., :1] * normal - torch.tensor([1.0, 0.0, 0.0])
-    light = EnvMap(map)
-    grey = grey_ball(map, normal.flatten(0, 1)).view(height, height, 3)
-    balls = [torch.where(inside[..., None], b, 0.0) for b in (grey, lookup(light, mirrored))]
-    return [lookup(light, latlong_directions(height)), *balls]

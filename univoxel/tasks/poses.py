@@ -37,6 +37,7 @@ from univoxel.capture.world import moved, settle
 from univoxel.errors import DataError, ExistingFile, StillBackground
 from univoxel.files import replacing
 from univoxel.names import KEEP_SIZE
+from univoxel.sphere import gaps
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -120,7 +121,7 @@ def poses(
             log.warning("the cameras do not say what is up: the world may be askew")
         names = [image.name for image in model.images]
         centres = np.stack([image.centre for image in model.images])
-        for gap in checks.gaps(centres, names, config):
+        for gap in gaps(centres, names, config.gap):
             log.info(gap)
         written = write_scene(out, capture, model, wanted, keep_size)
         _follow(progress, "writing", written, len(wanted))

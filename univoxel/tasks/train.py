@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -30,11 +30,15 @@ from univoxel.preparation.prepare import Silhouettes, find_silhouettes, prepare
 from univoxel.render.picture import preview
 from univoxel.run import kept_photos
 from univoxel.scene import Scene
+from univoxel.training.clock import Clock
 from univoxel.training.config import StageConfig
 from univoxel.training.loop import run_stage
 from univoxel.training.memory import check_memory
 from univoxel.training.pixels import TrainingPixels, split_pixels
 from univoxel.training.progress import LOG, Progress, TrainingProgress
+
+if TYPE_CHECKING:
+    from univoxel.viewer.training import Spectators
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -44,6 +48,7 @@ def train(
     resume: bool = False,
     timelapse: str | Path | None = None,
     on_progress: Callable[[TrainingProgress], None] | None = None,
+    view: tuple[str, int] | None = None,
 ) -> Path:
     """Train a scene; leave model, log, preview, configuration and trust.txt in cfg.out; return it.
 
@@ -53,18 +58,38 @@ def train(
             not count as time.
         on_progress: called every few seconds. Where it raises `Cancelled` the run is saved, and can
             be resumed.
+        view: host and port that browsers may look at the training at, while it goes; port 0: any
+            free one. A button there ends it early, with a result.
 
     Raises:
+        MissingExtra: view without viser.
         MissingNative: the compiled extension is missing or was built without Embree.
         DataError: input that cannot be used.
         ExistingFile: cfg.out holds a run already and resume is False.
         OSError: a file of the run cannot be written; what was there before stays.
         UserError: with resume, the checkpoint cannot be read, or it belongs to another
-            configuration; or training needs more memory than there is.
+            configuration; or training needs more memory than there is; or the port is taken.
     """
     if not native.reference_asked():
         native.require_embree("train")  # now, and not minutes later
     film = None if timelapse is None else Timelapse(timelapse, cfg)
+    if view is None:
+        return _train(cfg, resume, film, None, on_progress)
+    from univoxel.viewer.training import watched
+
+    with watched(*view, cfg.out.resolve().name) as spectators:
+        log.info(f"to look at while it trains, in a browser: {spectators.address}")
+        return _train(cfg, resume, film, spectators, on_progress)
+
+
+def _train(
+    cfg: TrainConfig,
+    resume: bool,
+    film: Timelapse | None,
+    spectators: Spectators | None,
+    on_progress: Callable[[TrainingProgress], None] | None,
+) -> Path:
+    """`train`, with those who look at it between steps."""
     torch.manual_seed(cfg.seed)
     kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
     photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
@@ -87,9 +112,11 @@ def train(
     save_config(cfg)
     keep_photos(photos, kept)
     begin -= state.get("seconds", 0.0)
-    with Progress(limited, begin, state, on_progress) as progress:
-        if film:
-            progress.clock.watch = lambda: film.take_frame(scene, progress.clock)
+    if spectators:
+        spectators.show(pixels.photos)
+    told = _told(spectators, on_progress)
+    with Progress(limited, begin, state, told) as progress:
+        progress.clock.watch = _between_steps(scene, progress.clock, film, spectators)
         try:
             for index in range(progress.clock.stage, len(cfg.stages)):
                 make_stage_(scene, limited, index, silhouettes.box, pixels, progress)
@@ -100,6 +127,37 @@ def train(
             film.finish(scene, progress.clock)
     save_trust(scene, pixels.photos, cfg, progress.troubles)
     return cfg.out
+
+
+def _told(
+    spectators: Spectators | None, on_progress: Callable[[TrainingProgress], None] | None
+) -> Callable[[TrainingProgress], None] | None:
+    """What takes the reports of a training."""
+    if spectators is None:
+        return on_progress
+
+    def told(now: TrainingProgress) -> None:
+        spectators.tell(now)
+        if on_progress is not None:
+            on_progress(now)
+
+    return told
+
+
+def _between_steps(
+    scene: Scene, clock: Clock, film: Timelapse | None, spectators: Spectators | None
+) -> Callable[[], None] | None:
+    """What is done between steps, off the clock."""
+    if film is None and spectators is None:
+        return None
+
+    def between() -> None:
+        if film:
+            film.take_frame(scene, clock)
+        if spectators:
+            spectators.look(scene, clock)
+
+    return between
 
 
 def start(

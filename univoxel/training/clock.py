@@ -14,6 +14,8 @@ RESERVE_SECONDS = 4.0  # of the budget, kept for the last checkpoint and the pre
 PACE = 0.1  # weight of the newest step in the mean time of a step
 UNSURE = 4  # first steps of a stage, whose time is no measure for the others
 REST = 0.3  # of the steps that are left to a stage that is shortened: for its rates to fall
+HURRY = 0.15  # of the time that is left to a training that is stopped, for the rest of its schedule
+HURRY_SECONDS = 8.0  # and at least so much, if it is left: for some light and materials
 ALL = 0.995  # share of the planned steps from which on a stage was not cut
 
 
@@ -59,19 +61,24 @@ class Clock:
         """
         self.cfg: TrainConfig = cfg
         self.begin: float = begin
+        self.limit: float = 60 * cfg.minutes  # seconds
+        self.finished: bool = state.get("finished", False)  # by hand, see `finish`
         self.stage: int = state.get("stage", 0)
         self.done: float = state.get("progress", 0.0)  # of the present stage, in [0, 1]
         self.step: int = state.get("step", 0)
         self.made: list[float] = list(state.get("made", ()))  # share of its steps, by ended stage
         self.early: list[int] = list(state.get("early", ()))  # numbers of shortened stages
+        self.took: list[float] = list(state.get("took", ()))  # seconds, by ended stage
         self.watch: Callable[[], None] | None = None  # called between steps; its time is no time
         self.reserved: float = 0.0  # seconds of this stage that are kept for blocks off the pace
         self._stopped: float | None = None  # when the clock was, see `stopped`
         self._stage_steps: int = state.get("stage_steps", 0)  # made in the present stage
         self._planned, self._count = 0, 0  # steps of the stage in this sitting
         self._stage_begin = self.seconds  # of the stage in this sitting
+        self._stage_before: float = state.get("stage_took", 0.0)  # seconds of it in earlier ones
         self._stage_end = 0.0  # when its time is over
         self._off_pace, self._last_block = 0.0, 0.0  # seconds, see `off_pace`
+        self._in_rounds = False  # whether the present stage has blocks off the pace
 
     def state(self) -> dict[str, Any]:
         """What a later sitting needs to go on; JSON."""
@@ -82,6 +89,9 @@ class Clock:
             "made": self.made,
             "early": self.early,
             "stage_steps": self._stage_steps,
+            "took": self.took,
+            "stage_took": self.stage_took,
+            "finished": self.finished,
             "seconds": self.seconds,
         }
 
@@ -92,9 +102,15 @@ class Clock:
         return now - self.begin
 
     @property
+    def stage_took(self) -> float:
+        """Seconds of the present stage so far, over all sittings, with what came before its steps:
+        the choice of sizes after the stage before."""
+        return self._stage_before + self.seconds - self._stage_begin
+
+    @property
     def over(self) -> bool:
         """Whether the time is up."""
-        return self.seconds >= 60 * self.cfg.minutes - RESERVE_SECONDS
+        return self.seconds >= self.limit - RESERVE_SECONDS
 
     @property
     def pace(self) -> float:
@@ -107,7 +123,7 @@ class Clock:
         """Of the whole run, in [0, 1], by stages or by time, whichever is further along."""
         shares = [stage.share for stage in self.cfg.stages]
         by_stage = sum(shares[: self.stage]) + shares[self.stage] * self.done
-        return max(by_stage / sum(shares), min(self.seconds / (60 * self.cfg.minutes), 1.0))
+        return max(by_stage / sum(shares), min(self.seconds / self.limit, 1.0))
 
     def steps(self, off_pace: float = 0.0) -> Iterator[float]:
         """Progress through the present stage in [0, 1), once a step; then the next stage is on.
@@ -142,20 +158,23 @@ class Clock:
     def _plan(self, off_pace: float) -> None:
         """How many steps are left of the stage, and when its time is over."""
         stage = self.cfg.stages[self.stage]
-        shares = [
-            (1 - self.done) * stage.share,
-            *(s.share for s in self.cfg.stages[self.stage + 1 :]),
-        ]
-        left = max(60 * self.cfg.minutes - RESERVE_SECONDS - self._stage_begin, 0.0)
-        allowed = left * shares[0] / sum(shares)
+        allowed = self._allowed(max(self.limit - RESERVE_SECONDS - self._stage_begin, 0.0))
         self._planned, self._count = max(1, round((1 - self.done) * stage.iterations)), 0
         self._stage_end, self.reserved = self._stage_begin + allowed, off_pace * allowed
+        self._in_rounds = off_pace > 0
+
+    def _allowed(self, left: float) -> float:
+        """Of so many seconds, those for the rest of the present stage."""
+        stages = self.cfg.stages[self.stage :]
+        shares = [(1 - self.done) * stages[0].share, *(s.share for s in stages[1:])]
+        return left * shares[0] / max(sum(shares), 1e-9)
 
     def skip(self) -> None:
         """Leave the present stage as it is for the next."""
         self.made.append(self._stage_steps / self.cfg.stages[self.stage].iterations)
+        self.took.append(self.stage_took)
         self.stage, self.done, self._stage_steps = self.stage + 1, 0.0, 0
-        self._stage_begin = self.seconds
+        self._stage_begin, self._stage_before = self.seconds, 0.0
 
     def count_as_done(self, share: float) -> None:
         """Count a share of the coming stage's steps as made."""
@@ -171,6 +190,18 @@ class Clock:
         """Leave the present stage, between steps, with what it has."""
         self.done = 1.0
         self.early.append(self.stage)
+
+    def finish(self) -> None:
+        """Run through the rest of the schedule in a fraction of the time that is left: without the
+        stages to come materials and light would lack. A stage of rounds is left as it is."""
+        if self.finished:
+            return
+        left = max(self.limit - RESERVE_SECONDS - self.seconds, 0.0)
+        hurried = min(left, max(HURRY * left, HURRY_SECONDS))
+        self.limit, self.finished = self.seconds + hurried + RESERVE_SECONDS, True
+        if self._in_rounds:  # one may take longer than all that is left
+            self.done = 1.0
+        self._stage_end = self.seconds + self._allowed(hurried)
 
     @contextmanager
     def off_pace(self) -> Iterator[None]:
@@ -200,13 +231,16 @@ class Clock:
             self.begin += spent
 
     def cut(self) -> str:
-        """A line about the stages that time ended before their steps; empty if none was."""
+        """A line about the stages that ended before their steps, by time or by hand; empty if none
+        did."""
         short = [
             (i + 1, made) for i, made in enumerate(self.made) if made < ALL and i not in self.early
         ]
         if not short:
             return ""
         stages = ", ".join(f"{made:.0%} in stage {i}" for i, made in short)
+        if self.finished:
+            return f"this training was stopped early: of the planned steps it made {stages}"
         return (
             f"time ended this training early: of the planned steps it made {stages}; "
             "more minutes give more quality"

@@ -9,14 +9,12 @@ import contextlib
 import io
 import logging
 import math
-import socket
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import torch
@@ -31,7 +29,7 @@ from univoxel.assets.topology import simplify
 from univoxel.camera import Cameras, image_rays, looked_at, project, resize
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
-from univoxel.errors import MissingExtra, UserError
+from univoxel.errors import UserError
 from univoxel.names import TEXTURE_SIZE
 from univoxel.ops import Sun
 from univoxel.page import FACES, JPEG_QUALITY, PageOptions, lights_of
@@ -39,12 +37,10 @@ from univoxel.page.maps import Light, light_of_file
 from univoxel.pictures.viewpoints import VIEW_ANGLE, orbit
 from univoxel.render.relight import Lighting, rotated
 from univoxel.viewer.frames import LAYERS, Look
+from univoxel.viewer.hosting import HOST, PORT, address_of, hosted
 from univoxel.viewer.studio import Studio, Viewer
 from univoxel.viewer.subject import Subject
 
-HOST = "127.0.0.1"
-PORT = 8080
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 DARK = "no map"  # the light that leaves the sun alone
 PLAIN = 0.16  # sRGB, behind a transparent picture
 JPEG = 90  # quality of pictures that are sent
@@ -66,24 +62,12 @@ def serving(
         MissingExtra: viser is not installed.
         UserError: the port is taken, or a map cannot be used.
     """
-    try:
-        import viser
-    except ImportError:
-        raise MissingExtra("the viewer needs viser: pip install 'univoxel[view]'") from None
     options = options or PageOptions()
-    _require_port(host, port)
-    lights = lights_of(subject.scene, options)
-    studio = Studio(subject)
-    with _silent():
-        server = viser.ViserServer(host=host, port=port, verbose=False)
-    try:
-        if port and server.get_port() != port:  # taken in between; viser goes on to the next
-            raise _taken(host, port)
-        _guard(server, host)
-        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        title = options.title or (subject.run.resolve().name if subject.run else "univoxel")
-        server.gui.set_panel_label(title)
+    title = options.title or (subject.run.resolve().name if subject.run else "univoxel")
+    with hosted(host, port, title) as server:
+        lights = lights_of(subject.scene, options)
         _start_camera(server, subject)
+        studio = Studio(subject)
         clients: dict[int, Viewer] = {}
 
         @server.on_client_connect
@@ -95,11 +79,10 @@ def serving(
             if viewer := clients.pop(client.client_id, None):
                 studio.leave(viewer)
 
-        yield f"http://{'localhost' if host in LOOPBACK else host}:{server.get_port()}"
-    finally:
-        studio.stop()
-        with _silent():
-            server.stop()
+        try:
+            yield address_of(server, host)
+        finally:
+            studio.stop()
 
 
 class Panel:
@@ -342,57 +325,3 @@ def _start_camera(server: Any, subject: Subject) -> None:
     server.initial_camera.position = pose[:, 3].numpy()
     server.initial_camera.look_at = ((low + high) / 2).numpy()
     server.initial_camera.fov = math.radians(VIEW_ANGLE)
-
-
-def _guard(server: Any, host: str) -> None:
-    """Answer pages of this server alone, and tell nobody outside of it."""
-
-    def refused(*args: Any, **options: Any) -> None:
-        log.warning("a page asked to share the viewer with the network: refused")
-
-    server.request_share_url = refused  # would open a tunnel to a host outside
-    inner = server._websock_server
-
-    @inner.on_client_connect
-    async def _(connection: Any) -> None:
-        websocket = inner._live_connections[connection.client_id]
-        headers = websocket.request.headers
-        if not same_site(headers.get("Origin"), headers.get("Host"), host):
-            log.warning("a page of %s asked for the viewer: refused", headers.get("Origin"))
-            await websocket.close(1008, "another site")
-
-
-def same_site(origin: str | None, asked: str | None, host: str) -> bool:
-    """Whether a page that a browser names as `origin` is our own, reached as `asked`.
-
-    A program that is no browser names none. On the loopback only its own names count: another
-    site's name may have been made to lead here.
-    """
-    if host in LOOPBACK and urlsplit(f"//{asked}").hostname not in LOOPBACK:
-        return False
-    return origin is None or urlsplit(origin).netloc == asked
-
-
-def _require_port(host: str, port: int) -> None:
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family[0], socket.SOCK_STREAM) as tried:
-            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            tried.bind(family[4])
-    except (OSError, OverflowError):
-        raise _taken(host, port) from None
-
-
-def _taken(host: str, port: int) -> UserError:
-    return UserError(
-        f"view: {host}:{port} is taken or cannot be listened on; give another port, or 0 for a "
-        "free one",
-        "port",
-    )
-
-
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """A block in which viser's own lines are dropped."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        yield

@@ -1,0 +1,88 @@
+"""Curves over the time of a training, as SVG in the text of a dark page."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+WIDTH, HEIGHT = 560.0, 190.0
+LEFT, BOTTOM, TOP = 56.0, 24.0, 12.0  # for numbers
+TICKS = 4  # numbers along an axis, about
+INK, GRID, STAGE, LINE = "#f1efec", "#ffffff14", "#ffffff50", "#ffb454"
+STYLE = (
+    'width="100%" font-family="system-ui, sans-serif" font-size="13" fill="#b4b0aa" '
+    'text-anchor="middle"'
+)
+NUMBER = 'text-anchor="end" font-size="11"'
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A measure over time, in pieces: what lies between two of them is not joined."""
+
+    title: str
+    pieces: Sequence[Sequence[tuple[float, float]]]  # (seconds, value)
+    logarithmic: bool = False
+
+
+def chart(curve: Curve, ends: Sequence[float]) -> str:
+    """A curve over the seconds of training, with lines where stages end."""
+    points = [point for piece in curve.pieces for point in piece]
+    if not points:
+        return ""
+    values = [_scaled(curve, y) for _, y in points]
+    low, high = min(values), max(values)
+    margin = 0.06 * (high - low) or 0.5
+    low, high = low - margin, high + margin
+    last = max([x for x, _ in points] + list(ends)) or 1.0
+
+    def place(x: float, y: float) -> str:
+        across = LEFT + (WIDTH - LEFT - 8) * x / last
+        down = TOP + (HEIGHT - TOP - BOTTOM) * (high - _scaled(curve, y)) / (high - low)
+        return f"{across:.1f},{down:.1f}"
+
+    title = html.escape(curve.title)
+    parts = [f'<text x="{LEFT:.0f}" y="10" text-anchor="start" fill="{INK}">{title}</text>']
+    floor = HEIGHT - BOTTOM
+    for value in _ticks(low, high):
+        shown = 10**value if curve.logarithmic else value
+        y = place(0.0, shown).split(",")[1]
+        parts.append(f'<path d="M{LEFT:.0f} {y}H{WIDTH - 8:.0f}" stroke="{GRID}"/>')
+        parts.append(f'<text x="{LEFT - 6:.0f}" y="{y}" dy="4" {NUMBER}>{shown:.2g}</text>')
+    for end in ends:
+        x = place(end, points[0][1]).split(",")[0]
+        parts.append(
+            f'<path d="M{x} {TOP}V{floor}" stroke="{STAGE}" stroke-dasharray="3 3" class="stage"/>'
+        )
+    for x in _ticks(0.0, last):
+        across = place(x, points[0][1]).split(",")[0]
+        parts.append(f'<text x="{across}" y="{HEIGHT - 8:.0f}">{x:g} s</text>')
+    for piece in curve.pieces:
+        if len(piece) == 1:
+            x, y = place(*piece[0]).split(",")
+            parts.append(f'<circle cx="{x}" cy="{y}" r="2.5" fill="{LINE}" class="point"/>')
+        elif piece:
+            line = " ".join(place(x, y) for x, y in piece)
+            parts.append(
+                f'<polyline points="{line}" fill="none" stroke="{LINE}" stroke-width="1.8"/>'
+            )
+    box = f"0 0 {WIDTH:.0f} {HEIGHT:.0f}"
+    return (
+        f'<svg class="chart" viewBox="{box}" role="img" aria-label="{title}" {STYLE}>'
+        f"{''.join(parts)}</svg>"
+    )
+
+
+def _scaled(curve: Curve, value: float) -> float:
+    return math.log10(max(value, 1e-9)) if curve.logarithmic else value
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Round numbers within a range."""
+    raw = max(high - low, 1e-9) / TICKS
+    unit = 10 ** math.floor(math.log10(raw))
+    step = next(unit * k for k in (1, 2, 5, 10) if unit * k >= raw)
+    first = math.ceil(low / step)
+    return [step * k for k in range(first, math.floor(high / step) + 1)]

@@ -1,0 +1,318 @@
+"""A run as a report: one page without scripts and without network, which says how good the run is,
+where it is in doubt, and what to photograph next. No truth is read."""
+
+from __future__ import annotations
+
+import html
+import string
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from univoxel import __version__
+from univoxel.checkpoint import load_checkpoint
+from univoxel.confidence.advice import (
+    ADVICE,
+    Advice,
+    AdviceConfig,
+    advise,
+    in_words,
+    missing,
+    place,
+)
+from univoxel.confidence.config import confidence_of
+from univoxel.confidence.doubts import Doubts
+from univoxel.confidence.report import numbers, words
+from univoxel.confidence.survey import Survey, survey
+from univoxel.errors import UserError
+from univoxel.files import replacing
+from univoxel.page import START, facts_of
+from univoxel.pictures.charts import chart
+from univoxel.pictures.inline import inline
+from univoxel.records import Mesh
+from univoxel.render.pipeline import extract_mesh
+from univoxel.report import drawing, light, photographs, sides, training
+from univoxel.run import photos_of
+from univoxel.scene import Scene
+
+FOLDER = Path(__file__).parent
+RING_GAP = 60.0  # degrees between neighbouring azimuths that are worth a word, as of `poses`
+CHARTS = (
+    "Stages minimise different sums, so the loss jumps between them. Held-out pixels are shown by "
+    "the radiance head first, and by light and materials once those are trained."
+)
+LAYERS = {
+    "render": "in the light of the photographs",
+    "albedo": "colour without light",
+    "roughness": "black mirrors, white is matte",
+    "metal": "white is metal",
+    "normal": "in the world's axes",
+}
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What a report shows.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+
+    title: str | None = None  # None: the run folder's name
+    data: str | Path | None = None  # photographs; None: those that the run names
+    views: int = 4  # photographs beside their render, the worst first; >= 0
+    size: int = 256  # pixels along the longer side of pictures, >= 16
+    advice: AdviceConfig = ADVICE  # how directions are chosen
+
+    def __post_init__(self) -> None:
+        for name, least in (("views", 0), ("size", 16)):
+            if getattr(self, name) < least:
+                value = getattr(self, name)
+                raise UserError(f"report: {name} must be at least {least}, got {value}", name)
+
+
+@dataclass(frozen=True)
+class Known:
+    """What photographs say of a scene."""
+
+    splits: list[photographs.Split]  # those trained on first, and test views, if there are any
+    surveyed: Survey
+    advice: Advice
+
+
+def write_report(run: str | Path, path: str | Path, **options: Any) -> Path:
+    """Write the report of a run as one page that opens by double click; return its path.
+
+    Args:
+        run: folder of the trained run.
+        path: .html file, written whole or not at all.
+        options: fields of `ReportOptions`.
+
+    Raises:
+        UserError: the run cannot be used, there is no surface, or an option is out of range; or
+            `data` is given and cannot be used.
+        OSError: a file cannot be read or written.
+    """
+    run, path = Path(run), Path(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise UserError(f"html: expected a file that ends in .html, got {path}", "html")
+    asked = ReportOptions(**options)
+    scene, state = load_checkpoint(run)
+    text = report_text(run, scene, state, asked)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path
+
+
+@torch.no_grad()
+def report_text(
+    run: Path,
+    scene: Scene,
+    state: dict[str, Any],
+    options: ReportOptions = ReportOptions(),
+) -> str:
+    """The report of a scene as HTML; errors as of `write_report`.
+
+    Args:
+        run: the scene's folder; what is missing of log, configuration and photographs is left out,
+            and the page says so.
+        state: of its training, as its checkpoint has it.
+    """
+    mesh = extract_mesh(scene)
+    known, why = None, ""
+    try:
+        known = what_is_known(run, scene, options)
+    except (UserError, OSError) as error:  # moved, or not on this machine
+        if options.data is not None:
+            raise
+        why = f"The photographs cannot be read, so this is left out: {error}."
+    title = options.title or run.resolve().name or "univoxel"
+    front = START[0] if known is None else known.advice.front
+    doubts = None if known is None else Doubts(known.surveyed)
+    pictures = sides.layers(scene, mesh, options.size, front, doubts)
+    sections = [
+        ("What to photograph next", next_section(known.advice) if known else paragraph(why)),
+        ("Doubt", doubt_section(known, state, pictures.pop("doubt", [])) if known else ""),
+        ("Photographs and render", views_section(scene, known, options) if known else ""),
+        ("Materials", materials_section(pictures)),
+        ("Light", light_section(scene, mesh)),
+        ("Training", training_section(run, state)),
+    ]
+    return string.Template(_source("report.html")).substitute(
+        title=html.escape(title),
+        facts=html.escape(" · ".join(facts_of(run, state.get("seconds")))),
+        generator=f"univoxel {__version__}",
+        style=_source("report.css"),
+        sections="\n".join(
+            f"<section><h2>{name}</h2>\n{text}\n</section>" for name, text in sections if text
+        ),
+    )
+
+
+def what_is_known(run: Path, scene: Scene, options: ReportOptions) -> Known:
+    """Survey the surface by the photographs of a run, and weigh directions for more.
+
+    Raises:
+        UserError: they cannot be used; OSError: they cannot be read.
+    """
+    data = None if options.data is None else Path(options.data)
+    photos, cfg = photos_of(run, data, "train"), confidence_of(run)
+    surveyed = survey(scene, photos, cfg.points, cfg)
+    photos = scene.registered(photos)
+    occluder = scene.occluder()
+    advice = advise(surveyed, photos.cameras, photos.names, occluder, options.advice)
+    splits = [photographs.Split(photos, True)]
+    try:
+        splits.append(photographs.Split(photos_of(run, data, "test"), False))
+    except (UserError, OSError):  # few have any
+        pass
+    return Known(splits, surveyed, advice)
+
+
+def next_section(advice: Advice) -> str:
+    """Directions for more photographs, in words, as a list and on the sphere."""
+    parts = []
+    told = in_words(advice)
+    if told:
+        text = "".join(f"<li>{html.escape(line)}" for line in told)
+        parts.append(f'<ul class="advice">{text}</ul>')
+        rows = "".join(
+            f"<tr><td>{k + 1}<td>{_direction(advice, k)}<td>{html.escape(near)}<td>{gain:.1%}"
+            for k, (near, gain) in enumerate(
+                zip(advice.nearest, advice.gains.tolist(), strict=True)
+            )
+        )
+        head = "<tr><th><th>from<th>nearest so far<th>worth"
+        parts.append(f"<table>{head}{rows}</table>")
+    else:
+        parts.append(
+            paragraph("Nothing stands out: photographs are all around what can be seen from there.")
+        )
+    told = [f"{line[0].upper()}{line[1:]}." for line in missing(advice, RING_GAP)]
+    if advice.hidden >= 0.01:
+        told.append(
+            f"{advice.hidden:.0%} of the surface is seen by no photograph, nor from any of these "
+            "directions: turn the object over for a second run, or leave it as it is."
+        )
+    told.append(
+        f"The front is where {advice.front_name} was taken. Left and right are those of whoever "
+        "stands there. Keep the distance of the other photographs, and their light."
+    )
+    parts += [paragraph(line) for line in told]
+    legend = (
+        "The directions around the object, seen from above. White: photographs. Bright: what one "
+        "more would add. Ringed: a gap, no photograph is near. Numbers: what to take, the best "
+        "first. Worth: share of the surface that it would fix, at most."
+    )
+    left = "\n".join(parts)
+    figure = f"<figure>{drawing.sphere(advice)}<figcaption>{legend}</figcaption></figure>"
+    return f'<div class="beside"><div>{left}</div>{figure}</div>'
+
+
+def doubt_section(known: Known, state: dict[str, Any], pictures: Sequence[Tensor]) -> str:
+    """What photographs leave open, in words and painted on the object."""
+    surveyed = known.surveyed
+    text = words(numbers(surveyed), list(state.get("troubles", [])), surveyed.cfg)
+    legend = "Doubt of the albedo: black is well determined, white is a guess."
+    return paragraph(text) + gallery(zip(sides.SIDES, pictures, strict=True), legend)
+
+
+def views_section(scene: Scene, known: Known, options: ReportOptions) -> str:
+    """Photographs beside what the scene shows from there, the worst first."""
+    found, count = photographs.worst(scene, known.splits, options.views, options.size)
+    if not found:
+        return ""
+    rows = "".join(
+        f'<figure class="row">{"".join(inline(tile, words) for tile in tiles)}'
+        f"<figcaption>{html.escape(words)}</figcaption></figure>"
+        for words, tiles in photographs.rows(found)
+    )
+    said = (
+        f"The {len(found)} that differ most, of {count} compared: photograph, render, and their "
+        f"difference, drawn brightest at {photographs.LIMIT} in sRGB. Numbers are over the object."
+    )
+    return paragraph(said) + f'<div class="views">{rows}</div>'
+
+
+def materials_section(pictures: dict[str, list[Tensor]]) -> str:
+    """The layers from four sides."""
+    parts = [
+        gallery(zip(sides.SIDES, row, strict=True), f"{name.capitalize()}: {LAYERS[name]}.")
+        for name, row in pictures.items()
+    ]
+    if "metal" not in pictures:
+        parts.append(paragraph("Nothing is metal."))
+    return "\n".join(parts)
+
+
+def light_section(scene: Scene, mesh: Mesh) -> str:
+    """The recovered light as a map, and a grey and a mirror ball under it."""
+    found = light.found_light(scene, mesh)
+    if found is None:
+        kind = scene.cfg.light.kind
+        return paragraph(f"No light was recovered: it was trained with {kind} light.")
+    names = ("map", "grey ball", "mirror ball")
+    tiles = zip(names, light.pictures_of(found), strict=True)
+    legend = (
+        "Balls are seen from +X, with +Z up. Light and albedo share a scale for each channel, "
+        "which photographs do not fix."
+    )
+    return paragraph(found.about) + gallery(tiles, legend, "light")
+
+
+def training_section(run: Path, state: dict[str, Any]) -> str:
+    """Curves, times of the stages, and what time cut."""
+    parts = []
+    ends = training.ends(state)
+    drawn = [chart(curve, ends) for curve in training.curves(run)]
+    if any(drawn):
+        parts.append(f'<div class="charts">{"".join(drawn)}</div>')
+        parts.append(paragraph(CHARTS))
+    else:
+        parts.append(paragraph("There is no log of this training to draw."))
+    cfg = training.configuration(run)
+    if cfg is None:
+        return "\n".join([*parts, paragraph("config.json cannot be read: stages are not told.")])
+    rows = []
+    if (before := training.prepared(state)) is not None:
+        rows.append(f"<tr><td>preparation<td><td><td>{before:.1f} s<td>")
+    for k, fact in enumerate(training.stages(cfg, state)):
+        made = "" if fact.made is None else f"{fact.made:.0%}"
+        took = "" if fact.seconds is None else f"{fact.seconds:.1f} s"
+        rows.append(
+            f"<tr><td>{k + 1}: {fact.name}<td>{fact.planned:,}<td>{made}<td>{took}<td>{fact.fate}"
+        )
+    head = "<tr><th>stage<th>planned steps<th>made<th>time<th>"
+    parts.append(f"<table>{head}{''.join(rows)}</table>")
+    limit = f"The limit was {60 * cfg.minutes:,.0f} s."
+    told = [limit, *training.remarks(cfg, state)]
+    return "\n".join([*parts, *(paragraph(line) for line in told)])
+
+
+def gallery(named: Any, legend: str, kind: str = "") -> str:
+    """Pictures in a row under their names."""
+    figures = "".join(
+        f"<figure>{inline(picture, name)}<figcaption>{name}</figcaption></figure>"
+        for name, picture in named
+    )
+    return f'<p class="legend">{html.escape(legend)}</p><div class="gallery {kind}">{figures}</div>'
+
+
+def paragraph(text: str) -> str:
+    return f"<p>{html.escape(text)}</p>" if text else ""
+
+
+def _direction(advice: Advice, k: int) -> str:
+    """An advised direction as side and elevation."""
+    direction = advice.chosen[k]
+    up = float(torch.rad2deg(direction[2].clamp(-1, 1).asin()))
+    return f"{place(advice, direction)}, {abs(up):.0f}° {'above' if up >= 0 else 'below'}"
+
+
+def _source(name: str) -> str:
+    return (FOLDER / name).read_text(encoding="utf-8")

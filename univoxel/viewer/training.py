@@ -1,0 +1,191 @@
+"""A training in browsers, as it goes: photograph beside render, curves, and a button that ends it.
+
+It lives in the training's own thread, between steps: what browsers do never waits for it, and what
+it costs is bounded. All who look see the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import html
+import logging
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from univoxel.camera import resize
+from univoxel.color import linear_to_srgb
+from univoxel.data import Photos
+from univoxel.errors import UserError
+from univoxel.pictures.charts import Curve, chart
+from univoxel.pictures.shrunk import shrunk
+from univoxel.pictures.timelapse import LAYERS, frame, labelled, shown
+from univoxel.scene import Scene
+from univoxel.training.clock import Clock
+from univoxel.training.progress import TrainingProgress
+from univoxel.viewer.hosting import address_of, hosted
+
+SIZE = 192  # pixels along a picture, at most
+EVERY = 3.0  # seconds between pictures, at least
+SHARE = 0.05  # of the time that pictures may take; the longer one takes, the rarer they are
+ENDING = "Ending early: what is left is hurried through."
+BEHIND = 32  # of 255, around the pictures
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+
+@contextlib.contextmanager
+def watched(host: str, port: int, title: str) -> Iterator[Spectators]:
+    """A block in which browsers may look at a training.
+
+    Raises:
+        MissingExtra: viser is not installed.
+        UserError: the port is taken.
+    """
+    with hosted(host, port, f"{title}, in training") as server:
+        if panel := getattr(
+            server.gui, "main_panel", None
+        ):  # of viser since 1.1: beside the picture
+            panel.dock_right()
+        yield Spectators(server, address_of(server, host))
+
+
+class Spectators:
+    """Who looks at a training. Nothing that goes wrong here reaches it."""
+
+    def __init__(self, server: Any, address: str) -> None:
+        """
+        Args:
+            server: of viser's.
+            address: that browsers find it at.
+        """
+        self.address: str = address
+        self._server = server
+        self._photos: Photos | None = None
+        self._next = 0.0  # when a picture is due
+        self._asked = threading.Event()  # to end the training
+        self._failed = False
+        self._stage: int | None = None
+        self._losses: list[list[tuple[float, float]]] = []
+        self._qualities: list[list[tuple[float, float]]] = []
+        self._ends: list[float] = []
+        gui = server.gui
+        self._status = gui.add_markdown("Reading photographs, and preparing.")
+        self._share = gui.add_progress_bar(0.0)
+        self._choice = gui.add_dropdown("photograph", ("",), initial_value="")
+        self._curves = gui.add_html("")
+        button = gui.add_button("end training, keep the result", color="red")
+        self._choice.on_update(lambda event: self._hasten())
+        button.on_click(lambda event: self.stop())
+
+    def show(self, photos: Photos) -> None:
+        """Offer the photographs that are trained on."""
+        self._photos = photos
+        with self._guarded():
+            self._choice.options = tuple(photos.names)
+            self._choice.value = photos.names[0]
+
+    def stop(self) -> None:
+        """Ask for the end of training: it comes after the present step."""
+        self._asked.set()
+        with self._guarded():
+            self._status.content = ENDING
+
+    def look(self, scene: Scene, clock: Clock) -> None:
+        """Between steps: end the stage where that was asked for; show a picture where one is due
+        and somebody looks. The scene and the random numbers stay as they are."""
+        if self._asked.is_set() and not clock.finished:
+            clock.finish()
+            log.info("training is ended early: what is left is hurried through")
+        if self._failed or time.monotonic() < self._next:
+            return
+        begin = time.monotonic()
+        with self._guarded():
+            clients = self._clients()
+            if clients and self._photos is not None:
+                self._send(clients, self._picture(scene, clock, self._photos))
+        end = time.monotonic()
+        self._next = end + max(EVERY, (end - begin) / SHARE)
+
+    def tell(self, now: TrainingProgress) -> None:
+        """Take in a report of the training: its curves, stage and time."""
+        with self._guarded():
+            if now.stage != self._stage:
+                self._stage = now.stage
+                self._losses.append([])
+                self._qualities.append([])
+                if len(self._losses) > 1:
+                    self._ends.append(now.seconds)
+            if now.losses:
+                self._losses[-1].append((now.seconds, sum(now.losses.values())))
+            if now.held_out_psnr is not None:
+                self._qualities[-1].append((now.seconds, now.held_out_psnr))
+            curves = (
+                Curve("loss", self._losses, logarithmic=True),
+                Curve("held-out pixels, PSNR in dB", self._qualities),
+            )
+            self._curves.content = "".join(chart(curve, self._ends) for curve in curves)
+            self._share.value = 100 * now.share
+            self._status.content = words(now, self._asked.is_set())
+
+    def _picture(self, scene: Scene, clock: Clock, photos: Photos) -> np.ndarray:
+        """The chosen photograph and LAYERS from there, side by side: [H, W, 3] uint8."""
+        view = photos.names.index(self._choice.value)
+        with torch.random.fork_rng(devices=[]), torch.no_grad():
+            cameras = scene.registered(photos).cameras.of(torch.tensor([view]))
+            longest = max(*cameras.size(0))
+            width = max(1, round(cameras.width * min(1.0, SIZE / longest)))
+            cameras = resize(cameras, width)
+            layers = frame(scene, cameras, *shown(clock), view)
+        photograph = linear_to_srgb(shrunk(photos, view, *cameras.size(0))[..., :3])
+        return labelled(torch.cat([photograph, layers], 1), ("photograph", *LAYERS))
+
+    def _send(self, clients: Mapping[int, Any], picture: np.ndarray) -> None:
+        """Show a picture to all; who cannot be reached is left out."""
+        for client in clients.values():
+            try:
+                client.scene.set_background_image(fitted(picture, client.camera.aspect))
+            except Exception as error:  # gone in between, or broken: its own affair
+                log.debug("a browser was not reached: %s", error)
+
+    def _clients(self) -> Mapping[int, Any]:
+        return self._server.get_clients()
+
+    def _hasten(self) -> None:
+        """Let the next picture come soon, since another is chosen; not sooner than SHARE allows."""
+        self._next = min(self._next, time.monotonic() + 0.5)
+
+    @contextlib.contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """A block whose faults end what is shown, and not the training."""
+        try:
+            yield
+        except UserError as error:  # such as no surface yet
+            log.debug("no picture of the training: %s", error)
+        except Exception:
+            self._failed = True
+            log.exception("the view of the training failed and shows no more; training goes on")
+
+
+def words(now: TrainingProgress, asked: bool) -> str:
+    """How far a training is, as Markdown."""
+    left = f"about {now.remaining / 60:.0f}:{now.remaining % 60:02.0f} left"
+    quality = "" if now.held_out_psnr is None else f", held-out pixels {now.held_out_psnr:.1f} dB"
+    text = f"Stage {now.stage} of {now.stages}, {now.share:.0%}, {left}{quality}."
+    return html.escape(text) + (f" {ENDING}" if asked else "")
+
+
+def fitted(picture: np.ndarray, aspect: float) -> np.ndarray:
+    """A picture [H, W, 3] uint8 in the middle of a window of another aspect, width over height."""
+    height, width = picture.shape[:2]
+    if not 0.05 < aspect < 20:  # no window yet
+        return picture
+    high, wide = max(height, round(width / aspect)), max(width, round(height * aspect))
+    whole = np.full((high, wide, 3), BEHIND, np.uint8)
+    top, left = (high - height) // 2, (wide - width) // 2
+    whole[top : top + height, left : left + width] = picture
+    return whole
