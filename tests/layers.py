@@ -64,7 +64,7 @@ HELPERS = {
     "evaluation": {"measures", "truth"},
     "segmentation": {"config", "distances", "vote"},
     "page": {"maps", "transfer"},
-    "viewer": {"subject", "frames", "film", "incident", "studio"},
+    "viewer": {"subject", "denoise", "frames", "film", "incident", "studio"},
     "capture": {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
         *("prepare", "video"),

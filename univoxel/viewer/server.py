@@ -38,6 +38,7 @@ from univoxel.page import FACES, JPEG_QUALITY, PageOptions, lights_of
 from univoxel.page.maps import Light, light_of_file
 from univoxel.pictures.viewpoints import VIEW_ANGLE, orbit
 from univoxel.render.relight import Lighting, rotated
+from univoxel.viewer import denoise
 from univoxel.viewer.film import film, kind
 from univoxel.viewer.frames import LAYERS, Look
 from univoxel.viewer.incident import (
@@ -142,7 +143,10 @@ class Panel:
         self._elevation = gui.add_slider("sun elevation", 0.0, 90.0, 1.0, 45.0)
         self._ground = gui.add_checkbox("ground", False)
         self._backdrop = gui.add_checkbox("backdrop", False)
-        for control in (self._layer, self._ground, self._backdrop):
+        self._denoise = gui.add_checkbox(
+            "denoise", denoise.available(), visible=denoise.available()
+        )
+        for control in (self._layer, self._ground, self._backdrop, self._denoise):
             control.on_update(lambda event: self._ask())
         for control in (
             *(self._light, self._turn, self._exposure),
@@ -222,6 +226,7 @@ class Panel:
                 self._exposure.value,
                 self._ground.value,
                 self._backdrop.value,
+                self._denoise.value,
             )
 
     def _relight(self) -> None:
