@@ -244,7 +244,7 @@ class Panel:
             return
         extent = float((self._subject.traced.mesh.vertices.abs()).max())
         self._client.scene.add_icosphere(
-            "/point", 0.01 * extent, (255, 80, 60), position=point.position.numpy()
+            "/point", 0.015 * extent, (255, 80, 60), position=point.position.numpy()
         )
         self._point = point
         self._studio.do(self.viewer, "light at the point", self._gather(point))
