@@ -67,7 +67,7 @@ HELPERS = {
     "segmentation": {"config", "distances", "vote"},
     "page": {"maps", "transfer"},
     "report": {"drawing", "light", "photographs", "sides", "training"},
-    "viewer": {"subject", "frames", "hosting", "studio"},
+    "viewer": {"subject", "denoise", "frames", "film", "hosting", "incident", "studio"},
     "capture": {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
         *("prepare", "video"),

@@ -105,7 +105,7 @@ def calls(monkeypatch):
     replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)
     stand_in("univoxel.tasks.relight", relight_to_files=task("relight", None))
-    replace("export", None)
+    replace("export", [Path("out.ply"), Path("out_lod1.ply")])
     replace("envmap", None)
     found = {"chosen": [{"said": "lobes 24 -> 12"}]}
     replace("info", found, tables=lambda found: ["parts", "sizes"])
@@ -310,21 +310,28 @@ def test_eval(calls, capsys):
 
 def test_relight_export_view_and_demo(calls, capsys):
     assert main(["relight", "run", "--envmap", "maps/hall.exr", "--rotate", "90"]) == 0
+    placed = ["--size", "0.3", "--origin", "bottom", "--lods", "1", "--texture-format", "jpeg"]
     assert main(["export", "run", "--mesh", "out.ply"]) == 0
+    assert main(["export", "run", "--mesh", "out.ply", *placed, "--quality", "80"]) == 0
     assert main(["view", "run", "--html", "mug.html", "--envmap", "maps/hall.exr"]) == 0
     assert main(["demo", "--out", "demo"]) == 0
     paths = (Path("run"), Path("maps/hall.exr"), Path("run/relight/hall"))
-    options = {"faces": None, "texture_size": 1024, "watertight": False}
+    options = {"faces": None, "texture_size": 1024, "watertight": False, "texture_format": "png"}
+    options |= {"quality": 90, "size": None, "origin": "world", "lods": 0}
+    chosen_options = {"texture_format": "jpeg", "quality": 80}
+    chosen_options |= {"size": 0.3, "origin": "bottom", "lods": 1}
     served = {"host": "127.0.0.1", "port": 8080}
     (name, given, chosen), *others = calls.noted
     assert (name, given, chosen["cameras"], chosen["rotate"]) == ("relight", paths, "test", 90.0)
     assert others == [
         ("export", (Path("run"), Path("out.ply")), options),
+        ("export", (Path("run"), Path("out.ply")), options | chosen_options),
         ("view", (Path("run"), Path("mug.html")), {"envmap": (paths[1],), "title": None} | served),
         ("demo", (Path("demo"),), {}),
     ]
     printed = capsys.readouterr().out.split()
-    assert printed == ["run/relight/hall", "out.ply", "mug.html", "demo/index.html"]
+    levels = ["out.ply", "out_lod1.ply"]
+    assert printed == ["run/relight/hall", *levels, *levels, "mug.html", "demo/index.html"]
 
 
 def test_envmap(calls, capsys):

@@ -109,13 +109,14 @@ class Run:
         return relight_images(self.path, envmap, cameras, **options)
 
     def export(self, path: str | Path, **options: Any) -> Path:
-        """Write the surface with its materials as .glb, .obj or .ply; return the file.
+        """Write the surface with its materials as .glb, .usdz, .obj or .ply; return the file.
 
         Args:
-            options: as of `univoxel.tasks.export.export`.
+            options: fields of `univoxel.tasks.export.ExportOptions`.
 
         Raises:
             UserError: an argument is out of range, or there is no surface.
+            MissingExtra: .usdz without usd-core.
             OSError: a file cannot be written.
         """
         export(self.path, path, **options)

@@ -27,6 +27,7 @@ from univoxel.names import (
     LIGHTS,
     MAP_ROWS,
     SAMPLES,
+    TEXTURE_QUALITY,
     TEXTURE_SIZE,
     Animation,
     Background,
@@ -40,8 +41,10 @@ from univoxel.names import (
     LightFrameOrAuto,
     LightName,
     MasksFrom,
+    Origin,
     PresetName,
     PresetOrAuto,
+    TextureFormat,
 )
 from univoxel.parsing import Command, Shell
 
@@ -603,27 +606,52 @@ def relight(
 def export(
     run: Run,
     /,
-    mesh: Annotated[Path, arg(metavar="FILE.glb|obj|ply")],
+    mesh: Annotated[Path, arg(metavar="FILE.glb|usdz|obj|ply")],
     faces: Annotated[
         int | None,
         arg(metavar="N", help_behavior_hint="(default: 20000 with textures, all without)"),
     ] = None,
     texture_size: Annotated[int, arg(metavar="TEXELS")] = TEXTURE_SIZE,
     watertight: bool = False,
+    texture_format: TextureFormat = "png",
+    quality: Annotated[int, arg(metavar="1-95")] = TEXTURE_QUALITY,
+    size: Annotated[
+        float | None, arg(metavar="METRES", help_behavior_hint="(default: as photographed)")
+    ] = None,
+    origin: Origin = "world",
+    lods: Annotated[int, arg(metavar="N")] = 0,
 ) -> None:
     """Write the surface as a mesh with its materials, for any renderer.
 
     Args:
         run: folder of a trained run
-        mesh: the file to write: .glb and .obj hold textures, .ply materials at the vertices
+        mesh: the file to write: .glb, .usdz and .obj hold textures, .ply materials at the vertices
         faces: most triangles, at least 4
         texture_size: width of the square textures, a power of 2 up to 4096
         watertight: close holes, or fail
+        texture_format: png loses nothing, jpeg is smaller
+        quality: of textures as jpeg
+        size: what the longest side of the object becomes
+        origin: what lies at 0: the origin of the data set, the middle of the object's floor, or its
+            centre
+        lods: coarser levels of detail to write beside, FILE_lod1 and so on: each has a quarter of
+            the triangles, and textures of half the width
     """
     from univoxel.tasks import export as task
 
-    task.export(run, mesh, faces=faces, texture_size=texture_size, watertight=watertight)
-    print(mesh)
+    for path in task.export(
+        run,
+        mesh,
+        faces=faces,
+        texture_size=texture_size,
+        watertight=watertight,
+        texture_format=texture_format,
+        quality=quality,
+        size=size,
+        origin=origin,
+        lods=lods,
+    ):
+        print(path)
 
 
 def view(
@@ -662,7 +690,7 @@ def view(
 def envmap(
     run: Run,
     /,
-    out: Annotated[Path, arg(metavar="FILE.exr")],
+    out: Annotated[Path, arg(metavar="FILE.exr|hdr")],
     height: Annotated[int, arg(metavar="ROWS")] = MAP_ROWS,
     light_of: LightOf = None,
 ) -> None:
@@ -670,8 +698,8 @@ def envmap(
 
     Args:
         run: folder of a trained run
-        out: the map, linear radiance; a picture of it goes beside, with the true map if the data
-            set has it
+        out: the map, linear radiance, in 32 bits a channel as .exr, a pixel as .hdr; a picture of
+            it goes beside, with the true map if the data set has it
         height: rows of the map; it is twice as wide
         light_of: training view, by name or number, whose map it is, where the run was trained with
             --varying

@@ -25,11 +25,16 @@ Ground: TypeAlias = float | Literal["lowest"] | None  # height of a floor, or at
 Downscale: TypeAlias = Literal["auto"] | int  # side of the squares of pixels that become one
 Animation: TypeAlias = Literal["gif", "mp4"]
 ANIMATIONS: tuple[Animation, ...] = get_args(Animation)
+TextureFormat: TypeAlias = Literal["png", "jpeg"]
+Origin: TypeAlias = Literal["world", "bottom", "centre"]  # what of an exported mesh lies at 0
+TEXTURE_FORMATS: tuple[TextureFormat, ...] = get_args(TextureFormat)
+ORIGINS: tuple[Origin, ...] = get_args(Origin)
 
 SAMPLES = 64  # of the light, per pixel of relit pictures
 BOUNCES = 2  # reflections between parts of the object in relit pictures
 ELEVATION = 25.0  # degrees, of an orbit's cameras above the object's middle
 MAP_ROWS = 128  # of a written environment map
 TEXTURE_SIZE = 1024  # texels along a side
+TEXTURE_QUALITY = 90  # of JPEG textures
 FEATURE_SIZE = 1200  # pixels along the longer side in which features of photographs are sought
 KEEP_SIZE = 2000  # and at most of the photographs that are written: twice what grids can use

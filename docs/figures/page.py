@@ -19,6 +19,7 @@ from browser import browser
 DESK, PHONE = (1160, 720), (360, 720)
 GAP = 12  # pixels between them
 SCALE = 0.75  # of what is written
+COLORS = 256
 
 
 def main(page: Path, out: Path) -> None:
@@ -34,7 +35,10 @@ def main(page: Path, out: Path) -> None:
     picture.paste(shots[0], (0, 0))
     picture.paste(shots[1], (DESK[0] + GAP, 0))
     size = [round(SCALE * side) for side in picture.size]
-    picture.resize(size, Image.Resampling.LANCZOS).save(out / "page.png", optimize=True)
+    small = picture.resize(size, Image.Resampling.LANCZOS)
+    palette = small.quantize(COLORS)
+    dithered = small.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
+    dithered.save(out / "page.png", optimize=True)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from PIL import Image
 
 from univoxel.data import images
 from univoxel.data.images import image_size, read_exr, read_image, write_exr, write_png
+from univoxel.data.radiance import write_radiance
 from univoxel.errors import DataError
 from univoxel.files import replacing
 
@@ -143,6 +144,28 @@ def test_flat_radiance_is_exact(tmp_path):
             if (row, column) == (1, 2):
                 expected = [0.0] * 3
             assert image[row, column].tolist() == expected
+
+
+def test_written_radiance_decodes_by_hand(tmp_path):
+    """Numbers of the format come back exactly; others within half a step; none overflows."""
+    picture = np.zeros((2, 8, 3))
+    picture[0, 0] = rgbe_value(255, 128, 1, 140)
+    picture[0, 1] = rgbe_value(128, 0, 7, 1)
+    picture[0, 2] = (1.0, 0.999, 0.998)  # 255.7 of 256 steps: rounds into the next exponent
+    picture[0, 3] = (0.999, 0.5, 0.1)
+    picture[0, 4] = (1e39, 1.0, 0.0)  # above the largest number
+    picture[0, 5] = 1e-40  # below the smallest
+    picture[1] = np.exp(np.random.default_rng(0).normal(0, 8, (8, 3)))
+    write_radiance(tmp_path / "a.hdr", picture)
+    body = (tmp_path / "a.hdr").read_bytes()[-64:]
+    back = np.array([rgbe_value(*body[i : i + 4]) for i in range(0, 64, 4)]).reshape(2, 8, 3)
+    assert np.array_equal(back[0, :2], picture[0, :2])
+    assert back[0, 4].tolist() == [255 * 2.0**119, 0, 0]
+    assert back[0, 5].tolist() == [0, 0, 0]
+    fair = np.delete(np.arange(16), [4, 5])
+    error = np.abs(back - picture).reshape(16, 3)[fair]
+    assert (error <= picture.reshape(16, 3)[fair].max(1, keepdims=True) / 256).all()
+    assert np.array_equal(read_image(tmp_path / "a.hdr").numpy(), back.astype(np.float32))
 
 
 def test_run_lengths_are_decoded(tmp_path):

@@ -44,6 +44,16 @@ def test_the_map_is_written_as_it_is(run):
     assert read_image(out.with_suffix(".png")).shape == (32, 4 * 32, 3)
 
 
+def test_the_map_as_hdr(run):
+    """Pixels of a common exponent: off by half of 1/128 of the largest channel at most."""
+    folder, map = run
+    out = folder / "map.hdr"
+    assert envmap(folder, out, height=32) is None
+    error = (read_image(out) - map).abs()
+    assert (error <= map.amax(2, keepdim=True) / 256).all()
+    assert error.max() > 0
+
+
 @pytest.mark.parametrize("light", [EnvmapConfig(rows=32), EnvmapSGConfig(lobes=8)])
 def test_the_map_of_a_light_alone(tmp_path, light):
     scene = sphere_scene(0, light=light)
@@ -122,9 +132,9 @@ def test_a_run_without_a_map(tmp_path):
 def test_bad_arguments(run):
     folder, _ = run
     with pytest.raises(
-        ValueError, match=r"out: expected a name that ends in \.exr, got .*map\.hdr"
+        ValueError, match=r"out: expected a name that ends in \.exr or \.hdr, got .*map\.png"
     ):
-        envmap(folder, folder / "map.hdr")
+        envmap(folder, folder / "map.png")
     with pytest.raises(ValueError, match="height must be at least 1, got 0"):
         envmap(folder, folder / "map.exr", height=0)
 

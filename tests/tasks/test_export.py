@@ -225,7 +225,7 @@ def test_watertight(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("a.stl", {}, r"ends in \.glb, \.obj, \.ply, got .*a\.stl"),
+        ("a.stl", {}, r"ends in \.glb, \.obj, \.ply, \.usdz, got .*a\.stl"),
         ("a", {}, "ends in"),
         ("a.ply", {"faces": 3}, "faces must be at least 4, got 3"),
         ("a.glb", {"texture_size": 1000}, "power of 2 from 16 to 4096, got 1000"),
@@ -233,6 +233,16 @@ def test_watertight(tmp_path, monkeypatch):
         ("a.glb", {"texture_size": 8192}, "got 8192"),
         ("a.glb", {"texture_size": 0}, "got 0"),
         ("a.glb", {"texture_size": -64}, "got -64"),
+        ("a.glb", {"texture_format": "webp"}, "texture_format must be png or jpeg, got webp"),
+        ("a.glb", {"quality": 96}, "quality must be 1 to 95, got 96"),
+        ("a.glb", {"quality": 0}, "quality must be 1 to 95, got 0"),
+        ("a.glb", {"size": 0.0}, "size must be above 0, got 0"),
+        ("a.glb", {"size": float("inf")}, "size must be above 0, got inf"),
+        ("a.glb", {"size": float("nan")}, "size must be above 0, got nan"),
+        ("a.glb", {"origin": "top"}, "origin must be world or bottom or centre, got top"),
+        ("a.glb", {"lods": -1}, "lods must be 0 to 8, got -1"),
+        ("a.glb", {"lods": 9}, "lods must be 0 to 8, got 9"),
+        ("a.glb", {"lods": 3, "faces": 2000}, "lods=3 of 2000 faces leave 31 in the coarsest"),
     ],
 )
 def test_bad_arguments(tmp_path, name, options, message):

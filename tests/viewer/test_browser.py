@@ -12,6 +12,7 @@ from browser import browser, installed
 
 from univoxel.page import PageOptions
 from univoxel.render.relight import traced_mesh
+from univoxel.viewer import film
 from univoxel.viewer.server import serving
 from univoxel.viewer.subject import Subject, mesh_of
 
@@ -66,6 +67,43 @@ def test_dragging_shows_another_side(tab):
     before = rested(tab)
     tab.drag((200, 250), (300, 260))
     assert np.abs(rested(tab) - before).mean() > 3
+
+
+def test_a_click_shows_the_light_at_a_point(tab):
+    """A picture of it in the panel; beside the object a click shows nothing."""
+    shown = """[...document.querySelectorAll("img")].filter(
+        (image) => image.naturalWidth == 288 && image.naturalHeight == 144 && image.offsetWidth
+    ).map((image) => image.src)"""
+    click(tab, 30, 30)
+    time.sleep(1)
+    assert tab.run(shown) == []
+    click(tab, 370, 250)
+    until(lambda: len(tab.run(shown)) == 1)
+    (before,) = tab.run(shown)
+    click(tab, 360, 290)
+    until(lambda: tab.run(shown) != [before])
+
+
+def click(tab, x, y):
+    tab.mouse("mouseMoved", x, y)
+    tab.mouse("mousePressed", x, y, button="left", clickCount=1)
+    tab.mouse("mouseReleased", x, y, button="left", clickCount=1)
+
+
+def test_a_turntable_is_sent(tab, monkeypatch):
+    """As a download, in a form that the installation can write."""
+    monkeypatch.setattr(film, "FRAMES", 2)
+    tab.run("""
+        window.sent = [];
+        const made = URL.createObjectURL;
+        URL.createObjectURL = (blob) => { window.sent.push(blob.size); return made(blob); };
+    """)
+    press = """[...document.querySelectorAll("button")].find(
+        (button) => button.textContent.trim() == "turntable"
+    )"""
+    tab.run(f"{press}.click()")
+    until(lambda: tab.run("window.sent.length"))
+    until(lambda: not tab.run(f"{press}.disabled"))
 
 
 def test_nothing_is_asked_of_others(tab, address):

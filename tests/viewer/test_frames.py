@@ -1,6 +1,9 @@
 """Frames of the viewer against the pictures of `univoxel relight` and the scene's own layers."""
 
 import math
+import sys
+import threading
+import types
 from dataclasses import replace
 from itertools import islice
 
@@ -18,6 +21,7 @@ from univoxel.render.pipeline import surface_of_view
 from univoxel.render.relight import traced_mesh
 from univoxel.sphere import latlong_directions
 from univoxel.tasks import relight as relighting
+from univoxel.viewer import denoise
 from univoxel.viewer.frames import LAYERS, Look, quick_picture, refined_pictures
 from univoxel.viewer.subject import Subject, mesh_of
 
@@ -164,3 +168,56 @@ def test_a_caller_can_leave_between_steps(subject, lamp, camera):
     steps = list(islice(refined_pictures(subject, camera, look), 6))
     assert steps[0] is not None
     assert steps[1] is None
+
+
+def test_denoised_pictures_are_better(monkeypatch, scene, subject, lamp, camera):
+    """With the package itself: five times less error from the same few samples."""
+    if not denoise.available():
+        pytest.skip("needs pyoidn")
+    expected = relit(monkeypatch, scene, lamp, camera, ground="lowest")
+    looks = [Look(relighting.lighting(lamp), ground=True, denoise=d) for d in (False, True)]
+    noisy, clean = (shown(refined_pictures(subject, camera, look, samples=4)) for look in looks)
+    for found in (noisy, clean):
+        assert found[-1].shape == (SIZE, SIZE, 4)
+    quality = [float(psnr(on_black(p[-1]), on_black(expected))) for p in (noisy, clean)]
+    assert quality[1] > quality[0] + 3
+    assert quality[1] >= 30
+    shadow = [(p[-1][..., 3] - expected[..., 3]).abs().mean() for p in (noisy, clean)]
+    assert shadow[1] < shadow[0]
+
+
+def test_a_denoiser_goes_beside(monkeypatch, subject, lamp, camera):
+    """It gets light, albedo and normals without background, and the last pass; None meanwhile."""
+    calls, held = [], threading.Event()
+
+    def slow(color, **others):
+        held.wait(60)
+        calls.append((color, others))
+        return 0.5 * color
+
+    package = types.SimpleNamespace(denoise=slow)
+    monkeypatch.setitem(sys.modules, "pyoidn", package)
+    noisy = shown(refined_pictures(subject, camera, Look(relighting.lighting(lamp)), samples=20))
+    look = Look(relighting.lighting(lamp), denoise=True)
+    pictures, steps = refined_pictures(subject, camera, look, samples=20), []
+    for picture in pictures:
+        steps.append(picture)
+        if len(steps) > 40:
+            held.set()  # the passes are over long since
+    found = shown(steps)
+    assert len(calls) == 2  # the first pass, then the last
+    color, aside = calls[0]
+    assert aside["hdr"] is True
+    nothing = (noisy[-1][..., 3] == 0).numpy()
+    for values in (color, aside["albedo"], aside["normal"]):
+        assert values.shape == (SIZE, SIZE, 3)
+        assert (values[nothing] == 0).all()
+        assert (values[~nothing] != 0).any()
+    half = Look(relighting.lighting(lamp), exposure=-1.0)
+    last = shown(refined_pictures(subject, camera, half, samples=20))[-1]
+    torch.testing.assert_close(found[-1], last, rtol=0, atol=1e-5)
+
+
+def test_without_a_denoiser(monkeypatch):
+    monkeypatch.setattr(denoise, "find_spec", lambda name: None)
+    assert not denoise.available()

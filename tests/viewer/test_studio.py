@@ -114,6 +114,77 @@ def test_a_mistake_is_one_line_and_others_go_on(studio, subject, light):
     watcher.wait(lambda: watcher.sizes)
 
 
+def test_chores_go_on_beside_pictures(studio, subject, light):
+    """Step by step; views that move go before; another of the same name takes its place."""
+    cameras, watcher = orbit(subject.traced.mesh, 1, 64), Watcher()
+    studio.join(watcher.viewer)
+    seen = []
+
+    def chore(name, steps):
+        for step in range(steps):
+            seen.append((name, step))
+            watcher.news.set()
+            yield
+
+    studio.ask(watcher.viewer, cameras, Look(light))
+    studio.do(watcher.viewer, "a", chore("a", 5))
+    studio.do(watcher.viewer, "b", chore("b", 3))
+    watcher.wait(lambda: len(seen) == 8 and len(watcher.sizes) >= 3)
+    assert sorted(seen) == [("a", i) for i in range(5)] + [("b", i) for i in range(3)]
+    assert [step for name, step in seen if name == "a"] == list(range(5))
+
+    held = threading.Event()
+
+    def endless():
+        while True:
+            held.wait(PATIENCE)
+            yield
+
+    studio.do(watcher.viewer, "c", endless())
+    studio.do(watcher.viewer, "c", chore("c", 1))
+    held.set()
+    watcher.wait(lambda: seen[-1] == ("c", 0))
+    watcher.wait(lambda: not watcher.viewer.chores)
+
+
+def test_a_chore_that_fails_is_one_line(studio, subject, light, caplog):
+    cameras, watcher = orbit(subject.traced.mesh, 1, 64), Watcher()
+    studio.join(watcher.viewer)
+
+    def failing(error):
+        yield
+        raise error
+
+    studio.do(watcher.viewer, "a", failing(OSError("no room")))
+    watcher.wait(lambda: watcher.lines)
+    studio.do(watcher.viewer, "a", failing(KeyError("a fault")))
+    watcher.wait(lambda: len(watcher.lines) == 2)
+    assert watcher.lines == ["no room", "a picture failed: the program's log says more"]
+    assert "a fault" in caplog.text
+    studio.ask(watcher.viewer, cameras, Look(light, "albedo"))  # the studio goes on
+    watcher.wait(lambda: watcher.sizes)
+
+
+def test_chores_go_with_their_viewer(studio, subject, light):
+    watcher, ended = Watcher(), threading.Event()
+    studio.join(watcher.viewer)
+
+    def chore():
+        try:
+            while True:
+                watcher.news.set()
+                yield
+        finally:
+            ended.set()
+
+    studio.do(watcher.viewer, "a", chore())
+    watcher.news.wait(PATIENCE)
+    studio.leave(watcher.viewer)
+    assert ended.wait(PATIENCE)
+    studio.do(watcher.viewer, "a", chore())  # too late
+    assert not watcher.viewer.chores
+
+
 def test_the_port_is_taken(subject):
     pytest.importorskip("viser")
     with socket.socket() as other:

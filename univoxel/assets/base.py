@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from univoxel.color import linear_to_srgb
+
+# glTF and USD look along -Z with +Y up, our world has +Z up: (x, y, z) -> (x, z, -y), a quarter
+# turn.
+Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,16 @@ def metallic_picture(mesh: TexturedMesh) -> np.ndarray:
 def relief_picture(mesh: TexturedMesh) -> np.ndarray:
     """[T, T, 3] uint8, linear, 127.5 (n + 1); green is +y, upwards in the picture."""
     return _bytes(0.5 * (mesh.relief + 1))
+
+
+def encoded(picture: np.ndarray, jpeg: int | None) -> bytes:
+    """A picture as the bytes of a PNG file, or of a JPEG file of some quality."""
+    file = io.BytesIO()
+    if jpeg is None:
+        Image.fromarray(picture).save(file, format="PNG")
+    else:  # 4:4:4: channels of these are no colours
+        Image.fromarray(picture).save(file, format="JPEG", quality=jpeg, subsampling=0)
+    return file.getvalue()
 
 
 def _bytes(values: Tensor) -> np.ndarray:

@@ -2,37 +2,37 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pygltflib as gltf
 import torch
-from PIL import Image
 from torch import Tensor
 
 from univoxel import __version__
 from univoxel.assets.base import (
+    Y_UP,
     TexturedMesh,
     albedo_picture,
+    encoded,
     metallic_picture,
     relief_picture,
     roughness_picture,
 )
 from univoxel.files import replacing
 
-# glTF looks along -Z with +Y up, our world has +Z up: (x, y, z) -> (x, z, -y), a quarter turn.
-Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
-
-def write_glb(path: Path, mesh: TexturedMesh) -> None:
+def write_glb(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
     """Write a textured mesh as GLB, turned to +Y up, whole or not at all.
+
+    Args:
+        jpeg: as of `glb`.
 
     Raises:
         OSError: the file cannot be written; nothing is left behind.
     """
-    data = glb(mesh)
+    data = glb(mesh, jpeg)
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
@@ -106,22 +106,12 @@ def glb(
         ("occlusion roughness metallic", packed),
         ("normal", relief_picture(mesh)),
     ):
-        view = _view(file, blob, _encoded(picture, jpeg), None)
+        view = _view(file, blob, encoded(picture, jpeg), None)
         kind = "image/png" if jpeg is None else "image/jpeg"
         file.images.append(gltf.Image(name=name, mimeType=kind, bufferView=view))
     file.buffers = [gltf.Buffer(byteLength=len(blob))]
     file.set_binary_blob(bytes(blob))
     return b"".join(file.save_to_bytes())
-
-
-def _encoded(picture: np.ndarray, jpeg: int | None) -> bytes:
-    """A picture as the bytes of a PNG file, or of a JPEG file of some quality."""
-    file = io.BytesIO()
-    if jpeg is None:
-        Image.fromarray(picture).save(file, format="PNG")
-    else:  # 4:4:4: channels of these are no colours
-        Image.fromarray(picture).save(file, format="JPEG", quality=jpeg, subsampling=0)
-    return file.getvalue()
 
 
 def _view(file: gltf.GLTF2, blob: bytearray, data: bytes, target: int | None) -> int:

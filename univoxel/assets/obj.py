@@ -7,22 +7,25 @@ from pathlib import Path
 from univoxel.assets.base import (
     TexturedMesh,
     albedo_picture,
+    encoded,
     metallic_picture,
     relief_picture,
     roughness_picture,
 )
-from univoxel.data.images import write_png
 from univoxel.errors import UserError
 from univoxel.files import replacing
 
 
-def write_obj(path: Path, mesh: TexturedMesh) -> None:
+def write_obj(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
     """Write NAME.obj, NAME.mtl and NAME_{albedo,roughness,normal}.png, each whole or not at all.
 
     A mesh with metal has a NAME_metallic.png besides. Positions stay in the world's axes, +Z up.
     The .obj comes last: where it is, the others are. Roughness, metallic and normal map stand in
     the widespread extension for physically based materials (Pr, Pm, map_Pr, map_Pm, norm); OBJ has
     no tangents, programs compute their own.
+
+    Args:
+        jpeg: quality of pictures as .jpg, 1 to 95; None: .png, which loses nothing.
 
     Raises:
         OSError: a file cannot be written.
@@ -36,12 +39,13 @@ def write_obj(path: Path, mesh: TexturedMesh) -> None:
         "roughness": roughness_picture(mesh),
         "normal": relief_picture(mesh),
     }
-    metal = "Pm 0"
+    metal, suffix = "Pm 0", "png" if jpeg is None else "jpg"
     if mesh.metallic is not None:
         pictures["metallic"] = metallic_picture(mesh)
-        metal = f"Pm 1\nmap_Pm {name}_metallic.png"
+        metal = f"Pm 1\nmap_Pm {name}_metallic.{suffix}"
     for kind, picture in pictures.items():
-        write_png(path.with_name(f"{name}_{kind}.png"), picture)
+        with replacing(path.with_name(f"{name}_{kind}.{suffix}")) as temporary:
+            temporary.write_bytes(encoded(picture, jpeg))
     material = f"""newmtl object
 Kd 1 1 1
 Ks 0 0 0
@@ -49,9 +53,9 @@ Pr 1
 {metal}
 Ni 1.5
 illum 2
-map_Kd {name}_albedo.png
-map_Pr {name}_roughness.png
-norm {name}_normal.png
+map_Kd {name}_albedo.{suffix}
+map_Pr {name}_roughness.{suffix}
+norm {name}_normal.{suffix}
 """
     _write_text(path.with_suffix(".mtl"), material)
     corners = (mesh.faces + 1).tolist()  # v/vt/vn of each corner are the same

@@ -1,4 +1,4 @@
-"""Reading Radiance pictures (.hdr): shared-exponent pixels, flat or run-length encoded."""
+"""Radiance pictures (.hdr): pixels of a shared exponent, flat or in run lengths; written flat."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.errors import DataError
+from univoxel.files import replacing
+
+SMALLEST = 2.0**-128  # what is darker has no exponent: black
+LARGEST = 255 * 2.0**119  # the largest number of the format
 
 
 def read_radiance(path: Path) -> np.ndarray:
@@ -51,6 +55,28 @@ def read_radiance(path: Path) -> np.ndarray:
     exponent = rgbe[..., 3:].astype(np.int32)
     value = np.ldexp(rgbe[..., :3].astype(np.float32), exponent - 136)
     return np.where(exponent > 0, value, np.float32(0))
+
+
+def write_radiance(path: Path, radiance: np.ndarray) -> None:
+    """Write linear RGB [H, W, 3], at least 0, as flat pixels, whole or not at all.
+
+    A channel is off by at most 1/256 of the pixel's largest channel, as `read_radiance` reads it.
+
+    Raises:
+        OSError: the file cannot be written; nothing is left behind.
+    """
+    height, width, _ = radiance.shape
+    value = np.minimum(radiance.astype(np.float64), LARGEST)
+    largest = value.max(2)
+    _, exponent = np.frexp(largest)
+    # Mantissas of 255.5 and more would round to 256
+    exponent += np.rint(np.ldexp(largest, 8 - exponent)) > 255
+    mantissa = np.rint(np.ldexp(value, 8 - exponent[..., None]))
+    rgbe = np.concatenate([mantissa, exponent[..., None] + 128], 2)
+    rgbe[largest < SMALLEST] = 0
+    header = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n"
+    with replacing(path) as temporary:
+        temporary.write_bytes(header.encode("ascii") + rgbe.astype(np.uint8).tobytes())
 
 
 def _run_lengths(

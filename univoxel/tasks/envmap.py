@@ -14,6 +14,7 @@ from univoxel.checkpoint import load_scene
 from univoxel.color import linear_to_srgb, luminance
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.maps import true_map
+from univoxel.data.radiance import write_radiance
 from univoxel.errors import UserError
 from univoxel.names import MAP_ROWS
 from univoxel.pictures.balls import grey_ball, map_and_balls, summed_light
@@ -44,9 +45,9 @@ def envmap(
 
     Args:
         run: folder of a trained run.
-        out: .exr, [height, 2 height] of 32-bit linear R, G, B; the picture goes to the same name
-            with .png: a row for the recovered map and one for the true map, each with a grey and a
-            mirror ball seen from +X, +Z up.
+        out: .exr, [height, 2 height] of 32-bit linear R, G, B, or .hdr, of 8 bits and a common
+            exponent; the picture goes to the same name with .png: a row for the recovered map and
+            one for the true map, each with a grey and a mirror ball seen from +X, +Z up.
         height: rows of the map, >= 1.
         light_of: training view, by name or number, whose light it is, where light varies; their
             mean when left out.
@@ -63,13 +64,16 @@ def envmap(
     run, out = Path(run), Path(out)
     if height < 1:
         raise UserError(f"height must be at least 1, got {height}", "height")
-    if out.suffix.lower() != ".exr":
-        raise UserError(f"out: expected a name that ends in .exr, got {out}", "out")
+    if out.suffix.lower() not in (".exr", ".hdr"):
+        raise UserError(f"out: expected a name that ends in .exr or .hdr, got {out}", "out")
     scene = load_scene(run)
     scene.show_light_of(light_of)
     recovered, true = recovered_map(scene, run, height), true_map(trained_on(run))
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_exr(out, dict(zip("RGB", recovered.unbind(2), strict=True)), half=False)
+    if out.suffix.lower() == ".hdr":
+        write_radiance(out, recovered.numpy())
+    else:
+        write_exr(out, dict(zip("RGB", recovered.unbind(2), strict=True)), half=False)
     rows, result = [recovered], None
     if true is not None:
         recovered = recovered * _scale(recovered, true)

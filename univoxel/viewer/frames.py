@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
@@ -18,6 +19,7 @@ from univoxel.pictures.contact_sheet import heat
 from univoxel.records import Rays, Surface
 from univoxel.render.pipeline import at_rays, surface_at
 from univoxel.render.relight import Lighting, ground_shadow, relight_surface
+from univoxel.viewer.denoise import denoised_beside
 from univoxel.viewer.subject import Subject, at_hits, mesh_surface
 
 Layer: TypeAlias = Literal["render", "albedo", "roughness", "metal", "normal", "depth", "doubt"]
@@ -28,6 +30,7 @@ QUICK_BOUNCES = 1
 FLOOR_SAMPLES = 4  # of the light for the floor's shadow, while something moves
 PASSES = (4, 4, 8, 16, 32)  # samples of the passes at rest; the last one again and again
 MOST_SAMPLES = 1024  # per pixel at rest: no eye sees the noise that is left
+WAIT_SECONDS = 0.05  # for the denoiser, in one step
 STEP_RAYS = 4096  # that are marched in one step, some 0.05 s
 STEP_PATHS = 2**15  # that are traced in one step, likewise
 
@@ -41,6 +44,7 @@ class Look:
     exposure: float = 0.0  # stops
     ground: bool = False  # whether a floor under the object catches its shadow
     backdrop: bool = False  # whether the map stands behind
+    denoise: bool = False  # at rest; needs the extra `denoise`
 
 
 @torch.no_grad()
@@ -72,6 +76,8 @@ def refined_pictures(
 ) -> Iterator[Tensor | None]:
     """View 0 as `univoxel relight` renders it, better with every pass: [H, W, 4] as above.
 
+    Without noise, from the first samples on, where the look asks for that.
+
     Between pictures comes None, after every step of about 0.1 s: a caller who has something more
     urgent to do leaves then.
 
@@ -90,6 +96,19 @@ def refined_pictures(
     if look.layer != "render":
         yield _layer(subject, cameras, look.layer, surface)
         return
+    passes = _passes(subject, cameras, look, surface, wo, samples)
+    for found in _denoised(passes, cameras, surface) if look.denoise else passes:
+        yield None if found is None else _composed(cameras, look, surface, *found)
+
+
+Light: TypeAlias = "tuple[Tensor, Tensor | None]"  # of pixels [N, 3], and a floor's shadow [N]
+
+
+def _passes(
+    subject: Subject, cameras: Cameras, look: Look, surface: Surface, wo: Tensor, samples: int
+) -> Iterator[Light | None]:
+    """The light of pixels after each pass, better and better; None after each step of one."""
+    rays = image_rays(cameras, 0)
     rgb, shadow = torch.zeros_like(wo), wo.new_zeros(len(wo)) if look.ground else None
     hit = (surface.opacity > 0).nonzero()[:, 0]
     floor = (surface.opacity <= 0.999).nonzero()[:, 0] if look.ground else hit[:0]
@@ -119,7 +138,54 @@ def refined_pictures(
         if shadow is not None:
             yield from _accumulated_(shadow, floor, darkened, share, 2 * more)
         done, number = done + more, number + 1
-        yield _composed(cameras, look, surface, rgb, shadow)
+        yield rgb, shadow
+
+
+def _denoised(
+    passes: Iterator[Light | None], cameras: Cameras, surface: Surface
+) -> Iterator[Light | None]:
+    """The same passes without their noise, while the next are made; the first with it, too.
+
+    Of passes that end while one is denoised the last one follows.
+    """
+    running: Future[Light] | None = None
+    waiting: Light | None = None
+    clean = False
+    for found in passes:
+        if found is not None:
+            waiting = found
+            if not clean:
+                yield found
+        if running is not None and running.done():
+            yield _flat(*running.result())
+            running, clean = None, True
+        if running is None and waiting is not None:
+            running = denoised_beside(*_guided(cameras, surface, *waiting))
+            waiting = None
+        yield None
+    while running is not None:
+        wait([running], WAIT_SECONDS)
+        if running.done():
+            yield _flat(*running.result())
+            running = None
+        if running is None and waiting is not None:
+            running = denoised_beside(*_guided(cameras, surface, *waiting))
+            waiting = None
+        yield None
+
+
+def _guided(
+    cameras: Cameras, surface: Surface, rgb: Tensor, shadow: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """What a denoiser takes: pictures of light, albedo and normals; and of the shadow."""
+    hit = surface.opacity[:, None] > 0
+    parts = [rgb, torch.where(hit, surface.albedo, 0), torch.where(hit, surface.normal, 0)]
+    light, albedo, normal = (_grid(cameras, part) for part in parts)
+    return light, albedo, normal, None if shadow is None else _grid(cameras, shadow)[..., 0]
+
+
+def _flat(rgb: Tensor, shadow: Tensor | None) -> Light:
+    return rgb.reshape(-1, 3), None if shadow is None else shadow.reshape(-1)
 
 
 def _accumulated_(

@@ -26,7 +26,7 @@ from univoxel import envmap as env
 from univoxel.assets.bake import bake
 from univoxel.assets.gltf import glb
 from univoxel.assets.topology import simplify
-from univoxel.camera import Cameras, image_rays, looked_at, project, resize
+from univoxel.camera import Cameras, image_rays, looked_at, pixel_rays, project, resize
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.errors import UserError
@@ -36,8 +36,17 @@ from univoxel.page import FACES, JPEG_QUALITY, PageOptions, lights_of
 from univoxel.page.maps import Light, light_of_file
 from univoxel.pictures.viewpoints import VIEW_ANGLE, orbit
 from univoxel.render.relight import Lighting, rotated
+from univoxel.viewer import denoise
+from univoxel.viewer.film import film, kind
 from univoxel.viewer.frames import LAYERS, Look
 from univoxel.viewer.hosting import HOST, PORT, address_of, hosted
+from univoxel.viewer.incident import (
+    ROWS,
+    Point,
+    incident_light,
+    incident_picture,
+    point_on_mesh,
+)
 from univoxel.viewer.studio import Studio, Viewer
 from univoxel.viewer.subject import Subject
 
@@ -96,10 +105,12 @@ class Panel:
         self._tables: dict[str, env.EnvTables] = {}
         self._lock = threading.Lock()
         self._last: Tensor | None = None
+        self._point: Point | None = None
         self.viewer: Viewer = Viewer(self._show, self._complain)
         self._controls(client.gui)
         self._photographs(client.gui)
         studio.join(self.viewer)
+        client.scene.on_click()(lambda event: self._pick(event.screen_pos))
         client.camera.on_update(lambda camera: self._ask())
         self._ask()
 
@@ -115,14 +126,24 @@ class Panel:
         self._elevation = gui.add_slider("sun elevation", 0.0, 90.0, 1.0, 45.0)
         self._ground = gui.add_checkbox("ground", False)
         self._backdrop = gui.add_checkbox("backdrop", False)
-        for control in (
-            *(self._layer, self._light, self._turn, self._exposure, self._sun),
-            *(self._azimuth, self._elevation, self._ground, self._backdrop),
-        ):
+        self._denoise = gui.add_checkbox(
+            "denoise", denoise.available(), visible=denoise.available()
+        )
+        for control in (self._layer, self._ground, self._backdrop, self._denoise):
             control.on_update(lambda event: self._ask())
+        for control in (
+            *(self._light, self._turn, self._exposure),
+            *(self._sun, self._azimuth, self._elevation),
+        ):
+            control.on_update(lambda event: self._relight())
         self._map.on_upload(lambda event: self._guarded(self._take_map))
         gui.add_button("PNG").on_click(lambda event: self._guarded(self._send_png))
         gui.add_button("GLB").on_click(lambda event: self._guarded(self._send_glb))
+        self._film = gui.add_button("turntable", hint="a turn around the object as MP4 or GIF")
+        self._film.on_click(lambda event: self._make_film())
+        self._progress = gui.add_progress_bar(0.0, visible=False)
+        nothing = np.zeros((3 * ROWS, 6 * ROWS, 3), np.uint8)
+        self._arriving = gui.add_image(nothing, label="light at the point", visible=False)
 
     def _photographs(self, gui: Any) -> None:
         """Their frusta, and a slider that lays one over the render; nothing where they lack."""
@@ -177,17 +198,65 @@ class Panel:
     def _ask(self) -> None:
         camera = self._client.camera
         width, height = max(camera.image_width, 1), max(camera.image_height, 1)
-        cameras = camera_of(camera.wxyz, camera.position, camera.fov, width, height)
+        self._cameras = camera_of(camera.wxyz, camera.position, camera.fov, width, height)
+        self._studio.ask(self.viewer, self._cameras, self._look())
+
+    def _look(self) -> Look:
         with self._lock:
-            look = Look(
+            return Look(
                 self._lighting(),
                 self._layer.value,
                 self._exposure.value,
                 self._ground.value,
                 self._backdrop.value,
+                self._denoise.value,
             )
-        self._cameras = cameras
-        self._studio.ask(self.viewer, cameras, look)
+
+    def _relight(self) -> None:
+        """The light has changed: the picture, and what arrives at the point."""
+        self._ask()
+        if self._point is not None:
+            self._studio.do(self.viewer, "light at the point", self._gather(self._point))
+
+    def _pick(self, place: tuple[float, float]) -> None:
+        """Show what light arrives where the mesh is seen; `place` in widths and heights."""
+        size = torch.tensor([float(self._cameras.width), float(self._cameras.height)])
+        pixel = (torch.tensor(place, dtype=torch.float32) * size)[None]
+        point = point_on_mesh(self._subject, pixel_rays(self._cameras, torch.tensor(0), pixel))
+        if point is None:
+            return
+        extent = float((self._subject.traced.mesh.vertices.abs()).max())
+        self._client.scene.add_icosphere(
+            "/point", 0.015 * extent, (255, 80, 60), position=point.position.numpy()
+        )
+        self._point = point
+        self._studio.do(self.viewer, "light at the point", self._gather(point))
+
+    def _gather(self, point: Point) -> Iterator[None]:
+        look = self._look()
+        light = incident_light(self._subject, point, look.lighting)
+        self._arriving.image = _bytes(incident_picture(light, look.exposure))
+        self._arriving.visible = True
+        yield
+
+    def _make_film(self) -> None:
+        if self._film.disabled:
+            return
+        self._film.disabled, self._progress.value, self._progress.visible = True, 0.0, True
+        self._studio.do(self.viewer, "turntable", self._filming(self._cameras, self._look()))
+
+    def _filming(self, cameras: Cameras, look: Look) -> Iterator[None]:
+        def report(share: float) -> None:
+            self._progress.value = 100 * share
+
+        def send(content: bytes) -> None:
+            self._client.send_file_download(f"{self._title}.{kind()}", content)
+
+        try:
+            yield from film(self._subject, cameras, look, send, report)
+        finally:
+            if not self.viewer.gone:
+                self._film.disabled, self._progress.visible = False, False
 
     def _lighting(self) -> Lighting:
         name = self._light.value
@@ -209,7 +278,7 @@ class Panel:
         share = self._overlay.value if self._overlay else 0.0
         if share and self._shown is not None:
             rgb = laid_over(rgb, self._subject.photos, self._shown, self._cameras, share)
-        values = (255 * rgb + 0.5).clamp(0, 255).byte().numpy()
+        values = _bytes(rgb)
         self._client.scene.set_background_image(values, format="jpeg", jpeg_quality=JPEG)
 
     def _again(self) -> None:
@@ -235,19 +304,22 @@ class Panel:
             self._tables.pop(light.name, None)
         self._light.options = [*self._lights, DARK]
         self._light.value = light.name
-        self._ask()
+        self._relight()
 
     def _send_png(self) -> None:
         if self._last is None:
             return
-        values = (255 * self._last + 0.5).clamp(0, 255).byte().numpy()
         held = io.BytesIO()
-        Image.fromarray(values).save(held, "png")
+        Image.fromarray(_bytes(self._last)).save(held, "png")
         self._client.send_file_download(f"{self._title}.png", held.getvalue())
 
     def _send_glb(self) -> None:
         mesh = bake(self._subject.scene, simplify(self._subject.traced.mesh, FACES), TEXTURE_SIZE)
         self._client.send_file_download(f"{self._title}.glb", glb(mesh, JPEG_QUALITY))
+
+
+def _bytes(picture: Tensor) -> np.ndarray:
+    return (255 * picture + 0.5).clamp(0, 255).byte().numpy()
 
 
 def light_of_bytes(name: str, content: bytes) -> Light:

@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
@@ -20,6 +20,7 @@ QUICK_WIDTHS = (64, 384)  # pixels, between which its width is chosen
 FIRST_WIDTH = 160  # pixels, before any was timed
 REST_WIDTH = 640  # most pixels along the width at rest
 REST_SECONDS = 0.25  # without a change, after which a view rests
+DONE = object()  # what a chore yields no more
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -35,6 +36,7 @@ class Viewer:
     changed: float = 0.0  # when it was last asked for something
     stale: bool = False  # whether a quick picture is due
     refining: Iterator[Tensor | None] | None = None
+    chores: dict[str, Iterator[None]] = field(default_factory=dict)  # by what they make
     gone: bool = False
 
 
@@ -58,6 +60,7 @@ class Studio:
         """Let a viewer go; a picture that is being made for it is dropped."""
         with self._news:
             viewer.gone = True
+            viewer.chores.clear()
             self._viewers = [other for other in self._viewers if other is not viewer]
 
     def ask(self, viewer: Viewer, cameras: Cameras, look: Look) -> None:
@@ -66,6 +69,18 @@ class Studio:
             viewer.wanted, viewer.stale = (cameras, look), True
             viewer.refining, viewer.changed = None, time.monotonic()
             self._news.notify()
+
+    def do(self, viewer: Viewer, name: str, steps: Iterator[None]) -> None:
+        """Run something for a viewer, step by step, where nobody's view moves.
+
+        Args:
+            name: another chore of this name is dropped for it.
+            steps: each of about 0.1 s. A UserError or OSError becomes one line for the viewer.
+        """
+        with self._news:
+            if not viewer.gone:
+                viewer.chores[name] = steps
+                self._news.notify()
 
     def stop(self) -> None:
         """End the thread after the step that it is in."""
@@ -78,35 +93,48 @@ class Studio:
         turn = 0
         while True:
             with self._news:
-                viewer = None
-                while not self._ended and (viewer := self._next(turn)) is None:
+                work = None
+                while not self._ended and (work := self._next(turn)) is None:
                     waiting = any(v.wanted and v.refining is None for v in self._viewers)
                     self._news.wait(REST_SECONDS / 4 if waiting else None)
-                if viewer is None:
+                if self._ended or work is None:
                     return
                 turn += 1
-                assert viewer.wanted is not None
-                (cameras, look), quick = viewer.wanted, viewer.stale
-                viewer.stale = False
+                viewer, chore = work
             try:
-                if quick:
-                    self._quick(viewer, cameras, look)
-                else:
-                    self._refine(viewer, cameras, look)
+                self._work(viewer, chore)
             except (UserError, OSError) as error:
-                self._give_up(viewer, str(error))
+                self._give_up(viewer, chore, str(error))
             except Exception:
                 log.exception("a picture failed")  # a fault of the program: its traceback
-                self._give_up(viewer, "a picture failed: the program's log says more")
+                self._give_up(viewer, chore, "a picture failed: the program's log says more")
 
-    def _next(self, turn: int) -> Viewer | None:
-        """The viewer whose turn it is; None: all are served."""
+    def _next(self, turn: int) -> tuple[Viewer, str | None] | None:
+        """The viewer whose turn it is, and its chore, if not its view; None: all are served."""
         for viewer in self._viewers:
             if viewer.stale:
-                return viewer
+                return viewer, None
         rested = time.monotonic() - REST_SECONDS
-        able = [v for v in self._viewers if v.wanted and v.changed <= rested]
+        able: list[tuple[Viewer, str | None]] = [
+            (v, None) for v in self._viewers if v.wanted and v.changed <= rested
+        ]
+        able += [(v, name) for v in self._viewers for name in v.chores]
         return able[turn % len(able)] if able else None
+
+    def _work(self, viewer: Viewer, chore: str | None) -> None:
+        """One step."""
+        with self._news:
+            steps = viewer.chores.pop(chore, None) if chore is not None else None
+            wanted, quick = viewer.wanted, viewer.stale
+            if chore is None:
+                viewer.stale = False
+        if chore is None:
+            if wanted is not None:
+                (self._quick if quick else self._refine)(viewer, *wanted)
+        elif steps is not None and next(steps, DONE) is not DONE:
+            with self._news:
+                if not viewer.gone:
+                    viewer.chores.setdefault(chore, steps)  # another of its name goes before it
 
     def _quick(self, viewer: Viewer, cameras: Cameras, look: Look) -> None:
         begin = time.monotonic()
@@ -141,9 +169,10 @@ class Studio:
                 return
         viewer.show(picture)
 
-    def _give_up(self, viewer: Viewer, line: str) -> None:
+    def _give_up(self, viewer: Viewer, chore: str | None, line: str) -> None:
         with self._news:
-            viewer.wanted, viewer.refining = None, None
+            if chore is None:
+                viewer.wanted, viewer.refining = None, None
             if viewer.gone:
                 return
         viewer.complain(line)

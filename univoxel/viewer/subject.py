@@ -19,7 +19,7 @@ from univoxel.confidence.survey import survey
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.ops.visibility import Hit
-from univoxel.records import Mesh, Surface
+from univoxel.records import Mesh, Rays, Surface
 from univoxel.render.pipeline import RAYS_AT_ONCE
 from univoxel.render.relight import TracedMesh, traced_mesh
 from univoxel.run import photos_of
@@ -92,11 +92,16 @@ def mesh_of(scene: Scene, faces: int = FACES) -> Mesh:
 
 
 def mesh_surface(subject: Subject, cameras: Cameras, view: int = 0) -> tuple[Surface, Tensor, Hit]:
-    """What the rays of a view meet of the mesh, wo [N, 3] and the hits: no volume is marched.
+    """What the rays of a view meet of the mesh, as of `surface_along`."""
+    return surface_along(subject, image_rays(cameras, view))
+
+
+def surface_along(subject: Subject, rays: Rays) -> tuple[Surface, Tensor, Hit]:
+    """What rays meet of the mesh, wo [N, 3] and the hits: no volume is marched.
 
     Materials and normals are those of the triangle's corners in between; features are empty.
     """
-    rays, mesh = image_rays(cameras, view), subject.traced.mesh
+    mesh = subject.traced.mesh
     hit = subject.traced.visibility.closest_hit(rays.origin, rays.direction)
     met = hit.face >= 0
     assert mesh.normals is not None
