@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -28,8 +29,10 @@ from univoxel.names import (
     MAP_ROWS,
     SAMPLES,
     TEXTURE_SIZE,
+    USUAL_STEPS,
     Animation,
     Background,
+    BatchStep,
     Behind,
     CamerasFrom,
     CapacityOrAuto,
@@ -42,6 +45,7 @@ from univoxel.names import (
     MasksFrom,
     PresetName,
     PresetOrAuto,
+    Until,
 )
 from univoxel.parsing import Command, Shell
 
@@ -302,6 +306,70 @@ def train(
     print(with_page(task.train(changed(asked, set), resume=resume, timelapse=timelapse)))
 
 
+def batch(
+    scenes: Scenes,
+    /,
+    out: Annotated[Path, arg(metavar="NIGHT")],
+    steps: Annotated[tuple[BatchStep, ...], arg(metavar="STEP [STEP ...]")] = USUAL_STEPS,
+    jobs: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: as cores and memory allow)")
+    ] = None,
+    scheduler: Annotated[
+        str | None, arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")
+    ] = None,
+    preset: PresetOrAuto = "auto",
+    light: LightName = "hybrid",
+    minutes: Minutes = None,
+    config: ConfigFile = None,
+    set: Changes = (),
+    masks: Annotated[str, arg(metavar="auto|rembg|FOLDER|none")] = "auto",
+    samples: int = SAMPLES,
+    tries: Annotated[int, arg(metavar="N")] = 3,
+    json: JsonFile = None,
+) -> None:
+    """Take many scenes through training, measures, mesh and page, on one machine or a cluster.
+
+    Each scene has processes of its own: one that crashes, or that the system ends, takes no other
+    with it. What is done is kept: the same command goes on after an interruption, and tries again
+    what failed. NIGHT/index.html shows all scenes, batch.json and batch.csv hold their measures,
+    NIGHT/SCENE has what was made, NIGHT/logs what was said. Ends with exit code 2 where a scene
+    failed.
+
+    Args:
+        scenes: folders of photographs, of different names
+        out: folder to write
+        steps: of each scene: train eval export page; before them poses masks, for photographs
+            without cameras or masks, as capture makes them
+        jobs: scenes at once; each runs on --threads, or its share of the cores
+        scheduler: of a Dask cluster whose workers take the scenes, such as tcp://10.0.0.1:8786;
+            they see the same folders. Whoever reaches a scheduler can run programs on its workers
+        preset: as of train; without --minutes on one thread, its training gets twice its time
+        light: as of train
+        minutes: wall-clock limit of each training, above 0
+        config: as of train
+        set: as of train
+        masks: as of capture, for the step masks
+        samples: of the light, per pixel of relit pictures that are measured
+        tries: how often a scene whose process is killed is tried before it counts as failed
+        json: another file for what batch.json holds; - prints it in place of the table
+    """
+    from univoxel.batch.scenes import Wanted
+    from univoxel.tasks import batch as task
+
+    check_minutes(minutes)
+    wanted = Wanted(steps, masks, preset, light, minutes, config, set, samples)
+    threads = os.environ.get("OMP_NUM_THREADS", "")  # as --threads sets it
+    options = {"jobs": jobs, "threads": int(threads) if threads.isdigit() else None}
+    with json_file(json) as file:
+        results = task.batch(
+            scenes, out, wanted, **options, scheduler=scheduler, tries=tries, json=file
+        )
+    if json != STDOUT:
+        rich.print(task.table(results))
+        print(out / "index.html")
+    task.check(results)
+
+
 def cutout(
     data: Annotated[Positional[Path], arg(metavar="DATA")],
     /,
@@ -403,6 +471,7 @@ def capture(
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
     set: Changes = (),
+    until: Until = "page",
 ) -> None:
     """From photographs to a mesh with materials and a page, in one command.
 
@@ -421,10 +490,17 @@ def capture(
         light: as of train
         minutes: of training, above 0; as of train
         set: as of train
+        until: the last step: page is all of them; cameras or masks end before training, and the
+            folder to train on is printed
     """
     from univoxel.tasks import capture as task
 
     check_minutes(minutes)
+    if until != "page":
+        if (preset, light, minutes, set) != ("auto", "hybrid", None, ()):
+            raise UserError(f"--until {until}: --preset, --light, --minutes, --set come after it")
+        print(task.find_data(photographs, out, masks=masks, until=until))
+        return
     made = task.capture(
         photographs,
         out,
@@ -900,6 +976,7 @@ COMMANDS: dict[str, Command] = {
     "poses": poses,
     "cutout": cutout,
     "train": train,
+    "batch": batch,
     "eval": evaluate,
     "relight": relight,
     "export": export,

@@ -24,6 +24,10 @@ Behind: TypeAlias = Literal["black", "white"]  # what measured novel views are c
 Ground: TypeAlias = float | Literal["lowest"] | None  # height of a floor, or at the lowest point
 Downscale: TypeAlias = Literal["auto"] | int  # side of the squares of pixels that become one
 Animation: TypeAlias = Literal["gif", "mp4"]
+Until: TypeAlias = Literal["cameras", "masks", "page"]  # the step that a capture ends with
+BatchStep: TypeAlias = Literal["poses", "masks", "train", "eval", "export", "page"]
+BATCH_STEPS: tuple[BatchStep, ...] = get_args(BatchStep)
+USUAL_STEPS: tuple[BatchStep, ...] = ("train", "eval", "export", "page")
 ANIMATIONS: tuple[Animation, ...] = get_args(Animation)
 
 SAMPLES = 64  # of the light, per pixel of relit pictures

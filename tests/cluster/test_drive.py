@@ -266,14 +266,15 @@ def test_what_nobody_waits_for_is_ended(tmp_path):
 
 def test_an_interrupt_ends_the_processes(tmp_path):
     piece = counting(tmp_path, "mug", last=1000, pause=0.1)
-    with machines(1) as client, pytest.raises(KeyboardInterrupt):
 
-        def stop() -> None:
-            wait_for(lambda: begun(tmp_path, "mug"))
-            os.kill(os.getpid(), signal.SIGINT)
+    def stop() -> None:
+        wait_for(lambda: begun(tmp_path, "mug"))
+        os.kill(os.getpid(), signal.SIGINT)
 
+    with machines(1) as client:
         threading.Thread(target=stop).start()
-        list(drive(client, [piece], 1))
+        with pytest.raises(KeyboardInterrupt):
+            list(drive(client, [piece], 1))
     wait_for(lambda: not alive(begun(tmp_path, "mug")[0]))
 
 
@@ -349,7 +350,7 @@ def test_mistakes_are_named(tmp_path, monkeypatch):
         pass
     monkeypatch.setattr("univoxel.cluster.machines.CONNECT_SECONDS", 0.5)
     with (
-        pytest.raises(ProcessFailed, match="scheduler=tcp://127.0.0.1:9: no scheduler of Dask"),
+        pytest.raises(ProcessFailed, match=r"scheduler=tcp://127\.0\.0\.1:9: no scheduler of Dask"),
         machines(1, "tcp://127.0.0.1:9"),
     ):
         pass

@@ -32,11 +32,14 @@ class Step:
     arguments: tuple[str | FirstOf, ...]  # of Python
     makes: Path | None = None  # whole or absent: where it is there the step is done; None: never
     after: Path | None = None  # what it makes must not be older than this file
+    unless: tuple[Path, ...] = ()  # where one of these is there the step is done, too
     log: Path | None = None  # that a training tells in
     needed: bool = True  # steps after it make no sense without it
 
     def done(self) -> bool:
         """Whether there is nothing left to do."""
+        if any(path.exists() for path in self.unless):
+            return True
         if self.makes is None or not self.makes.exists():
             return False
         if self.after is None or not self.after.exists():
