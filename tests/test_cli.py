@@ -541,7 +541,8 @@ def test_the_laboratory_has_a_screen_of_its_own(capsys):
 def test_commands_of_the_laboratory_have_their_old_names_too(calls, word):
     calls.stand_in("univoxel.experiments.stress.suite", stress=calls.task("stress", "breaks"))
     assert main([*word, "stress", "--out", "out"]) == 0
-    assert calls.noted == [("stress", (Path("out"), (), (), None, False, ()), {})]
+    here = {"jobs": 1, "scheduler": None}
+    assert calls.noted == [("stress", (Path("out"), (), (), None, False, ()), here)]
 
 
 def said(capsys, calls, *options):

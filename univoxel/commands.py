@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from rich.text import Text
 from tyro.conf import Positional, UseAppendAction, arg
 
 from univoxel.errors import ExistingFile, UserError
+from univoxel.machine import threads_asked
 from univoxel.names import (
     BOUNCES,
     ELEVATION,
@@ -54,6 +54,10 @@ if TYPE_CHECKING:
     from univoxel.ops import PointLight, Sun
 
 Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
+AtOnce: TypeAlias = Annotated[int, arg(metavar="N")]
+Scheduler: TypeAlias = Annotated[
+    str | None, arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")
+]
 Scenes: TypeAlias = Annotated[
     Positional[tuple[Path, ...]],
     arg(metavar="SCENE [SCENE ...]", help_behavior_hint="(required)"),
@@ -247,6 +251,7 @@ def train(
     seed: Seed = None,
     config: ConfigFile = None,
     set: Changes = (),
+    no_page: bool = False,
 ) -> None:
     """Recover geometry, materials and light from posed photographs.
 
@@ -287,6 +292,7 @@ def train(
             --preset, --light and such would; --minutes, --seed, --downscale and --set go before it
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
             stages.1.voxels=3; config.json in a run's folder holds them all
+        no_page: write no RUN/index.html at the end
     """
     from univoxel.overrides import changed
     from univoxel.tasks import train as task
@@ -303,7 +309,8 @@ def train(
         asked = configuration_of(config, of_preset, minutes, data, out)
     given = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
     asked = dataclasses.replace(asked, **given, **({} if seed is None else {"seed": seed}))
-    print(with_page(task.train(changed(asked, set), resume=resume, timelapse=timelapse)))
+    run = task.train(changed(asked, set), resume=resume, timelapse=timelapse)
+    print(run if no_page else with_page(run))
 
 
 def batch(
@@ -314,9 +321,7 @@ def batch(
     jobs: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: as cores and memory allow)")
     ] = None,
-    scheduler: Annotated[
-        str | None, arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")
-    ] = None,
+    scheduler: Scheduler = None,
     preset: PresetOrAuto = "auto",
     light: LightName = "hybrid",
     minutes: Minutes = None,
@@ -358,12 +363,9 @@ def batch(
 
     check_minutes(minutes)
     wanted = Wanted(steps, masks, preset, light, minutes, config, set, samples)
-    threads = os.environ.get("OMP_NUM_THREADS", "")  # as --threads sets it
-    options = {"jobs": jobs, "threads": int(threads) if threads.isdigit() else None}
+    options = {"jobs": jobs, "threads": threads_asked(), "scheduler": scheduler, "tries": tries}
     with json_file(json) as file:
-        results = task.batch(
-            scenes, out, wanted, **options, scheduler=scheduler, tries=tries, json=file
-        )
+        results = task.batch(scenes, out, wanted, **options, json=file)
     if json != STDOUT:
         rich.print(task.table(results))
         print(out / "index.html")
@@ -826,6 +828,8 @@ def compare(
     minutes: Minutes = None,
     samples: int = SAMPLES,
     set: Changes = (),
+    jobs: AtOnce = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Train scenes with every model of light, side by side.
 
@@ -843,11 +847,14 @@ def compare(
         minutes: wall-clock limit of each training, above 0
         samples: of the light, per pixel of relit pictures
         set: one field of the configuration of all trainings, as of train
+        jobs: trainings at once; with more than one, their times say little
+        scheduler: of a Dask cluster whose workers train, as of batch
     """
     from univoxel.experiments import compare as experiment
 
     check_minutes(minutes)
-    print(experiment.compare(scenes, out, preset, light, minutes, set, samples))
+    where = {"jobs": jobs, "scheduler": scheduler}
+    print(experiment.compare(scenes, out, preset, light, minutes, set, samples, **where))
 
 
 def chart(
@@ -862,6 +869,8 @@ def chart(
     ] = (),
     samples: int = SAMPLES,
     set: Changes = (),
+    jobs: AtOnce = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Draw quality against training time, of presets and knobs.
 
@@ -881,10 +890,13 @@ def chart(
         only: names of settings
         samples: of the light, per pixel of relit pictures
         set: one field of the configuration of all trainings, as of train
+        jobs: trainings at once; with more than one, their times say little
+        scheduler: of a Dask cluster whose workers train, as of batch
     """
     from univoxel.experiments import chart as experiment
 
-    print(experiment.chart(scenes, out, preset, light, quick, only, set, samples))
+    where = {"jobs": jobs, "scheduler": scheduler}
+    print(experiment.chart(scenes, out, preset, light, quick, only, set, samples, **where))
 
 
 def stress(
@@ -904,6 +916,8 @@ def stress(
         int | None, arg(metavar="N", help_behavior_hint="(default: 3; with --quick: 1)")
     ] = None,
     set: Changes = (),
+    jobs: AtOnce = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Find out where the method breaks, on scenes of known truth.
 
@@ -921,10 +935,13 @@ def stress(
         light: models of light, as of train
         seeds: trainings of each level, with other random numbers
         set: one field of the configuration of all trainings, as of train
+        jobs: trainings at once; with more than one, their times say little
+        scheduler: of a Dask cluster whose workers train, as of batch
     """
     from univoxel.experiments.stress import suite
 
-    print(suite.stress(out, only, light, seeds, quick, set))
+    where = {"jobs": jobs, "scheduler": scheduler}
+    print(suite.stress(out, only, light, seeds, quick, set, **where))
 
 
 def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> None:

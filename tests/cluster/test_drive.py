@@ -4,7 +4,6 @@ Workers and schedulers of a cluster are processes of their own, as people start 
 """
 
 import contextlib
-import json
 import os
 import pickle
 import re
@@ -16,6 +15,7 @@ import time
 from pathlib import Path
 
 import pytest
+from clusters import alive, process, scheduler, wait_for, worker
 
 from univoxel import child
 from univoxel.cluster.drive import drive
@@ -65,47 +65,6 @@ def begun(out: Path, name: str) -> list[int]:
 
 def alone(piece: Piece):
     return work(piece, lambda told: None, lambda: True)
-
-
-def wait_for(what, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-@contextlib.contextmanager
-def process(*arguments: str, **options):
-    """A process of ours, which is ended."""
-    running = subprocess.Popen([sys.executable, *arguments], **options)
-    try:
-        yield running
-    finally:
-        running.kill()
-        running.wait()
-
-
-@contextlib.contextmanager
-def scheduler(folder: Path, port: int = 0):
-    """A scheduler; its process and address."""
-    file = folder / f"scheduler-{time.monotonic_ns()}.json"
-    options = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard", "--no-show"]
-    options += ["--dashboard-address", "127.0.0.1:0", "--scheduler-file", str(file)]
-    with process("-m", "distributed.cli.dask_scheduler", *options, stderr=-3) as running:
-        wait_for(file.exists)
-        yield running, json.loads(file.read_text())["address"]
-
-
-def worker(address: str):
-    options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1"]
-    return process("-m", "distributed.cli.dask_worker", address, *options, stderr=-3)
 
 
 def test_all_are_done_once_and_recorded(tmp_path):
@@ -314,6 +273,22 @@ def test_a_scheduler_that_is_gone_is_said_and_its_work_ends(tmp_path):
     with scheduler(tmp_path) as (_, address), worker(address), machines(1, address) as client:
         assert [ended.state for ended in drive(client, [last], 1)] == ["done"]
     assert len(begun(tmp_path, "mug")) == 2
+
+
+def test_a_client_that_ends_takes_its_work_from_the_workers(tmp_path):
+    piece = counting(tmp_path, "mug", last=1000, pause=0.1)
+    with scheduler(tmp_path) as (_, address), worker(address):
+        with machines(1, address) as client:
+            handed_out = drive(client, [piece], 1)
+            thread = threading.Thread(target=lambda: [*handed_out], daemon=True)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(threading, "excepthook", lambda _: None)
+                thread.start()
+                wait_for(lambda: begun(tmp_path, "mug"))
+                client.close()
+                thread.join()
+        wait_for(lambda: not alive(begun(tmp_path, "mug")[0]))
+        assert alone(counting(tmp_path, "mug", last=3)).state == "done"
 
 
 def test_files_that_cannot_be_written_fail_the_piece_alone(tmp_path):

@@ -144,7 +144,16 @@ def _steps(
     before = [project.cut] if "masks" in wanted.steps else []
     before += [project.scene] if {"poses", "masks"} & set(wanted.steps) else []
     found = FirstOf((*before, data))
-    train = (*MODULE, "train", found, "--out", run, "--resume", *_training(wanted, threads))
+    train = (
+        *MODULE,
+        "train",
+        found,
+        "--out",
+        run,
+        "--resume",
+        "--no-page",
+        *_training(wanted, threads),
+    )
     evaluate = (*MODULE, "eval", run, "--json", str(measures), "--samples", str(wanted.samples))
     page = (*MODULE, "view", run, "--html", str(project.page), "--title", project.out.name)
     export = (*MODULE, "export", run, "--mesh", str(project.mesh))
