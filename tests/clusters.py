@@ -7,14 +7,19 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+POLL_SECONDS = 0.02
 
-def wait_for(what, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
+
+def wait_for(what: Callable[[], object], seconds: float = 60.0) -> None:
+    """Wait until something is so; time in which this process is stopped does not count."""
+    for _ in range(round(seconds / POLL_SECONDS)):
+        if what():
+            return
+        time.sleep(POLL_SECONDS)
+    raise AssertionError("waited in vain")
 
 
 def alive(pid: int) -> bool:
@@ -42,7 +47,7 @@ def scheduler(folder: Path, port: int = 0):
     options = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard", "--no-show"]
     options += ["--dashboard-address", "127.0.0.1:0", "--scheduler-file", str(file)]
     with process("-m", "distributed.cli.dask_scheduler", *options, stderr=-3) as running:
-        wait_for(file.exists)
+        wait_for(lambda: file.exists() and file.read_text().rstrip().endswith("}"))
         yield running, json.loads(file.read_text())["address"]
 
 

@@ -76,7 +76,7 @@ HELPERS = {
     "segmentation": {"config", "distances", "vote"},
     "page": {"maps", "transfer"},
     "cluster": {"piece", "shown", "work"},
-    "batch": {"scenes"},
+    "batch": {"results", "scenes"},
     "viewer": {"subject", "frames", "studio"},
     "capture": {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),

@@ -147,6 +147,18 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     assert calls.noted == [("train", (expected,), {"resume": False, "timelapse": None})]
 
 
+def test_capture_until_a_step(calls, capsys):
+    find = calls.task("find", Path("mug/cut"))
+    calls.stand_in("univoxel.tasks.capture", find_data=find)
+    assert main(["capture", "photos", "--out", "mug", "--until", "masks"]) == 0
+    assert capsys.readouterr().out == "mug/cut\n"
+    assert calls.noted[0][2] == {"masks": "auto", "until": "masks"}
+    assert main(["capture", "photos", "--out", "mug", "--until", "cameras", "--minutes", "2"]) == 2
+    assert "--until cameras: --preset, --light, --minutes, --set come after it" in (
+        capsys.readouterr().err
+    )
+
+
 def test_capture(calls, capsys):
     options = ["--masks", "rembg", "--preset", "draft", "--light", "sg", "--minutes", "2"]
     assert main(["capture", "photos", "--out", "mug", *options, "--set=seed=3"]) == 0

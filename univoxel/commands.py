@@ -163,15 +163,17 @@ class Choices:
 
 
 def configuration_of(
-    file: Path, choices: Choices, minutes: float | None, data: Path, out: Path
+    file: Path | None, choices: Choices, minutes: float | None, data: Path, out: Path
 ) -> TrainConfig:
-    """The configuration in a file, for other photographs.
+    """The configuration in a file, for other photographs; without a file that of the choices.
 
     Raises:
         UserError: the file cannot be read, or a choice was made that it makes itself.
     """
     from univoxel.config import load_config
 
+    if file is None:
+        return choices.configuration(minutes, data, out)
     for field in dataclasses.fields(choices):
         if (value := getattr(choices, field.name)) != field.default:
             option = f"--{field.name.replace('_', '-')} {value}"
@@ -303,10 +305,7 @@ def train(
         raise ExistingFile(f"{out} holds a run already: add --resume, or choose another --out")
     of_preset = Choices(preset, light, varying, light_frame, masks, cameras, field)
     of_preset = dataclasses.replace(of_preset, capacity=capacity, budget_mb=budget_mb)
-    if config is None:
-        asked = of_preset.configuration(minutes, data, out)
-    else:
-        asked = configuration_of(config, of_preset, minutes, data, out)
+    asked = configuration_of(config, of_preset, minutes, data, out)
     given = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
     asked = dataclasses.replace(asked, **given, **({} if seed is None else {"seed": seed}))
     run = task.train(changed(asked, set), resume=resume, timelapse=timelapse)

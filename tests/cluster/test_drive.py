@@ -237,15 +237,16 @@ def test_an_interrupt_ends_the_processes(tmp_path):
     wait_for(lambda: not alive(begun(tmp_path, "mug")[0]))
 
 
-def test_a_worker_that_is_killed_and_one_that_joins(tmp_path):
-    """The piece of the one that died goes on with what it had, at the one that joined."""
+@pytest.mark.parametrize("what", [signal.SIGKILL, signal.SIGTERM])
+def test_a_worker_that_is_ended_and_one_that_joins(tmp_path, what):
+    """The piece of the one that ended goes on with what it had, at the one that joined."""
     pieces = [counting(tmp_path, f"p{i}", last=25, pause=0.1) for i in range(2)]
     with scheduler(tmp_path) as (_, address), worker(address) as first, contextlib.ExitStack() as s:
 
         def change() -> None:
             wait_for(lambda: begun(tmp_path, "p0") or begun(tmp_path, "p1"))
             time.sleep(0.5)
-            first.kill()
+            first.send_signal(what)
             s.enter_context(worker(address))
 
         with machines(1, address) as client:
@@ -273,6 +274,16 @@ def test_a_scheduler_that_is_gone_is_said_and_its_work_ends(tmp_path):
     with scheduler(tmp_path) as (_, address), worker(address), machines(1, address) as client:
         assert [ended.state for ended in drive(client, [last], 1)] == ["done"]
     assert len(begun(tmp_path, "mug")) == 2
+
+
+def test_a_worker_without_the_package_is_named(tmp_path):
+    def on_worker(piece, topic):
+        raise ModuleNotFoundError("No module named 'univoxel'")
+
+    with machines(1) as client, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("univoxel.cluster.drive.on_worker", on_worker)
+        with pytest.raises(ProcessFailed, match="a worker has another univoxel than this, or none"):
+            list(drive(client, [counting(tmp_path, "mug")], 1))
 
 
 def test_a_client_that_ends_takes_its_work_from_the_workers(tmp_path):

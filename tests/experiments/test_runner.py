@@ -127,7 +127,7 @@ def test_two_processes_do_not_share_a_folder(data, out, tmp_path):
     shutil.copytree(out / "ball" / "small", folder)
     result = folder / "result.json"
     result.rename(folder / "later")
-    lock = FileLock(folder / runner.LOCK)
+    lock = FileLock(folder / runner.LOCK, thread_local=False)
 
     def leave() -> None:
         (folder / "later").rename(result)

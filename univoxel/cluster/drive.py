@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from univoxel.cluster.piece import Ended, Piece, Told
 from univoxel.cluster.shown import Shown
-from univoxel.cluster.work import on_worker
+from univoxel.cluster.work import Unwanted, on_worker
 from univoxel.errors import ProcessFailed
 
 if TYPE_CHECKING:
@@ -88,7 +88,11 @@ class Drive:
             raise ProcessFailed("the scheduler is gone: the same command goes on")
 
     def _found(self, future: Any) -> Ended:
-        """What a task returned; a task without workers died."""
+        """What a task returned, or what its end says.
+
+        Raises:
+            ProcessFailed: the scheduler is gone, or a worker cannot do it.
+        """
         from distributed import KilledWorker
 
         name = self._names.pop(future.key)
@@ -97,8 +101,13 @@ class Drive:
         error = future.exception()
         if error is None:
             return future.result()
-        if isinstance(error, KilledWorker):
-            return Ended(name, "failed", {"worker": "every worker that took it died"})
+        match error:
+            case KilledWorker():
+                return Ended(name, "failed", {"worker": "every worker that took it died"})
+            case Unwanted():  # by a worker that is closing
+                return Ended(name, "taken")
+            case ImportError():
+                raise ProcessFailed(f"a worker has another univoxel than this, or none: {error}")
         raise error
 
     def _last(self, found: Ended) -> Ended:
@@ -147,7 +156,7 @@ def _own(event: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in event.items() if name in names}
 
 
-def _slots(client: Client) -> int:
+def _slots(client: Any) -> int:
     """Pieces that workers take at once."""
     try:
         return sum(client.nthreads().values()) if client.status == "running" else 0

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import tempfile
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from univoxel.errors import MissingExtra, ProcessFailed, UserError
 
@@ -70,7 +70,7 @@ def machines(jobs: int, scheduler: str | None = None) -> Iterator[Client]:
 
 def _local(jobs: int, stack: contextlib.ExitStack) -> Client:
     """A client of a cluster in this process."""
-    import dask
+    import dask.config
     from distributed import Client, LocalCluster
 
     # Its pages would tell others on this machine what runs here
@@ -100,7 +100,8 @@ def _check_workers(client: Client, scheduler: str) -> None:
     """
     from univoxel import __version__
 
-    for address, found in client.run(_version, on_error="return").items():
+    workers: Any = client.run(_version, on_error="return")
+    for address, found in workers.items():
         if found != __version__:
             raise ProcessFailed(
                 f"scheduler={scheduler}: expected workers with univoxel {__version__}, got "
