@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import subprocess
 import sys
 
 PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>; it stays through exec
@@ -26,6 +27,8 @@ def main(parent: int, lock: str, command: list[str]) -> None:
             sys.exit(1)
     if lock != "-" and not hold(lock):
         sys.exit(LOCKED)
+    if os.name == "nt":  # exec there begins another process, and ends this one at once
+        sys.exit(subprocess.call(command))
     os.execvp(command[0], command)
 
 

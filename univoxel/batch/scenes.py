@@ -16,6 +16,7 @@ from univoxel.config import TrainConfig, load_config
 from univoxel.data.images import image_size
 from univoxel.data.shots import LARGE
 from univoxel.errors import UserError
+from univoxel.files import read_json
 from univoxel.machine import Memory
 from univoxel.names import (
     BATCH_STEPS,
@@ -77,6 +78,8 @@ class Wanted:
         """What a later sitting must agree with to go on; JSON. Steps may be added."""
         fields = asdict(self) | {"data": str(data)}
         del fields["steps"]
+        if self.config is not None:
+            fields["config"] = read_json(self.config)
         return json.loads(json.dumps(fields, default=str))
 
 

@@ -106,7 +106,7 @@ class Shown:
         if not self._progress.console.is_terminal:
             facts += [f"{n} {told.step}{_percent(told)}" for n, told in list(fresh.items())[:4]]
         hours = (time.monotonic() - self._begin) / 3600
-        if self._done:
+        if self._done and hours:
             facts.append(f"{self._done / hours:.3g} an hour")
         left = self.left(slots)
         facts.append("waits for workers" if left is None else f"about {minutes(left)} left")

@@ -131,6 +131,7 @@ def _run(
             command,
             **{"stdin": subprocess.DEVNULL, "stdout": output, "stderr": subprocess.STDOUT},
             env=os.environ | limits,
+            start_new_session=True,  # Ctrl-C is for who waits for it
         )
         try:
             while process.poll() is None:
