@@ -74,7 +74,7 @@ class Wanted:
                 configuration = replace(configuration, minutes=self.minutes)
         return changed(configuration, self.changes)
 
-    def identity(self, data: Path) -> dict:
+    def identity(self, data: Path) -> dict[str, Any]:
         """What a later sitting must agree with to go on; JSON. Steps may be added."""
         fields = asdict(self) | {"data": str(data)}
         del fields["steps"]

@@ -40,7 +40,7 @@ class Shown:
         self._progress.start()
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
     def now(self, told: Told) -> None:
