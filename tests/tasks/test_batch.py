@@ -34,7 +34,7 @@ TINY = (
 # Its steps take a moment; draft's minute would cut them on a busy machine
 WANTED = Wanted(("train",), "auto", "draft", "sg", 30.0, changes=TINY, samples=1)
 # The first stage is saved at once; the second takes long enough to be killed in
-SLOW = dataclasses.replace(WANTED, changes=(*TINY, "stages.1.iterations=500"))
+SLOW = dataclasses.replace(WANTED, changes=(*TINY, "stages.1.iterations=1500"))
 
 
 @pytest.fixture(scope="module")
