@@ -5,7 +5,18 @@ docs/figures/diagrams.py draws them."""
 # helpers named here.
 LAYERS = [
     {"errors"},
-    {"bars", "files", "installation", "machine", "names", "records", "threads", "validation"},
+    {
+        "bars",
+        "child",
+        "files",
+        "installation",
+        "machine",
+        "names",
+        "records",
+        "threads",
+        "validation",
+    },
+    {"cluster"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "poses"},
@@ -29,7 +40,7 @@ LAYERS = [
     {"confidence"},
     {"compression", "pictures"},
     {"build", "capture", "evaluation", "page", "segmentation"},
-    {"report", "viewer"},
+    {"batch", "report", "viewer"},
     {"tasks"},
     {"tasks.demo", "tasks.submit"},
     {"tasks.capture"},
@@ -66,6 +77,8 @@ HELPERS = {
     "evaluation": {"measures", "truth"},
     "segmentation": {"config", "distances", "vote"},
     "page": {"maps", "transfer"},
+    "cluster": {"piece", "shown", "work"},
+    "batch": {"results", "scenes"},
     "report": {"drawing", "light", "photographs", "sides", "training"},
     "viewer": {"subject", "denoise", "frames", "film", "hosting", "incident", "studio"},
     "capture": {

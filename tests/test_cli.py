@@ -149,6 +149,18 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     ]
 
 
+def test_capture_until_a_step(calls, capsys):
+    find = calls.task("find", Path("mug/cut"))
+    calls.stand_in("univoxel.tasks.capture", find_data=find)
+    assert main(["capture", "photos", "--out", "mug", "--until", "masks"]) == 0
+    assert capsys.readouterr().out == "mug/cut\n"
+    assert calls.noted[0][2] == {"masks": "auto", "until": "masks"}
+    assert main(["capture", "photos", "--out", "mug", "--until", "cameras", "--minutes", "2"]) == 2
+    assert "--until cameras: --preset, --light, --minutes, --set come after it" in (
+        capsys.readouterr().err
+    )
+
+
 def test_capture(calls, capsys):
     options = ["--masks", "rembg", "--preset", "draft", "--light", "sg", "--minutes", "2"]
     assert main(["capture", "photos", "--out", "mug", *options, "--set=seed=3"]) == 0
@@ -550,7 +562,8 @@ def test_the_laboratory_has_a_screen_of_its_own(capsys):
 def test_commands_of_the_laboratory_have_their_old_names_too(calls, word):
     calls.stand_in("univoxel.experiments.stress.suite", stress=calls.task("stress", "breaks"))
     assert main([*word, "stress", "--out", "out"]) == 0
-    assert calls.noted == [("stress", (Path("out"), (), (), None, False, ()), {})]
+    here = {"jobs": 1, "scheduler": None}
+    assert calls.noted == [("stress", (Path("out"), (), (), None, False, ()), here)]
 
 
 def said(capsys, calls, *options):

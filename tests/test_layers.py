@@ -12,7 +12,7 @@ from univoxel.commands import COMMANDS
 ROOT = Path(__file__).parent.parent
 
 # Extras: imported inside the function that needs one
-OPTIONAL = {"drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh"}
+OPTIONAL = {"dask", "distributed", "drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh"}
 OPTIONAL |= {"onnxruntime", "pillow_heif", "pycolmap", "rawpy", "rembg", "viser"}
 # The one file or folder of csrc/ that includes it; no header of ours passes it on to others.
 INCLUDES = {r"embree\d?/": "visibility.cpp", r"pybind11/": "bindings"}
@@ -152,5 +152,5 @@ def test_functions_are_short():
 def test_tasks_are_commands():
     names = {path.stem for path in (ROOT / "univoxel" / "tasks").glob("*.py")} - {"__init__"}
     commands = {"poses", "cutout", "train", "eval", "relight", "export", "envmap", "inspect"}
-    commands |= {"capture", "info", "submit", "demo", "doctor", "view", "report"}
+    commands |= {"batch", "capture", "info", "submit", "demo", "doctor", "view", "report"}
     assert names - {"evaluate"} | {"eval"} == commands <= set(COMMANDS)

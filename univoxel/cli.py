@@ -17,6 +17,7 @@ from univoxel.commands import (
     EVERYDAY,
     LABORATORY,
     STDOUT,
+    batch,
     capture,
     chart,
     compare,
@@ -118,7 +119,7 @@ def help_screen(arguments: Sequence[str]) -> str | None:
 
 def groups() -> dict[str, dict[str, Command]]:
     """Commands in the order of work; what no group names is of a run."""
-    first = ("capture", "poses", "cutout", "train")
+    first = ("capture", "poses", "cutout", "train", "batch")
     last = ("demo", "doctor", "completion")
     run = [name for name in EVERYDAY if name not in first + last]
     named = {"From photographs": first, "Of a run": run, "Of the package": last}
@@ -225,7 +226,7 @@ def spoken(common: Common, results_alone: bool) -> Iterator[None]:
 def _kept(call: Call) -> str:
     """What an interrupted command left behind."""
     out = call.run.keywords.get("out")
-    if call.run.func in (compare, chart, stress):
+    if call.run.func in (batch, compare, chart, stress):
         return f"; {out} keeps the trainings that are done: the same command goes on"
     if call.run.func in (capture, poses):
         return f"; {out} keeps the steps that are done: the same command goes on"

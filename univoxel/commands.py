@@ -19,6 +19,7 @@ from rich.text import Text
 from tyro.conf import Positional, UseAppendAction, arg
 
 from univoxel.errors import ExistingFile, UserError
+from univoxel.machine import threads_asked
 from univoxel.names import (
     BOUNCES,
     ELEVATION,
@@ -29,8 +30,10 @@ from univoxel.names import (
     SAMPLES,
     TEXTURE_QUALITY,
     TEXTURE_SIZE,
+    USUAL_STEPS,
     Animation,
     Background,
+    BatchStep,
     Behind,
     CamerasFrom,
     CapacityOrAuto,
@@ -45,6 +48,7 @@ from univoxel.names import (
     PresetName,
     PresetOrAuto,
     TextureFormat,
+    Until,
 )
 from univoxel.parsing import Command, Shell
 
@@ -53,6 +57,10 @@ if TYPE_CHECKING:
     from univoxel.ops import PointLight, Sun
 
 Run: TypeAlias = Annotated[Positional[Path], arg(metavar="RUN")]
+AtOnce: TypeAlias = Annotated[int, arg(metavar="N")]
+Scheduler: TypeAlias = Annotated[
+    str | None, arg(metavar="ADDRESS", help_behavior_hint="(default: this machine)")
+]
 Scenes: TypeAlias = Annotated[
     Positional[tuple[Path, ...]],
     arg(metavar="SCENE [SCENE ...]", help_behavior_hint="(required)"),
@@ -178,6 +186,8 @@ def configuration_of(
         return choices.configuration(minutes, data, out)
     from univoxel.config import load_config
 
+    if file is None:
+        return choices.configuration(minutes, data, out)
     for field in dataclasses.fields(choices):
         if (value := getattr(choices, field.name)) != field.default:
             option = f"--{field.name.replace('_', '-')} {value}"
@@ -272,6 +282,7 @@ def train(
     seed: Seed = None,
     config: ConfigFile = None,
     set: Changes = (),
+    no_page: bool = False,
 ) -> None:
     """Recover geometry, materials and light from posed photographs.
 
@@ -315,6 +326,7 @@ def train(
             --preset, --light and such would; --minutes, --seed, --downscale and --set go before it
         set: for experts: one field of the configuration, such as loss.radiance=0.5 or
             stages.1.voxels=3; config.json in a run's folder holds them all
+        no_page: write no RUN/index.html at the end
     """
     from univoxel.overrides import changed
     from univoxel.tasks import train as task
@@ -323,11 +335,72 @@ def train(
     watched = {"timelapse": timelapse, "view": view_at(view, host, port)}
     if not resume and (out / "scene.safetensors").exists():
         raise ExistingFile(f"{out} holds a run already: add --resume, or choose another --out")
-    chosen = preset, light, varying, light_frame, masks, cameras, field, capacity, budget_mb
-    asked = configuration_of(config, Choices(*chosen), minutes, data, out)
+    of_preset = Choices(preset, light, varying, light_frame, masks, cameras, field)
+    of_preset = dataclasses.replace(of_preset, capacity=capacity, budget_mb=budget_mb)
+    asked = configuration_of(config, of_preset, minutes, data, out)
     given = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
     asked = dataclasses.replace(asked, **given, **({} if seed is None else {"seed": seed}))
-    print(with_page(task.train(changed(asked, set), resume=resume, **watched)))
+    run = task.train(changed(asked, set), resume=resume, **watched)
+    print(run if no_page else with_page(run))
+
+
+def batch(
+    scenes: Scenes,
+    /,
+    out: Annotated[Path, arg(metavar="NIGHT")],
+    steps: Annotated[tuple[BatchStep, ...], arg(metavar="STEP [STEP ...]")] = USUAL_STEPS,
+    jobs: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: as cores and memory allow)")
+    ] = None,
+    scheduler: Scheduler = None,
+    preset: PresetOrAuto = "auto",
+    light: LightName = "hybrid",
+    minutes: Minutes = None,
+    config: ConfigFile = None,
+    set: Changes = (),
+    masks: Annotated[str, arg(metavar="auto|rembg|FOLDER|none")] = "auto",
+    samples: int = SAMPLES,
+    tries: Annotated[int, arg(metavar="N")] = 3,
+    json: JsonFile = None,
+) -> None:
+    """Take many scenes through training, measures, mesh and page, on one machine or a cluster.
+
+    Each scene has processes of its own: one that crashes, or that the system ends, takes no other
+    with it. What is done is kept: the same command goes on after an interruption, and tries again
+    what failed. NIGHT/index.html shows all scenes, batch.json and batch.csv hold their measures,
+    NIGHT/SCENE has what was made, NIGHT/logs what was said. Ends with exit code 2 where a scene
+    failed.
+
+    Args:
+        scenes: folders of photographs, of different names
+        out: folder to write
+        steps: of each scene: train eval export page; before them poses masks, for photographs
+            without cameras or masks, as capture makes them
+        jobs: scenes at once; each runs on --threads, or its share of the cores
+        scheduler: of a Dask cluster whose workers take the scenes, such as tcp://10.0.0.1:8786;
+            they see the same folders. Whoever reaches a scheduler can run programs on its workers
+        preset: as of train; without --minutes on one thread, its training gets twice its time
+        light: as of train
+        minutes: wall-clock limit of each training, above 0
+        config: as of train
+        set: as of train
+        masks: as of capture, for the step masks
+        samples: of the light, per pixel of relit pictures that are measured
+        tries: how often a scene whose process is killed is tried before it counts as failed
+        json: another file for what batch.json holds; - prints it in place of the table
+    """
+    from univoxel.batch.scenes import Wanted
+    from univoxel.tasks import batch as task
+
+    check_minutes(minutes)
+    wanted = Wanted(steps, masks, preset, light, minutes, config, set, samples)
+    options = {"jobs": jobs, "threads": threads_asked(), "scheduler": scheduler, "tries": tries}
+    with json_file(json) as file:
+        results = task.batch(scenes, out, wanted, **options, json=file)
+    if json != STDOUT:
+        rich.print(task.table(results))
+        print(out / "index.html")
+    task.check(results)
 
 
 def cutout(
@@ -431,6 +504,7 @@ def capture(
         float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
     ] = None,
     set: Changes = (),
+    until: Until = "page",
 ) -> None:
     """From photographs to a mesh with materials and a page, in one command.
 
@@ -449,10 +523,17 @@ def capture(
         light: as of train
         minutes: of training, above 0; as of train
         set: as of train
+        until: the last step: page is all of them; cameras or masks end before training, and the
+            folder to train on is printed
     """
     from univoxel.tasks import capture as task
 
     check_minutes(minutes)
+    if until != "page":
+        if (preset, light, minutes, set) != ("auto", "hybrid", None, ()):
+            raise UserError(f"--until {until}: --preset, --light, --minutes, --set come after it")
+        print(task.find_data(photographs, out, masks=masks, until=until))
+        return
     made = task.capture(
         photographs,
         out,
@@ -834,6 +915,8 @@ def compare(
     minutes: Minutes = None,
     samples: int = SAMPLES,
     set: Changes = (),
+    jobs: AtOnce = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Train scenes with every model of light, side by side.
 
@@ -851,11 +934,14 @@ def compare(
         minutes: wall-clock limit of each training, above 0
         samples: of the light, per pixel of relit pictures
         set: one field of the configuration of all trainings, as of train
+        jobs: trainings at once; with more than one, their times say little
+        scheduler: of a Dask cluster whose workers train, as of batch
     """
     from univoxel.experiments import compare as experiment
 
     check_minutes(minutes)
-    print(experiment.compare(scenes, out, preset, light, minutes, set, samples))
+    where = {"jobs": jobs, "scheduler": scheduler}
+    print(experiment.compare(scenes, out, preset, light, minutes, set, samples, **where))
 
 
 def chart(
@@ -870,6 +956,8 @@ def chart(
     ] = (),
     samples: int = SAMPLES,
     set: Changes = (),
+    jobs: AtOnce = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Draw quality against training time, of presets and knobs.
 
@@ -889,10 +977,13 @@ def chart(
         only: names of settings
         samples: of the light, per pixel of relit pictures
         set: one field of the configuration of all trainings, as of train
+        jobs: trainings at once; with more than one, their times say little
+        scheduler: of a Dask cluster whose workers train, as of batch
     """
     from univoxel.experiments import chart as experiment
 
-    print(experiment.chart(scenes, out, preset, light, quick, only, set, samples))
+    where = {"jobs": jobs, "scheduler": scheduler}
+    print(experiment.chart(scenes, out, preset, light, quick, only, set, samples, **where))
 
 
 def stress(
@@ -912,6 +1003,8 @@ def stress(
         int | None, arg(metavar="N", help_behavior_hint="(default: 3; with --quick: 1)")
     ] = None,
     set: Changes = (),
+    jobs: AtOnce = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Find out where the method breaks, on scenes of known truth.
 
@@ -929,10 +1022,13 @@ def stress(
         light: models of light, as of train
         seeds: trainings of each level, with other random numbers
         set: one field of the configuration of all trainings, as of train
+        jobs: trainings at once; with more than one, their times say little
+        scheduler: of a Dask cluster whose workers train, as of batch
     """
     from univoxel.experiments.stress import suite
 
-    print(suite.stress(out, only, light, seeds, quick, set))
+    where = {"jobs": jobs, "scheduler": scheduler}
+    print(suite.stress(out, only, light, seeds, quick, set, **where))
 
 
 def demo(out: Annotated[Path, arg(metavar="DIR")] = Path("univoxel-demo")) -> None:
@@ -984,6 +1080,7 @@ COMMANDS: dict[str, Command] = {
     "poses": poses,
     "cutout": cutout,
     "train": train,
+    "batch": batch,
     "eval": evaluate,
     "relight": relight,
     "export": export,

@@ -49,6 +49,12 @@ def cores(root: Path = ROOT) -> float:
     return min(granted)
 
 
+def threads_asked() -> int | None:
+    """Threads that the environment asks for, as `--threads` does; None: it does not."""
+    asked = os.environ.get("OMP_NUM_THREADS", "").strip()
+    return int(asked) if asked.isdigit() and int(asked) else None
+
+
 def memory(root: Path = ROOT) -> Memory | None:
     """Memory that this process may have."""
     told = {}

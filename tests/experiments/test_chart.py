@@ -81,7 +81,7 @@ def passed(monkeypatch):
     """What reaches the runner, in place of the trainings."""
     noted = []
 
-    def run(scenes, settings, out, samples):
+    def run(scenes, settings, out, samples, at_once, scheduler):
         noted.append([s.name for s in settings])
         out.mkdir(exist_ok=True)
         return [outcome("cup", s.name, 60, 30.0) for s in settings]

@@ -54,7 +54,7 @@ def passed(monkeypatch):
     """What reaches the runner, in place of the trainings."""
     noted = []
 
-    def run(scenes, settings, out, samples):
+    def run(scenes, settings, out, samples, at_once, scheduler):
         noted.append((scenes, settings, out, samples))
         out.mkdir(exist_ok=True)
         return [

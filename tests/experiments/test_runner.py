@@ -2,13 +2,17 @@
 
 import dataclasses
 import json
+import os
 import re
 import shutil
+import threading
 
 import pytest
 from analytic import write_scene
+from filelock import FileLock
 
 from univoxel.checkpoint import FILE
+from univoxel.cluster.piece import Ended
 from univoxel.errors import DataError
 from univoxel.evaluation.measures import MEASURES
 from univoxel.experiments import runner, worker
@@ -43,11 +47,14 @@ def trained(monkeypatch):
     """The names of the settings whose process was started, in place of the process."""
     names = []
 
-    def note(job, bar):
-        names.append(job.setting.name)
-        return runner.Outcome(job.scene, job.setting.name, job.identity)
+    def note(client, pieces, total, tries):
+        for piece in pieces:
+            scene, _, setting = piece.name.partition("/")
+            names.append(setting)
+            runner.Outcome(scene, setting, {}).save(piece.output.parent)
+            yield Ended(piece.name, "done")
 
-    monkeypatch.setattr(runner, "_train", note)
+    monkeypatch.setattr(runner, "drive", note)
     return names
 
 
@@ -76,6 +83,8 @@ def test_what_is_done_is_not_done_again(data, out, trained):
     again = runner.run([data], [DIES, SMALL], out, samples=1)
     assert trained == ["dies"]
     assert again[1] == load_outcome(out / "ball" / "small")
+    assert runner.run([data], [SMALL], out, samples=1) == again[1:]
+    assert trained == ["dies"]
 
 
 def test_results_of_other_settings_are_not_taken(data, out, trained):
@@ -98,6 +107,7 @@ def test_a_killed_evaluation_goes_on_from_the_trained_scene(out, tmp_path, monke
 def test_a_killed_training_starts_anew(out, tmp_path, monkeypatch):
     folder = tmp_path / "ball" / "small"
     shutil.copytree(out / "ball" / "small", folder)
+    (folder / "result.json").unlink()
     (folder / "run" / FILE).write_bytes(b"cut short")
     begun = []
 
@@ -111,20 +121,37 @@ def test_a_killed_training_starts_anew(out, tmp_path, monkeypatch):
     assert len(begun) == 1
 
 
-def test_two_processes_do_not_share_a_folder(out, tmp_path):
-    folder = tmp_path / "small"
+def test_two_processes_do_not_share_a_folder(data, out, tmp_path):
+    """Who comes second waits, and takes what the first has left."""
+    folder = tmp_path / "ball" / "small"
     shutil.copytree(out / "ball" / "small", folder)
-    with (
-        worker.FileLock(folder / worker.LOCK),
-        pytest.raises(RuntimeError, match="small: another process is at work there"),
-    ):
-        worker.work(folder)
+    result = folder / "result.json"
+    result.rename(folder / "later")
+    lock = FileLock(folder / runner.LOCK, thread_local=False)
+
+    def leave() -> None:
+        (folder / "later").rename(result)
+        lock.release()
+
+    lock.acquire()
+    timer = threading.Timer(1.0, leave)
+    timer.start()
+    found = runner.run([data], [SMALL], tmp_path, samples=1)
+    timer.join()
+    assert found == [load_outcome(out / "ball" / "small")]  # with its load and its seconds
 
 
-def test_a_signal_is_named(tmp_path):
-    assert runner._reason(-9, tmp_path / "none") == "ended by SIGKILL"
-    (tmp_path / "said").write_text("")
-    assert runner._reason(3, tmp_path / "said") == "ended with exit code 3"
+def test_a_killed_process_is_an_outcome(data, tmp_path, monkeypatch):
+    """It is not tried again in one sitting: a crash is what experiments look for."""
+    (tmp_path / "killed.py").write_text("import os; os.kill(os.getpid(), 9)")
+    monkeypatch.setattr(runner.worker, "__name__", "killed")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    (outcome,) = runner.run([data], [SMALL], tmp_path / "out", samples=1)
+    assert outcome.error.startswith("ended by SIGKILL")
+    assert load_outcome(tmp_path / "out" / "ball" / "small") == outcome
+    (tmp_path / "killed.py").write_text("")
+    (outcome,) = runner.run([data], [SMALL], tmp_path / "other", samples=1)
+    assert outcome.error == "left no result.json"
 
 
 def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):

@@ -308,6 +308,17 @@ def test_photographs_with_cameras_and_masks_are_trained_on_as_they_lie(
     assert "cut" not in kept
 
 
+def test_the_first_steps_alone(steps, pictures, tmp_path):
+    out = tmp_path / "mug"
+    assert task.find_data(pictures, out, until="cameras") == out / "scene"
+    assert task.find_data(pictures, out, masks="none") == out / "cut"
+    assert [name for name, *_ in steps] == ["poses", "cutout"]
+    assert task.capture(pictures, out, masks="none").page.exists()  # goes on with them
+    assert [name for name, *_ in steps] == ["poses", "cutout", "train"]
+    with pytest.raises(UserError, match="is a trained run: there are cameras and masks"):
+        task.find_data(out / "run", tmp_path / "other")
+
+
 def still(photographs, out, masks=None, config=None):
     raise StillBackground("the background stands still in 9 of 10 pairs")
 

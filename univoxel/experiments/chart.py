@@ -59,6 +59,8 @@ def chart(
     only: Sequence[str] = (),
     changes: Sequence[str] = (),
     samples: int = 64,
+    jobs: int = 1,
+    scheduler: str | None = None,
 ) -> Path:
     """Train every scene with presets and knobs; write out/chart.json, .png and .svg.
 
@@ -71,13 +73,14 @@ def chart(
         only: names of settings; all when empty.
         changes: FIELD=VALUE of the configuration, for all.
         samples: of the light per pixel of relit pictures in evaluation.
+        jobs, scheduler: trainings at once here, or who else trains; as of runner.run_pairs.
 
     Returns:
         out/chart.png.
 
     Raises:
         UserError: a scene or an argument cannot be used; nothing was trained.
-        MissingExtra: matplotlib is missing.
+        MissingExtra: matplotlib or Dask is missing.
         ProcessFailed: trainings failed; what came through is in the files.
         OSError: a file cannot be written.
     """
@@ -86,7 +89,9 @@ def chart(
     wanted = only or ((*dict.fromkeys(("draft", preset)), *QUICK) if quick else tuple(chosen))
     if unknown := [name for name in wanted if name not in chosen]:
         raise UserError(f"only must be of {', '.join(chosen)}, got {', '.join(unknown)}", "only")
-    outcomes = runner.run(scenes, [chosen[name] for name in wanted], out, samples)
+    outcomes = runner.run(
+        scenes, [chosen[name] for name in wanted], out, samples, at_once=jobs, scheduler=scheduler
+    )
     record = {
         "preset": preset,
         "light": light,

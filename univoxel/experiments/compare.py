@@ -37,6 +37,8 @@ def compare(
     minutes: float | None = None,
     changes: Sequence[str] = (),
     samples: int = 64,
+    jobs: int = 1,
+    scheduler: str | None = None,
 ) -> Path:
     """Train every scene with every light; write out/compare.md, .json, .png and .svg.
 
@@ -47,19 +49,20 @@ def compare(
         preset, minutes: how much work goes into each, as of config.chosen.
         changes: FIELD=VALUE of the configuration, for all.
         samples: of the light per pixel of relit pictures in evaluation.
+        jobs, scheduler: trainings at once here, or who else trains; as of runner.run_pairs.
 
     Returns:
         out/compare.md.
 
     Raises:
         UserError: a scene or an argument cannot be used; nothing was trained.
-        MissingExtra: matplotlib is missing.
+        MissingExtra: matplotlib or Dask is missing.
         ProcessFailed: trainings failed; what came through is in the files.
         OSError: a file cannot be written.
     """
     plots.require()
     settings = [_setting(text, preset, minutes, tuple(changes)) for text in light]
-    outcomes = runner.run(scenes, settings, out, samples)
+    outcomes = runner.run(scenes, settings, out, samples, at_once=jobs, scheduler=scheduler)
     record = {
         "preset": preset,
         "minutes": minutes,

@@ -6,30 +6,28 @@ import dataclasses
 import json
 import logging
 import re
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-
-from univoxel.bars import bar
+from univoxel.cluster.drive import drive
+from univoxel.cluster.machines import machines
+from univoxel.cluster.piece import Ended, Piece, Step
 from univoxel.data import load_photos
 from univoxel.errors import UserError
 from univoxel.experiments import worker
 from univoxel.experiments.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.files import replacing
+from univoxel.machine import threads_asked
+from univoxel.training import progress
 
 log: logging.Logger = logging.getLogger("univoxel")
 
 OUTPUT = "output.txt"  # what the process said
+LOCK = "lock"  # held by who is at work in the folder
 NAME = re.compile(r"[\w.+=-]*\w[\w.+=-]*")
 EVALUATION_SECONDS = 60.0  # a guess, until runs of this sitting say better
-POLL_SECONDS = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,13 @@ class Job:
 
 
 def run(
-    scenes: Sequence[Path], settings: Sequence[Setting], out: Path, samples: int = 64
+    scenes: Sequence[Path],
+    settings: Sequence[Setting],
+    out: Path,
+    samples: int = 64,
+    *,
+    at_once: int = 1,
+    scheduler: str | None = None,
 ) -> list[Outcome]:
     """Train every scene with every setting; by scene, then by setting. See `run_pairs`.
 
@@ -62,7 +66,7 @@ def run(
         for split in ("train", "test"):
             config = settings[0].config(data, out)
             load_photos(data, split, config.downscale, allow_outside=config.allow_outside)
-    return _run(jobs)
+    return _run(jobs, at_once, scheduler)
 
 
 def run_pairs(
@@ -70,8 +74,11 @@ def run_pairs(
     out: Path,
     samples: int = 64,
     seconds: float | None = None,
+    *,
+    at_once: int = 1,
+    scheduler: str | None = None,
 ) -> list[Outcome]:
-    """Train scenes with settings of their own, one after another.
+    """Train scenes with settings of their own.
 
     out/SCENE/SETTING/ holds the run, what it said (output.txt) and result.json, an `Outcome`. A
     training whose result.json is there already is not done again; one that failed is. A failure is
@@ -81,19 +88,24 @@ def run_pairs(
         pairs: scenes are told apart by the names of their folders.
         samples: of the light per pixel of relit pictures in evaluation, >= 1.
         seconds: what one may take, a guess for the bar; the configuration's time when left out.
+        at_once: how many at once on this machine; more than one, and their times say little.
+        scheduler: address of a scheduler of Dask, whose workers train; they see the same folders.
 
     Raises:
         UserError: a setting that no configuration follows from, a pair that comes twice, or
             results of other settings in `out`.
+        MissingExtra: Dask is missing.
+        ProcessFailed: the scheduler does not answer, or is gone.
         OSError: `out` cannot be written.
     """
     _named(dict.fromkeys(data for data, _ in pairs))
     for scene in dict.fromkeys(data for data, _ in pairs):
         _distinct([setting for data, setting in pairs if data == scene])
-    return _run([_job(data.resolve(), s, out, samples, seconds) for data, s in pairs])
+    jobs = [_job(data.resolve(), s, out, samples, seconds) for data, s in pairs]
+    return _run(jobs, at_once, scheduler)
 
 
-def _run(jobs: Sequence[Job]) -> list[Outcome]:
+def _run(jobs: Sequence[Job], at_once: int, scheduler: str | None) -> list[Outcome]:
     before = {job.folder: load_outcome(job.folder) for job in jobs}
     for job in jobs:
         found = before[job.folder]
@@ -105,11 +117,23 @@ def _run(jobs: Sequence[Job]) -> list[Outcome]:
             )
     done = {folder: found for folder, found in before.items() if found and not found.error}
     missing = [job for job in jobs if job.folder not in done]
-    with _Bar(missing, len(jobs)) as shown:
-        for job in missing:
-            done[job.folder] = _train(job, shown)
-            shown.finished(job, done[job.folder])
+    if missing:
+        done |= _train(missing, len(jobs), at_once, scheduler)
     return [done[job.folder] for job in jobs]
+
+
+def _train(
+    missing: Sequence[Job], total: int, at_once: int, scheduler: str | None
+) -> dict[Path, Outcome]:
+    """Outcomes of jobs by their folders."""
+    work = {piece.name: (piece, job) for job in missing for piece in [_begin(job)]}
+    pieces = [piece for piece, _ in work.values()]
+    found = {}
+    with machines(at_once, scheduler) as client:
+        for ended in drive(client, pieces, total, tries=1):
+            job = work[ended.name][1]
+            found[job.folder] = _outcome(job, ended)
+    return found
 
 
 def failures(outcomes: Sequence[Outcome]) -> str:
@@ -152,79 +176,33 @@ def _job(data: Path, setting: Setting, out: Path, samples: int, seconds: float |
     return Job(folder, data.name, data, setting, samples, identity(config, samples), seconds)
 
 
-def _train(job: Job, shown: _Bar) -> Outcome:
-    """The outcome of a job, which is recorded in its folder."""
+def _begin(job: Job) -> Piece:
+    """The work on a job, which is written into its folder."""
     job.folder.mkdir(parents=True, exist_ok=True)
-    (job.folder / RESULT).unlink(missing_ok=True)  # of a failure before
     fields = {"data": str(job.data), "setting": job.setting, "samples": job.samples}
     with replacing(job.folder / worker.JOB) as temporary:
         temporary.write_text(json.dumps(fields, default=dataclasses.asdict), encoding="utf-8")
-    with (job.folder / OUTPUT).open("wb") as output:
-        command = [sys.executable, "-m", worker.__name__, str(job.folder)]
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
-        )
-        begin = time.monotonic()
-        try:
-            while process.poll() is None:
-                shown.now(job, time.monotonic() - begin)
-                time.sleep(POLL_SECONDS)
-        finally:
-            process.kill()  # only when this was interrupted is it still there
-            process.wait()
+    folder = job.folder.absolute()
+    step = Step(
+        "training", ("-m", worker.__name__, str(folder)), log=folder / worker.RUN / progress.LOG
+    )
+    return Piece(
+        f"{job.scene}/{job.setting.name}",
+        (step,),
+        folder / LOCK,
+        folder / OUTPUT,
+        threads=threads_asked(),
+        seconds=job.seconds,
+    )
+
+
+def _outcome(job: Job, ended: Ended) -> Outcome:
+    """What came out of a job, which is recorded in its folder."""
     found = load_outcome(job.folder)
-    if found is None:
-        error = _reason(process.returncode, job.folder / OUTPUT)
-        found = Outcome(job.scene, job.setting.name, job.identity, error=error)
-        found.save(job.folder)
-    return found
-
-
-def _reason(code: int, output: Path) -> str:
-    """Why a process ended without a result: the signal, or the last line that it said."""
-    if code < 0:
-        return f"ended by {signal.Signals(-code).name}"
-    said = output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return said[-1] if said else f"ended with exit code {code}"
-
-
-class _Bar:
-    """How far the trainings are, and the time that is left."""
-
-    def __init__(self, jobs: Sequence[Job], total: int) -> None:
-        self._left = sum(job.seconds for job in jobs)
-        self._spent, self._expected = 0.0, 0.0  # seconds of what was done in this sitting
-        self._now = 0.0
-        self._progress = bar(
-            TextColumn("{task.completed}/{task.total}"),
-            BarColumn(),
-            TextColumn("{task.description}  {task.fields[left]}"),
-            TimeElapsedColumn(),
-        )
-        self._task = self._progress.add_task("", total=total, completed=total - len(jobs), left="")
-
-    def __enter__(self) -> _Bar:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_) -> None:
-        self._progress.stop()
-
-    def now(self, job: Job, seconds: float) -> None:
-        """A job has run for so many seconds."""
-        self._now = seconds
-        # How long earlier jobs of this sitting took against what was expected of them
-        pace = self._spent / self._expected if self._expected else 1.0
-        left = max(pace * self._left - seconds, 0.0)
-        self._progress.update(
-            self._task,
-            description=f"{job.scene}/{job.setting.name}",
-            left=f"about {left / 60:.0f} min left",
-        )
-
-    def finished(self, job: Job, outcome: Outcome) -> None:
-        self._spent, self._expected = self._spent + self._now, self._expected + job.seconds
-        self._left -= job.seconds
-        self._progress.advance(self._task)
-        if outcome.error:
-            log.info("%s/%s failed: %s", job.scene, job.setting.name, outcome.error)
+    if ended.state == "done" and found is not None:
+        return found
+    error = "; ".join(ended.errors.values()) or f"left no {RESULT}"
+    log.info("%s/%s failed: %s", job.scene, job.setting.name, error)
+    failed = Outcome(job.scene, job.setting.name, job.identity, error=error)
+    failed.save(job.folder)
+    return failed

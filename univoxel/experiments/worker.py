@@ -1,7 +1,8 @@
 """The process of one training: `python -m univoxel.experiments.worker FOLDER`.
 
 FOLDER holds job.json; result.json is written into it, whole or not at all. A process of its own
-gives each training a fresh peak of memory, and takes nothing down with it when it dies.
+gives each training a fresh peak of memory, and takes nothing down with it when it dies. Who begins
+it holds the folder's lock.
 """
 
 from __future__ import annotations
@@ -14,19 +15,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from univoxel.checkpoint import load_checkpoint
 from univoxel.config import TrainConfig, check_same
-from univoxel.errors import ProcessFailed, UserError
-from univoxel.experiments.record import Outcome, Setting, identity
+from univoxel.errors import UserError
+from univoxel.experiments.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.machine import load
 from univoxel.tasks.envmap import Comparison, envmap
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
 
 JOB = "job.json"
-LOCK = "lock"  # held by the process that is at work in the folder
 RUN = "run"  # the training's own folder
 MAP = "envmap.exr"  # the recovered light, where the run has one
 
@@ -35,25 +33,21 @@ def work(folder: Path) -> None:
     """Train, evaluate and record what folder/job.json says.
 
     A training that was broken off starts anew: one in several sittings is not what a reader of its
-    figures expects. One that was finished is only evaluated.
+    figures expects. One that was finished is only evaluated; what came through in the meantime, in
+    another process, stays.
     """
-    try:
-        with FileLock(folder / LOCK, timeout=0):
-            _work(folder)
-    except Timeout:
-        raise ProcessFailed(f"{folder}: another process is at work there") from None
-
-
-def _work(folder: Path) -> None:
-    """`work`, alone in the folder."""
     job = json.loads((folder / JOB).read_text(encoding="utf-8"))
     setting = Setting(**job["setting"] | {"changes": tuple(job["setting"]["changes"])})
     config = setting.config(Path(job["data"]), folder / RUN)
+    samples = job["samples"]
+    before = load_outcome(folder)
+    if before is not None and not before.error and before.identity == identity(config, samples):
+        return
+    (folder / RESULT).unlink(missing_ok=True)  # of a failure before
     load_average = load()
     if not finished(config):
         shutil.rmtree(config.out, ignore_errors=True)
         train(config)
-    samples = job["samples"]
     measures = {
         **evaluate(config.out, samples=samples),
         "steps_made": steps_made(config),

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -135,6 +136,33 @@ def capture(
     _say("page", str(project.page))
     _write_page(project, given, run)
     return Captured(project.page, project.mesh, run)
+
+
+def find_data(
+    photographs: str | Path,
+    out: str | Path,
+    *,
+    masks: str | Path = AUTO,
+    until: Literal["cameras", "masks"] = "masks",
+    config: CaptureConfig = DEFAULTS,
+) -> Path:
+    """The first steps of a capture alone; return the folder to train on. `capture` goes on with it.
+
+    Args:
+        until: the step that is the last.
+
+    Raises:
+        UserError: photographs are a trained run; else as of `capture`.
+        OSError: a file cannot be written.
+    """
+    given = look_at(Path(photographs))
+    if given.kind == "run":
+        raise UserError(f"{given.path} is a trained run: there are cameras and masks", "until")
+    project = Project(Path(out))
+    _check_machine(given, masks)
+    begin(project, given)
+    scene = _find_cameras(project, given, masks, config)
+    return scene if until == "cameras" else _find_masks(project, scene, masks)
 
 
 def _say(step: str, what: str) -> None:

@@ -21,9 +21,14 @@ log: logging.Logger = logging.getLogger("univoxel")
 
 def needed(photos: Photos, cfg: TrainConfig) -> int:
     """Bytes, about, that training takes besides the photographs, which are there already."""
+    return needed_for(photos.alpha.numel(), cfg)
+
+
+def needed_for(pixels: int, cfg: TrainConfig) -> int:
+    """`needed`, of so many pixels in all photographs."""
     stages = [stage for stage in cfg.stages if isinstance(stage, StageConfig)]
     return round(
-        PER_PIXEL * photos.alpha.numel()
+        PER_PIXEL * pixels
         + PER_VOXEL * 1e6 * max(stage.voxels for stage in stages)
         + PER_RAY * max(stage.rays for stage in stages)
     )

@@ -155,9 +155,9 @@ class Progress:
         now, stage = clock.seconds, self.cfg.stages[clock.stage]
         rate = (clock.step - self._reported_step) * stage.rays / (now - self._reported)
         self._reported, self._reported_step = now, clock.step
-        line = self.state() | {"losses": losses, "held_out_psnr": psnr, "rays_per_second": rate}
-        append_line(self._log, json.dumps(line))
         done = clock.share_done
+        line = self.state() | {"losses": losses, "held_out_psnr": psnr, "rays_per_second": rate}
+        append_line(self._log, json.dumps(line | {"share": done}))
         remaining = clock.seconds * (1 - done) / max(done, 1e-3)
         if self._on_progress is not None:
             place = clock.stage + 1, len(self.cfg.stages), done, now, remaining

@@ -86,7 +86,7 @@ def stood_in(monkeypatch):
         noted["damaged"].append((scene.name, place.name, damage, seed, second))
         place.mkdir(parents=True)
 
-    def trained(pairs, out, samples, seconds):
+    def trained(pairs, out, samples, seconds, at_once, scheduler):
         noted["trained"] += [(data.name, one.name) for data, one in pairs]
         return [
             Outcome(d.name, s.name, {}, {"relit_psnr": 30.0 - 5 * ("6" in d.name)})
@@ -148,7 +148,7 @@ def test_photographs_of_another_kind_are_not_taken(stood_in, tmp_path, monkeypat
 
 
 def test_numbers_that_are_none_are_kept_as_text(stood_in, tmp_path, monkeypatch):
-    def trained(pairs, *_):
+    def trained(pairs, *_, **__):
         return [Outcome(d.name, s.name, {}, {"relit_psnr": math.nan}) for d, s in pairs]
 
     monkeypatch.setattr(suite.runner, "run_pairs", trained)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from univoxel.errors import UserError
@@ -49,6 +50,8 @@ def stress(
     seeds: int | None = None,
     quick: bool = False,
     changes: Sequence[str] = (),
+    jobs: int = 1,
+    scheduler: str | None = None,
 ) -> Path:
     """Train on harder and harder scenes; write out/stress.md, .json, .png and .svg.
 
@@ -60,13 +63,14 @@ def stress(
         seeds: of the training and of what is random in the photographs, >= 1; when None 3, or 1.
         quick: fewer severities.
         changes: FIELD=VALUE of the configuration, for all.
+        jobs, scheduler: trainings at once here, or who else trains; as of runner.run_pairs.
 
     Returns:
         out/stress.md. A training that failed is a result.
 
     Raises:
         UserError: an argument cannot be used, or `out` holds other scenes or settings.
-        MissingExtra: Mitsuba or matplotlib is missing.
+        MissingExtra: Mitsuba, matplotlib or Dask is missing.
         ProcessFailed: Mitsuba failed.
         OSError: a file cannot be written.
     """
@@ -78,7 +82,8 @@ def stress(
     plots.require()
     render.require()
     prepared = photographs(found, seeds, out)
-    cells = _train(found, lights, seeds, prepared, out / "runs", tuple(changes))
+    train = partial(runner.run_pairs, at_once=jobs, scheduler=scheduler)
+    cells = _train(found, lights, seeds, prepared, out / "runs", tuple(changes), train)
     clipping = {path.name: clipped(path) for path in dict.fromkeys(prepared.values())}
     with replacing(out / "stress.json") as temporary:
         temporary.write_text(result_text(_record(cells, clipping, changes)), encoding="utf-8")
@@ -136,6 +141,7 @@ def _train(
     data: dict[tuple[Level, int], Path],
     out: Path,
     changes: tuple[str, ...],
+    train: Callable[..., list[Outcome]],
 ) -> list[Cell]:
     """Every level under every light, all seeds; what no configuration follows from is refused."""
     wanted: dict[tuple[Path, str], Setting] = {}
@@ -156,7 +162,7 @@ def _train(
             else:
                 wanted[place, one.name] = one
     pairs = [(place, one) for (place, _), one in wanted.items()]
-    trained = runner.run_pairs(pairs, out, SAMPLES, SECONDS)
+    trained = train(pairs, out, SAMPLES, SECONDS)
     done |= dict(zip(wanted, trained, strict=True))
 
     def outcomes(level: Level, light: LightName) -> tuple[Outcome, ...]:

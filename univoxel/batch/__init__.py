@@ -1,0 +1,1 @@
+"""Many scenes: the steps of each, what came out of them, and pages of it."""
