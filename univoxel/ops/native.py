@@ -214,7 +214,7 @@ class Operator:
         hints = get_type_hints(kernel).items()
         kernel.__annotations__ = {name: _spelt_out(hint) for name, hint in hints}
         qualified = f"univoxel::{name}"
-        self.defined: torch.library.CustomOpDef = torch.library.custom_op(
+        self.defined: Any = torch.library.custom_op(
             qualified, kernel, mutates_args=mutates_args, device_types=()
         )
         # Kernels that custom_op registers itself import the compiler when first called: a second,

@@ -76,7 +76,7 @@ class Guard:
         gradients = [p.grad for p in self._parameters() if p.grad is not None]
         values = [g._values() if g.is_sparse else g for g in gradients]
         # The root of the sum of squares: Adam's moments must not overflow either
-        norms = torch._foreach_norm(values)
+        norms = [torch.linalg.vector_norm(v) for v in values]
         if bool(torch.isfinite(torch.stack([loss.detach(), *norms]).sum())):
             self._sound += 1
             if self._sound >= PROOF:
