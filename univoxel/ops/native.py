@@ -220,7 +220,6 @@ class Operator:
         # Kernels that custom_op registers itself import the compiler when first called: a second,
         # and 70 MB, of every command
         torch.library.impl(qualified, "cpu", kernel)
-        self.register_fake: Callable = self.defined.register_fake
         self._kernel = kernel
         self._direct: Callable = self.defined if mutates_args else kernel
 
@@ -228,6 +227,10 @@ class Operator:
         if torch.compiler.is_compiling() or _watched(arguments):
             return self.defined(*arguments)
         return self._direct(*arguments)
+
+    def register_fake(self, fake: Callable[..., Any]) -> Callable[..., Any]:
+        """As of `torch.library.custom_op`: what comes out, without values."""
+        return self.defined.register_fake(fake)
 
     def register_autograd(self, backward: Callable, *, setup_context: Callable) -> None:
         """As of `torch.library.custom_op`."""
