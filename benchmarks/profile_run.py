@@ -2,9 +2,9 @@
 
     python benchmarks/profile_run.py SCENE [--preset fast] [--part 6] [--cpu]
 
-`univoxel.tasks.train` itself runs; what it calls is timed where it is called. Of every 16th
-backward pass the profiler says which part of the forward pass its nodes belong to; the time of all
-of them is divided in these proportions.
+`univoxel.tasks.train` itself runs, on one thread; what it calls is timed where it is called. Of
+every 16th backward pass the profiler says which part of the forward pass its nodes belong to; the
+time of all of them is divided in these proportions.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class RunClock(Clock):
             divide = self.steps % EVERY == 0
             begin = self.now()
             with torch.autograd.profiler.profile(enabled=divide) as events:
-                function(*arguments, **options)
+                result = function(*arguments, **options)
             if divide:
                 self.add_backward(events.function_events)
             self._ranges.clear()
@@ -138,6 +138,7 @@ class RunClock(Clock):
                 seconds = usual
             self.spent += seconds
             self.steps += 1
+            return result
 
         return call
 
@@ -155,6 +156,7 @@ def profile(cfg: TrainConfig, now: Callable[[], float] = time.perf_counter) -> d
         for owner, attribute in places:
             patch(owner, attribute, lambda f, name=name: clock.timed(name, f))
     patch(torch.Tensor, "backward", clock.backward_pass)
+    patch(loop, "descent", clock.backward_pass)
     patch(train, "run_stage", clock.stage)
     patch(stage, "solve", clock.stage)
     begin = now()
@@ -232,6 +234,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=HERE / "results" / "profile.json")
     options = parser.parse_args()
+    torch.set_num_threads(1)  # a step's parts would run side by side, and no clock is for both
     with tempfile.TemporaryDirectory() as folder:
         cfg = chosen(options.preset, options.minutes, options.scene, Path(folder) / "run")
         stages = (part_of(s, options.part) for s in cfg.stages)

@@ -2,10 +2,11 @@
 
     python benchmarks/train_step.py [--rays 4096] [--out benchmarks/results/train_step.json]
 
-The bundled scene is trained natively for some steps, then the loop of univoxel.tasks.train itself
-runs on, once on each backend: its stages are timed where they are called. With the kernels the
-backward pass is divided too: a node belongs to the stage in which its forward was called. The
-references' is not: under the profiler that this takes their memory grew past 20 GB.
+On one thread. The bundled scene is trained natively for some steps, then the loop of
+univoxel.tasks.train itself runs on, once on each backend: its stages are timed where they are
+called. With the kernels the backward pass is divided too: a node belongs to the stage in which its
+forward was called. The references' is not: under the profiler that this takes their memory grew
+past 20 GB.
 """
 
 from __future__ import annotations
@@ -42,10 +43,11 @@ from univoxel.training.pixels import TrainingPixels, split_pixels
 HERE = Path(__file__).parent
 DATA = HERE.parent / "univoxel" / "example_data" / "tiny"
 STAGES = {
-    "rays": [(loop, "random_batch")],
+    "rays": [(loop, "batch_at")],
     "march": [(Field, "march")],
     "sample": [(Field, "sample")],
     "composite": [(pipeline, "composite")],
+    "sums of gradients": [(loop, "total")],
     "heads": [
         *((head, "forward") for head in (MaterialHead, RadianceHead, MirroredLight)),
         (LocalSG, "raw"),
@@ -135,7 +137,7 @@ def profile(scene: Scene, pixels: TrainingPixels, rays: int, count: int, divide:
     """Milliseconds a step, whole and by stage."""
     run_steps(scene, pixels, rays, 1)
     clock, originals = Clock(), []
-    for name, places in (STAGES | {BACKWARD: [(torch.Tensor, "backward")]}).items():
+    for name, places in (STAGES | {BACKWARD: [(loop, "descent")]}).items():
         for owner, attribute in places:
             originals.append((owner, attribute, getattr(owner, attribute)))
             setattr(owner, attribute, clock.timed(name, originals[-1][2]))
@@ -196,6 +198,7 @@ def main() -> None:
     parser.add_argument("--warm-up", type=int, default=96, help="steps of training before")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "train_step.json")
     options = parser.parse_args()
+    torch.set_num_threads(1)  # a step's parts would run side by side, and no clock is for both
     torch.manual_seed(0)
     scene, pixels = hull_scene(options.voxels)
     run_steps(scene, pixels, options.rays, options.warm_up, begin=0.0)
