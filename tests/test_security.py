@@ -14,6 +14,7 @@ PACKAGE = Path(univoxel.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 # What is used of them all the same
 NAMES_ONLY = {
+    "batch/sheet.py": {"urllib"},  # names of files as addresses
     "data/arrays.py": {"zipfile"},  # the errors of broken archives
     "viewer/hosting.py": {"socket", "urllib"},  # is a port free; of what host is a page
 }

@@ -6,11 +6,10 @@ Tasks are imported by the command that runs them: `univoxel --help` does not wai
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
@@ -161,15 +160,15 @@ class Choices:
         from univoxel.presets import chosen, with_field
 
         config = chosen(self.preset, minutes, data, out, self.light, self.varying)
-        config = dataclasses.replace(config, masks=self.masks, cameras=self.cameras)
+        config = replace(config, masks=self.masks, cameras=self.cameras)
         config = with_field(config, self.field)
         if self.light_frame != "auto":
-            config = dataclasses.replace(config, light_frame=self.light_frame)
+            config = replace(config, light_frame=self.light_frame)
         fits = self.budget_mb is not None and self.capacity == "auto"
         capacity = "adaptive" if fits else self.capacity
         if capacity == "auto":
             return config
-        return dataclasses.replace(config, capacity=capacity, budget_mb=self.budget_mb)
+        return replace(config, capacity=capacity, budget_mb=self.budget_mb)
 
 
 def configuration_of(
@@ -188,12 +187,12 @@ def configuration_of(
 
     if file is None:
         return choices.configuration(minutes, data, out)
-    for field in dataclasses.fields(choices):
+    for field in fields(choices):
         if (value := getattr(choices, field.name)) != field.default:
             option = f"--{field.name.replace('_', '-')} {value}"
             raise UserError(f"expected --config or {option}, got both: {file} says it")
-    config = dataclasses.replace(load_config(file), data=data, out=out)
-    return config if minutes is None else dataclasses.replace(config, minutes=minutes)
+    config = replace(load_config(file), data=data, out=out)
+    return config if minutes is None else replace(config, minutes=minutes)
 
 
 def sun_light(values: tuple[float, ...]) -> Sun:
@@ -296,31 +295,28 @@ def train(
             local too, envmap-sg and envmap, one map from the beginning, and baked, none: the
             photographs' colours are taken for albedo, as a photogrammetry mesh has them
         varying: what differs from photograph to photograph: exposure, with the colour balance, or
-            the light itself too; auto is exposure where the photographs' are seen to differ, or
-            else none
-        light_frame: what the light stands still in: the world of the cameras, or the room of a
-            turntable, whose camera stood still too; auto is what explains the photographs better
+            the light itself too; auto is exposure where it is seen to differ, else none
+        light_frame: world, where the light stood still, or turntable, where it turned with the
+            camera; auto is what explains the photographs better
         masks: auto takes masks in that end outside of the object, as the photographs show it
         cameras: refined puts the photographs' cameras right, before training and in it; auto does
             so where their silhouettes contradict one another
         downscale: train on photographs of 1/N of their width and height; auto is as large as
-            leaves what grids can use, 1 for photographs of 1499 pixels and fewer
+            leaves what grids can use, 1 below 1500 pixels
         field: hash takes features from a small table of many resolutions; dense stores them at
             every node of the grid, sparse in bricks around the surface alone, for finer grids than
             the presets', such as --set stages.1.voxels=30
         minutes: wall-clock limit, above 0; training ends in time with what it has
         capacity: adaptive makes no larger a model than the scene needs, as held-out pixels tell:
-            coarser grid, fewer rows or channels of features, fewer lobes and hidden units;
-            `univoxel info` says what was chosen. auto is that, but fixed for sparse fields and for
-            lights other than hybrid
-        budget_mb: most that the file of the model may have, in millions of bytes; implies
-            --capacity adaptive
+            coarser grid, fewer rows or channels of features, fewer lobes and hidden units. auto is
+            that, but fixed for sparse fields and for lights other than hybrid
+        budget_mb: most megabytes of the model's file; implies --capacity adaptive
         allow_outside: read photographs outside of DATA too, where its files or links name such
         resume: go on with the run in --out; where nothing was saved yet, it begins
         timelapse: picture of a test view over training time, or a folder of its frames
-        view: look at the training in a browser while it goes, and end it early there
-        host: address that --view listens on, as of view
-        port: port that --view listens on, as of view
+        view: look at the training in a browser while it goes, and end it early
+        host: address that --view listens on
+        port: port that --view listens on
         seed: of all random choices
         config: config.json of another run, to train these photographs alike: it says all that
             --preset, --light and such would; --minutes, --seed, --downscale and --set go before it
@@ -335,11 +331,10 @@ def train(
     watched = {"timelapse": timelapse, "view": view_at(view, host, port)}
     if not resume and (out / "scene.safetensors").exists():
         raise ExistingFile(f"{out} holds a run already: add --resume, or choose another --out")
-    of_preset = Choices(preset, light, varying, light_frame, masks, cameras, field)
-    of_preset = dataclasses.replace(of_preset, capacity=capacity, budget_mb=budget_mb)
-    asked = configuration_of(config, of_preset, minutes, data, out)
-    given = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
-    asked = dataclasses.replace(asked, **given, **({} if seed is None else {"seed": seed}))
+    of_preset = preset, light, varying, light_frame, masks, cameras, field, capacity, budget_mb
+    asked = configuration_of(config, Choices(*of_preset), minutes, data, out)
+    asked = replace(asked, downscale=check_downscale(downscale), allow_outside=allow_outside)
+    asked = asked if seed is None else replace(asked, seed=seed)
     run = task.train(changed(asked, set), resume=resume, **watched)
     print(run if no_page else with_page(run))
 
@@ -487,9 +482,9 @@ def poses(
         raise UserError(f"--keep-size must be at least 0, got {keep_size}")
     if every is not None and not every > 0:
         raise UserError(f"--every must be above 0, got {every:g}")
-    config = dataclasses.replace(FAST if fast else DEFAULTS, size=size, seed=seed)
+    config = replace(FAST if fast else DEFAULTS, size=size, seed=seed)
     if features is not None:
-        config = dataclasses.replace(config, features=features)
+        config = replace(config, features=features)
     print(task.poses(photographs, out, masks, every, keep_size, keep_weak, config))
 
 

@@ -36,6 +36,7 @@ class AdviceConfig:
     # worth of a photograph, in [0, 1], from which on it is advised: the share of the surface, times
     # its doubt, that it would show as well as many photographs
     least: float = 0.006
+    share: float = 0.5  # of the best one's worth, in [0, 1]; less is not worth the walk
     apart: float = 25.0  # degrees, > 0; photographs nearer to one another show much the same
     gap: float = 30.0  # degrees to the nearest photograph, > 0; directions beyond are a gap
     # degrees, in [-90, 90], below which nobody is sent, unless a photograph was taken from there:
@@ -44,7 +45,7 @@ class AdviceConfig:
 
     def __post_init__(self) -> None:
         check_fields(self, "at least 1", lambda x: x >= 1, "candidates", "most")
-        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "least")
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "least", "share")
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "apart", "gap")
         check_fields(self, "in [-90, 90]", lambda x: -90 <= x <= 90, "lowest")
 
@@ -113,7 +114,8 @@ def advise(
         gain = gain / len(straight) * (nearest / cfg.apart).clamp_max(1)
         first = gain if first is None else first
         best = int(gain.argmax())
-        if len(chosen) == cfg.most or gain[best] < cfg.least:
+        least = max(cfg.least, cfg.share * gains[0]) if gains else cfg.least
+        if len(chosen) == cfg.most or gain[best] < least:
             break
         chosen.append(best)
         gains.append(float(gain[best]))

@@ -40,9 +40,13 @@ class MirroredLight(nn.Module):
 
     @property
     def silent(self) -> bool:
-        """Whether it is 0 everywhere, and is not learned."""
+        """Whether training may pass it over: it is 0 everywhere, and is not learned."""
         last = self.net.linear[-1]
-        return not last.weight.requires_grad and not bool(last.weight.any() or last.bias.any())
+        return (
+            self.training
+            and not last.weight.requires_grad
+            and not bool(last.weight.any() or last.bias.any())
+        )
 
     def forward(self, surface: Surface, wo: Tensor, table: DirectionTable) -> Tensor:
         """Radiance [N, 3] towards unit directions wo [N, 3], to be added.
