@@ -67,8 +67,7 @@ class RowSet {
             for (int64_t w = begin; w < end; ++w) {
                 int64_t slot = words_[w].first;
                 for (uint64_t bits = words_[w].bits; bits; bits &= bits - 1, ++slot) {
-                    // Rows are fewer than 2^32 where an array has them in memory; 64 bits divide
-                    // slowly
+                    // Divided in 32 bits where the row fits, as it mostly does: 64 bits are slow
                     uint64_t row = 64 * w + __builtin_ctzll(bits);
                     for (int d = dims - 1; d > 0; --d) {
                         const uint64_t size = shape[d];

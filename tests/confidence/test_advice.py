@@ -146,6 +146,7 @@ def test_the_front_is_where_the_first_photograph_was_taken(scene, photos):
     ("change", "message"),
     [
         ({"candidates": 0}, "candidates must be at least 1, got 0"),
+        ({"share": -0.5}, r"share must be in \[0, 1\], got -0.5"),
         ({"least": 2.0}, r"least must be in \[0, 1\], got 2.0"),
         ({"apart": 0.0}, "apart must be above 0, got 0.0"),
         ({"lowest": -100.0}, r"lowest must be in \[-90, 90\], got -100.0"),

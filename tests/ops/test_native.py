@@ -4,8 +4,9 @@ import logging
 
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
-from univoxel.ops import composite, native, native_status, use_backend
+from univoxel.ops import adam_rows_, composite, native, native_status, use_backend
 
 
 @pytest.fixture(autouse=True)
@@ -61,3 +62,26 @@ def test_who_asks_for_the_reference_is_not_warned(caplog):
         call(torch.bfloat16)
     call()
     assert warned(caplog) == []
+
+
+def test_fakes_and_transforms_go_by_the_registered_op():
+    """Neither can be given to the kernel itself, which reads memory."""
+    alpha, value = torch.rand(5, requires_grad=True), torch.rand(5, 3)
+    offsets = torch.tensor([0, 2, 5])
+    with FakeTensorMode() as mode:
+        fakes = [mode.from_tensor(t) for t in (alpha, value, offsets)]
+        out, weight = composite(*fakes)
+    assert isinstance(out, FakeTensor)
+    assert (out.shape, weight.shape) == ((2, 3), (5,))
+    # torch takes no op of its library through transforms, and says so
+    with pytest.raises(RuntimeError, match="functorch transforms"):
+        torch.func.grad(lambda a: composite(a, value, offsets)[0].sum())(alpha.detach())
+
+
+def test_what_a_kernel_writes_is_counted():
+    """By torch's count of changes a scene tells that its surface has moved."""
+    param, m, v = torch.rand(3, 4, 2).unbind()
+    before = param._version
+    rates = {"lr": 0.1, "beta1": 0.9, "beta2": 0.99, "eps": 1e-8, "step": 1}
+    adam_rows_(param, m, v, torch.tensor([1]), torch.rand(1, 2), **rates)
+    assert param._version > before

@@ -108,7 +108,7 @@ def test_gradients_that_are_missing_count_as_none():
     assert torch.equal(total([one, one, one]), 3 * one)
 
 
-def test_an_error_in_a_part_is_raised(scene, pixels):
+def test_an_error_in_a_part_is_raised():
     def fail(_):
         raise ArithmeticError("in a part")
 

@@ -49,9 +49,8 @@ class Wanted:
     masks: str = "auto"  # where they come from, as of capture
     preset: PresetOrAuto = "auto"
     light: LightName = "hybrid"
-    minutes: float | None = (
-        None  # of each training; None: the preset's, in which it makes all steps
-    )
+    # of each training; None: the preset's, in which it makes all steps
+    minutes: float | None = None
     config: Path | None = None  # a file that says all of a training, in place of a preset
     changes: tuple[str, ...] = ()  # FIELD=VALUE of the configuration
     samples: int = SAMPLES  # of the light, per pixel of relit pictures that are measured

@@ -67,7 +67,7 @@ class Advice:
     front_name: str  # the photograph that says so
     weighed: Tensor  # [C, 3]
     worth: Tensor  # [C] in [0, 1], before any was taken
-    least: float  # worth from which on a direction is advised
+    least: float  # worth below which no direction is advised, `AdviceConfig.least`
     gap: Tensor  # [C] bool: no photograph is near
     chosen: Tensor  # [K, 3]
     gains: Tensor  # [K] worth of each, with those before it taken

@@ -48,7 +48,6 @@ def encode_hash(
             holds only the rows some point touched: what ``RowAdam`` takes. Eager only: under
             torch.compile ask for dense gradients.
         felt: levels, from the first on, that pass gradients on to points, at least 0; None: all.
-            Where points come from a surface, fine levels are noise to it.
 
     Returns:
         [M, L * F], level after level.

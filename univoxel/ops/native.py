@@ -204,9 +204,11 @@ if hasattr(os, "register_at_fork"):
 class Operator:
     """A kernel as an op of torch, and a short way to it.
 
-    `torch.library` makes it known to compilers, transforms and tensors of other kinds; through it a
-    call costs a fifth of a millisecond, as much as the kernels of a small batch. Where none of
-    these is there, calls go to the kernel itself, or to an autograd function of it.
+    `torch.library` makes it known to compilers and to tensors of other kinds; through it a call
+    costs a fifth of a millisecond, as much as the kernels of a small batch. Where none of these is
+    there, calls go to the kernel itself, or to an autograd function of it. Two kinds go by the
+    library always: kernels that write to their arguments, which torch counts, and those that lists
+    of tensors are differentiated in, which autograd functions do not see.
     """
 
     def __init__(self, name: str, kernel: Callable, mutates_args: tuple[str, ...]) -> None:

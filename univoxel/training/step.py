@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -65,7 +66,7 @@ def total(gradients: Sequence[Tensor | None]) -> Tensor | None:
     if len(given) < 2:
         return given[0] if given else None
     if not given[0].is_sparse:
-        return torch.stack(given).sum(0) if len(given) > 2 else given[0] + given[1]
+        return reduce(torch.add, given)
     first = given[0]
     dims, shape = first.sparse_dim(), first.shape
     channels = shape[dims:].numel()

@@ -47,9 +47,8 @@ def watched(host: str, port: int, title: str) -> Iterator[Spectators]:
         UserError: the port is taken.
     """
     with hosted(host, port, f"{title}, in training") as server:
-        if panel := getattr(
-            server.gui, "main_panel", None
-        ):  # of viser since 1.1: beside the picture
+        # Beside the picture; not every viser has it
+        if panel := getattr(server.gui, "main_panel", None):
             panel.dock_right()
         yield Spectators(server, address_of(server, host))
 
