@@ -1,20 +1,26 @@
-"""How long a browser waits for a frame of the live viewer after a hand has moved something.
+"""How long the live viewer takes for a frame, and for a clean picture at rest.
 
     python benchmarks/live_latency.py RUN [RUN ...] [--moves 20] [--out FILE.json]
 
-A headless Chromium opens the viewer of each run. Time goes from an event of the mouse that drags
-the camera to the moment at which the page has decoded the next quick picture. Pictures of a view
-at rest are larger, and do not count. It needs the extra `view` and a browser, which
-scripts/browser.sh brings in. The browser draws in software on the same cores: with a graphics card
-it waits less.
+A headless Chromium opens the viewer of each run. Its mouse drags the camera, then the slider that
+turns the light. Two times are taken of each move. *Frame* goes from the arrival of the page's
+message to the moment at which the next picture is on its way back. *Decoded* goes from the event
+of the mouse that drags the camera to the moment at which the page has decoded that picture. The
+browser draws the page in software on the same cores: with a graphics card, or on another machine,
+*decoded* takes less. Pictures of a view at rest are larger, and do not count as decoded.
+
+*At rest* is the time from a move until the picture is within 38 dB of one of 1024 samples. It needs
+the extra `view` and a browser, which scripts/browser.sh brings in.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import statistics
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +28,30 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from browser import browser
 from made import made
 
+from univoxel import envmap
+from univoxel.camera import Cameras, resize
 from univoxel.experiments.record import result_text
+from univoxel.metrics import psnr
+from univoxel.page import PageOptions, lights_of
+from univoxel.pictures.viewpoints import orbit
+from univoxel.render.relight import Lighting
+from univoxel.viewer import denoise
+from univoxel.viewer.frames import Look, refined_pictures
 from univoxel.viewer.server import serving
-from univoxel.viewer.studio import QUICK_WIDTHS
-from univoxel.viewer.subject import subject_of
+from univoxel.viewer.studio import QUICK_WIDTHS, REST_SECONDS, REST_WIDTH, Studio
+from univoxel.viewer.subject import Subject, subject_of
 
 WINDOW = (1160, 720)
 PATIENCE = 60.0  # seconds
+REST_DECIBELS = 38.0
+COLUMNS = [
+    {"name": "run"},
+    {"name": "triangles"},
+    {"name": "camera to frame", "unit": "ms", "digits": 0},
+    {"name": "light to frame", "unit": "ms", "digits": 0},
+    {"name": "camera to decoded", "unit": "ms", "digits": 0},
+    {"name": "at rest", "unit": "s", "digits": 1},
+]
 # When the page decoded quick pictures, in milliseconds of its clock
 HOOK = """
 window.decoded = [];
@@ -47,6 +70,35 @@ window.createImageBitmap = (...given) => bitmap(...given).then((made) => {
     return made;
 });
 """
+
+
+class Answers:
+    """Milliseconds from a message to the frame that answers it, while its block runs."""
+
+    def __init__(self) -> None:
+        self.found: list[float] = []
+        self._asked: float | None = None
+
+    @contextlib.contextmanager
+    def taken(self) -> Iterator[None]:
+        """Take the times of every panel."""
+        ask, show = Studio.ask, Studio._show
+
+        def asked(studio: Studio, *given: Any) -> None:
+            self._asked = self._asked or time.monotonic()
+            ask(studio, *given)
+
+        def shown(studio: Studio, *given: Any) -> None:
+            show(studio, *given)
+            if self._asked:
+                self.found.append(1000 * (time.monotonic() - self._asked))
+            self._asked = None
+
+        Studio.ask, Studio._show = asked, shown
+        try:
+            yield
+        finally:
+            Studio.ask, Studio._show = ask, show
 
 
 def waits(tab: Any, moves: int) -> list[float]:
@@ -70,22 +122,66 @@ def waits(tab: Any, moves: int) -> list[float]:
     return found
 
 
-def measured(run: Path, moves: int) -> dict[str, Any]:
-    """A row of a run: the frame after a move, in milliseconds."""
+def turn_light(tab: Any, moves: int) -> None:
+    """Click along the slider that turns the light."""
+    slider = """(() => {
+        const label = [...document.querySelectorAll("label")].find((l) => l.textContent == "turn");
+        let around = label;
+        while (!around.querySelector("[class*=Slider-track]")) around = around.parentElement;
+        const track = around.querySelector("[class*=Slider-track]");
+        const box = track.getBoundingClientRect();
+        return [box.left, box.top + box.height / 2, box.width];
+    })()"""
+    left, top, width = tab.run(slider)
+    for move in range(moves):
+        x = left + width * (0.2 + 0.6 * (move % 7) / 6)
+        tab.mouse("mouseMoved", x, top)
+        tab.mouse("mousePressed", x, top, button="left", clickCount=1)
+        tab.mouse("mouseReleased", x, top, button="left", clickCount=1)
+        time.sleep(0.6)
+
+
+def rest_seconds(subject: Subject) -> float | None:
+    """From a move to a picture at rest within REST_DECIBELS of one of MOST_SAMPLES."""
+    light = lights_of(subject.scene, PageOptions())[0]
+    lighting = Lighting(envmap.tables(envmap.EnvMap(light.radiance)))
+    view = orbit(subject.traced.mesh, 8, REST_WIDTH)
+    cameras = resize(
+        Cameras(
+            view.camera_to_world[1:2], view.focal[1:2], view.centre[1:2], view.width, view.height
+        ),
+        REST_WIDTH,
+    )
+    plain = Look(lighting)
+    *_, best = (x for x in refined_pictures(subject, cameras, plain) if x is not None)
+    begin = time.monotonic()
+    for picture in refined_pictures(subject, cameras, Look(lighting, denoise=denoise.available())):
+        if picture is None:
+            continue
+        quality = float(psnr(picture[..., :3] * picture[..., 3:], best[..., :3] * best[..., 3:]))
+        if quality >= REST_DECIBELS:
+            return REST_SECONDS + time.monotonic() - begin
+    return None
+
+
+def measured(run: Path, moves: int) -> list[str | float | None]:
+    """A row of a run, with a value for each of COLUMNS."""
     subject = subject_of(run)
+    camera, light = Answers(), Answers()
     with serving(subject, port=0) as address, browser() as tab:
         tab.open(address, *WINDOW)
         tab.run(HOOK.replace("QUICK", str(QUICK_WIDTHS[1])))
         time.sleep(5)
         waits(tab, 5)  # the width of quick pictures settles
-        found = sorted(waits(tab, moves))
-    return {
-        "run": run.resolve().parent.name if run.name == "run" else run.resolve().name,
-        "triangles": len(subject.traced.mesh.faces),
-        "median ms": round(statistics.median(found), 1),
-        "90 % ms": round(found[int(0.9 * (len(found) - 1))], 1),
-        "longest ms": round(found[-1], 1),
-    }
+        with camera.taken():
+            decoded = waits(tab, moves)
+        time.sleep(1)
+        with light.taken():
+            turn_light(tab, moves)
+    assert min(len(camera.found), len(light.found)) > moves / 2, "moves were not answered"
+    medians = [statistics.median(found) for found in (camera.found, light.found, decoded)]
+    name = run.resolve().parent.name if run.name == "run" else run.resolve().name
+    return [name, len(subject.traced.mesh.faces), *medians, rest_seconds(subject)]
 
 
 def main() -> None:
@@ -100,8 +196,8 @@ def main() -> None:
         rows.append(measured(run, options.moves))
         print(rows[-1])
     if options.out:
-        title = "From a move of the mouse to the frame, in headless Chromium"
-        written = made() | {"title": title, "columns": list(rows[0]), "rows": rows}
+        title = "The live viewer in headless Chromium on the same cores"
+        written = made() | {"title": title, "columns": COLUMNS, "rows": rows}
         options.out.write_text(result_text(written), encoding="utf-8")
 
 
