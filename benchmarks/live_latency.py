@@ -180,7 +180,7 @@ def measured(run: Path, moves: int) -> list[str | float | None]:
             turn_light(tab, moves)
     assert min(len(camera.found), len(light.found)) > moves / 2, "moves were not answered"
     medians = [statistics.median(found) for found in (camera.found, light.found, decoded)]
-    name = run.resolve().parent.name if run.name == "run" else run.resolve().name
+    name = run.parent.name if run.name == "run" else run.name
     return [name, len(subject.traced.mesh.faces), *medians, rest_seconds(subject)]
 
 
