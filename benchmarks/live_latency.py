@@ -50,7 +50,7 @@ COLUMNS = [
     {"name": "camera to frame", "unit": "ms", "digits": 0},
     {"name": "light to frame", "unit": "ms", "digits": 0},
     {"name": "camera to decoded", "unit": "ms", "digits": 0},
-    {"name": "at rest", "unit": "s", "digits": 1},
+    {"name": "at rest to 38 dB", "unit": "s", "digits": 1},
 ]
 # When the page decoded quick pictures, in milliseconds of its clock
 HOOK = """
