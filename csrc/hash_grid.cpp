@@ -77,6 +77,37 @@ void with_features(int64_t n, F&& f) {
     }
 }
 
+/// Encode n points; to(i): where the L * F numbers of point i go.
+template <class T, class To>
+void encode_levels(const HashGrid<T>& in, const T* points, int64_t n, To to) {
+    with_features(in.n_features, [&](auto constant) {
+        constexpr int64_t kF = decltype(constant)::value;
+        const int64_t F = kF ? kF : in.n_features;
+        // Level by level: the rows that the points share stay in the cache.
+        for (int64_t l = 0; l < in.n_levels(); ++l) {
+            const RowLookup rows(in.levels[l], in.rows);
+            const T* table = in.table + l * in.rows * F;
+            Corners<T> block[kPointsPerBlock];
+            for (int64_t j = 0; j < n; j += kPointsPerBlock) {
+                const int64_t count = std::min(kPointsPerBlock, n - j);
+                for (int64_t i = 0; i < count; ++i) {
+                    block[i] = corners(in.levels[l], rows, points + 3 * (j + i));
+                    for (const int64_t row : block[i].row) __builtin_prefetch(table + row * F);
+                }
+                for (int64_t i = 0; i < count; ++i) {
+                    T* o = to(j + i) + l * F;
+                    const bool lost = has_nan(points + 3 * (j + i));
+                    std::fill(o, o + F, lost ? std::numeric_limits<T>::quiet_NaN() : T(0));
+                    for (int k = 0; k < 8; ++k) {
+                        const T* row = table + block[i].row[k] * F;
+                        for (int64_t f = 0; f < F; ++f) o[f] += block[i].weight[k] * row[f];
+                    }
+                }
+            }
+        }
+    });
+}
+
 /// Derivative of a level's output, weighted by grad, to the point: added to out [3].
 template <class T>
 void add_point_gradient(const HashGrid<T>& in, int64_t l, const RowLookup& rows, const T* p,
@@ -150,34 +181,17 @@ void HashRows::write(int64_t* rows, int threads) const {
 template <class T>
 void encode_hash_forward(const HashGrid<T>& in, T* out, int threads) {
     const int64_t width = in.n_levels() * in.n_features;
-    with_features(in.n_features, [&](auto constant) {
-        constexpr int64_t kF = decltype(constant)::value;
-        const int64_t F = kF ? kF : in.n_features;
-        parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
-            // Level by level: the rows that a chunk shares stay in the cache.
-            for (int64_t l = 0; l < in.n_levels(); ++l) {
-                const RowLookup rows(in.levels[l], in.rows);
-                const T* table = in.table + l * in.rows * F;
-                Corners<T> block[kPointsPerBlock];
-                for (int64_t j = begin; j < end; j += kPointsPerBlock) {
-                    const int64_t n = std::min(kPointsPerBlock, end - j);
-                    for (int64_t i = 0; i < n; ++i) {
-                        block[i] = corners(in.levels[l], rows, in.points + 3 * (j + i));
-                        for (const int64_t row : block[i].row) __builtin_prefetch(table + row * F);
-                    }
-                    for (int64_t i = 0; i < n; ++i) {
-                        T* o = out + (j + i) * width + l * F;
-                        const bool lost = has_nan(in.points + 3 * (j + i));
-                        std::fill(o, o + F, lost ? std::numeric_limits<T>::quiet_NaN() : T(0));
-                        for (int k = 0; k < 8; ++k) {
-                            const T* row = table + block[i].row[k] * F;
-                            for (int64_t f = 0; f < F; ++f) o[f] += block[i].weight[k] * row[f];
-                        }
-                    }
-                }
-            }
-        });
+    parallel_for(in.n_points, kPointsPerChunk, threads, [&](int64_t begin, int64_t end) {
+        encode_levels(in, in.points + 3 * begin, end - begin,
+                      [&](int64_t i) { return out + (begin + i) * width; });
     });
+}
+
+template <class T>
+void encode_hash_rows(const HashGrid<T>& in, const T* points, const std::vector<int64_t>& rows,
+                      T* out, int64_t stride) {
+    encode_levels(in, points, static_cast<int64_t>(rows.size()),
+                  [&](int64_t i) { return out + rows[i] * stride; });
 }
 
 template <class T>
@@ -226,6 +240,10 @@ template HashRows HashRows::touched(const HashGrid<float>&, int);
 template HashRows HashRows::touched(const HashGrid<double>&, int);
 template void encode_hash_forward(const HashGrid<float>&, float*, int);
 template void encode_hash_forward(const HashGrid<double>&, double*, int);
+template void encode_hash_rows(const HashGrid<float>&, const float*, const std::vector<int64_t>&,
+                               float*, int64_t);
+template void encode_hash_rows(const HashGrid<double>&, const double*, const std::vector<int64_t>&,
+                               double*, int64_t);
 template void encode_hash_backward(const HashGrid<float>&, const float*, float*, const HashRows*,
                                    float*, int64_t, int);
 template void encode_hash_backward(const HashGrid<double>&, const double*, double*, const HashRows*,

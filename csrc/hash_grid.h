@@ -54,6 +54,11 @@ class HashRows {
 template <class T>
 void encode_hash_forward(const HashGrid<T>& in, T* out, int threads);
 
+/// The same of other points, one for each of some rows of out, which are `stride` numbers apart.
+template <class T>
+void encode_hash_rows(const HashGrid<T>& in, const T* points, const std::vector<int64_t>& rows,
+                      T* out, int64_t stride);
+
 /// Gradients: grad_table [L * R, F], or [touched->count(), F]; grad_points [M, 3], from the first
 /// `felt` levels; null: not wanted.
 ///

@@ -5,6 +5,7 @@
 
 #include "bindings/common.h"
 #include "nodes.h"
+#include "trilinear.h"
 
 namespace univoxel {
 
@@ -24,6 +25,33 @@ inline BrickNodes brick_nodes_of(In<int32_t> table, const Size3& size) {
                 "the table of bricks does not belong to this size");
     }
     return {table.data(), table.shape(1), table.shape(2)};
+}
+
+/// A grid as Python passes it: its lattice in the world, and in which rows its nodes are stored.
+template <class Nodes>
+struct Grid {
+    Lattice lattice;
+    Nodes nodes;
+};
+
+inline bool has_rows(const Grid<DenseNodes>& grid, int64_t n_rows) {
+    const int64_t* size = grid.lattice.size;
+    return n_rows == size[0] * size[1] * size[2];
+}
+inline bool has_rows(const Grid<BrickNodes>&, int64_t n_rows) {
+    return n_rows >= kMissingRows && n_rows % kBrickNodes == 0;
+}
+
+using Sizes = const std::vector<Size3>&;
+using Numbers = const std::vector<double>&;
+
+/// The levels of a hash table as Python passes them.
+inline std::vector<Lattice> levels_of(Sizes sizes, const Vec3& origin, Numbers voxel_sizes) {
+    require(sizes.size() == voxel_sizes.size(), "each level needs a size and a voxel size");
+    std::vector<Lattice> levels;
+    for (size_t l = 0; l < sizes.size(); ++l)
+        levels.push_back(lattice_of(sizes[l], origin, voxel_sizes[l]));
+    return levels;
 }
 
 }  // namespace univoxel

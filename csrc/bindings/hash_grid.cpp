@@ -5,20 +5,18 @@
 namespace univoxel {
 namespace {
 
-using Sizes = const std::vector<Size3>&;
-using Numbers = const std::vector<double>&;
-
 template <class T>
 HashGrid<T> hash_grid_of(In<T> table, In<T> points, Sizes sizes, const Vec3& origin,
                          Numbers voxel_sizes) {
     const int64_t levels = static_cast<int64_t>(sizes.size());
-    require(levels > 0 && voxel_sizes.size() == sizes.size() && table.shape(0) % levels == 0,
+    require(levels > 0 && table.shape(0) % levels == 0,
             "encode_hash: levels and rows do not fit together");
-    HashGrid<T> grid{table.data(),    points.data(), {}, table.shape(0) / levels,
-                     points.shape(0), table.shape(1)};
-    for (int64_t l = 0; l < levels; ++l)
-        grid.levels.push_back(lattice_of(sizes[l], origin, voxel_sizes[l]));
-    return grid;
+    return {table.data(),
+            points.data(),
+            levels_of(sizes, origin, voxel_sizes),
+            table.shape(0) / levels,
+            points.shape(0),
+            table.shape(1)};
 }
 
 template <class T>

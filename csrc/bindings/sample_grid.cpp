@@ -8,21 +8,6 @@
 namespace univoxel {
 namespace {
 
-/// A grid as Python passes it: its lattice in the world, and in which rows its nodes are stored.
-template <class Nodes>
-struct Grid {
-    Lattice lattice;
-    Nodes nodes;
-};
-
-bool has_rows(const Grid<DenseNodes>& grid, int64_t n_rows) {
-    const int64_t* size = grid.lattice.size;
-    return n_rows == size[0] * size[1] * size[2];
-}
-bool has_rows(const Grid<BrickNodes>&, int64_t n_rows) {
-    return n_rows >= kMissingRows && n_rows % kBrickNodes == 0;
-}
-
 template <class T, class Nodes>
 Sampling<T, Nodes> sampling_of(const Grid<Nodes>& grid, In<T> sdf, In<T> features, In<T> points,
                                In<int32_t> order) {
@@ -67,6 +52,11 @@ void bind_sampling(py::module_& m) {
                 make<SamplingGrads<T, Rows>>(grad_value, grad_gradient, grad_feature, grad_sdf,
                                              grad_features, grad_points, sdf_rows, feature_rows);
             sample_grid_backward(in, grads, threads);
+        });
+    def(m, "sort_by_tile", "grid points order threads",
+        [](const Grid<Nodes>& grid, In<T> points, Out<int32_t> order, int threads) {
+            require(order.size() == points.shape(0), "sort_by_tile: order of another length");
+            sort_by_tile(grid.lattice, points.data(), order.size(), order.mutable_data(), threads);
         });
     def(m, "touched_rows", "grid points order n_rows sdf features threads",
         [](const Grid<Nodes>& grid, In<T> points, In<int32_t> order, int64_t n_rows, bool sdf,

@@ -2,7 +2,13 @@
 
 from univoxel.ops.adam import adam_rows_, adam_rows_reference_
 from univoxel.ops.composite import composite, composite_reference
+from univoxel.ops.composite_field import (
+    FieldAlongRays,
+    composite_field,
+    composite_field_reference,
+)
 from univoxel.ops.dense_grid import sample_dense, sample_dense_reference
+from univoxel.ops.density import section_alpha
 from univoxel.ops.hash_grid import encode_hash, encode_hash_reference
 from univoxel.ops.integrator import EnvTables, PointLight, Sun, relight
 from univoxel.ops.march import brick_minimum, march, march_reference
@@ -31,6 +37,7 @@ Lamp = PointLight  # its name before
 
 __all__ = [
     "EnvTables",
+    "FieldAlongRays",
     "Hit",
     "NativeStatus",
     "PointLight",
@@ -41,6 +48,8 @@ __all__ = [
     "brick_minimum",
     "closest_hit_reference",
     "composite",
+    "composite_field",
+    "composite_field_reference",
     "composite_reference",
     "diffuse_rows_",
     "diffuse_rows_reference_",
@@ -59,6 +68,7 @@ __all__ = [
     "sample_dense_reference",
     "sample_sparse",
     "sample_sparse_reference",
+    "section_alpha",
     "semi_global",
     "semi_global_reference",
     "shade_map",

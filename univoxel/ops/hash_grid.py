@@ -60,25 +60,8 @@ def encode_hash(
     Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", section 3.
     """
     sizes = check("encode_hash", table=(table, "N F"), points=(points, "M 3"))
+    check_levels("encode_hash", sizes["N"], lower, upper, voxel_sizes)
     levels = len(voxel_sizes)
-    for name, corner in (("lower", lower), ("upper", upper)):
-        if len(corner) != 3 or not all(math.isfinite(x) for x in corner):
-            raise ValueError(f"encode_hash: {name} must be 3 finite numbers, got {list(corner)}")
-    if any(a > b for a, b in zip(lower, upper, strict=True)):
-        raise ValueError(
-            f"encode_hash: lower must be at most upper, got {list(lower)} and {list(upper)}"
-        )
-    if not levels or not all(0 < h < math.inf for h in voxel_sizes):
-        raise ValueError(
-            f"encode_hash: voxel_sizes must be numbers above 0, at least one, got "
-            f"{list(voxel_sizes)}"
-        )
-    rows = sizes["N"] // levels
-    if rows * levels != sizes["N"] or rows < 1 or rows & (rows - 1) or rows > 2**31:
-        raise ValueError(
-            f"encode_hash: table must have a power of two rows for each of {levels} levels, got "
-            f"{sizes['N']} in all"
-        )
     place = ([float(x) for x in lower], [float(x) for x in upper], [float(h) for h in voxel_sizes])
     felt = levels if felt is None else min(felt, levels)
     if felt < 0:
@@ -88,6 +71,36 @@ def encode_hash(
     if sparse_grad:
         table = SparseGrad.apply(table, 1)
     return encode_hash_reference(table, points, *place, felt)
+
+
+def check_levels(
+    op: str,
+    rows: int,
+    lower: Sequence[float],
+    upper: Sequence[float],
+    voxel_sizes: Sequence[float],
+) -> None:
+    """Check where the lattices of a table of that many rows lie.
+
+    Raises:
+        ValueError: corners or voxel_sizes out of range; rows that are no power of two a level.
+    """
+    levels = len(voxel_sizes)
+    for name, corner in (("lower", lower), ("upper", upper)):
+        if len(corner) != 3 or not all(math.isfinite(x) for x in corner):
+            raise ValueError(f"{op}: {name} must be 3 finite numbers, got {list(corner)}")
+    if any(a > b for a, b in zip(lower, upper, strict=True)):
+        raise ValueError(f"{op}: lower must be at most upper, got {list(lower)} and {list(upper)}")
+    if not levels or not all(0 < h < math.inf for h in voxel_sizes):
+        raise ValueError(
+            f"{op}: voxel_sizes must be numbers above 0, at least one, got {list(voxel_sizes)}"
+        )
+    each = rows // levels
+    if each * levels != rows or each < 1 or each & (each - 1) or each > 2**31:
+        raise ValueError(
+            f"{op}: table must have a power of two rows for each of {levels} levels, got {rows} in "
+            "all"
+        )
 
 
 def lattice_sizes(
@@ -222,6 +235,27 @@ def _sparse_backward(
         rows[None], values, table.shape, is_coalesced=True, check_invariants=False
     )
     return grad, grad_points
+
+
+def backward(
+    table: Tensor,
+    points: Tensor,
+    grad_out: Tensor,
+    place: tuple,
+    felt: int,
+    needs: list[bool],
+    sparse: bool,
+) -> tuple[Tensor | None, Tensor | None]:
+    """Gradients to table and points; None where not needed.
+
+    Args:
+        place: as the extension takes it.
+    """
+    if sparse:
+        return _sparse_backward(table, points, grad_out, place, felt, needs)
+    into = [torch.empty_like(t) if n else None for t, n in zip((table, points), needs, strict=True)]
+    _backward_into(table, points, grad_out, into[0], None, into[1], place, felt)
+    return into[0], into[1]
 
 
 @_encode_hash.register_fake

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from univoxel.ops import native
 from univoxel.ops.checks import check
@@ -133,4 +135,28 @@ def _backward(ctx, grad_out):
     )
 
 
-_mlp.register_autograd(_backward, setup_context=_save)
+class _Layers(torch.autograd.Function):
+    """The op with its layers one by one: weights, then biases."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, layers: int, *parameters: Tensor) -> Tensor:
+        ctx.layers = layers
+        ctx.save_for_backward(x, *parameters)
+        return _mlp.kernel(x, parameters[:layers], parameters[layers:])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
+        x, *parameters = ctx.saved_tensors
+        layers = parameters[: ctx.layers], parameters[ctx.layers :]
+        need_x, _, *need = ctx.needs_input_grad
+        grads = _mlp_backward(x, *layers, grad_out.contiguous(), need_x, any(need))
+        none = [None] * len(parameters)
+        return grads[0] if need_x else None, None, *(grads[1:] if any(need) else none)
+
+
+def _direct(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
+    return _Layers.apply(x, len(weights), *weights, *biases)
+
+
+_mlp.register_autograd(_backward, setup_context=_save, direct=_direct)

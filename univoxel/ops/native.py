@@ -206,9 +206,8 @@ class Operator:
 
     `torch.library` makes it known to compilers and to tensors of other kinds; through it a call
     costs a fifth of a millisecond, as much as the kernels of a small batch. Where none of these is
-    there, calls go to the kernel itself, or to an autograd function of it. Two kinds go by the
-    library always: kernels that write to their arguments, which torch counts, and those that lists
-    of tensors are differentiated in, which autograd functions do not see.
+    there, calls go to the kernel itself, or to an autograd function of it. Kernels that write to
+    their arguments, which torch counts, go by the library always.
     """
 
     def __init__(self, name: str, kernel: Callable, mutates_args: tuple[str, ...]) -> None:
@@ -222,7 +221,7 @@ class Operator:
         # Kernels that custom_op registers itself import the compiler when first called: a second,
         # and 70 MB, of every command
         torch.library.impl(qualified, "cpu", kernel)
-        self._kernel = kernel
+        self.kernel = kernel
         self._direct: Callable = self.defined if mutates_args else kernel
 
     def __call__(self, *arguments: Any) -> Any:
@@ -234,19 +233,26 @@ class Operator:
         """As of `torch.library.custom_op`: what comes out, without values."""
         return self.defined.register_fake(fake)
 
-    def register_autograd(self, backward: Callable, *, setup_context: Callable) -> None:
-        """As of `torch.library.custom_op`."""
+    def register_autograd(
+        self, backward: Callable, *, setup_context: Callable, direct: Callable | None = None
+    ) -> None:
+        """As of `torch.library.custom_op`.
+
+        Args:
+            direct: the short way, for an op that lists of tensors are differentiated in: autograd
+                functions see no lists.
+        """
         self.defined.register_autograd(backward, setup_context=setup_context)
-        if List[Tensor] in self._kernel.__annotations__.values():  # noqa: UP006
-            self._direct = self.defined
+        if direct is not None:
+            self._direct = direct
             return
         parts = {
-            "forward": self._kernel,
+            "forward": self.kernel,
             "setup_context": setup_context,
             "backward": once_differentiable(backward),
         }
         methods = {name: staticmethod(part) for name, part in parts.items()}
-        self._direct = type(self._kernel.__name__, (torch.autograd.Function,), methods).apply
+        self._direct = type(self.kernel.__name__, (torch.autograd.Function,), methods).apply
 
 
 def _watched(arguments: tuple) -> bool:

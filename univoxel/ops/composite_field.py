@@ -1,0 +1,425 @@
+"""A field composited along packed rays: sampling, opacity and compositing in one pass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from univoxel.ops import grid_sampling, hash_grid, native
+from univoxel.ops.checks import check, check_bricks
+from univoxel.ops.composite import composite_reference
+from univoxel.ops.dense_grid import sample_dense_reference
+from univoxel.ops.density import section_alpha
+from univoxel.ops.grid_sampling import SparseGrad, check_place
+from univoxel.ops.hash_grid import check_levels, encode_hash_reference, lattice_sizes
+from univoxel.ops.sparse_grid import sample_sparse_reference
+from univoxel.records import Bricks, Samples
+
+RAY_NUMBERS = 5  # of a ray before its features: opacity, t, gradient
+SAMPLE_NUMBERS = 4  # of a held sample before its features: sdf, gradient
+
+
+class FieldAlongRays(NamedTuple):
+    """Sums over the sections of each ray, each times what it weighs."""
+
+    opacity: Tensor  # [N] of the weights themselves
+    t: Tensor  # [N] world units
+    gradient: Tensor  # [N, 3] of the sdf
+    features: Tensor  # [N, C]
+
+
+def composite_field(
+    sdf: Tensor,  # [X, Y, Z]
+    features: Tensor,  # [X, Y, Z, C]
+    origin: Tensor,  # [N, 3]
+    direction: Tensor,  # [N, 3]
+    samples: Samples,
+    grid_origin: Sequence[float],
+    voxel_size: float,
+    inv_s: float,
+    *,
+    bricks: Bricks | None = None,
+    levels: tuple[Sequence[float], Sequence[float], Sequence[float]] | None = None,
+    min_share: float = 0.0,
+    sparse_grad: bool = False,
+) -> FieldAlongRays:
+    """Sample a field along packed rays and composite what it says, front to back.
+
+    At the samples x_i = origin + t_i direction of a ray, the field has distances f_i, gradients and
+    features as `sample_dense` (with bricks `sample_sparse`) and `encode_hash` define them. From i
+    to i + 1, where they are connected, reaches a section. With sigmoid S its opacity and weight are
+
+        alpha_i = max(0, 1 - S(inv_s f_{i+1}) / S(inv_s f_i))
+        w_i = alpha_i prod_{j < i} (1 - alpha_j)
+
+    and its value v the mean of its ends'. A sample's share is c_i = (w_{i-1} + w_i) / 2, so that
+
+        sum_i w_i (v_i + v_{i+1}) / 2 = sum_i c_i v_i
+
+    This is `composite` of `section_alpha` of what the other ops sample, without their tensors in
+    between.
+
+    Args:
+        sdf: [X, Y, Z] world units, negative inside; with bricks [R].
+        features: [X, Y, Z, C], with bricks [R, C]; with levels [L * rows, F] as of `encode_hash`,
+            and then C = L F.
+        origin, direction: [N, 3] rays in the world.
+        samples: packed along them, as of `march`.
+        grid_origin: world position of node (0, 0, 0).
+        voxel_size: world units, above 0.
+        inv_s: 1 / s, sharpness of the density, 1 / world units, above 0.
+        bricks: of a sparse grid.
+        levels: lower and upper corner and voxel sizes of a hash table, as of `encode_hash`.
+        min_share: in [0, 1), of a ray's heaviest sample. Of samples with less only the distance is
+            read: features and gradients are then the mean of the others, times the opacity.
+        sparse_grad: gradients of sdf and features come back as coalesced ``sparse_coo`` tensors of
+            touched rows. Eager only: under torch.compile ask for dense gradients.
+
+    Raises:
+        TypeError, ValueError: an argument is no tensor, or of another size, dtype, device or range
+            than above; offsets do not rise from 0 to the number of samples.
+
+    Differentiable in: sdf, features, origin, direction; which samples weigh little is taken as
+    fixed. Second order raises.
+    Source: Wang et al. 2021 (NeuS), eq. 13; Max 1995 for the sums.
+    """
+    _check(sdf, features, origin, direction, samples, bricks, levels)
+    check_place("composite_field", len(samples.t), grid_origin, voxel_size)
+    if not 0 < inv_s < math.inf:
+        raise ValueError(f"composite_field: inv_s must be positive and finite, got {inv_s}")
+    if not 0 <= min_share < 1:
+        raise ValueError(f"composite_field: min_share must be in [0, 1), got {min_share}")
+    place = [float(x) for x in grid_origin], float(voxel_size)
+    if native.serves(sdf):
+        corners = (
+            ([], [], []) if levels is None else tuple([float(x) for x in part] for part in levels)
+        )
+        table = sdf.new_empty(0, 0, 0, dtype=torch.int32) if bricks is None else bricks.table
+        total, _ = _composite_field(
+            *(x.contiguous() for x in (sdf, features, table, origin, direction)),
+            *(x.contiguous() for x in (samples.t, samples.connected, samples.offsets)),
+            list(sdf.shape if bricks is None else bricks.size),
+            *place,
+            *corners,
+            float(inv_s),
+            float(min_share),
+            sparse_grad,
+        )
+    else:
+        if sparse_grad:
+            sdf = SparseGrad.apply(sdf, sdf.dim())
+            features = SparseGrad.apply(features, features.dim() - 1)
+        total = composite_field_reference(
+            sdf,
+            features,
+            origin,
+            direction,
+            samples,
+            *place,
+            inv_s,
+            bricks=bricks,
+            levels=levels,
+            min_share=min_share,
+        )
+    opacity, t, gradient, composited = total.split([1, 1, 3, total.shape[1] - RAY_NUMBERS], 1)
+    return FieldAlongRays(opacity[:, 0], t[:, 0], gradient, composited)
+
+
+def _check(
+    sdf: Tensor,
+    features: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    samples: Samples,
+    bricks: Bricks | None,
+    levels: tuple[Sequence[float], ...] | None,
+) -> None:
+    op = "composite_field"
+    nodes = "X Y Z"
+    if bricks is not None:
+        check_bricks(op, bricks, sdf=(sdf, "R"))
+        nodes = "R"
+    sizes = check(
+        op,
+        sdf=(sdf, nodes),
+        features=(features, "T F" if levels is not None else f"{nodes} C"),
+        origin=(origin, "N 3"),
+        direction=(direction, "N 3"),
+        t=(samples.t, "M"),
+        connected=(samples.connected, "M", torch.bool),
+        offsets=(samples.offsets, "N+1", torch.int64),
+    )
+    if not sdf.numel():
+        raise ValueError(f"{op}: sdf must have nodes, got {list(sdf.shape)}")
+    if levels is not None:
+        check_levels(op, sizes["T"], *levels)
+
+
+def composite_field_reference(
+    sdf: Tensor,
+    features: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    samples: Samples,
+    grid_origin: Sequence[float],
+    voxel_size: float,
+    inv_s: float,
+    *,
+    bricks: Bricks | None = None,
+    levels: tuple[Sequence[float], Sequence[float], Sequence[float]] | None = None,
+    min_share: float = 0.0,
+) -> Tensor:
+    """The same in eager torch, op by op: opacity, t, gradient and features, [N, 5 + C]."""
+    ray = torch.repeat_interleave(samples.offsets.diff())
+    points = origin[ray] + samples.t[:, None] * direction[ray]
+    of_nodes = features if levels is None else sdf.new_empty(*sdf.shape, 0)
+    if bricks is None:
+        value, gradient, feature = sample_dense_reference(
+            sdf, of_nodes, points, grid_origin, voxel_size
+        )
+    else:
+        value, gradient, feature = sample_sparse_reference(
+            sdf, of_nodes, bricks, points, grid_origin, voxel_size
+        )
+    if levels is not None:
+        feature = encode_hash_reference(features, points, *levels)
+    alpha = section_alpha(value, samples.connected, inv_s)
+    _, weight = composite_reference(alpha, value[:, None], samples.offsets)
+    share = (weight + weight.roll(1)) / 2  # the last sample of a ray starts no section
+    n = len(samples.offsets) - 1
+    most = share.new_zeros(n).scatter_reduce(0, ray, share.detach(), "amax")
+    read = torch.where(share.detach() >= min_share * most[ray], share, 0.0)
+
+    def summed(values: Tensor) -> Tensor:
+        return values.new_zeros(n, values.shape[1]).index_add(0, ray, values)
+
+    opacity = summed(share[:, None])
+    scale = opacity / summed(read[:, None]).clamp_min(torch.finfo(share.dtype).tiny)
+    sums = summed(read[:, None] * torch.cat([gradient, feature], 1))
+    return torch.cat([opacity, summed((share * samples.t)[:, None]), scale * sums], 1)
+
+
+def _grid(table: Tensor, size: list[int], origin: list[float], voxel_size: float) -> Any:
+    if table.numel():
+        return native.require().SparseGrid(table.numpy(), size, origin, voxel_size)
+    return native.require().DenseGrid(size, origin, voxel_size)
+
+
+def _hash_place(
+    lower: list[float], upper: list[float], voxel_sizes: list[float]
+) -> tuple[list[list[int]], list[float], list[float]]:
+    """Levels as the extension takes them; none: no hash table."""
+    if not voxel_sizes:
+        return [], [0.0] * 3, []
+    return lattice_sizes(lower, upper, voxel_sizes), lower, voxel_sizes
+
+
+@native.operator("composite_field")
+def _composite_field(
+    sdf: Tensor,
+    features: Tensor,
+    table: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    t: Tensor,
+    connected: Tensor,
+    offsets: Tensor,
+    size: list[int],
+    grid_origin: list[float],
+    voxel_size: float,
+    lower: list[float],
+    upper: list[float],
+    voxel_sizes: list[float],
+    inv_s: float,
+    min_share: float,
+    sparse_grad: bool,
+) -> tuple[Tensor, Tensor]:
+    out, held = _empty(features, t, offsets, voxel_sizes)
+    native.require().composite_field_forward(
+        _grid(table, size, grid_origin, voxel_size),
+        *native.arrays(sdf, features),
+        *_hash_place(lower, upper, voxel_sizes),
+        *native.arrays(origin, direction, t, connected, offsets),
+        inv_s,
+        min_share,
+        *native.arrays(out, held),
+        native.threads(),
+    )
+    return out, held
+
+
+def _empty(
+    features: Tensor, t: Tensor, offsets: Tensor, voxel_sizes: list[float]
+) -> tuple[Tensor, Tensor]:
+    """What rays sum up to, and what is held of samples for the way back."""
+    channels = features.shape[-1] * max(len(voxel_sizes), 1)
+    return (
+        t.new_empty(len(offsets) - 1, RAY_NUMBERS + channels),
+        t.new_empty(len(t), SAMPLE_NUMBERS + channels),
+    )
+
+
+@_composite_field.register_fake
+def _(sdf, features, table, origin, direction, t, connected, offsets, *numbers):
+    return _empty(features, t, offsets, numbers[5])
+
+
+class _Pulls(NamedTuple):
+    """How far the loss pulls at what was read of each sample."""
+
+    points: Tensor  # [M, 3]
+    feature_points: Tensor  # [M, 3] the same, or NaN where no features were read
+    value: Tensor  # [M]
+    gradient: Tensor  # [M, 3]
+    feature: Tensor  # [M, C]
+
+
+def _pulls(
+    tensors: Sequence[Tensor],
+    held: Tensor,
+    grad_out: Tensor,
+    grid: Any,
+    levels: tuple,
+    inv_s: float,
+    min_share: float,
+) -> _Pulls:
+    sdf, features, _, *rays = tensors
+    t = rays[2]
+    pulls = _Pulls(
+        t.new_empty(len(t), 3),
+        t.new_empty(len(t), 3),
+        torch.empty_like(t),
+        t.new_empty(len(t), 3),
+        t.new_empty(len(t), held.shape[1] - SAMPLE_NUMBERS),
+    )
+    native.require().composite_field_pulls(
+        grid,
+        *native.arrays(sdf, features),
+        *levels,
+        *native.arrays(*rays),
+        inv_s,
+        min_share,
+        *native.arrays(held, grad_out, *pulls),
+        native.threads(),
+    )
+    return pulls
+
+
+def _gradients(
+    tensors: Sequence[Tensor],
+    held: Tensor,
+    grad_out: Tensor,
+    grid: Any,
+    levels: tuple,
+    inv_s: float,
+    min_share: float,
+    needs: list[bool],
+    sparse: bool,
+) -> list[Tensor | None]:
+    """Of sdf, features, origin and direction; None where not needed."""
+    sdf, features, _, _, direction, t, _, offsets = tensors
+    pulls = _pulls(tensors, held, grad_out, grid, levels, inv_s, min_share)
+    hashed = bool(levels[0])
+    moved = needs[2] or needs[3]
+    of_nodes = sdf.new_empty(*sdf.shape, 0) if hashed else features
+    feature = pulls.feature[:, :0] if hashed else pulls.feature
+    order = torch.empty(len(t), dtype=torch.int32)
+    native.require().sort_by_tile(grid, *native.arrays(pulls.points, order), native.threads())
+    backward = grid_sampling.sample_backward_sparse if sparse else grid_sampling.sample_backward
+    grads = list(
+        backward(
+            grid,
+            (sdf, of_nodes, pulls.points, order),
+            (pulls.value, pulls.gradient, feature.contiguous()),
+            [needs[0], needs[1] and not hashed, moved],
+        )
+    )
+    of_points = grads[2]
+    if hashed:
+        hash_needs, count = [needs[1], moved], len(levels[0])
+        grads[1], of_hash = hash_grid.backward(
+            features, pulls.feature_points, pulls.feature, levels, count, hash_needs, sparse
+        )
+        if moved:
+            of_points = of_points + of_hash
+    rays: list[Tensor | None] = [None, None]
+    if moved:
+        ray = torch.repeat_interleave(offsets.diff())
+        rays = [
+            torch.zeros_like(direction).index_add(0, ray, of_points),
+            torch.zeros_like(direction).index_add(0, ray, t[:, None] * of_points),
+        ]
+    return [g if need else None for g, need in zip([*grads[:2], *rays], needs, strict=True)]
+
+
+@native.operator("composite_field_backward")
+def _composite_field_backward(
+    sdf: Tensor,
+    features: Tensor,
+    table: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    t: Tensor,
+    connected: Tensor,
+    offsets: Tensor,
+    held: Tensor,
+    grad_out: Tensor,
+    size: list[int],
+    grid_origin: list[float],
+    voxel_size: float,
+    lower: list[float],
+    upper: list[float],
+    voxel_sizes: list[float],
+    inv_s: float,
+    min_share: float,
+    needs: list[bool],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    tensors = sdf, features, table, origin, direction, t, connected, offsets
+    grid = _grid(table, size, grid_origin, voxel_size)
+    levels = _hash_place(lower, upper, voxel_sizes)
+    grads = _gradients(tensors, held, grad_out, grid, levels, inv_s, min_share, needs, sparse=False)
+    # An op cannot return None
+    a, b, c, d = (t.new_empty(0) if g is None else g for g in grads)
+    return a, b, c, d
+
+
+@_composite_field_backward.register_fake
+def _(sdf, features, table, origin, direction, t, connected, offsets, held, grad_out, *numbers):
+    inputs = zip((sdf, features, origin, direction), numbers[-1], strict=True)
+    return tuple(torch.empty_like(x) if need else x.new_empty(0) for x, need in inputs)
+
+
+def _save(ctx, inputs, output):
+    tensors = inputs[:8]
+    ctx.place, (ctx.inv_s, ctx.min_share, ctx.sparse_grad) = inputs[8:14], inputs[14:]
+    ctx.save_for_backward(*tensors, output[1])
+    ctx.set_materialize_grads(False)
+
+
+def _backward(ctx, grad_out, _):
+    *tensors, held = ctx.saved_tensors
+    none = [None] * (len(ctx.place) + 3)
+    if grad_out is None:
+        return *[None] * len(tensors), *none
+    wanted = ctx.needs_input_grad
+    needs = [wanted[0], wanted[1], wanted[3], wanted[4]]
+    density = ctx.inv_s, ctx.min_share
+    if ctx.sparse_grad:
+        size, grid_origin, voxel_size, *levels = ctx.place
+        grid = _grid(tensors[2], size, grid_origin, voxel_size)
+        grads = _gradients(
+            tensors, held, grad_out.contiguous(), grid, _hash_place(*levels), *density, needs, True
+        )
+    else:
+        dense = _composite_field_backward(
+            *tensors, held, grad_out.contiguous(), *ctx.place, *density, needs
+        )
+        grads = [g if need else None for g, need in zip(dense, needs, strict=True)]
+    return grads[0], grads[1], None, grads[2], grads[3], None, None, None, *none
+
+
+_composite_field.register_autograd(_backward, setup_context=_save)
