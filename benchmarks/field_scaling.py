@@ -25,6 +25,7 @@ from statistics import median
 
 import torch
 from made import made
+from univoxel.render.density import section_alpha
 
 from univoxel.experiments.record import result_text
 from univoxel.fields.features import PER_LEVEL, Levels
@@ -33,7 +34,6 @@ from univoxel.grid import GridShape
 from univoxel.ops import composite
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays
-from univoxel.render.density import section_alpha
 from univoxel.training import surface_update
 
 HERE = Path(__file__).parent

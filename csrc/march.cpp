@@ -5,6 +5,7 @@
 #include <limits>
 
 #include "dcheck.h"
+#include "density.h"
 #include "parallel.h"
 
 namespace univoxel {
@@ -72,12 +73,6 @@ T least(const March<T>& in, const BrickNodes& nodes, const int64_t b[3]) {
     return in.brick_min[nodes.brick(b[0], b[1], b[2])];
 }
 
-/// log(sigmoid(x)) without overflow.
-template <class T>
-T log_sigmoid(T x) {
-    return std::min(x, T(0)) - std::log1p(std::exp(-std::abs(x)));
-}
-
 /// Part of a ray inside the box [0, upper]; false when it misses or is no ray.
 template <class T>
 bool clip(vec3<T> o, vec3<T> d, vec3<T> upper, T& near, T& far) {
@@ -112,7 +107,8 @@ void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, PackedSample
     const T band = kClearBand / in.inv_s;
     const int64_t last = static_cast<int64_t>((far - start) / in.step);
 
-    T trans = 1, log_before = 0;
+    const T clear = -std::log(std::numeric_limits<T>::epsilon());
+    T trans = 1, f_before = 0;
     int64_t k = 0, before = -2, emitted = -2;
     while (k <= last && trans >= in.early_stop) {
         const vec3<T> g = o + (start + T(k) * in.step) * d;
@@ -135,10 +131,11 @@ void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, PackedSample
         // The section that ends here starts at the sample before, even if that was skipped.
         if (before != k - 1) {
             const T t = start + T(std::max<int64_t>(k - 1, 0)) * in.step;
-            log_before = log_sigmoid(sdf_at(in, nodes, o + t * d) * in.inv_s);
+            f_before = sdf_at(in, nodes, o + t * d) * in.inv_s;
         }
-        const T log_here = log_sigmoid(sdf_at(in, nodes, g) * in.inv_s);
-        const T alpha = k > 0 ? std::max(T(0), -std::expm1(log_here - log_before)) : T(0);
+        const T f_here = sdf_at(in, nodes, g) * in.inv_s;
+        // Where this ends so far outside, opacity is less than a rounding error.
+        const T alpha = k > 0 && f_here < clear ? section_alpha(f_before, f_here) : T(0);
         if (alpha * trans > in.min_weight) {
             if (emitted != k - 1) {
                 out.t.push_back(start + T(k - 1) * in.step);
@@ -151,7 +148,7 @@ void march_ray(const March<T>& in, const Nodes& nodes, int64_t ray, PackedSample
             DCHECK(out.t.size() == out.connected.size());
         }
         trans *= 1 - alpha;
-        log_before = log_here;
+        f_before = f_here;
         before = k++;
     }
 }

@@ -2,9 +2,8 @@
 
 import torch
 
-from univoxel.ops import brick_minimum, composite, march, sample_dense
+from univoxel.ops import brick_minimum, composite, march, sample_dense, section_alpha
 from univoxel.optim import RowAdam
-from univoxel.render.density import section_alpha
 
 torch.manual_seed(0)
 NODES, ORIGIN, VOXEL = 64, (-1.0, -1.0, -1.0), 2 / 63

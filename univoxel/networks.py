@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from univoxel import ops
 
-FEWEST_ROWS = 2048  # for the fused op: with fewer, torch's layers one by one are done sooner
+FEWEST_ROWS = 256  # for the fused op: with fewer, torch's layers one by one are done sooner
 
 
 class MLP(nn.Sequential):
@@ -51,7 +51,8 @@ def waves(x: Tensor, octaves: int) -> list[Tensor]:
 
     Networks of low dimension learn detail from them. Source: Mildenhall et al. 2020, eq. 4.
     """
-    return [wave for i in range(octaves) for wave in ((x * 2**i).sin(), (x * 2**i).cos())]
+    higher = [x * 2**i if i else x for i in range(octaves)]
+    return [wave for y in higher for wave in (y.sin(), y.cos())]
 
 
 class DirectionTable(nn.Module):

@@ -11,9 +11,17 @@ from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from univoxel.errors import NoSurface
-from univoxel.fields.distances import BAND, AbstractDistances, no_values
+from univoxel.fields.distances import BAND, MIN_SHARE, AbstractDistances, no_values
 from univoxel.grid import GridShape
-from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_sparse, smooth_rows_
+from univoxel.ops import (
+    brick_minimum,
+    composite_field,
+    diffuse_rows_,
+    march,
+    sample_sparse,
+    smooth_rows_,
+)
+from univoxel.ops.composite_field import FieldAlongRays, Lattices
 from univoxel.records import Bricks, FieldSample, Rays, Samples
 
 SLAB = 64  # planes of the grid whose surface is found at once; whole bricks
@@ -105,6 +113,29 @@ class BrickDistances(AbstractDistances):
             step=self.voxel_size,
             inv_s=inv_s,
             bricks=self.bricks,
+        )
+
+    def composite(
+        self,
+        rays: Rays,
+        samples: Samples,
+        inv_s: float,
+        values: Tensor,
+        levels: Lattices | None = None,
+    ) -> FieldAlongRays:
+        return composite_field(
+            self.sdf,
+            values,
+            rays.origin,
+            rays.direction,
+            samples,
+            self.grid.origin,
+            self.voxel_size,
+            inv_s,
+            bricks=self.bricks,
+            levels=levels,
+            min_share=MIN_SHARE,
+            sparse_grad=True,
         )
 
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:

@@ -7,9 +7,17 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from univoxel.errors import NoSurface
-from univoxel.fields.distances import AbstractDistances, no_values
+from univoxel.fields.distances import MIN_SHARE, AbstractDistances, no_values
 from univoxel.grid import GridShape, resample
-from univoxel.ops import brick_minimum, diffuse_rows_, march, sample_dense, smooth_rows_
+from univoxel.ops import (
+    brick_minimum,
+    composite_field,
+    diffuse_rows_,
+    march,
+    sample_dense,
+    smooth_rows_,
+)
+from univoxel.ops.composite_field import FieldAlongRays, Lattices
 from univoxel.records import FieldSample, Rays, Samples
 
 
@@ -48,6 +56,28 @@ class DenseDistances(AbstractDistances):
             self.voxel_size,
             step=self.voxel_size,
             inv_s=inv_s,
+        )
+
+    def composite(
+        self,
+        rays: Rays,
+        samples: Samples,
+        inv_s: float,
+        values: Tensor,
+        levels: Lattices | None = None,
+    ) -> FieldAlongRays:
+        return composite_field(
+            self.sdf,
+            values,
+            rays.origin,
+            rays.direction,
+            samples,
+            self.grid.origin,
+            self.voxel_size,
+            inv_s,
+            levels=levels,
+            min_share=MIN_SHARE,
+            sparse_grad=True,
         )
 
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:

@@ -9,9 +9,14 @@ import torch
 from torch import Tensor, nn
 
 from univoxel.grid import GridShape
+from univoxel.ops.composite_field import FieldAlongRays, Lattices
 from univoxel.records import FieldSample, Rays, Samples
 
 BAND = 4.0  # voxels from the surface beyond which density is nothing: 8 s at a sharpness of 0.5
+
+# Of a ray's heaviest sample: of lighter ones only the distance is read. What they would say of
+# colour is what is seen a fraction of a voxel further on.
+MIN_SHARE = 0.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,21 @@ class AbstractDistances(nn.Module, ABC):
     @abstractmethod
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         """The samples along rays that matter under density sharpness 1 / s; no gradients."""
+
+    @abstractmethod
+    def composite(
+        self,
+        rays: Rays,
+        samples: Samples,
+        inv_s: float,
+        values: Tensor,
+        levels: Lattices | None = None,
+    ) -> FieldAlongRays:
+        """Composite distances and values along samples of rays.
+
+        Args:
+            values: of nodes, as features; or a hash table with these levels.
+        """
 
     @torch.no_grad()
     def refresh(self) -> bool:

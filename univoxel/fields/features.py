@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from univoxel.errors import ConfigError
 from univoxel.fields.distances import BAND, AbstractDistances, nodes_within
 from univoxel.ops import encode_hash
-from univoxel.records import FieldSample
+from univoxel.ops.composite_field import FieldAlongRays, Lattices
+from univoxel.records import FieldSample, Rays, Samples
 from univoxel.validation import check_fields
 
 PER_LEVEL = 2  # channels; so levels are half as many as channels
@@ -49,6 +50,12 @@ class AbstractFeatures(nn.Module, ABC):
         Args:
             values: read in place of its own.
         """
+
+    @abstractmethod
+    def composite(
+        self, distances: AbstractDistances, rays: Rays, samples: Samples, inv_s: float
+    ) -> FieldAlongRays:
+        """Composite distances, their gradient and features along samples of rays."""
 
     @abstractmethod
     def hold_channels_(self, count: int) -> None:
@@ -93,6 +100,11 @@ class NodeFeatures(AbstractFeatures):
         self, distances: AbstractDistances, points: Tensor, values: Tensor | None = None
     ) -> Tensor:
         return distances.interpolate(self.values if values is None else values, points)
+
+    def composite(
+        self, distances: AbstractDistances, rays: Rays, samples: Samples, inv_s: float
+    ) -> FieldAlongRays:
+        return distances.composite(rays, samples, inv_s, self.values)
 
     def hold_channels_(self, count: int) -> None:
         assert self.values.grad is not None
@@ -175,17 +187,28 @@ class HashFeatures(AbstractFeatures):
     def at(
         self, distances: AbstractDistances, points: Tensor, values: Tensor | None = None
     ) -> Tensor:
-        by_level = self.encode(points, values).view(
-            len(points), len(self.levels.voxel_sizes), PER_LEVEL
-        )
-        return by_level.transpose(1, 2).reshape(len(points), self.channels)
+        return self._by_channel(self.encode(points, values))
+
+    def _by_channel(self, encoded: Tensor) -> Tensor:
+        """Features [N, C] from those of a level together."""
+        n = len(encoded)
+        by_level = encoded.view(n, len(self.levels.voxel_sizes), PER_LEVEL)
+        return by_level.transpose(1, 2).reshape(n, self.channels)
+
+    def composite(
+        self, distances: AbstractDistances, rays: Rays, samples: Samples, inv_s: float
+    ) -> FieldAlongRays:
+        found = distances.composite(rays, samples, inv_s, self.values, self._lattices)
+        return found._replace(features=self._by_channel(found.features))
+
+    @property
+    def _lattices(self) -> Lattices:
+        return self.levels.lower, self.levels.upper, self.levels.voxel_sizes
 
     def encode(self, points: Tensor, values: Tensor | None = None) -> Tensor:
         """The features [M, C], those of a level together; values as in `at`."""
-        levels = self.levels
-        place = levels.lower, levels.upper, levels.voxel_sizes
         table = self.values if values is None else values
-        return encode_hash(table, points, *place, sparse_grad=True)
+        return encode_hash(table, points, *self._lattices, sparse_grad=True)
 
     def hold_channels_(self, count: int) -> None:
         grad = self.values.grad

@@ -13,6 +13,7 @@ from univoxel.fields.distances import AbstractDistances
 from univoxel.fields.features import AbstractFeatures, HashFeatures, Levels, NodeFeatures
 from univoxel.grid import GridShape
 from univoxel.names import FieldName
+from univoxel.ops.composite_field import FieldAlongRays
 from univoxel.records import FieldSample, Rays, Samples
 
 DENSE_MOST = 8_000_000  # nodes; of finer grids bricks around the surface cost less
@@ -93,6 +94,10 @@ class Field(nn.Module):
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         """The samples along rays that matter under density sharpness 1 / s; no gradients."""
         return self.distances.march(rays, jitter, inv_s)
+
+    def composite(self, rays: Rays, samples: Samples, inv_s: float) -> FieldAlongRays:
+        """Composite distances, their gradient and features along samples of rays, in one pass."""
+        return self.encoding.composite(self.distances, rays, samples, inv_s)
 
     @torch.no_grad()
     def refresh(self) -> bool:

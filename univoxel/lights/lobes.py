@@ -23,7 +23,8 @@ def decode(parameters: Tensor, max_sharpness: float) -> tuple[Tensor, Tensor, Te
     # rsqrt of a floored square: a zero vector keeps a finite gradient
     axis = vector * ((vector * vector).sum(-1, keepdim=True).clamp_min(1e-12)).rsqrt()
     sharpness = max_sharpness * sharpness[..., 0].sigmoid() + _MIN_SHARPNESS
-    return axis, sharpness, torch.nn.functional.softplus(amplitude)
+    # softplus, for which torch has no vector instructions
+    return axis, sharpness, -torch.nn.functional.logsigmoid(-amplitude)
 
 
 def white_light(count: int, max_sharpness: float) -> Tensor:

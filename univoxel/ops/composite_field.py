@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -19,6 +19,8 @@ from univoxel.ops.hash_grid import check_levels, encode_hash_reference, lattice_
 from univoxel.ops.sparse_grid import sample_sparse_reference
 from univoxel.records import Bricks, Samples
 
+# Lower and upper corner and voxel sizes of a hash table's levels, as of `encode_hash`
+Lattices: TypeAlias = "tuple[Sequence[float], Sequence[float], Sequence[float]]"
 RAY_NUMBERS = 5  # of a ray before its features: opacity, t, gradient
 SAMPLE_NUMBERS = 4  # of a held sample before its features: sdf, gradient
 
@@ -43,7 +45,7 @@ def composite_field(
     inv_s: float,
     *,
     bricks: Bricks | None = None,
-    levels: tuple[Sequence[float], Sequence[float], Sequence[float]] | None = None,
+    levels: Lattices | None = None,
     min_share: float = 0.0,
     sparse_grad: bool = False,
 ) -> FieldAlongRays:
@@ -136,7 +138,7 @@ def _check(
     direction: Tensor,
     samples: Samples,
     bricks: Bricks | None,
-    levels: tuple[Sequence[float], ...] | None,
+    levels: Lattices | None,
 ) -> None:
     op = "composite_field"
     nodes = "X Y Z"
@@ -170,7 +172,7 @@ def composite_field_reference(
     inv_s: float,
     *,
     bricks: Bricks | None = None,
-    levels: tuple[Sequence[float], Sequence[float], Sequence[float]] | None = None,
+    levels: Lattices | None = None,
     min_share: float = 0.0,
 ) -> Tensor:
     """The same in eager torch, op by op: opacity, t, gradient and features, [N, 5 + C]."""

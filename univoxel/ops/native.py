@@ -246,11 +246,15 @@ class Operator:
         if direct is not None:
             self._direct = direct
             return
-        parts = {
-            "forward": self.kernel,
-            "setup_context": setup_context,
-            "backward": once_differentiable(backward),
-        }
+        kernel = self.kernel
+
+        # With a setup_context of its own torch would look up the kernel's signature in every call
+        def forward(ctx: Any, *inputs: Any) -> Any:
+            output = kernel(*inputs)
+            setup_context(ctx, inputs, output)
+            return output
+
+        parts = {"forward": forward, "backward": once_differentiable(backward)}
         methods = {name: staticmethod(part) for name, part in parts.items()}
         self._direct = type(self.kernel.__name__, (torch.autograd.Function,), methods).apply
 

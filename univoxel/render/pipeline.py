@@ -11,9 +11,7 @@ from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb_unclipped, srgb_to_linear
 from univoxel.lights.quadrature import rotations
-from univoxel.ops import composite
 from univoxel.records import Mesh, Rays, Surface
-from univoxel.render.density import section_alpha
 from univoxel.render.occlusion import occlusion
 from univoxel.scene import Scene
 
@@ -30,25 +28,17 @@ def surface_at(scene: Scene, rays: Rays, jitter: Tensor | None = None) -> Surfac
     n = len(rays.origin)
     jitter = rays.origin.new_full((n,), 0.5) if jitter is None else jitter
     samples = scene.field.march(rays, jitter, scene.inv_s)
-    ray = torch.repeat_interleave(samples.offsets.diff())
-    points = torch.addcmul(rays.origin[ray], samples.t[:, None], rays.direction[ray])
-    field = scene.field.sample(points)
-    alpha = section_alpha(field.sdf, samples.connected, scene.inv_s)
-    one = torch.ones_like(alpha)[:, None]
-    ends = torch.cat([field.features, field.gradient, samples.t[:, None], one], 1)
-    middles = 0.5 * (ends + ends.roll(-1, 0))  # a section's value; where none starts alpha is 0
-    total, _ = composite(alpha, middles, samples.offsets)
-    opacity = total[:, -1]
-    mean = total[:, :-1] / opacity.clamp_min(1e-4)[:, None]
-    features, gradient, t = mean.split([scene.field.channels, 3, 1], 1)
+    along = scene.field.composite(rays, samples, scene.inv_s)
+    weight = along.opacity.clamp_min(1e-4)[:, None]
+    features, t = along.features / weight, along.t[:, None] / weight
     albedo, roughness, metallic = scene.material(features)
     return Surface(
         position=rays.origin + t * rays.direction,
-        normal=torch.nn.functional.normalize(gradient, dim=1, eps=1e-6),
+        normal=torch.nn.functional.normalize(along.gradient, dim=1, eps=1e-6),
         features=features,
         albedo=albedo,
         roughness=roughness,
-        opacity=opacity,
+        opacity=along.opacity,
         depth=t[:, 0],
         metallic=metallic,
     )

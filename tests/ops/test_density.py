@@ -2,7 +2,7 @@
 
 import torch
 
-from univoxel.render.density import section_alpha
+from univoxel.ops import section_alpha
 
 
 def test_matches_the_formula_of_the_paper():
