@@ -143,7 +143,11 @@ void forward_chunk(const FieldRays<T, Nodes>& in, int64_t begin, int64_t end, T*
     for (int64_t ray = begin; ray < end; ++ray) {
         weigh(ray);
         for (int64_t i = in.offsets[ray]; i < in.offsets[ray + 1]; ++i) {
-            if (!w.reads(i - in.offsets[ray])) continue;
+            if (!w.reads(i - in.offsets[ray])) {
+                T* row = held + (i - first) * stride;
+                std::fill(row + 1, row + stride, T(0));
+                continue;
+            }
             const T* p = scratch.points.data() + 3 * (i - first);
             scratch.read.push_back(i - first);
             scratch.read_points.insert(scratch.read_points.end(), p, p + 3);

@@ -33,7 +33,7 @@ struct FieldRays {
 };
 
 /// Sums over the sections of rays, out [N, 5 + C]: opacity, t, gradient, features. What was read of
-/// samples is held [M, 4 + C] for the way back; of light ones only the first number is written.
+/// samples is held [M, 4 + C] for the way back; of light ones only the distance, else 0.
 template <class T, class Nodes>
 void composite_field_forward(const FieldRays<T, Nodes>& in, T* out, T* held, int threads);
 
