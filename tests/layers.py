@@ -54,7 +54,19 @@ LAYERS = [
     {"cli"},
 ]
 HELPERS = {
-    "ops": {"checks", "dense_grid", "grid_sampling", "native", "reflectance", "visibility"},
+    "ops": {
+        "checks",
+        "composite",
+        "composite_field",
+        "dense_grid",
+        "density",
+        "grid_sampling",
+        "hash_grid",
+        "native",
+        "reflectance",
+        "sparse_grid",
+        "visibility",
+    },
     "fields": {"bricks", "dense", "distances", "features"},
     "lights": {"base", "latlong", "lobes", "local", "priors", "quadrature"},
     "data": {

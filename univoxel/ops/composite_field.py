@@ -95,40 +95,49 @@ def composite_field(
         raise ValueError(f"composite_field: inv_s must be positive and finite, got {inv_s}")
     if not 0 <= min_share < 1:
         raise ValueError(f"composite_field: min_share must be in [0, 1), got {min_share}")
-    place = [float(x) for x in grid_origin], float(voxel_size)
+    options = {"bricks": bricks, "levels": levels, "min_share": min_share}
+    place = [float(x) for x in grid_origin], float(voxel_size), float(inv_s)
+    rays = origin, direction, samples
     if native.serves(sdf):
-        corners = (
-            ([], [], []) if levels is None else tuple([float(x) for x in part] for part in levels)
-        )
-        table = sdf.new_empty(0, 0, 0, dtype=torch.int32) if bricks is None else bricks.table
-        total, _ = _composite_field(
-            *(x.contiguous() for x in (sdf, features, table, origin, direction)),
-            *(x.contiguous() for x in (samples.t, samples.connected, samples.offsets)),
-            list(sdf.shape if bricks is None else bricks.size),
-            *place,
-            *corners,
-            float(inv_s),
-            float(min_share),
-            sparse_grad,
-        )
+        total = _total(sdf, features, *rays, *place, **options, sparse_grad=sparse_grad)
     else:
         if sparse_grad:
             sdf = SparseGrad.apply(sdf, sdf.dim())
             features = SparseGrad.apply(features, features.dim() - 1)
-        total = composite_field_reference(
-            sdf,
-            features,
-            origin,
-            direction,
-            samples,
-            *place,
-            inv_s,
-            bricks=bricks,
-            levels=levels,
-            min_share=min_share,
-        )
+        total = composite_field_reference(sdf, features, *rays, *place, **options)
     opacity, t, gradient, composited = total.split([1, 1, 3, total.shape[1] - RAY_NUMBERS], 1)
     return FieldAlongRays(opacity[:, 0], t[:, 0], gradient, composited)
+
+
+def _total(
+    sdf: Tensor,
+    features: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    samples: Samples,
+    grid_origin: list[float],
+    voxel_size: float,
+    inv_s: float,
+    bricks: Bricks | None,
+    levels: Lattices | None,
+    min_share: float,
+    sparse_grad: bool,
+) -> Tensor:
+    """As the reference, from the kernel."""
+    table = sdf.new_empty(0, 0, 0, dtype=torch.int32) if bricks is None else bricks.table
+    corners = [[float(x) for x in part] for part in levels or ((), (), ())]
+    total, _ = _composite_field(
+        *(x.contiguous() for x in (sdf, features, table, origin, direction)),
+        *(x.contiguous() for x in (samples.t, samples.connected, samples.offsets)),
+        list(sdf.shape if bricks is None else bricks.size),
+        grid_origin,
+        voxel_size,
+        *corners,
+        inv_s,
+        float(min_share),
+        sparse_grad,
+    )
+    return total
 
 
 def _check(
