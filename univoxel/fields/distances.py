@@ -14,9 +14,9 @@ from univoxel.records import FieldSample, Rays, Samples
 
 BAND = 4.0  # voxels from the surface beyond which density is nothing: 8 s at a sharpness of 0.5
 
-# Of a ray's heaviest sample: of lighter ones only the distance is read. What they would say of
-# colour is what is seen a fraction of a voxel further on.
-MIN_SHARE = 0.0
+# Of a ray's heaviest sample: of lighter ones, nearly half of all, only the distance is read. What
+# they would say of colour is what is seen a fraction of a voxel further on.
+MIN_SHARE = 0.05
 
 
 @dataclass(frozen=True)
