@@ -4,6 +4,7 @@
         [--out benchmarks/results/preparation/poses.json]
     python benchmarks/poses.py --novel [--width 1200] [--views 40]
         [--out benchmarks/results/preparation/poses_novel.json]
+    python benchmarks/poses.py --real FOLDER [--out benchmarks/results/preparation/poses_real.json]
 
 A textured object on a patterned floor in a furnished room (tests/textured_room.py). `plain` are
 JPEG files without EXIF; `heic` HEIC; `turned` has every third held upright and stored lying, as
@@ -12,6 +13,9 @@ file. Rotations and centres are compared after a similarity. Pictures and scenes
 
 --novel trains a `draft` of the object in `plain` with found and one with true cameras, on the same
 pictures and with true masks. Novel views are every eighth photograph, each from its own camera.
+
+--real finds cameras of the photographs in FOLDER/images with the masks in FOLDER/masks, and says
+how long it took; what their cameras are nobody knows.
 """
 
 from __future__ import annotations
@@ -159,6 +163,17 @@ def trained(variant: str, photos: Path, scene: Path, views: int, width: int) -> 
     return rows
 
 
+def placed(photos: Path, masks: Path, out: Path) -> list[object]:
+    """A row of photographs whose true cameras are not known."""
+    shutil.rmtree(out, ignore_errors=True)
+    wall, used = time.monotonic(), processor_seconds()
+    poses(photos, out, masks=masks)
+    wall, used = time.monotonic() - wall, processor_seconds() - used
+    found, count = len(read_images(out / "sparse/0/images.bin")), len(list(photos.iterdir()))
+    error = json.loads((out / "poses.json").read_text(encoding="utf-8"))["error"]
+    return [photos.parent.name, f"{found} of {count}", error, None, None, used, wall]
+
+
 def known(views: list[textured_room.View]) -> Cameras:
     """True cameras, of pictures of one size."""
     width, height = views[0].width, views[0].height
@@ -183,11 +198,16 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=40)
     parser.add_argument("--only", nargs="+", choices=VARIANTS, default=VARIANTS)
     parser.add_argument("--novel", action="store_true", help="train with them")
+    parser.add_argument("--real", type=Path, help="a folder of images/ and masks/")
     parser.add_argument("--work", type=Path, default=Path("runs/poses"))
     parser.add_argument("--out", type=Path, default=HERE / "results/preparation/poses.json")
     args = parser.parse_args()
     rows, novel = [], []
-    for variant in ("plain",) if args.novel else args.only:
+    if args.real:
+        rows.append(placed(args.real / "images", args.real / "masks", args.work / args.real.name))
+        print(rows[-1], flush=True)
+    variants = () if args.real else ("plain",) if args.novel else args.only
+    for variant in variants:
         folder = args.work / f"{variant}-{args.width}"
         folder.mkdir(parents=True, exist_ok=True)
         photograph(variant, folder, args.views, args.width)
@@ -218,6 +238,8 @@ def main() -> None:
         "columns": FOUND,
         "rows": rows,
     }
+    if args.real:
+        record["title"] = "Cameras of real photographs, with masks"
     if args.novel:
         title = "A `draft` with found and with true cameras"
         record = {"title": title, **made(), "columns": NOVEL, "rows": novel}
