@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy import ndimage
+from skimage.measure import label
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -84,8 +85,8 @@ def _sight(
 def _gaps(sight: _Sight, cfg: VoteConfig) -> list[np.ndarray]:
     """Parts of the silhouette [H W + 1], largest first, that the mask sees through."""
     silhouette = sight.nodes[:-1].reshape(sight.shown.shape) > 0
-    through = silhouette & ~np.asarray(ndimage.binary_dilation(sight.shown))
-    parts, _ = ndimage.label(through)
+    through = silhouette & ~np.asarray(ndimage.binary_dilation(sight.shown), bool)
+    parts = np.asarray(label(through, connectivity=1))
     area = np.bincount(parts.ravel())
     area[0] = 0
     order = np.argsort(-area)
