@@ -134,11 +134,14 @@ def errors(scene: Path, true: list[textured_room.View]) -> tuple[np.ndarray, np.
 def trained(variant: str, photos: Path, scene: Path, views: int, width: int) -> list[list[object]]:
     """Rows of novel views by a draft: with found and with true cameras."""
     cameras = [view(variant, v, views, width) for v in range(views)]
-    masks = [textured_room.photograph(seen)[1] for seen in cameras]
-    (scene / "masks").mkdir(exist_ok=True)
     images = sorted((scene / "images").iterdir())
-    for image, mask in zip(images, masks, strict=True):
-        mask.save(scene / "masks" / f"{image.name}.png")
+    masks = []
+    (scene / "masks").mkdir(exist_ok=True)
+    for image, seen in zip(images, cameras, strict=True):
+        path = scene / "masks" / f"{image.name}.png"
+        if not path.exists():
+            textured_room.photograph(seen)[1].save(path)
+        masks.append(Image.open(path))
     true = photos.with_name(f"{photos.name}-true")
     for split, kept in (
         ("train", lambda v: v % TEST_EVERY),
@@ -147,9 +150,12 @@ def trained(variant: str, photos: Path, scene: Path, views: int, width: int) -> 
         chosen = [v for v in range(views) if kept(v)]
         (true / split).mkdir(parents=True, exist_ok=True)
         for v in chosen:
+            path = true / split / f"{images[v].stem}.png"
+            if path.exists():
+                continue
             picture = Image.open(images[v]).convert("RGB")
             picture.putalpha(masks[v])
-            picture.save(true / split / f"{images[v].stem}.png")
+            picture.save(path)
         write_cameras(
             true, split, known([cameras[v] for v in chosen]), [images[v].stem for v in chosen]
         )
