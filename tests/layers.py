@@ -87,7 +87,7 @@ HELPERS = {
     "confidence": {"survey"},
     "pictures": {"animation", "inline"},
     "evaluation": {"measures", "truth"},
-    "segmentation": {"config", "distances", "vote"},
+    "segmentation": {"config", "distances", "gaps", "vote"},
     "page": {"maps", "transfer"},
     "cluster": {"piece", "shown", "work"},
     "batch": {"results", "scenes"},

@@ -74,16 +74,25 @@ class VoteConfig:
     # many masks are wrong: it is searched
     lowest: float = 0.3
     highest: float = 0.99
-    below: float = 0.08  # IoU below the median's, from where on a mask is wrong, in (0, 1)
+    # IoU below the median's, from where on a mask is wrong, in (0, 1). As much of it has to be more
+    # than a pixel off
+    below: float = 0.08
     # IoU with its silhouette below which a mask is wrong whatever the others have, in (0, 1). If
     # more than half are, it is the hull that is wrong
     least: float = 0.75
+    # Gaps that few masks see through, and a vote fills
+    gap_pixel: float = 1.5  # voxels, of the pixels in which they are looked for, >= 1
+    smallest_gap: float = 0.002  # of the silhouette's area, in [0, 1]
+    gap_rounds: int = 3  # through all photographs, at most, >= 0; one gap may open the next
     band: float = 1.5  # voxels beside the silhouette within which a mended mask is kept, > 0
 
     def __post_init__(self) -> None:
         check_fields(self, "at least 2", lambda x: x >= 2, "photographs")
         check_fields(self, "at least 16", lambda x: x >= 16, "pixels")
         check_fields(self, "at least 8", lambda x: x >= 8, "voxels", "first_voxels")
+        check_fields(self, "at least 1", lambda x: x >= 1, "gap_pixel")
+        check_fields(self, "at least 0", lambda x: x >= 0, "gap_rounds")
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "smallest_gap")
         check_fields(self, "above 0", lambda x: x > 0, "room", "band")
         check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "seen_by")
         open_ones = ("around", "lowest", "highest", "below", "least")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, interpolate
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
 from univoxel.bars import track
 from univoxel.camera import Cameras, pixel_rays, project
@@ -21,6 +21,7 @@ from univoxel.grid import GridShape, fit_grid
 from univoxel.preparation.hull import mask_distances
 from univoxel.segmentation.config import VoteConfig
 from univoxel.segmentation.distances import surroundings
+from univoxel.segmentation.gaps import carve_gaps_
 
 VOTE = VoteConfig()
 BESIDE, MISSING = "keeps something beside the object", "misses a part"
@@ -63,22 +64,39 @@ def elect(
     middle, half = (lower + upper) / 2, cfg.room * (upper - lower) / 2
     first = fit_grid(middle - half, middle + half, cfg.first_voxels**3)
     vote = votes(small, cameras, first, cfg)
-    inside = first.nodes()[vote >= cfg.around * vote.max()]
     if not float(vote.max()):
         raise UserError("the masks of the photographs have nothing in common: check masks, cameras")
-    low, high = inside.amin(0) - first.voxel_size, inside.amax(0) + first.voxel_size
-    grid = fit_grid(low, high, cfg.voxels**3)
+    second = _around(first, vote >= cfg.around * vote.max(), (cfg.voxels // 2) ** 3)
+    smaller = [shrunk(mask, cfg.pixels // 2) for mask in small]
+    vote = votes(smaller, cameras, second, cfg)
+    threshold, _, _ = _compared(second, vote, smaller, cameras, cfg)
+    grid = _around(second, vote >= threshold, cfg.voxels**3)
     vote = votes(small, cameras, grid, cfg)
+    threshold, usual, largest = _compared(grid, vote, small, cameras, cfg)
+    if carve_gaps_(vote, threshold, small, cameras, grid, cfg):
+        threshold, usual, largest = _compared(grid, vote, small, cameras, cfg)
+    return Hull(grid, vote, threshold, usual), largest
 
+
+def _around(grid: GridShape, inside: Tensor, voxels: int) -> GridShape:
+    """A grid over the nodes [X, Y, Z] that are inside, and a voxel around them."""
+    nodes = grid.nodes()[inside]
+    return fit_grid(nodes.amin(0) - grid.voxel_size, nodes.amax(0) + grid.voxel_size, voxels)
+
+
+def _compared(
+    grid: GridShape, vote: Tensor, masks: Sequence[Tensor], cameras: Cameras, cfg: VoteConfig
+) -> tuple[float, float, list[Tensor]]:
+    """The threshold whose silhouettes agree best with masks, their median IoU, `largest_votes`."""
     levels = torch.linspace(cfg.lowest, cfg.highest, THRESHOLDS)
     largest = [
         largest_votes(grid, vote, cameras, view, mask.shape)
-        for view, mask in enumerate(track(small, "comparing masks"))
+        for view, mask in enumerate(track(masks, "comparing masks"))
     ]
-    agreed = [overlaps(one, mask, levels) for one, mask in zip(largest, small, strict=True)]
+    agreed = [overlaps(one, mask, levels) for one, mask in zip(largest, masks, strict=True)]
     medians = torch.stack(agreed).quantile(0.5, 0)
     best = int(medians.argmax())
-    return Hull(grid, vote, float(levels[best]), float(medians[best])), largest
+    return float(levels[best]), float(medians[best]), largest
 
 
 def judge(
@@ -98,10 +116,12 @@ def judge(
     if largest is None:
         largest = largest_votes(hull.grid, hull.vote, cameras, view, small.shape)
     agreement = float(overlaps(largest, small, torch.tensor([hull.threshold])))
-    if agreement >= max(hull.usual - cfg.below, cfg.least):
-        return Verdict(agreement, "", mask)
     silhouette, shown = largest >= hull.threshold, small >= 0.5
-    beside, missing = (shown & ~silhouette).sum(), (silhouette & ~shown).sum()
+    # Edges that are a pixel off are no fault, though they are much of an object that is seen flat
+    beside, missing = (shown & ~_grown(silhouette)).sum(), (silhouette & ~_grown(shown)).sum()
+    differs = (beside + missing) / (silhouette | shown).sum().clamp_min(1)
+    if agreement >= max(hull.usual - cfg.below, cfg.least) or differs <= cfg.below:
+        return Verdict(agreement, "", mask)
     fault = BESIDE if beside > missing else MISSING
     return Verdict(agreement, fault, _mended(mask, silhouette, hull, cameras, view, cfg))
 
@@ -204,6 +224,11 @@ def _mended(
     grown, middle, core = (0.5 - fine[0] + s for s in (cfg.band, 0.0, -cfg.band))
     within = torch.maximum(torch.minimum(mask, grown.clamp(0, 1)), core.clamp(0, 1))
     return torch.lerp(middle.clamp(0, 1), within, fine[1])
+
+
+def _grown(mask: Tensor) -> Tensor:
+    """A mask [H, W] and the pixels that touch it."""
+    return max_pool2d(mask.float()[None], 3, 1, 1)[0] > 0
 
 
 def _mean_near(values: Tensor, where: Tensor, kernel: int) -> Tensor:
