@@ -325,6 +325,7 @@ def train(
         no_page: write no RUN/index.html at the end
     """
     from univoxel.overrides import changed
+    from univoxel.ranks import leads
     from univoxel.tasks import train as task
     from univoxel.tasks.view import with_page
 
@@ -336,7 +337,8 @@ def train(
     asked = replace(asked, downscale=check_downscale(downscale), allow_outside=allow_outside)
     asked = asked if seed is None else replace(asked, seed=seed)
     run = task.train(changed(asked, set), resume=resume, **watched)
-    print(run if no_page else with_page(run))
+    if leads():
+        print(run if no_page else with_page(run))
 
 
 def batch(

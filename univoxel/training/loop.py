@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from univoxel import losses
+from univoxel import losses, ranks
 from univoxel.camera import pixel_rays
 from univoxel.checkpoint import save_scene
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
@@ -25,10 +25,11 @@ from univoxel.scene import Scene
 from univoxel.threads import Team, team
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
+from univoxel.training.exchange import summed_over_ranks_
 from univoxel.training.pixels import TrainingPixels
 from univoxel.training.plateau import Plateau
 from univoxel.training.progress import Listener, Rehearsal
-from univoxel.training.step import PARTS, Descent, Part, descent, parts_of, summed_terms, total
+from univoxel.training.step import Descent, Part, descent, parts_for, parts_of, summed_terms, total
 from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
@@ -74,7 +75,9 @@ def run_stage(
     guard = Guard(progress, restored=lambda: restore_surface_(scene))
     guard.follow(optimizer)
     parameters = parameters_of(optimizer)
-    with scene.surface_held(), team(PARTS) as work:
+    ranks.as_first_([*scene.state_dict().values()])
+    count = parts_for(ranks.count())
+    with scene.surface_held(), team(count // ranks.count()) as work:
         for done in progress.clock.steps():
             physical = done >= stage.physical_from
             rates = learning_rates(stage, done, field.voxel_size)
@@ -91,8 +94,9 @@ def run_stage(
             if progress.clock.step % RETRACE == 0 and not stage.refit:
                 scene.release_surface()
 
-            parts = parts_of(pixels.trained, stage.rays)
+            parts = ranks.mine(parts_of(pixels.trained, stage.rays, count))
             terms = descend_(scene, cfg.loss, pixels, parts, physical, parameters, work)
+            terms = summed_over_ranks_(parameters, terms)
             if not guard.sound(torch.stack(list(terms.values())).sum()):
                 continue
             if stage.refit:
