@@ -157,6 +157,17 @@ def shared(call: Callable[[Item], Result], pieces: Sequence[Item]) -> list[Resul
     return gathered([call(piece) for piece in mine(pieces)])
 
 
+def spread_(results: Sequence[Tensor] | Tensor) -> None:
+    """Of tensors that are pieces of work, of which each rank has filled its `mine`: fill the others
+    with what their ranks have made."""
+    if _group.store is None:
+        return
+    with _lost():
+        for number, result in enumerate(results):
+            distributed.broadcast(result, number % count())
+            _group.sent += result.nbytes
+
+
 def messages(message: Tensor) -> list[Tensor]:
     """What each rank tells all others, in the order of ranks; each int32 [N], N its own."""
     if _group.store is None:

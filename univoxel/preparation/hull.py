@@ -7,6 +7,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from univoxel import ranks
 from univoxel.camera import Cameras, looked_at, project
 from univoxel.errors import UserError
 from univoxel.grid import GridShape, fit_coarse, fit_grid, resample
@@ -33,8 +34,10 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
         a = (alpha[view] if cameras is None else cameras.cut(view, alpha[view])).numpy()
         result[view, : a.shape[0], : a.shape[1]] = _mask_distance(a)
 
-    side_by_side(fill_, range(len(alpha)))
-    return torch.from_numpy(result)
+    side_by_side(fill_, ranks.mine(range(len(alpha))))
+    distances = torch.from_numpy(result)
+    ranks.spread_(distances)
+    return distances
 
 
 def _mask_distance(alpha: np.ndarray) -> np.ndarray | float:
