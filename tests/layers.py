@@ -14,6 +14,7 @@ LAYERS = [
         "names",
         "ranks",
         "records",
+        "shelf",
         "threads",
         "validation",
     },

@@ -24,14 +24,16 @@ from univoxel.training.exchange import summed_over_ranks_
 DATA = Path(univoxel.__file__).parent / "example_data" / "tiny"
 WORKER = Path(__file__).parent / "rank_worker.py"
 # All stages, in few steps, and with more time than they want
-TRAIN = (
-    *("train", str(DATA), "--preset", "draft", "--minutes", "60", "--downscale", "2"),
-    *("--capacity", "fixed", "--no-page", "--set"),
+FEW = (
     *("stages.0.voxels=0.05", "stages.0.iterations=60", "stages.0.rays=256"),
     *("stages.1.voxels=0.1", "stages.1.iterations=60", "stages.1.rays=256"),
     *("stages.2.iterations=20", "stages.2.rays=256", "stages.2.points=1500"),
     *("stages.2.newton_points=600", "stages.2.rounds=2"),
     *("stages.3.voxels=0.1", "stages.3.iterations=20", "stages.3.rays=256"),
+)
+TRAIN = (
+    *("train", str(DATA), "--preset", "draft", "--minutes", "60", "--downscale", "2"),
+    *("--capacity", "fixed", "--no-page", *(x for change in FEW for x in ("--set", change))),
 )
 
 

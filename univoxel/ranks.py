@@ -111,6 +111,16 @@ def joined() -> Iterator[None]:
             distributed.destroy_process_group()
 
 
+@contextmanager
+def in_turn() -> Iterator[None]:
+    """A block that the first rank has to have left before the others enter: it makes files."""
+    if rank() > 0:
+        tick()
+    yield
+    if rank() == 0:
+        tick()
+
+
 def now() -> float:
     """Seconds on time.monotonic's clock; of several ranks on the first one's, as it was at the last
     exchange: what depends on time is decided alike."""

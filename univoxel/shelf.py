@@ -41,8 +41,9 @@ def shelved(folder: Path) -> Iterator[None]:
 
 def is_large(shape: Sequence[int], dtype: torch.dtype) -> bool:
     """Whether an array is one for the disk, and there is a place for it."""
-    # Windows keeps no file without a name
-    return _folder is not None and os.name == "posix" and math.prod(shape) * dtype.itemsize >= LARGE
+    if _folder is None or not hasattr(os, "posix_fallocate"):  # of Linux, beside others
+        return False
+    return math.prod(shape) * dtype.itemsize >= LARGE
 
 
 def zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
@@ -56,9 +57,25 @@ def zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     assert _folder is not None
     _folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=_folder, prefix=".univoxel-") as file:
-        size = math.prod(shape) * dtype.itemsize
-        os.posix_fallocate(file.fileno(), 0, size)  # now: a full disk would end the process later
+        reserve(file.fileno(), math.prod(shape) * dtype.itemsize, _folder)
         return mapped(file.fileno(), 0, shape, dtype)
+
+
+def reserve(descriptor: int, size: int, place: Path) -> None:
+    """Make an open file as long, on the disk too: where that is full later, the process would end.
+
+    Args:
+        place: that an error names.
+
+    Raises:
+        OSError: there is no room.
+    """
+    try:
+        os.posix_fallocate(descriptor, 0, size)
+    except OSError as error:
+        raise OSError(
+            error.errno, f"no room for {size / 1e9:.1f} GB: {error.strerror}", str(place)
+        ) from error
 
 
 def mapped(descriptor: int, offset: int, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
@@ -86,20 +103,30 @@ def release(array: Tensor | None = None) -> None:
         for each in list(_maps):
             each.madvise(DROP)
         return
-    begin = array.data_ptr()
+    if (found := _map_of(array)) is None:
+        return
+    whole, begin = found
     end = begin + array.numel() * array.element_size()
-    for each in list(_maps):
-        first = np.frombuffer(each, np.uint8).ctypes.data
-        if first <= begin < first + len(each):
-            low = (begin - first) // mmap.PAGESIZE * mmap.PAGESIZE
-            each.madvise(DROP, low, min(end - first, len(each)) - low)
-            return
+    low = begin // mmap.PAGESIZE * mmap.PAGESIZE
+    whole.madvise(DROP, low, end - low)
+
+
+def on_disk(array: Tensor) -> bool:
+    """Whether an array lies on disk."""
+    return _map_of(array) is not None
 
 
 def flush(array: Tensor) -> None:
-    """Write what an array on disk holds to the disk, so that no crash of the machine loses it."""
+    """Write what an array holds to its file on disk: a crash of the machine does not lose it."""
+    if (found := _map_of(array)) is not None:
+        found[0].flush()
+
+
+def _map_of(array: Tensor) -> tuple[mmap.mmap, int] | None:
+    """The file that an array lies in, and where it begins there; None: it lies in memory."""
     begin = array.data_ptr()
     for each in list(_maps):
         first = np.frombuffer(each, np.uint8).ctypes.data
         if first <= begin < first + len(each):
-            each.flush()
+            return each, begin - first
+    return None

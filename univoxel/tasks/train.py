@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from univoxel import ranks
+from univoxel import ranks, shelf
 from univoxel.build import build_scene
 from univoxel.checkpoint import FILE, load_checkpoint, save_scene
 from univoxel.compression import plan
@@ -77,11 +77,11 @@ def train(
         raise UserError(f"{what} is of trainings in one process, not under torchrun", what)
     film = None if timelapse is None else Timelapse(timelapse, cfg)
     if view is None:
-        with ranks.joined():
+        with ranks.joined(), shelf.shelved(cfg.out):
             return _train(cfg, resume, film, None, on_progress)
     from univoxel.viewer.training import watched
 
-    with watched(*view, cfg.out.resolve().name) as spectators:
+    with watched(*view, cfg.out.resolve().name) as spectators, shelf.shelved(cfg.out):
         log.info(f"to look at while it trains, in a browser: {spectators.address}")
         return _train(cfg, resume, film, spectators, on_progress)
 
@@ -96,7 +96,11 @@ def _train(
     """`train`, with those who look at it between steps."""
     torch.manual_seed(cfg.seed)
     kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
-    photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
+    with ranks.in_turn():
+        photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
+        if ranks.count() > 1 and ranks.leads():  # the others need not shrink them again
+            cfg.out.mkdir(parents=True, exist_ok=True)
+            keep_photos(photos, kept)
     cfg = replace(cfg, downscale=photos.downscale)
     if not resume and (cfg.out / FILE).exists():
         raise ExistingFile(

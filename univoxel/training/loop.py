@@ -26,7 +26,7 @@ from univoxel.threads import Team, team
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
 from univoxel.training.exchange import summed_over_ranks_
-from univoxel.training.pixels import TrainingPixels
+from univoxel.training.pixels import TrainingPixels, unpacked
 from univoxel.training.plateau import Plateau
 from univoxel.training.progress import Listener, Rehearsal
 from univoxel.training.step import Descent, Part, descent, parts_for, parts_of, summed_terms, total
@@ -292,8 +292,12 @@ def weighted(prior: Regularisation, weight: LossConfig) -> dict[str, Tensor]:
 
 
 def batch_at(photos: Photos, pixels: Tensor) -> Batch:
-    view, row, column = pixels.long().unbind(1)
-    color, alpha = photos.pixels(view, row, column)
+    """The rays of pixels as `TrainingPixels` has them."""
+    view, row, column = pixels[:, :3].long().unbind(1)
+    if pixels.shape[1] == 3:
+        color, alpha = photos.pixels(view, row, column)
+    else:
+        color, alpha = unpacked(photos, pixels[:, 3:])
     centre = torch.stack([column, row], 1) + 0.5
     return Batch(view, pixel_rays(photos.cameras, view, centre), color, alpha)
 
