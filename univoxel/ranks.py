@@ -112,6 +112,17 @@ def joined() -> Iterator[None]:
 
 
 @contextmanager
+def alone() -> Iterator[None]:
+    """A block that this rank works through by itself, as if there were one process: the others do
+    something else meanwhile."""
+    store, _group.store = _group.store, None
+    try:
+        yield
+    finally:
+        _group.store = store
+
+
+@contextmanager
 def in_turn() -> Iterator[None]:
     """A block that the first rank has to have left before the others enter: it makes files."""
     if rank() > 0:

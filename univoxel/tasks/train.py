@@ -136,7 +136,8 @@ def _train(
         if film:
             film.finish(scene, progress.clock)
     if ranks.leads():
-        save_trust(scene, pixels.photos, cfg, progress.troubles)
+        with ranks.alone():
+            save_trust(scene, pixels.photos, cfg, progress.troubles)
     return cfg.out
 
 
@@ -219,9 +220,10 @@ def make_stage_(
             progress.clock.count_as_done(cfg.compression.rehearsal_share)
     if not ranks.leads():
         return
-    reach = chosen_reach(progress.chosen)
-    save_scene(scene, cfg.out, progress.state(), slim=last, reach=reach)
-    preview(scene, scene.registered(photos), cfg.out / "preview.png")
+    reach, state = chosen_reach(progress.chosen), progress.state()
+    with ranks.alone():
+        save_scene(scene, cfg.out, state, slim=last, reach=reach)
+        preview(scene, scene.registered(photos), cfg.out / "preview.png")
 
 
 def bring_to_grid_(
