@@ -82,17 +82,15 @@ def case(scene: Path, run: Path, rays: int, resolution: int) -> dict[str, float]
     from univoxel import ranks
     from univoxel.machine import peak_memory_mb
     from univoxel.optim import rows_of
-    from univoxel.presets import preset
+    from univoxel.presets import preset, with_field
     from univoxel.tasks import train as task
     from univoxel.training import exchange, loop
 
-    cfg = preset("draft", scene, run)
+    cfg = with_field(preset("draft", scene, run), "sparse")
     coarse, fine = cfg.stages[0], cfg.stages[1]
     coarse = replace(coarse, voxels=0.1, iterations=8, rays=512)
     # A box about the ball, that many nodes wide; bricks about its surface
-    fine = replace(
-        fine, voxels=resolution**3 / 1e6, iterations=STEPS, rays=rays, field="sparse", spread=4
-    )
+    fine = replace(fine, voxels=resolution**3 / 1e6, iterations=STEPS, rays=rays)
     cfg = replace(
         cfg, stages=(coarse, fine), minutes=600, capacity="fixed", voxel_pixels=0.0, hollows=0.0
     )
@@ -225,7 +223,7 @@ def main() -> None:
         if found["rank"] == 0:
             Path(told).write_text(json.dumps(found))
         return
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=HERE / "results" / "growth.json")
     parser.add_argument("--work", type=Path, default=Path("growth"))
     parser.add_argument("--only", choices=tuple(AXES))

@@ -30,6 +30,7 @@ def main() -> None:
             net.grad = torch.full((3,), me + 1.0)
         terms = {"a": torch.tensor(me + 1.0)} | ({"b": torch.ones(())} if me == 1 else {})
         summed = summed_over_ranks_([table, net, unused], terms)
+        assert net.grad is not None
         got = {
             "gathered": gathered,
             "spread": rows.tolist(),

@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, distributed
+from torch.distributed.rendezvous import rendezvous
 
 from univoxel.errors import ProcessFailed
 
@@ -86,7 +87,7 @@ def joined() -> Iterator[None]:
         if name not in os.environ:
             raise ProcessFailed(f"expected {name} in the environment, as torchrun sets it")
     with _lost():
-        store, number, size = next(distributed.rendezvous("env://", timeout=PATIENCE))
+        store, number, size = next(rendezvous("env://", timeout=PATIENCE))
         distributed.init_process_group(
             "gloo", store=store, rank=number, world_size=size, timeout=PATIENCE
         )
@@ -157,7 +158,12 @@ def sent_bytes() -> int:
 
 def mine(pieces: Sequence[Item]) -> Sequence[Item]:
     """This rank's share of pieces of work: every `count`-th."""
-    return pieces[rank() :: count()]
+    return pieces[share()]
+
+
+def share() -> slice:
+    """Which of pieces of work are this rank's."""
+    return slice(rank(), None, count())
 
 
 def gathered(results: Sequence[Result]) -> list[Result]:

@@ -298,11 +298,9 @@ def objective(
     nearby = position + distance * torch.randn_like(position)
     share = 1.0
     if ranks.count() > 1:  # all draw the same
-        drawn = len(point)
-        point, position, nearby = (ranks.mine(x) for x in (point, position, nearby))
-        index, observation = (
-            ranks.mine(x.view(drawn, cfg.views)).flatten() for x in (index, observation)
-        )
+        drawn, own = len(point), ranks.share()
+        point, position, nearby = (x[own] for x in (point, position, nearby))
+        index, observation = (x.view(drawn, cfg.views)[own].flatten() for x in (index, observation))
         share = len(point) / drawn
     # One sampling, one gradient: adding up sparse ones costs more than either
     sample = scene.field.sample(torch.cat([position, nearby]))
