@@ -17,8 +17,11 @@ from univoxel import ranks
 from univoxel.checkpoint import load_checkpoint
 from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos
+from univoxel.errors import ProcessFailed, UserError
 from univoxel.metrics import psnr
+from univoxel.presets import preset
 from univoxel.render.pipeline import shade_hits, surface_of_view
+from univoxel.tasks.train import train
 from univoxel.training.exchange import summed_over_ranks_
 
 DATA = Path(univoxel.__file__).parent / "example_data" / "tiny"
@@ -142,10 +145,18 @@ def test_a_mistake_is_said_once(tmp_path):
     assert "expected photographs with their cameras" in lines[0]
 
 
-def test_a_look_at_the_training_is_of_one_process(tmp_path):
-    command = [sys.executable, "-m", "univoxel.cli", *TRAIN, "--out", str(tmp_path / "out")]
-    told = ended(begin_ranks([*command, "--view"], 1))
-    assert told[0][0] in (0, 2)
+def test_a_look_at_the_training_is_of_one_process(tmp_path, monkeypatch):
+    monkeypatch.delenv("MASTER_ADDR", raising=False)
+    for name, value in {"TORCHELASTIC_RUN_ID": "x", "WORLD_SIZE": "2", "RANK": "1"}.items():
+        monkeypatch.setenv(name, value)
+    assert not ranks.leads()
+    cfg = preset("draft", DATA, tmp_path / "out")
+    with pytest.raises(UserError, match="view is of trainings in one process"):
+        train(cfg, view=("127.0.0.1", 0))
+    with pytest.raises(UserError, match="timelapse is of trainings in one process"):
+        train(cfg, timelapse=tmp_path / "film.gif")
+    with pytest.raises(ProcessFailed, match="MASTER_ADDR"):
+        train(cfg)
 
 
 def test_all_ranks_get_what_each_has_made():

@@ -116,6 +116,25 @@ def test_reading_that_was_ended_goes_on(scene, tmp_path, monkeypatch):
     assert torch.equal(photos.alpha, usual.alpha)
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda raw: raw[:-5000],
+        lambda raw: raw[:5000] + bytes([raw[5000] ^ 1]) + raw[5001:],
+        lambda raw: b"\xff" * 8 + raw[8:],
+        lambda raw: raw[:8] + raw[8:].replace(b"[20, 32, 32, 3]", b'{"a": 1.0, "b"}', 1),
+    ],
+)
+def test_a_broken_file_is_read_again(scene, tmp_path, monkeypatch, damage):
+    usual = load_photos(scene, "train")
+    on_shelf(scene, tmp_path / "run", monkeypatch)
+    path = tmp_path / "run/kept.safetensors"
+    path.write_bytes(damage(path.read_bytes()))
+    again = on_shelf(scene, tmp_path / "run", monkeypatch)
+    assert torch.equal(again.color, usual.color)
+    assert torch.equal(again.alpha, usual.alpha)
+
+
 def test_what_cannot_be_used_leaves_no_photographs(tmp_path, monkeypatch):
 
     scene = write_scene(tmp_path / "scene", views=4, size=32)

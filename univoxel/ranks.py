@@ -99,7 +99,7 @@ def joined() -> Iterator[None]:
         tick()
         yield
         tick()  # none ends before all are done: torchrun would take that for a failure
-    except Exception:
+    except (Exception, KeyboardInterrupt):
         if _said_already():
             raise SystemExit(2) from None
         raise

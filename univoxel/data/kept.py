@@ -30,6 +30,8 @@ from univoxel import shelf
 from univoxel.data.base import Photos, coverage_of
 from univoxel.files import replacing
 
+# What is raised of files that are none of ours, or broken
+UNFIT = (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError)
 HEADER = 4096  # bytes of the header of a file that is written while photographs are read
 FLUSHED = 16  # photographs after which what was read is safe on disk
 VERSION = 1  # of what is done to pixels: another one makes all files that are there unfit
@@ -68,7 +70,7 @@ def kept_pixels(origin: str) -> tuple[Tensor, Tensor] | None:
         color, alpha, facts = _opened(path)
         if facts.get("checksum") == _checksum(color, alpha):
             return color, alpha
-    except (OSError, SafetensorError, ValueError, KeyError):
+    except UNFIT:
         pass
     with suppress(OSError):  # of no use, and in the way of one that is
         path.unlink()
@@ -105,7 +107,7 @@ class Reading:
             if not shelf.on_disk(color):
                 return None
             return Reading(color, alpha, partial, origin, **state)
-        except (OSError, SafetensorError, ValueError, KeyError, TypeError):
+        except UNFIT:
             return None
 
     @staticmethod
