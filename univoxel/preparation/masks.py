@@ -77,6 +77,8 @@ def _change(
         depth = (0.5 - d).floor().long()
         y, x = (~hidden & (depth >= 0) & (depth <= deepest)).nonzero(as_tuple=True)
         inward, _ = _slopes(encoded, d, y, x)
+        for array in view:
+            shelf.release(array)
         at = depth[y, x]
         return torch.bincount(at, inward, deepest + 1), torch.bincount(at, minlength=deepest + 1)
 

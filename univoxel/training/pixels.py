@@ -65,7 +65,18 @@ def split_pixels(photos: Photos, distance: Tensor, doubted: Tensor | None = None
     held = min(HELD_OUT, len(pixels) // 10)
     if not held:  # so few that none can be spared
         return TrainingPixels(photos, pixels, pixels)
+    if with_colors:
+        return TrainingPixels(photos, *_taken_out_(pixels, order[:held]))
     return TrainingPixels(photos, pixels[order[held:]], pixels[order[:held]])
+
+
+def _taken_out_(pixels: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows without the chosen ones [K], and these; in the memory of all, in another order."""
+    taken, last = pixels[chosen], len(pixels) - len(chosen)
+    stays = torch.ones(len(pixels), dtype=torch.bool)
+    stays[chosen] = False
+    pixels[chosen[chosen < last]] = pixels[last + stays[last:].nonzero()[:, 0]]
+    return pixels[:last], taken
 
 
 def _near(distance: Tensor, doubted: Tensor | None, view: int) -> Tensor:
