@@ -97,11 +97,13 @@ def case(scene: Path, run: Path, rays: int, resolution: int) -> dict[str, float]
     cfg = replace(cfg, light_frame="world", exposures=False)
     steps: list[tuple[float, float]] = []
     touched: list[int] = []
+    sent: list[int] = []
     summed = loop.summed_over_ranks_
 
     def noted(parameters, terms):
         result = summed(parameters, terms)
         steps.append((time.process_time(), time.monotonic()))
+        sent.append(exchange.TRAFFIC.sent)
         grads = [p.grad for p in parameters if p.grad is not None]
         sparse = [g for g in grads if g.is_sparse]
         touched.append(
@@ -120,7 +122,6 @@ def case(scene: Path, run: Path, rays: int, resolution: int) -> dict[str, float]
 
     task.run_stage = first_stage
     task.save_trust = lambda *_: None
-    traffic = exchange.TRAFFIC
     task.train(cfg)
     last = steps[-(STEPS - WARM) :]
     each = [(b[0] - a[0], b[1] - a[1]) for a, b in itertools.pairwise(last)]
@@ -129,7 +130,7 @@ def case(scene: Path, run: Path, rays: int, resolution: int) -> dict[str, float]
         "step": median(c for c, _ in each),
         "wall": median(w for _, w in each),
         "touched": median(touched[-(STEPS - WARM) :]),
-        "sent": traffic.sent / max(traffic.steps, 1),
+        "sent": median(b - a for a, b in itertools.pairwise(sent[-(STEPS - WARM) :])),
         "peak_mb": peak_memory_mb() or 0.0,
         "rank": int(os.environ.get("RANK", "0")),
         "ranks": ranks.count(),
