@@ -243,6 +243,15 @@ def parse_ground(text: str | None) -> Ground:
         raise UserError(f"--ground: expected lowest or a height, got {text!r}") from None
 
 
+def tell_run(run: Path, no_page: bool) -> None:
+    """Print where a trained run lies, with its page if it gets one; the first rank does so."""
+    from univoxel.ranks import leads
+    from univoxel.tasks.view import with_page
+
+    if leads():
+        print(run if no_page else with_page(run))
+
+
 def view_at(view: bool, host: str | None, port: int | None) -> tuple[str, int] | None:
     """Host and port that a training is looked at, if at all.
 
@@ -326,7 +335,6 @@ def train(
     """
     from univoxel.overrides import changed
     from univoxel.tasks import train as task
-    from univoxel.tasks.view import with_page
 
     watched = {"timelapse": timelapse, "view": view_at(view, host, port)}
     if not resume and (out / "scene.safetensors").exists():
@@ -335,8 +343,7 @@ def train(
     asked = configuration_of(config, Choices(*of_preset), minutes, data, out)
     asked = replace(asked, downscale=check_downscale(downscale), allow_outside=allow_outside)
     asked = asked if seed is None else replace(asked, seed=seed)
-    run = task.train(changed(asked, set), resume=resume, **watched)
-    print(run if no_page else with_page(run))
+    tell_run(task.train(changed(asked, set), resume=resume, **watched), no_page)
 
 
 def batch(

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from univoxel import ranks
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
-from univoxel.training import clock as clock_module
 from univoxel.training.clock import HURRY, RESERVE_SECONDS, REST
 from univoxel.training.config import StageConfig
 from univoxel.training.progress import Progress
@@ -26,7 +26,7 @@ def clock(monkeypatch):
             return self.now
 
     clock = Clock()
-    monkeypatch.setattr(clock_module, "time", clock)
+    monkeypatch.setattr(ranks, "time", clock)
     return clock
 
 

@@ -1,6 +1,7 @@
 """Photographs as training takes them, kept in a file: reading them again takes no time.
 
-Only what was shrunk or straightened is kept; other photographs are read as fast from their files.
+Only what was shrunk or straightened is kept, and what is too large for memory; other photographs
+are read as fast from their files.
 The file is one of safetensors with `color` and `alpha` as in `Photos`, and in its header what they
 were made from and a checksum. A file that does not fit, or is broken, is passed over.
 """
@@ -8,21 +9,31 @@ were made from and a checksum. A file that does not fit, or is broken, is passed
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
+import math
+import os
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from univoxel.data.base import Photos
+from univoxel import shelf
+from univoxel.data.base import Photos, coverage_of
 from univoxel.files import replacing
 
+# What is raised of files that are none of ours, or broken
+UNFIT = (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError)
+HEADER = 4096  # bytes of the header of a file that is written while photographs are read
+FLUSHED = 16  # photographs after which what was read is safe on disk
 VERSION = 1  # of what is done to pixels: another one makes all files that are there unfit
 
 log: logging.Logger = logging.getLogger("univoxel")
@@ -50,20 +61,159 @@ def origin_of(files: Sequence[Path], *treatment: object) -> str:
 
 
 def kept_pixels(origin: str) -> tuple[Tensor, Tensor] | None:
-    """Colour and alpha of that origin, if they were kept where `looking_in` says."""
+    """Colour and alpha of that origin, if they were kept where `looking_in` says; large ones on a
+    shelf, the file itself."""
     path = _place.get()
     if path is None or _origin_in(path) != origin:
         return None
     try:
-        with safe_open(path, "pt") as file:
-            color, alpha = file.get_tensor("color"), file.get_tensor("alpha")
-            if file.metadata().get("checksum") == _checksum(color, alpha):
-                return color, alpha
-    except (OSError, SafetensorError):
+        color, alpha, facts = _opened(path)
+        if facts.get("checksum") == _checksum(color, alpha):
+            return color, alpha
+    except UNFIT:
         pass
     with suppress(OSError):  # of no use, and in the way of one that is
         path.unlink()
     return None
+
+
+def to_be_kept(views: int, height: int, width: int) -> bool:
+    """Whether photographs of 8 bits are so large that they are read onto a shelf."""
+    return _place.get() is not None and shelf.is_large((views, height, width, 3), torch.uint8)
+
+
+@dataclass
+class Reading:
+    """Photographs while they are read, one after the other: in memory, or where they are large in
+    the file where they are kept. There, reading that was ended goes on where it was."""
+
+    color: Tensor  # [V, H, W, 3]
+    alpha: Tensor  # [V, H, W]
+    partial: Path | None = None  # the file, under the name that it has meanwhile
+    origin: str = ""
+    read: int = 0  # photographs that are whole
+    empty: bool = True  # whether all of them are
+    opaque: bool = True  # the same
+
+    @staticmethod
+    def resumed(origin: str) -> Reading | None:
+        """What an earlier process has read of photographs of that origin."""
+        path = _place.get()
+        if not origin or path is None or _origin_in(partial := _partial(path)) != origin:
+            return None
+        try:
+            color, alpha, facts = _opened(partial)
+            state = json.loads(facts["reading"])
+            if not shelf.on_disk(color):
+                return None
+            return Reading(color, alpha, partial, origin, **state)
+        except UNFIT:
+            return None
+
+    @staticmethod
+    def begun(origin: str, color: Tensor, alpha: Tensor, size: tuple[int, int, int]) -> Reading:
+        """Room for photographs [V, H, W], all stored as this one is.
+
+        Raises:
+            OSError: there is no room on the disk for what is large.
+        """
+        path, shape = _place.get(), (*size, 3)
+        if not origin or path is None or not shelf.is_large(shape, color.dtype):
+            return Reading(color.new_zeros(shape), alpha.new_zeros(size))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        reading = Reading(torch.empty(0), torch.empty(0), _partial(path), origin)
+        _write_empty(_partial(path), {"color": (shape, color.dtype), "alpha": (size, alpha.dtype)})
+        _set_facts(_partial(path), reading._facts())
+        reading.color, reading.alpha, _ = _opened(_partial(path))
+        return reading
+
+    def done(self, view: int) -> None:
+        """Note that a photograph is whole."""
+        self.read = view + 1
+        for array in (self.color, self.alpha):
+            shelf.release(array[view])
+        if self.partial is not None and self.read % FLUSHED == 0:
+            shelf.flush(self.color)
+            shelf.flush(self.alpha)
+            _set_facts(self.partial, self._facts())
+
+    def with_floating_alpha(self) -> Reading:
+        """The same in memory, as `keep_photos` may keep it at the end: that some masks are stored
+        in other ways than the first is rare."""
+        self.drop()
+        return replace(self, alpha=coverage_of(self.alpha), partial=None)
+
+    def drop(self) -> None:
+        """Leave no file."""
+        if self.partial is not None:
+            self.partial.unlink(missing_ok=True)
+
+    def finished(self) -> tuple[Tensor, Tensor]:
+        """Colour and alpha of all; the file has its name."""
+        if self.partial is not None and (path := _place.get()) is not None:
+            shelf.flush(self.color)
+            shelf.flush(self.alpha)
+            checksum = _checksum(self.color, self.alpha)
+            _set_facts(self.partial, {"origin": self.origin, "checksum": checksum})
+            os.replace(self.partial, path)
+        return self.color, self.alpha
+
+    def _facts(self) -> dict[str, str]:
+        state = {"read": self.read, "empty": self.empty, "opaque": self.opaque}
+        return {"origin": self.origin, "reading": json.dumps(state)}
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f".{path.name}.partial")
+
+
+def _write_empty(path: Path, arrays: dict[str, tuple[Sequence[int], torch.dtype]]) -> None:
+    """A file of safetensors with zeros, in whose header there is room for facts."""
+    header, end = {}, 0
+    for name, (shape, dtype) in arrays.items():
+        begin, end = end, end + math.prod(shape) * dtype.itemsize
+        kind = "U8" if dtype == torch.uint8 else "F32"
+        header[name] = {"dtype": kind, "shape": list(shape), "data_offsets": [begin, end]}
+    with path.open("wb") as file:
+        file.write(_encoded(header))
+        file.flush()
+        shelf.reserve(file.fileno(), 8 + HEADER + end, path)
+
+
+def _encoded(header: dict[str, Any]) -> bytes:
+    return HEADER.to_bytes(8, "little") + json.dumps(header).encode().ljust(HEADER)
+
+
+def _header(path: Path) -> tuple[dict[str, Any], int]:
+    """The header of a file of safetensors, and its length."""
+    with path.open("rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        return json.loads(file.read(length)), length
+
+
+def _set_facts(path: Path, facts: dict[str, str]) -> None:
+    """Replace what a file of `_write_empty` says of itself."""
+    header = _header(path)[0] | {"__metadata__": facts}
+    with path.open("r+b") as file:
+        file.write(_encoded(header))
+
+
+def _opened(path: Path) -> tuple[Tensor, Tensor, dict[str, str]]:
+    """Colour, alpha and facts of a file; large arrays are the file itself."""
+    header, length = _header(path)
+    about = header["color"]
+    dtype = torch.uint8 if about["dtype"] == "U8" else torch.float32
+    if shelf.is_large(about["shape"], dtype) and os.access(path, os.W_OK):
+        arrays = []
+        with path.open("r+b") as file:
+            for name in ("color", "alpha"):
+                about = header[name]
+                dtype = torch.uint8 if about["dtype"] == "U8" else torch.float32
+                begin = 8 + length + about["data_offsets"][0]
+                arrays.append(shelf.mapped(file.fileno(), begin, about["shape"], dtype))
+        return arrays[0], arrays[1], header.get("__metadata__", {})
+    with safe_open(path, "pt") as file:
+        return file.get_tensor("color"), file.get_tensor("alpha"), file.metadata() or {}
 
 
 def keep_photos(photos: Photos, path: Path) -> None:
@@ -94,5 +244,7 @@ def _origin_in(path: Path) -> str | None:
 def _checksum(*tensors: Tensor) -> str:
     value = 0
     for tensor in tensors:
-        value = zlib.crc32(tensor.flatten().view(torch.uint8).numpy().data, value)
+        for picture in tensor:
+            value = zlib.crc32(picture.flatten().view(torch.uint8).numpy().data, value)
+            shelf.release(picture)
     return f"{value:08x}"

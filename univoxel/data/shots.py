@@ -20,7 +20,7 @@ from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data.base import Photos, coverage_of, decode
 from univoxel.data.images import orientation, read_image, turn_note
 from univoxel.data.inside import inside
-from univoxel.data.kept import kept_pixels, origin_of
+from univoxel.data.kept import Reading, kept_pixels, origin_of, to_be_kept
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
 from univoxel.data.masks import masks_by_stem, read_mask
 from univoxel.errors import DataError, UserError, WithoutMasks
@@ -91,11 +91,12 @@ def read_shots(
     pinholes = _pinholes(shots)
     cameras = cameras_of([s.pose for s in shots], [shrunk(lens, factor) for lens in pinholes])
     origin = ""
-    if factor > 1 or any(shot.lens.bent for shot in shots):
+    large = to_be_kept(len(cameras), cameras.height, cameras.width)
+    if factor > 1 or large or any(shot.lens.bent for shot in shots):
         lenses = [(shot.lens, pinhole) for shot, pinhole in zip(shots, pinholes, strict=True)]
         origin = origin_of([f for shot in shots for f in _files(shot)], lenses, factor, masks)
     pixels = kept_pixels(origin) if origin else None
-    color, alpha = pixels or _read_all(folder, shots, pinholes, cameras, factor, masks)
+    color, alpha = pixels or _read_all(folder, shots, pinholes, cameras, factor, masks, origin)
 
     told = [f"{len(shots)} photographs of {_words(cameras)} pixels in {split}"]
     told += ["lens distortion taken out"] if any(shot.lens.bent for shot in shots) else []
@@ -151,29 +152,35 @@ def _read_all(
     cameras: Cameras,
     factor: int,
     masks: bool,
+    origin: str,
 ) -> tuple[Tensor, Tensor]:
     """Colour [V, H, W, 3] and alpha [V, H, W] of all photographs as `Photos` has them."""
-    colors = alphas = torch.empty(0)
-    empty = opaque = True
-    for view, (color, alpha) in enumerate(_read_each(shots, pinholes, factor, masks)):
-        if not view:
+    reading = Reading.resumed(origin)
+    begin = reading.read if reading else 0
+    pictures = _read_each(shots[begin:], pinholes[begin:], factor, masks)
+    for view, (color, alpha) in enumerate(pictures, begin):
+        if reading is None:
             size = len(shots), cameras.height, cameras.width
-            colors, alphas = color.new_zeros(*size, 3), alpha.new_zeros(size)
-        if color.dtype != colors.dtype:
+            reading = Reading.begun(origin, color, alpha, size)
+        if color.dtype != reading.color.dtype:
             raise DataError(
                 f"{shots[view].image}: expected the format of {shots[0].name} in all photographs"
             )
-        if alpha.dtype != alphas.dtype:
-            alpha, alphas = coverage_of(alpha), coverage_of(alphas)
-        empty &= not alpha.any()
-        opaque &= bool((alpha == (1 if alpha.is_floating_point() else 255)).all())
-        cameras.cut(view, colors[view]).copy_(color)
-        cameras.cut(view, alphas[view]).copy_(alpha)
-    if empty:
+        if alpha.dtype != reading.alpha.dtype:
+            alpha, reading = coverage_of(alpha), reading.with_floating_alpha()
+        reading.empty &= not alpha.any()
+        reading.opaque &= bool((alpha == (1 if alpha.is_floating_point() else 255)).all())
+        cameras.cut(view, reading.color[view]).copy_(color)
+        cameras.cut(view, reading.alpha[view]).copy_(alpha)
+        reading.done(view)
+    assert reading is not None
+    if reading.empty or (masks and reading.opaque):
+        reading.drop()
+    if reading.empty:
         raise DataError(f"{folder}: all {len(shots)} pictures are fully transparent")
-    if masks and opaque:
+    if masks and reading.opaque:
         raise WithoutMasks(f"{folder}: all {len(shots)} pictures are fully opaque: {HOW_TO_MASK}")
-    return colors, alphas
+    return reading.finished()
 
 
 def _read_each(

@@ -11,6 +11,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from univoxel import shelf
 from univoxel.camera import Cameras
 from univoxel.data import Photos
 from univoxel.errors import UserError
@@ -99,7 +100,7 @@ def _widened(
     """The box, or that of wider silhouettes: what wrong cameras share is too small."""
     if not (refined and off > 0):
         return box
-    return estimate_bounds(distance - off, cameras, cfg.hull)
+    return estimate_bounds(distance, cameras, cfg.hull, wider=off)
 
 
 def _say(seen: Agreement | None, off: float, believed: bool, refined: bool) -> None:
@@ -128,7 +129,7 @@ def doubted_pixels(
     """
     grid = fit_grid(*belief.box, cfg.box_nodes)
     hull = visual_hull(distance, cameras, grid, cfg, belief.votes)
-    doubted = torch.zeros(distance.shape, dtype=torch.bool)
+    doubted = shelf.zeros(distance.shape, torch.bool)
 
     def doubt_(view_and_depth: tuple[int, Tensor]) -> None:
         view, depth = view_and_depth
@@ -136,6 +137,7 @@ def doubted_pixels(
         differs = (shown != cameras.cut(view, depth.isfinite())).numpy()
         reach = max(cfg.rough_pixels, cfg.rough_share * max(shown.shape))
         deep = np.asarray(ndimage.distance_transform_edt(np.pad(differs, 1)))[1:-1, 1:-1] > reach
+        shelf.release(distance[view])
         if not deep.any():
             return
         near = np.asarray(ndimage.distance_transform_edt(~deep)) <= reach + 1

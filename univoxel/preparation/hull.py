@@ -7,7 +7,9 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from univoxel import ranks, shelf
 from univoxel.camera import Cameras, looked_at, project
+from univoxel.data.base import coverage_of
 from univoxel.errors import UserError
 from univoxel.grid import GridShape, fit_coarse, fit_grid, resample
 from univoxel.preparation.config import HULL, HullConfig
@@ -19,7 +21,8 @@ PIECE = (
 
 
 def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
-    """Signed distance to the silhouette in pixels, negative inside: [V, H, W] -> the same.
+    """Signed distance to the silhouette in pixels, negative inside, of coverage [V, H, W] that is
+    stored as in `Photos`: [V, H, W] float32, on a shelf where they are large.
 
     Sub-pixel: a half-covered pixel lies on the silhouette. Infinite beyond a picture. Where the
     object leaves the picture there is no silhouette: the picture's edge is none.
@@ -27,14 +30,20 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
     Args:
         cameras: V, which know the sizes of the pictures, where these differ.
     """
-    result = np.full(alpha.shape, np.inf, np.float32)
+    distances = shelf.zeros(alpha.shape, torch.float32)
+    result = distances.numpy()
 
     def fill_(view: int) -> None:
-        a = (alpha[view] if cameras is None else cameras.cut(view, alpha[view])).numpy()
+        covered = coverage_of(alpha[view])
+        a = (covered if cameras is None else cameras.cut(view, covered)).numpy()
+        result[view] = np.inf
         result[view, : a.shape[0], : a.shape[1]] = _mask_distance(a)
+        for array in (alpha, distances):
+            shelf.release(array[view])
 
-    side_by_side(fill_, range(len(alpha)))
-    return torch.from_numpy(result)
+    side_by_side(fill_, ranks.mine(range(len(alpha))))
+    ranks.spread_(distances)
+    return distances
 
 
 def _mask_distance(alpha: np.ndarray) -> np.ndarray | float:
@@ -53,7 +62,12 @@ def _mask_distance(alpha: np.ndarray) -> np.ndarray | float:
 
 
 def hull_sdf(
-    distance: Tensor, cameras: Cameras, points: Tensor, votes: int = 1, seen_by: int = 1
+    distance: Tensor,
+    cameras: Cameras,
+    points: Tensor,
+    votes: int = 1,
+    seen_by: int = 1,
+    wider: float = 0.0,
 ) -> Tensor:
     """Signed distance to the visual hull, a lower bound of the object's: [P, 3] -> [P].
 
@@ -67,16 +81,17 @@ def hull_sdf(
             can say anything of it, if these are fewer; with more than one the hull is somewhat too
             large, and wrong masks of fewer views do not bite into it.
         seen_by: views, >= 1, that have to be able to say anything of a point; others are outside.
+        wider: pixels that silhouettes are taken to be wider by.
     """
 
     def of_piece(piece: Tensor) -> Tensor:
-        return _hull_sdf(distance, cameras, piece, votes, seen_by)
+        return _hull_sdf(distance, cameras, piece, votes, seen_by, wider)
 
     return torch.cat(side_by_side(of_piece, points.split(PIECE)))
 
 
 def _hull_sdf(
-    distance: Tensor, cameras: Cameras, points: Tensor, votes: int, seen_by: int
+    distance: Tensor, cameras: Cameras, points: Tensor, votes: int, seen_by: int, wider: float
 ) -> Tensor:
     highest = torch.full((votes, len(points)), -torch.inf)  # of the views so far, the largest first
     voters = torch.zeros(len(points), dtype=torch.int64)
@@ -84,6 +99,8 @@ def _hull_sdf(
         pixel, depth = project(cameras, v, points)
         uv = pixel * (2 / torch.tensor(cameras.size(v))) - 1
         shown = cameras.cut(v, distance[v])
+        if wider:
+            shown = shown - wider
         border = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
         uncut = all(float(b.amin()) > 0 for b in border)
         d = torch.nn.functional.grid_sample(
@@ -93,6 +110,7 @@ def _hull_sdf(
         bound = d.clamp_min(0.5) if uncut else torch.full_like(d, -torch.inf)
         bound = torch.where(seen, d, bound) * depth.abs() / cameras.focal[v].mean()
         voters += bound > -torch.inf
+        shelf.release(distance[v])
         for rank in range(votes):
             highest[rank], bound = (
                 torch.maximum(highest[rank], bound),
@@ -121,12 +139,16 @@ def views_needed(views: int, votes: int, cfg: HullConfig = HULL) -> int:
 
 
 def estimate_bounds(
-    distance: Tensor, cameras: Cameras, cfg: HullConfig = HULL, votes: int = 1
+    distance: Tensor,
+    cameras: Cameras,
+    cfg: HullConfig = HULL,
+    votes: int = 1,
+    wider: float = 0.0,
 ) -> tuple[Tensor, Tensor]:
     """Corners [3], [3] of a box around the visual hull, with a margin.
 
     Args:
-        votes: see `hull_sdf`.
+        votes, wider: see `hull_sdf`.
 
     Raises:
         UserError: the silhouettes share no volume.
@@ -141,7 +163,8 @@ def estimate_bounds(
         grid = fit_grid(lower, upper, cfg.box_nodes)
         nodes = grid.nodes().reshape(-1, 3)
         seen_by = views_needed(len(cameras), votes, cfg)
-        inside = nodes[hull_sdf(distance, cameras, nodes, votes, seen_by) < grid.voxel_size]
+        sdf = hull_sdf(distance, cameras, nodes, votes, seen_by, wider)
+        inside = nodes[sdf < grid.voxel_size]
         if not len(inside):
             raise UserError(
                 "the silhouettes of the photographs share no volume: check masks and cameras"

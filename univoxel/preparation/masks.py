@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from univoxel import shelf
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
+from univoxel.data.base import coverage_of
 from univoxel.names import MasksFrom
 from univoxel.preparation.config import MASKS, MaskConfig
 from univoxel.preparation.hull import mask_distances
@@ -36,7 +38,7 @@ def mask_excess(
         color: V photographs [H, W, 3], uint8 sRGB or linear. What surrounds the object may be
             there, or be cut away or covered by colours of the object's edge: then masks have to be
             too wide by 3 pixels to be seen so.
-        coverage: V, [H, W] in [0, 1], by masks.
+        coverage: V, [H, W] by masks, stored as in `Photos`.
         distance: V, [H, W] from `hull.mask_distances`.
     """
     longest = max(max(d.shape) for d in distance)
@@ -67,14 +69,16 @@ def _change(
     is 0, 1, ... deepest: [deepest + 1] sRGB a pixel; NaN where there are few."""
 
     def of_view(view: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        c, covered, d = view
-        encoded = as_srgb(c)
+        c, stored, d = view
+        encoded, covered = as_srgb(c), coverage_of(stored)
         away = cut_away(encoded, covered, d, cfg)
         hidden = (covered < 0.99) if away else torch.zeros_like(covered, dtype=torch.bool)
         hidden = max_pool2d(hidden[None].float(), 3, 1, 1)[0] > 0
         depth = (0.5 - d).floor().long()
         y, x = (~hidden & (depth >= 0) & (depth <= deepest)).nonzero(as_tuple=True)
         inward, _ = _slopes(encoded, d, y, x)
+        for array in view:
+            shelf.release(array)
         at = depth[y, x]
         return torch.bincount(at, inward, deepest + 1), torch.bincount(at, minlength=deepest + 1)
 
@@ -116,7 +120,7 @@ def _slopes(encoded: Tensor, distance: Tensor, y: Tensor, x: Tensor) -> tuple[Te
 
 
 def eroded(distance: Tensor, pixels: int) -> Tensor:
-    """Coverage [V, H, W] in [0, 1] by masks that end so many pixels further in; 0 beyond."""
+    """Coverage in [0, 1] by masks that end so many pixels further in; 0 beyond a picture."""
     return (0.5 - pixels - distance).clamp(0, 1)
 
 
@@ -128,13 +132,14 @@ def fitted_masks(
     Args:
         wanted: as of the configuration.
     """
-    coverage, cameras = photos.coverage(), photos.cameras
-    distance = mask_distances(coverage, cameras)
+    cameras = photos.cameras
+    distance = mask_distances(photos.alpha, cameras)
     colors, covered, away = (
         [cameras.cut(v, picture) for v, picture in enumerate(pictures)]
-        for pictures in (photos.color, coverage, distance)
+        for pictures in (photos.color, photos.alpha, distance)
     )
     excess = mask_excess(colors, covered, away, cfg)
+    shelf.release()
     if not excess:
         return photos, distance
     much = f"masks are {excess} {'pixel' if excess == 1 else 'pixels'} too wide"
@@ -142,10 +147,17 @@ def fitted_masks(
         log.info("%s: see masks=auto", much, extra={"arguments": ("masks",)})
         return photos, distance
     log.info("%s: they are taken in", much)
-    return with_masks(photos, eroded(distance, excess))
+    return with_masks(photos, lambda view: eroded(distance[view], excess))
 
 
-def with_masks(photos: Photos, coverage: Tensor) -> tuple[Photos, Tensor]:
-    """The photographs with masks of such coverage [V, H, W], and `mask_distances`."""
-    stored = coverage if photos.alpha.is_floating_point() else (255 * coverage).round().byte()
-    return replace(photos, alpha=stored), mask_distances(coverage, photos.cameras)
+def with_masks(photos: Photos, coverage: Callable[[int], Tensor]) -> tuple[Photos, Tensor]:
+    """The photographs with masks of such coverage [H, W] by view, and `mask_distances`."""
+    stored = shelf.zeros(photos.alpha.shape, photos.alpha.dtype)
+    exact = shelf.zeros(photos.alpha.shape, torch.float32)
+    for view in range(len(photos)):
+        exact[view] = coverage(view)
+        covered = exact[view]
+        stored[view] = covered if stored.is_floating_point() else (255 * covered).round().byte()
+        for array in (stored, exact):
+            shelf.release(array[view])
+    return replace(photos, alpha=stored), mask_distances(exact, photos.cameras)

@@ -13,7 +13,9 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from univoxel import shelf
 from univoxel.data import Photos
+from univoxel.data.base import coverage_of
 from univoxel.preparation.config import MASKS, OUTLINES, MaskConfig, OutlineConfig
 from univoxel.preparation.masks import as_srgb, cut_away
 from univoxel.threads import side_by_side
@@ -36,9 +38,10 @@ def drawn_again(
         off: pixels, > 0, that edges may be off by; at most cfg.most are moved.
         doubted: [V, H, W] bool, where a mask is not believed at all: it stays, and tells nothing.
     """
-    coverage, cut = photos.coverage(), photos.cameras.cut
+    coverage, cut = shelf.zeros(photos.alpha.shape, torch.float32), photos.cameras.cut
 
     def draw_(view: int) -> None:
+        coverage[view] = coverage_of(photos.alpha[view])
         color, covered = as_srgb(photos.stored(view)[0]), cut(view, coverage[view])
         away = cut(view, distance[view])
         if cut_away(color, covered, away, masks):
@@ -49,6 +52,7 @@ def drawn_again(
         covered.copy_(torch.from_numpy(outlined(picture, mask, far, believed, reach, cfg)))
 
     side_by_side(draw_, range(len(photos)))
+    shelf.release()
     return coverage
 
 

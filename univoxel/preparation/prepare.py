@@ -68,7 +68,7 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
     coverage = drawn_again(
         photos, distance, belief.off, doubted, constants.outlines, constants.masks
     )
-    photos, distance = with_masks(photos, coverage)
+    photos, distance = with_masks(photos, lambda view: coverage[view])
     box = estimate_bounds(distance, photos.cameras, constants.hull, belief.votes)
     return replace(found, photos=photos, distance=distance, box=box, doubted=doubted)
 

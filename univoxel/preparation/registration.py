@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from univoxel import shelf
 from univoxel.camera import Cameras, pixel_rays
 from univoxel.poses import PoseSteps
 from univoxel.preparation.config import REGISTRATION, RegistrationConfig
@@ -41,9 +43,11 @@ class Edges:
         self.ray_samples: int = cfg.ray_samples
         self.distance = distance
         self.extended: Tensor = _extended(distance)
-        self.pixels: Tensor = (
-            (distance > low) & (distance < high)
-        ).nonzero()  # [K, 3] view, row, column
+        edges = [((d > low) & (d < high)).nonzero() for d in _one_by_one(distance)]
+        view = torch.repeat_interleave(torch.tensor([len(e) for e in edges]))
+        self.pixels: Tensor = torch.cat(
+            [view[:, None], torch.cat(edges)], 1
+        )  # [K, 3] with row, column
         self.middle: Tensor = (box[0] + box[1]) / 2
         self.reach: float = float((box[1] - box[0]).norm()) / 2
 
@@ -69,7 +73,9 @@ class Edges:
         slice_ = (2 * other + 1) / len(self.distance) - 1
         where = torch.cat([uv, slice_[:, None].to(uv)], 1)[None, None, None]
         volume = self.extended[None, None]
-        return grid_sample(volume, where, align_corners=False, padding_mode="border")[0, 0, 0, 0]
+        missed = grid_sample(volume, where, align_corners=False, padding_mode="border")
+        shelf.release(self.extended)
+        return missed[0, 0, 0, 0]
 
     def _nearest(self, cameras: Cameras, rays: Rays, others: Tensor) -> tuple[Tensor, Tensor]:
         """Distance [N] along each ray where it is least outside, and the view [N] that says so."""
@@ -96,6 +102,7 @@ class Edges:
             seen = (depth > 0) & (uv.abs() <= 1).all(1)  # beyond its picture a view says nothing
             further = seen & (d > most)
             most[further], worst[further] = d[further], v
+            shelf.release(self.distance[v])
         return torch.where(most.isinf(), torch.inf, most), worst  # unseen places are outside
 
 
@@ -153,15 +160,23 @@ def align_(
 
 def _extended(distance: Tensor) -> Tensor:
     """Distances [V, H, W] with what stands at the border of a picture beyond it too."""
-    known = distance.isfinite()
-    if known.all():
+    if all(bool(d.isfinite().all()) for d in _one_by_one(distance)):
         return distance
-    extended = distance.clone()
-    for picture, there in zip(extended, known, strict=True):
+    extended = shelf.zeros(distance.shape, distance.dtype)
+    for picture, given in zip(_one_by_one(extended), _one_by_one(distance), strict=True):
+        picture.copy_(given)
+        there = given.isfinite()
         height, width = int(there[:, 0].sum()), int(there[0].sum())
         picture[:height, width:] = picture[:height, width - 1 : width]
         picture[height:] = picture[height - 1]
     return extended
+
+
+def _one_by_one(pictures: Tensor) -> Iterator[Tensor]:
+    """Pictures of [V, H, W], which hold no memory once the next one is asked for."""
+    for picture in pictures:
+        yield picture
+        shelf.release(picture)
 
 
 def _seen(cameras: Cameras, points: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:

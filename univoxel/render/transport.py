@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
+from univoxel import ranks, shelf
 from univoxel.camera import project
 from univoxel.color import srgb_to_linear
 from univoxel.data import Photos
@@ -70,8 +71,8 @@ def observe(
     Args:
         offset: world units that rays start above the surface.
     """
-    point, wo, color, view = [], [], [], []
-    for v in range(len(photos)):
+
+    def seen_in(v: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         eye = photos.cameras.camera_to_world[v, :, 3]
         towards = normalize(eye - position, dim=1)
         pixel, depth = project(photos.cameras, v, position)
@@ -86,15 +87,17 @@ def observe(
         if photos.color.dtype == torch.uint8:
             pixel_color = srgb_to_linear(pixel_color / 255)
         coverage = coverage_of(stored_alpha)
+        for array in (photos.color, photos.alpha):
+            shelf.release(array[v])
         alpha = grid_sample(coverage[None, None], uv, align_corners=False)[0, 0, 0]
         start = position[facing] + offset * (normal[facing] + towards[facing])
         reach = (eye - start).norm(dim=1).max().item() if len(facing) else 0.0
         visible = ~scene.occluded(start, towards[facing], 0.0, reach)
         counted = visible & (alpha > MIN_ALPHA)
-        point.append(facing[counted])
-        wo.append(towards[facing][counted])
-        color.append(pixel_color[counted])
-        view.append(torch.full((int(counted.sum()),), v))
+        of_view = torch.full((int(counted.sum()),), v)
+        return facing[counted], towards[facing][counted], pixel_color[counted], of_view
+
+    point, wo, color, view = zip(*ranks.shared(seen_in, range(len(photos))), strict=True)
     index = torch.cat(point)
     order = torch.argsort(index, stable=True)
     counts = torch.bincount(index, minlength=len(position))
@@ -141,8 +144,9 @@ def trace(
     first = mesh.faces[:, 0].long()
     visibility = torch.zeros(count, nodes, dtype=torch.uint8)
     indirect = torch.zeros(count, nodes, 3, dtype=torch.float16)
-    for begin in range(0, count, POINTS_AT_ONCE):
-        part = slice(begin, min(begin + POINTS_AT_ONCE, count))
+    parts = [slice(b, min(b + POINTS_AT_ONCE, count)) for b in range(0, count, POINTS_AT_ONCE)]
+    own = ranks.mine(range(len(parts)))
+    for number, part in enumerate(parts):
         above = observations.normal[part] @ direction.T > -spread
         point, node = above.nonzero().unbind(1)
         start = observations.position[part] + offset * observations.normal[part]
@@ -151,9 +155,13 @@ def trace(
         radiance = torch.zeros(len(point), 3)
         for _ in range(rays):
             jitter = spread * torch.randn(len(point), 3, generator=generator) / math.sqrt(2)
+            if number not in own:  # all draw the same
+                continue
             hit = scene.closest_hit(start, normalize(direction[node] + jitter, dim=1)).face
             sky += hit < 0
             radiance += torch.where((hit >= 0)[:, None], vertex_color[first[hit.clamp_min(0)]], 0.0)
         visibility[part][point, node] = (255 * sky / rays).round().to(torch.uint8)
         indirect[part][point, node] = (radiance / rays).clamp_max(HALF_MAX).half()
+    ranks.spread_([visibility[part] for part in parts])
+    ranks.spread_([indirect[part] for part in parts])
     return Transport(direction, visibility, indirect)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from univoxel import losses
+from univoxel import losses, ranks
 from univoxel.camera import pixel_rays
 from univoxel.checkpoint import save_scene
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
@@ -25,10 +25,11 @@ from univoxel.scene import Scene
 from univoxel.threads import Team, team
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
-from univoxel.training.pixels import TrainingPixels
+from univoxel.training.exchange import summed_over_ranks_
+from univoxel.training.pixels import TrainingPixels, unpacked
 from univoxel.training.plateau import Plateau
 from univoxel.training.progress import Listener, Rehearsal
-from univoxel.training.step import PARTS, Descent, Part, descent, parts_of, summed_terms, total
+from univoxel.training.step import Descent, Part, descent, parts_for, parts_of, summed_terms, total
 from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
@@ -74,7 +75,9 @@ def run_stage(
     guard = Guard(progress, restored=lambda: restore_surface_(scene))
     guard.follow(optimizer)
     parameters = parameters_of(optimizer)
-    with scene.surface_held(), team(PARTS) as work:
+    ranks.as_first_([*scene.state_dict().values()])
+    count = parts_for(ranks.count())
+    with scene.surface_held(), team(count // ranks.count()) as work:
         for done in progress.clock.steps():
             physical = done >= stage.physical_from
             rates = learning_rates(stage, done, field.voxel_size)
@@ -91,8 +94,9 @@ def run_stage(
             if progress.clock.step % RETRACE == 0 and not stage.refit:
                 scene.release_surface()
 
-            parts = parts_of(pixels.trained, stage.rays)
+            parts = ranks.mine(parts_of(pixels.trained, stage.rays, count))
             terms = descend_(scene, cfg.loss, pixels, parts, physical, parameters, work)
+            terms = summed_over_ranks_(parameters, terms)
             if not guard.sound(torch.stack(list(terms.values())).sum()):
                 continue
             if stage.refit:
@@ -288,8 +292,12 @@ def weighted(prior: Regularisation, weight: LossConfig) -> dict[str, Tensor]:
 
 
 def batch_at(photos: Photos, pixels: Tensor) -> Batch:
-    view, row, column = pixels.long().unbind(1)
-    color, alpha = photos.pixels(view, row, column)
+    """The rays of pixels as `TrainingPixels` has them."""
+    view, row, column = pixels[:, :3].long().unbind(1)
+    if pixels.shape[1] == 3:
+        color, alpha = photos.pixels(view, row, column)
+    else:
+        color, alpha = unpacked(photos, pixels[:, 3:])
     centre = torch.stack([column, row], 1) + 0.5
     return Batch(view, pixel_rays(photos.cameras, view, centre), color, alpha)
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import logging
 import math
 
+from univoxel import shelf
 from univoxel.config import TrainConfig
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.machine import Memory, memory
 from univoxel.training.config import StageConfig
+from univoxel.training.pixels import MOST
 
 # Bytes, as trainings on 13 to 133 million pixels, 0.25 to 4 million voxels, were seen to take
 PER_PIXEL = 21  # distances, masks and orders of pixels, besides the photographs themselves
+PER_DRAWN = 48  # of a pixel that is trained on, where the photographs lie on disk: its row, twice
 PER_VOXEL = 100  # distances and features with gradients and moments, hulls, meshes
 PER_RAY = 40_000  # of a step: samples and what is between them
 
@@ -21,6 +24,8 @@ log: logging.Logger = logging.getLogger("univoxel")
 
 def needed(photos: Photos, cfg: TrainConfig) -> int:
     """Bytes, about, that training takes besides the photographs, which are there already."""
+    if shelf.on_disk(photos.color):
+        return needed_for(0, cfg) + PER_DRAWN * MOST
     return needed_for(photos.alpha.numel(), cfg)
 
 
@@ -47,7 +52,7 @@ def check_memory(photos: Photos, cfg: TrainConfig, there: Memory | None = None) 
     if there is None:
         return
     further = needed(photos, cfg)
-    have = photos.color.nbytes + photos.alpha.nbytes
+    have = 0 if shelf.on_disk(photos.color) else photos.color.nbytes + photos.alpha.nbytes
     left = there.total if there.free is None else there.free
     if further <= left:
         return

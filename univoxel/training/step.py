@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -15,6 +16,11 @@ from univoxel.optim import rows_of
 # Of a step's rays, each a forward and backward pass of its own. The number is fixed: sums must not
 # depend on how many threads there are. Each part costs its small operations anew.
 PARTS = 2
+
+
+def parts_for(ranks: int) -> int:
+    """Parts of a step that so many ranks share: as many for each."""
+    return ranks * math.ceil(PARTS / ranks)
 
 
 @dataclass(frozen=True)
@@ -34,11 +40,11 @@ class Descent:
     gradients: Sequence[Tensor | None]  # of the loss, times the part's share
 
 
-def parts_of(pixels: Tensor, rays: int) -> list[Part]:
-    """Draw a step's rays among pixels [P, 3], with replacement."""
+def parts_of(pixels: Tensor, rays: int, count: int = PARTS) -> list[Part]:
+    """Draw a step's rays among pixels [P, 3], with replacement: `count` parts, or one of few."""
     drawn = pixels[torch.randint(len(pixels), (rays,))]
-    seeds = torch.randint(2**62, (PARTS,)).tolist()
-    chunks = drawn.tensor_split(PARTS) if rays >= PARTS else [drawn]
+    seeds = torch.randint(2**62, (count,)).tolist()
+    chunks = drawn.tensor_split(count) if rays >= count else [drawn]
     return [
         Part(chunk, seed, len(chunk) / rays) for chunk, seed in zip(chunks, seeds, strict=False)
     ]
