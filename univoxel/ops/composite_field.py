@@ -341,30 +341,26 @@ def _gradients(
     order = torch.empty(len(t), dtype=torch.int32)
     native.require().sort_by_tile(grid, *native.arrays(pulls.points, order), native.threads())
     backward = grid_sampling.sample_backward_sparse if sparse else grid_sampling.sample_backward
-    grads = list(
-        backward(
-            grid,
-            (sdf, of_nodes, pulls.points, order),
-            (pulls.value, pulls.gradient, feature.contiguous()),
-            [needs[0], needs[1] and not hashed, moved],
-        )
+    of_sdf, of_features, of_points = backward(
+        grid,
+        (sdf, of_nodes, pulls.points, order),
+        (pulls.value, pulls.gradient, feature.contiguous()),
+        [needs[0], needs[1] and not hashed, moved],
     )
-    of_points = grads[2]
+    of_hash = None
     if hashed:
         hash_needs, count = [needs[1], moved], len(levels[0])
-        grads[1], of_hash = hash_grid.backward(
+        of_features, of_hash = hash_grid.backward(
             features, pulls.feature_points, pulls.feature, levels, count, hash_needs, sparse
         )
-        if moved:
-            of_points = of_points + of_hash
-    rays: list[Tensor | None] = [None, None]
-    if moved:
+    of_origin = of_direction = None
+    if of_points is not None and moved:
+        pull = of_points if of_hash is None else of_points + of_hash
         ray = torch.repeat_interleave(offsets.diff())
-        rays = [
-            torch.zeros_like(direction).index_add(0, ray, of_points),
-            torch.zeros_like(direction).index_add(0, ray, t[:, None] * of_points),
-        ]
-    return [g if need else None for g, need in zip([*grads[:2], *rays], needs, strict=True)]
+        of_origin = torch.zeros_like(direction).index_add(0, ray, pull)
+        of_direction = torch.zeros_like(direction).index_add(0, ray, t[:, None] * pull)
+    grads = (of_sdf, of_features, of_origin, of_direction)
+    return [g if need else None for g, need in zip(grads, needs, strict=True)]
 
 
 @native.operator("composite_field_backward")
