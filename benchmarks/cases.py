@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any
 
 import peers
 import torch
@@ -271,11 +272,10 @@ def _ellipsoid(size: tuple[int, int, int]) -> tuple[Tensor, list[float], float]:
     return sdf, [float(a[0]) for a in axes], h
 
 
-def march(rays: int = 2048) -> Case:
+def _rays_to_ellipsoid(rays: int) -> tuple[Any, ...]:
+    """Distances, brick minima; rays from all around and their jitter; place and voxel size."""
     g = torch.Generator().manual_seed(0)
-    size = (200, 155, 130)
-    sdf, start, h = _ellipsoid(size)
-    least = ops.brick_minimum(sdf)
+    sdf, start, h = _ellipsoid((200, 155, 130))
 
     def unit(t):
         return torch.nn.functional.normalize(t, dim=1)
@@ -283,6 +283,11 @@ def march(rays: int = 2048) -> Case:
     origin = 1.5 * unit(torch.randn(rays, 3, generator=g))
     direction = unit(0.15 * torch.randn(rays, 3, generator=g) - origin)
     jitter = torch.rand(rays, generator=g)
+    return sdf, ops.brick_minimum(sdf), origin, direction, jitter, start, h
+
+
+def march(rays: int = 2048) -> Case:
+    *tensors, start, h = _rays_to_ellipsoid(rays)
 
     def count(samples):  # rounding moves single samples in or out
         return samples.t.sum(), samples.t.new_tensor(len(samples.t))
@@ -295,12 +300,44 @@ def march(rays: int = 2048) -> Case:
 
     return Case(
         "march",
-        f"{rays:,} rays, {'x'.join(map(str, size))}",
+        f"{rays:,} rays, {'x'.join(map(str, tensors[0].shape))}",
         ours,
         reference,
-        (sdf, least, origin, direction, jitter),
+        tuple(tensors),
         {},
         tolerance=1e-3,
+    )
+
+
+def composite_field(rays: int = 2048, channels: int = 12, min_share: float = 0.05) -> Case:
+    """What `march` above finds, composited; the chain is of the ops that do it one by one."""
+    g = torch.Generator().manual_seed(0)
+    sdf, least, origin, direction, jitter, start, h = _rays_to_ellipsoid(rays)
+    samples = ops.march(sdf, least, origin, direction, jitter, start, h, step=h, inv_s=2 / h)
+    features = torch.randn(*sdf.shape, channels, generator=g)
+    place = start, h, 2 / h
+
+    def ours(*tensors):
+        options = {"min_share": min_share, "sparse_grad": True}
+        opacity, t, *rest = ops.composite_field(*tensors, samples, *place, **options)
+        return torch.cat([opacity[:, None], t[:, None], *rest], 1)
+
+    def reference(*tensors):
+        double = replace(samples, t=samples.t.to(tensors[0]))
+        return ops.composite_field_reference(*tensors, double, *place, min_share=min_share)
+
+    tensors = tuple(x.requires_grad_() for x in (sdf, features, origin, direction))
+    m = len(samples.t)
+    return Case(
+        "composite_field",
+        f"{rays:,} rays of {m:,} samples, {channels} channels",
+        ours,
+        reference,
+        tensors,
+        # eight corners of a distance and its gradient forward and backward
+        {"fma": 2.0 * 2 * 8 * m * 7},
+        {"chain of ops": lambda: peers.composite_field(tensors, samples, *place)},
+        tolerance=1e-3,  # what is read where a share is just the least one
     )
 
 
@@ -419,6 +456,7 @@ CASES: list[tuple[str, Callable[[], Case]]] = [
     ("occluded", occluded),
     ("adam_rows_", adam_rows),
     ("march", march),
+    ("composite_field", composite_field),
     ("smooth_rows_", smooth_rows),
     ("smooth_rows_", lambda: smooth_rows(channels=12, order=1)),
     ("diffuse_rows_", diffuse_rows),

@@ -14,6 +14,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from univoxel import ops
+from univoxel.records import Samples
+
 Peers = dict[str, Callable[[], Callable[[], object]]]  # by name: sets up and returns the work
 
 
@@ -94,6 +97,27 @@ def _jax_composite(alpha: Tensor, value: Tensor, n_rays: int):
     run = jax.jit(jax.grad(loss, (0, 1)))
     seeds = jnp.ones((n_rays, v.shape[-1])), jnp.ones_like(a)
     return lambda: jax.block_until_ready(run(a, v, *seeds))
+
+
+def composite_field(
+    tensors: tuple[Tensor, ...], samples: Samples, start: list[float], h: float, inv_s: float
+) -> Callable[[], object]:
+    """Distances, gradients and features composited by ops of this package, one after the other."""
+    sdf, features, origin, direction = tensors
+
+    def work() -> object:
+        ray = torch.repeat_interleave(samples.offsets.diff())
+        points = origin[ray] + samples.t[:, None] * direction[ray]
+        value, gradient, feature = ops.sample_dense(
+            sdf, features, points, start, h, sparse_grad=True
+        )
+        alpha = ops.section_alpha(value, samples.connected, inv_s)
+        read = torch.cat([samples.t[:, None], gradient, feature], 1)
+        between = (read + read.roll(-1, 0)) / 2  # the last section of a ray has no weight
+        total, weight = ops.composite(alpha, between, samples.offsets)
+        return torch.autograd.grad(total.sum() + weight.sum(), tensors)
+
+    return work
 
 
 def sample_dense(sdf: Tensor, features: Tensor, points: Tensor, h: float) -> Peers:

@@ -35,7 +35,6 @@ from univoxel.lights.sg import LocalSG
 from univoxel.optim import RowAdam
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
 from univoxel.presets import preset
-from univoxel.render import pipeline
 from univoxel.scene import Scene
 from univoxel.training import loop
 from univoxel.training.pixels import TrainingPixels, split_pixels
@@ -45,8 +44,7 @@ DATA = HERE.parent / "univoxel" / "example_data" / "tiny"
 STAGES = {
     "rays": [(loop, "batch_at")],
     "march": [(Field, "march")],
-    "sample": [(Field, "sample")],
-    "composite": [(pipeline, "composite")],
+    "sample and composite": [(Field, "composite")],
     "sums of gradients": [(loop, "total")],
     "heads": [
         *((head, "forward") for head in (MaterialHead, RadianceHead, MirroredLight)),
@@ -62,7 +60,7 @@ STAGES = {
     "refresh": [(Field, "refresh")],
 }
 BACKWARD = "backward"
-OTHER = "other"  # points along rays, normals, opacities, gradients of what is used twice
+OTHER = "other"  # surfaces of what was composited, gradients of what is used twice
 COUNT = {"native": 32, "reference": 4}  # steps: of 16, one refreshes and four smooth
 
 

@@ -12,7 +12,7 @@ def main() -> None:
     with ranks.joined():
         me = ranks.rank()
         torch.manual_seed(me)
-        gathered = ranks.shared(lambda i: 10 * i, range(7))
+        gathered = ranks.shared(lambda i: (torch.tensor([10 * i]), torch.ones(i, 2)), range(7))
         rows = torch.full((5, 2), -1.0)
         for i in ranks.mine(range(5)):
             rows[i] = i
@@ -32,7 +32,7 @@ def main() -> None:
         summed = summed_over_ranks_([table, net, unused], terms)
         assert net.grad is not None
         got = {
-            "gathered": gathered,
+            "gathered": [[part.sum().item() for part in parts] for parts in gathered],
             "spread": rows.tolist(),
             "total": total.tolist(),
             "as_first": value.item(),

@@ -35,6 +35,8 @@ WORDS |= {
     "FACTOR",
     "TEXELS",
     "OPENCV",
+    "EPYC",
+    "OMP_NUM_THREADS",
     "QT_QPA_PLATFORM",
 }
 

@@ -164,7 +164,7 @@ def test_all_ranks_get_what_each_has_made():
     assert [code for code, _, _ in told] == [0, 0, 0], told
     each = [json.loads(out) for _, out, _ in told]
     assert each[0] == each[1] == each[2]
-    assert each[0]["gathered"] == [10 * i for i in range(7)]
+    assert each[0]["gathered"] == [[10 * i, 2 * i] for i in range(7)]
     assert each[0]["spread"] == [[float(i)] * 2 for i in range(5)]
     assert each[0]["total"] == [0.0 + 1.0 + 2.0, 7.0]
     assert each[0]["as_first"] == 0.0
@@ -185,7 +185,7 @@ def test_one_process_is_left_alone():
     assert ranks.total(part) is part
     assert ranks.once(part) is part
     assert ranks.mine([1, 2, 3]) == [1, 2, 3]
-    assert ranks.shared(lambda x: 2 * x, [1, 2]) == [2, 4]
+    assert ranks.shared(lambda x: (2 * x,), torch.arange(2)) == [(0,), (2,)]
     assert (ranks.count(), ranks.rank(), ranks.leads()) == (1, 0, True)
     assert ranks.sent_bytes() == 0
     assert abs(ranks.now() - time.monotonic()) < 5

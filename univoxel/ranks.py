@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import logging
 import os
-import pickle
 import signal
 import threading
 import time
@@ -20,16 +19,17 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import torch
+from safetensors.torch import load, save
 from torch import Tensor, distributed
 from torch.distributed.rendezvous import rendezvous
 
 from univoxel.errors import ProcessFailed
 
 Item = TypeVar("Item")
-Result = TypeVar("Result")
+Tensors: TypeAlias = "tuple[Tensor, ...]"
 
 PATIENCE = timedelta(minutes=10)  # for a rank that does not answer; the first one writes meanwhile
 
@@ -166,20 +166,29 @@ def share() -> slice:
     return slice(rank(), None, count())
 
 
-def gathered(results: Sequence[Result]) -> list[Result]:
+def gathered(results: Sequence[Tensors]) -> list[Tensors]:
     """Of what each rank made of its `mine`, that of all pieces, in their order."""
     if _group.store is None:
         return list(results)
-    packed = torch.frombuffer(bytearray(pickle.dumps(list(results), protocol=5)), dtype=torch.uint8)
+    named = {f"{i} {k}": t.contiguous() for i, ts in enumerate(results) for k, t in enumerate(ts)}
+    packed = torch.frombuffer(bytearray(save(named)), dtype=torch.uint8)
     padded = torch.nn.functional.pad(packed, (0, -len(packed) % 4)).view(torch.int32)
-    of_ranks = [pickle.loads(m.numpy().tobytes()) for m in messages(padded)]
-    whole: list[Any] = [None] * sum(map(len, of_ranks))
+    header = torch.tensor([len(packed), len(results)], dtype=torch.int32)
+    of_ranks = [_unpacked(message) for message in messages(torch.cat([header, padded]))]
+    whole: list[Tensors] = [()] * sum(map(len, of_ranks))
     for number, several in enumerate(of_ranks):
         whole[number :: count()] = several
     return whole
 
 
-def shared(call: Callable[[Item], Result], pieces: Sequence[Item]) -> list[Result]:
+def _unpacked(message: Tensor) -> list[Tensors]:
+    length, pieces = message[:2].tolist()
+    found = load(message[2:].numpy().tobytes()[:length])
+    widths = [sum(name.startswith(f"{i} ") for name in found) for i in range(pieces)]
+    return [tuple(found[f"{i} {k}"] for k in range(width)) for i, width in enumerate(widths)]
+
+
+def shared(call: Callable[[Item], Tensors], pieces: Sequence[Item]) -> list[Tensors]:
     """The results of `call`, in order; each rank makes its share of them."""
     return gathered([call(piece) for piece in mine(pieces)])
 
