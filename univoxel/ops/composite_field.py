@@ -222,7 +222,7 @@ def _grid(table: Tensor, size: list[int], origin: list[float], voxel_size: float
 
 def _hash_place(
     lower: list[float], upper: list[float], voxel_sizes: list[float]
-) -> tuple[list[list[int]], list[float], list[float]]:
+) -> hash_grid.Place:
     """Levels as the extension takes them; none: no hash table."""
     if not voxel_sizes:
         return [], [0.0] * 3, []
@@ -294,7 +294,7 @@ def _pulls(
     held: Tensor,
     grad_out: Tensor,
     grid: Any,
-    levels: tuple,
+    levels: hash_grid.Place,
     inv_s: float,
     min_share: float,
 ) -> _Pulls:
@@ -325,7 +325,7 @@ def _gradients(
     held: Tensor,
     grad_out: Tensor,
     grid: Any,
-    levels: tuple,
+    levels: hash_grid.Place,
     inv_s: float,
     min_share: float,
     needs: list[bool],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -13,6 +14,8 @@ from univoxel.ops.checks import check
 from univoxel.ops.grid_sampling import SparseGrad
 
 PRIMES = (1, 2654435761, 805459861)
+# Numbers of nodes of each level, the lower corner and voxel sizes, as the extension takes them
+Place: TypeAlias = "tuple[list[list[int]], list[float], list[float]]"
 
 
 def encode_hash(
@@ -165,7 +168,7 @@ def _encode_hash(
     return out
 
 
-def _place(lower: list[float], upper: list[float], voxel_sizes: list[float]) -> tuple:
+def _place(lower: list[float], upper: list[float], voxel_sizes: list[float]) -> Place:
     """Levels as the extension takes them."""
     return lattice_sizes(lower, upper, voxel_sizes), lower, voxel_sizes
 
@@ -203,7 +206,7 @@ def _backward_into(
     grad_table: Tensor | None,
     touched,
     grad_points: Tensor | None,
-    place: tuple,
+    place: Place,
     felt: int,
 ) -> None:
     native.require().encode_hash_backward(
@@ -218,7 +221,7 @@ def _backward_into(
 
 
 def _sparse_backward(
-    table: Tensor, points: Tensor, grad_out: Tensor, place: tuple, felt: int, needs: list[bool]
+    table: Tensor, points: Tensor, grad_out: Tensor, place: Place, felt: int, needs: list[bool]
 ) -> tuple[Tensor | None, Tensor | None]:
     """The backward into touched rows; no op: how many there are depends on data."""
     grad_points = torch.empty_like(points) if needs[1] else None
@@ -241,7 +244,7 @@ def backward(
     table: Tensor,
     points: Tensor,
     grad_out: Tensor,
-    place: tuple,
+    place: Place,
     felt: int,
     needs: list[bool],
     sparse: bool,
