@@ -153,7 +153,8 @@ def test_a_training_is_ended_from_a_browser(data, tmp_path, looking, caplog):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "Spectators", Stops)
-        run = train(config(data, tmp_path / "run", iterations=100_000), view=ANY)
+        cfg = dataclasses.replace(config(data, tmp_path / "run", iterations=100_000), minutes=1.0)
+        run = train(cfg, view=ANY)
     scene, state = load_checkpoint(run)
     assert state["finished"]
     assert state["stage"] == 3
