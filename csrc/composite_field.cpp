@@ -214,9 +214,14 @@ void pull_at_ray(const FieldRays<T, Nodes>& in, int64_t ray, const T* all_held, 
         mean += w.share[i] * dot;
     }
     mean = w.read > 0 ? mean / w.read : T(0);
+    // One way for all places in memory: the compiler's own check whether arrays overlap may choose
+    // between loops that round differently
+    T* o = own.data();
+    const T *share = w.share.data(), *t = in.t + from, least = w.least;
+#pragma omp simd
     for (int64_t i = 0; i < n; ++i) {
-        const T beyond = w.reads(i) ? scale * (own[i] - mean) : T(0);
-        own[i] = mean + beyond + g[1] * in.t[from + i] + g[0];
+        const T beyond = share[i] >= least ? scale * (o[i] - mean) : T(0);
+        o[i] = mean + beyond + g[1] * t[i] + g[0];
     }
 
     T* value = pulls.value + from;
