@@ -20,7 +20,9 @@ function(add_core_variants)
     target_include_directories(univoxel_bindings PRIVATE csrc)
     target_link_libraries(univoxel_bindings PRIVATE
         pybind11::module univoxel_embree univoxel_warnings univoxel_sanitizers glm::glm)
-    if(UNIVOXEL_SANITIZE)  # instrumented templates of pybind11 take minutes to optimise
+    set(optimisation -O3)
+    if(UNIVOXEL_SANITIZE)  # instrumented code takes minutes to optimise
+        set(optimisation -O1)
         target_compile_options(univoxel_bindings PRIVATE -O1)
         set(extras NO_EXTRAS)  # not stripped: reports name functions and lines
     endif()
@@ -31,7 +33,7 @@ function(add_core_variants)
             OpenMP::OpenMP_CXX glm::glm univoxel_embree univoxel_warnings univoxel_sanitizers)
         # No -ffast-math: at link time it would flush denormals in the whole process, torch included.
         target_compile_options(kernels_${variant} PRIVATE
-            -O3 -fno-math-errno -fno-trapping-math ${UNIVOXEL_FLAGS_${variant}})
+            ${optimisation} -fno-math-errno -fno-trapping-math ${UNIVOXEL_FLAGS_${variant}})
         pybind11_add_module(core_${variant} ${extras} $<TARGET_OBJECTS:univoxel_bindings>)
         set_target_properties(core_${variant} PROPERTIES
             OUTPUT_NAME _core
