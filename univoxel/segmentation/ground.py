@@ -1,0 +1,305 @@
+"""Objects on a patterned floor or table: what lies in its plane looks alike from everywhere.
+
+Seen through any two cameras, points of a plane have one colour where nothing stands on it. So the
+plane is found as the one on which photographs agree best, its picture as what most of them show,
+and a pixel that shows something else than the picture is of what stands on the plane, or beyond its
+edge. A hull tells those apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+from scipy.optimize import minimize
+from skimage.measure import label
+from torch import Tensor
+from torch.nn.functional import grid_sample, interpolate, max_pool2d
+
+from univoxel.bars import track
+from univoxel.camera import Cameras, image_rays, pixel_width, project, resize
+from univoxel.errors import UserError
+from univoxel.grid import GridShape, fit_grid
+from univoxel.segmentation.config import GroundConfig, VoteConfig
+from univoxel.segmentation.distances import surroundings
+from univoxel.segmentation.vote import elect, largest_votes, shrunk, votes
+
+GROUND = GroundConfig()
+ROUGH = VoteConfig(pixels=96, voxels=48, first_voxels=24)  # enough to compare thresholds
+
+
+@dataclass(frozen=True)
+class Plane:
+    """z = height + slope (x, y) around a middle."""
+
+    middle: Tensor  # [2] x, y
+    height: float  # there
+    slope: tuple[float, float]
+
+    def points(self, half: float, count: int) -> Tensor:
+        """A grid [count count, 3] over a square around the middle, x first."""
+        side = ((torch.arange(count) + 0.5) / count * 2 - 1) * half
+        x, y = torch.meshgrid(side, side, indexing="ij")
+        z = self.height + self.slope[0] * x + self.slope[1] * y
+        return torch.stack([x + self.middle[0], y + self.middle[1], z], -1).reshape(-1, 3)
+
+    def met(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Where rays [N, 3] meet it: x, y from the middle [N, 2], and whether they do [N]."""
+        normal = torch.tensor([-self.slope[0], -self.slope[1], 1.0])
+        begin = origin - torch.cat([self.middle, torch.tensor([self.height])])
+        away = -(begin @ normal) / (direction @ normal)
+        place = begin + away[:, None] * direction
+        return place[:, :2], (away > 0) & place.isfinite().all(1)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A plane with its picture, and the hull of what stands on it."""
+
+    plane: Plane
+    half: float  # of the square that the picture covers, world units
+    picture: Tensor  # [3, N, N] sRGB in [0, 1], along x and y
+    known: Tensor  # [N, N] 1 where photographs agree on it, else 0
+    grid: GridShape
+    vote: Tensor  # [X, Y, Z] share of the photographs that see no floor behind a node
+    threshold: float  # the vote from which on a node belongs to the object
+    around: Tensor  # [X, Y, Z] whether a node is in or beside the object's part of the hull
+
+
+def find_ground(
+    photographs: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig = GROUND
+) -> Ground | None:
+    """What an object stands on, in photographs [H, W, 3] uint8 of a world with +Z up.
+
+    None where there is no plane on which photographs agree, or no object on it.
+    """
+    small = resize(cameras, min(cameras.width, cfg.pixels))
+    sharp = [_small(one, small.size(v)) for v, one in enumerate(photographs)]
+    plane = find_plane(sharp, small, cfg)
+    if plane is None:
+        return None
+    lower, upper = surroundings(small)
+    half = cfg.reach * float((upper - lower).max()) / 2
+    soft = [_blurred(one, cfg.blur) for one in sharp]
+    picture, known = _picture(plane, half, soft, small, cfg)
+    flat = Ground(plane, half, picture, known, *_nothing(lower, upper))
+    shown = [_beside_floor(flat, one, small, v, cfg) for v, one in enumerate(soft)]
+    return _carved(flat, shown, small, (lower, upper), cfg)
+
+
+def ground_mask(
+    ground: Ground, photograph: Tensor, cameras: Cameras, view: int, cfg: GroundConfig = GROUND
+) -> Tensor:
+    """The mask [H, W], 0 or 1, of a photograph [H, W, 3] uint8 by what stands on the ground."""
+    small = resize(cameras, min(cameras.width, cfg.pixels))
+    picture = _blurred(_small(photograph, small.size(view)), cfg.blur)
+    found = _object(ground, _beside_floor(ground, picture, small, view, cfg), small, view, cfg)
+    whole = interpolate(found[None, None], photograph.shape[:2], mode="bilinear")[0, 0]
+    return (whole >= 0.5).float()
+
+
+def find_plane(
+    pictures: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig = GROUND
+) -> Plane | None:
+    """The plane on which pictures [3, H, W] agree best; None where they agree on no one clearly.
+
+    It may lean by a few degrees from the horizontal, and is below the cameras.
+    """
+    lower, upper = surroundings(cameras)
+    middle, half = (lower + upper) / 2, float((upper - lower).max()) / 2
+    chosen = torch.arange(0, len(cameras), max(1, len(cameras) // cfg.views))
+    some, cams = [pictures[v] for v in chosen.tolist()], cameras.of(chosen)
+    square = cfg.searched * half
+
+    def disagreement(values: Sequence[float], blurred: Sequence[Tensor]) -> float:
+        plane = Plane(middle[:2], float(values[0]), (float(values[1]), float(values[2])))
+        return _disagreement(plane.points(square, cfg.points), blurred, cams, cfg)
+
+    coarse = [_blurred(one, cfg.blurs[0]) for one in some]
+    top = min(float(middle[2]) + half, float(cameras.camera_to_world[:, 2, 3].min()))
+    heights = np.linspace(float(middle[2]) - 2 * half, top, cfg.heights)
+    found = [disagreement((z, 0, 0), coarse) for z in track(heights, "looking for the ground")]
+    best = int(np.argmin(found))
+    if found[best] > cfg.clearly * float(np.median(found)):
+        return None
+    values = np.array([heights[best], 0.0, 0.0])
+    for blur in cfg.blurs:
+        blurred = [_blurred(one, blur) for one in some]
+        step = blur * pixel_width(cameras, middle) * np.array([1, 1 / half, 1 / half])
+        simplex = np.concatenate([values[None], values + np.diag(step)])
+        options = {"initial_simplex": simplex, "maxfev": cfg.trials, "xatol": 1e-5, "fatol": 1e-4}
+        result = minimize(disagreement, values, (blurred,), "Nelder-Mead", options=options)
+        values = result.x
+    if result.fun > cfg.agree:
+        return None
+    return Plane(middle[:2], float(values[0]), (float(values[1]), float(values[2])))
+
+
+def _small(photograph: Tensor, size: tuple[int, int]) -> Tensor:
+    """A photograph [H, W, 3] uint8 as [3, h, w] in [0, 1]."""
+    whole = photograph.permute(2, 0, 1)[None].float() / 255
+    return interpolate(whole, (size[1], size[0]), mode="area")[0]
+
+
+def _blurred(picture: Tensor, sigma: float) -> Tensor:
+    return torch.from_numpy(ndimage.gaussian_filter(picture.numpy(), (0, sigma, sigma)))
+
+
+def _looked_up(
+    pictures: Sequence[Tensor], cameras: Cameras, points: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Colours [V, N, 3] of points [N, 3] in each picture, and whether they are in it [V, N]."""
+    colors, seen = [], []
+    for view, picture in enumerate(pictures):
+        pixel, depth = project(cameras, view, points)
+        uv = pixel * (2 / torch.tensor(cameras.size(view))) - 1
+        found = grid_sample(picture[None], uv[None, None], align_corners=False)
+        colors.append(found[0, :, 0].T)
+        seen.append((depth > 0) & (uv.abs() <= 1).all(1))
+    return torch.stack(colors), torch.stack(seen)
+
+
+def _disagreement(
+    points: Tensor, pictures: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig
+) -> float:
+    """How much colours of a point differ between pictures, over how much they do between points.
+
+    Large where too few points are seen, or all look alike: that says nothing.
+    """
+    colors, seen = _looked_up(pictures, cameras, points)
+    colors = torch.where(seen[..., None], colors, torch.nan)
+    usual = colors.nanmedian(0).values
+    differs = (colors - usual).abs().sum(2).nanmedian(0).values
+    enough = seen.sum(0) >= max(cfg.seen, cfg.seen_share * len(pictures))
+    if enough.float().mean() < cfg.seen_share:
+        return torch.inf
+    usual = usual[enough]
+    spread = (usual - usual.median(0).values).abs().sum(1).median()
+    # Half of the points may be hidden by the object from half of the cameras
+    return float(differs[enough].quantile(cfg.hidden) / (spread + cfg.noise))
+
+
+def _picture(
+    plane: Plane, half: float, pictures: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig
+) -> tuple[Tensor, Tensor]:
+    """What most pictures show at each place of the plane: [3, N, N], and where they agree."""
+    chosen = torch.arange(0, len(cameras), max(1, len(cameras) // cfg.views))
+    some, cams = [pictures[v] for v in chosen.tolist()], cameras.of(chosen)
+    points = plane.points(half, cfg.side)
+    color, known = torch.zeros(len(points), 3), torch.zeros(len(points))
+    asked = range(0, len(some), max(1, len(some) // cfg.candidates))
+    parts = list(torch.arange(len(points)).split(1 << 14))
+    for part in track(parts, "drawing the ground"):
+        found, seen = _looked_up(some, cams, points[part])
+        most, mean = torch.zeros(len(part)), torch.zeros(len(part), 3)
+        for v in asked:
+            like = ((found - found[v]).abs().amax(2) < cfg.tolerance) & seen & seen[v]
+            number = like.sum(0)
+            better = number > most
+            most = torch.where(better, number, most)
+            average = (found * like[..., None]).sum(0) / number.clamp_min(1)[:, None]
+            mean = torch.where(better[:, None], average, mean)
+        enough = (most >= cfg.seen) & (most >= cfg.alike * seen.sum(0))
+        color[part], known[part] = mean, enough.float()
+    return color.T.reshape(3, cfg.side, cfg.side), known.reshape(cfg.side, cfg.side)
+
+
+def _beside_floor(
+    ground: Ground, picture: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
+) -> Tensor:
+    """Pixels [H, W] of a blurred picture [3, H, W] that do not show the floor: 0 or 1."""
+    width, height = cameras.size(view)
+    rays = image_rays(cameras, view)
+    place, meets = ground.plane.met(rays.origin, rays.direction)
+    where = (place / ground.half).flip(1)
+    meets &= (where.abs() < 1).all(1)
+    where = torch.where(meets[:, None], where, 2.0)[None, None]
+    layers = torch.cat([ground.picture, ground.known[None]])[None]
+    *floor, known = grid_sample(layers, where, align_corners=False)[0].reshape(4, height, width)
+    around = torch.nn.functional.pad(torch.stack(floor)[None], (1, 1, 1, 1), mode="replicate")[0]
+    # A pixel's width of error is forgiven: cameras and plane are not exact
+    differs = torch.stack(
+        [
+            (picture - around[:, i : i + height, j : j + width]).abs().amax(0)
+            for i in range(3)
+            for j in range(3)
+        ]
+    ).amin(0)
+    alike = ((differs < cfg.tolerance) & (known > 0.5)).float().numpy()
+    return torch.from_numpy((ndimage.uniform_filter(alike, cfg.patch) < 0.5).astype(np.float32))
+
+
+def _nothing(lower: Tensor, upper: Tensor) -> tuple[GridShape, Tensor, float, Tensor]:
+    grid = fit_grid(lower, upper, 8)
+    return grid, torch.zeros(grid.size), 1.0, torch.zeros(grid.size)
+
+
+def _carved(
+    flat: Ground,
+    shown: Sequence[Tensor],
+    cameras: Cameras,
+    box: tuple[Tensor, Tensor],
+    cfg: GroundConfig,
+) -> Ground | None:
+    """The ground with the hull whose silhouettes agree best with what is not floor."""
+    lower, upper = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
+    low, high = lower - cfg.room * upper, lower + cfg.room * upper
+    low[2] = flat.plane.height
+    grid = fit_grid(low, high, cfg.voxels**3)
+    rough = [shrunk(one, ROUGH.pixels) for one in shown]
+    vote = votes(rough, cameras, grid)
+    best, agreed = None, cfg.overlap
+    for threshold in cfg.thresholds:
+        around = _largest_part(vote >= threshold, grid, flat.plane.height)
+        if around is None:
+            continue
+        ground = Ground(
+            *(flat.plane, flat.half, flat.picture, flat.known, grid, vote, threshold),
+            around=max_pool2d(around.float(), 3, 1, 1),
+        )
+        masks = [_object(ground, one, cameras, v, cfg) for v, one in enumerate(rough)]
+        try:
+            hull, _ = elect(masks, cameras, ROUGH)
+        except UserError:  # nothing in common
+            continue
+        if hull.usual >= agreed:
+            best, agreed = ground, hull.usual
+    return best
+
+
+def _largest_part(inside: Tensor, grid: GridShape, height: float) -> Tensor | None:
+    """The part of nodes [X, Y, Z] that has most of them; None where it ends at the box's sides."""
+    parts = np.asarray(label(inside.numpy(), connectivity=1))
+    size = np.bincount(parts.ravel())
+    size[0] = 0
+    if not size.any():
+        return None
+    part = parts == size.argmax()
+    sides = (part[0], part[-1], part[:, 0], part[:, -1], part[:, :, -1])
+    return None if any(side.any() for side in sides) else torch.from_numpy(part)
+
+
+def _object(
+    ground: Ground, shown: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
+) -> Tensor:
+    """Of pixels that do not show the floor [H, W] those of the object; 0 or 1."""
+    vote = torch.where(ground.around > 0, ground.vote, 0.0)
+    small = shrunk(shown, ROUGH.pixels).shape
+    largest = largest_votes(ground.grid, vote, cameras, view, small)
+    silhouette = interpolate(largest[None, None], shown.shape, mode="bilinear")[0, 0]
+    found = ((silhouette >= ground.threshold) & (shown > 0.5)).numpy()
+    return torch.from_numpy(_without_specks(found, cfg.speck)).float()
+
+
+def _without_specks(found: np.ndarray, share: float) -> np.ndarray:
+    """A mask [H, W] without parts, and without holes, that are small against the whole."""
+    least = share * found.sum()
+    for value in (True, False):
+        parts = np.asarray(label(found == value, connectivity=1))
+        size = np.bincount(parts.ravel())
+        size[0] = len(found.ravel())
+        found = np.where(size[parts] < least, not value, found)
+    return found
