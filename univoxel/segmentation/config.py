@@ -160,40 +160,39 @@ class GroundConfig:
     # Disagreement between pictures over that between points, at most, > 0: .07 on that floor
     agree: float = 0.35
     # Its picture
-    reach: float = 3.0  # half width of the square, in those of what is looked at, > 0
-    side: int = 512  # places along it, >= 2
+    # Half of the picture's places are within so many half widths of what is looked at, > 0; the
+    # others are the wider, the farther away
+    near: float = 2.0
+    side: int = 768  # places along it, >= 2
     blur: float = 1.0  # pixels, of pictures that are compared with it, > 0
     candidates: int = 10  # pictures whose colour others are asked to share, about; >= 1
     tolerance: float = 0.08  # sRGB, within which colours are alike, > 0
     alike: float = 0.3  # of the pictures that see a place: so many share its colour, in (0, 1)
     patch: int = 5  # pixels along a square whose majority decides, odd, >= 1
     # The object on it
-    room: float = 1.5  # half width of the hull's box, in those of what is looked at, > 0
-    voxels: int = 64  # along its sides, about; >= 8
-    # Share of the pictures that see no floor behind a node of the hull, in (0, 1): each is tried
-    thresholds: tuple[float, ...] = (0.8, 0.9, 0.95, 0.98)
-    overlap: float = 0.9  # median IoU with the hull from which on masks are believed, in (0, 1)
+    voxels: int = 64  # along the sides of the hull's box, about; >= 8
+    rough: int = 96  # pixels of the longer side of the pictures that make it, >= 8
+    # Share of the pictures that see no floor behind a node, all in (0, 1): from `first` on what
+    # hangs together is the object, and the silhouettes that agree best are of one in between
+    first: float = 0.9
+    lowest: float = 0.7
+    highest: float = 0.98
+    band: int = 4  # of those pixels, beside the first silhouette, that are compared; >= 1
+    overlap: float = 0.85  # median IoU with the hull from which on masks are believed, in (0, 1)
     speck: float = 0.005  # of the mask's area, >= 0: smaller parts and holes are none
 
     def __post_init__(self) -> None:
         check_fields(self, "at least 16", lambda x: x >= 16, "pixels")
-        check_fields(self, "at least 8", lambda x: x >= 8, "voxels")
-        check_fields(
-            self, "at least 2", lambda x: x >= 2, "views", "heights", "points", "side"
-        )
-        check_fields(self, "at least 1", lambda x: x >= 1, "trials", "seen", "candidates")
+        check_fields(self, "at least 8", lambda x: x >= 8, "voxels", "rough")
+        check_fields(self, "at least 2", lambda x: x >= 2, "views", "heights", "points", "side")
+        check_fields(self, "at least 1", lambda x: x >= 1, "trials", "seen", "candidates", "band")
         check_fields(self, "odd and at least 1", lambda x: x >= 1 and x % 2 == 1, "patch")
-        positive = ("searched", "noise", "agree", "reach", "blur", "tolerance", "room")
+        positive = ("searched", "noise", "agree", "near", "blur", "tolerance")
         check_fields(self, "above 0", lambda x: x > 0, *positive)
         check_fields(self, "at least 0", lambda x: x >= 0, "speck")
         shares = ("seen_share", "hidden", "clearly", "alike", "overlap")
+        shares += ("first", "lowest", "highest")
         check_fields(self, "in (0, 1)", lambda x: 0 < x < 1, *shares)
         check_fields(
             self, "one or more numbers above 0", lambda x: len(x) > 0 and min(x) > 0, "blurs"
-        )
-        check_fields(
-            self,
-            "one or more numbers in (0, 1)",
-            lambda x: len(x) > 0 and all(0 < t < 1 for t in x),
-            "thresholds",
         )

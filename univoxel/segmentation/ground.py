@@ -8,6 +8,7 @@ edge. A hull tells those apart.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,18 +18,19 @@ from scipy import ndimage
 from scipy.optimize import minimize
 from skimage.measure import label
 from torch import Tensor
-from torch.nn.functional import grid_sample, interpolate, max_pool2d
+from torch.nn.functional import grid_sample, interpolate, max_pool2d, max_pool3d, pad
 
 from univoxel.bars import track
 from univoxel.camera import Cameras, image_rays, pixel_width, project, resize
-from univoxel.errors import UserError
 from univoxel.grid import GridShape, fit_grid
-from univoxel.segmentation.config import GroundConfig, VoteConfig
+from univoxel.segmentation.config import GroundConfig
 from univoxel.segmentation.distances import surroundings
-from univoxel.segmentation.vote import elect, largest_votes, shrunk, votes
+from univoxel.segmentation.vote import largest_votes, overlaps, shrunk, votes
+
+log: logging.Logger = logging.getLogger("univoxel")
 
 GROUND = GroundConfig()
-ROUGH = VoteConfig(pixels=96, voxels=48, first_voxels=24)  # enough to compare thresholds
+THRESHOLDS = 40  # that are tried
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,8 @@ class Plane:
     height: float  # there
     slope: tuple[float, float]
 
-    def points(self, half: float, count: int) -> Tensor:
-        """A grid [count count, 3] over a square around the middle, x first."""
-        side = ((torch.arange(count) + 0.5) / count * 2 - 1) * half
+    def points(self, side: Tensor) -> Tensor:
+        """A grid [K K, 3] of K places along x and along y, from the middle."""
         x, y = torch.meshgrid(side, side, indexing="ij")
         z = self.height + self.slope[0] * x + self.slope[1] * y
         return torch.stack([x + self.middle[0], y + self.middle[1], z], -1).reshape(-1, 3)
@@ -56,17 +57,23 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class Ground:
-    """A plane with its picture, and the hull of what stands on it."""
+class Floor:
+    """A plane with its picture."""
 
     plane: Plane
-    half: float  # of the square that the picture covers, world units
+    near: float  # from the middle, world units: a quarter of the picture's width, see `warped`
     picture: Tensor  # [3, N, N] sRGB in [0, 1], along x and y
     known: Tensor  # [N, N] 1 where photographs agree on it, else 0
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A floor, and the hull of what stands on it."""
+
+    floor: Floor
     grid: GridShape
-    vote: Tensor  # [X, Y, Z] share of the photographs that see no floor behind a node
+    vote: Tensor  # [X, Y, Z] share of the photographs that see no floor behind a node; 0 far off
     threshold: float  # the vote from which on a node belongs to the object
-    around: Tensor  # [X, Y, Z] whether a node is in or beside the object's part of the hull
 
 
 def find_ground(
@@ -81,13 +88,11 @@ def find_ground(
     plane = find_plane(sharp, small, cfg)
     if plane is None:
         return None
-    lower, upper = surroundings(small)
-    half = cfg.reach * float((upper - lower).max()) / 2
+    box = surroundings(small)
     soft = [_blurred(one, cfg.blur) for one in sharp]
-    picture, known = _picture(plane, half, soft, small, cfg)
-    flat = Ground(plane, half, picture, known, *_nothing(lower, upper))
-    shown = [_beside_floor(flat, one, small, v, cfg) for v, one in enumerate(soft)]
-    return _carved(flat, shown, small, (lower, upper), cfg)
+    floor = _floor(plane, cfg.near * float((box[1] - box[0]).max()) / 2, soft, small, cfg)
+    seen = [_seen(floor, one, small, v, cfg) for v, one in enumerate(soft)]
+    return _carved(floor, seen, small, box, cfg)
 
 
 def ground_mask(
@@ -96,7 +101,7 @@ def ground_mask(
     """The mask [H, W], 0 or 1, of a photograph [H, W, 3] uint8 by what stands on the ground."""
     small = resize(cameras, min(cameras.width, cfg.pixels))
     picture = _blurred(_small(photograph, small.size(view)), cfg.blur)
-    found = _object(ground, _beside_floor(ground, picture, small, view, cfg), small, view, cfg)
+    found = _object(ground, *_seen(ground.floor, picture, small, view, cfg), small, view, cfg)
     whole = interpolate(found[None, None], photograph.shape[:2], mode="bilinear")[0, 0]
     return (whole >= 0.5).float()
 
@@ -112,11 +117,11 @@ def find_plane(
     middle, half = (lower + upper) / 2, float((upper - lower).max()) / 2
     chosen = torch.arange(0, len(cameras), max(1, len(cameras) // cfg.views))
     some, cams = [pictures[v] for v in chosen.tolist()], cameras.of(chosen)
-    square = cfg.searched * half
+    side = cfg.searched * half * _places(cfg.points)
 
     def disagreement(values: Sequence[float], blurred: Sequence[Tensor]) -> float:
         plane = Plane(middle[:2], float(values[0]), (float(values[1]), float(values[2])))
-        return _disagreement(plane.points(square, cfg.points), blurred, cams, cfg)
+        return _disagreement(plane.points(side), blurred, cams, cfg)
 
     coarse = [_blurred(one, cfg.blurs[0]) for one in some]
     top = min(float(middle[2]) + half, float(cameras.camera_to_world[:, 2, 3].min()))
@@ -136,6 +141,16 @@ def find_plane(
     if result.fun > cfg.agree:
         return None
     return Plane(middle[:2], float(values[0]), (float(values[1]), float(values[2])))
+
+
+def warped(place: Tensor, near: float) -> Tensor:
+    """Where places [N, 2] are in the picture of the ground, which holds all of it: in (-1, 1)."""
+    return place / (near + place.abs())
+
+
+def _places(count: int) -> Tensor:
+    """So many, evenly, in (-1, 1)."""
+    return (torch.arange(count) + 0.5) / count * 2 - 1
 
 
 def _small(photograph: Tensor, size: tuple[int, int]) -> Tensor:
@@ -182,13 +197,14 @@ def _disagreement(
     return float(differs[enough].quantile(cfg.hidden) / (spread + cfg.noise))
 
 
-def _picture(
-    plane: Plane, half: float, pictures: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig
-) -> tuple[Tensor, Tensor]:
-    """What most pictures show at each place of the plane: [3, N, N], and where they agree."""
+def _floor(
+    plane: Plane, near: float, pictures: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig
+) -> Floor:
+    """A plane with what most pictures show at each place of it."""
     chosen = torch.arange(0, len(cameras), max(1, len(cameras) // cfg.views))
     some, cams = [pictures[v] for v in chosen.tolist()], cameras.of(chosen)
-    points = plane.points(half, cfg.side)
+    side = _places(cfg.side)
+    points = plane.points(near * side / (1 - side.abs()))
     color, known = torch.zeros(len(points), 3), torch.zeros(len(points))
     asked = range(0, len(some), max(1, len(some) // cfg.candidates))
     parts = list(torch.arange(len(points)).split(1 << 14))
@@ -204,22 +220,23 @@ def _picture(
             mean = torch.where(better[:, None], average, mean)
         enough = (most >= cfg.seen) & (most >= cfg.alike * seen.sum(0))
         color[part], known[part] = mean, enough.float()
-    return color.T.reshape(3, cfg.side, cfg.side), known.reshape(cfg.side, cfg.side)
+    shape = cfg.side, cfg.side
+    return Floor(plane, near, color.T.reshape(3, *shape), known.reshape(shape))
 
 
-def _beside_floor(
-    ground: Ground, picture: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
-) -> Tensor:
-    """Pixels [H, W] of a blurred picture [3, H, W] that do not show the floor: 0 or 1."""
+def _seen(
+    floor: Floor, picture: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
+) -> tuple[Tensor, Tensor]:
+    """Pixels [H, W] of a blurred picture [3, H, W] that do not show the floor, and those behind
+    which the floor is known: 0 or 1."""
     width, height = cameras.size(view)
     rays = image_rays(cameras, view)
-    place, meets = ground.plane.met(rays.origin, rays.direction)
-    where = (place / ground.half).flip(1)
-    meets &= (where.abs() < 1).all(1)
+    place, meets = floor.plane.met(rays.origin, rays.direction)
+    where = warped(place, floor.near).flip(1)
     where = torch.where(meets[:, None], where, 2.0)[None, None]
-    layers = torch.cat([ground.picture, ground.known[None]])[None]
-    *floor, known = grid_sample(layers, where, align_corners=False)[0].reshape(4, height, width)
-    around = torch.nn.functional.pad(torch.stack(floor)[None], (1, 1, 1, 1), mode="replicate")[0]
+    layers = torch.cat([floor.picture, floor.known[None]])[None]
+    *colors, known = grid_sample(layers, where, align_corners=False)[0].reshape(4, height, width)
+    around = pad(torch.stack(colors)[None], (1, 1, 1, 1), mode="replicate")[0]
     # A pixel's width of error is forgiven: cameras and plane are not exact
     differs = torch.stack(
         [
@@ -229,68 +246,75 @@ def _beside_floor(
         ]
     ).amin(0)
     alike = ((differs < cfg.tolerance) & (known > 0.5)).float().numpy()
-    return torch.from_numpy((ndimage.uniform_filter(alike, cfg.patch) < 0.5).astype(np.float32))
-
-
-def _nothing(lower: Tensor, upper: Tensor) -> tuple[GridShape, Tensor, float, Tensor]:
-    grid = fit_grid(lower, upper, 8)
-    return grid, torch.zeros(grid.size), 1.0, torch.zeros(grid.size)
+    shown = torch.from_numpy(ndimage.uniform_filter(alike, cfg.patch)) < 0.5
+    return shown.float(), (known > 0.5).float()
 
 
 def _carved(
-    flat: Ground,
-    shown: Sequence[Tensor],
+    floor: Floor,
+    seen: Sequence[tuple[Tensor, Tensor]],
     cameras: Cameras,
     box: tuple[Tensor, Tensor],
     cfg: GroundConfig,
 ) -> Ground | None:
-    """The ground with the hull whose silhouettes agree best with what is not floor."""
-    lower, upper = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
-    low, high = lower - cfg.room * upper, lower + cfg.room * upper
-    low[2] = flat.plane.height
-    grid = fit_grid(low, high, cfg.voxels**3)
-    rough = [shrunk(one, ROUGH.pixels) for one in shown]
-    vote = votes(rough, cameras, grid)
-    best, agreed = None, cfg.overlap
-    for threshold in cfg.thresholds:
-        around = _largest_part(vote >= threshold, grid, flat.plane.height)
-        if around is None:
-            continue
-        ground = Ground(
-            *(flat.plane, flat.half, flat.picture, flat.known, grid, vote, threshold),
-            around=max_pool2d(around.float(), 3, 1, 1),
-        )
-        masks = [_object(ground, one, cameras, v, cfg) for v, one in enumerate(rough)]
-        try:
-            hull, _ = elect(masks, cameras, ROUGH)
-        except UserError:  # nothing in common
-            continue
-        if hull.usual >= agreed:
-            best, agreed = ground, hull.usual
-    return best
+    """The ground with the hull of what hides it; None where that is not one object within the box.
+
+    Args:
+        seen: as `_seen` has them.
+    """
+    lower, upper = box
+    lower = torch.cat([lower[:2], lower.new_tensor([floor.plane.height])])
+    grid = fit_grid(lower, upper, cfg.voxels**3)
+    shown, known = ([shrunk(one[i], cfg.rough).round() for one in seen] for i in (0, 1))
+    vote = votes(shown, cameras, grid)
+    part = _largest_part(vote >= cfg.first)
+    if part is None:
+        return None
+    around = max_pool3d(part[None].float(), 3, 1, 1)[0]
+    vote = torch.where(around > 0, vote, 0.0)
+    levels = torch.linspace(cfg.lowest, cfg.highest, THRESHOLDS)
+    agreed = []
+    for view, (one, behind) in enumerate(zip(shown, known, strict=True)):
+        largest = largest_votes(grid, vote, cameras, view, one.shape)
+        beside = behind * one * _grown(largest >= cfg.first, cfg.band)
+        agreed.append(overlaps(largest * behind, beside, levels))
+    medians = torch.stack(agreed).quantile(0.5, 0)
+    log.debug("the hull on the ground agrees to %.3f", float(medians.max()))
+    if medians.max() < cfg.overlap:
+        return None
+    return Ground(floor, grid, vote, float(levels[medians.argmax()]))
 
 
-def _largest_part(inside: Tensor, grid: GridShape, height: float) -> Tensor | None:
+def _largest_part(inside: Tensor) -> Tensor | None:
     """The part of nodes [X, Y, Z] that has most of them; None where it ends at the box's sides."""
     parts = np.asarray(label(inside.numpy(), connectivity=1))
     size = np.bincount(parts.ravel())
     size[0] = 0
-    if not size.any():
-        return None
     part = parts == size.argmax()
-    sides = (part[0], part[-1], part[:, 0], part[:, -1], part[:, :, -1])
-    return None if any(side.any() for side in sides) else torch.from_numpy(part)
+    sides = (part[0], part[-1], part[:, 0], part[:, -1])
+    return None if not size.any() or any(one.any() for one in sides) else torch.from_numpy(part)
+
+
+def _grown(mask: Tensor, pixels: int) -> Tensor:
+    """A mask [H, W] grown by pixels: 0 or 1."""
+    return max_pool2d(mask[None].float(), 2 * pixels + 1, 1, pixels)[0]
 
 
 def _object(
-    ground: Ground, shown: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
+    ground: Ground, shown: Tensor, known: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
 ) -> Tensor:
-    """Of pixels that do not show the floor [H, W] those of the object; 0 or 1."""
-    vote = torch.where(ground.around > 0, ground.vote, 0.0)
-    small = shrunk(shown, ROUGH.pixels).shape
-    largest = largest_votes(ground.grid, vote, cameras, view, small)
-    silhouette = interpolate(largest[None, None], shown.shape, mode="bilinear")[0, 0]
-    found = ((silhouette >= ground.threshold) & (shown > 0.5)).numpy()
+    """Of pixels that do not show the floor [H, W] those of the object: 0 or 1.
+
+    Before the floor they are believed; elsewhere the silhouette is.
+    """
+    small = shrunk(shown, cfg.rough).shape
+    largest = largest_votes(ground.grid, ground.vote, cameras, view, small)
+    grown = _grown(largest >= ground.threshold, 1)
+    largest, grown = (
+        interpolate(one[None, None], shown.shape, mode="bilinear")[0, 0] for one in (largest, grown)
+    )
+    silhouette = torch.where(known > 0, grown >= 0.5, largest >= ground.threshold)
+    found = (silhouette & (shown > 0)).numpy()
     return torch.from_numpy(_without_specks(found, cfg.speck)).float()
 
 
@@ -300,6 +324,6 @@ def _without_specks(found: np.ndarray, share: float) -> np.ndarray:
     for value in (True, False):
         parts = np.asarray(label(found == value, connectivity=1))
         size = np.bincount(parts.ravel())
-        size[0] = len(found.ravel())
+        size[0] = found.size
         found = np.where(size[parts] < least, not value, found)
     return found
