@@ -177,6 +177,7 @@ class GroundConfig:
     first: float = 0.9
     lowest: float = 0.7
     highest: float = 0.98
+    certain: float = 0.96  # from which on it is the object's whatever a picture shows
     band: int = 4  # of those pixels, beside the first silhouette, that are compared; >= 1
     overlap: float = 0.85  # median IoU with the hull from which on masks are believed, in (0, 1)
     speck: float = 0.005  # of the mask's area, >= 0: smaller parts and holes are none
@@ -191,7 +192,7 @@ class GroundConfig:
         check_fields(self, "above 0", lambda x: x > 0, *positive)
         check_fields(self, "at least 0", lambda x: x >= 0, "speck")
         shares = ("seen_share", "hidden", "clearly", "alike", "overlap")
-        shares += ("first", "lowest", "highest")
+        shares += ("first", "lowest", "highest", "certain")
         check_fields(self, "in (0, 1)", lambda x: 0 < x < 1, *shares)
         check_fields(
             self, "one or more numbers above 0", lambda x: len(x) > 0 and min(x) > 0, "blurs"

@@ -64,6 +64,7 @@ class Floor:
     near: float  # from the middle, world units: a quarter of the picture's width, see `warped`
     picture: Tensor  # [3, N, N] sRGB in [0, 1], along x and y
     known: Tensor  # [N, N] 1 where photographs agree on it, else 0
+    within: Tensor  # [N, N] 1 there and where only the object hides it
 
 
 @dataclass(frozen=True)
@@ -221,21 +222,24 @@ def _floor(
         enough = (most >= cfg.seen) & (most >= cfg.alike * seen.sum(0))
         color[part], known[part] = mean, enough.float()
     shape = cfg.side, cfg.side
-    return Floor(plane, near, color.T.reshape(3, *shape), known.reshape(shape))
+    known = known.reshape(shape)
+    within = torch.from_numpy(ndimage.binary_fill_holes(known.numpy() > 0)).float()
+    return Floor(plane, near, color.T.reshape(3, *shape), known, within)
 
 
 def _seen(
     floor: Floor, picture: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
 ) -> tuple[Tensor, Tensor]:
-    """Pixels [H, W] of a blurred picture [3, H, W] that do not show the floor, and those behind
-    which the floor is known: 0 or 1."""
+    """Pixels [H, W] of a blurred picture [3, H, W] that do not show the floor, and those before it:
+    0 or 1."""
     width, height = cameras.size(view)
     rays = image_rays(cameras, view)
     place, meets = floor.plane.met(rays.origin, rays.direction)
     where = warped(place, floor.near).flip(1)
     where = torch.where(meets[:, None], where, 2.0)[None, None]
-    layers = torch.cat([floor.picture, floor.known[None]])[None]
-    *colors, known = grid_sample(layers, where, align_corners=False)[0].reshape(4, height, width)
+    layers = torch.cat([floor.picture, floor.known[None], floor.within[None]])[None]
+    found = grid_sample(layers, where, align_corners=False)[0].reshape(5, height, width)
+    *colors, known, within = found
     around = pad(torch.stack(colors)[None], (1, 1, 1, 1), mode="replicate")[0]
     # A pixel's width of error is forgiven: cameras and plane are not exact
     differs = torch.stack(
@@ -247,7 +251,7 @@ def _seen(
     ).amin(0)
     alike = ((differs < cfg.tolerance) & (known > 0.5)).float().numpy()
     shown = torch.from_numpy(ndimage.uniform_filter(alike, cfg.patch)) < 0.5
-    return shown.float(), (known > 0.5).float()
+    return shown.float(), (within > 0.5).float()
 
 
 def _carved(
@@ -265,7 +269,7 @@ def _carved(
     lower, upper = box
     lower = torch.cat([lower[:2], lower.new_tensor([floor.plane.height])])
     grid = fit_grid(lower, upper, cfg.voxels**3)
-    shown, known = ([shrunk(one[i], cfg.rough).round() for one in seen] for i in (0, 1))
+    shown, within = ([shrunk(one[i], cfg.rough).round() for one in seen] for i in (0, 1))
     vote = votes(shown, cameras, grid)
     part = _largest_part(vote >= cfg.first)
     if part is None:
@@ -274,7 +278,7 @@ def _carved(
     vote = torch.where(around > 0, vote, 0.0)
     levels = torch.linspace(cfg.lowest, cfg.highest, THRESHOLDS)
     agreed = []
-    for view, (one, behind) in enumerate(zip(shown, known, strict=True)):
+    for view, (one, behind) in enumerate(zip(shown, within, strict=True)):
         largest = largest_votes(grid, vote, cameras, view, one.shape)
         beside = behind * one * _grown(largest >= cfg.first, cfg.band)
         agreed.append(overlaps(largest * behind, beside, levels))
@@ -301,20 +305,22 @@ def _grown(mask: Tensor, pixels: int) -> Tensor:
 
 
 def _object(
-    ground: Ground, shown: Tensor, known: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
+    ground: Ground, shown: Tensor, within: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
 ) -> Tensor:
     """Of pixels that do not show the floor [H, W] those of the object: 0 or 1.
 
-    Before the floor they are believed; elsewhere the silhouette is.
+    Before the floor they are believed; elsewhere the silhouette is, and where hardly any picture
+    sees floor behind: what looks like it by chance does in one picture.
     """
     small = shrunk(shown, cfg.rough).shape
     largest = largest_votes(ground.grid, ground.vote, cameras, view, small)
-    grown = _grown(largest >= ground.threshold, 1)
-    largest, grown = (
-        interpolate(one[None, None], shown.shape, mode="bilinear")[0, 0] for one in (largest, grown)
+    hidden = largest < cfg.certain
+    parts = largest, _grown(largest >= ground.threshold, 1), _grown(hidden, 1)
+    largest, grown, hidden = (
+        interpolate(one[None, None], shown.shape, mode="bilinear")[0, 0] for one in parts
     )
-    silhouette = torch.where(known > 0, grown >= 0.5, largest >= ground.threshold)
-    found = (silhouette & (shown > 0)).numpy()
+    silhouette = torch.where(within > 0, grown >= 0.5, largest >= ground.threshold)
+    found = ((silhouette & (shown > 0)) | (hidden < 0.5)).numpy()
     return torch.from_numpy(_without_specks(found, cfg.speck)).float()
 
 

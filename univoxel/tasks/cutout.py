@@ -29,6 +29,7 @@ from univoxel.errors import DataError, ExistingFile, UserError
 from univoxel.pictures.mask_sheet import MaskTile, darkened, mask_sheet, worst_first, write_page
 from univoxel.segmentation.config import SegmentationConfig, VoteConfig
 from univoxel.segmentation.distances import corners, surroundings
+from univoxel.segmentation.ground import find_ground, ground_mask
 from univoxel.segmentation.network import network
 from univoxel.segmentation.plain import plain_mask, plain_threshold
 from univoxel.segmentation.separation import DEFAULTS, find_object, mask
@@ -92,9 +93,11 @@ def cutout(
         for name in splits_of(data)
     }
     log.info(photos.about)
-    before_plain = None if box or origin != COLOURS else _from_edges(splits, vote)
-    if before_plain:
-        masks = before_plain
+    without_box = None if box or origin != COLOURS else _from_edges(splits, vote)
+    if without_box is None and origin == COLOURS and not box:
+        without_box = _from_ground(splits, vote)
+    if without_box:
+        masks = without_box
         verdicts, told = _judged(splits, masks, vote)
     elif origin == COLOURS:
         masks = _from_colours(splits, box, seed, config)
@@ -149,6 +152,25 @@ def _from_edges(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
     log.info("plain surroundings: the object is what edges of %g a pixel shut off", threshold)
     return {
         name: [_bytes(plain_mask(_encoded(split, v), threshold)) for v in range(len(split))]
+        for name, split in splits.items()
+    }
+
+
+def _from_ground(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
+    """Masks of what stands on a patterned ground; None where there is none."""
+    train = splits["train"]
+    if len(train) < cfg.photographs:
+        return None
+    photographs = [_encoded(train, view) for view in range(len(train))]
+    ground = find_ground(photographs, train.cameras)
+    if ground is None:
+        return None
+    log.info("patterned ground: the object is what stands on it")
+    return {
+        name: [
+            _bytes(ground_mask(ground, _encoded(split, v), split.cameras, v))
+            for v in track(range(len(split)), "masks")
+        ]
         for name, split in splits.items()
     }
 
