@@ -163,11 +163,14 @@ class GroundConfig:
     # Half of the picture's places are within so many half widths of what is looked at, > 0; the
     # others are the wider, the farther away
     near: float = 2.0
-    side: int = 768  # places along it, >= 2
+    side: int = 512  # places along it, >= 2
     blur: float = 1.0  # pixels, of pictures that are compared with it, > 0
-    candidates: int = 10  # pictures whose colour others are asked to share, about; >= 1
+    candidates: int = 20  # pictures whose colour others are asked to share, about; >= 1
     tolerance: float = 0.08  # sRGB, within which colours are alike, > 0
-    alike: float = 0.3  # of the pictures that see a place: so many share its colour, in (0, 1)
+    alike: float = 0.2  # of the pictures that see a place: so many share its colour, in (0, 1)
+    above: float = 0.15  # half widths of what is looked at, by which a place is lifted, > 0
+    # Times as many pictures share its colour as then, >= 1: what has one colour has no height
+    better: float = 1.25
     patch: int = 5  # pixels along a square whose majority decides, odd, >= 1
     # The object on it
     voxels: int = 64  # along the sides of the hull's box, about; >= 8
@@ -186,9 +189,11 @@ class GroundConfig:
         check_fields(self, "at least 16", lambda x: x >= 16, "pixels")
         check_fields(self, "at least 8", lambda x: x >= 8, "voxels", "rough")
         check_fields(self, "at least 2", lambda x: x >= 2, "views", "heights", "points", "side")
-        check_fields(self, "at least 1", lambda x: x >= 1, "trials", "seen", "candidates", "band")
+        check_fields(
+            self, "at least 1", lambda x: x >= 1, "trials", "seen", "candidates", "band", "better"
+        )
         check_fields(self, "odd and at least 1", lambda x: x >= 1 and x % 2 == 1, "patch")
-        positive = ("searched", "noise", "agree", "near", "blur", "tolerance")
+        positive = ("searched", "noise", "agree", "near", "blur", "tolerance", "above")
         check_fields(self, "above 0", lambda x: x > 0, *positive)
         check_fields(self, "at least 0", lambda x: x >= 0, "speck")
         shares = ("seen_share", "hidden", "clearly", "alike", "overlap")

@@ -167,7 +167,7 @@ def _blurred(picture: Tensor, sigma: float) -> Tensor:
 def _looked_up(
     pictures: Sequence[Tensor], cameras: Cameras, points: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Colours [V, N, 3] of points [N, 3] in each picture, and whether they are in it [V, N]."""
+    """Values [V, N, C] of points [N, 3] in each picture, and whether they are in it [V, N]."""
     colors, seen = [], []
     for view, picture in enumerate(pictures):
         pixel, depth = project(cameras, view, points)
@@ -206,25 +206,42 @@ def _floor(
     some, cams = [pictures[v] for v in chosen.tolist()], cameras.of(chosen)
     side = _places(cfg.side)
     points = plane.points(near * side / (1 - side.abs()))
-    color, known = torch.zeros(len(points), 3), torch.zeros(len(points))
-    asked = range(0, len(some), max(1, len(some) // cfg.candidates))
+    above = cfg.above * near / cfg.near
+    value, known = torch.zeros(len(points), 3), torch.zeros(len(points))
     parts = list(torch.arange(len(points)).split(1 << 14))
     for part in track(parts, "drawing the ground"):
-        found, seen = _looked_up(some, cams, points[part])
-        most, mean = torch.zeros(len(part)), torch.zeros(len(part), 3)
-        for v in asked:
-            like = ((found - found[v]).abs().amax(2) < cfg.tolerance) & seen & seen[v]
-            number = like.sum(0)
-            better = number > most
-            most = torch.where(better, number, most)
-            average = (found * like[..., None]).sum(0) / number.clamp_min(1)[:, None]
-            mean = torch.where(better[:, None], average, mean)
-        enough = (most >= cfg.seen) & (most >= cfg.alike * seen.sum(0))
-        color[part], known[part] = mean, enough.float()
+        value[part], known[part] = _agreed(points[part], above, some, cams, cfg)
     shape = cfg.side, cfg.side
     known = known.reshape(shape)
     within = torch.from_numpy(ndimage.binary_fill_holes(known.numpy() > 0)).float()
-    return Floor(plane, near, color.T.reshape(3, *shape), known, within)
+    return Floor(plane, near, value.T.reshape(3, *shape), known, within)
+
+
+def _agreed(
+    points: Tensor, above: float, pictures: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig
+) -> tuple[Tensor, Tensor]:
+    """The colour [N, 3] that pictures share at points [N, 3], and whether it is of the floor [N].
+
+    An object of one colour has it at any height: what counts is how many pictures more show a
+    colour here than do that far above. Few may see the floor beneath an object.
+    """
+    found, seen = _looked_up(pictures, cameras, points)
+    higher, _ = _looked_up(pictures, cameras, points + torch.tensor([0, 0, above]))
+    enough = torch.clamp_min(cfg.alike * seen.sum(0), cfg.seen)
+    best, color, floor = (torch.zeros(len(points), *shape) for shape in ((), (3,), ()))
+    for v in range(0, len(pictures), max(1, len(pictures) // cfg.candidates)):
+        here, there = (
+            ((one - found[v]).abs().amax(2) < cfg.tolerance) & seen & seen[v]
+            for one in (found, higher)
+        )
+        number = here.sum(0)
+        more = number - cfg.better * there.sum(0)
+        better = (more > best) & (number >= enough)
+        mean = (found * here[..., None]).sum(0) / number.clamp_min(1)[:, None]
+        color = torch.where(better[:, None], mean, color)
+        floor = torch.where(better, 1.0, floor)
+        best = torch.where(better, more, best)
+    return color, floor
 
 
 def _seen(
