@@ -167,7 +167,7 @@ class GroundConfig:
     blur: float = 1.0  # pixels, of pictures that are compared with it, > 0
     candidates: int = 20  # pictures whose colour others are asked to share, about; >= 1
     tolerance: float = 0.08  # sRGB, within which colours are alike, > 0
-    alike: float = 0.2  # of the pictures that see a place: so many share its colour, in (0, 1)
+    alike: float = 0.3  # of the pictures that see a place: so many share its colour, in (0, 1)
     above: float = 0.15  # half widths of what is looked at, by which a place is lifted, > 0
     # Times as many pictures share its colour as then, >= 1: what has one colour has no height
     better: float = 1.25
