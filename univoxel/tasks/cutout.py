@@ -1,10 +1,11 @@
 """Cut an object out of photographs without masks.
 
 Masks come from colours alone, from a network, or from a folder. Colours: before plain walls and on
-plain desks the object is what edges shut off from the picture's border. Elsewhere a coarse surface
-within a box and a backdrop around it explain the photographs together; what cameras all around
-agree on inside the box is the object, and its silhouettes are the masks. Masks of single
-photographs vote for a hull, and those that it contradicts are mended.
+plain desks the object is what edges shut off from the picture's border; on a patterned ground it is
+what hides that. Elsewhere a coarse surface within a box and a backdrop around it explain the
+photographs together; what cameras all around agree on inside the box is the object, and its
+silhouettes are the masks. Masks of single photographs vote for a hull, and those that it
+contradicts are mended.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def cutout(
             folder of masks with the stems of the photographs.
         box: lower and upper corner of where the object is, world units; by default a cube around
             what the cameras look at, as large as their pictures. For masks from colours; plain
-            surroundings are then not looked for.
+            surroundings and a ground are then not looked for.
         downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
         config: how the object is found from colours.
         allow_outside: as of `load_photos`.
