@@ -116,7 +116,7 @@ def photograph(folder: Path, views: int) -> tuple[list[str], list[Tensor]]:
     for name, view in zip(names, seen, strict=True):
         picture, mask = textured_room.photograph(view)
         picture.save(folder / "train" / f"{name}.png")
-        masks.append(torch.from_numpy(np.asarray(mask)).float() / 255)
+        masks.append(torch.from_numpy(np.array(mask)).float() / 255)
     write_cameras(folder, "train", textured_room.cameras(seen), names)
     return names, masks
 

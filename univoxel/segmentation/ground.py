@@ -126,7 +126,7 @@ def find_plane(
 
     coarse = [_blurred(one, cfg.blurs[0]) for one in some]
     top = min(float(middle[2]) + half, float(cameras.camera_to_world[:, 2, 3].min()))
-    heights = np.linspace(float(middle[2]) - 2 * half, top, cfg.heights)
+    heights = np.linspace(float(middle[2]) - 2 * half, top, cfg.heights).tolist()
     found = [disagreement((z, 0, 0), coarse) for z in track(heights, "looking for the ground")]
     best = int(np.argmin(found))
     if found[best] > cfg.clearly * float(np.median(found)):
