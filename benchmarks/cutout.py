@@ -6,13 +6,16 @@
 DATA holds the scenes sneaker, tea_table and chrome_bottle. `near room` is the sneaker in the middle
 of a blurred ball, `street` the tea table in a sharp photograph of a street far away, `desk` the
 sneaker on a plain desk with a soft shadow, before plain walls of a room, photographed from above
-and from the side. The photographs are kept in --work.
+and from the side; `patterned desk` the same on a desk with a pattern, and `patterned room` an
+object whose pattern is that of floor and walls (tests/textured_room.py). The photographs are kept
+in --work.
 """
 
 from __future__ import annotations
 
 import argparse
 import shutil
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +29,7 @@ from torch.nn.functional import normalize
 
 from univoxel.camera import Cameras, Rays, image_rays
 from univoxel.color import linear_to_srgb
-from univoxel.data import Photos, load_photos
+from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
@@ -34,10 +37,16 @@ from univoxel.experiments.record import result_text
 from univoxel.tasks.cutout import COLOURS, REMBG, cutout
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent / "tests"))
+
+import textured_room  # noqa: E402  beside the tests that share it
+
 ROOMS = {
     "near room": ("sneaker", "tea_table/envmaps/warehouse.hdr", 6.0),
     "street": ("tea_table", "chrome_bottle/envmaps/city.hdr", 0.5),
     "desk": ("sneaker", "", 0.0),
+    "patterned desk": ("sneaker", "", 0.0),
+    "patterned room": ("", "", 0.0),
 }  # object, what surrounds it, and by how many pixels that is blurred
 BRIGHTEST = 3.0  # radiance of a surrounding's pixel, at most
 RADIUS = 7.0  # of the near room
@@ -49,7 +58,7 @@ def surroundings(room: str, data: Path, rays: Rays, floor: float) -> Tensor:
     """Linear colours [N, 3] of what is behind the object."""
     _, path, blur = ROOMS[room]
     if not path:
-        return desk(rays, floor)
+        return desk(rays, floor, room == "patterned desk")
     radiance = read_image(data / path).clamp(0, BRIGHTEST).numpy()
     blurred = ndimage.gaussian_filter(radiance, (blur, blur, 0), mode="wrap")
     env = EnvMap(torch.from_numpy(np.asarray(blurred)).float())
@@ -60,26 +69,32 @@ def surroundings(room: str, data: Path, rays: Rays, floor: float) -> Tensor:
     return lookup(env, normalize(rays.origin + away[:, None] * rays.direction, dim=1))
 
 
-def desk(rays: Rays, height: float) -> Tensor:
+def desk(rays: Rays, height: float, patterned: bool) -> Tensor:
     """A desk with the object's soft shadow, and the walls of a room, each of another grey."""
     away = (height - rays.origin[:, 2]) / rays.direction[:, 2]
     place = (rays.origin + away[:, None] * rays.direction)[:, :2]
     met = (away > 0) & (place.abs().amax(1) < DESK)
     shadow = torch.exp(-(place / torch.tensor([0.8, 0.45])).square().sum(1))
     top = torch.tensor(TOP) * (1 - 0.6 * shadow[:, None])
+    if patterned:
+        flat = torch.cat([place, torch.zeros(len(place), 1)], 1).T.clamp(-DESK, DESK)
+        top *= 0.4 + 1.2 * torch.from_numpy(textured_room.noise(flat.numpy())).float()
     axis = ((torch.sign(rays.direction) * WALLS - rays.origin) / rays.direction).argmin(1)
     far = (rays.direction.gather(1, axis[:, None]) > 0).float()
     return torch.where(met[:, None], top, torch.tensor(SIDES)[axis] * (0.9 + 0.1 * far))
 
 
-def paint(room: str, data: Path, folder: Path, views: int) -> tuple[Photos, list[int]]:
-    """Write a room's photographs, without alpha; return the object's, and which of them."""
+def paint(room: str, data: Path, folder: Path, views: int) -> tuple[list[str], list[Tensor]]:
+    """Write a room's photographs, without alpha; return their names and true masks."""
+    if room == "patterned room":
+        return photograph(folder, views)
     photos = load_photos(data / ROOMS[room][0])
     floor = float(np.load(data / ROOMS[room][0] / "points.npz")["points"][:, 2].min())
     chosen = list(range(0, len(photos), max(1, len(photos) // views)))
-    if room == "desk":  # nobody photographs it from below the desk
+    if room.endswith("desk"):  # nobody photographs it from below the desk
         height = photos.cameras.camera_to_world[:, 2, 3]
         chosen = [v for v in range(len(photos)) if height[v] > floor + 0.5][:views]
+    names = [photos.names[view] for view in chosen]
     if not folder.exists():
         (folder / "train").mkdir(parents=True)
         for view in chosen:
@@ -89,9 +104,21 @@ def paint(room: str, data: Path, folder: Path, views: int) -> tuple[Photos, list
             seen = torch.lerp(behind, color, alpha[..., None]).clamp(0, 1)
             encoded = (255 * linear_to_srgb(seen)).round().byte()
             write_png(folder / "train" / f"{photos.names[view]}.png", encoded)
-        names = [photos.names[view] for view in chosen]
         write_cameras(folder, "train", some(photos.cameras, chosen), names)
-    return photos, chosen
+    return names, [photos.picture(view)[1] for view in chosen]
+
+
+def photograph(folder: Path, views: int) -> tuple[list[str], list[Tensor]]:
+    """Photographs of the patterned room: their names and true masks."""
+    seen = textured_room.orbit(views, 400, 300)
+    names, masks = [f"{v:03d}" for v in range(views)], []
+    (folder / "train").mkdir(parents=True, exist_ok=True)
+    for name, view in zip(names, seen, strict=True):
+        picture, mask = textured_room.photograph(view)
+        picture.save(folder / "train" / f"{name}.png")
+        masks.append(torch.from_numpy(np.array(mask)).float() / 255)
+    write_cameras(folder, "train", textured_room.cameras(seen), names)
+    return names, masks
 
 
 def some(cameras: Cameras, views: list[int]) -> Cameras:
@@ -122,7 +149,7 @@ def main() -> None:
     rows = []
     for room in args.only:
         folder = args.work / room.replace(" ", "-")
-        photos, chosen = paint(room, args.data, folder, args.views)
+        names, true = paint(room, args.data, folder, args.views)
         for source in args.sources:
             out = args.work / f"{folder.name}-{source}"
             shutil.rmtree(out, ignore_errors=True)
@@ -131,8 +158,8 @@ def main() -> None:
             used = time.process_time() - used
             masks = load_photos(out)
             found = [
-                overlap(masks.picture(masks.names.index(photos.names[v]))[1], photos.picture(v)[1])
-                for v in chosen
+                overlap(masks.picture(masks.names.index(name))[1], mask)
+                for name, mask in zip(names, true, strict=True)
             ]
             label = "a network" if source == REMBG else "colours"
             rows.append([room, label, sum(found) / len(found), min(found), used])

@@ -31,12 +31,10 @@ from pathlib import Path
 
 import numpy as np
 import pillow_heif
-import torch
 from made import made
 from PIL import Image
 
 import univoxel
-from univoxel.camera import Cameras
 from univoxel.data.colmap import read_images
 from univoxel.data.shots import TEST_EVERY
 from univoxel.data.transforms import write_cameras
@@ -157,7 +155,10 @@ def trained(variant: str, photos: Path, scene: Path, views: int, width: int) -> 
             picture.putalpha(masks[v])
             picture.save(path)
         write_cameras(
-            true, split, known([cameras[v] for v in chosen]), [images[v].stem for v in chosen]
+            true,
+            split,
+            textured_room.cameras([cameras[v] for v in chosen]),
+            [images[v].stem for v in chosen],
         )
     rows = []
     for name, folder in (("found", scene), ("true", true)):
@@ -178,18 +179,6 @@ def placed(photos: Path, masks: Path, out: Path) -> list[object]:
     found, count = len(read_images(out / "sparse/0/images.bin")), len(list(photos.iterdir()))
     error = json.loads((out / "poses.json").read_text(encoding="utf-8"))["error"]
     return [photos.parent.name, f"{found} of {count}", error, None, None, used, wall]
-
-
-def known(views: list[textured_room.View]) -> Cameras:
-    """True cameras, of pictures of one size."""
-    width, height = views[0].width, views[0].height
-    return Cameras(
-        torch.tensor(np.stack([seen.pose for seen in views])).float(),
-        torch.tensor([2 * [seen.focal * max(width, height)] for seen in views]),
-        torch.tensor([[width / 2, height / 2]] * len(views)),
-        width,
-        height,
-    )
 
 
 def processor_seconds() -> float:

@@ -106,7 +106,7 @@ HELPERS = {
     "viewer": {"subject", "denoise", "frames", "film", "hosting", "incident", "studio"},
     "capture": {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
-        *("prepare", "video"),
+        *("prepare", "video", "evidence"),
     },
     "experiments.stress": {"axes", "damage", "render", "report", "rough", "scenes", "shapes"},
 }

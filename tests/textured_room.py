@@ -10,7 +10,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from PIL import Image
+
+from univoxel.camera import Cameras
 
 RADIUS = 2.2  # of the orbit
 ROOM = 4.0  # half of its width; the floor is at z = 0
@@ -47,6 +50,17 @@ def orbit(views: int, width: int = 480, height: int = 360, focal: float = 1.0) -
         target = np.array([0.0, 0.0, 0.45])
         found.append(View(look_at(place + target, target), focal, width, height))
     return found
+
+
+def cameras(views: list[View]) -> Cameras:
+    """Those of views whose pictures are of one size."""
+    width, height = views[0].width, views[0].height
+    return Cameras(
+        torch.tensor(np.stack([seen.pose for seen in views])).float(),
+        torch.tensor([2 * [seen.focal * max(width, height)] for seen in views]),
+        torch.tensor([[width / 2, height / 2]] * len(views)),
+        *(width, height),
+    )
 
 
 def look_at(place: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -108,11 +122,12 @@ def _band(
         points = origin + best * direction
     points[:, own] = (rays[1][0] + best[own] * rays[1][1][:, own]) + 50.0
     shape = (end - first, samples, view.width, samples)
-    color = _noise(points).reshape(*shape, 3)
+    color = noise(points).reshape(*shape, 3)
     return color.mean((1, 3)), own.reshape(shape).mean((1, 3))
 
 
-def _noise(points: np.ndarray) -> np.ndarray:
+def noise(points: np.ndarray) -> np.ndarray:
+    """Colours [N, 3] in [0, 1] of points [3, N]."""
     color = np.zeros((points.shape[1], 3), np.float32)
     for table, (cells, weight) in zip(TABLES, SCALES, strict=True):
         i, j, k = np.floor(points * cells + 0.123).astype(np.int64) % 32

@@ -475,7 +475,7 @@ def poses(
             within them alone, as a turntable needs it
         every: of a video, the sharpest frame of each so many seconds is taken
         keep_size: most pixels along the longer side of written photographs; 0: as they are
-        keep_weak: write photographs too that hang on few points and may be off by degrees
+        keep_weak: write photographs too whose cameras may be off by degrees
         size: pixels along the longer side, in which features are sought
         features: most of a photograph
         fast: fewer features, of larger details alone, in a quarter of the time; loses photographs

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from univoxel.capture.checks import still, weak, why_not
+from univoxel.capture.checks import still, why_not
 from univoxel.capture.config import CaptureConfig
 from univoxel.capture.grouping import group, in_words
 from univoxel.capture.model import (
@@ -132,12 +132,6 @@ def test_the_work_of_choosing_pairs_is_bounded():
 def test_a_shift_alone_counts_as_still():
     pairs = [(1, 2, 30, 7), (1, 3, 40, 2), (2, 3, 0, 7), (1, 4, 0, 1), (2, 4, 50, 3)]
     assert still(pairs) == (1, 3)
-
-
-def test_weak_are_those_below_a_fifth_of_the_median_or_fifty():
-    assert weak({1: 1000, 2: 1000, 3: 1000, 4: 199, 5: 201}, CONFIG) == {4}
-    assert weak({1: 100, 2: 100, 3: 49, 4: 51}, CONFIG) == {3}
-    assert weak({}, CONFIG) == set()
 
 
 def test_reasons_of_photographs_without_a_place():

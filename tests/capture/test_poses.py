@@ -16,7 +16,7 @@ import pytest
 import textured_room
 from PIL import Image
 
-from univoxel.capture import database, engine, structure
+from univoxel.capture import database, engine, evidence, structure
 from univoxel.capture.config import CaptureConfig
 from univoxel.capture.photographs import find_photographs
 from univoxel.capture.prepare import Folders, gather
@@ -425,3 +425,37 @@ def test_the_database_is_read_as_it_is_written(scene):
     features = database.largest_features(path, next(iter(keys.values())), 50)
     assert features.shape == (50, 128)
     np.testing.assert_allclose(np.linalg.norm(features, axis=1), 1, rtol=1e-5)
+    places = database.positions(path)
+    assert {n: len(xy) for n, xy in places.items()} == database.feature_counts(path)
+    assert all((xy >= 0).all() and (xy <= 1200).all() for xy in places.values())
+    pairs = list(database.matches(path))
+    counted = {(a, b): n for a, b, n, _ in database.verified_pairs(path) if n}
+    assert {(p.first, p.second): len(p.matches) for p in pairs} == counted
+    for pair in pairs:
+        for number, features in zip((pair.first, pair.second), pair.matches.T, strict=True):
+            assert features.max() < len(places[number])
+
+
+def test_matches_of_right_places_fit_and_of_a_wrong_one_do_not(scene):
+    """The database's matches against the model as it was found, and with one picture turned."""
+    folders = Folders(scene[0] / "sfm")
+    model = structure.models(folders)[0]
+    features, limit = database.positions(folders.database), SMALL.fitting_pixels
+
+    def shares(model):
+        found = evidence.partners(model, database.matches(folders.database), features, limit)
+        return {
+            n: sum(p.fitting for p in those) / sum(p.matches for p in those)
+            for n, those in found.items()
+        }
+
+    assert min(shares(model).values()) > SMALL.fitting_share
+    first = model.images[0]
+    angle = np.radians(3.0)
+    turn = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
+    wrong = replace(first, to_camera=turn @ first.to_camera)
+    spoilt = shares(replace(model, images=[wrong, *model.images[1:]]))
+    assert spoilt[first.number] < SMALL.contradicted_share
+    assert min(share for n, share in spoilt.items() if n != first.number) > 0.8

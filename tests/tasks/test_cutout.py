@@ -178,3 +178,21 @@ def test_plain_surroundings_need_no_room(tmp_path, with_masks, monkeypatch, capl
     monkeypatch.setattr(task, "find_object", lambda *_: None)
     monkeypatch.setattr(task, "mask", lambda *_: torch.ones(SIZE, SIZE))
     task.cutout(data, tmp_path / "other", box=(-1, -1, -1, 1, 1, 1))
+
+
+def test_what_stands_on_a_pattern_needs_no_room(tmp_path, with_masks, monkeypatch, caplog):
+    """Where edges tell nothing the ground is asked, and the room only where there is none."""
+    data, _, true = with_masks
+    caplog.set_level("INFO", "univoxel")
+    monkeypatch.setattr(task, "_from_edges", lambda *_: None)
+    monkeypatch.setattr(task, "find_ground", lambda photographs, cameras: len(photographs))
+    monkeypatch.setattr(task, "ground_mask", lambda ground, photo, cameras, view: true[view])
+    monkeypatch.setattr(task, "find_object", lambda *_: pytest.fail("there is a ground"))
+    cut = load_photos(task.cutout(data, tmp_path / "cut", vote=SMALL))
+    assert "patterned ground" in caplog.text
+    assert f"{VIEWS} of {VIEWS} agree with the hull" in caplog.text
+    assert all(iou(cut.picture(view)[1], true[view]) > 0.95 for view in range(VIEWS))
+    monkeypatch.setattr(task, "find_ground", lambda *_: None)
+    monkeypatch.setattr(task, "find_object", lambda *_: None)
+    monkeypatch.setattr(task, "mask", lambda *_: torch.ones(SIZE, SIZE))
+    task.cutout(data, tmp_path / "other")

@@ -8,12 +8,23 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 MOST_IMAGES = 2147483647  # what pair ids are made with
 WATERMARK = 7  # configuration of a pair whose match is a shift alone, near the pictures' border
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two pictures with matches that were verified."""
+
+    first: int  # image ids
+    second: int
+    matches: np.ndarray  # [M, 2] which feature of the first and of the second
+    kind: int  # configuration
 
 
 @contextmanager
@@ -73,3 +84,23 @@ def verified_pairs(path: Path) -> list[tuple[int, int, int, int]]:
     with _opened(path) as db:
         rows = db.execute("SELECT pair_id, rows, config FROM two_view_geometries").fetchall()
     return [(pair // MOST_IMAGES, pair % MOST_IMAGES, n, kind) for pair, n, kind in rows]
+
+
+def matches(path: Path) -> Iterator[Pair]:
+    """Pairs that were verified, with their inliers."""
+    with _opened(path) as db:
+        for pair, rows, data, kind in db.execute(
+            "SELECT pair_id, rows, data, config FROM two_view_geometries WHERE rows > 0"
+        ):
+            found = np.frombuffer(data, np.uint32).reshape(rows, 2)
+            yield Pair(pair // MOST_IMAGES, pair % MOST_IMAGES, found, kind)
+
+
+def positions(path: Path) -> dict[int, np.ndarray]:
+    """Where features are [F, 2], pixels, by image id."""
+    with _opened(path) as db:
+        rows = db.execute("SELECT image_id, rows, cols, data FROM keypoints").fetchall()
+    return {
+        number: np.frombuffer(data or b"", np.float32).reshape(count, width)[:, :2].astype(float)
+        for number, count, width, data in rows
+    }

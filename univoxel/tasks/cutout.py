@@ -1,10 +1,11 @@
 """Cut an object out of photographs without masks.
 
 Masks come from colours alone, from a network, or from a folder. Colours: before plain walls and on
-plain desks the object is what edges shut off from the picture's border. Elsewhere a coarse surface
-within a box and a backdrop around it explain the photographs together; what cameras all around
-agree on inside the box is the object, and its silhouettes are the masks. Masks of single
-photographs vote for a hull, and those that it contradicts are mended.
+plain desks the object is what edges shut off from the picture's border; on a patterned ground it is
+what hides that. Elsewhere a coarse surface within a box and a backdrop around it explain the
+photographs together; what cameras all around agree on inside the box is the object, and its
+silhouettes are the masks. Masks of single photographs vote for a hull, and those that it
+contradicts are mended.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from univoxel.errors import DataError, ExistingFile, UserError
 from univoxel.pictures.mask_sheet import MaskTile, darkened, mask_sheet, worst_first, write_page
 from univoxel.segmentation.config import SegmentationConfig, VoteConfig
 from univoxel.segmentation.distances import corners, surroundings
+from univoxel.segmentation.ground import find_ground, ground_mask
 from univoxel.segmentation.network import network
 from univoxel.segmentation.plain import plain_mask, plain_threshold
 from univoxel.segmentation.separation import DEFAULTS, find_object, mask
@@ -64,7 +66,7 @@ def cutout(
             folder of masks with the stems of the photographs.
         box: lower and upper corner of where the object is, world units; by default a cube around
             what the cameras look at, as large as their pictures. For masks from colours; plain
-            surroundings are then not looked for.
+            surroundings and a ground are then not looked for.
         downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
         config: how the object is found from colours.
         allow_outside: as of `load_photos`.
@@ -92,9 +94,11 @@ def cutout(
         for name in splits_of(data)
     }
     log.info(photos.about)
-    before_plain = None if box or origin != COLOURS else _from_edges(splits, vote)
-    if before_plain:
-        masks = before_plain
+    without_box = None if box or origin != COLOURS else _from_edges(splits, vote)
+    if without_box is None and origin == COLOURS and not box:
+        without_box = _from_ground(splits, vote)
+    if without_box:
+        masks = without_box
         verdicts, told = _judged(splits, masks, vote)
     elif origin == COLOURS:
         masks = _from_colours(splits, box, seed, config)
@@ -149,6 +153,25 @@ def _from_edges(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
     log.info("plain surroundings: the object is what edges of %g a pixel shut off", threshold)
     return {
         name: [_bytes(plain_mask(_encoded(split, v), threshold)) for v in range(len(split))]
+        for name, split in splits.items()
+    }
+
+
+def _from_ground(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
+    """Masks of what stands on a patterned ground; None where there is none."""
+    train = splits["train"]
+    if len(train) < cfg.photographs:
+        return None
+    photographs = [_encoded(train, view) for view in range(len(train))]
+    ground = find_ground(photographs, train.cameras)
+    if ground is None:
+        return None
+    log.info("patterned ground: the object is what stands on it")
+    return {
+        name: [
+            _bytes(ground_mask(ground, _encoded(split, v), split.cameras, v))
+            for v in track(range(len(split)), "masks")
+        ]
         for name, split in splits.items()
     }
 

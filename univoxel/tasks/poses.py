@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from univoxel import __version__
 from univoxel.bars import bar
-from univoxel.capture import checks, database, structure, video
+from univoxel.capture import checks, database, evidence, structure, video
 from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.capture.engine import Engine, find_engine
 from univoxel.capture.grouping import in_words
@@ -50,7 +50,7 @@ class Found:
     """What structure from motion says, and what is believed of it."""
 
     model: Model  # the largest, as it is
-    weak: set[int]  # ids of pictures that hang on few points
+    weak: dict[int, str]  # ids of pictures whose poses are not trusted, and why
     reports: list[Report]  # of all photographs
 
 
@@ -74,7 +74,7 @@ def poses(
         masks: folder of a mask for each photograph; features are sought within them alone.
         every: seconds of a video, of each of which the sharpest frame is taken.
         keep_size: pixels of written photographs along the longer side, at most; 0 for any.
-        keep_weak: write photographs too that hang on few points.
+        keep_weak: write photographs too whose cameras are not trusted.
         config: how cameras are found.
 
     Raises:
@@ -109,7 +109,7 @@ def poses(
         unreadable = _search(engine, capture, folders, config, progress)
         found = _judge(capture, folders, config, unreadable)
         _say(capture, found, len(capture.photographs), keep_weak)
-        left_out = set() if keep_weak else found.weak
+        left_out = set() if keep_weak else set(found.weak)
         model = without(found.model, left_out) if left_out else found.model
         index = {name: i for i, name in enumerate(capture.pictures)}
         ordered = sorted(model.images, key=lambda i: index[i.name])
@@ -264,8 +264,8 @@ def _judge(
     numbers = database.images(folders.database)
     placed = {i.number: i for i in models[0].images} if models else {}
     elsewhere = {i.number: len(m.images) - 1 for m in reversed(models[1:]) for i in m.images}
-    weak = checks.weak({n: i.points for n, i in placed.items()}, config)
     errors = models[0].errors() if models else {}
+    weak = _weak(models[0], folders, errors, config) if models else {}
     reports = []
     for index, name in enumerate(capture.pictures):
         photograph = capture.photographs[index].path.name
@@ -273,7 +273,7 @@ def _judge(
         partners = sum(n >= checks.NEEDED for a, b, n, _ in pairs if number in (a, b))
         if number in placed:
             points = placed[number].points
-            reason = f"hangs on {points} points" if number in weak else ""
+            reason = weak.get(number, "")
             reports.append(
                 Report(photograph, True, points, errors[number], partners, reason=reason)
             )
@@ -287,6 +287,20 @@ def _judge(
             f"closer to one another, all of the same still object; not placed: {_some(missing)}"
         )
     return Found(models[0], weak, reports)
+
+
+def _weak(
+    model: Model, folders: Folders, errors: dict[int, float], config: CaptureConfig
+) -> dict[int, str]:
+    """Placed pictures whose poses are not trusted, and why."""
+    partners = evidence.partners(
+        model,
+        database.matches(folders.database),
+        database.positions(folders.database),
+        config.fitting_pixels,
+    )
+    doubts = {i.number: evidence.doubt(model, i, errors[i.number]) for i in model.images}
+    return checks.weak({i.number: i.points for i in model.images}, partners, doubts, config)
 
 
 def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
@@ -304,12 +318,14 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
         log.warning(f"not placed: {_some(missing)}")
     index = {name: i for i, name in enumerate(capture.pictures)}
     weak = [
-        capture.photographs[index[i.name]].path.name for i in model.images if i.number in found.weak
+        f"{capture.photographs[index[i.name]].path.name} ({found.weak[i.number]})"
+        for i in model.images
+        if i.number in found.weak
     ]
     if weak:
         fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
         log.warning(
-            f"{len(weak)} hang on few points and may be off by degrees, {fate}: {_some(weak)}; "
+            f"{len(weak)} may be off by degrees, {fate}: {_some(weak)}; "
             "photograph that side again with more overlap",
             extra={"arguments": ("keep_weak",)},
         )

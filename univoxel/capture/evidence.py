@@ -1,0 +1,136 @@
+"""What matches say about where a photograph was placed, beyond the points that it hangs on.
+
+Structure from motion keeps the matches that fit and drops the others. Those dropped tell where it
+went wrong: of a photograph placed right, nearly all matches fit its place, however few there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from univoxel.capture.database import WATERMARK, Pair
+from univoxel.capture.model import NO_POINT, Model, Placed
+from univoxel.data.lens import Lens
+
+STEPS = 10  # of turning a bent lens back: far below a thousandth of a pixel
+TO_SPREAD = np.sqrt(2 / np.pi)  # mean length of an error in a plane to its spread along one axis
+
+
+@dataclass(frozen=True)
+class Partner:
+    """A picture that shares verified matches with another."""
+
+    number: int
+    matches: int
+    fitting: int  # of them to where both were placed
+
+
+def partners(
+    model: Model, pairs: Iterable[Pair], features: Mapping[int, np.ndarray], pixels: float
+) -> dict[int, list[Partner]]:
+    """Those of each placed picture among the placed.
+
+    Args:
+        pairs: verified ones, see `database.matches`.
+        features: where they are in each picture [F, 2], pixels.
+        pixels: how far from where the other's line of sight is seen a match may be.
+    """
+    placed = {image.number: image for image in model.images}
+    index = {number: i for i, number in enumerate(model.points.number.tolist())}
+    looks = {
+        n: _Look(
+            image,
+            model.cameras[image.camera],
+            features[n],
+            _rays(features[n], model.cameras[image.camera]),
+            np.array([index.get(p, -1) for p in image.point.tolist()]),
+        )
+        for n, image in placed.items()
+    }
+    found: dict[int, list[Partner]] = {number: [] for number in placed}
+    for pair in pairs:
+        if pair.first not in placed or pair.second not in placed or not len(pair.matches):
+            continue
+        a, b = looks[pair.first], looks[pair.second]
+        for one, other, columns in ((a, b, [0, 1]), (b, a, [1, 0])):
+            matches = pair.matches[:, columns]
+            # A shift alone is what stands still in the pictures, whatever the cameras do
+            off = _off(model, one, other, matches)
+            fitting = 0 if pair.kind == WATERMARK else int((off < pixels).sum())
+            found[one.image.number].append(Partner(other.image.number, len(matches), fitting))
+    return found
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A placed picture with its features."""
+
+    image: Placed
+    lens: Lens
+    xy: np.ndarray  # [F, 2]
+    rays: np.ndarray  # [F, 3] directions (x, y, 1)
+    point: np.ndarray  # [F] row of the point that each shows, or -1
+
+
+def _rays(xy: np.ndarray, lens: Lens) -> np.ndarray:
+    """Directions (x, y, 1) [F, 3] of features, of a lens that bends by its first coefficient."""
+    bent = (xy - np.array(lens.centre)) / np.array(lens.focal)
+    straight = bent
+    for _ in range(STEPS):
+        straight = bent / (1 + lens.radial[0] * (straight**2).sum(1, keepdims=True))
+    return np.concatenate([straight, np.ones((len(xy), 1))], 1)
+
+
+def _off(model: Model, one: _Look, other: _Look, matches: np.ndarray) -> np.ndarray:
+    """How far matches [M, 2] of two pictures are from fitting in the first of them, pixels [M].
+
+    Where the other shows a known point, it is how far from it the match is; else from the line
+    that the other sees along: Sampson's error. Along such lines a camera may be off unseen.
+    """
+    mine, theirs = matches.T
+    pose, seen = one.image.to_camera, other.image.to_camera
+    turn = pose[:, :3] @ seen[:, :3].T
+    u, v, w = pose[:, 3] - turn @ seen[:, 3]
+    essential = np.array([[0, -w, v], [w, 0, -u], [-v, u, 0]]) @ turn
+    x, y = other.rays[theirs], one.rays[mine]
+    ahead, back = x @ essential.T, y @ essential
+    length = (ahead[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
+    off = np.abs((y * ahead).sum(1)) / np.sqrt(np.maximum(length, 1e-30)) * one.lens.focal[0]
+    known = other.point[theirs] >= 0
+    place = model.points.position[other.point[theirs[known]]] @ pose[:, :3].T + pose[:, 3]
+    depth = np.maximum(place[:, 2], 1e-9)
+    where = np.stack(one.lens.seen(place[:, 0] / depth, place[:, 1] / depth), 1)
+    away = np.linalg.norm(where - one.xy[mine[known]], axis=1)
+    off[known] = np.where(place[:, 2] > 0, away, np.inf)
+    return off
+
+
+def doubt(model: Model, image: Placed, error: float) -> float:
+    """Spread of where a camera stands, over its distance from what it sees, as degrees.
+
+    It is what points in the picture leave open if they are right themselves: infinite for too few,
+    large where they are close to one another.
+
+    Args:
+        error: mean reprojection error of its points, pixels.
+    """
+    index = {number: i for i, number in enumerate(model.points.number.tolist())}
+    seen = [index[p] for p in image.point.tolist() if p != NO_POINT and p in index]
+    if len(seen) < 6:
+        return float("inf")
+    turn, shift = image.to_camera[:, :3], image.to_camera[:, 3]
+    points = model.points.position[seen] @ turn.T + shift
+    x, y, z = points.T
+    along = np.stack([1 / z, 0 * z, -x / z**2], 1), np.stack([0 * z, 1 / z, -y / z**2], 1)
+    rows = [np.concatenate([np.cross(points, one), one], 1) for one in along]
+    slopes = np.concatenate(rows) * model.cameras[image.camera].focal[0]
+    try:
+        spread = np.linalg.inv(slopes.T @ slopes) * (TO_SPREAD * error) ** 2
+    except np.linalg.LinAlgError:
+        return float("inf")
+    # Turns are about the camera's centre, which shifts alone move
+    centre = np.trace(spread[3:, 3:])
+    return float(np.degrees(np.sqrt(max(centre, 0)) / np.median(points[:, 2])))
