@@ -115,6 +115,56 @@ class MetalConfig:
 
 
 @dataclass(frozen=True)
+class MirrorConfig:
+    """Which points mirror the map, see joint/mirrors.py."""
+
+    # observations of a point that are compared, >= 1
+    views: int = 16
+    # of them, that mirror the sky, at least, >= 1; other points are as their neighbours
+    min_views: int = 5
+    # cosine, [0, 1], between normal and eye of an observation, at least
+    min_cosine: float = 0.2
+    # mean deviation of a point's colours from their mean, sRGB, >= 0, below which it is paint
+    contrast: float = 0.05
+    # points whose shares are averaged, >= 1
+    neighbours: int = 32
+    # points whose normals are smoothed together, >= 1
+    smoothing: int = 12
+    # degrees, > 0, that the normals may be off by
+    radius: float = 12.0
+    # normals that are tried across twice the radius, >= 2
+    steps: int = 13
+    # share, (0, 1], of the deviation that the map explains of metal, at least: of the map of nodes,
+    # and of that of texels
+    share: tuple[float, float] = (0.35, 0.45)
+    # brightest channel of a metal at least, [0, 1]
+    min_reflectance: float = 0.25
+    # sRGB, > 0: larger residuals count as this
+    max_residual: float = 0.25
+    # contrast, (0, 1], of the points that a map of texels is first made from, over the largest
+    sharpest: float = 0.75
+    # maps of texels that are made one after the other, >= 1
+    rounds: int = 3
+    # rows of those maps, >= 1
+    rows: int = 64
+    # sightings, > 0, that the map of nodes counts for in a texel
+    prior: float = 0.5
+    # weight, >= 0, of normals, albedo and roughness of sharp points in Adam
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        counts = ("views", "min_views", "neighbours", "smoothing", "rounds", "rows")
+        check_fields(self, *_WHOLE, *counts)
+        check_fields(self, "at least 2", lambda x: x >= 2, "steps")
+        check_fields(self, *_FROM_ZERO, "min_cosine", "min_reflectance")
+        check_fields(self, *_NOT_BELOW, "contrast", "weight")
+        check_fields(self, *_ABOVE, "radius", "max_residual", "prior")
+        check_fields(self, *_SHARE, "sharpest")
+        wanted = "two numbers in (0, 1]"
+        check_fields(self, wanted, lambda x: len(x) == 2 and all(0 < v <= 1 for v in x), "share")
+
+
+@dataclass(frozen=True)
 class EntropyConfig:
     """The prior that paint comes in few colours, see joint/albedo_entropy.py."""
 
@@ -265,6 +315,8 @@ class JointConfig:
     newton: NewtonConfig = field(default_factory=NewtonConfig)
     # how points are decided to be metal
     metal: MetalConfig = field(default_factory=MetalConfig)
+    # how points are decided to mirror the map
+    mirror: MirrorConfig = field(default_factory=MirrorConfig)
     # the prior on few colours, where colors is set
     entropy: EntropyConfig = field(default_factory=EntropyConfig)
     # hypothesis trials, from which the solve starts
