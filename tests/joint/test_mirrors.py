@@ -1,0 +1,180 @@
+"""Metals that mirror: found on a sphere under a map finer than its nodes, with normals that are
+off."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import scene_of
+from observed_points import NODES, photographed, problem_on_a_sphere
+from torch.nn.functional import normalize
+
+from univoxel import sphere
+from univoxel.color import linear_to_srgb_unclipped
+from univoxel.joint import mirrors, stage
+from univoxel.joint.config import JointConfig, MirrorConfig
+from univoxel.joint.mirrors import TexelMap, find_mirrors, reflect, texel_map
+from univoxel.joint.observations import Mirrors
+from univoxel.lights.turntable import Turntable
+
+POINTS, VIEWS = 1500, 16
+BASE = torch.tensor([0.9, 0.7, 0.5])
+CFG = JointConfig()
+
+
+def fine_map(direction):
+    """Radiance [..., 3] finer than the nodes are apart, and lamps."""
+    x, y, z = direction.unbind(-1)
+    pattern = 0.5 + 0.25 * ((9 * x).sin() * (7 * y + 1).sin() + (8 * z + 2).sin())
+    tint = torch.stack([0.5 + 0.2 * x, 0.5 + 0.2 * y, 0.5 - 0.2 * z], -1)
+    return pattern[..., None] * tint
+
+
+def under_fine_map(metal, paint, off=0.0):
+    """A scene with the map's nodes, and photographs of a sphere: mirrors where `metal` of the
+    normals [P, 3] says so, else what `paint` makes; normals are off by degrees."""
+    torch.manual_seed(0)
+    scene = scene_of((0.5, 0.5, 0.5), 0.5, NODES)
+    problem = problem_on_a_sphere(POINTS, VIEWS, NODES, scene)
+    nodes = torch.zeros(NODES, 3)
+    texels = sphere.latlong_directions(64).flatten(0, 1)
+    nearest = (texels @ scene.sky.direction.T).argmax(1)
+    area = sphere.texel_solid_angles(64, 128).reshape(-1, 1)
+    nodes.index_add_(0, nearest, fine_map(texels) * area)
+    nodes /= torch.zeros(NODES, 1).index_add(0, nearest, area)
+    with torch.no_grad():
+        scene.sky.log_radiance.copy_(nodes.log())
+    normal = problem.observations.normal
+    painted = photographed(problem, nodes, *paint(normal)).observations.color
+    wo = problem.observations.wo.view(POINTS, VIEWS, 3)
+    mirrored = BASE * fine_map(reflect(normal, wo)[0]).flatten(0, 1)
+    is_metal = metal(normal)
+    color = torch.where(is_metal.repeat_interleave(VIEWS)[:, None], mirrored, painted)
+    wave = math.radians(1.4 * off) * (3 * normal[:, [1, 2, 0]] + 1).sin()
+    seen = replace(problem.observations, color=color, normal=normalize(normal + wave, dim=1))
+    return scene, replace(problem, observations=seen, target=linear_to_srgb_unclipped(color))
+
+
+def white(normal):
+    return torch.full((POINTS, 3), 0.6), torch.full((POINTS,), 0.9)
+
+
+def black_and_glossy(normal):
+    return torch.full((POINTS, 3), 0.02), torch.full((POINTS,), 0.3)
+
+
+def degrees(a, b):
+    return torch.rad2deg((a * b).sum(1).clamp(-1, 1).acos())
+
+
+@pytest.mark.parametrize("paint", [white, black_and_glossy])
+def test_a_mirror_is_found_though_its_normals_are_off(paint):
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, paint, off=5)
+    found = find_mirrors(scene, problem, CFG)
+    true_normal = normalize(problem.observations.position, dim=1)
+    above, below = true_normal[:, 2] > 0.25, true_normal[:, 2] < -0.25
+    assert found.metal[above].float().mean() > 0.95
+    assert found.metal[below].float().mean() < 0.02
+    sharp = above & found.sharp
+    assert sharp.sum() > 0.9 * above.sum()
+    before = degrees(problem.observations.normal, true_normal)[sharp].mean()
+    assert before > 4
+    # The map of texels is 3 degrees fine: normals half of that
+    assert degrees(found.normal, true_normal)[sharp].mean() < 0.5 * before
+    assert (found.base[sharp].median(0).values / BASE - 1).abs().max() < 0.1
+    assert not found.base[~found.metal].any()
+
+
+@pytest.mark.parametrize("paint", [white, black_and_glossy])
+def test_where_nothing_mirrors_nothing_changes(paint):
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 2, paint)
+    torch.manual_seed(3)
+    expected = torch.rand(4)
+    torch.manual_seed(3)
+    assert find_mirrors(scene, problem, CFG) is None
+    assert torch.equal(torch.rand(4), expected)
+
+
+def test_points_that_see_no_sky_are_as_their_neighbours():
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
+    true_normal = normalize(problem.observations.position, dim=1)
+    visibility = problem.transport.visibility.clone()
+    blocked = (true_normal[:, 2] > 0.3) & (torch.arange(POINTS) % 2 == 0)
+    visibility[blocked] = 0
+    problem = replace(problem, transport=replace(problem.transport, visibility=visibility))
+    found = find_mirrors(scene, problem, CFG)
+    assert found.metal[blocked].float().mean() > 0.95
+    assert torch.equal(found.normal[blocked], problem.observations.normal[blocked])
+
+
+def test_light_that_turns_has_no_common_map():
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
+    assert find_mirrors(scene, replace(problem, turned=Turntable), CFG) is None
+
+
+def test_too_few_points_say_nothing():
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
+    many = replace(CFG, mirror=MirrorConfig(neighbours=POINTS + 1))
+    assert find_mirrors(scene, problem, many) is None
+
+
+def test_texels_take_what_sharp_points_show():
+    """A point at the pole that shows one direction; the other points are not sharp."""
+    coarse = torch.full((8, 16, 3), 0.25)
+    towards = normalize(torch.tensor([1.0, 0.4, 0.3]), dim=0)
+    normal = normalize(torch.stack([towards, -towards]), dim=1)
+    color = torch.full((2, 3, 3), 0.2)
+    seen = mirrors.Sightings(
+        torch.zeros(2, 6), normal, normal[:, None].expand(2, 3, 3), color,
+        torch.ones(2, 3, dtype=torch.bool),
+    )  # fmt: skip
+    base, sharp = torch.full((2, 3), 0.5), torch.tensor([True, False])
+    map = texel_map(seen, base, sharp, coarse, prior=0.5)
+    shown = linear_to_srgb_unclipped(torch.tensor(0.2)) / 0.5 ** (1 / 2.4)
+    changed = (map - 0.25).abs().amax(2) > 1e-6
+    assert changed.sum() == 4
+    uv = sphere.direction_to_latlong(towards)
+    row, column = int(uv[1] * 8), int(uv[0] * 16)
+    share = (map[row, column, 0] - 0.25) / (shown - 0.25)
+    # 3 sightings against half of one, of which the nearest texel has a quarter of the weight at
+    # least
+    assert 0.75 / 1.25 <= share <= 3 / 3.5
+
+
+def test_blurring_keeps_what_is_even():
+    texels = TexelMap.of(sphere.fibonacci_sphere(64), 16, 6)
+    even = torch.full((16, 32, 3), 0.3)
+    torch.testing.assert_close(texels.blurred(even), even)
+    direction = sphere.latlong_directions(16)
+    nearest = (direction @ sphere.fibonacci_sphere(64).T).argmax(2)
+    assert torch.equal(texels.nearest(direction), nearest)
+
+
+def test_sharp_points_learn_what_was_found_of_them():
+    normal = normalize(torch.randn(3, 3), dim=1)
+    base = torch.full((3, 3), 0.8)
+    sharp = torch.tensor([True, True, False])
+    found = Mirrors(torch.ones(3, dtype=torch.bool), sharp, normal, base)
+    point = torch.arange(3)
+    smooth = torch.full((3,), 0.05)
+    there = stage.mirror_loss(found, point, normal, base, smooth)
+    assert there == 0
+    elsewhere = -normal, 0.5 * base, smooth + 0.3
+    # of two thirds of the points
+    expected = 2 / 3 * (2 + math.log(2) + 0.3)
+    away = stage.mirror_loss(found, point, *elsewhere).item()
+    assert away == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_map_of_nodes_teaches_sharp_points_nothing():
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
+    everything = torch.ones(POINTS, dtype=torch.bool)
+    found = Mirrors(everything, everything, problem.observations.normal, BASE.expand(POINTS, 3))
+    decisions = stage.Decisions(everything, mirrors=found)
+    terms = stage.objective(scene, problem, decisions, replace(CFG, rays=64))
+    assert terms["joint"] == 0
+    assert terms["mirrors"] > 0
+    none = stage.objective(scene, problem, stage.Decisions(everything), replace(CFG, rays=64))
+    assert none["joint"] > 0
+    assert "mirrors" not in none
