@@ -96,6 +96,15 @@ def test_where_nothing_mirrors_nothing_changes(paint):
     assert torch.equal(torch.rand(4), expected)
 
 
+def test_change_that_no_map_explains_is_no_mirror():
+    """Colours of mirrors, given to the points in another order."""
+    scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
+    assert find_mirrors(scene, problem, CFG).metal.all()
+    mixed = torch.randperm(POINTS * VIEWS)
+    seen = replace(problem.observations, color=problem.observations.color[mixed])
+    assert find_mirrors(scene, replace(problem, observations=seen), CFG) is None
+
+
 def test_points_that_see_no_sky_are_as_their_neighbours():
     scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
     true_normal = normalize(problem.observations.position, dim=1)
@@ -119,10 +128,11 @@ def test_too_few_points_say_nothing():
     assert find_mirrors(scene, problem, many) is None
 
 
-def test_texels_take_what_sharp_points_show():
-    """A point at the pole that shows one direction; the other points are not sharp."""
+@pytest.mark.parametrize("towards", [[1.0, 0.4, 0.3], [-1.0, 0.05, -0.2], [-1.0, -0.05, -0.2]])
+def test_texels_take_what_sharp_points_show(towards):
+    """One point shows one direction, next to the map's border too; the other is not sharp."""
     coarse = torch.full((8, 16, 3), 0.25)
-    towards = normalize(torch.tensor([1.0, 0.4, 0.3]), dim=0)
+    towards = normalize(torch.tensor(towards), dim=0)
     normal = normalize(torch.stack([towards, -towards]), dim=1)
     color = torch.full((2, 3, 3), 0.2)
     seen = mirrors.Sightings(
@@ -136,6 +146,9 @@ def test_texels_take_what_sharp_points_show():
     assert changed.sum() == 4
     uv = sphere.direction_to_latlong(towards)
     row, column = int(uv[1] * 8), int(uv[0] * 16)
+    left, top = math.floor(float(uv[0]) * 16 - 0.5), math.floor(float(uv[1]) * 8 - 0.5)
+    around = {(y, x % 16) for y in (top, top + 1) for x in (left, left + 1)}
+    assert {(y, x) for y, x in changed.nonzero().tolist()} == around
     share = (map[row, column, 0] - 0.25) / (shown - 0.25)
     # 3 sightings against half of one, of which the nearest texel has a quarter of the weight at
     # least
@@ -146,6 +159,12 @@ def test_blurring_keeps_what_is_even():
     texels = TexelMap.of(sphere.fibonacci_sphere(64), 16, 6)
     even = torch.full((16, 32, 3), 0.3)
     torch.testing.assert_close(texels.blurred(even), even)
+    # The poles are many texels and little sky
+    striped = torch.linspace(0, 1, 16)[:, None, None].square().expand(16, 32, 3).contiguous()
+    area = sphere.texel_solid_angles(16, 32)[..., None]
+    light = (area * striped).sum() / (3 * 4 * math.pi)
+    kept = (area * texels.blurred(striped)).sum() / (3 * 4 * math.pi)
+    assert kept == pytest.approx(light.item(), rel=0.01)
     direction = sphere.latlong_directions(16)
     nearest = (direction @ sphere.fibonacci_sphere(64).T).argmax(2)
     assert torch.equal(texels.nearest(direction), nearest)
