@@ -121,47 +121,48 @@ class MirrorConfig:
     # observations of a point that are compared, >= 1
     views: int = 16
     # of them, that mirror the sky, at least, >= 1; other points are as their neighbours
-    min_views: int = 5
+    min_views: int = 3
     # cosine, [0, 1], between normal and eye of an observation, at least
     min_cosine: float = 0.2
-    # mean deviation of a point's colours from their mean, sRGB, >= 0, below which it is paint
-    contrast: float = 0.05
-    # points whose shares are averaged, >= 1
+    # mean deviation of a point's colours from their mean, sRGB, >= 0, up to which it is paint
+    contrast: float = 0.08
+    # points whose shares, colours and normals are averaged, >= 1
     neighbours: int = 32
-    # points whose normals are smoothed together, >= 1
-    smoothing: int = 12
-    # degrees, > 0, that the normals may be off by
+    # points, >= 1, most of which decide for each among them
+    voters: int = 96
+    # difference of unit normals, > 0, that counts as one unit of distance between points
+    turn: float = 0.5
+    # degrees, in (0, 90), that normals may be off by
     radius: float = 12.0
-    # normals that are tried across twice the radius, >= 2
+    # normals that are tried across the cone, >= 2
     steps: int = 13
-    # share, (0, 1], of the deviation that the map explains of metal, at least: of the map of nodes,
-    # and of that of texels
-    share: tuple[float, float] = (0.35, 0.45)
+    # share, (0, 1], of the deviation that the map explains of metal, at least
+    share: float = 0.35
+    # part of that share, (0, 1], that it explains with the present normals where metal is rough
+    sharp: float = 0.65
     # brightest channel of a metal at least, [0, 1]
     min_reflectance: float = 0.25
     # sRGB, > 0: larger residuals count as this
     max_residual: float = 0.25
-    # contrast, (0, 1], of the points that a map of texels is first made from, over the largest
-    sharpest: float = 0.75
-    # maps of texels that are made one after the other, >= 1
-    rounds: int = 3
-    # rows of those maps, >= 1
-    rows: int = 64
-    # sightings, > 0, that the map of nodes counts for in a texel
-    prior: float = 0.5
-    # weight, >= 0, of normals, albedo and roughness of sharp points in Adam
+    # degrees, > 0, around a direction, whose brightest node tells how dark it is
+    around: float = 27.0
+    # share, (0, 1], of the directions, the darkest, that base colours are read from
+    darkest: float = 0.25
+    # length, [0, 1], of the mean of neighbouring normals, above which a surface is not thin
+    flat: float = 0.7
+    # cosine, [0, 1], between normals above which they are averaged
+    alike: float = 0.3
+    # weight, >= 0, of what was found of sharp points, in Adam
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        counts = ("views", "min_views", "neighbours", "smoothing", "rounds", "rows")
-        check_fields(self, *_WHOLE, *counts)
+        check_fields(self, *_WHOLE, "views", "min_views", "neighbours", "voters")
         check_fields(self, "at least 2", lambda x: x >= 2, "steps")
-        check_fields(self, *_FROM_ZERO, "min_cosine", "min_reflectance")
+        check_fields(self, *_FROM_ZERO, "min_cosine", "min_reflectance", "flat", "alike")
         check_fields(self, *_NOT_BELOW, "contrast", "weight")
-        check_fields(self, *_ABOVE, "radius", "max_residual", "prior")
-        check_fields(self, *_SHARE, "sharpest")
-        wanted = "two numbers in (0, 1]"
-        check_fields(self, wanted, lambda x: len(x) == 2 and all(0 < v <= 1 for v in x), "share")
+        check_fields(self, *_ABOVE, "turn", "max_residual", "around")
+        check_fields(self, "in (0, 90)", lambda x: 0 < x < 90, "radius")
+        check_fields(self, *_SHARE, "share", "sharp", "darkest")
 
 
 @dataclass(frozen=True)

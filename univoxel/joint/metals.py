@@ -13,7 +13,7 @@ from torch import Tensor
 
 from univoxel.brdf import F0
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped, srgb_slope, srgb_to_linear
-from univoxel.joint.config import JointConfig, MetalConfig
+from univoxel.joint.config import JointConfig
 from univoxel.joint.observations import (
     JointProblem,
     observations_of,
@@ -42,7 +42,7 @@ def evidence(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Tensor:
     points that are near and of like albedo; the other points take that of the nearest of them. A
     metal has to reflect what metals do: black plastic would pass for a metal that is black.
     """
-    metal_cfg = cfg.metal
+    position, metal_cfg = problem.observations.position, cfg.metal
     counts = problem.observations.offsets.diff()
     candidates = (counts >= cfg.newton.min_views).nonzero()[:, 0]
     if not len(candidates):
@@ -54,20 +54,15 @@ def evidence(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Tensor:
     limit = metal_cfg.max_evidence
     ratio = (metal / dielectric).log().clamp(-limit, limit)
 
-    key = likeness(scene, problem, metal_cfg).numpy()
+    albedo = scene.material(scene.field.features_at(position))[0].clamp_min(1e-2).log()
+    scaled = position / (metal_cfg.near * problem.voxel_size), albedo / metal_cfg.alike
+    key = torch.cat(scaled, 1).numpy()
     key_of_point = key[point.numpy()]  # a tensor of one index would be taken for a number
     tree = KDTree(key_of_point)
     count = min(metal_cfg.neighbours, len(point))
     nearest = tree.query(key_of_point, k=count, workers=-1)[1]
     mean = ratio[torch.from_numpy(nearest).reshape(len(point), -1)].mean(1)
     return mean[torch.from_numpy(tree.query(key, workers=-1)[1])]
-
-
-def likeness(scene: Scene, problem: JointProblem, cfg: MetalConfig) -> Tensor:
-    """Keys [P, 6] of the problem's points: those of one material, near one another, are alike."""
-    position = problem.observations.position
-    albedo = scene.material(scene.field.features_at(position))[0].clamp_min(1e-2).log()
-    return torch.cat([position / (cfg.near * problem.voxel_size), albedo / cfg.alike], 1)
 
 
 def residuals(

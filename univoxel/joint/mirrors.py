@@ -3,8 +3,7 @@
 A mirror shows the map sharper than its nodes lie apart, through normals that are off by degrees. So
 neither material fits, and nothing tells them apart. But where a point shows what lies in the
 mirrored direction, some normal near the present one explains most of how its colour changes from
-view to view; no normal does so for paint, whose colour changes less, or in another way. What the
-sharpest of those points show makes a finer map, and that map finer normals.
+view to view. No normal does so for paint, whose colour changes less, or in another way.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from univoxel import sphere
 from univoxel.color import linear_to_srgb_unclipped
 from univoxel.envmap import EnvMap, lookup
 from univoxel.joint.config import JointConfig, MirrorConfig
-from univoxel.joint.metals import likeness
 from univoxel.joint.observations import (
     JointProblem,
     Mirrors,
@@ -30,12 +28,14 @@ from univoxel.joint.observations import (
 )
 from univoxel.scene import Scene
 
+ROWS = 64  # of the map that is looked up: finer than the nodes lie apart
+
 
 @dataclass(frozen=True)
 class Sightings:
     """What N points of the surface show in V observations each."""
 
-    key: Tensor  # [N, 6] of points, see `likeness`
+    key: Tensor  # [N, 6] position and normal, in units that count as one distance
     normal: Tensor  # [N, 3]
     wo: Tensor  # [N, V, 3]
     color: Tensor  # [N, V, 3] linear
@@ -55,38 +55,38 @@ class Sightings:
 
 
 @dataclass(frozen=True)
-class TexelMap:
-    """What maps of texels [H, 2 H] and of nodes [D] are to one another."""
+class NodeMap:
+    """A map of nodes, at texels where it is looked up quickly."""
 
-    weight: Tensor  # [2 H H, D] of the nodes at a texel
-    node_at: Tensor  # [H, 2 H] int64 nearest node
-    beside: Tensor  # [D, K] int64 nodes next to each, itself among them
-    rows: int
+    direction: Tensor  # [D, 3] unit, of the nodes
+    radiance: Tensor  # [D, 3]
+    node_at: Tensor  # [ROWS, 2 ROWS] int64 nearest node
+    encoded: Tensor  # [ROWS, 2 ROWS, 3] sRGB
 
     @staticmethod
-    def of(direction: Tensor, rows: int, neighbours: int) -> TexelMap:
-        texels = sphere.latlong_directions(rows).flatten(0, 1)
-        cosine = texels @ direction.T
-        weight = torch.softmax(len(direction) / 5.0 * cosine, 1)
-        beside = (direction @ direction.T).topk(neighbours + 1, 1).indices
-        return TexelMap(weight, cosine.argmax(1).view(rows, 2 * rows), beside, rows)
-
-    def from_nodes(self, nodes: Tensor) -> Tensor:
-        """[D, 3] -> [H, 2 H, 3]."""
-        return (self.weight @ nodes).view(self.rows, 2 * self.rows, 3)
-
-    def blurred(self, texels: Tensor) -> Tensor:
-        """[H, 2 H, 3] as the nodes would hold it."""
-        area = sphere.texel_solid_angles(self.rows, 2 * self.rows).reshape(-1, 1)
-        weight = self.weight * area
-        nodes = weight.T @ texels.flatten(0, 1) / weight.sum(0)[:, None]
-        return self.from_nodes(nodes)
+    def of(direction: Tensor, incident: Tensor, radiance: Tensor) -> NodeMap:
+        """
+        Args:
+            incident: [ROWS, 2 ROWS, 3] what the nodes are at the texels.
+        """
+        node_at = (sphere.latlong_directions(ROWS) @ direction.T).argmax(2)
+        encoded = linear_to_srgb_unclipped(incident.clamp(0, 1)).contiguous()
+        return NodeMap(direction, radiance, node_at, encoded)
 
     def nearest(self, direction: Tensor) -> Tensor:
         """Node [...] next to directions [..., 3]."""
         u, v = sphere.direction_to_latlong(direction).unbind(-1)
-        column = (u * 2 * self.rows).long() % (2 * self.rows)
-        return self.node_at[(v * self.rows).long().clamp_max(self.rows - 1), column]
+        column = (u * 2 * ROWS).long() % (2 * ROWS)
+        return self.node_at[(v * ROWS).long().clamp_max(ROWS - 1), column]
+
+    def beside(self, count: int) -> Tensor:
+        """The nodes [D, count + 1] next to each, itself among them."""
+        return (self.direction @ self.direction.T).topk(count + 1, 1).indices
+
+    def brightest_within(self, degrees: float) -> Tensor:
+        """Brightest channel [D] of the nodes around each."""
+        near = self.direction @ self.direction.T > math.cos(math.radians(degrees))
+        return torch.where(near, self.radiance.amax(1), 0.0).amax(1)
 
 
 @torch.no_grad()
@@ -94,51 +94,55 @@ def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirro
     """Points that mirror the present map; None: there are none, or light differs between
     photographs, so that no map is common to them.
 
-    What is random is drawn from a generator of its own: where nothing mirrors, nothing changes.
+    What is random comes from a generator of its own: where nothing mirrors, nothing changes.
     """
     if problem.turned is not None or (scene.views and scene.views.sky_change() is not None):
         return None
-    texels = TexelMap.of(problem.sky.direction, cfg.mirror.rows, cfg.newton.neighbours)
+    sky, count = problem.sky, cfg.mirror.neighbours
+    map = NodeMap.of(sky.direction, sky.latlong(ROWS), sky.radiance)
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(0)
-        seen = sightings(scene, problem, texels, cfg)
-    usable = (seen.open.sum(1) >= cfg.mirror.min_views).nonzero()[:, 0]
-    if len(usable) < cfg.mirror.neighbours:
+        seen = sightings(scene, problem, map, cfg)
+    decided = (seen.open.sum(1) >= cfg.mirror.min_views).nonzero()[:, 0]
+    if len(decided) < count:
         return None
-    contrast = spread(seen.at(usable))
-    contrast = contrast[neighbours(seen.key[usable], cfg.mirror.neighbours)].mean(1)
-    chosen = usable[contrast > cfg.mirror.contrast]
-    if len(chosen) < cfg.mirror.neighbours:
+    contrast = spread(seen.at(decided))[neighbours(seen.key[decided], count)].mean(1)
+    chosen = decided[contrast > cfg.mirror.contrast]
+    if len(chosen) < count:
         return None
-    found = mirrors_among(seen.at(chosen), problem.sky.radiance, texels, cfg.mirror)
+    found = mirrors_among(seen.at(chosen), map, cfg.mirror)
     if not found.metal.any():
         return None
-    count = len(seen.key)
-    metal, sharp = torch.zeros(2, count, dtype=torch.bool)
-    base, normal = torch.zeros(count, 3), seen.normal.clone()
+    points = len(seen.key)
+    metal, sharp = torch.zeros(2, points, dtype=torch.bool)
+    base = torch.zeros(points, 3)
     metal[chosen], sharp[chosen], base[chosen] = found.metal, found.sharp, found.base
-    normal[chosen] = found.normal
     # Points that mirror the object, not the sky, are as their neighbours
-    nearest = KDTree(seen.key[usable].numpy()).query(seen.key.numpy(), workers=-1)[1]
-    like = usable[torch.from_numpy(nearest)]
-    return Mirrors(metal[like], sharp[like], normal, base[like])
+    nearest = KDTree(seen.key[decided].numpy()).query(seen.key.numpy(), workers=-1)[1]
+    like = decided[torch.from_numpy(nearest)]
+    around = neighbours(seen.key, min(cfg.mirror.voters, points))
+    voters = metal[like][around][..., None].float()
+    base = (voters * base[like][around]).sum(1) / voters.sum(1).clamp_min(1)
+    metal, sharp = (x[like][around].float().mean(1) > 0.5 for x in (metal, sharp))
+    sharp &= metal
+    normal = smoothed(problem.observations.position, seen.normal, sharp, cfg.mirror)
+    return Mirrors(metal, sharp, normal, base)
 
 
-def sightings(scene: Scene, problem: JointProblem, texels: TexelMap, cfg: JointConfig) -> Sightings:
+def sightings(scene: Scene, problem: JointProblem, map: NodeMap, cfg: JointConfig) -> Sightings:
     """Of all points of the problem; those that no photograph sees have none that are open."""
     observations = without_exposure(scene, problem.observations)
     counts = observations.offsets.diff()
-    point = torch.arange(len(counts))
-    observation = observations_of(problem, point, cfg.mirror.views)
+    observation = observations_of(problem, torch.arange(len(counts)), cfg.mirror.views)
     observation = observation.clamp_max(len(observations.view) - 1)
     normal, wo = observations.normal, observations.wo[observation]
     mirrored, cosine = reflect(normal, wo)
-    visible = problem.transport.visibility == 255
-    node = texels.nearest(mirrored)
+    visible, node = problem.transport.visibility == 255, map.nearest(mirrored)
     is_open = (cosine > cfg.mirror.min_cosine) & (counts > 0)[:, None]
-    for beside in texels.beside.unbind(1):
+    for beside in map.beside(cfg.newton.neighbours).unbind(1):
         is_open &= visible.gather(1, beside[node])
-    key = likeness(scene, problem, cfg.metal)
+    unit = cfg.metal.near * problem.voxel_size
+    key = torch.cat([observations.position / unit, normal / cfg.mirror.turn], 1)
     return Sightings(key, normal, wo, observations.color[observation], is_open)
 
 
@@ -149,8 +153,8 @@ def reflect(normal: Tensor, wo: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def neighbours(key: Tensor, count: int) -> Tensor:
-    """Index [N, K] of the nearest by key [N, 6], at most `count`, itself first."""
-    nearest = KDTree(key.numpy()).query(key.numpy(), k=min(count, len(key)), workers=-1)[1]
+    """Index [N, count] of the nearest by key [N, K], itself first."""
+    nearest = KDTree(key.numpy()).query(key.numpy(), k=count, workers=-1)[1]
     return torch.from_numpy(nearest).reshape(len(key), -1)
 
 
@@ -161,84 +165,44 @@ def spread(seen: Sightings) -> Tensor:
     return seen.mean((encoded - mean[:, None]).abs().mean(2))
 
 
-def mirrors_among(
-    seen: Sightings, radiance: Tensor, texels: TexelMap, cfg: MirrorConfig
-) -> Mirrors:
-    """Which of N points mirror a map of nodes, radiance [D, 3].
+def mirrors_among(seen: Sightings, map: NodeMap, cfg: MirrorConfig) -> Mirrors:
+    """Which of N points mirror the map, by the share of their deviation that it explains.
 
-    First by the map itself. From what the points show that do so with most contrast a map of texels
-    is made; the points that it explains better than a blurred copy of it are sharp.
+    Metal that the map explains with the present normals is rough: it blurs what is wrong with them.
     """
     nearest = neighbours(seen.key, cfg.neighbours)
-    near = nearest[:, : cfg.smoothing]
-    radius, total = math.radians(cfg.radius), spread(seen)[nearest].sum(1).clamp_min(1e-4)
-    coarse = linear_to_srgb_unclipped(texels.from_nodes(radiance).clamp(0, 1)).contiguous()
-
-    def turned(map: Tensor, normal: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-        cost, best = best_normals(replace(seen, normal=normal), map, radius, cfg)
-        offset = (best - normal)[near].median(1).values
-        return 1 - cost[nearest].sum(1) / total, normalize(normal + offset, dim=1)
-
-    share, normal = turned(coarse, seen.normal, radius)
-    metal = share > cfg.share[0]
-    if not metal.any():
-        return Mirrors(metal, metal, seen.normal, torch.zeros_like(normal))
-    normal = torch.where(metal[:, None], normal, seen.normal)
-    base = reflectance(replace(seen, normal=normal), radiance, texels, metal, nearest, cfg)
-    contrast = total / base.amax(1) ** (1 / 2.4)
-    sharp = metal & (contrast > cfg.sharpest * contrast[metal].quantile(0.9))
-    for k in range(cfg.rounds):
-        fine = texel_map(replace(seen, normal=normal), base, sharp, coarse, cfg.prior)
-        share, finer = turned(fine, normal, radius / 2**k)
-        metal = metal | (share > cfg.share[1])
-        costs = [
-            cost_of(replace(seen, normal=finer), map, cfg)[nearest].sum(1)
-            for map in (fine, texels.blurred(fine).contiguous())
-        ]
-        sharp = metal & (costs[0] < costs[1])
-        normal = torch.where(sharp[:, None], finer, normal)
-        base = reflectance(replace(seen, normal=normal), radiance, texels, metal, nearest, cfg)
-        if not sharp.any():
-            break
-    normal = torch.where(sharp[:, None], normal, seen.normal)
-    return Mirrors(metal, sharp, normal, torch.where(metal[:, None], base, 0.0))
+    total = spread(seen)[nearest].sum(1).clamp_min(1e-4)
+    share, at_present = (
+        1 - cost[nearest].sum(1) / total
+        for cost in (lowest_cost(seen, map, cfg), cost_of(seen, map, cfg))
+    )
+    metal = share > cfg.share
+    sharp = metal & (at_present < cfg.sharp * share)
+    return Mirrors(metal, sharp, seen.normal, reflectance(seen, map, metal, nearest, cfg))
 
 
-def best_normals(
-    seen: Sightings, map: Tensor, radius: float, cfg: MirrorConfig
-) -> tuple[Tensor, Tensor]:
-    """The normals [N, 3] around those of the points with which they mirror a map best, and their
-    costs [N].
-
-    Args:
-        map: [H, 2 H, 3] sRGB.
-        radius: radians, of the cone that is searched.
-    """
+def lowest_cost(seen: Sightings, map: NodeMap, cfg: MirrorConfig) -> Tensor:
+    """Lowest `cost_of` [N] of any normals in a cone around those of the points."""
     u, v = sphere.frame(seen.normal)
-    cost, best = torch.full((len(u),), math.inf), seen.normal.clone()
-    grid = torch.linspace(-radius, radius, cfg.steps)
-    for a in grid.tolist():
-        for b in grid.tolist():
-            if math.hypot(a, b) > 1.01 * radius:
-                continue
-            normal = normalize(seen.normal + a * u + b * v, dim=1)
-            present = cost_of(replace(seen, normal=normal), map, cfg)
-            better = present < cost
-            cost, best = (
-                torch.where(better, present, cost),
-                torch.where(better[:, None], normal, best),
-            )
-    return cost, best
+    radius = math.tan(math.radians(cfg.radius))
+    lowest = torch.full((len(u),), math.inf)
+    offsets = torch.linspace(-radius, radius, cfg.steps).tolist()
+    for a in offsets:
+        for b in offsets:
+            if math.hypot(a, b) < 1.001 * radius:
+                turned = normalize(seen.normal + a * u + b * v, dim=1)
+                lowest = torch.minimum(lowest, cost_of(replace(seen, normal=turned), map, cfg))
+    return lowest
 
 
-def cost_of(seen: Sightings, map: Tensor, cfg: MirrorConfig) -> Tensor:
-    """Mean deviation [N] of what points show from a map [H, 2 H, 3] that they mirror, both in sRGB,
-    with the best colour of each. A metal has to reflect what metals do."""
-    mirrored = lookup(EnvMap(map), reflect(seen.normal, seen.wo)[0])
+def cost_of(seen: Sightings, map: NodeMap, cfg: MirrorConfig) -> Tensor:
+    """Mean deviation [N] of what points show from the map that they mirror, sRGB, with the best
+    colour of each. A metal has to reflect what metals do."""
+    mirrored = lookup(EnvMap(map.encoded), reflect(seen.normal, seen.wo)[0])
     shown, weight = seen.encoded, seen.open[..., None]
     factor = (weight * shown * mirrored).sum(1)
     factor = factor / (weight * mirrored.square()).sum(1).clamp_min(1e-4)
-    factor = bounded(factor, cfg.min_reflectance ** (1 / 2.4))
+    factor = bounded(factor, float(linear_to_srgb_unclipped(torch.tensor(cfg.min_reflectance))))
     residual = (shown - factor[:, None] * mirrored).abs().mean(2)
     return seen.mean(residual.clamp_max(cfg.max_residual))
 
@@ -250,46 +214,38 @@ def bounded(factor: Tensor, brightest: float) -> Tensor:
 
 
 def reflectance(
-    seen: Sightings,
-    radiance: Tensor,
-    texels: TexelMap,
-    metal: Tensor,
-    nearest: Tensor,
-    cfg: MirrorConfig,
+    seen: Sightings, map: NodeMap, metal: Tensor, nearest: Tensor, cfg: MirrorConfig
 ) -> Tensor:
-    """Base colour [N, 3]: what metals and their neighbours show over what they mirror.
+    """Base colour [N, 3] of metals: what they and their neighbours show over what they mirror; 0
+    elsewhere.
 
-    Only in the darker half of the directions: near a lamp either is clipped, and the map blurred.
+    Only of directions where all around is dark. Near a lamp the photographs are clipped and the map
+    is blurred, and normals that are off mistake the lamp for what is beside it.
     """
     mirrored, cosine = reflect(seen.normal, seen.wo)
-    node = texels.nearest(mirrored)
-    brightest = radiance.amax(1)[texels.beside].amax(1)[node]
+    node = map.nearest(mirrored)
+    around = map.brightest_within(cfg.around)[node]
     counted = seen.open & (cosine > 0.5) & metal[:, None]
     if counted.any():
-        counted &= brightest <= brightest[counted].median()
+        counted &= around <= around[counted].quantile(cfg.darkest)
     shown = (counted[..., None] * seen.color).sum(1)[nearest].sum(1)
-    sent = (counted[..., None] * radiance[node]).sum(1)[nearest].sum(1)
-    return bounded(shown / sent.clamp_min(1e-3), cfg.min_reflectance)
+    sent = (counted[..., None] * map.radiance[node]).sum(1)[nearest].sum(1)
+    base = bounded(shown / sent.clamp_min(1e-3), cfg.min_reflectance)
+    return torch.where(metal[:, None], base, 0.0)
 
 
-def texel_map(seen: Sightings, base: Tensor, sharp: Tensor, coarse: Tensor, prior: float) -> Tensor:
-    """The map [H, 2 H, 3], sRGB, that sharp points show; where they show none, the coarse one.
+def smoothed(position: Tensor, normal: Tensor, sharp: Tensor, cfg: MirrorConfig) -> Tensor:
+    """Normals [P, 3], those of sharp points averaged over their neighbours.
 
-    Args:
-        prior: sightings that the coarse map counts for.
+    What is mirrored looks like relief while geometry forms; polished surfaces have none. Thin ones
+    stay, whose normals differ among neighbours.
     """
-    rows = len(coarse)
-    counted = seen.open & sharp[:, None]
-    value = (seen.encoded / base[:, None] ** (1 / 2.4))[counted].clamp_max(1.0)
-    uv = sphere.direction_to_latlong(reflect(seen.normal, seen.wo)[0][counted])
-    x, y = uv[:, 0] * 2 * rows - 0.5, (uv[:, 1] * rows - 0.5).clamp(0, rows - 1)
-    left, top = x.floor(), y.floor()
-    total, weight = prior * coarse.flatten(0, 1), torch.full((2 * rows * rows, 1), prior)
-    for right in (0, 1):
-        for below in (0, 1):
-            share = (1 - (x - left - right).abs()) * (1 - (y - top - below).abs())
-            row = (top.long() + below).clamp_max(rows - 1)
-            texel = row * 2 * rows + (left.long() + right) % (2 * rows)
-            total = total.index_add(0, texel, share[:, None] * value)
-            weight = weight.index_add(0, texel, share[:, None])
-    return (total / weight).view_as(coarse)
+    index = sharp.nonzero()[:, 0]
+    if len(index) < cfg.neighbours:
+        return normal
+    own = normal[index]
+    around = own[neighbours(position[index], cfg.neighbours)]
+    flat = around.mean(1).norm(dim=1, keepdim=True) > cfg.flat
+    weight = ((own[:, None] * around).sum(2, keepdim=True) - cfg.alike).clamp_min(0)
+    mean = normalize((weight * around).sum(1), dim=1)
+    return normal.index_copy(0, index, torch.where(flat, mean, own))

@@ -69,7 +69,7 @@ class Mirrors:
 
     metal: Tensor  # [P] bool
     sharp: Tensor  # [P] bool: of them, those that mirror more sharply than the map's nodes
-    normal: Tensor  # [P, 3] unit; of sharp points, with which they do so
+    normal: Tensor  # [P, 3] unit, without relief where sharp
     base: Tensor  # [P, 3] what they reflect; 0 elsewhere
 
 
