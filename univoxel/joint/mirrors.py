@@ -111,8 +111,6 @@ def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirro
     if len(chosen) < count:
         return None
     found = mirrors_among(seen.at(chosen), map, cfg.mirror)
-    if not found.metal.any():
-        return None
     points = len(seen.key)
     metal, sharp = torch.zeros(2, points, dtype=torch.bool)
     base = torch.zeros(points, 3)
@@ -124,9 +122,10 @@ def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirro
     voters = metal[like][around][..., None].float()
     base = (voters * base[like][around]).sum(1) / voters.sum(1).clamp_min(1)
     metal, sharp = (x[like][around].float().mean(1) > 0.5 for x in (metal, sharp))
-    sharp &= metal
-    normal = smoothed(problem.observations.position, seen.normal, sharp, cfg.mirror)
-    return Mirrors(metal, sharp, normal, base)
+    if not metal.any():
+        return None
+    normal = smoothed(problem.observations.position, seen.normal, sharp & metal, cfg.mirror)
+    return Mirrors(metal, sharp & metal, normal, torch.where(metal[:, None], base, 0.0))
 
 
 def sightings(scene: Scene, problem: JointProblem, map: NodeMap, cfg: JointConfig) -> Sightings:
