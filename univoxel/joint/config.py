@@ -124,26 +124,21 @@ class MirrorConfig:
     min_views: int = 3
     # cosine, [0, 1], between normal and eye of an observation, at least
     min_cosine: float = 0.2
-    # mean deviation of a point's colours from their mean, sRGB, >= 0, up to which it is paint
-    contrast: float = 0.08
-    # points whose shares, colours and normals are averaged, >= 1
+    # points whose changes, colours and normals are averaged, >= 1
     neighbours: int = 32
     # points, >= 1, most of which decide for each among them
     voters: int = 96
     # difference of unit normals, > 0, that counts as one unit of distance between points
     turn: float = 0.5
-    # degrees, in (0, 90), that normals may be off by
-    radius: float = 12.0
-    # normals that are tried across the cone, >= 2
-    steps: int = 13
-    # share, (0, 1], of the deviation that the map explains of metal, at least
-    share: float = 0.35
-    # part of that share, (0, 1], that it explains with the present normals where metal is rough
-    sharp: float = 0.65
+    # change of metal from view to view, linear, >= 0, at least: mean deviation from the mean
+    change: float = 0.05
+    # part, (0, 1], of the change of what it mirrors. Metals of the scenes reach 0.6 to 1, glossy
+    # paint 0.1 to 0.45
+    reflected: float = 0.55
+    # part, (0, 1], of the change that the map leaves unexplained where metal mirrors sharply
+    sharp: float = 0.6
     # brightest channel of a metal at least, [0, 1]
     min_reflectance: float = 0.25
-    # sRGB, > 0: larger residuals count as this
-    max_residual: float = 0.25
     # degrees, > 0, around a direction, whose brightest node tells how dark it is
     around: float = 27.0
     # share, (0, 1], of the directions, the darkest, that base colours are read from
@@ -157,12 +152,10 @@ class MirrorConfig:
 
     def __post_init__(self) -> None:
         check_fields(self, *_WHOLE, "views", "min_views", "neighbours", "voters")
-        check_fields(self, "at least 2", lambda x: x >= 2, "steps")
         check_fields(self, *_FROM_ZERO, "min_cosine", "min_reflectance", "flat", "alike")
-        check_fields(self, *_NOT_BELOW, "contrast", "weight")
-        check_fields(self, *_ABOVE, "turn", "max_residual", "around")
-        check_fields(self, "in (0, 90)", lambda x: 0 < x < 90, "radius")
-        check_fields(self, *_SHARE, "share", "sharp", "darkest")
+        check_fields(self, *_NOT_BELOW, "change", "weight")
+        check_fields(self, *_ABOVE, "turn", "around")
+        check_fields(self, *_SHARE, "reflected", "sharp", "darkest")
 
 
 @dataclass(frozen=True)

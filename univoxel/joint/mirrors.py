@@ -1,15 +1,15 @@
-"""Metals that mirror their surroundings, found by how much of what they show the map explains.
+"""Metals that mirror their surroundings, found by how much they change from view to view.
 
-A mirror shows the map sharper than its nodes lie apart, through normals that are off by degrees. So
-neither material fits, and nothing tells them apart. But where a point shows what lies in the
-mirrored direction, some normal near the present one explains most of how its colour changes from
-view to view. No normal does so for paint, whose colour changes less, or in another way.
+A mirror shows the map sharper than its nodes lie apart, and through normals that are off by many
+degrees. So neither material fits, and residuals do not tell them apart. But how much a point
+changes from view to view does not depend on where exactly it mirrors: of metal it is about as much
+as the map changes between the mirrored directions, of paint a part of that.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from scipy.spatial import KDTree
@@ -106,22 +106,13 @@ def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirro
     decided = (seen.open.sum(1) >= cfg.mirror.min_views).nonzero()[:, 0]
     if len(decided) < count:
         return None
-    contrast = spread(seen.at(decided))[neighbours(seen.key[decided], count)].mean(1)
-    chosen = decided[contrast > cfg.mirror.contrast]
-    if len(chosen) < count:
-        return None
-    found = mirrors_among(seen.at(chosen), map, cfg.mirror)
-    points = len(seen.key)
-    metal, sharp = torch.zeros(2, points, dtype=torch.bool)
-    base = torch.zeros(points, 3)
-    metal[chosen], sharp[chosen], base[chosen] = found.metal, found.sharp, found.base
+    found = mirrors_among(seen.at(decided), map, cfg.mirror)
     # Points that mirror the object, not the sky, are as their neighbours
     nearest = KDTree(seen.key[decided].numpy()).query(seen.key.numpy(), workers=-1)[1]
-    like = decided[torch.from_numpy(nearest)]
-    around = neighbours(seen.key, min(cfg.mirror.voters, points))
-    voters = metal[like][around][..., None].float()
-    base = (voters * base[like][around]).sum(1) / voters.sum(1).clamp_min(1)
-    metal, sharp = (x[like][around].float().mean(1) > 0.5 for x in (metal, sharp))
+    like = torch.from_numpy(nearest)[neighbours(seen.key, min(cfg.mirror.voters, len(seen.key)))]
+    voters = found.metal[like][..., None].float()
+    base = (voters * found.base[like]).sum(1) / voters.sum(1).clamp_min(1)
+    metal, sharp = (x[like].float().mean(1) > 0.5 for x in (found.metal, found.sharp))
     if not metal.any():
         return None
     normal = smoothed(problem.observations.position, seen.normal, sharp & metal, cfg.mirror)
@@ -157,53 +148,39 @@ def neighbours(key: Tensor, count: int) -> Tensor:
     return torch.from_numpy(nearest).reshape(len(key), -1)
 
 
-def spread(seen: Sightings) -> Tensor:
-    """Mean deviation [N] of a point's colours from their mean, sRGB."""
-    encoded = seen.encoded
-    mean = torch.stack([seen.mean(encoded[..., c]) for c in range(3)], 1)
-    return seen.mean((encoded - mean[:, None]).abs().mean(2))
-
-
 def mirrors_among(seen: Sightings, map: NodeMap, cfg: MirrorConfig) -> Mirrors:
-    """Which of N points mirror the map, by the share of their deviation that it explains.
+    """Which of N points change from view to view as much as what they mirror.
 
     Metal that the map explains with the present normals is rough: it blurs what is wrong with them.
     """
     nearest = neighbours(seen.key, cfg.neighbours)
-    total = spread(seen)[nearest].sum(1).clamp_min(1e-4)
-    share, at_present = (
-        1 - cost[nearest].sum(1) / total
-        for cost in (lowest_cost(seen, map, cfg), cost_of(seen, map, cfg))
+    node = map.nearest(reflect(seen.normal, seen.wo)[0])
+    shown, sent = (
+        change(seen, radiance.clamp(0, 1))[nearest].sum(1)
+        for radiance in (seen.color, map.radiance[node])
     )
-    metal = share > cfg.share
-    sharp = metal & (at_present < cfg.sharp * share)
+    enough = shown > cfg.change * nearest.shape[1]
+    metal = enough & (shown > cfg.reflected * sent)
+    unexplained = unexplained_change(seen, map)[nearest].sum(1)
+    total = change(seen, seen.encoded)[nearest].sum(1)
+    sharp = metal & (unexplained > cfg.sharp * total)
     return Mirrors(metal, sharp, seen.normal, reflectance(seen, map, metal, nearest, cfg))
 
 
-def lowest_cost(seen: Sightings, map: NodeMap, cfg: MirrorConfig) -> Tensor:
-    """Lowest `cost_of` [N] of any normals in a cone around those of the points."""
-    u, v = sphere.frame(seen.normal)
-    radius = math.tan(math.radians(cfg.radius))
-    lowest = torch.full((len(u),), math.inf)
-    offsets = torch.linspace(-radius, radius, cfg.steps).tolist()
-    for a in offsets:
-        for b in offsets:
-            if math.hypot(a, b) < 1.001 * radius:
-                turned = normalize(seen.normal + a * u + b * v, dim=1)
-                lowest = torch.minimum(lowest, cost_of(replace(seen, normal=turned), map, cfg))
-    return lowest
+def change(seen: Sightings, color: Tensor) -> Tensor:
+    """Mean deviation [N] of colours [N, V, 3] from the mean of their point."""
+    mean = torch.stack([seen.mean(color[..., c]) for c in range(3)], 1)
+    return seen.mean((color - mean[:, None]).abs().mean(2))
 
 
-def cost_of(seen: Sightings, map: NodeMap, cfg: MirrorConfig) -> Tensor:
+def unexplained_change(seen: Sightings, map: NodeMap) -> Tensor:
     """Mean deviation [N] of what points show from the map that they mirror, sRGB, with the best
-    colour of each. A metal has to reflect what metals do."""
+    colour of each."""
     mirrored = lookup(EnvMap(map.encoded), reflect(seen.normal, seen.wo)[0])
     shown, weight = seen.encoded, seen.open[..., None]
     factor = (weight * shown * mirrored).sum(1)
     factor = factor / (weight * mirrored.square()).sum(1).clamp_min(1e-4)
-    factor = bounded(factor, float(linear_to_srgb_unclipped(torch.tensor(cfg.min_reflectance))))
-    residual = (shown - factor[:, None] * mirrored).abs().mean(2)
-    return seen.mean(residual.clamp_max(cfg.max_residual))
+    return seen.mean((shown - factor[:, None] * mirrored).abs().mean(2))
 
 
 def bounded(factor: Tensor, brightest: float) -> Tensor:
