@@ -70,7 +70,7 @@ def degrees(a, b):
 
 @pytest.mark.parametrize("paint", [white, black_and_glossy])
 def test_a_mirror_is_found_though_its_normals_are_off(paint):
-    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, paint, off=5)
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, paint, off=10)
     found = find_mirrors(scene, problem, CFG)
     true_normal = normalize(problem.observations.position, dim=1)
     above, below = true_normal[:, 2] > 0.25, true_normal[:, 2] < -0.25
@@ -92,13 +92,21 @@ def test_where_nothing_mirrors_nothing_changes(paint):
     assert torch.equal(torch.rand(4), expected)
 
 
-def test_change_that_no_map_explains_is_no_mirror():
+def test_how_much_a_point_changes_tells_and_not_what_it_mirrors():
     """Colours of mirrors, given to the points in another order."""
     scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
-    assert find_mirrors(scene, problem, CFG).metal.all()
     mixed = torch.randperm(POINTS * VIEWS)
     seen = replace(problem.observations, color=problem.observations.color[mixed])
-    assert find_mirrors(scene, replace(problem, observations=seen), CFG) is None
+    found = find_mirrors(scene, replace(problem, observations=seen), CFG)
+    assert found.metal.float().mean() > 0.97
+    assert found.sharp.float().mean() > 0.97
+
+
+def test_points_that_hardly_change_are_paint():
+    """However little the map changes: 8 bits are noisy."""
+    scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
+    loud = replace(CFG, mirror=MirrorConfig(change=0.5))
+    assert find_mirrors(scene, problem, loud) is None
 
 
 def test_points_that_see_no_sky_are_as_their_neighbours():
@@ -164,8 +172,7 @@ def test_what_is_rough_mirrors_but_is_not_sharp():
     scene, problem = under_fine_map(lambda n: n[:, 2] > 2, white)
     metal = torch.zeros(POINTS, 3), torch.full((POINTS,), 0.25), BASE.expand(POINTS, 3)
     problem = photographed(problem, scene.sky.radiance.detach(), *metal)
-    loose = replace(CFG, mirror=MirrorConfig(contrast=0.01))
-    found = find_mirrors(scene, problem, loose)
+    found = find_mirrors(scene, problem, CFG)
     assert found.metal.float().mean() > 0.95
     assert not found.sharp.any()
 
