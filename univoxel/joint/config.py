@@ -115,6 +115,50 @@ class MetalConfig:
 
 
 @dataclass(frozen=True)
+class MirrorConfig:
+    """Which points mirror the map, see joint/mirrors.py."""
+
+    # observations of a point that are compared, >= 1
+    views: int = 16
+    # of them, that mirror the sky, at least, >= 1; other points are as their neighbours
+    min_views: int = 3
+    # cosine, [0, 1], between normal and eye of an observation, at least
+    min_cosine: float = 0.2
+    # points whose changes, colours and normals are averaged, >= 1
+    neighbours: int = 32
+    # points, >= 1, most of which decide for each among them
+    voters: int = 96
+    # difference of unit normals, > 0, that counts as one unit of distance between points
+    turn: float = 0.5
+    # change of metal from view to view, linear, >= 0, at least: mean deviation from the mean
+    change: float = 0.05
+    # part, (0, 1], of the change of what it mirrors. Metals of the scenes reach 0.6 to 1, glossy
+    # paint 0.1 to 0.45
+    reflected: float = 0.55
+    # part, (0, 1], of the change that the map leaves unexplained where metal mirrors sharply
+    sharp: float = 0.6
+    # brightest channel of a metal at least, [0, 1]
+    min_reflectance: float = 0.25
+    # degrees, > 0, around a direction, whose brightest node tells how dark it is
+    around: float = 27.0
+    # share, (0, 1], of the directions, the darkest, that base colours are read from
+    darkest: float = 0.25
+    # length, [0, 1], of the mean of neighbouring normals, above which a surface is not thin
+    flat: float = 0.7
+    # cosine, [0, 1], between normals above which they are averaged
+    alike: float = 0.3
+    # weight, >= 0, of what was found of sharp points, in Adam
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_fields(self, *_WHOLE, "views", "min_views", "neighbours", "voters")
+        check_fields(self, *_FROM_ZERO, "min_cosine", "min_reflectance", "flat", "alike")
+        check_fields(self, *_NOT_BELOW, "change", "weight")
+        check_fields(self, *_ABOVE, "turn", "around")
+        check_fields(self, *_SHARE, "reflected", "sharp", "darkest")
+
+
+@dataclass(frozen=True)
 class EntropyConfig:
     """The prior that paint comes in few colours, see joint/albedo_entropy.py."""
 
@@ -265,6 +309,8 @@ class JointConfig:
     newton: NewtonConfig = field(default_factory=NewtonConfig)
     # how points are decided to be metal
     metal: MetalConfig = field(default_factory=MetalConfig)
+    # how points are decided to mirror the map
+    mirror: MirrorConfig = field(default_factory=MirrorConfig)
     # the prior on few colours, where colors is set
     entropy: EntropyConfig = field(default_factory=EntropyConfig)
     # hypothesis trials, from which the solve starts

@@ -64,12 +64,23 @@ class JointProblem:
 
 
 @dataclass(frozen=True)
+class Mirrors:
+    """Points that mirror the map, among all P of the problem."""
+
+    metal: Tensor  # [P] bool
+    sharp: Tensor  # [P] bool: of them, those that mirror more sharply than the map's nodes
+    normal: Tensor  # [P, 3] unit, without relief where sharp
+    base: Tensor  # [P, 3] what they reflect; 0 elsewhere
+
+
+@dataclass(frozen=True)
 class Decisions:
     """What the joint solve has decided so far; replaced as it goes on."""
 
     metal: Tensor  # [P] bool, which points are metal
     sun: Tensor | None = None  # [D, 3] what a sun adds to the log map, which else is smooth
     albedo: Tensor | None = None  # [P, 3] where the materials do not follow the map yet
+    mirrors: Mirrors | None = None  # None: nothing mirrors the map
 
 
 @torch.no_grad()

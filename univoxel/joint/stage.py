@@ -20,14 +20,17 @@ from univoxel.checkpoint import save_scene
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped
 from univoxel.data import Photos
 from univoxel.errors import NoSurface
+from univoxel.fields.heads import MaterialHead
 from univoxel.joint.albedo_entropy import diffuse_albedo, fit_sun_, minimise_entropy_
 from univoxel.joint.config import JointConfig
 from univoxel.joint.initialise import initialise_
 from univoxel.joint.metals import find_metal
+from univoxel.joint.mirrors import find_mirrors
 from univoxel.joint.newton import newton_round_
 from univoxel.joint.observations import (
     Decisions,
     JointProblem,
+    Mirrors,
     build_problem,
     first_decisions,
     prefiltered_roughness,
@@ -78,8 +81,8 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     current_round = Round(begin=0.0, end=-1.0, rounds_after=cfg.rounds, solved=False)
     if progress.within is not None:
         current_round = Round(**progress.within)
-        metal = find_metal(scene, problem, cfg, rounds_done(cfg, current_round.rounds_after))
-        decisions = replace(decisions, metal=metal)
+        done = rounds_done(cfg, current_round.rounds_after)
+        decisions = with_metals(scene, problem, decisions, cfg, done)
         optimizer = adam(scene, problem)
         guard.follow(optimizer)
     for done in progress.clock.steps(newton_share(cfg)):
@@ -168,11 +171,23 @@ def newton_phase_(
         if cfg.colors:
             minimise_entropy_(scene, problem, decisions, cfg.entropy)
         done = rounds_done(cfg, rounds_left - 1)
-        decisions = replace(decisions, metal=find_metal(scene, problem, cfg, done))
+        decisions = with_metals(scene, problem, decisions, cfg, done)
         if decisions.albedo is not None:
             teach_albedo_(scene, problem, decisions, cfg)
             decisions = replace(decisions, albedo=None)
     return decisions, bool(newton.costs)
+
+
+def with_metals(
+    scene: Scene, problem: JointProblem, decisions: Decisions, cfg: JointConfig, done: float
+) -> Decisions:
+    """The decisions with the metals that are found under the present map; done as in
+    `find_metal`."""
+    metal = find_metal(scene, problem, cfg, done)
+    mirrors = find_mirrors(scene, problem, cfg)
+    if mirrors is not None:
+        metal = metal | mirrors.metal
+    return replace(decisions, metal=metal, mirrors=mirrors)
 
 
 def rounds_done(cfg: JointConfig, rounds_after: int) -> float:
@@ -315,6 +330,8 @@ def objective(
     surface = normal[repeated], diffuse[repeated], filtered_roughness[repeated], f0[repeated]
     rgb = shade_observations(scene, problem, index, observation, *surface)
     encoded, target = linear_to_srgb_unclipped(rgb), problem.target[observation]
+    if decisions.mirrors is not None:  # the map is too coarse for them
+        encoded = torch.where(decisions.mirrors.sharp[index][:, None], target, encoded)
     squared_distance = (sample.sdf[: len(point)] / problem.voxel_size).square().mean()
     terms = {
         "joint": losses.photometric(encoded, target, clipped=CLIPPED),
@@ -323,4 +340,23 @@ def objective(
         "roughness": cfg.roughness_smoothness * priors.smoothness(roughness, roughness_nearby),
         "metallic": cfg.metallic * binary_cross_entropy(metallic, metal),
     }
+    if decisions.mirrors is not None:
+        terms["mirrors"] = cfg.mirror.weight * mirror_loss(
+            decisions.mirrors, point, normal, albedo, roughness
+        )
     return {name: share * term for name, term in terms.items()}
+
+
+def mirror_loss(
+    mirrors: Mirrors, point: Tensor, normal: Tensor, albedo: Tensor, roughness: Tensor
+) -> Tensor:
+    """How far points [N] that mirror sharply are from what was found of them: a mean over all.
+
+    Args:
+        normal, albedo, roughness: of the points, [N, 3], [N, 3] and [N].
+    """
+    from_normal = (normal - mirrors.normal[point]).norm(dim=1)
+    log_base = mirrors.base[point].clamp_min(1e-3).log()
+    from_base = (albedo.clamp_min(1e-3).log() - log_base).abs().mean(1)
+    from_roughness = (roughness - MaterialHead.min_roughness).abs()
+    return (mirrors.sharp[point] * (from_normal + from_base + from_roughness)).mean()

@@ -1,0 +1,206 @@
+"""Metals that mirror: found on a sphere under a map finer than its nodes, with normals that are
+off."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import scene_of
+from observed_points import photographed, problem_on_a_sphere
+from torch.nn.functional import normalize
+
+from univoxel import sphere
+from univoxel.color import linear_to_srgb_unclipped
+from univoxel.joint import stage
+from univoxel.joint.config import JointConfig, MirrorConfig
+from univoxel.joint.mirrors import find_mirrors, reflect, smoothed
+from univoxel.joint.observations import Mirrors
+from univoxel.lights.turntable import Turntable
+
+POINTS, VIEWS, NODES = 1500, 16, 512
+BASE = torch.tensor([0.9, 0.7, 0.5])
+CFG = JointConfig()
+
+
+def fine_map(direction):
+    """Radiance [..., 3] finer than the nodes are apart, and lamps."""
+    x, y, z = direction.unbind(-1)
+    pattern = 0.4 * (1.2 * (7 * x).sin() * (6 * y + 1).sin() + 1.2 * (7 * z + 2).sin()).exp()
+    tint = torch.stack([0.5 + 0.2 * x, 0.5 + 0.2 * y, 0.5 - 0.2 * z], -1)
+    return pattern[..., None] * tint
+
+
+def under_fine_map(metal, paint, off=0.0):
+    """A scene with the map's nodes, and photographs of a sphere: mirrors where `metal` of the
+    normals [P, 3] says so, else what `paint` makes; normals are off by degrees."""
+    torch.manual_seed(0)
+    scene = scene_of((0.5, 0.5, 0.5), 0.5, NODES)
+    problem = problem_on_a_sphere(POINTS, VIEWS, NODES, scene)
+    nodes = torch.zeros(NODES, 3)
+    texels = sphere.latlong_directions(64).flatten(0, 1)
+    nearest = (texels @ scene.sky.direction.T).argmax(1)
+    area = sphere.texel_solid_angles(64, 128).reshape(-1, 1)
+    nodes.index_add_(0, nearest, fine_map(texels) * area)
+    nodes /= torch.zeros(NODES, 1).index_add(0, nearest, area)
+    with torch.no_grad():
+        scene.sky.log_radiance.copy_(nodes.log())
+    normal = problem.observations.normal
+    painted = photographed(problem, nodes, *paint(normal)).observations.color
+    wo = problem.observations.wo.view(POINTS, VIEWS, 3)
+    mirrored = BASE * fine_map(reflect(normal, wo)[0]).flatten(0, 1)
+    is_metal = metal(normal)
+    color = torch.where(is_metal.repeat_interleave(VIEWS)[:, None], mirrored, painted)
+    wave = math.radians(1.4 * off) * (3 * normal[:, [1, 2, 0]] + 1).sin()
+    seen = replace(problem.observations, color=color, normal=normalize(normal + wave, dim=1))
+    return scene, replace(problem, observations=seen, target=linear_to_srgb_unclipped(color))
+
+
+def white(normal):
+    return torch.full((POINTS, 3), 0.6), torch.full((POINTS,), 0.9)
+
+
+def black_and_glossy(normal):
+    return torch.full((POINTS, 3), 0.02), torch.full((POINTS,), 0.3)
+
+
+def degrees(a, b):
+    return torch.rad2deg((a * b).sum(1).clamp(-1, 1).acos())
+
+
+@pytest.mark.parametrize("paint", [white, black_and_glossy])
+def test_a_mirror_is_found_though_its_normals_are_off(paint):
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, paint, off=10)
+    found = find_mirrors(scene, problem, CFG)
+    true_normal = normalize(problem.observations.position, dim=1)
+    above, below = true_normal[:, 2] > 0.25, true_normal[:, 2] < -0.25
+    assert found.metal[above].float().mean() > 0.95
+    assert found.metal[below].float().mean() < 0.02
+    sharp = above & found.sharp
+    assert sharp.sum() > 0.85 * above.sum()
+    assert degrees(problem.observations.normal, true_normal)[sharp].mean() > 4
+    assert not found.base[~found.metal].any()
+
+
+@pytest.mark.parametrize("paint", [white, black_and_glossy])
+def test_where_nothing_mirrors_nothing_changes(paint):
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 2, paint)
+    torch.manual_seed(3)
+    expected = torch.rand(4)
+    torch.manual_seed(3)
+    assert find_mirrors(scene, problem, CFG) is None
+    assert torch.equal(torch.rand(4), expected)
+
+
+def test_how_much_a_point_changes_tells_and_not_what_it_mirrors():
+    """Colours of mirrors, given to the points in another order."""
+    scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
+    mixed = torch.randperm(POINTS * VIEWS)
+    seen = replace(problem.observations, color=problem.observations.color[mixed])
+    found = find_mirrors(scene, replace(problem, observations=seen), CFG)
+    assert found.metal.float().mean() > 0.97
+    assert found.sharp.float().mean() > 0.97
+
+
+def test_points_that_hardly_change_are_paint():
+    """However little the map changes: 8 bits are noisy."""
+    scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
+    loud = replace(CFG, mirror=MirrorConfig(change=0.5))
+    assert find_mirrors(scene, problem, loud) is None
+
+
+def test_points_that_see_no_sky_are_as_their_neighbours():
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
+    true_normal = normalize(problem.observations.position, dim=1)
+    visibility = problem.transport.visibility.clone()
+    blocked = (true_normal[:, 2] > 0.3) & (torch.arange(POINTS) % 2 == 0)
+    visibility[blocked] = 0
+    problem = replace(problem, transport=replace(problem.transport, visibility=visibility))
+    found = find_mirrors(scene, problem, CFG)
+    assert found.metal[blocked].float().mean() > 0.95
+
+
+def test_light_that_turns_has_no_common_map():
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
+    assert find_mirrors(scene, replace(problem, turned=Turntable), CFG) is None
+
+
+def test_too_few_points_say_nothing():
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
+    many = replace(CFG, mirror=MirrorConfig(neighbours=POINTS + 1))
+    assert find_mirrors(scene, problem, many) is None
+
+
+def test_base_colours_are_read_from_where_it_is_dark():
+    """A lamp, which the photographs clip, lights half of the sky."""
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
+    seen, direction = problem.observations, scene.sky.direction
+    dark = 0.3 + 0.2 * direction
+    with torch.no_grad():
+        scene.sky.log_radiance.copy_(torch.where(direction[:, :1] > 0, 8.0, dark).log())
+    point = torch.arange(POINTS).repeat_interleave(VIEWS)
+    wo = seen.wo
+    mirrored = reflect(seen.normal[point], wo[:, None])[0][:, 0]
+    shown = BASE * torch.where(mirrored[:, :1] > 0, 8.0, 0.3 + 0.2 * mirrored)
+    problem = replace(problem, observations=replace(seen, color=shown.clamp_max(1.0)))
+    found = find_mirrors(scene, problem, CFG)
+    assert found.metal.float().mean() > 0.5  # points that mirror one side alone do not tell
+    base = found.base[found.metal].median(0).values
+    assert (base / BASE - 1).abs().max() < 0.03
+
+
+def test_polished_surfaces_have_no_relief_and_thin_ones_stay():
+    torch.manual_seed(0)
+    normal = normalize(torch.randn(2000, 3), dim=1)
+    bumpy = normalize(normal + 0.15 * torch.randn(2000, 3), dim=1)
+    ball = 0.5 * normal
+    everywhere = torch.ones(2000, dtype=torch.bool)
+    smooth = smoothed(ball, bumpy, everywhere, CFG.mirror)
+    before, after = (degrees(n, normal).mean() for n in (bumpy, smooth))
+    assert after < 0.4 * before
+    around = normalize(bumpy * torch.tensor([1.0, 1.0, 0.0]), dim=1)
+    wire = 0.005 * around + torch.linspace(-0.5, 0.5, 2000)[:, None] * torch.tensor([0.0, 0, 1])
+    assert torch.equal(smoothed(wire, around, everywhere, CFG.mirror), around)
+    half = everywhere & (normal[:, 2] > 0)
+    assert torch.equal(smoothed(ball, bumpy, half, CFG.mirror)[~half], bumpy[~half])
+    few = torch.arange(2000) < CFG.mirror.neighbours - 1
+    assert torch.equal(smoothed(ball, bumpy, few, CFG.mirror), bumpy)
+
+
+def test_what_is_rough_mirrors_but_is_not_sharp():
+    """Metal that blurs the map as its nodes do is explained with the normals that it has."""
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 2, white)
+    metal = torch.zeros(POINTS, 3), torch.full((POINTS,), 0.25), BASE.expand(POINTS, 3)
+    problem = photographed(problem, scene.sky.radiance.detach(), *metal)
+    found = find_mirrors(scene, problem, CFG)
+    assert found.metal.float().mean() > 0.95
+    assert not found.sharp.any()
+
+
+def test_sharp_points_learn_what_was_found_of_them():
+    normal = normalize(torch.randn(3, 3), dim=1)
+    base = torch.full((3, 3), 0.8)
+    sharp = torch.tensor([True, True, False])
+    found = Mirrors(torch.ones(3, dtype=torch.bool), sharp, normal, base)
+    point = torch.arange(3)
+    smooth = torch.full((3,), 0.05)
+    there = stage.mirror_loss(found, point, normal, base, smooth)
+    assert there == 0
+    elsewhere = -normal, 0.5 * base, smooth + 0.3
+    # of two thirds of the points
+    expected = 2 / 3 * (2 + math.log(2) + 0.3)
+    away = stage.mirror_loss(found, point, *elsewhere).item()
+    assert away == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_map_of_nodes_teaches_sharp_points_nothing():
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
+    everything = torch.ones(POINTS, dtype=torch.bool)
+    found = Mirrors(everything, everything, problem.observations.normal, BASE.expand(POINTS, 3))
+    decisions = stage.Decisions(everything, mirrors=found)
+    terms = stage.objective(scene, problem, decisions, replace(CFG, rays=64))
+    assert terms["joint"] == 0
+    assert terms["mirrors"] > 0
+    none = stage.objective(scene, problem, stage.Decisions(everything), replace(CFG, rays=64))
+    assert none["joint"] > 0
+    assert "mirrors" not in none

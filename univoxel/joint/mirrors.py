@@ -1,0 +1,227 @@
+"""Metals that mirror their surroundings, found by how much they change from view to view.
+
+A mirror shows the map sharper than its nodes lie apart, and through normals that are off by many
+degrees. So neither material fits, and residuals do not tell them apart. But how much a point
+changes from view to view does not depend on where exactly it mirrors: of metal it is about as much
+as the map changes between the mirrored directions, of paint a part of that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from univoxel import sphere
+from univoxel.color import linear_to_srgb_unclipped
+from univoxel.envmap import EnvMap, lookup
+from univoxel.joint.config import JointConfig, MirrorConfig
+from univoxel.joint.observations import (
+    JointProblem,
+    Mirrors,
+    observations_of,
+    without_exposure,
+)
+from univoxel.scene import Scene
+
+ROWS = 64  # of the map that is looked up: finer than the nodes lie apart
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """What N points of the surface show in V observations each."""
+
+    key: Tensor  # [N, 6] position and normal, in units that count as one distance
+    normal: Tensor  # [N, 3]
+    wo: Tensor  # [N, V, 3]
+    color: Tensor  # [N, V, 3] linear
+    open: Tensor  # [N, V] bool: the sky is where the mirrored direction points, and around it
+
+    @property
+    def encoded(self) -> Tensor:
+        """[N, V, 3] sRGB."""
+        return linear_to_srgb_unclipped(self.color.clamp(0, 1))
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Of values [N, V] over the observations that are open: [N]."""
+        return (values * self.open).sum(1) / self.open.sum(1).clamp_min(1)
+
+    def at(self, index: Tensor) -> Sightings:
+        return Sightings(**{name: value[index] for name, value in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class NodeMap:
+    """A map of nodes, at texels where it is looked up quickly."""
+
+    direction: Tensor  # [D, 3] unit, of the nodes
+    radiance: Tensor  # [D, 3]
+    node_at: Tensor  # [ROWS, 2 ROWS] int64 nearest node
+    encoded: Tensor  # [ROWS, 2 ROWS, 3] sRGB
+
+    @staticmethod
+    def of(direction: Tensor, incident: Tensor, radiance: Tensor) -> NodeMap:
+        """
+        Args:
+            incident: [ROWS, 2 ROWS, 3] what the nodes are at the texels.
+        """
+        node_at = (sphere.latlong_directions(ROWS) @ direction.T).argmax(2)
+        encoded = linear_to_srgb_unclipped(incident.clamp(0, 1)).contiguous()
+        return NodeMap(direction, radiance, node_at, encoded)
+
+    def nearest(self, direction: Tensor) -> Tensor:
+        """Node [...] next to directions [..., 3]."""
+        u, v = sphere.direction_to_latlong(direction).unbind(-1)
+        column = (u * 2 * ROWS).long() % (2 * ROWS)
+        return self.node_at[(v * ROWS).long().clamp_max(ROWS - 1), column]
+
+    def beside(self, count: int) -> Tensor:
+        """The nodes [D, count + 1] next to each, itself among them."""
+        return (self.direction @ self.direction.T).topk(count + 1, 1).indices
+
+    def brightest_within(self, degrees: float) -> Tensor:
+        """Brightest channel [D] of the nodes around each."""
+        near = self.direction @ self.direction.T > math.cos(math.radians(degrees))
+        return torch.where(near, self.radiance.amax(1), 0.0).amax(1)
+
+
+@torch.no_grad()
+def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirrors | None:
+    """Points that mirror the present map; None: there are none, or light differs between
+    photographs, so that no map is common to them.
+
+    What is random comes from a generator of its own: where nothing mirrors, nothing changes.
+    """
+    if problem.turned is not None or (scene.views and scene.views.sky_change() is not None):
+        return None
+    sky, count = problem.sky, cfg.mirror.neighbours
+    map = NodeMap.of(sky.direction, sky.latlong(ROWS), sky.radiance)
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(0)
+        seen = sightings(scene, problem, map, cfg)
+    decided = (seen.open.sum(1) >= cfg.mirror.min_views).nonzero()[:, 0]
+    if len(decided) < count:
+        return None
+    found = mirrors_among(seen.at(decided), map, cfg.mirror)
+    # Points that mirror the object, not the sky, are as their neighbours
+    nearest = KDTree(seen.key[decided].numpy()).query(seen.key.numpy(), workers=-1)[1]
+    like = torch.from_numpy(nearest)[neighbours(seen.key, min(cfg.mirror.voters, len(seen.key)))]
+    voters = found.metal[like][..., None].float()
+    base = (voters * found.base[like]).sum(1) / voters.sum(1).clamp_min(1)
+    metal, sharp = (x[like].float().mean(1) > 0.5 for x in (found.metal, found.sharp))
+    if not metal.any():
+        return None
+    normal = smoothed(problem.observations.position, seen.normal, sharp & metal, cfg.mirror)
+    return Mirrors(metal, sharp & metal, normal, torch.where(metal[:, None], base, 0.0))
+
+
+def sightings(scene: Scene, problem: JointProblem, map: NodeMap, cfg: JointConfig) -> Sightings:
+    """Of all points of the problem; those that no photograph sees have none that are open."""
+    observations = without_exposure(scene, problem.observations)
+    counts = observations.offsets.diff()
+    observation = observations_of(problem, torch.arange(len(counts)), cfg.mirror.views)
+    observation = observation.clamp_max(len(observations.view) - 1)
+    normal, wo = observations.normal, observations.wo[observation]
+    mirrored, cosine = reflect(normal, wo)
+    visible, node = problem.transport.visibility == 255, map.nearest(mirrored)
+    is_open = (cosine > cfg.mirror.min_cosine) & (counts > 0)[:, None]
+    for beside in map.beside(cfg.newton.neighbours).unbind(1):
+        is_open &= visible.gather(1, beside[node])
+    unit = cfg.metal.near * problem.voxel_size
+    key = torch.cat([observations.position / unit, normal / cfg.mirror.turn], 1)
+    return Sightings(key, normal, wo, observations.color[observation], is_open)
+
+
+def reflect(normal: Tensor, wo: Tensor) -> tuple[Tensor, Tensor]:
+    """Mirrored directions [N, V, 3] of wo [N, V, 3] about normals [N, 3], and cosines [N, V]."""
+    cosine = (normal[:, None] * wo).sum(2)
+    return 2 * cosine[..., None] * normal[:, None] - wo, cosine
+
+
+def neighbours(key: Tensor, count: int) -> Tensor:
+    """Index [N, count] of the nearest by key [N, K], itself first."""
+    nearest = KDTree(key.numpy()).query(key.numpy(), k=count, workers=-1)[1]
+    return torch.from_numpy(nearest).reshape(len(key), -1)
+
+
+def mirrors_among(seen: Sightings, map: NodeMap, cfg: MirrorConfig) -> Mirrors:
+    """Which of N points change from view to view as much as what they mirror.
+
+    Metal that the map explains with the present normals is rough: it blurs what is wrong with them.
+    """
+    nearest = neighbours(seen.key, cfg.neighbours)
+    node = map.nearest(reflect(seen.normal, seen.wo)[0])
+    shown, sent = (
+        change(seen, radiance.clamp(0, 1))[nearest].sum(1)
+        for radiance in (seen.color, map.radiance[node])
+    )
+    enough = shown > cfg.change * nearest.shape[1]
+    metal = enough & (shown > cfg.reflected * sent)
+    unexplained = unexplained_change(seen, map)[nearest].sum(1)
+    total = change(seen, seen.encoded)[nearest].sum(1)
+    sharp = metal & (unexplained > cfg.sharp * total)
+    return Mirrors(metal, sharp, seen.normal, reflectance(seen, map, metal, nearest, cfg))
+
+
+def change(seen: Sightings, color: Tensor) -> Tensor:
+    """Mean deviation [N] of colours [N, V, 3] from the mean of their point."""
+    mean = torch.stack([seen.mean(color[..., c]) for c in range(3)], 1)
+    return seen.mean((color - mean[:, None]).abs().mean(2))
+
+
+def unexplained_change(seen: Sightings, map: NodeMap) -> Tensor:
+    """Mean deviation [N] of what points show from the map that they mirror, sRGB, with the best
+    colour of each."""
+    mirrored = lookup(EnvMap(map.encoded), reflect(seen.normal, seen.wo)[0])
+    shown, weight = seen.encoded, seen.open[..., None]
+    factor = (weight * shown * mirrored).sum(1)
+    factor = factor / (weight * mirrored.square()).sum(1).clamp_min(1e-4)
+    return seen.mean((shown - factor[:, None] * mirrored).abs().mean(2))
+
+
+def bounded(factor: Tensor, brightest: float) -> Tensor:
+    """Factors [N, 3] of at most 1, their largest channel at least as bright as that."""
+    factor = factor.clamp(1e-3, 1.0)
+    return (factor * (brightest / factor.amax(1, keepdim=True)).clamp_min(1.0)).clamp_max(1.0)
+
+
+def reflectance(
+    seen: Sightings, map: NodeMap, metal: Tensor, nearest: Tensor, cfg: MirrorConfig
+) -> Tensor:
+    """Base colour [N, 3] of metals: what they and their neighbours show over what they mirror; 0
+    elsewhere.
+
+    Only of directions where all around is dark. Near a lamp the photographs are clipped and the map
+    is blurred, and normals that are off mistake the lamp for what is beside it.
+    """
+    mirrored, cosine = reflect(seen.normal, seen.wo)
+    node = map.nearest(mirrored)
+    around = map.brightest_within(cfg.around)[node]
+    counted = seen.open & (cosine > 0.5) & metal[:, None]
+    if counted.any():
+        counted &= around <= around[counted].quantile(cfg.darkest)
+    shown = (counted[..., None] * seen.color).sum(1)[nearest].sum(1)
+    sent = (counted[..., None] * map.radiance[node]).sum(1)[nearest].sum(1)
+    base = bounded(shown / sent.clamp_min(1e-3), cfg.min_reflectance)
+    return torch.where(metal[:, None], base, 0.0)
+
+
+def smoothed(position: Tensor, normal: Tensor, sharp: Tensor, cfg: MirrorConfig) -> Tensor:
+    """Normals [P, 3], those of sharp points averaged over their neighbours.
+
+    What is mirrored looks like relief while geometry forms; polished surfaces have none. Thin ones
+    stay, whose normals differ among neighbours.
+    """
+    index = sharp.nonzero()[:, 0]
+    if len(index) < cfg.neighbours:
+        return normal
+    own = normal[index]
+    around = own[neighbours(position[index], cfg.neighbours)]
+    flat = around.mean(1).norm(dim=1, keepdim=True) > cfg.flat
+    weight = ((own[:, None] * around).sum(2, keepdim=True) - cfg.alike).clamp_min(0)
+    mean = normalize((weight * around).sum(1), dim=1)
+    return normal.index_copy(0, index, torch.where(flat, mean, own))
