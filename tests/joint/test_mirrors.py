@@ -109,6 +109,15 @@ def test_points_that_hardly_change_are_paint():
     assert find_mirrors(scene, problem, loud) is None
 
 
+def test_lacquer_changes_less_than_what_it_mirrors():
+    scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
+    lacquer = 0.3 + 0.35 * problem.observations.color
+    problem = replace(problem, observations=replace(problem.observations, color=lacquer))
+    assert find_mirrors(scene, problem, CFG) is None
+    lenient = replace(CFG, mirror=MirrorConfig(reflected=0.2))
+    assert find_mirrors(scene, problem, lenient).metal.float().mean() > 0.9
+
+
 def test_points_that_see_no_sky_are_as_their_neighbours():
     scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
     true_normal = normalize(problem.observations.position, dim=1)
