@@ -43,6 +43,9 @@ from univoxel.training.surface_update import (
 
 RETRACE = 100  # steps after which light is traced through the surface as it has become
 RATES = ("lr_sdf", "lr_features", "lr_networks")
+# Of so many rays one is compared with a place beside it: priors need no more, and the networks'
+# evaluations for them are a sixth of a step
+COMPARED = 4
 MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silhouette's fringe
 
 
@@ -265,18 +268,38 @@ def objective(
     opacity, behind, target = opacity[hit], behind[hit], target[hit]
     shaded = shade(scene, met, batch.wo[hit], draw, view)
     encoded = linear_to_srgb_unclipped(shaded * opacity + behind * (1 - opacity))
+    assert met.metallic is not None
+    terms |= {
+        "physical": losses.photometric(encoded, target),
+        "metallic": weight.metallic * met.metallic.mean(),
+    }
+    some = torch.arange(0, len(hit), COMPARED)
+    return terms | evenness(scene, weight, at_rays(met, some), view[some], draw, features)
+
+
+def evenness(
+    scene: Scene,
+    weight: LossConfig,
+    met: Surface,
+    view: Tensor,
+    draw: torch.Generator,
+    features: Tensor | None,
+) -> dict[str, Tensor]:
+    """The terms by which material and light change little from points to places beside them.
+
+    Args:
+        view: [N] as of `shade`.
+        draw, features: as of `objective`.
+    """
     away = scene.field.voxel_size * torch.randn(met.position.shape, generator=draw)
     beside = met.position.detach() + away
     near = scene.field.features_at(beside, features)
     albedo, roughness, _ = scene.material(near)
-    assert met.metallic is not None
     here = replace(met, features=scene.coded(met.features, view))
     near = replace(met, features=scene.coded(near, view), position=beside)
-    terms |= {
-        "physical": losses.photometric(encoded, target),
+    terms = {
         "albedo": weight.albedo_smoothness * priors.smoothness(met.albedo, albedo),
         "roughness": weight.roughness_smoothness * priors.smoothness(met.roughness, roughness),
-        "metallic": weight.metallic * met.metallic.mean(),
     }
     return terms | weighted(scene.light.regularisation(here, near), weight)
 
