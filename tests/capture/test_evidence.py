@@ -34,17 +34,23 @@ def project(to_camera: np.ndarray, points: np.ndarray = CLOUD) -> np.ndarray:
 
 
 def scene(noise: float = 0.3) -> tuple[Model, dict[int, np.ndarray], list[Pair]]:
-    """A model of cameras around a cloud, features and matches of all pairs."""
-    images, features = [], {}
+    """A model of cameras around a cloud, features in an order of their own and matches of all
+    pairs."""
+    images, features, feature_of = [], {}, {}
     for v in range(1, VIEWS + 1):
-        xy = project(pose(0.3 * v)) + noise * RNG.normal(size=(POINTS, 2))
-        images.append(Placed(v, 1, f"{v}.jpg", pose(0.3 * v), xy, np.arange(POINTS)))
-        features[v] = xy
+        point = RNG.permutation(POINTS)
+        xy = project(pose(0.3 * v))[point] + noise * RNG.normal(size=(POINTS, 2))
+        images.append(Placed(v, 1, f"{v}.jpg", pose(0.3 * v), xy, point))
+        features[v], feature_of[v] = xy, point.argsort()
     points = Points(
         np.arange(POINTS), CLOUD, np.zeros((POINTS, 3), np.uint8), np.full(POINTS, noise), []
     )
-    same = np.repeat(np.arange(POINTS)[:, None], 2, 1)
-    pairs = [Pair(a, b, same, 2) for a in features for b in features if a < b]
+    pairs = [
+        Pair(a, b, np.stack([feature_of[a], feature_of[b]], 1), 2)
+        for a in features
+        for b in features
+        if a < b
+    ]
     return Model({1: LENS}, images, points), features, pairs
 
 

@@ -223,8 +223,16 @@ def test_what_nobody_waits_for_is_ended(tmp_path):
     assert not alive(begun(tmp_path, "mug")[0])
 
 
+@pytest.fixture
+def interruptible():
+    """SIGINT interrupts, also where these tests run in the background, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_ends_the_processes(tmp_path):
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it is ignored
     piece = counting(tmp_path, "mug", last=1000, pause=0.1)
 
     def stop() -> None:

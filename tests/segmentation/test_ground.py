@@ -78,6 +78,12 @@ def test_photographs_of_other_sizes_are_masked_in_their_own(ground):
     assert iou(found, torch.from_numpy(np.array(mask)).float() / 255) > 0.9
 
 
+@pytest.mark.parametrize("strict", [{"clearly": 0.01}, {"agree": 0.01}])
+def test_a_plane_on_which_photographs_agree_too_little_is_none(room, strict):
+    photographs, _, cameras = room
+    assert find_ground(photographs, cameras, replace(SMALL, **strict)) is None
+
+
 def test_a_background_that_stands_still_is_no_ground():
     """On a turntable no plane agrees."""
     view = textured_room.orbit(VIEWS, WIDTH, HEIGHT)[0]

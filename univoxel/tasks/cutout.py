@@ -135,10 +135,7 @@ def _from_colours(
             lambda db: progress.update(task, advance=1, facts=f"{db:.1f} dB"),
             config,
         )
-    return {
-        name: [_bytes(mask(scene, split, view)) for view in track(range(len(split)), "masks")]
-        for name, split in splits.items()
-    }
+    return _of_all(splits, lambda split, view: mask(scene, split, view))
 
 
 def _from_edges(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
@@ -151,10 +148,7 @@ def _from_edges(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
     if threshold is None:
         return None
     log.info("plain surroundings: the object is what edges of %g a pixel shut off", threshold)
-    return {
-        name: [_bytes(plain_mask(_encoded(split, v), threshold)) for v in range(len(split))]
-        for name, split in splits.items()
-    }
+    return _of_all(splits, lambda split, view: plain_mask(_encoded(split, view), threshold))
 
 
 def _from_ground(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
@@ -167,18 +161,20 @@ def _from_ground(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
     if ground is None:
         return None
     log.info("patterned ground: the object is what stands on it")
-    return {
-        name: [
-            _bytes(ground_mask(ground, _encoded(split, v), split.cameras, v))
-            for v in track(range(len(split)), "masks")
-        ]
-        for name, split in splits.items()
-    }
+    return _of_all(
+        splits,
+        lambda split, view: ground_mask(ground, _encoded(split, view), split.cameras, view),
+    )
 
 
 def _from_network(splits: dict[str, Photos], masked: Callable[[Tensor], Tensor]) -> Masks:
+    return _of_all(splits, lambda split, view: masked(_encoded(split, view)))
+
+
+def _of_all(splits: dict[str, Photos], masked: Callable[[Photos, int], Tensor]) -> Masks:
+    """Masks of all photographs, of each by its split and number."""
     return {
-        name: [_bytes(masked(_encoded(split, view))) for view in track(range(len(split)), "masks")]
+        name: [_bytes(masked(split, view)) for view in track(range(len(split)), "masks")]
         for name, split in splits.items()
     }
 

@@ -43,8 +43,8 @@ from univoxel.training.surface_update import (
 
 RETRACE = 100  # steps after which light is traced through the surface as it has become
 RATES = ("lr_sdf", "lr_features", "lr_networks")
-# Of so many rays one is compared with a place beside it: priors need no more, and the networks'
-# evaluations for them are a sixth of a step
+# Of so many rays one is compared with a place beside it, for which networks are evaluated again:
+# priors need no more
 COMPARED = 4
 MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silhouette's fringe
 
