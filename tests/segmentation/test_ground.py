@@ -78,7 +78,21 @@ def test_photographs_of_other_sizes_are_masked_in_their_own(ground):
     assert iou(found, torch.from_numpy(np.array(mask)).float() / 255) > 0.9
 
 
-@pytest.mark.parametrize("strict", [{"clearly": 0.01}, {"agree": 0.01}])
+def test_an_object_of_one_colour_is_no_floor(room):
+    """It has its colour at any height, and so in the plane, too."""
+    photographs, true, cameras = room
+    red = torch.tensor([200, 60, 40]).byte()
+    painted = [
+        torch.where(mask[..., None] > 0.5, red, one)
+        for one, mask in zip(photographs, true, strict=True)
+    ]
+    found = find_ground(painted, cameras, SMALL)
+    assert found is not None
+    overlaps = [iou(ground_mask(found, painted[v], cameras, v, SMALL), true[v]) for v in (0, 9)]
+    assert min(overlaps) > 0.9
+
+
+@pytest.mark.parametrize("strict", [{"clearly": 0.01}, {"agree": 0.01}, {"overlap": 0.999}])
 def test_a_plane_on_which_photographs_agree_too_little_is_none(room, strict):
     photographs, _, cameras = room
     assert find_ground(photographs, cameras, replace(SMALL, **strict)) is None
