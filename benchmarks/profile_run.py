@@ -2,7 +2,7 @@
 
     python benchmarks/profile_run.py SCENE [--preset fast] [--part 6] [--cpu]
 
-`univoxel.tasks.train` itself runs, on one thread; what it calls is timed where it is called. Of
+`univoxel.tasks.train` itself runs; what it calls is timed where it is called. Of
 every 16th backward pass the profiler says which part of the forward pass its nodes belong to; the
 time of all of them is divided in these proportions.
 """
@@ -232,9 +232,10 @@ def main() -> None:
     parser.add_argument(
         "--part", type=int, default=1, help="make an n-th of the steps and multiply (default: 1)"
     )
+    parser.add_argument("--threads", type=int, default=1, help="of all kernels (default: 1)")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "profile.json")
     options = parser.parse_args()
-    torch.set_num_threads(1)  # a step's parts would run side by side, and no clock is for both
+    torch.set_num_threads(options.threads)
     with tempfile.TemporaryDirectory() as folder:
         cfg = chosen(options.preset, options.minutes, options.scene, Path(folder) / "run")
         stages = (part_of(s, options.part) for s in cfg.stages)

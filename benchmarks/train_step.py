@@ -2,7 +2,7 @@
 
     python benchmarks/train_step.py [--rays 4096] [--out benchmarks/results/train_step.json]
 
-On one thread. The bundled scene is trained natively for some steps, then the loop of
+The bundled scene is trained natively for some steps, then the loop of
 univoxel.tasks.train itself runs on, once on each backend: its stages are timed where they are
 called. With the kernels the backward pass is divided too: a node belongs to the stage in which its
 forward was called. The references' is not: under the profiler that this takes their memory grew
@@ -194,9 +194,10 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=4096, help="per step (default: 4096)")
     parser.add_argument("--voxels", type=float, default=1.0, help="millions (default: 1)")
     parser.add_argument("--warm-up", type=int, default=96, help="steps of training before")
+    parser.add_argument("--threads", type=int, default=1, help="of all kernels (default: 1)")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "train_step.json")
     options = parser.parse_args()
-    torch.set_num_threads(1)  # a step's parts would run side by side, and no clock is for both
+    torch.set_num_threads(options.threads)
     torch.manual_seed(0)
     scene, pixels = hull_scene(options.voxels)
     run_steps(scene, pixels, options.rays, options.warm_up, begin=0.0)

@@ -13,10 +13,44 @@ namespace {
 
 constexpr int64_t kRowsPerChunk = 4096;
 
-/// node_of(row) -> Node, which nodes.row undoes.
-template <class T, class Nodes, class NodeOf>
+/// Nodes of ascending rows of a dense grid: divides once a line.
+struct DenseCursor {
+    int64_t size_y, size_z;
+    int64_t begin = 0, end = 0;  // rows of the line that the last row lay in
+    int64_t x = 0, y = 0;        // where that line is
+
+    Node operator()(int64_t row) {
+        if (row < begin || row >= end) {
+            const int64_t line = row / size_z;
+            begin = line * size_z, end = begin + size_z;
+            x = line / size_y, y = line - x * size_y;
+        }
+        return {x, y, row - begin};
+    }
+};
+
+/// Nodes of ascending rows of bricks: divides once a brick.
+struct BrickCursor {
+    const BrickNodes& nodes;
+    const int32_t* place;
+    int64_t brick = -1;  // that the last row lay in
+    Node first{0, 0, 0};
+
+    Node operator()(int64_t row) {
+        if (row / kBrickNodes != brick) {
+            brick = row / kBrickNodes;
+            first = nodes.first_node(place[brick]);
+        }
+        const Node offset = BrickNodes::offset(row % kBrickNodes);
+        return {first.x + offset.x, first.y + offset.y, first.z + offset.z};
+    }
+};
+
+/// cursor(row) -> Node, which nodes.row undoes.
+template <class T, class Nodes, class Cursor>
 void diffuse(T* values, const int64_t size[3], const Nodes& nodes, int64_t n_rows,
-             const int64_t* rows, int64_t n, T amount, int passes, int threads, NodeOf&& node_of) {
+             const int64_t* rows, int64_t n, T amount, int passes, int threads,
+             const Cursor& cursor) {
     threads = team_for(n, threads);
     RowSet chosen(n_rows);
     for (int64_t k = 0; k < n; ++k) chosen.mark(rows[k]);
@@ -24,10 +58,9 @@ void diffuse(T* values, const int64_t size[3], const Nodes& nodes, int64_t n_row
     DCHECK(chosen.count() == n && std::is_sorted(rows, rows + n));  // slot k is that of row k
     // Neighbours by slot, looked up once for all passes; slot n holds the 0 of all other nodes.
     const std::unique_ptr<int32_t[]> near(new int32_t[6 * n]);
-    const auto slot = [&](int64_t row) {
-        return static_cast<int32_t>(chosen.has(row) ? chosen.slot(row) : n);
-    };
+    const auto slot = [&](int64_t row) { return static_cast<int32_t>(chosen.slot_or(row, n)); };
     parallel_for(n, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
+        Cursor node_of = cursor;
         for (int64_t k = begin; k < end; ++k) {
             const Node at = node_of(rows[k]);
             const auto put = [&](int side, bool inside, int64_t x, int64_t y, int64_t z) {
@@ -65,24 +98,17 @@ template <class T>
 void diffuse_rows(T* values, const int64_t size[3], const int64_t* rows, int64_t n, T amount,
                   int passes, int threads) {
     const DenseNodes nodes{size[1], size[2]};
-    const auto node_of = [&](int64_t row) {
-        const int64_t line = row / size[2], x = line / size[1];
-        return Node{x, line - x * size[1], row - line * size[2]};
-    };
     const int64_t n_rows = size[0] * size[1] * size[2];
-    diffuse(values, size, nodes, n_rows, rows, n, amount, passes, threads, node_of);
+    diffuse(values, size, nodes, n_rows, rows, n, amount, passes, threads,
+            DenseCursor{size[1], size[2]});
 }
 
 template <class T>
 void diffuse_brick_rows(T* values, const int64_t size[3], const BrickNodes& nodes,
                         const int32_t* place, int64_t n_rows, const int64_t* rows, int64_t n,
                         T amount, int passes, int threads) {
-    const auto node_of = [&](int64_t row) {
-        const Node first = nodes.first_node(place[row / kBrickNodes]);
-        const Node offset = BrickNodes::offset(row % kBrickNodes);
-        return Node{first.x + offset.x, first.y + offset.y, first.z + offset.z};
-    };
-    diffuse(values, size, nodes, n_rows, rows, n, amount, passes, threads, node_of);
+    diffuse(values, size, nodes, n_rows, rows, n, amount, passes, threads,
+            BrickCursor{nodes, place});
 }
 
 template void diffuse_rows(float*, const int64_t[3], const int64_t*, int64_t, float, int, int);

@@ -46,6 +46,14 @@ class RowSet {
         return w.first + __builtin_popcountll(w.bits & ((uint64_t(1) << (row & 63)) - 1));
     }
 
+    /// Slot of a row, or `other` of one that is not marked: without a jump, which would be guessed.
+    int64_t slot_or(int64_t row, int64_t other) const {
+        const Word& w = words_[row >> 6];
+        const uint64_t bit = uint64_t(1) << (row & 63);
+        const int64_t slot = w.first + __builtin_popcountll(w.bits & (bit - 1));
+        return w.bits & bit ? slot : other;
+    }
+
     /// Write the row of every slot to rows [count].
     void write_rows(int64_t* rows, int threads) const {
         const int64_t n = static_cast<int64_t>(words_.size());

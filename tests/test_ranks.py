@@ -39,6 +39,16 @@ TRAIN = (
     *("--capacity", "fixed", "--no-page", *(x for change in FEW for x in ("--set", change))),
 )
 
+# One process that draws what two ranks draw
+IN_TWO_PARTS = """
+import sys
+from univoxel import cli
+from univoxel.training import loop
+parts_of = loop.parts_of
+loop.parts_of = lambda pixels, rays, _: parts_of(pixels, rays, 2)
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
 
 def environment(**more: str) -> dict[str, str]:
     return {**os.environ, "OMP_NUM_THREADS": "1", **more}
@@ -88,7 +98,7 @@ def quality(run: Path) -> float:
 @pytest.fixture(scope="module")
 def in_one(tmp_path_factory):
     out = tmp_path_factory.mktemp("ranks") / "one"
-    command = [sys.executable, "-m", "univoxel.cli", *TRAIN, "--out", str(out)]
+    command = [sys.executable, "-c", IN_TWO_PARTS, *TRAIN, "--out", str(out)]
     subprocess.run(command, env=environment(), check=True, capture_output=True)
     return out
 

@@ -98,7 +98,7 @@ class RowAdam(torch.optim.Optimizer):
         grad = param.grad
         rows = rows_of(grad)
         # Autograd forgets that a gradient is coalesced when it stores it; sorting again is dear.
-        if not (rows[1:] > rows[:-1]).all():
+        if not grad.is_coalesced() and not (rows[1:] > rows[:-1]).all():
             grad = grad.coalesce()
             rows = rows_of(grad)
         values = grad._values()

@@ -20,7 +20,6 @@ from univoxel.training import divergence, loop
 from univoxel.training import progress as progress_module
 from univoxel.training.config import StageConfig
 from univoxel.training.divergence import LIMIT, PROOF, Guard
-from univoxel.training.step import PARTS
 
 
 @pytest.fixture(scope="module")
@@ -59,15 +58,14 @@ def huge_gradient(terms, scene):
     return terms | {"bad": 1e20 * scene.material.net[-1].bias.sum()}
 
 
-def failing(monkeypatch, module, name, how, when, parts=1):
-    """`module.name`, broken in the steps whose number `when` accepts; the count of calls, of which
-    a step makes `parts`."""
+def failing(monkeypatch, module, name, how, when):
+    """`module.name`, broken in the steps whose number `when` accepts; the calls so far."""
     original, calls = getattr(module, name), []
 
     def broken(scene, *rest):
         terms = original(scene, *rest)
         calls.append(None)
-        return how(terms, scene) if when((len(calls) - 1) // parts) else terms
+        return how(terms, scene) if when(len(calls) - 1) else terms
 
     monkeypatch.setattr(module, name, broken)
     return calls
@@ -76,9 +74,9 @@ def failing(monkeypatch, module, name, how, when, parts=1):
 @pytest.mark.parametrize("how", [bad_loss, bad_gradient, huge_gradient])
 def test_one_bad_step_is_dropped(data, tmp_path, monkeypatch, caplog, how):
     caplog.set_level("INFO", "univoxel")
-    calls = failing(monkeypatch, loop, "objective", how, lambda i: i == 7, PARTS)
+    calls = failing(monkeypatch, loop, "objective", how, lambda i: i == 7)
     out = task.train(small(data, tmp_path / "run"))
-    assert len(calls) == 48 * PARTS
+    assert len(calls) == 48
     assert finite(load_scene(out))
     (told,) = events(out)
     what = "the loss is nan" if how is bad_loss else "a gradient is not finite"
@@ -88,7 +86,7 @@ def test_one_bad_step_is_dropped(data, tmp_path, monkeypatch, caplog, how):
 
 
 def test_a_failure_that_stays_ends_its_stage(data, tmp_path, monkeypatch):
-    calls = failing(monkeypatch, loop, "objective", bad_gradient, lambda i: 7 <= i < 20, PARTS)
+    calls = failing(monkeypatch, loop, "objective", bad_gradient, lambda i: 7 <= i < 20)
     out = task.train(small(data, tmp_path / "run"))
     told = events(out)
     assert len(told) == 2 * (LIMIT + 1)
@@ -97,7 +95,7 @@ def test_a_failure_that_stays_ends_its_stage(data, tmp_path, monkeypatch):
     assert told[LIMIT].startswith(f"stage 1, step {7 + LIMIT}:")
     assert told[LIMIT].endswith("the stage ends with the last state that was good")
     assert told[-1].startswith("stage 2,")
-    assert len(calls) == PARTS * (7 + 2 * (LIMIT + 1))
+    assert len(calls) == 7 + 2 * (LIMIT + 1)
     assert finite(load_scene(out))
 
 

@@ -1,4 +1,4 @@
-"""A step's gradients from parts that are worked on side by side."""
+"""A step's gradients, from the parts of its rays."""
 
 import pytest
 import torch
@@ -12,11 +12,10 @@ from univoxel.lights import SGConfig
 from univoxel.optim import parameters_of
 from univoxel.preparation.hull import mask_distances, visual_hull
 from univoxel.scene import Scene, SceneConfig
-from univoxel.threads import team
 from univoxel.training.config import LossConfig
 from univoxel.training.loop import build_optimizer, descend_, part_terms
 from univoxel.training.pixels import split_pixels
-from univoxel.training.step import PARTS, parts_of, total
+from univoxel.training.step import parts_of, total
 
 
 @pytest.fixture(scope="module")
@@ -46,16 +45,15 @@ def gradients(scene, pixels, parts, threads):
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        with team(PARTS) as work, scene.surface_held():
-            terms = descend_(scene, LossConfig(), pixels, parts, True, parameters, work)
-        assert torch.get_num_threads() == threads
+        with scene.surface_held():
+            terms = descend_(scene, LossConfig(), pixels, parts, True, parameters)
     finally:
         torch.set_num_threads(before)
     return terms, [p.grad for p in parameters if p.grad is not None]
 
 
 def test_they_are_the_gradients_of_the_whole_loss(scene, pixels):
-    parts = parts_of(pixels.trained, 301)
+    parts = parts_of(pixels.trained, 301, 2)
     terms, got = gradients(scene, pixels, parts, 2)
     parameters = [p for p in scene.parameters() if p.grad is not None]
     loss = sum(
@@ -73,7 +71,7 @@ def test_they_are_the_gradients_of_the_whole_loss(scene, pixels):
 
 
 def test_bits_do_not_depend_on_threads(scene, pixels):
-    parts = parts_of(pixels.trained, 600)
+    parts = parts_of(pixels.trained, 600, 1)
     found = []
     for threads in (1, 2):
         terms, grads = gradients(scene, pixels, parts, threads)
@@ -83,21 +81,21 @@ def test_bits_do_not_depend_on_threads(scene, pixels):
 
 
 def test_what_is_held_keeps_no_gradient_of_before(scene, pixels):
-    parts = parts_of(pixels.trained, 64)
+    parts = parts_of(pixels.trained, 64, 1)
     gradients(scene, pixels, parts, 1)
     assert scene.material.net[0].weight.grad is not None
     parameters = parameters_of(build_optimizer(scene, refit=True))
-    with team(1) as work, scene.surface_held():
-        descend_(scene, LossConfig(), pixels, parts, True, parameters, work)
+    with scene.surface_held():
+        descend_(scene, LossConfig(), pixels, parts, True, parameters)
     assert scene.material.net[0].weight.grad is None
 
 
 def test_parts_share_out_the_rays(pixels):
-    parts = parts_of(pixels.trained, 301)
+    parts = parts_of(pixels.trained, 301, 2)
     assert sum(len(p.pixels) for p in parts) == 301
     assert sum(p.share for p in parts) == pytest.approx(1)
-    assert len({p.seed for p in parts}) == PARTS
-    (alone,) = parts_of(pixels.trained, 1)
+    assert len({p.seed for p in parts}) == 2
+    (alone,) = parts_of(pixels.trained, 1, 2)
     assert alone.share == 1
 
 
@@ -106,17 +104,3 @@ def test_gradients_that_are_missing_count_as_none():
     assert total([None, None]) is None
     assert total([None, one]) is one
     assert torch.equal(total([one, one, one]), 3 * one)
-
-
-def test_an_error_in_a_part_is_raised():
-    def fail(_):
-        raise ArithmeticError("in a part")
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        with team(PARTS) as work, pytest.raises(ArithmeticError, match="in a part"):
-            work(fail, [1, 2])
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)

@@ -22,14 +22,13 @@ from univoxel.optim import RowAdam, parameters_of
 from univoxel.records import Rays, Surface
 from univoxel.render.pipeline import at_rays, radiance_of, shade, surface_at
 from univoxel.scene import Scene
-from univoxel.threads import Team, team
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
 from univoxel.training.exchange import summed_over_ranks_
 from univoxel.training.pixels import TrainingPixels, unpacked
 from univoxel.training.plateau import Plateau
 from univoxel.training.progress import Listener, Rehearsal
-from univoxel.training.step import Descent, Part, descent, parts_for, parts_of, summed_terms, total
+from univoxel.training.step import Part, descent, parts_of, summed_terms, total
 from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
@@ -79,8 +78,7 @@ def run_stage(
     guard.follow(optimizer)
     parameters = parameters_of(optimizer)
     ranks.as_first_([*scene.state_dict().values()])
-    count = parts_for(ranks.count())
-    with scene.surface_held(), team(count // ranks.count()) as work:
+    with scene.surface_held():
         for done in progress.clock.steps():
             physical = done >= stage.physical_from
             rates = learning_rates(stage, done, field.voxel_size)
@@ -97,8 +95,8 @@ def run_stage(
             if progress.clock.step % RETRACE == 0 and not stage.refit:
                 scene.release_surface()
 
-            parts = ranks.mine(parts_of(pixels.trained, stage.rays, count))
-            terms = descend_(scene, cfg.loss, pixels, parts, physical, parameters, work)
+            parts = ranks.mine(parts_of(pixels.trained, stage.rays, ranks.count()))
+            terms = descend_(scene, cfg.loss, pixels, parts, physical, parameters)
             terms = summed_over_ranks_(parameters, terms)
             if not guard.sound(torch.stack(list(terms.values())).sum()):
                 continue
@@ -130,21 +128,16 @@ def descend_(
     parts: Sequence[Part],
     physical: bool,
     parameters: Sequence[Tensor],
-    work: Team,
 ) -> dict[str, Tensor]:
-    """Give every parameter the gradient of the loss of all parts; the terms, weighted."""
+    """Give every parameter the gradient of the loss of the parts; the terms, weighted."""
     features = scene.field.features
     wanted = [p for p in parameters if p.requires_grad]
-    if physical and scene.light.traced:
-        scene.occluder()  # for all parts
-
-    def one(part: Part) -> Descent:
+    descents = []
+    for part in parts:
         # What is read beside the surface has a gradient of its own: torch adds sparse ones slowly
         beside = features.detach().requires_grad_()
         terms = part_terms(scene, weight, pixels.photos, part, physical, beside)
-        return descent(terms, part.share, [*wanted, beside])
-
-    descents = work(one, parts)
+        descents.append(descent(terms, part.share, [*wanted, beside]))
     for parameter in parameters:  # of one that no longer is trained an old gradient may be there
         parameter.grad = None
     for i, parameter in enumerate(wanted):

@@ -1,8 +1,7 @@
-"""A step's gradients, from rays in parts that are worked on side by side."""
+"""A step's gradients, from the parts of its rays."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -13,19 +12,10 @@ from torch import Tensor
 from univoxel.ops import sum_rows
 from univoxel.optim import rows_of
 
-# Of a step's rays, each a forward and backward pass of its own. The number is fixed: sums must not
-# depend on how many threads there are. Each part costs its small operations anew.
-PARTS = 2
-
-
-def parts_for(ranks: int) -> int:
-    """Parts of a step that so many ranks share: as many for each."""
-    return ranks * math.ceil(PARTS / ranks)
-
 
 @dataclass(frozen=True)
 class Part:
-    """What a part of a step is given: the same on any number of threads."""
+    """What a process does of a step, of which each rank has a part; threads share its kernels."""
 
     pixels: Tensor  # [N, 3] of the photographs: view, row, column
     seed: int  # of all that it draws
@@ -40,7 +30,7 @@ class Descent:
     gradients: Sequence[Tensor | None]  # of the loss, times the part's share
 
 
-def parts_of(pixels: Tensor, rays: int, count: int = PARTS) -> list[Part]:
+def parts_of(pixels: Tensor, rays: int, count: int) -> list[Part]:
     """Draw a step's rays among pixels [P, 3], with replacement: `count` parts, or one of few."""
     drawn = pixels[torch.randint(len(pixels), (rays,))]
     seeds = torch.randint(2**62, (count,)).tolist()
