@@ -357,12 +357,12 @@ class HeldConfig:
     # rounds, >= 1, in which points leave the table
     rounds: int = 8
     # root mean square, in sRGB, >= 0, by which a neighbourhood changes from view to view at least
-    change: float = 0.12
-    # times, >= 0, that points in the table show its changes
+    change: float = 0.18
+    # times, >= 0, that points which stay in the table show its changes
     gain: float = 0.6
     # share of all points, in [0, 1], that the table is made of at least: some agree by chance
-    least_share: float = 0.02
-    # correlation, in [0, 1], of changes with those of the table, from which on a point is held
+    least_share: float = 0.05
+    # correlation, in [0, 1], of their changes with those of the table
     correlation: float = 0.5
     # voxels, > 0, around the surface within which nodes stay
     band: float = 3.0

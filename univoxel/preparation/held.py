@@ -105,7 +105,6 @@ def mirroring(seen: Observations, hull: Tensor, grid: GridShape, cfg: HeldConfig
     change = sightings.centred(sightings.color, torch.ones(len(sightings.point)))
     rms = (sightings.around(total(change.square().sum(1))) / sightings.around(count)).sqrt()
     in_table = rms > cfg.change
-    correlation = torch.zeros_like(rms)
     for i in range(cfg.rounds):
         gain, correlation = sightings.explained(in_table)
         strictness = min(1.0, (i + 1) / (cfg.rounds / 2))
@@ -113,7 +112,7 @@ def mirroring(seen: Observations, hull: Tensor, grid: GridShape, cfg: HeldConfig
         in_table &= (gain > strictness * cfg.gain) & (correlation > strictness * cfg.correlation)
         if in_table.sum() < cfg.least_share * len(in_table):
             return torch.zeros_like(in_table)
-    return (rms > cfg.change) & (correlation > cfg.correlation)
+    return in_table
 
 
 @dataclass(frozen=True)
