@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 from scipy.spatial import KDTree
-from scipy.stats import rankdata
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -130,6 +129,8 @@ def spearman(a: Tensor, b: Tensor) -> float | None:
     None where one of the sets is all equal, or empty. Source: Spearman 1904.
     """
     _same_size("spearman", a, b)
+    from scipy.stats import rankdata  # half a second, which every command would wait
+
     first, second = rankdata(a.numpy()), rankdata(b.numpy())
     if not len(first) or not first.std() or not second.std():
         return None

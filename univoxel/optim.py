@@ -50,7 +50,11 @@ class RowAdam(torch.optim.Optimizer):
                 raise ValueError(f"RowAdam: {name} must be at least 0, got {group[name]}")
         if not all(0 <= beta < 1 for beta in group["betas"]):
             raise ValueError(f"RowAdam: betas must be in [0, 1), got {group['betas']}")
-        super().add_param_group(param_group)
+        _plain(torch.optim.Optimizer.add_param_group)(self, param_group)
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """As of any optimizer."""
+        _plain(torch.optim.Optimizer.zero_grad)(self, set_to_none)
 
     @torch.no_grad()
     def follow(self, old: Tensor, new: Tensor) -> None:
@@ -148,6 +152,12 @@ class RowAdam(torch.optim.Optimizer):
             state["exp_avg"] = torch.zeros_like(param)
             state["exp_avg_sq"] = torch.zeros_like(param)
         return state
+
+
+def _plain(method: Callable[..., None]) -> Callable[..., None]:
+    """A method of torch's optimizers without what hides it from the compiler: that imports the
+    compiler when first called, a second and 70 MB."""
+    return getattr(method, "__wrapped__", method)
 
 
 def parameters_of(optimizer: torch.optim.Optimizer) -> list[Tensor]:

@@ -9,6 +9,7 @@ from univoxel import losses
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.data import Photos
 from univoxel.lights.views import ShownLight, ViewLights
+from univoxel.optim import RowAdam
 from univoxel.render.pipeline import at_rays, shade, surface_of_view
 from univoxel.scene import Scene
 from univoxel.training.surface_update import geometric
@@ -37,7 +38,7 @@ def fit_light_(scene: Scene, photos: Photos, view: int) -> None:
     log_gain = torch.zeros(3, requires_grad=True)
     codes = scene.views.raw_codes
     code = None if codes is None else torch.zeros(codes.shape[1], requires_grad=True)
-    optimizer = torch.optim.Adam([log_gain] if code is None else [log_gain, code])
+    optimizer = RowAdam([log_gain] if code is None else [log_gain, code])
     generator = torch.Generator().manual_seed(view)
     for step in range(STEPS):
         optimizer.param_groups[0]["lr"] = geometric(LR, step / STEPS)

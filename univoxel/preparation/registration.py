@@ -11,6 +11,7 @@ from torch.nn.functional import grid_sample
 
 from univoxel import shelf
 from univoxel.camera import Cameras, pixel_rays
+from univoxel.optim import RowAdam
 from univoxel.poses import PoseSteps
 from univoxel.preparation.config import REGISTRATION, RegistrationConfig
 from univoxel.records import Rays
@@ -144,7 +145,7 @@ def align_(
     if not len(edges.pixels):
         return
     begin, end = cfg.lr
-    optimizer = torch.optim.Adam(poses.parameters(), betas=(0.9, 0.99))
+    optimizer = RowAdam(poses.parameters(), betas=(0.9, 0.99))
     poses.train()
     for k in range(cfg.steps):
         optimizer.param_groups[0]["lr"] = begin * (end / begin) ** (k / cfg.steps)
