@@ -15,7 +15,7 @@ from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape, fit_grid
 from univoxel.optim import rows_of
 from univoxel.preparation.config import HeldConfig
-from univoxel.preparation.held import held_hull
+from univoxel.preparation.held import grown, held_hull
 from univoxel.preparation.hull import mask_distances, visual_hull
 from univoxel.preparation.prepare import Silhouettes, held_in, prepare
 from univoxel.presets import preset
@@ -102,6 +102,20 @@ def test_a_few_points_that_agree_are_chance():
 
 def test_nothing_is_looked_at_where_no_points_are_asked_for():
     assert held(mirror, replace(CFG, points=0))[0] is None
+
+
+def test_regions_take_in_holes_and_what_is_weak_beside_them():
+    line = torch.arange(40)
+    nearest = (line[:, None] + torch.arange(-4, 5)).clamp(0, 39)
+    strong, weak = (line >= 8) & (line < 20), (line >= 20) & (line < 30)
+    strong[13] = strong[35] = False
+    alone = strong.clone()
+    alone[35] = True  # and no region
+    found = grown(alone, weak, nearest)
+    assert found[8:26].all()
+    assert not found[:5].any()
+    assert not found[31:].any()
+    assert not grown(strong & (line > 17), weak, nearest).any()
 
 
 def test_nodes_near_held_points_stay(ball):

@@ -364,13 +364,23 @@ class HeldConfig:
     least_share: float = 0.05
     # correlation, in [0, 1], of their changes with those of the table
     correlation: float = 0.5
+    # change, >= 0, of points of the table from which regions grow that are held. Chrome changes by
+    # 0.3 to 0.45 under lamps, rough copper by 0.2 to 0.3: that is trained better than it is held
+    strong_change: float = 0.33
+    # change, >= 0, of points that they take in
+    weak_change: float = 0.26
+    # correlation, in [0, 1], of such points
+    weak_correlation: float = 0.2
     # voxels, > 0, around the surface within which nodes stay
     band: float = 3.0
 
     def __post_init__(self) -> None:
         check_fields(self, *_WHOLE, "min_views", "rows", "classes", "neighbours", "rounds")
-        check_fields(self, *_NOT_BELOW, "points", "change", "gain")
-        check_fields(self, *_SHARE, "min_cosine", "share", "least_share", "correlation")
+        check_fields(self, *_NOT_BELOW, "points", "gain")
+        check_fields(self, *_NOT_BELOW, "change", "strong_change", "weak_change")
+        check_fields(
+            self, *_SHARE, "min_cosine", "share", "least_share", "correlation", "weak_correlation"
+        )
         check_fields(self, *_ABOVE, "off_surface", "least", "near", "bend", "band")
         check_fields(self, "in [0, 180]", lambda x: 0 <= x <= 180, "turn")
 

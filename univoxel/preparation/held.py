@@ -29,6 +29,10 @@ from univoxel.preparation.hull import visual_hull
 from univoxel.preparation.observed_hull import observe_hull
 from univoxel.render.transport import Observations
 
+# Shares of a point's neighbours that take it into a region, or, some, if it is weak; and rounds
+MOST, SOME = 0.5, 0.3
+GROWTHS, TRIMS = 4, 3
+
 
 @dataclass(frozen=True)
 class HeldHull:
@@ -112,7 +116,31 @@ def mirroring(seen: Observations, hull: Tensor, grid: GridShape, cfg: HeldConfig
         in_table &= (gain > strictness * cfg.gain) & (correlation > strictness * cfg.correlation)
         if in_table.sum() < cfg.least_share * len(in_table):
             return torch.zeros_like(in_table)
-    return in_table
+    place = torch.cat([seen.position / (cfg.near * grid.voxel_size), seen.normal], 1)
+    nearest = KDTree(place.numpy()).query(place.numpy(), k=cfg.neighbours, workers=-1)[1]
+    weak = (rms > cfg.weak_change) & (correlation > cfg.weak_correlation)
+    return grown(in_table & (rms > cfg.strong_change), weak, torch.from_numpy(nearest))
+
+
+def grown(strong: Tensor, weak: Tensor, nearest: Tensor) -> Tensor:
+    """Regions that begin where most points are strong, and take in weak ones and holes: [N] bool.
+
+    Some of a mirror shows what stands beside it, or is not seen often enough.
+
+    Args:
+        strong, weak: [N] bool.
+        nearest: [N, K] int64, neighbours of each.
+    """
+
+    def share(region: Tensor) -> Tensor:
+        return region[nearest].float().mean(1)
+
+    region = strong & (share(strong) > MOST)
+    for _ in range(GROWTHS):
+        region = region | (weak & (share(region) > SOME)) | (share(region) > MOST)
+    for _ in range(TRIMS):
+        region = region & (share(region) > SOME)
+    return region
 
 
 @dataclass(frozen=True)
