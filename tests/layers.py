@@ -78,7 +78,7 @@ HELPERS = {
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "preparation": {
-        *("belief", "depth_sweep", "carving", "exposures", "hull", "light_frame", "masks"),
+        *("belief", "depth_sweep", "carving", "exposures", "held", "hull", "light_frame", "masks"),
         *("matches", "observed_hull", "outlines", "registration", "surroundings"),
     },
     "training": {

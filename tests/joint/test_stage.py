@@ -30,6 +30,7 @@ from univoxel.joint.config import JointConfig, NewtonConfig
 from univoxel.joint.newton import NewtonRound, newton_round_
 from univoxel.joint.observations import (
     Decisions,
+    Mirrors,
     prefiltered_roughness,
     sample_observations,
 )
@@ -598,6 +599,28 @@ def test_materials_follow_a_map_that_was_changed(monkeypatch):
     assert (after[0] - before[0]).abs()[held].mean() < 0.2 * off[held].mean()
     for now, was in zip(after[1:], before[1:], strict=True):
         assert (now - was).abs().mean() < 0.02
+
+
+def test_mirrors_are_learned_and_do_not_pull_the_rest_along():
+    torch.manual_seed(0)
+    scene = sphere_scene(12)
+    problem = problem_on_a_sphere(600, 4, 12, scene)
+    height = problem.observations.normal[:, 2]
+    sharp, base = height > 0.5, torch.tensor([0.9, 0.6, 0.3]).expand(600, 3)
+    mirrors = Mirrors(sharp, sharp, problem.observations.normal, base)
+    position = problem.observations.position
+    before = [m.detach() for m in scene.material(scene.field.features_at(position))]
+    cfg = replace(CFG, rays=512, lr_features=0.2, lr_networks=0.03)  # from features that are 0
+    stage.teach_mirrors_(scene, problem, mirrors, cfg)
+    albedo, roughness, metallic = (
+        m.detach() for m in scene.material(scene.field.features_at(position))
+    )
+    inside, outside = height > 0.8, height < 0.2
+    assert (albedo - base)[inside].abs().mean() < 0.1
+    assert roughness[inside].mean() < 0.05 + 0.2 * (before[1][inside].mean() - 0.05)
+    assert metallic[inside].mean() > 0.5  # from 0.02; the solve goes on with it
+    for now, was in zip((albedo, roughness, metallic), before, strict=True):
+        assert (now - was)[outside].abs().mean() < 0.02
 
 
 def test_without_paint_materials_stay(monkeypatch):

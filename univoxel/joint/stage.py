@@ -9,6 +9,7 @@ and highlights determine better than silhouettes and colours did.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import torch
@@ -175,6 +176,8 @@ def newton_phase_(
         if decisions.albedo is not None:
             teach_albedo_(scene, problem, decisions, cfg)
             decisions = replace(decisions, albedo=None)
+        if decisions.mirrors is not None:
+            teach_mirrors_(scene, problem, decisions.mirrors, cfg)
     return decisions, bool(newton.costs)
 
 
@@ -236,10 +239,33 @@ def teach_albedo_(
     diffuse = target.isfinite().all(1) & ~decisions.metal
     if not diffuse.any():
         return
-    position, steps = problem.observations.position, cfg.entropy.teaching_steps
     with torch.no_grad():
-        albedo, *other_materials = scene.material(scene.field.features_at(position))
-    target = torch.where(diffuse[:, None], target, albedo.clamp_min(1e-3)).log()
+        albedo, *others = scene.material(scene.field.features_at(problem.observations.position))
+    teach_(scene, problem, (torch.where(diffuse[:, None], target, albedo), *others), cfg)
+
+
+def teach_mirrors_(scene: Scene, problem: JointProblem, mirrors: Mirrors, cfg: JointConfig) -> None:
+    """Teach the materials what was found of points that mirror sharply; the others stay.
+
+    Adam on the photographs would pull everything along, as all begin alike, and roughness would not
+    come back from where it ends.
+    """
+    with torch.no_grad():
+        materials = scene.material(scene.field.features_at(problem.observations.position))
+    low = torch.full_like(materials[1], MaterialHead.min_roughness)
+    found = mirrors.base, low, torch.ones_like(low)
+    sharp = mirrors.sharp
+    target = [
+        torch.where(sharp.view(-1, *[1] * (before.dim() - 1)), after, before)
+        for before, after in zip(materials, found, strict=True)
+    ]
+    teach_(scene, problem, target, cfg)
+
+
+def teach_(scene: Scene, problem: JointProblem, target: Sequence[Tensor], cfg: JointConfig) -> None:
+    """Teach the materials albedo [N, 3], roughness [N] and metallic [N] of the problem's points."""
+    position, steps = problem.observations.position, cfg.entropy.teaching_steps
+    log_albedo, *others = target[0].clamp_min(1e-3).log(), *target[1:]
     materials = {"params": list(scene.material.parameters())}
     optimizer = RowAdam([{"params": [scene.field.features], "eps": EPS_FEATURES}, materials])
     for step in range(steps):
@@ -248,9 +274,9 @@ def teach_albedo_(
             group["lr"] = rate * cfg.adam.decay ** (step / steps)
         point = torch.randint(len(position), (cfg.rays,))
         material = scene.material(scene.field.features_at(position[point]))
-        loss = (material[0].clamp_min(1e-3).log() - target[point]).abs().mean()
-        for value, value_before in zip(material[1:], other_materials, strict=True):
-            loss = loss + (value - value_before[point]).abs().mean()
+        loss = (material[0].clamp_min(1e-3).log() - log_albedo[point]).abs().mean()
+        for value, wanted in zip(material[1:], others, strict=True):
+            loss = loss + (value - wanted[point]).abs().mean()
         optimizer.zero_grad(set_to_none=True)
         (cfg.entropy.teaching_weight * loss).backward()
         optimizer.step()

@@ -327,6 +327,65 @@ class LightFrameConfig:
 
 
 @dataclass(frozen=True)
+class HeldConfig:
+    """Where training leaves the visual hull as it is, see preparation/held.py."""
+
+    # points of the hull that are looked at, >= 0; 0: nothing is held
+    points: int = 8000
+    # cosine of normal and direction to the camera, in [0, 1], below which sightings are left out
+    min_cosine: float = 0.25
+    # sightings that a point has at least, >= 1
+    min_views: int = 8
+    # voxels, > 0, off the surface at which mirrored rays start
+    off_surface: float = 2.0
+    # rows, >= 1, and twice as many columns, of the table of what directions send
+    rows: int = 24
+    # sightings, > 0, that have to tell what a direction sends
+    least: float = 3.0
+    # share, in [0, 1], of a neighbourhood's sightings that have to be told so
+    share: float = 0.3
+    # classes of normals, >= 1, spread over the sphere
+    classes: int = 64
+    # degrees, in [0, 180], by which normals differ that are compared with one another
+    turn: float = 20.0
+    # points, >= 1, of a neighbourhood, over which sums are taken
+    neighbours: int = 32
+    # voxels, > 0, that count in the search for neighbours as much as `bend`
+    near: float = 3.0
+    # difference of unit normals, > 0
+    bend: float = 0.5
+    # rounds, >= 1, in which points leave the table
+    rounds: int = 8
+    # root mean square, in sRGB, >= 0, by which a neighbourhood changes from view to view at least
+    change: float = 0.18
+    # times, >= 0, that points which stay in the table show its changes
+    gain: float = 0.6
+    # share of all points, in [0, 1], that the table is made of at least: some agree by chance
+    least_share: float = 0.05
+    # correlation, in [0, 1], of their changes with those of the table
+    correlation: float = 0.5
+    # change, >= 0, of points of the table from which regions grow that are held. Chrome changes by
+    # 0.3 to 0.45 under lamps, rough copper by 0.2 to 0.3: that is trained better than it is held
+    strong_change: float = 0.33
+    # change, >= 0, of points that they take in
+    weak_change: float = 0.26
+    # correlation, in [0, 1], of such points
+    weak_correlation: float = 0.2
+    # voxels, > 0, around the surface within which nodes stay
+    band: float = 3.0
+
+    def __post_init__(self) -> None:
+        check_fields(self, *_WHOLE, "min_views", "rows", "classes", "neighbours", "rounds")
+        check_fields(self, *_NOT_BELOW, "points", "gain")
+        check_fields(self, *_NOT_BELOW, "change", "strong_change", "weak_change")
+        check_fields(
+            self, *_SHARE, "min_cosine", "share", "least_share", "correlation", "weak_correlation"
+        )
+        check_fields(self, *_ABOVE, "off_surface", "least", "near", "bend", "band")
+        check_fields(self, "in [0, 180]", lambda x: 0 <= x <= 180, "turn")
+
+
+@dataclass(frozen=True)
 class PreparationConfig:
     """What happens before the first gradient, in order."""
 
@@ -344,12 +403,14 @@ class PreparationConfig:
     exposures: ExposureConfig = field(default_factory=ExposureConfig)
     # whether the light turned with the camera
     light_frame: LightFrameConfig = field(default_factory=LightFrameConfig)
+    # where training leaves the hull as it is
+    held: HeldConfig = field(default_factory=HeldConfig)
     # where the hull is opened
     carving: CarvingConfig = field(default_factory=CarvingConfig)
 
 
 MASKS, HULL, REGISTRATION = MaskConfig(), HullConfig(), RegistrationConfig()
 MATCHES, OUTLINES = MatchesConfig(), OutlineConfig()
-EXPOSURES, CARVING = ExposureConfig(), CarvingConfig()
+EXPOSURES, CARVING, HELD = ExposureConfig(), CarvingConfig(), HeldConfig()
 LIGHT_FRAME = LightFrameConfig()
 PREPARATION = PreparationConfig()

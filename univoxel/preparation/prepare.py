@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
+from univoxel.camera import Cameras
 from univoxel.config import TrainConfig
 from univoxel.data import Photos
 from univoxel.errors import DataError, UserError
@@ -15,12 +17,15 @@ from univoxel.names import Varying
 from univoxel.poses import PoseSteps
 from univoxel.preparation.belief import doubted_pixels, weighed
 from univoxel.preparation.carving import carve_within_time
+from univoxel.preparation.config import PreparationConfig
 from univoxel.preparation.exposures import say_clipped, varying_and_gains
+from univoxel.preparation.held import HeldHull, held_hull
 from univoxel.preparation.hull import estimate_bounds, visual_hull
 from univoxel.preparation.light_frame import turntable_of
 from univoxel.preparation.masks import fitted_masks, with_masks
 from univoxel.preparation.outlines import drawn_again
 from univoxel.preparation.registration import registered_poses
+from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
 
 
@@ -47,6 +52,7 @@ class Prepared:
     varying: Varying  # what differs from photograph to photograph
     gains: Tensor | None  # [V] log gains of the exposures; None: all are alike
     turntable: Turntable | None  # about which the light turns; None: it stands still
+    held: HeldHull | None  # where training leaves the hull as it is; None: nowhere
 
 
 def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
@@ -94,7 +100,42 @@ def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
         photos, hull, grid, cfg.scene.varying, cfg.exposures, constants.exposures
     )
     turntable = turntable_of(photos, hull, grid, cfg.light_frame, constants.light_frame)
+    held = None
+    if varying == "none" and turntable is None:
+        held = find_held(silhouettes, photos.cameras, hull, grid, constants)
     if cfg.hollows and varying != "light" and turntable is None:
         seconds = cfg.hollows * 60 * cfg.minutes
-        hull = carve_within_time(hull, grid, photos, gains, seconds, constants.carving)
-    return Prepared(silhouettes, poses, grid, hull, varying, gains, turntable)
+        carved = carve_within_time(hull, grid, photos, gains, seconds, constants.carving)
+        hull = carved if held is None else torch.where(held.nodes(hull, grid), hull, carved)
+    return Prepared(silhouettes, poses, grid, hull, varying, gains, turntable, held)
+
+
+def held_in(silhouettes: Silhouettes, scene: Scene, cfg: TrainConfig) -> HeldHull | None:
+    """What `prepare` held, of a scene that goes on."""
+    stage = cfg.stages[0]
+    assert isinstance(stage, StageConfig)
+    if scene.cfg.varying != "none" or scene.cfg.turntable is not None:
+        return None
+    cameras = scene.registered(silhouettes.photos).cameras
+    grid = fit_grid(*silhouettes.box, round(1e6 * stage.voxels))
+    hull = visual_hull(silhouettes.distance, cameras, grid, cfg.preparation.hull)
+    return find_held(silhouettes, cameras, hull, grid, cfg.preparation)
+
+
+def find_held(
+    silhouettes: Silhouettes,
+    cameras: Cameras,
+    hull: Tensor,
+    grid: GridShape,
+    cfg: PreparationConfig,
+) -> HeldHull | None:
+    """`held_hull`; rough masks give no hull that could be right.
+
+    Args:
+        cameras: where they are believed to be.
+        hull: [X, Y, Z] sdf of the visual hull on the grid, world units.
+    """
+    if silhouettes.votes > 1:
+        return None
+    photos = replace(silhouettes.photos, cameras=cameras)
+    return held_hull(photos, silhouettes.distance, hull, grid, cfg.held, cfg.hull)

@@ -1,0 +1,199 @@
+"""Where the visual hull stays, on balls that mirror, are painted, or are seen through."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from analytic import RADIUS, cameras_around, sphere_normals
+
+from univoxel.build import build_scene
+from univoxel.camera import image_rays
+from univoxel.color import linear_to_srgb
+from univoxel.data import Photos
+from univoxel.fields.field import dense_field
+from univoxel.grid import GridShape, fit_grid
+from univoxel.optim import rows_of
+from univoxel.preparation.config import HeldConfig
+from univoxel.preparation.held import grown, held_hull
+from univoxel.preparation.hull import mask_distances, visual_hull
+from univoxel.preparation.prepare import Silhouettes, held_in, prepare
+from univoxel.presets import preset
+from univoxel.training.surface_update import smooth_sdf_gradient_
+
+VIEWS, SIZE = 24, 64
+CFG = HeldConfig(points=4000, classes=24)
+GRID = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 24**3)
+
+
+def sky(direction):
+    """Lamps of several colours in the dark."""
+    phase = torch.tensor([0.0, 2.0, 4.0])
+    lamps = torch.sin(4 * direction + phase) + torch.sin(5 * direction.roll(1, -1))
+    return lamps.clamp_min(0) / 2
+
+
+def mirror(rays, normal):
+    cosine = (rays.direction * normal).sum(-1, keepdim=True)
+    return sky(rays.direction - 2 * cosine * normal)
+
+
+def paint(rays, normal):
+    return sky(3 * normal)
+
+
+def half(rays, normal):
+    """A mirror above, grey below."""
+    return torch.where(normal[:, 2:] > 0, mirror(rays, normal), 0.3)
+
+
+def far_side(rays, normal):
+    """What is painted inside, as in a bowl."""
+    cosine = (rays.direction * normal).sum(-1, keepdim=True)
+    return sky(3 * (RADIUS * normal - 2 * RADIUS * cosine * rays.direction) / RADIUS)
+
+
+def photographs(look) -> Photos:
+    cameras = cameras_around(VIEWS, SIZE)
+    colors, masks = [], []
+    for view in range(VIEWS):
+        normal, hit = sphere_normals(cameras, view)
+        color = look(image_rays(cameras, view), normal.view(-1, 3)).view(SIZE, SIZE, 3)
+        colors.append(linear_to_srgb(color * hit[..., None]))
+        masks.append(hit)
+    encoded = (255 * torch.stack(colors)).round().byte()
+    names = [f"r_{v}" for v in range(VIEWS)]
+    return Photos(Path("ball"), names, encoded, 255 * torch.stack(masks).byte(), cameras)
+
+
+def held(look, cfg=CFG):
+    photos = photographs(look)
+    distance = mask_distances(photos.coverage())
+    hull = visual_hull(distance, photos.cameras, GRID)
+    return held_hull(photos, distance, hull, GRID, cfg), hull
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return held(mirror)
+
+
+def test_a_mirror_is_held(ball):
+    found, _ = ball
+    assert found.held.float().mean() > 0.8
+
+
+@pytest.mark.parametrize("look", [paint, far_side])
+def test_paint_and_hollows_are_not(look):
+    found, _ = held(look)
+    assert found is None
+
+
+def test_neighbours_that_agree_prove_nothing():
+    """Without points that are turned away from one another there is no table."""
+    found, _ = held(mirror, replace(CFG, turn=180.0))
+    assert found is None
+
+
+def test_a_few_points_that_agree_are_chance():
+    assert held(half)[0] is not None
+    assert held(half, replace(CFG, least_share=0.9))[0] is None
+
+
+def test_nothing_is_looked_at_where_no_points_are_asked_for():
+    assert held(mirror, replace(CFG, points=0))[0] is None
+
+
+def test_regions_take_in_holes_and_what_is_weak_beside_them():
+    line = torch.arange(40)
+    nearest = (line[:, None] + torch.arange(-4, 5)).clamp(0, 39)
+    strong, weak = (line >= 8) & (line < 20), (line >= 20) & (line < 30)
+    strong[13] = strong[35] = False
+    alone = strong.clone()
+    alone[35] = True  # and no region
+    found = grown(alone, weak, nearest)
+    assert found[8:26].all()
+    assert not found[:5].any()
+    assert not found[31:].any()
+    assert not grown(strong & (line > 17), weak, nearest).any()
+
+
+def test_nodes_near_held_points_stay(ball):
+    found, hull = ball
+    nodes = found.nodes(hull, GRID)
+    near = hull.abs() < CFG.band * GRID.voxel_size
+    assert not (nodes & ~near).any()
+    assert nodes.sum() > 0.8 * near.sum()
+    upper = replace(found, held=found.position[:, 2] > 0)
+    assert (GRID.nodes()[upper.nodes(hull, GRID)][:, 2] > -0.1).all()
+
+
+def test_the_hull_is_put_back_once_and_gets_no_gradient(ball):
+    found, hull = ball
+    upper = replace(found, held=found.position[:, 2] > 0)
+    field = dense_field(GRID, 2, hull + 0.01)
+    upper.hold_(field)
+    stays = field.distances.held
+    assert torch.equal(field.sdf[stays], hull[stays])
+    assert torch.equal(field.sdf[~stays], (hull + 0.01)[~stays])
+    with torch.no_grad():
+        field.sdf += 0.01
+    upper.hold_(field)  # the same grid: training has begun
+    assert not torch.equal(field.sdf[stays], hull[stays])
+
+    index = (hull.abs() < GRID.voxel_size).nonzero().T
+    field.sdf.grad = torch.sparse_coo_tensor(
+        index, torch.ones(index.shape[1]), hull.shape, is_coalesced=True, check_invariants=True
+    )
+    smooth_sdf_gradient_(field, 2)
+    gradient, rows = field.sdf.grad._values(), rows_of(field.sdf.grad)
+    assert (gradient[stays.flatten()[rows]] == 0).all()
+    assert (gradient[~stays.flatten()[rows]] > 0).all()
+
+
+def test_bricks_are_let_go(ball):
+    found, hull = ball
+    field = dense_field(GRID, 2, hull).in_bricks(GridShape(GRID.origin, GRID.voxel_size, GRID.size))
+    before = field.sdf.clone()
+    found.hold_(field)
+    assert field.distances.held is None
+    assert torch.equal(field.sdf, before)
+
+
+def silhouettes_of(look) -> Silhouettes:
+    photos = photographs(look)
+    box = torch.full((3,), -0.7), torch.full((3,), 0.7)
+    return Silhouettes(photos, mask_distances(photos.coverage()), box, refined=False)
+
+
+def draft(tmp_path, **changes):
+    cfg = preset("draft", tmp_path, tmp_path)
+    first = replace(cfg.stages[0], voxels=GRID.nodes_count / 1e6)
+    stages = first, *cfg.stages[1:]
+    return replace(cfg, stages=stages, light_frame="world", exposures=False, **changes)
+
+
+def test_a_run_that_goes_on_holds_the_same(tmp_path):
+    silhouettes, cfg = silhouettes_of(half), draft(tmp_path)
+    prepared = prepare(silhouettes, cfg)
+    again = held_in(silhouettes, build_scene(prepared, cfg), cfg)
+    assert torch.equal(again.position, prepared.held.position)
+    assert torch.equal(again.held, prepared.held.held)
+
+
+def test_what_is_held_is_not_carved(tmp_path, monkeypatch):
+    carved = []
+
+    def carve(hull, *_):
+        carved.append(hull)
+        return hull + 1
+
+    monkeypatch.setattr("univoxel.preparation.prepare.carve_within_time", carve)
+    prepared = prepare(silhouettes_of(half), draft(tmp_path))
+    stays = prepared.held.nodes(carved[0], prepared.grid)
+    assert torch.equal(prepared.hull, torch.where(stays, carved[0], carved[0] + 1))
+    assert stays.any()
+
+
+def test_rough_masks_hold_nothing(tmp_path):
+    assert prepare(replace(silhouettes_of(half), votes=2), draft(tmp_path)).held is None

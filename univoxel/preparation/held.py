@@ -1,0 +1,235 @@
+"""Where the visual hull is right because it explains what mirrors.
+
+What a mirror shows lies behind it for all photographs, so colours pull its surface there, and bend
+it. Yet silhouettes give the shape of most polished things to a fraction of a voxel. Whether they do
+can be seen: in a smooth surface under distant light, photographs that are mirrored to the same
+direction show the same, wherever on the surface and however it is turned there. Where the hull is
+wrong, its normals mirror them elsewhere, and nothing agrees.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from univoxel import sphere
+from univoxel.camera import Cameras
+from univoxel.color import linear_to_srgb
+from univoxel.data import Photos
+from univoxel.fields.dense import DenseDistances
+from univoxel.fields.field import Field
+from univoxel.grid import GridShape
+from univoxel.ops import VisibilityScene
+from univoxel.preparation.config import HELD, HULL, HeldConfig, HullConfig
+from univoxel.preparation.hull import visual_hull
+from univoxel.preparation.observed_hull import observe_hull
+from univoxel.render.transport import Observations
+
+# Shares of a point's neighbours that take it into a region, or, some, if it is weak; and rounds
+MOST, SOME = 0.5, 0.3
+GROWTHS, TRIMS = 4, 3
+
+
+@dataclass(frozen=True)
+class HeldHull:
+    """Points of the visual hull, and which of them training leaves as they are."""
+
+    position: Tensor  # [P, 3] world
+    held: Tensor  # [P] bool
+    distance: Tensor  # of masks, as of `visual_hull`
+    cameras: Cameras
+    cfg: HeldConfig
+    hull: HullConfig
+
+    def nodes(self, sdf: Tensor, grid: GridShape) -> Tensor:
+        """Which nodes of a grid stay, by the point next to each: [X, Y, Z] bool.
+
+        Args:
+            sdf: [X, Y, Z] of the visual hull, world units.
+        """
+        near = sdf.abs() < self.cfg.band * grid.voxel_size
+        _, point = KDTree(self.position.numpy()).query(grid.nodes()[near].numpy(), workers=-1)
+        return torch.zeros_like(near).masked_scatter(near, self.held[torch.from_numpy(point)])
+
+    @torch.no_grad()
+    def hold_(self, field: Field) -> None:
+        """Put the hull back where it is held, and have training leave it there.
+
+        A field in bricks, which are finer than the hull is right, stays as it is.
+        """
+        distances = field.distances
+        if not isinstance(distances, DenseDistances) or distances.held is not None:
+            return
+        hull = visual_hull(self.distance, self.cameras, field.grid, self.hull)
+        distances.held = self.nodes(hull, field.grid)
+        distances.sdf[distances.held] = hull[distances.held]
+
+
+@torch.no_grad()
+def held_hull(
+    photos: Photos,
+    distance: Tensor,
+    hull: Tensor,
+    grid: GridShape,
+    cfg: HeldConfig = HELD,
+    hull_cfg: HullConfig = HULL,
+) -> HeldHull | None:
+    """Where training leaves the visual hull as it is; None: nowhere.
+
+    Args:
+        photos: in one light and exposure, their cameras where they are believed to be.
+        distance: of masks, as of `visual_hull`.
+        hull: [X, Y, Z] sdf of the visual hull on the grid, world units.
+    """
+    seen = observe_hull(photos, hull, grid, cfg.points) if cfg.points else None
+    if seen is None:
+        return None
+    held = mirroring(seen, hull, grid, cfg)
+    if not held.any():
+        return None
+    return HeldHull(seen.position, held, distance, photos.cameras, cfg, hull_cfg)
+
+
+def mirroring(seen: Observations, hull: Tensor, grid: GridShape, cfg: HeldConfig = HELD) -> Tensor:
+    """Which of N points change as others do that mirror the same direction: [N] bool.
+
+    A table of what each direction sends is the mean of what points show that mirror it. A point is
+    compared with what points say whose normals differ from its own by `turn`: neighbours on a plane
+    would agree whatever they show. Points that change least as the table does leave it, round by
+    round.
+    """
+    sightings = _open_sightings(seen, hull, grid, cfg)
+    if sightings is None:
+        return torch.zeros(len(seen.position), dtype=torch.bool)
+    total, count = sightings.total, sightings.count
+    change = sightings.centred(sightings.color, torch.ones(len(sightings.point)))
+    rms = (sightings.around(total(change.square().sum(1))) / sightings.around(count)).sqrt()
+    in_table = rms > cfg.change
+    for i in range(cfg.rounds):
+        gain, correlation = sightings.explained(in_table)
+        strictness = min(1.0, (i + 1) / (cfg.rounds / 2))
+        in_table = rms > cfg.change
+        in_table &= (gain > strictness * cfg.gain) & (correlation > strictness * cfg.correlation)
+        if in_table.sum() < cfg.least_share * len(in_table):
+            return torch.zeros_like(in_table)
+    place = torch.cat([seen.position / (cfg.near * grid.voxel_size), seen.normal], 1)
+    nearest = KDTree(place.numpy()).query(place.numpy(), k=cfg.neighbours, workers=-1)[1]
+    weak = (rms > cfg.weak_change) & (correlation > cfg.weak_correlation)
+    return grown(in_table & (rms > cfg.strong_change), weak, torch.from_numpy(nearest))
+
+
+def grown(strong: Tensor, weak: Tensor, nearest: Tensor) -> Tensor:
+    """Regions that begin where most points are strong, and take in weak ones and holes: [N] bool.
+
+    Some of a mirror shows what stands beside it, or is not seen often enough.
+
+    Args:
+        strong, weak: [N] bool.
+        nearest: [N, K] int64, neighbours of each.
+    """
+
+    def share(region: Tensor) -> Tensor:
+        return region[nearest].float().mean(1)
+
+    region = strong & (share(strong) > MOST)
+    for _ in range(GROWTHS):
+        region = region | (weak & (share(region) > SOME)) | (share(region) > MOST)
+    for _ in range(TRIMS):
+        region = region & (share(region) > SOME)
+    return region
+
+
+@dataclass(frozen=True)
+class _Sightings:
+    """What S photographs show of N points, where nothing of the object is mirrored."""
+
+    point: Tensor  # [S] int64
+    color: Tensor  # [S, 3] sRGB
+    bin: Tensor  # [S] int64, of the mirrored direction
+    turned: Tensor  # [N] int64, class of the normal
+    apart: Tensor  # [K, K] float 0 or 1, whether classes of normals differ by `turn`
+    neighbours: Tensor  # [N, M] int64, points around each that were seen often enough
+    least: float  # sightings that tell what a direction sends
+    share: float  # of the sightings that have to be told
+
+    @property
+    def count(self) -> Tensor:
+        """[N] sightings of each point."""
+        return torch.bincount(self.point, minlength=len(self.turned)).float()
+
+    def total(self, values: Tensor) -> Tensor:
+        """Sums of values [S, ...] over each point: [N, ...]."""
+        return values.new_zeros(len(self.turned), *values.shape[1:]).index_add(
+            0, self.point, values
+        )
+
+    def around(self, values: Tensor) -> Tensor:
+        """Sums of values [N] over each point's neighbours: [N]."""
+        return values[self.neighbours].sum(1)
+
+    def centred(self, values: Tensor, weight: Tensor) -> Tensor:
+        """Values [S, 3] less their mean over each point, times weights [S] of 0 and 1."""
+        mean = self.total(weight[:, None] * values) / self.total(weight).clamp_min(1)[:, None]
+        return weight[:, None] * (values - mean[self.point])
+
+    def explained(self, in_table: Tensor) -> tuple[Tensor, Tensor]:
+        """Around each point, how many times the changes of the table it shows, and how alike both
+        are: gain and correlation [N]; 0 where the table says too little.
+
+        Args:
+            in_table: [N] bool, points that it is made of.
+        """
+        classes, bins = len(self.apart), int(self.bin.max()) + 1
+        cell, weight = self.bin * classes + self.turned[self.point], in_table[self.point].float()
+        sums = self.color.new_zeros(bins * classes, 4)
+        sums.index_add_(
+            0, cell, weight[:, None] * torch.nn.functional.pad(self.color, (0, 1), value=1)
+        )
+        others = torch.einsum("bkc,kj->bjc", sums.view(bins, classes, 4), self.apart)
+        color, weight = others.reshape(-1, 4)[cell].split([3, 1], 1)
+        told = (weight[:, 0] >= self.least).float()
+        shown = self.centred(self.color, told)
+        sent = self.centred(color / weight.clamp_min(1), told)
+        products = (shown * sent, shown * shown, sent * sent)
+        both, of_shown, of_sent = (self.around(self.total(p.sum(1))) for p in products)
+        enough = self.around(self.total(told)) > self.share * self.around(self.count)
+        gain = torch.where(enough, both / of_sent.clamp_min(1e-9), 0.0)
+        return gain, torch.where(enough, both / (of_shown * of_sent).clamp_min(1e-12).sqrt(), 0.0)
+
+
+def _open_sightings(
+    seen: Observations, hull: Tensor, grid: GridShape, cfg: HeldConfig
+) -> _Sightings | None:
+    """The sightings that can be compared; None: too few points have any."""
+    point = torch.repeat_interleave(seen.offsets.diff())
+    normal = seen.normal[point]
+    cosine = (normal * seen.wo).sum(1)
+    mirrored = 2 * cosine[:, None] * normal - seen.wo
+    occluder = VisibilityScene(*DenseDistances(grid, hull).isosurface())
+    start = seen.position[point] + cfg.off_surface * grid.voxel_size * normal
+    usable = (cosine > cfg.min_cosine) & ~occluder.occluded(start, mirrored)
+    point, mirrored = point[usable], mirrored[usable]
+    decided = torch.bincount(point, minlength=len(seen.normal)) >= cfg.min_views
+    decided = decided.nonzero()[:, 0]
+    if len(decided) < cfg.neighbours:
+        return None
+    place = torch.cat([seen.position / (cfg.near * grid.voxel_size), seen.normal / cfg.bend], 1)
+    tree = KDTree(place[decided].numpy())
+    nearest = torch.from_numpy(tree.query(place.numpy(), k=cfg.neighbours, workers=-1)[1])
+    u, v = sphere.direction_to_latlong(mirrored).unbind(1)
+    column = (u * 2 * cfg.rows).long() % (2 * cfg.rows)
+    classes = sphere.fibonacci_sphere(cfg.classes)
+    return _Sightings(
+        point,
+        linear_to_srgb(seen.color[usable].clamp(0, 1)),
+        (v * cfg.rows).long().clamp_max(cfg.rows - 1) * 2 * cfg.rows + column,
+        (seen.normal @ classes.T).argmax(1),
+        (classes @ classes.T < math.cos(math.radians(cfg.turn))).float(),
+        decided[nearest.reshape(len(place), -1)],
+        cfg.least,
+        cfg.share,
+    )
