@@ -28,8 +28,8 @@ DATA = Path(univoxel.__file__).parent / "example_data" / "tiny"
 WORKER = Path(__file__).parent / "rank_worker.py"
 # All stages, in few steps, and with more time than they want
 FEW = (
-    *("stages.0.voxels=0.05", "stages.0.iterations=60", "stages.0.rays=256"),
-    *("stages.1.voxels=0.1", "stages.1.iterations=60", "stages.1.rays=256"),
+    *("stages.0.voxels=0.05", "stages.0.iterations=30", "stages.0.rays=256"),
+    *("stages.1.voxels=0.1", "stages.1.iterations=30", "stages.1.rays=256"),
     *("stages.2.iterations=20", "stages.2.rays=256", "stages.2.points=1500"),
     *("stages.2.newton_points=600", "stages.2.rounds=2"),
     *("stages.3.voxels=0.1", "stages.3.iterations=20", "stages.3.rays=256"),
@@ -121,7 +121,7 @@ def test_two_ranks_end_where_one_process_does(in_one, tmp_path):
     state = load_checkpoint(out)[1]
     exchanged = state["ranks"]
     assert exchanged["count"] == 2
-    assert exchanged["steps"] == 160
+    assert exchanged["steps"] == 100
     # Each rank tells its rows once; where both touch one it travels twice
     assert exchanged["touched"] < exchanged["sent"] < 2 * exchanged["touched"]
 
