@@ -14,6 +14,7 @@ import argparse
 import contextlib
 import io
 import json
+import logging
 import os
 import resource
 import select
@@ -528,6 +529,7 @@ def outcome_of(name: str, seed: int, sound_ones: Path, said: Path) -> tuple[str,
 def work() -> None:
     """Answer cases on stdin, a line each, on stdout."""
     torch.set_num_threads(1)
+    logging.getLogger("univoxel").addHandler(logging.NullHandler())  # strangers' lines are noise
     with tempfile.TemporaryDirectory() as place:
         said = Path(place) / "said"
         answers = os.fdopen(os.dup(1), "w", buffering=1)

@@ -36,6 +36,8 @@ def test_what_is_written_is_read(tmp_path):
         (lambda data: data.replace(b"float z", b"float w"), "expected vertices x y z"),
         (lambda data: data.replace(b"float z", b"half z"), "expected vertices x y z"),
         (lambda data: data.replace(b"element face", b"element edge"), "expected vertices x y z"),
+        (lambda data: data.replace(b"vertex 4", b"vertex -1"), "something else: -1 of vertex"),
+        (lambda data: data.replace(b"face 2", b"face 9" + 30 * b"9"), "expected vertices x y z"),
         (lambda data: data[:-12] + b"\x63" + data[-11:], "expected triangles of the 4 vertices"),
         (lambda data: data[:-13] + b"\4" + data[-12:], "expected triangles of the 4 vertices"),
     ],
@@ -45,6 +47,13 @@ def test_other_files_are_refused(tmp_path, change, message):
     write_ply(path, Mesh(VERTICES, FACES))
     path.write_bytes(change(path.read_bytes()))
     with pytest.raises(DataError, match=f"mesh.ply: .*{message}"):
+        read_ply(path)
+
+
+def test_places_that_are_not_finite_are_refused(tmp_path):
+    path = tmp_path / "mesh.ply"
+    write_ply(path, Mesh(VERTICES / torch.tensor([1.0, 0, 1]), FACES))
+    with pytest.raises(DataError, match=r"mesh.ply: expected vertices at finite places"):
         read_ply(path)
 
 

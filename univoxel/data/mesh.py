@@ -26,7 +26,8 @@ def read_ply(path: Path) -> Mesh:
     """Vertices and faces of a binary little-endian PLY file of triangles; the rest is passed over.
 
     Raises:
-        DataError: the file is missing, cut off, of another kind, or holds other polygons.
+        DataError: the file is missing, cut off, of another kind, or holds other polygons or
+            places that are not finite.
     """
     try:
         data = path.read_bytes()
@@ -42,6 +43,8 @@ def read_ply(path: Path) -> Mesh:
         for word, *rest in (line for line in lines if line):
             if word == "element":
                 counts[rest[0]], fields[rest[0]] = int(rest[1]), []
+                if counts[rest[0]] < 0:
+                    raise ValueError(f"{rest[1]} of {rest[0]}")
             elif word == "property" and rest[0] == "list":
                 row = ("count", _TYPES[rest[1]]), ("corner", _TYPES[rest[2]], (3,))
                 fields[list(fields)[-1]] += row
@@ -53,10 +56,12 @@ def read_ply(path: Path) -> Mesh:
         face = np.frombuffer(body[vertex.nbytes :], np.dtype(fields["face"]), counts["face"])
         corner = np.stack([vertex[axis] for axis in "xyz"], -1).astype(np.float32)
         index, sides = face["corner"].astype(np.int32), face["count"]
-    except (KeyError, IndexError, ValueError) as error:
+    except (KeyError, IndexError, ValueError, OverflowError) as error:
         raise DataError(
             f"{path}: expected vertices x y z and triangles, got something else: {error}"
         ) from None
     if (sides != 3).any() or (len(index) and not 0 <= index.min() <= index.max() < len(corner)):
         raise DataError(f"{path}: expected triangles of the {len(corner)} vertices")
+    if not np.isfinite(corner).all():
+        raise DataError(f"{path}: expected vertices at finite places, got NaN or infinity")
     return Mesh(torch.from_numpy(corner), torch.from_numpy(index))
