@@ -21,7 +21,7 @@ LAYERS = [
     {"cluster"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
-    {"envmap", "networks", "poses"},
+    {"envmap", "networks", "orbit", "poses"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
     {"checkpoint", "run"},
