@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
-from univoxel import shelf
 from univoxel.config import TrainConfig
 from univoxel.data import Photos
 from univoxel.errors import DataError, UserError
@@ -23,10 +21,8 @@ from univoxel.preparation.light_frame import turntable_of
 from univoxel.preparation.masks import fitted_masks, with_masks
 from univoxel.preparation.outlines import drawn_again
 from univoxel.preparation.registration import registered_poses
-from univoxel.preparation.strays import find_strays
+from univoxel.preparation.strays import say_strays
 from univoxel.training.config import StageConfig
-
-CARVES_NOTHING = -1e4  # pixels inside of its silhouette that all of a picture is then
 
 
 @dataclass(frozen=True)
@@ -60,16 +56,9 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
     Raises:
         DataError: the silhouettes share no volume.
     """
+    if cfg.cameras == "auto":
+        say_strays(photos, cfg.preparation.light_frame)
     photos, distance = fitted_masks(photos, cfg.masks, cfg.preparation.masks)
-    strays = find_strays(photos, cfg.cameras, cfg.preparation.light_frame)
-    if strays is None:
-        return _weighed(photos, distance, cfg)
-    kept = (~strays).nonzero()[:, 0]
-    return _with_strays(_weighed(photos.of(kept), distance[kept], cfg), photos, distance, strays)
-
-
-def _weighed(photos: Photos, distance: Tensor, cfg: TrainConfig) -> Silhouettes:
-    """What masks that fit say, by cameras that stand together."""
     try:
         belief = weighed(photos, distance, cfg.cameras, cfg.masks, cfg.preparation)
     except UserError as error:
@@ -85,25 +74,6 @@ def _weighed(photos: Photos, distance: Tensor, cfg: TrainConfig) -> Silhouettes:
     photos, distance = with_masks(photos, lambda view: coverage[view])
     box = estimate_bounds(distance, photos.cameras, constants.hull, belief.votes)
     return replace(found, photos=photos, distance=distance, box=box, doubted=doubted)
-
-
-def _with_strays(found: Silhouettes, photos: Photos, given: Tensor, strays: Tensor) -> Silhouettes:
-    """Silhouettes of the photographs that stay, among all: the others carve and teach nothing.
-
-    Args:
-        photos, given: all of them, and distances [V, H, W] to their masks.
-        strays: [V] bool, those that were left out.
-    """
-    stay = ~strays
-    alpha = shelf.zeros(photos.alpha.shape, photos.alpha.dtype)
-    distance = shelf.zeros(given.shape, given.dtype)
-    doubted = shelf.zeros(given.shape, torch.bool)
-    alpha[stay], distance[stay] = found.photos.alpha, found.distance
-    if found.doubted is not None:
-        doubted[stay] = found.doubted
-    doubted[strays] = True
-    distance[strays] = torch.where(given[strays].isfinite(), CARVES_NOTHING, torch.inf)
-    return replace(found, photos=replace(photos, alpha=alpha), distance=distance, doubted=doubted)
 
 
 def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
