@@ -24,7 +24,7 @@ from univoxel.pictures.layers import render_layers
 from univoxel.run import photos_of
 from univoxel.tasks.relight import relight_images
 
-VIEW = 3  # of the test views: the face
+VIEW = 0  # of the test views: the face
 SIDE, GAP = 300, 4  # pixels of a picture, and between two
 BRIGHT = 0.7  # sRGB of the picture's brightest hundredth; a light of other strength is scaled
 QUALITY = 85  # of the JPEG, which stays below 200 kB
