@@ -1,6 +1,7 @@
 """Draws docs/images/real.jpg: a photograph of a real object, and its model in other light.
 
-    univoxel train ethiopian_head --out RUN --preset fast
+    univoxel poses ethiopian_head/images --masks ethiopian_head/masks --out HEAD
+    univoxel train HEAD --out RUN --preset fast
     python docs/figures/real.py RUN docs/images MAP.hdr MAP.hdr
 
 From the left: a photograph that training did not see, on black; the render; the albedo; the model
