@@ -21,7 +21,7 @@ LAYERS = [
     {"cluster"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
-    {"envmap", "networks", "poses"},
+    {"envmap", "networks", "orbit", "poses"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
     {"checkpoint", "run"},
@@ -79,7 +79,7 @@ HELPERS = {
     "assets": {"atlas", "base"},
     "preparation": {
         *("belief", "depth_sweep", "carving", "exposures", "held", "hull", "light_frame", "masks"),
-        *("matches", "observed_hull", "outlines", "registration", "surroundings"),
+        *("matches", "observed_hull", "outlines", "registration", "strays", "surroundings"),
     },
     "training": {
         *(

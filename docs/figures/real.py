@@ -1,6 +1,7 @@
 """Draws docs/images/real.jpg: a photograph of a real object, and its model in other light.
 
-    univoxel train ethiopian_head --out RUN --preset fast
+    univoxel poses ethiopian_head/images --masks ethiopian_head/masks --out HEAD
+    univoxel train HEAD --out RUN --preset fast
     python docs/figures/real.py RUN docs/images MAP.hdr MAP.hdr
 
 From the left: a photograph that training did not see, on black; the render; the albedo; the model
@@ -24,7 +25,7 @@ from univoxel.pictures.layers import render_layers
 from univoxel.run import photos_of
 from univoxel.tasks.relight import relight_images
 
-VIEW = 3  # of the test views: the face
+VIEW = 0  # of the test views: the face
 SIDE, GAP = 300, 4  # pixels of a picture, and between two
 BRIGHT = 0.7  # sRGB of the picture's brightest hundredth; a light of other strength is scaled
 QUALITY = 85  # of the JPEG, which stays below 200 kB

@@ -77,7 +77,7 @@ def test_only_what_a_mask_shows_is_straightened(monkeypatch, window, factor):
 
 
 def test_only_what_a_mask_shows_is_decoded(monkeypatch):
-    """Nothing tells: what is hidden is black, a square that is half hidden is not."""
+    """Nothing tells: a square that is half hidden is the mean of what is shown of it."""
     color = torch.randint(1, 256, (31, 40, 3), dtype=torch.uint8)
     alpha = torch.zeros(31, 40, dtype=torch.uint8)
     alpha[11:20, 7:25] = 255
@@ -88,8 +88,27 @@ def test_only_what_a_mask_shows_is_decoded(monkeypatch):
     assert torch.equal(found[1], wanted[1])
     assert (wanted[1] > 0).sum() == 4 * 7
     empty = shots.resampled(color, torch.zeros_like(alpha), 3)
-    assert not empty[0].any()
+    assert torch.equal(empty[0], color[1:30:3, 1:39:3])
     assert not empty[1].any()
+
+
+@pytest.mark.parametrize("factor", [1, 3])
+@pytest.mark.parametrize("bent", [False, True])
+def test_surroundings_that_a_mask_hides_are_kept(factor, bent):
+    """A turntable is told by them, and rough outlines are drawn again by their colours."""
+    row, column = torch.meshgrid(torch.arange(90), torch.arange(120), indexing="ij")
+    color = torch.stack([row, column, row + column], 2).byte()  # a ramp: a place by its colour
+    alpha = torch.zeros(90, 120, dtype=torch.uint8)
+    alpha[30:60, 40:80] = 255
+    lens = Lens(120, 90, (120.0, 120.0), (60.0, 45.0), (-0.3 if bent else 0.0, 0.0, 0.0))
+    grid = sources(lens, straightened(lens)) if bent else None
+    found, covered = shots.resampled(color, alpha, factor, grid)
+    whole, _ = shots.resampled(color, torch.full_like(alpha, 255), factor, grid)
+    hidden = covered == 0
+    assert 0.5 < hidden.float().mean() < 0.95
+    # Of a square the mean, in linear light, is not its middle; a step is 255 grey levels here
+    assert (found.int() - whole.int())[hidden].abs().max() <= (3 if factor > 1 else 2)
+    assert torch.equal(found[covered == 255], whole[covered == 255])
 
 
 def test_the_first_broken_photograph_is_named(data, monkeypatch):

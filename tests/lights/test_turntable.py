@@ -1,6 +1,7 @@
 """Light that turns with the camera: the axis, and directions in the light's frame."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from univoxel.camera import Cameras
 from univoxel.errors import ConfigError
 from univoxel.lights.turntable import Turntable, resampling
+from univoxel.orbit import circle_of
 from univoxel.sphere import fibonacci_sphere
 
 TILTED = Rotation.from_rotvec([0.4, -0.3, 0.2])
@@ -76,6 +78,33 @@ def test_cameras_that_are_not_level_say_nothing():
     assert Turntable.of(Cameras(poses, tumbled.focal, tumbled.centre, 32, 32)) is None
     assert Turntable.of(ring().of(torch.arange(2))) is None
     assert Turntable.of(cameras_around(12)) is not None
+
+
+def test_a_camera_that_was_aimed_anew_stood_still_all_the_same():
+    """On a ball head below its pan the view turns and rolls: the circle of centres tells more."""
+    cameras = ring(24, tilt=TILTED)
+    pose = cameras.camera_to_world.clone()
+    angle = 2 * math.pi * torch.arange(24) / 24
+    aim = Rotation.from_rotvec(torch.stack([0 * angle, 0.06 * angle.sin(), 0 * angle], 1).numpy())
+    pose[:, :, :3] = pose[:, :, :3] @ torch.from_numpy(aim.as_matrix()).float()
+    turntable = Turntable.of(replace(cameras, camera_to_world=pose))
+    exact = Turntable.of(cameras)
+    assert turntable.axis == pytest.approx(exact.axis, abs=1e-4)
+    away = torch.tensor(turntable.point) - torch.tensor(exact.point)
+    axis = torch.tensor(exact.axis)
+    assert (away - (away @ axis) * axis).norm() < 1e-3
+
+
+def test_level_cameras_on_an_inclined_circle_were_carried_around_it():
+    """What is up is then said by how they were held: nobody inclines a turntable so far."""
+    inclined = Rotation.from_rotvec([0.6, 0, 0])
+    angle = 2 * math.pi * torch.arange(24) / 24
+    place = torch.stack([angle.cos(), angle.sin(), 0 * angle + 0.3], 1)
+    place = torch.from_numpy(inclined.apply(3 * place.numpy())).float()
+    sizes = torch.full((24, 2), 30.0), torch.full((24, 2), 16.0)
+    cameras = Cameras(torch.stack([look_at(p) for p in place]), *sizes, 32, 32)
+    assert circle_of(cameras) is not None
+    assert Turntable.of(cameras).axis[2] > 0.99
 
 
 def test_axis_and_start_are_across():

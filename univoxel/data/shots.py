@@ -273,11 +273,15 @@ def _beside(path: Path) -> list[Path]:
 def resampled(
     color: Tensor, alpha: Tensor, factor: int, grid: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Stored colour and alpha, straightened and then shrunk in linear light; stored as before."""
+    """Stored colour and alpha, straightened and then shrunk in linear light; stored as before.
+
+    What a mask hides keeps single colours, that of a pixel near the middle of each square: how the
+    surroundings look is asked, and not how exactly.
+    """
     height, width = (n // factor for n in alpha.shape)
     colors, alphas = color.new_zeros(height, width, 3), alpha.new_zeros(height, width)
     there = alpha > 0 if grid is None else _looked_up(alpha > 0, grid)
-    top, bottom = _span(there.any(1), factor)  # what a mask hides is black
+    top, bottom = _span(there.any(1), factor)
     left, right = _span(there.any(0), factor)
     whole = color if grid is None else _premultiplied(color, alpha)
     rows = max(1, BAND // (factor * color.shape[1]))  # in bands, to save memory
@@ -289,7 +293,21 @@ def resampled(
         else:
             part = straighten(whole, grid[of])
         colors[into], alphas[into] = _stored(shrink(part, factor), color.dtype, alpha.dtype)
+    hidden = alphas == 0
+    colors[hidden] = _picked(color, factor, grid)[hidden]
     return colors, alphas
+
+
+def _picked(color: Tensor, factor: int, grid: Tensor | None) -> Tensor:
+    """Stored colours [H // factor, W // factor, 3] of pixels near the middles of squares."""
+    height, width = color.shape[:2]
+    middle = slice(factor // 2, None, factor)
+    if grid is None:
+        return color[middle, middle][: height // factor, : width // factor]
+    size = torch.tensor([width, height])
+    column, row = ((grid[middle, middle] + 1) / 2 * size).long().unbind(-1)
+    picked = color[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    return picked[: height // factor, : width // factor]
 
 
 def _looked_up(there: Tensor, grid: Tensor) -> Tensor:

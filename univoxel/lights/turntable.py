@@ -10,9 +10,11 @@ from torch.nn.functional import normalize
 
 from univoxel.camera import Cameras, looked_at
 from univoxel.errors import ConfigError
+from univoxel.orbit import circle_of
 
 Vec3 = tuple[float, float, float]
 LEVEL = 0.2  # spread of the cameras' right axes along their axis over that across it, at most
+UPRIGHT = 0.97  # cosine between that axis and the one of the circle they stand on, at least
 
 
 @dataclass(frozen=True)
@@ -41,16 +43,19 @@ class Turntable:
         """The turntable that cameras stood around; None: they do not say where its axis is.
 
         A camera that stands still is held level: what is to the right in the photographs lies
-        across the axis. Turned all around, the cameras look at a point of it.
+        across the axis. Turned all around, the cameras look at a point of it. Where they stand on
+        one circle, it says both more exactly: however it was aimed, the camera stood still.
         """
         right = cameras.camera_to_world[:, :, 0]
         _, spread, directions = torch.linalg.svd(right, full_matrices=True)
         if len(cameras) < 3 or spread[2] > LEVEL * spread[1]:
             return None
-        axis = directions[2]
+        axis, point, circle = directions[2], looked_at(cameras), circle_of(cameras)
+        if circle is not None and abs(float(circle.axis @ axis.double())) > UPRIGHT:
+            axis, centre = circle.axis.to(axis), circle.centre.to(axis)
+            point = centre + ((point - centre) @ axis) * axis
         if axis @ cameras.camera_to_world[:, :, 1].mean(0) < 0:
             axis = -axis
-        point = looked_at(cameras)
         towards = cameras.camera_to_world[0, :, 3] - point
         start = normalize(towards - (towards @ axis) * axis, dim=0)
         if not start.isfinite().all() or start.norm() < 0.5:  # the first stands on the axis

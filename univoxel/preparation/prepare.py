@@ -25,6 +25,7 @@ from univoxel.preparation.light_frame import turntable_of
 from univoxel.preparation.masks import fitted_masks, with_masks
 from univoxel.preparation.outlines import drawn_again
 from univoxel.preparation.registration import registered_poses
+from univoxel.preparation.strays import say_strays
 from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
 
@@ -61,6 +62,8 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
     Raises:
         DataError: the silhouettes share no volume.
     """
+    if cfg.cameras == "auto":
+        say_strays(photos, cfg.preparation.light_frame)
     photos, distance = fitted_masks(photos, cfg.masks, cfg.preparation.masks)
     try:
         belief = weighed(photos, distance, cfg.cameras, cfg.masks, cfg.preparation)
