@@ -79,7 +79,7 @@ HELPERS = {
     "assets": {"atlas", "base"},
     "preparation": {
         *("belief", "depth_sweep", "carving", "exposures", "hull", "light_frame", "masks"),
-        *("matches", "observed_hull", "outlines", "registration", "surroundings"),
+        *("matches", "mending", "observed_hull", "outlines", "registration", "surroundings"),
     },
     "training": {
         *(
