@@ -7,8 +7,9 @@ import torch
 from analytic import RADIUS, photos_of
 
 from univoxel.data import Photos
+from univoxel.preparation import mending
 from univoxel.preparation.belief import Belief
-from univoxel.preparation.config import HULL, REGISTRATION
+from univoxel.preparation.config import HULL, PREPARATION, REGISTRATION
 from univoxel.preparation.hull import hull_sdf, mask_distances
 from univoxel.preparation.mending import mended
 from univoxel.preparation.registration import contradiction
@@ -120,3 +121,24 @@ def test_edges_that_waver_are_moved_by_colours(photos):
 def test_rounds_are_counted(photos):
     with pytest.raises(ValueError, match="doubt_rounds"):
         replace(HULL, doubt_rounds=0)
+
+
+def test_most_masks_know_better_than_each_of_them(photos, monkeypatch):
+    """Edges are drawn once more from the hull's silhouettes, unless it is too coarse."""
+    rough = wavering(photos, 1.5)
+    distance = mask_distances(rough.alpha)
+    again = mended(rough, distance, ROUGH).photos.alpha
+    coarse = replace(PREPARATION, hull=replace(HULL, nodes=8**3))
+    as_with_coarse = mended(rough, distance, ROUGH, coarse).photos.alpha
+    monkeypatch.setattr(mending, "_drawn_from_hull", lambda found, *_: found)
+    once = mended(rough, distance, ROUGH).photos.alpha
+    assert torch.equal(as_with_coarse, once)
+    assert 1 - agreement(again, photos.alpha) < 0.8 * (1 - agreement(once, photos.alpha))
+
+
+def test_photographs_of_the_object_alone_keep_their_masks():
+    """What is cut away tells no colours: a hull's silhouette would claim what is not there."""
+    cut = wavering(photos_of(VIEWS, SIZE), 1.5)
+    cut = replace(cut, color=cut.color * (cut.alpha[..., None] > 0))
+    found = mended(cut, mask_distances(cut.alpha), ROUGH)
+    assert torch.equal(found.photos.alpha, cut.alpha)

@@ -13,13 +13,16 @@ import torch
 from torch import Tensor
 
 from univoxel import shelf
+from univoxel.camera import looked_at, pixel_width
 from univoxel.data import Photos
 from univoxel.data.base import coverage_of
+from univoxel.grid import fit_grid
 from univoxel.preparation.belief import Belief, doubted_pixels
 from univoxel.preparation.config import PREPARATION, PreparationConfig
-from univoxel.preparation.hull import estimate_bounds, mask_distances
+from univoxel.preparation.depth_sweep import surface_depths
+from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
 from univoxel.preparation.masks import with_masks
-from univoxel.preparation.outlines import drawn_again
+from univoxel.preparation.outlines import drawn_again, shows_nothing_else
 from univoxel.preparation.registration import contradiction
 
 
@@ -56,7 +59,8 @@ def mended(
     coverage = drawn_again(photos, distance, reach, doubted, outlines, cfg.masks)
     photos, distance = with_masks(photos, lambda view: coverage[view])
     found = _doubted_again(photos, distance, doubted, belief, cfg)
-    return _with_votes(found, 1 if _agree(found, cfg) else belief.votes, cfg)
+    found = _with_votes(found, 1 if _agree(found, cfg) else belief.votes, cfg)
+    return _drawn_from_hull(found, reach, belief, cfg)
 
 
 def _doubted_again(
@@ -70,6 +74,34 @@ def _doubted_again(
     held = _holding(photos, distance, doubted)
     off = contradiction(held, cameras, box, cfg.registration, doubted)
     return Mended(photos, doubted, held, replace(belief, box=box, off=off))
+
+
+def _drawn_from_hull(found: Mended, reach: float, belief: Belief, cfg: PreparationConfig) -> Mended:
+    """Edges once more, from where most masks have them: single ones waver, each in its own way.
+
+    A hull that is coarser than what edges are off by tells nothing new.
+    """
+    photos, cameras = found.photos, found.photos.cameras
+    grid = fit_grid(*found.belief.box, round(cfg.hull.nodes))
+    if grid.voxel_size > reach * pixel_width(cameras, looked_at(cameras)):
+        return found
+    hull = visual_hull(found.distance, cameras, grid, cfg.hull, found.belief.votes)
+    depths = surface_depths(hull, grid, cameras)
+
+    def silhouette(view: int) -> Tensor:
+        depth = next(depths)
+        if shows_nothing_else(photos, found.distance, view, cfg.masks):
+            return coverage_of(photos.alpha[view])
+        return depth.isfinite().float()
+
+    usual, distance = with_masks(photos, silhouette)
+    coverage = drawn_again(usual, distance, reach, found.doubted, cfg.outlines, cfg.masks)
+    photos, distance = with_masks(photos, lambda view: coverage[view])
+    again = _doubted_again(photos, distance, found.doubted, belief, cfg)
+    doubted = again.doubted | found.doubted
+    held = _holding(photos, distance, doubted)
+    again = replace(again, doubted=doubted, distance=held)
+    return _with_votes(again, 1 if _agree(again, cfg) else belief.votes, cfg)
 
 
 def _agree(found: Mended, cfg: PreparationConfig) -> bool:
