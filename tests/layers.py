@@ -79,7 +79,8 @@ HELPERS = {
     "assets": {"atlas", "base"},
     "preparation": {
         *("belief", "depth_sweep", "carving", "exposures", "held", "hull", "light_frame", "masks"),
-        *("matches", "observed_hull", "outlines", "registration", "strays", "surroundings"),
+        *("matches", "mending", "observed_hull", "outlines", "registration", "strays"),
+        "surroundings",
     },
     "training": {
         *(

@@ -118,7 +118,11 @@ def _say(seen: Agreement | None, off: float, believed: bool, refined: bool) -> N
 
 
 def doubted_pixels(
-    distance: Tensor, cameras: Cameras, belief: Belief, cfg: HullConfig = HULL
+    distance: Tensor,
+    cameras: Cameras,
+    belief: Belief,
+    cfg: HullConfig = HULL,
+    carving: Tensor | None = None,
 ) -> Tensor:
     """Where a mask lacks a part that the others show, or shows what they do not: [V, H, W] bool.
 
@@ -126,9 +130,11 @@ def doubted_pixels(
 
     Args:
         distance: [V, H, W] from `hull.mask_distances`.
+        carving: the same of masks that the hull is made of, where these are others.
     """
     grid = fit_grid(*belief.box, cfg.box_nodes)
-    hull = visual_hull(distance, cameras, grid, cfg, belief.votes)
+    silhouettes = distance if carving is None else carving
+    hull = visual_hull(silhouettes, cameras, grid, cfg, belief.votes)
     doubted = shelf.zeros(distance.shape, torch.bool)
 
     def doubt_(view_and_depth: tuple[int, Tensor]) -> None:

@@ -68,6 +68,8 @@ class HullConfig:
     # share of the views, in [0, 1], that have to see a node where masks are doubted. Orbits have
     # the whole object in nearly all of their pictures
     doubted_seen: float = 0.25
+    # rounds, >= 1, in which pixels are doubted by the hull of those that were not before
+    doubt_rounds: int = 1
     # half the width of what a doubted mask lacks or shows too much, in pixels, >= 0: narrower
     # pieces are its jagged edge
     rough_pixels: float = 1.5
@@ -76,7 +78,7 @@ class HullConfig:
 
     def __post_init__(self) -> None:
         check_fields(self, "at least 8", lambda x: x >= 8, "box_nodes")
-        check_fields(self, *_WHOLE, "box_rounds")
+        check_fields(self, *_WHOLE, "box_rounds", "doubt_rounds")
         check_fields(self, *_ABOVE, "first_box", "nodes")
         check_fields(self, *_NOT_BELOW, "margin", "rough_pixels")
         check_fields(self, *_SHARE, "doubted_votes", "doubted_seen", "rough_share")
@@ -88,6 +90,11 @@ class OutlineConfig:
 
     # share of a picture's larger side, in (0, 1], by which edges are moved at most
     most: float = 0.04
+    # how many times as far, > 0, edges are moved at most as what is not doubted of the masks
+    # contradicts itself by: of one edge in twenty that is more
+    further: float = 2.0
+    # pixels, > 0, by which they may be moved at least
+    least: float = 2.0
     # pixels, > 0, beyond what a mask may be off by, in which colours of the object and of what is
     # around are taken
     samples_within: float = 6.0
@@ -115,8 +122,8 @@ class OutlineConfig:
     def __post_init__(self) -> None:
         check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "most")
         check_fields(self, *_WHOLE, "object_samples", "other_samples")
-        above = ("samples_within", "known_within", "spacing", "noise", "colors", "given")
-        check_fields(self, *_ABOVE, *above)
+        check_fields(self, *_ABOVE, "further", "least", "samples_within", "known_within")
+        check_fields(self, *_ABOVE, "spacing", "noise", "colors", "given")
         check_fields(self, *_NOT_BELOW, "smooth")
         check_fields(self, "at least 1", lambda x: 1 <= x < math.inf, "steeper")
 

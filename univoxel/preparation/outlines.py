@@ -44,7 +44,7 @@ def drawn_again(
         coverage[view] = coverage_of(photos.alpha[view])
         color, covered = as_srgb(photos.stored(view)[0]), cut(view, coverage[view])
         away = cut(view, distance[view])
-        if cut_away(color, covered, away, masks):
+        if shows_nothing_else(photos, distance, view, masks):
             return
         reach = min(off, cfg.most * max(covered.shape))
         believed = ~cut(view, doubted[view]).numpy()
@@ -54,6 +54,19 @@ def drawn_again(
     side_by_side(draw_, range(len(photos)))
     shelf.release()
     return coverage
+
+
+def shows_nothing_else(
+    photos: Photos, distance: Tensor, view: int, masks: MaskConfig = MASKS
+) -> bool:
+    """Whether nothing but the object is left of a photograph.
+
+    Args:
+        distance: [V, H, W] from `hull.mask_distances`.
+    """
+    color, stored = photos.stored(view)
+    away = photos.cameras.cut(view, distance[view])
+    return cut_away(as_srgb(color), coverage_of(stored), away, masks)
 
 
 def outlined(

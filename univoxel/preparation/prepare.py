@@ -15,15 +15,15 @@ from univoxel.grid import GridShape, fit_grid
 from univoxel.lights.turntable import Turntable
 from univoxel.names import Varying
 from univoxel.poses import PoseSteps
-from univoxel.preparation.belief import doubted_pixels, weighed
+from univoxel.preparation.belief import weighed
 from univoxel.preparation.carving import carve_within_time
 from univoxel.preparation.config import PreparationConfig
 from univoxel.preparation.exposures import say_clipped, varying_and_gains
 from univoxel.preparation.held import HeldHull, held_hull
-from univoxel.preparation.hull import estimate_bounds, visual_hull
+from univoxel.preparation.hull import visual_hull
 from univoxel.preparation.light_frame import turntable_of
-from univoxel.preparation.masks import fitted_masks, with_masks
-from univoxel.preparation.outlines import drawn_again
+from univoxel.preparation.masks import fitted_masks
+from univoxel.preparation.mending import mended
 from univoxel.preparation.registration import registered_poses
 from univoxel.preparation.strays import say_strays
 from univoxel.scene import Scene
@@ -35,7 +35,7 @@ class Silhouettes:
     """What masks and cameras say; a run that is resumed needs it too, and it is the same then."""
 
     photos: Photos  # masks as they are used, cameras as they were given
-    distance: Tensor  # [V, H, W] pixels to the silhouette, negative inside
+    distance: Tensor  # [V, H, W] pixels to the silhouette, negative inside and where it is doubted
     box: tuple[Tensor, Tensor]  # corners [3], [3] around the object
     refined: bool  # whether the cameras are refined
     votes: int = 1  # views that have to carve a node of the hull, >= 1
@@ -69,17 +69,12 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
         belief = weighed(photos, distance, cfg.cameras, cfg.masks, cfg.preparation)
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
-    found = Silhouettes(photos, distance, belief.box, belief.refined, belief.votes)
-    if belief.votes == 1:
-        return found
-    constants = cfg.preparation
-    doubted = doubted_pixels(distance, photos.cameras, belief, constants.hull)
-    coverage = drawn_again(
-        photos, distance, belief.off, doubted, constants.outlines, constants.masks
-    )
-    photos, distance = with_masks(photos, lambda view: coverage[view])
-    box = estimate_bounds(distance, photos.cameras, constants.hull, belief.votes)
-    return replace(found, photos=photos, distance=distance, box=box, doubted=doubted)
+    doubted = None
+    if belief.votes > 1:
+        found = mended(photos, distance, belief, cfg.preparation)
+        photos, doubted = found.photos, found.doubted
+        distance, belief = found.distance, found.belief
+    return Silhouettes(photos, distance, belief.box, belief.refined, belief.votes, doubted)
 
 
 def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:

@@ -34,11 +34,13 @@ class Edges:
         distance: Tensor,
         box: tuple[Tensor, Tensor],
         cfg: RegistrationConfig = REGISTRATION,
+        doubted: Tensor | None = None,
     ) -> None:
         """
         Args:
             distance: [V, H, W] from `hull.mask_distances`, pixels; infinite beyond a picture.
             box: corners [3], [3] around the object.
+            doubted: [V, H, W] bool, where an edge is none.
         """
         low, high = cfg.edge
         self.ray_samples: int = cfg.ray_samples
@@ -49,6 +51,8 @@ class Edges:
         self.pixels: Tensor = torch.cat(
             [view[:, None], torch.cat(edges)], 1
         )  # [K, 3] with row, column
+        if doubted is not None:
+            self.pixels = self.pixels[~doubted[self.pixels.unbind(1)]]
         self.middle: Tensor = (box[0] + box[1]) / 2
         self.reach: float = float((box[1] - box[0]).norm()) / 2
 
@@ -112,14 +116,15 @@ def contradiction(
     cameras: Cameras,
     box: tuple[Tensor, Tensor],
     cfg: RegistrationConfig = REGISTRATION,
+    doubted: Tensor | None = None,
 ) -> float:
     """Pixels that a cfg.quantile of the rays through silhouettes' edges miss the others by, at
     most: -0.3 or less where cameras and masks are exact, about their error where they are not.
 
     Args:
-        distance, box: see `Edges`.
+        distance, box, doubted: see `Edges`.
     """
-    edges, generator = Edges(distance, box, cfg), torch.Generator().manual_seed(0)
+    edges, generator = Edges(distance, box, cfg, doubted), torch.Generator().manual_seed(0)
     if not len(edges.pixels):
         return 0.0
     pixels, views = edges.sample(cfg.test_rays, generator), torch.arange(len(cameras))

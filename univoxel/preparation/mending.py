@@ -1,0 +1,129 @@
+"""Rough masks, mended: some of their pixels are doubted, and edges of the others moved.
+
+A doubted pixel tells neither of the object nor of emptiness. So masks that lack a part no longer
+bite into the hull, and it tells better what else to doubt. What the rest still contradicts itself
+by is how far edges are off: nothing where only single masks are wrong, and then no edge is moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from univoxel import shelf
+from univoxel.camera import looked_at, pixel_width
+from univoxel.data import Photos
+from univoxel.data.base import coverage_of
+from univoxel.grid import fit_grid
+from univoxel.preparation.belief import Belief, doubted_pixels
+from univoxel.preparation.config import PREPARATION, PreparationConfig
+from univoxel.preparation.depth_sweep import surface_depths
+from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
+from univoxel.preparation.masks import with_masks
+from univoxel.preparation.outlines import drawn_again, shows_nothing_else
+from univoxel.preparation.registration import contradiction
+
+
+@dataclass(frozen=True)
+class Mended:
+    """What is made of rough masks."""
+
+    photos: Photos  # edges are moved to where colours change, if they are off
+    doubted: Tensor  # [V, H, W] bool: nothing is known there
+    distance: Tensor  # [V, H, W] pixels to silhouettes that hold what is doubted, negative inside
+    belief: Belief  # one vote, where what is not doubted agrees
+
+
+def mended(
+    photos: Photos, distance: Tensor, belief: Belief, cfg: PreparationConfig = PREPARATION
+) -> Mended:
+    """Masks that contradict one another, as far as they can be believed.
+
+    Args:
+        distance: [V, H, W] from `hull.mask_distances`.
+        belief: of more than one vote.
+
+    Raises:
+        UserError: the silhouettes share no volume.
+    """
+    doubted = doubted_pixels(distance, photos.cameras, belief, cfg.hull)
+    for _ in range(cfg.hull.doubt_rounds):
+        found = _doubted_again(photos, distance, doubted, belief, cfg)
+        doubted = found.doubted
+    if _agree(found, cfg):
+        return _with_votes(found, 1, cfg)
+    outlines, off = cfg.outlines, found.belief.off
+    reach = max(outlines.further * off, outlines.least)
+    coverage = drawn_again(photos, distance, reach, doubted, outlines, cfg.masks)
+    photos, distance = with_masks(photos, lambda view: coverage[view])
+    found = _doubted_again(photos, distance, doubted, belief, cfg)
+    found = _with_votes(found, 1 if _agree(found, cfg) else belief.votes, cfg)
+    return _drawn_from_hull(found, reach, belief, cfg)
+
+
+def _doubted_again(
+    photos: Photos, distance: Tensor, doubted: Tensor, belief: Belief, cfg: PreparationConfig
+) -> Mended:
+    """What is doubted by the hull of what was not."""
+    cameras = photos.cameras
+    held = _holding(photos, distance, doubted)
+    box = estimate_bounds(held, cameras, cfg.hull, belief.votes)
+    doubted = doubted_pixels(distance, cameras, replace(belief, box=box), cfg.hull, held)
+    held = _holding(photos, distance, doubted)
+    off = contradiction(held, cameras, box, cfg.registration, doubted)
+    return Mended(photos, doubted, held, replace(belief, box=box, off=off))
+
+
+def _drawn_from_hull(found: Mended, reach: float, belief: Belief, cfg: PreparationConfig) -> Mended:
+    """Edges once more, from where most masks have them: single ones waver, each in its own way.
+
+    A hull that is coarser than what edges are off by tells nothing new.
+    """
+    photos, cameras = found.photos, found.photos.cameras
+    grid = fit_grid(*found.belief.box, round(cfg.hull.nodes))
+    if grid.voxel_size > reach * pixel_width(cameras, looked_at(cameras)):
+        return found
+    hull = visual_hull(found.distance, cameras, grid, cfg.hull, found.belief.votes)
+    depths = surface_depths(hull, grid, cameras)
+
+    def silhouette(view: int) -> Tensor:
+        depth = next(depths)
+        if shows_nothing_else(photos, found.distance, view, cfg.masks):
+            return coverage_of(photos.alpha[view])
+        return depth.isfinite().float()
+
+    usual, distance = with_masks(photos, silhouette)
+    coverage = drawn_again(usual, distance, reach, found.doubted, cfg.outlines, cfg.masks)
+    photos, distance = with_masks(photos, lambda view: coverage[view])
+    again = _doubted_again(photos, distance, found.doubted, belief, cfg)
+    doubted = again.doubted | found.doubted
+    held = _holding(photos, distance, doubted)
+    again = replace(again, doubted=doubted, distance=held)
+    return _with_votes(again, 1 if _agree(again, cfg) else belief.votes, cfg)
+
+
+def _agree(found: Mended, cfg: PreparationConfig) -> bool:
+    return found.belief.off <= cfg.registration.max_contradiction
+
+
+def _with_votes(found: Mended, votes: int, cfg: PreparationConfig) -> Mended:
+    box = estimate_bounds(found.distance, found.photos.cameras, cfg.hull, votes)
+    return replace(found, belief=replace(found.belief, box=box, votes=votes))
+
+
+def _holding(photos: Photos, distance: Tensor, doubted: Tensor) -> Tensor:
+    """`mask_distances` [V, H, W] of masks with all that is doubted: a view carves nothing there."""
+    views = doubted.flatten(1).any(1).nonzero()[:, 0]
+    if not len(views):
+        return distance
+    coverage = torch.stack([coverage_of(photos.alpha[v]).masked_fill(doubted[v], 1) for v in views])
+    changed = mask_distances(coverage, photos.cameras.of(views))
+    result = shelf.zeros(distance.shape, distance.dtype)
+    for view in range(len(distance)):
+        result[view] = distance[view]
+        shelf.release(result[view])
+    for view, one in zip(views.tolist(), changed, strict=True):
+        result[view] = one
+    return result
