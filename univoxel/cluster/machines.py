@@ -87,6 +87,7 @@ def _local(jobs: int, stack: contextlib.ExitStack) -> Client:
             dashboard_address=nowhere,
             worker_dashboard_address=nowhere,
             scheduler_kwargs={"dashboard": False},
+            dashboard=False,  # of the worker: two threads that import it at once get half of it
             local_directory=scratch,
         )
     return Client(stack.enter_context(cluster))
