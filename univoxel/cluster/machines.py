@@ -6,6 +6,7 @@ import contextlib
 import logging
 import tempfile
 from collections.abc import Iterator
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from univoxel.errors import MissingExtra, ProcessFailed, UserError
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
     from distributed import Client
 
 CONNECT_SECONDS = 15.0  # that a scheduler may take to answer
+# Clusters of one process start one by one: Dask changes its settings for all threads, and of what
+# two of them import at once one may get half
+STARTING = Lock()
 
 
 def require() -> None:
@@ -77,7 +81,7 @@ def _local(jobs: int, stack: contextlib.ExitStack) -> Client:
     routes = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
     nowhere = "127.0.0.1:0"
     scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="univoxel-"))
-    with dask.config.set(routes):
+    with STARTING, dask.config.set(routes):
         cluster = LocalCluster(
             n_workers=1,
             threads_per_worker=jobs,
@@ -87,7 +91,6 @@ def _local(jobs: int, stack: contextlib.ExitStack) -> Client:
             dashboard_address=nowhere,
             worker_dashboard_address=nowhere,
             scheduler_kwargs={"dashboard": False},
-            dashboard=False,  # of the worker: two threads that import it at once get half of it
             local_directory=scratch,
         )
     return Client(stack.enter_context(cluster))
