@@ -2,9 +2,9 @@
 
     python benchmarks/profile_run.py SCENE [--preset fast] [--part 6] [--cpu]
 
-`univoxel.tasks.train` itself runs; what it calls is timed where it is called. Of
-every 16th backward pass the profiler says which part of the forward pass its nodes belong to; the
-time of all of them is divided in these proportions.
+`univoxel.tasks.train` itself runs; what it calls is timed where it is called. Of every 16th
+backward pass the profiler says which part of the forward pass its nodes belong to; the time of all
+of them is divided in these proportions.
 """
 
 from __future__ import annotations

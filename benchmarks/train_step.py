@@ -2,11 +2,10 @@
 
     python benchmarks/train_step.py [--rays 4096] [--out benchmarks/results/train_step.json]
 
-The bundled scene is trained natively for some steps, then the loop of
-univoxel.tasks.train itself runs on, once on each backend: its stages are timed where they are
-called. With the kernels the backward pass is divided too: a node belongs to the stage in which its
-forward was called. The references' is not: under the profiler that this takes their memory grew
-past 20 GB.
+The bundled scene is trained natively for some steps, then the loop of univoxel.tasks.train itself
+runs on, once on each backend: its stages are timed where they are called. With the kernels the
+backward pass is divided too: a node belongs to the stage in which its forward was called. The
+references' is not: under the profiler that this takes their memory grew past 20 GB.
 """
 
 from __future__ import annotations

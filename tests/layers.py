@@ -78,9 +78,9 @@ HELPERS = {
     "render": {"density", "occlusion", "pipeline", "relight"},
     "assets": {"atlas", "base"},
     "preparation": {
-        *("belief", "depth_sweep", "carving", "exposures", "held", "hull", "light_frame", "masks"),
-        *("matches", "mending", "observed_hull", "outlines", "registration", "strays"),
-        "surroundings",
+        *("belief", "depth_sweep", "carving", "exposures", "hull", "light_frame", "masks"),
+        *("matches", "mending", "observed_hull", "outlines", "pinned", "registration"),
+        *("strays", "surroundings"),
     },
     "training": {
         *(

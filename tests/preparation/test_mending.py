@@ -7,12 +7,14 @@ import torch
 from analytic import RADIUS, photos_of
 
 from univoxel.data import Photos
-from univoxel.preparation import mending
+from univoxel.errors import DataError, UserError
+from univoxel.preparation import mending, prepare
 from univoxel.preparation.belief import Belief
-from univoxel.preparation.config import HULL, PREPARATION, REGISTRATION
+from univoxel.preparation.config import PREPARATION, REGISTRATION
 from univoxel.preparation.hull import hull_sdf, mask_distances
 from univoxel.preparation.mending import mended
 from univoxel.preparation.registration import contradiction
+from univoxel.presets import preset
 
 VIEWS, SIZE = 24, 96
 BOX = torch.full((3,), -0.7), torch.full((3,), 0.7)
@@ -118,11 +120,6 @@ def test_edges_that_waver_are_moved_by_colours(photos):
     assert found.belief.off < belief.off
 
 
-def test_rounds_are_counted(photos):
-    with pytest.raises(ValueError, match="doubt_rounds"):
-        replace(HULL, doubt_rounds=0)
-
-
 def test_most_masks_know_better_than_each_of_them(photos, monkeypatch):
     """Edges are drawn once more from the hull's silhouettes, unless it is too coarse."""
     rough, draw, once = wavering(photos, 1.5), mending._drawn_from_hull, []
@@ -144,3 +141,14 @@ def test_photographs_of_the_object_alone_keep_their_masks():
     cut = replace(cut, color=cut.color * (cut.alpha[..., None] > 0))
     found = mended(cut, mask_distances(cut.alpha), ROUGH)
     assert torch.equal(found.photos.alpha, cut.alpha)
+
+
+def test_masks_that_share_no_volume_once_mended_are_named(photos, tmp_path, monkeypatch):
+    def fails(*_):
+        raise UserError("the silhouettes share no volume")
+
+    monkeypatch.setattr(prepare, "weighed", lambda *_: ROUGH)
+    monkeypatch.setattr(prepare, "mended", fails)
+    cfg = replace(preset("draft", tmp_path / "mug", tmp_path), cameras="given")
+    with pytest.raises(DataError, match="mug: the silhouettes share no volume"):
+        prepare.find_silhouettes(photos, cfg)

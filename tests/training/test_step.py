@@ -80,7 +80,7 @@ def test_bits_do_not_depend_on_threads(scene, pixels):
         assert torch.equal(one, two)
 
 
-def test_what_is_held_keeps_no_gradient_of_before(scene, pixels):
+def test_what_is_frozen_keeps_no_gradient_of_before(scene, pixels):
     parts = parts_of(pixels.trained, 64, 1)
     gradients(scene, pixels, parts, 1)
     assert scene.material.net[0].weight.grad is not None

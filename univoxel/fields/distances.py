@@ -53,13 +53,13 @@ class AbstractDistances(nn.Module, ABC):
     grid: GridShape
     voxel_size: float  # of the grid, world units
     sdf: nn.Parameter
-    held: Tensor | None  # as the sdf, bool: nodes that training leaves as they are; None: none
+    pinned: Tensor | None  # as the sdf, bool: nodes that get no gradient; None: none
 
     def __init__(self, grid: GridShape, sdf: Tensor) -> None:
         super().__init__()
         self.grid, self.voxel_size = grid, grid.voxel_size
         self.sdf = nn.Parameter(sdf)
-        self.held = None
+        self.pinned = None
         self._minimum: tuple[Tensor, SurfaceVersion] | None = None
 
     def brick_minimum(self) -> Tensor:

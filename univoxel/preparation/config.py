@@ -68,8 +68,6 @@ class HullConfig:
     # share of the views, in [0, 1], that have to see a node where masks are doubted. Orbits have
     # the whole object in nearly all of their pictures
     doubted_seen: float = 0.25
-    # rounds, >= 1, in which pixels are doubted by the hull of those that were not before
-    doubt_rounds: int = 1
     # half the width of what a doubted mask lacks or shows too much, in pixels, >= 0: narrower
     # pieces are its jagged edge
     rough_pixels: float = 1.5
@@ -78,7 +76,7 @@ class HullConfig:
 
     def __post_init__(self) -> None:
         check_fields(self, "at least 8", lambda x: x >= 8, "box_nodes")
-        check_fields(self, *_WHOLE, "box_rounds", "doubt_rounds")
+        check_fields(self, *_WHOLE, "box_rounds")
         check_fields(self, *_ABOVE, "first_box", "nodes")
         check_fields(self, *_NOT_BELOW, "margin", "rough_pixels")
         check_fields(self, *_SHARE, "doubted_votes", "doubted_seen", "rough_share")
@@ -334,10 +332,10 @@ class LightFrameConfig:
 
 
 @dataclass(frozen=True)
-class HeldConfig:
-    """Where training leaves the visual hull as it is, see preparation/held.py."""
+class PinnedConfig:
+    """Where training leaves the visual hull as it is, see preparation/pinned.py."""
 
-    # points of the hull that are looked at, >= 0; 0: nothing is held
+    # points of the hull that are looked at, >= 0; 0: nothing is pinned
     points: int = 8000
     # cosine of normal and direction to the camera, in [0, 1], below which sightings are left out
     min_cosine: float = 0.25
@@ -371,8 +369,9 @@ class HeldConfig:
     least_share: float = 0.05
     # correlation, in [0, 1], of their changes with those of the table
     correlation: float = 0.5
-    # change, >= 0, of points of the table from which regions grow that are held. Chrome changes by
-    # 0.3 to 0.45 under lamps, rough copper by 0.2 to 0.3: that is trained better than it is held
+    # change, >= 0, of points of the table from which regions grow that are pinned. Half of
+    # the chrome of a scene changed by 0.30 to 0.43, half of its rough copper by 0.18 to 0.31: that
+    # is trained better than it is pinned
     strong_change: float = 0.33
     # change, >= 0, of points that they take in
     weak_change: float = 0.26
@@ -411,13 +410,13 @@ class PreparationConfig:
     # whether the light turned with the camera
     light_frame: LightFrameConfig = field(default_factory=LightFrameConfig)
     # where training leaves the hull as it is
-    held: HeldConfig = field(default_factory=HeldConfig)
+    pinned: PinnedConfig = field(default_factory=PinnedConfig)
     # where the hull is opened
     carving: CarvingConfig = field(default_factory=CarvingConfig)
 
 
 MASKS, HULL, REGISTRATION = MaskConfig(), HullConfig(), RegistrationConfig()
 MATCHES, OUTLINES = MatchesConfig(), OutlineConfig()
-EXPOSURES, CARVING, HELD = ExposureConfig(), CarvingConfig(), HeldConfig()
+EXPOSURES, CARVING, PINNED = ExposureConfig(), CarvingConfig(), PinnedConfig()
 LIGHT_FRAME = LightFrameConfig()
 PREPARATION = PreparationConfig()

@@ -49,9 +49,8 @@ def mended(
         UserError: the silhouettes share no volume.
     """
     doubted = doubted_pixels(distance, photos.cameras, belief, cfg.hull)
-    for _ in range(cfg.hull.doubt_rounds):
-        found = _doubted_again(photos, distance, doubted, belief, cfg)
-        doubted = found.doubted
+    found = _doubted_again(photos, distance, doubted, belief, cfg)
+    doubted = found.doubted
     if _agree(found, cfg):
         return _with_votes(found, 1, cfg)
     outlines, off = cfg.outlines, found.belief.off
@@ -68,12 +67,12 @@ def _doubted_again(
 ) -> Mended:
     """What is doubted by the hull of what was not."""
     cameras = photos.cameras
-    held = _holding(photos, distance, doubted)
-    box = estimate_bounds(held, cameras, cfg.hull, belief.votes)
-    doubted = doubted_pixels(distance, cameras, replace(belief, box=box), cfg.hull, held)
-    held = _holding(photos, distance, doubted)
-    off = contradiction(held, cameras, box, cfg.registration, doubted)
-    return Mended(photos, doubted, held, replace(belief, box=box, off=off))
+    filled = _filled(photos, distance, doubted)
+    box = estimate_bounds(filled, cameras, cfg.hull, belief.votes)
+    doubted = doubted_pixels(distance, cameras, replace(belief, box=box), cfg.hull, filled)
+    filled = _filled(photos, distance, doubted)
+    off = contradiction(filled, cameras, box, cfg.registration, doubted)
+    return Mended(photos, doubted, filled, replace(belief, box=box, off=off))
 
 
 def _drawn_from_hull(found: Mended, reach: float, belief: Belief, cfg: PreparationConfig) -> Mended:
@@ -99,8 +98,8 @@ def _drawn_from_hull(found: Mended, reach: float, belief: Belief, cfg: Preparati
     photos, distance = with_masks(photos, lambda view: coverage[view])
     again = _doubted_again(photos, distance, found.doubted, belief, cfg)
     doubted = again.doubted | found.doubted
-    held = _holding(photos, distance, doubted)
-    again = replace(again, doubted=doubted, distance=held)
+    filled = _filled(photos, distance, doubted)
+    again = replace(again, doubted=doubted, distance=filled)
     return _with_votes(again, 1 if _agree(again, cfg) else belief.votes, cfg)
 
 
@@ -113,7 +112,7 @@ def _with_votes(found: Mended, votes: int, cfg: PreparationConfig) -> Mended:
     return replace(found, belief=replace(found.belief, box=box, votes=votes))
 
 
-def _holding(photos: Photos, distance: Tensor, doubted: Tensor) -> Tensor:
+def _filled(photos: Photos, distance: Tensor, doubted: Tensor) -> Tensor:
     """`mask_distances` [V, H, W] of masks with all that is doubted: a view carves nothing there."""
     views = doubted.flatten(1).any(1).nonzero()[:, 0]
     if not len(views):

@@ -19,11 +19,11 @@ from univoxel.preparation.belief import weighed
 from univoxel.preparation.carving import carve_within_time
 from univoxel.preparation.config import PreparationConfig
 from univoxel.preparation.exposures import say_clipped, varying_and_gains
-from univoxel.preparation.held import HeldHull, held_hull
 from univoxel.preparation.hull import visual_hull
 from univoxel.preparation.light_frame import turntable_of
 from univoxel.preparation.masks import fitted_masks
 from univoxel.preparation.mending import mended
+from univoxel.preparation.pinned import PinnedHull, pinned_hull
 from univoxel.preparation.registration import registered_poses
 from univoxel.preparation.strays import say_strays
 from univoxel.scene import Scene
@@ -53,7 +53,7 @@ class Prepared:
     varying: Varying  # what differs from photograph to photograph
     gains: Tensor | None  # [V] log gains of the exposures; None: all are alike
     turntable: Turntable | None  # about which the light turns; None: it stands still
-    held: HeldHull | None  # where training leaves the hull as it is; None: nowhere
+    pinned: PinnedHull | None  # where training leaves the hull as it is; None: nowhere
 
 
 def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
@@ -67,11 +67,11 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
     photos, distance = fitted_masks(photos, cfg.masks, cfg.preparation.masks)
     try:
         belief = weighed(photos, distance, cfg.cameras, cfg.masks, cfg.preparation)
+        found = mended(photos, distance, belief, cfg.preparation) if belief.votes > 1 else None
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
     doubted = None
-    if belief.votes > 1:
-        found = mended(photos, distance, belief, cfg.preparation)
+    if found is not None:
         photos, doubted = found.photos, found.doubted
         distance, belief = found.distance, found.belief
     return Silhouettes(photos, distance, belief.box, belief.refined, belief.votes, doubted)
@@ -98,18 +98,18 @@ def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
         photos, hull, grid, cfg.scene.varying, cfg.exposures, constants.exposures
     )
     turntable = turntable_of(photos, hull, grid, cfg.light_frame, constants.light_frame)
-    held = None
+    pinned = None
     if varying == "none" and turntable is None:
-        held = find_held(silhouettes, photos.cameras, hull, grid, constants)
+        pinned = find_pinned(silhouettes, photos.cameras, hull, grid, constants)
     if cfg.hollows and varying != "light" and turntable is None:
         seconds = cfg.hollows * 60 * cfg.minutes
         carved = carve_within_time(hull, grid, photos, gains, seconds, constants.carving)
-        hull = carved if held is None else torch.where(held.nodes(hull, grid), hull, carved)
-    return Prepared(silhouettes, poses, grid, hull, varying, gains, turntable, held)
+        hull = carved if pinned is None else torch.where(pinned.nodes(hull, grid), hull, carved)
+    return Prepared(silhouettes, poses, grid, hull, varying, gains, turntable, pinned)
 
 
-def held_in(silhouettes: Silhouettes, scene: Scene, cfg: TrainConfig) -> HeldHull | None:
-    """What `prepare` held, of a scene that goes on."""
+def pinned_in(silhouettes: Silhouettes, scene: Scene, cfg: TrainConfig) -> PinnedHull | None:
+    """What `prepare` pinned, of a scene that goes on."""
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)
     if scene.cfg.varying != "none" or scene.cfg.turntable is not None:
@@ -117,17 +117,17 @@ def held_in(silhouettes: Silhouettes, scene: Scene, cfg: TrainConfig) -> HeldHul
     cameras = scene.registered(silhouettes.photos).cameras
     grid = fit_grid(*silhouettes.box, round(1e6 * stage.voxels))
     hull = visual_hull(silhouettes.distance, cameras, grid, cfg.preparation.hull)
-    return find_held(silhouettes, cameras, hull, grid, cfg.preparation)
+    return find_pinned(silhouettes, cameras, hull, grid, cfg.preparation)
 
 
-def find_held(
+def find_pinned(
     silhouettes: Silhouettes,
     cameras: Cameras,
     hull: Tensor,
     grid: GridShape,
     cfg: PreparationConfig,
-) -> HeldHull | None:
-    """`held_hull`; rough masks give no hull that could be right.
+) -> PinnedHull | None:
+    """`pinned_hull`; rough masks give no hull that could be right.
 
     Args:
         cameras: where they are believed to be.
@@ -136,4 +136,4 @@ def find_held(
     if silhouettes.votes > 1:
         return None
     photos = replace(silhouettes.photos, cameras=cameras)
-    return held_hull(photos, silhouettes.distance, hull, grid, cfg.held, cfg.hull)
+    return pinned_hull(photos, silhouettes.distance, hull, grid, cfg.pinned, cfg.hull)

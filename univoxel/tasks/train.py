@@ -26,8 +26,8 @@ from univoxel.joint import stage as joint_stage
 from univoxel.joint.config import JointConfig
 from univoxel.ops import native
 from univoxel.pictures.timelapse import Timelapse
-from univoxel.preparation.held import HeldHull
-from univoxel.preparation.prepare import Silhouettes, find_silhouettes, held_in, prepare
+from univoxel.preparation.pinned import PinnedHull
+from univoxel.preparation.prepare import Silhouettes, find_silhouettes, pinned_in, prepare
 from univoxel.render.picture import preview
 from univoxel.run import kept_photos
 from univoxel.scene import Scene
@@ -114,7 +114,7 @@ def _train(
     silhouettes = find_silhouettes(photos, cfg)
     pixels = split_pixels(silhouettes.photos, silhouettes.distance, silhouettes.doubted)
     limited = plan.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
-    scene, state, held = start(silhouettes, cfg, limited, resume)
+    scene, state, pinned = start(silhouettes, cfg, limited, resume)
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
     if ranks.leads():
         if not state:  # of a run that was killed before anything was saved
@@ -129,7 +129,7 @@ def _train(
         progress.clock.watch = _between_steps(scene, progress.clock, film, spectators)
         try:
             for index in range(progress.clock.stage, len(cfg.stages)):
-                make_stage_(scene, limited, index, silhouettes.box, held, pixels, progress)
+                make_stage_(scene, limited, index, silhouettes.box, pinned, pixels, progress)
         except Cancelled:
             if ranks.leads():
                 save_scene(scene, cfg.out, progress.state())
@@ -175,8 +175,8 @@ def _between_steps(
 
 def start(
     silhouettes: Silhouettes, cfg: TrainConfig, limited: TrainConfig, resume: bool
-) -> tuple[Scene, dict[str, Any], HeldHull | None]:
-    """The scene that training begins or goes on with, the state of its run, and what is held.
+) -> tuple[Scene, dict[str, Any], PinnedHull | None]:
+    """The scene that training begins or goes on with, the state of its run, and what is pinned.
 
     Args:
         cfg: as it was asked for.
@@ -187,10 +187,10 @@ def start(
         resume = False
     if not resume:
         prepared = prepare(silhouettes, limited)
-        return build_scene(prepared, limited), {}, prepared.held
+        return build_scene(prepared, limited), {}, prepared.pinned
     scene, state = load_checkpoint(cfg.out)
     check_same(cfg)
-    return scene, state, held_in(silhouettes, scene, limited)
+    return scene, state, pinned_in(silhouettes, scene, limited)
 
 
 def make_stage_(
@@ -198,7 +198,7 @@ def make_stage_(
     cfg: TrainConfig,
     index: int,
     box: tuple[torch.Tensor, torch.Tensor],
-    held: HeldHull | None,
+    pinned: PinnedHull | None,
     pixels: TrainingPixels,
     progress: Progress,
 ) -> None:
@@ -206,13 +206,13 @@ def make_stage_(
 
     Args:
         box: corners [3], [3] of the grids.
-        held: where the surface stays; None: nowhere.
+        pinned: where the surface stays; None: nowhere.
     """
     stage, photos = cfg.stages[index], pixels.photos
     if isinstance(stage, StageConfig):
         bring_to_grid_(scene, stage, box, progress)
-    if held is not None:
-        held.hold_(scene.field)
+    if pinned is not None:
+        pinned.pin_(scene.field)
     if isinstance(stage, JointConfig):
         joint_stage.solve(scene, scene.registered(photos), stage, cfg.seed, progress)
     else:

@@ -18,13 +18,13 @@ EPS_SDF, EPS_FEATURES = 1e-4, 1e-8
 def smooth_sdf_gradient_(field: Field, passes: int) -> None:
     """Diffuse the sdf's gradient over the nodes that it touches, before Adam sees it: the surface
     then moves in large pieces, far and without the bumps that steps of single nodes leave. Nodes
-    that are held get none."""
+    that are pinned get none."""
     grad = field.sdf.grad
     assert grad is not None
-    rows, held = rows_of(grad), field.distances.held
+    rows, pinned = rows_of(grad), field.distances.pinned
     field.distances.diffuse_rows_(grad._values(), rows, SPREAD, passes)
-    if held is not None:
-        grad._values()[held.flatten()[rows]] = 0
+    if pinned is not None:
+        grad._values()[pinned.flatten()[rows]] = 0
 
 
 def smooth_touched_(field: Field, stage: StageConfig) -> None:

@@ -14,15 +14,15 @@ from univoxel.data import Photos
 from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape, fit_grid
 from univoxel.optim import rows_of
-from univoxel.preparation.config import HeldConfig
-from univoxel.preparation.held import grown, held_hull
+from univoxel.preparation.config import PinnedConfig
 from univoxel.preparation.hull import mask_distances, visual_hull
-from univoxel.preparation.prepare import Silhouettes, held_in, prepare
+from univoxel.preparation.pinned import grown, pinned_hull
+from univoxel.preparation.prepare import Silhouettes, pinned_in, prepare
 from univoxel.presets import preset
 from univoxel.training.surface_update import smooth_sdf_gradient_
 
 VIEWS, SIZE = 24, 64
-CFG = HeldConfig(points=4000, classes=24)
+CFG = PinnedConfig(points=4000, classes=24)
 GRID = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 24**3)
 
 
@@ -66,42 +66,42 @@ def photographs(look) -> Photos:
     return Photos(Path("ball"), names, encoded, 255 * torch.stack(masks).byte(), cameras)
 
 
-def held(look, cfg=CFG):
+def pinned(look, cfg=CFG):
     photos = photographs(look)
     distance = mask_distances(photos.coverage())
     hull = visual_hull(distance, photos.cameras, GRID)
-    return held_hull(photos, distance, hull, GRID, cfg), hull
+    return pinned_hull(photos, distance, hull, GRID, cfg), hull
 
 
 @pytest.fixture(scope="module")
 def ball():
-    return held(mirror)
+    return pinned(mirror)
 
 
 def test_a_mirror_is_held(ball):
     found, _ = ball
-    assert found.held.float().mean() > 0.8
+    assert found.pinned.float().mean() > 0.8
 
 
 @pytest.mark.parametrize("look", [paint, far_side])
 def test_paint_and_hollows_are_not(look):
-    found, _ = held(look)
+    found, _ = pinned(look)
     assert found is None
 
 
 def test_neighbours_that_agree_prove_nothing():
     """Without points that are turned away from one another there is no table."""
-    found, _ = held(mirror, replace(CFG, turn=180.0))
+    found, _ = pinned(mirror, replace(CFG, turn=180.0))
     assert found is None
 
 
 def test_a_few_points_that_agree_are_chance():
-    assert held(half)[0] is not None
-    assert held(half, replace(CFG, least_share=0.9))[0] is None
+    assert pinned(half)[0] is not None
+    assert pinned(half, replace(CFG, least_share=0.9))[0] is None
 
 
 def test_nothing_is_looked_at_where_no_points_are_asked_for():
-    assert held(mirror, replace(CFG, points=0))[0] is None
+    assert pinned(mirror, replace(CFG, points=0))[0] is None
 
 
 def test_regions_take_in_holes_and_what_is_weak_beside_them():
@@ -124,21 +124,21 @@ def test_nodes_near_held_points_stay(ball):
     near = hull.abs() < CFG.band * GRID.voxel_size
     assert not (nodes & ~near).any()
     assert nodes.sum() > 0.8 * near.sum()
-    upper = replace(found, held=found.position[:, 2] > 0)
+    upper = replace(found, pinned=found.position[:, 2] > 0)
     assert (GRID.nodes()[upper.nodes(hull, GRID)][:, 2] > -0.1).all()
 
 
 def test_the_hull_is_put_back_once_and_gets_no_gradient(ball):
     found, hull = ball
-    upper = replace(found, held=found.position[:, 2] > 0)
+    upper = replace(found, pinned=found.position[:, 2] > 0)
     field = dense_field(GRID, 2, hull + 0.01)
-    upper.hold_(field)
-    stays = field.distances.held
+    upper.pin_(field)
+    stays = field.distances.pinned
     assert torch.equal(field.sdf[stays], hull[stays])
     assert torch.equal(field.sdf[~stays], (hull + 0.01)[~stays])
     with torch.no_grad():
         field.sdf += 0.01
-    upper.hold_(field)  # the same grid: training has begun
+    upper.pin_(field)  # the same grid: training has begun
     assert not torch.equal(field.sdf[stays], hull[stays])
 
     index = (hull.abs() < GRID.voxel_size).nonzero().T
@@ -155,8 +155,8 @@ def test_bricks_are_let_go(ball):
     found, hull = ball
     field = dense_field(GRID, 2, hull).in_bricks(GridShape(GRID.origin, GRID.voxel_size, GRID.size))
     before = field.sdf.clone()
-    found.hold_(field)
-    assert field.distances.held is None
+    found.pin_(field)
+    assert field.distances.pinned is None
     assert torch.equal(field.sdf, before)
 
 
@@ -176,9 +176,9 @@ def draft(tmp_path, **changes):
 def test_a_run_that_goes_on_holds_the_same(tmp_path):
     silhouettes, cfg = silhouettes_of(half), draft(tmp_path)
     prepared = prepare(silhouettes, cfg)
-    again = held_in(silhouettes, build_scene(prepared, cfg), cfg)
-    assert torch.equal(again.position, prepared.held.position)
-    assert torch.equal(again.held, prepared.held.held)
+    again = pinned_in(silhouettes, build_scene(prepared, cfg), cfg)
+    assert torch.equal(again.position, prepared.pinned.position)
+    assert torch.equal(again.pinned, prepared.pinned.pinned)
 
 
 def test_what_is_held_is_not_carved(tmp_path, monkeypatch):
@@ -190,10 +190,10 @@ def test_what_is_held_is_not_carved(tmp_path, monkeypatch):
 
     monkeypatch.setattr("univoxel.preparation.prepare.carve_within_time", carve)
     prepared = prepare(silhouettes_of(half), draft(tmp_path))
-    stays = prepared.held.nodes(carved[0], prepared.grid)
+    stays = prepared.pinned.nodes(carved[0], prepared.grid)
     assert torch.equal(prepared.hull, torch.where(stays, carved[0], carved[0] + 1))
     assert stays.any()
 
 
 def test_rough_masks_hold_nothing(tmp_path):
-    assert prepare(replace(silhouettes_of(half), votes=2), draft(tmp_path)).held is None
+    assert prepare(replace(silhouettes_of(half), votes=2), draft(tmp_path)).pinned is None

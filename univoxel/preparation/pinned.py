@@ -24,7 +24,7 @@ from univoxel.fields.dense import DenseDistances
 from univoxel.fields.field import Field
 from univoxel.grid import GridShape
 from univoxel.ops import VisibilityScene
-from univoxel.preparation.config import HELD, HULL, HeldConfig, HullConfig
+from univoxel.preparation.config import HULL, PINNED, HullConfig, PinnedConfig
 from univoxel.preparation.hull import visual_hull
 from univoxel.preparation.observed_hull import observe_hull
 from univoxel.render.transport import Observations
@@ -35,14 +35,14 @@ GROWTHS, TRIMS = 4, 3
 
 
 @dataclass(frozen=True)
-class HeldHull:
-    """Points of the visual hull, and which of them training leaves as they are."""
+class PinnedHull:
+    """Points of the visual hull, and which of them get no gradient."""
 
     position: Tensor  # [P, 3] world
-    held: Tensor  # [P] bool
+    pinned: Tensor  # [P] bool
     distance: Tensor  # of masks, as of `visual_hull`
     cameras: Cameras
-    cfg: HeldConfig
+    cfg: PinnedConfig
     hull: HullConfig
 
     def nodes(self, sdf: Tensor, grid: GridShape) -> Tensor:
@@ -52,32 +52,33 @@ class HeldHull:
             sdf: [X, Y, Z] of the visual hull, world units.
         """
         near = sdf.abs() < self.cfg.band * grid.voxel_size
-        _, point = KDTree(self.position.numpy()).query(grid.nodes()[near].numpy(), workers=-1)
-        return torch.zeros_like(near).masked_scatter(near, self.held[torch.from_numpy(point)])
+        point = _nearest(grid.nodes()[near], self.position, 1)[:, 0]
+        return torch.zeros_like(near).masked_scatter(near, self.pinned[point])
 
     @torch.no_grad()
-    def hold_(self, field: Field) -> None:
-        """Put the hull back where it is held, and have training leave it there.
+    def pin_(self, field: Field) -> None:
+        """Put the hull back where it is pinned, and give its nodes there no gradient from now on.
 
         A field in bricks, which are finer than the hull is right, stays as it is.
         """
         distances = field.distances
-        if not isinstance(distances, DenseDistances) or distances.held is not None:
+        if not isinstance(distances, DenseDistances) or distances.pinned is not None:
             return
         hull = visual_hull(self.distance, self.cameras, field.grid, self.hull)
-        distances.held = self.nodes(hull, field.grid)
-        distances.sdf[distances.held] = hull[distances.held]
+        distances.pinned = self.nodes(hull, field.grid)
+        distances.sdf[distances.pinned] = hull[distances.pinned]
+        field.refresh()
 
 
 @torch.no_grad()
-def held_hull(
+def pinned_hull(
     photos: Photos,
     distance: Tensor,
     hull: Tensor,
     grid: GridShape,
-    cfg: HeldConfig = HELD,
+    cfg: PinnedConfig = PINNED,
     hull_cfg: HullConfig = HULL,
-) -> HeldHull | None:
+) -> PinnedHull | None:
     """Where training leaves the visual hull as it is; None: nowhere.
 
     Args:
@@ -88,13 +89,15 @@ def held_hull(
     seen = observe_hull(photos, hull, grid, cfg.points) if cfg.points else None
     if seen is None:
         return None
-    held = mirroring(seen, hull, grid, cfg)
-    if not held.any():
+    pinned = mirroring(seen, hull, grid, cfg)
+    if not pinned.any():
         return None
-    return HeldHull(seen.position, held, distance, photos.cameras, cfg, hull_cfg)
+    return PinnedHull(seen.position, pinned, distance, photos.cameras, cfg, hull_cfg)
 
 
-def mirroring(seen: Observations, hull: Tensor, grid: GridShape, cfg: HeldConfig = HELD) -> Tensor:
+def mirroring(
+    seen: Observations, hull: Tensor, grid: GridShape, cfg: PinnedConfig = PINNED
+) -> Tensor:
     """Which of N points change as others do that mirror the same direction: [N] bool.
 
     A table of what each direction sends is the mean of what points show that mirror it. A point is
@@ -117,9 +120,9 @@ def mirroring(seen: Observations, hull: Tensor, grid: GridShape, cfg: HeldConfig
         if in_table.sum() < cfg.least_share * len(in_table):
             return torch.zeros_like(in_table)
     place = torch.cat([seen.position / (cfg.near * grid.voxel_size), seen.normal], 1)
-    nearest = KDTree(place.numpy()).query(place.numpy(), k=cfg.neighbours, workers=-1)[1]
     weak = (rms > cfg.weak_change) & (correlation > cfg.weak_correlation)
-    return grown(in_table & (rms > cfg.strong_change), weak, torch.from_numpy(nearest))
+    nearest = _nearest(place, place, cfg.neighbours)
+    return grown(in_table & (rms > cfg.strong_change), weak, nearest)
 
 
 def grown(strong: Tensor, weak: Tensor, nearest: Tensor) -> Tensor:
@@ -202,7 +205,7 @@ class _Sightings:
 
 
 def _open_sightings(
-    seen: Observations, hull: Tensor, grid: GridShape, cfg: HeldConfig
+    seen: Observations, hull: Tensor, grid: GridShape, cfg: PinnedConfig
 ) -> _Sightings | None:
     """The sightings that can be compared; None: too few points have any."""
     point = torch.repeat_interleave(seen.offsets.diff())
@@ -218,8 +221,6 @@ def _open_sightings(
     if len(decided) < cfg.neighbours:
         return None
     place = torch.cat([seen.position / (cfg.near * grid.voxel_size), seen.normal / cfg.bend], 1)
-    tree = KDTree(place[decided].numpy())
-    nearest = torch.from_numpy(tree.query(place.numpy(), k=cfg.neighbours, workers=-1)[1])
     u, v = sphere.direction_to_latlong(mirrored).unbind(1)
     column = (u * 2 * cfg.rows).long() % (2 * cfg.rows)
     classes = sphere.fibonacci_sphere(cfg.classes)
@@ -229,7 +230,13 @@ def _open_sightings(
         (v * cfg.rows).long().clamp_max(cfg.rows - 1) * 2 * cfg.rows + column,
         (seen.normal @ classes.T).argmax(1),
         (classes @ classes.T < math.cos(math.radians(cfg.turn))).float(),
-        decided[nearest.reshape(len(place), -1)],
+        decided[_nearest(place, place[decided], cfg.neighbours)],
         cfg.least,
         cfg.share,
     )
+
+
+def _nearest(place: Tensor, among: Tensor, count: int) -> Tensor:
+    """Index [N, count] of those among [P, D] that are nearest to each place [N, D]."""
+    index = KDTree(among.numpy()).query(place.numpy(), k=count, workers=-1)[1]
+    return torch.from_numpy(index).reshape(len(place), count)
