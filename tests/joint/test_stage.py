@@ -572,6 +572,20 @@ def test_paint_is_asked_before_and_after_newton(monkeypatch, changed):
     assert calls == ["newton", "newton"]
 
 
+def test_mirrors_are_taught_before_adam_in_every_round(monkeypatch):
+    calls, found = [], torch.ones(5, dtype=torch.bool)
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+    mirrors = Mirrors(found, found, torch.eye(3)[[0] * 5], torch.full((5, 3), 0.8))
+    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
+    monkeypatch.setattr(stage, "find_metal", lambda *_: found)
+    monkeypatch.setattr(stage, "find_mirrors", lambda *_: mirrors)
+    monkeypatch.setattr(stage, "initialise_", lambda scene, problem, decisions, *_: (decisions, []))
+    monkeypatch.setattr(stage, "newton_round_", lambda *_: calls.append("newton") or NewtonRound())
+    monkeypatch.setattr(stage, "teach_mirrors_", lambda *_: calls.append("teach"))
+    stage.solve(scene, photos_of(1, 8), replace(CFG, rounds=2, colors=False), 0, Steps(4))
+    assert calls == ["newton", "teach"] * 2
+
+
 def test_materials_follow_a_map_that_was_changed(monkeypatch):
     """Albedo goes to what the photographs say; the rest, metals, and what none sees stay."""
     torch.manual_seed(0)

@@ -13,12 +13,14 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape, fit_grid
+from univoxel.lights.turntable import Turntable
 from univoxel.optim import rows_of
 from univoxel.preparation.config import PinnedConfig
 from univoxel.preparation.hull import mask_distances, visual_hull
-from univoxel.preparation.pinned import grown, pinned_hull
+from univoxel.preparation.pinned import grown, open_sightings, pinned_hull
 from univoxel.preparation.prepare import Silhouettes, pinned_in, prepare
 from univoxel.presets import preset
+from univoxel.render.transport import Observations
 from univoxel.training.surface_update import smooth_sdf_gradient_
 
 VIEWS, SIZE = 24, 64
@@ -45,6 +47,18 @@ def paint(rays, normal):
 def half(rays, normal):
     """A mirror above, grey below."""
     return torch.where(normal[:, 2:] > 0, mirror(rays, normal), 0.3)
+
+
+def half_glossy(rays, normal):
+    """A mirror above, glossy paint below."""
+    share = torch.where(normal[:, 2:] > 0, 1.0, 0.15)
+    return 0.3 * (1 - share) + share * mirror(rays, normal)
+
+
+def noisy(rays, normal):
+    """A mirror whose every sighting is off by chance, by as much as the lamps change it."""
+    generator = torch.Generator().manual_seed(int(1e4 * rays.origin[0].sum().abs()))
+    return mirror(rays, normal) / 2 + 0.8 * torch.rand(normal.shape, generator=generator)
 
 
 def far_side(rays, normal):
@@ -100,6 +114,60 @@ def test_a_few_points_that_agree_are_chance():
     assert pinned(half, replace(CFG, least_share=0.9))[0] is None
 
 
+def test_paint_that_mirrors_a_part_is_not_pinned():
+    """However small the changes that are asked for."""
+    weak = replace(CFG, change=0.02, strong_change=0.02, weak_change=9.0)
+    found, _ = pinned(half_glossy, weak)
+    height = found.position[:, 2]
+    assert found.pinned[height > 0.2].float().mean() > 0.8
+    below = height < -0.3  # regions grow some way across the border
+    assert found.pinned[below].float().mean() < 0.1
+    all_agree, _ = pinned(half_glossy, replace(weak, gain=0.0))
+    assert all_agree.pinned[below].float().mean() > 0.5
+
+
+def test_changes_that_hardly_follow_the_table_prove_nothing():
+    all_change = {"change": 0.05, "strong_change": 0.05, "weak_change": 0.05}
+    any_gain = replace(CFG, gain=0.0, **all_change)
+    assert pinned(noisy, replace(any_gain, correlation=0.9))[0] is None
+    assert pinned(noisy, any_gain)[0] is not None
+
+
+def test_regions_begin_with_the_strongest_changes():
+    assert pinned(mirror, replace(CFG, strong_change=0.9))[0] is None
+
+
+def test_points_that_few_photographs_show_are_left_out():
+    assert pinned(mirror, replace(CFG, min_views=VIEWS))[0] is None
+
+
+def test_what_mirrors_the_object_tells_nothing():
+    """Of two balls side by side: a place that faces the other one, seen so that it mirrors it."""
+    nodes = GRID.nodes().view(*GRID.size, 3)
+    balls = [(nodes - torch.tensor([x, 0.0, 0.0])).norm(dim=-1) - 0.2 for x in (-0.35, 0.35)]
+    hull = torch.minimum(*balls)
+    towards = torch.tensor(
+        [[1.0, 0.0, 0.0], [0.6, 0.8, 0.0]]
+    )  # mirrored at +X: the other ball, sky
+    wo = towards * torch.tensor([1.0, -1.0, 1.0])
+    count = CFG.neighbours
+    normal = torch.tensor([[1.0, 0.0, 0.0]]).expand(count, 3)
+    position = torch.tensor([[-0.15, 0.0, 0.0]]) + 0.001 * torch.randn(
+        count, 3, generator=torch.Generator().manual_seed(0)
+    )
+    seen = Observations(
+        position,
+        normal,
+        2 * torch.arange(count + 1),
+        wo.repeat(count, 1),
+        torch.full((2 * count, 3), 0.5),
+        torch.arange(2).repeat(count),
+        torch.zeros(2, 3),
+    )
+    found = open_sightings(seen, hull, GRID, replace(CFG, min_views=1))
+    assert found.count.tolist() == [1.0] * count
+
+
 def test_nothing_is_looked_at_where_no_points_are_asked_for():
     assert pinned(mirror, replace(CFG, points=0))[0] is None
 
@@ -151,6 +219,17 @@ def test_the_hull_is_put_back_once_and_gets_no_gradient(ball):
     assert (gradient[~stays.flatten()[rows]] > 0).all()
 
 
+def test_which_bricks_are_empty_is_looked_at_again(ball):
+    """In training it is not by itself."""
+    found, hull = ball
+    field = dense_field(GRID, 2, hull + 0.2).train()
+    before = field.distances.brick_minimum()
+    found.pin_(field)
+    after = field.distances.brick_minimum()
+    assert torch.equal(after, field.eval().distances.brick_minimum())
+    assert not torch.equal(after, before)
+
+
 def test_bricks_are_let_go(ball):
     found, hull = ball
     field = dense_field(GRID, 2, hull).in_bricks(GridShape(GRID.origin, GRID.voxel_size, GRID.size))
@@ -197,3 +276,22 @@ def test_what_is_held_is_not_carved(tmp_path, monkeypatch):
 
 def test_rough_masks_hold_nothing(tmp_path):
     assert prepare(replace(silhouettes_of(half), votes=2), draft(tmp_path)).pinned is None
+
+
+@pytest.mark.parametrize("varying", ["exposure", "light"])
+def test_photographs_that_differ_pin_nothing(tmp_path, varying):
+    cfg = draft(tmp_path)
+    prepared = prepare(
+        silhouettes_of(half), replace(cfg, scene=replace(cfg.scene, varying=varying))
+    )
+    assert prepared.pinned is None
+    assert pinned_in(prepared.silhouettes, build_scene(prepared, cfg), cfg) is None
+
+
+def test_a_turntable_pins_nothing(tmp_path, monkeypatch):
+    silhouettes, cfg = silhouettes_of(half), draft(tmp_path)
+    turntable = Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+    monkeypatch.setattr("univoxel.preparation.prepare.turntable_of", lambda *_: turntable)
+    prepared = prepare(silhouettes, cfg)
+    assert prepared.pinned is None
+    assert pinned_in(silhouettes, build_scene(prepared, cfg), cfg) is None

@@ -271,6 +271,37 @@ def test_resume_goes_on_where_it_stopped(data, tmp_path, monkeypatch):
     assert load_scene(cfg.out).field.grid != first.field.grid  # the second stage's resolution
 
 
+def test_what_is_pinned_is_so_on_the_grid_of_every_stage_and_after_a_kill(
+    data, tmp_path, monkeypatch
+):
+    class Pinned:
+        def __init__(self):
+            self.grids = []
+
+        def pin_(self, field):
+            self.grids.append(field.grid.size)
+
+    first, second = Pinned(), Pinned()
+    monkeypatch.setattr(preparation, "find_pinned", lambda *_: first)
+    cfg = config(data, tmp_path / "run", hollows=0.0)
+    original = task.run_stage
+
+    def killed(scene, cfg, stage, *rest):
+        if stage.physical_from == 0.0:
+            raise KeyboardInterrupt
+        original(scene, cfg, stage, *rest)
+
+    monkeypatch.setattr(task, "run_stage", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(cfg)
+    coarse, fine = first.grids
+    assert coarse < fine
+    monkeypatch.setattr(task, "run_stage", original)
+    monkeypatch.setattr(preparation, "find_pinned", lambda *_: second)
+    train(cfg, resume=True)
+    assert second.grids == [fine]
+
+
 def test_resume_refuses_another_configuration(run, data):
     cfg = config(data, run)
     with pytest.raises(ValueError, match=r"the run began with other downscale: .* downscale, "):

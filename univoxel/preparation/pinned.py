@@ -105,7 +105,7 @@ def mirroring(
     would agree whatever they show. Points that change least as the table does leave it, round by
     round.
     """
-    sightings = _open_sightings(seen, hull, grid, cfg)
+    sightings = open_sightings(seen, hull, grid, cfg)
     if sightings is None:
         return torch.zeros(len(seen.position), dtype=torch.bool)
     total, count = sightings.total, sightings.count
@@ -147,7 +147,7 @@ def grown(strong: Tensor, weak: Tensor, nearest: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class _Sightings:
+class Sightings:
     """What S photographs show of N points, where nothing of the object is mirrored."""
 
     point: Tensor  # [S] int64
@@ -204,9 +204,9 @@ class _Sightings:
         return gain, torch.where(enough, both / (of_shown * of_sent).clamp_min(1e-12).sqrt(), 0.0)
 
 
-def _open_sightings(
+def open_sightings(
     seen: Observations, hull: Tensor, grid: GridShape, cfg: PinnedConfig
-) -> _Sightings | None:
+) -> Sightings | None:
     """The sightings that can be compared; None: too few points have any."""
     point = torch.repeat_interleave(seen.offsets.diff())
     normal = seen.normal[point]
@@ -224,7 +224,7 @@ def _open_sightings(
     u, v = sphere.direction_to_latlong(mirrored).unbind(1)
     column = (u * 2 * cfg.rows).long() % (2 * cfg.rows)
     classes = sphere.fibonacci_sphere(cfg.classes)
-    return _Sightings(
+    return Sightings(
         point,
         linear_to_srgb(seen.color[usable].clamp(0, 1)),
         (v * cfg.rows).long().clamp_max(cfg.rows - 1) * 2 * cfg.rows + column,
