@@ -10,7 +10,7 @@ from univoxel.data import Photos
 from univoxel.errors import DataError, UserError
 from univoxel.preparation import mending, prepare
 from univoxel.preparation.belief import Belief
-from univoxel.preparation.config import PREPARATION, REGISTRATION
+from univoxel.preparation.config import OUTLINES, PREPARATION, REGISTRATION
 from univoxel.preparation.hull import hull_sdf, mask_distances
 from univoxel.preparation.mending import mended
 from univoxel.preparation.registration import contradiction
@@ -133,6 +133,40 @@ def test_most_masks_know_better_than_each_of_them(photos, monkeypatch):
     left = 1 - agreement(once[0].photos.alpha, photos.alpha)
     assert 1 - agreement(again, photos.alpha) < 0.8 * left
     assert draw(once[0], 0.01, ROUGH, PREPARATION) is once[0]  # a hundredth of a pixel
+
+
+def test_edges_move_as_far_as_the_rest_contradicts_itself(photos, monkeypatch):
+    """Not as far as the worst masks do, which are doubted."""
+    reaches, draw = [], mending.drawn_again
+
+    def watched(photos, distance, reach, *rest):
+        reaches.append(reach)
+        return draw(photos, distance, reach, *rest)
+
+    monkeypatch.setattr(mending, "drawn_again", watched)
+    rough = wavering(photos, 1.5)
+    distance = mask_distances(rough.alpha)
+    first = mending._doubted_again(
+        rough,
+        distance,
+        mending.doubted_pixels(distance, rough.cameras, ROUGH),
+        ROUGH,
+        PREPARATION,
+    )
+    mended(rough, distance, replace(ROUGH, off=50.0))
+    wanted = max(OUTLINES.further * first.belief.off, OUTLINES.least)
+    assert reaches == [wanted, wanted]
+    assert wanted < 10
+
+
+def test_what_was_doubted_stays_so(photos):
+    """Edges that are drawn once more tell nothing of parts that a mask lacks."""
+    rough = wavering(photos, 1.5)
+    distance = mask_distances(rough.alpha)
+    doubted = torch.zeros(rough.alpha.shape, dtype=torch.bool)
+    doubted[3, 20:30, 20:30] = True
+    found = mending.Mended(rough, doubted, distance, ROUGH)
+    assert mending._drawn_from_hull(found, 2.0, ROUGH, PREPARATION).doubted[doubted].all()
 
 
 def test_photographs_of_the_object_alone_keep_their_masks():
