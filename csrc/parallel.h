@@ -20,7 +20,7 @@ namespace univoxel {
 /// With UNIVOXEL_STD_THREADS the team is one of std::thread, dealt out in turns: the thread
 /// sanitizer follows those, not OpenMP's runtime, and sees races of threads that had any work.
 template <class F>
-void share_out(int64_t n, int team, F&& f) {
+void share_out(int64_t n, [[maybe_unused]] int team, F&& f) {
 #ifdef UNIVOXEL_STD_THREADS
     const auto work = [&](int64_t first) {
         for (int64_t c = first; c < n; c += team) f(c);
