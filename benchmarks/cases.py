@@ -369,6 +369,19 @@ def diffuse_rows(rows: int = 130_000, passes: int = 4) -> Case:
     )
 
 
+def decode_lobes(points: int = 2048, lobes: int = 16) -> Case:
+    raw = torch.randn(points * lobes, 7, generator=torch.Generator().manual_seed(0))
+    return Case(
+        "decode_lobes",
+        f"{points:,} points, {lobes} lobes",
+        lambda raw: ops.decode_lobes(raw, 0.1, 30.0),
+        lambda raw: ops.decode_lobes_reference(raw, 0.1, 30.0),
+        (raw.requires_grad_(),),
+        # Forward and backward: the numbers of a lobe are read, and as many written, each way
+        {"read": 4.0 * 4 * raw.numel()},
+    )
+
+
 def specular_response(sightings: int = 2048, directions: int = 512) -> Case:
     g = torch.Generator().manual_seed(0)
     normal, wo = torch.nn.functional.normalize(torch.randn(2, sightings, 3, generator=g), dim=-1)
@@ -461,6 +474,7 @@ CASES: list[tuple[str, Callable[[], Case]]] = [
     ("smooth_rows_", lambda: smooth_rows(channels=12, order=1)),
     ("diffuse_rows_", diffuse_rows),
     ("specular_response", specular_response),
+    ("decode_lobes", decode_lobes),
     ("match_cost", match_cost),
     ("semi_global", semi_global),
 ]

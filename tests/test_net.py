@@ -36,7 +36,7 @@ def short(cfg: TrainConfig, **changes) -> TrainConfig:
     """A preset in few steps on coarse grids, with as much time as it wants."""
     stages = []
     for stage in cfg.stages:
-        few = {"iterations": max(12, stage.iterations // 12), "rays": 256}
+        few = {"iterations": max(12, stage.iterations // 9), "rays": 256}
         if hasattr(stage, "voxels"):
             few["voxels"] = min(stage.voxels, 0.1)
         else:

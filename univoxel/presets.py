@@ -32,12 +32,13 @@ class Work:
     voxels: float  # millions, of the finest grid
     steps: float  # of the fine stage; the others follow
     rays: float  # per step
+    lr_networks: float  # at the begin of a stage; few steps want larger ones
 
 
 PRESETS = {
-    "draft": Work(1.0, voxels=1.0, steps=400, rays=1024),
-    "fast": Work(4.0, voxels=2.0, steps=1200, rays=2048),
-    "full": Work(12.0, voxels=4.0, steps=4200, rays=2048),
+    "draft": Work(1.0, voxels=1.0, steps=400, rays=1024, lr_networks=6e-3),
+    "fast": Work(4.0, voxels=2.0, steps=900, rays=2048, lr_networks=6e-3),
+    "full": Work(12.0, voxels=4.0, steps=4200, rays=2048, lr_networks=3e-3),
 }
 
 
@@ -128,11 +129,13 @@ def work_in(minutes: float) -> Work:
     k = max(i for i, w in enumerate(known[:-1]) if i == 0 or w.minutes <= minutes)
     low, high = known[k], known[k + 1]
     x = math.log(minutes / low.minutes) / math.log(high.minutes / low.minutes)
-    voxels, steps, rays = (
+    voxels, steps, rays, lr_networks = (
         getattr(low, name) * (getattr(high, name) / getattr(low, name)) ** x
-        for name in ("voxels", "steps", "rays")
+        for name in ("voxels", "steps", "rays", "lr_networks")
     )
-    return Work(minutes, min(voxels, known[-1].voxels), steps, min(rays, known[-1].rays))
+    most = known[-1]
+    lr_networks = max(lr_networks, most.lr_networks)
+    return Work(minutes, min(voxels, most.voxels), steps, min(rays, most.rays), lr_networks)
 
 
 def _configuration(
@@ -141,8 +144,15 @@ def _configuration(
     minutes, voxels = work.minutes, round(work.voxels, 3)
     exposures, known = varying == "auto", "none" if varying == "auto" else varying
     steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
+    lr_networks = (work.lr_networks, 3e-4)
     coarse = StageConfig(
-        0.9, steps // 2, share=0.15, rays=rays // 2, sharpness=(0.7, 0.35), field="hash"
+        0.9,
+        steps // 2,
+        share=0.15,
+        rays=rays // 2,
+        sharpness=(0.7, 0.35),
+        lr_networks=lr_networks,
+        field="hash",
     )
     fine = StageConfig(
         voxels=voxels,
@@ -150,7 +160,8 @@ def _configuration(
         share=0.85,
         rays=rays,
         sharpness=(0.5, 0.3),
-        lr_sdf=(0.05, 0.005),
+        lr_sdf=(0.07, 0.005),
+        lr_networks=lr_networks,
         physical_from=0.3,
         field="hash",
     )
@@ -160,31 +171,9 @@ def _configuration(
     }
     match light:
         case "hybrid":
-            # Shares are what the stages cost where none is cut
-            coarse, fine = replace(coarse, share=0.12), replace(fine, share=0.48)
-            # What Newton and tracing cost follows the steps, or little work would be nothing else
-            joint = JointConfig(
-                iterations=steps,
-                share=0.25,
-                points=min(25 * steps, 15000 + 6 * steps),
-                newton_points=min(4000, 3 * steps),
-                colors=minutes > COLORS_MINUTES,
-            )
-            refit = StageConfig(
-                voxels=voxels,
-                iterations=steps // 3,
-                share=0.15,
-                rays=rays,
-                sharpness=(0.3, 0.3),
-                lr_sdf=(0.015, 0.0015),
-                lr_features=(0.01, 0.001),
-                plate=0.0,
-                diffusion=0.0,
-                physical_from=0.0,
-                refit=True,
-                field="hash",
-            )
-            scene, loss = SceneConfig(varying=known), LossConfig()
+            coarse, fine, joint, refit = _hybrid_stages(work, coarse, fine)
+            # Directions that turn at random in every step: half of what lobes alone take does
+            scene, loss = SceneConfig(light=SGConfig(directions=64), varying=known), LossConfig()
             stages, capacity = (coarse, fine, joint, refit), "adaptive"
         case "baked":
             scene = SceneConfig(
@@ -215,3 +204,34 @@ def _configuration(
         scene=scene,
         loss=loss,
     )
+
+
+def _hybrid_stages(
+    work: Work, coarse: StageConfig, fine: StageConfig
+) -> tuple[StageConfig, StageConfig, JointConfig, StageConfig]:
+    """The stages of the hybrid light, from the two that geometry forms in."""
+    steps = fine.iterations
+    # Shares are what the stages cost where none is cut
+    coarse, fine = replace(coarse, share=0.11), replace(fine, share=0.41)
+    # What Newton and tracing cost follows the steps, or little work would be nothing else
+    joint = JointConfig(
+        iterations=max(1, 3 * steps // 4),
+        share=0.27,
+        rays=2048,  # normals and roughness want steps more than they want observations
+        points=min(25 * steps, 15000 + 6 * steps),
+        newton_points=min(4000, 1000 + steps),
+        colors=work.minutes > COLORS_MINUTES,
+    )
+    refit = replace(
+        fine,
+        iterations=steps // 3,
+        share=0.21,
+        sharpness=(0.3, 0.3),
+        lr_sdf=(0.015, 0.0015),
+        lr_features=(0.01, 0.001),
+        plate=0.0,
+        diffusion=0.0,
+        physical_from=0.0,
+        refit=True,
+    )
+    return coarse, fine, joint, refit

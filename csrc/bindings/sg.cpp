@@ -1,6 +1,7 @@
 #include "sg.h"
 
 #include "bindings/common.h"
+#include "lobes.h"
 
 namespace univoxel {
 namespace {
@@ -45,11 +46,47 @@ void bind_sg(py::module_& m) {
         });
 }
 
+template <class T>
+RawLobes<T> raw_lobes_of(In<T> parameters, int64_t n, double low, double high) {
+    require(parameters.size() == 7 * n, "decode_lobes: sizes do not fit");
+    return make<RawLobes<T>>(parameters, n, static_cast<T>(low), static_cast<T>(high));
+}
+
+template <class T>
+void bind_lobes(py::module_& m) {
+    def(m, "decode_lobes_forward",
+        "parameters min_sharpness max_sharpness axis sharpness amplitude threads",
+        [](In<T> parameters, double low, double high, Out<T> axis, Out<T> sharpness,
+           Out<T> amplitude, int threads) {
+            const int64_t n = sharpness.size();
+            const auto in = raw_lobes_of(parameters, n, low, high);
+            require(axis.size() == 3 * n && amplitude.size() == 3 * n,
+                    "decode_lobes: sizes do not fit");
+            decode_lobes_forward(in, axis.mutable_data(), sharpness.mutable_data(),
+                                 amplitude.mutable_data(), threads);
+        });
+    def(m, "decode_lobes_backward",
+        "parameters min_sharpness max_sharpness grad_axis grad_sharpness grad_amplitude "
+        "grad_parameters threads",
+        [](In<T> parameters, double low, double high, In<T> grad_axis, In<T> grad_sharpness,
+           In<T> grad_amplitude, Out<T> grad_parameters, int threads) {
+            const int64_t n = grad_sharpness.size();
+            const auto in = raw_lobes_of(parameters, n, low, high);
+            require(grad_axis.size() == 3 * n && grad_amplitude.size() == 3 * n &&
+                        grad_parameters.size() == 7 * n,
+                    "decode_lobes: sizes do not fit");
+            decode_lobes_backward(in, grad_axis.data(), grad_sharpness.data(),
+                                  grad_amplitude.data(), grad_parameters.mutable_data(), threads);
+        });
+}
+
 }  // namespace
 
 void bind_sg_ops(py::module_& m) {
     bind_sg<float>(m);
     bind_sg<double>(m);
+    bind_lobes<float>(m);
+    bind_lobes<double>(m);
 }
 
 }  // namespace univoxel

@@ -33,6 +33,11 @@ def shade_sg():
     return rgb, [*leaves, f0]
 
 
+def decode_lobes():
+    numbers = normal(6 * N, 7)
+    return ops.decode_lobes(numbers, 0.1, 30.0), [numbers]
+
+
 def shade_radiance():
     radiance, albedo, f0 = normal(N, 16, 3), normal(N, 3), normal(N, 3, seed=1)
     roughness = torch.full((N,), 0.4).requires_grad_()
@@ -62,7 +67,9 @@ def march():
     return (least, samples.t, samples.connected, samples.offsets), []
 
 
-@pytest.mark.parametrize("op", [composite, shade_sg, shade_radiance, specular_response, march])
+@pytest.mark.parametrize(
+    "op", [composite, shade_sg, decode_lobes, shade_radiance, specular_response, march]
+)
 def test_same_bits(op):
     before, runs = torch.get_num_threads(), []
     try:

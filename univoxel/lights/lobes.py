@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from univoxel import sphere
+from univoxel.ops import decode_lobes
 
 _MIN_SHARPNESS = 0.1
 
@@ -19,12 +20,11 @@ def decode(parameters: Tensor, max_sharpness: float) -> tuple[Tensor, Tensor, Te
         parameters: [..., K, 7] any numbers: three for the axis, one for the sharpness, three for
             the amplitude.
     """
-    vector, sharpness, amplitude = parameters.split([3, 1, 3], -1)
-    # rsqrt of a floored square: a zero vector keeps a finite gradient
-    axis = vector * ((vector * vector).sum(-1, keepdim=True).clamp_min(1e-12)).rsqrt()
-    sharpness = max_sharpness * sharpness[..., 0].sigmoid() + _MIN_SHARPNESS
-    # softplus, for which torch has no vector instructions
-    return axis, sharpness, -torch.nn.functional.logsigmoid(-amplitude)
+    *leading, count, numbers = parameters.shape
+    flat = parameters.reshape(-1, numbers)
+    axis, sharpness, amplitude = decode_lobes(flat, _MIN_SHARPNESS, max_sharpness)
+    shape = *leading, count
+    return axis.view(*shape, 3), sharpness.view(shape), amplitude.view(*shape, 3)
 
 
 def white_light(count: int, max_sharpness: float) -> Tensor:

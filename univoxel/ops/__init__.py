@@ -11,6 +11,7 @@ from univoxel.ops.dense_grid import sample_dense, sample_dense_reference
 from univoxel.ops.density import section_alpha
 from univoxel.ops.hash_grid import encode_hash, encode_hash_reference
 from univoxel.ops.integrator import EnvTables, PointLight, Sun, relight
+from univoxel.ops.lobes import decode_lobes, decode_lobes_reference
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.mlp import mlp, mlp_reference
 from univoxel.ops.native import NativeStatus, native_status, use_backend
@@ -51,6 +52,8 @@ __all__ = [
     "composite_field",
     "composite_field_reference",
     "composite_reference",
+    "decode_lobes",
+    "decode_lobes_reference",
     "diffuse_rows_",
     "diffuse_rows_reference_",
     "encode_hash",

@@ -1,0 +1,117 @@
+"""Lobes from raw numbers: native against reference, closed forms, extremes, bad arguments."""
+
+import math
+
+import pytest
+import torch
+from check_op import check_op
+
+from univoxel.ops import decode_lobes, decode_lobes_reference
+from univoxel.ops.lobes import _decode_lobes
+
+LOW, HIGH = 0.1, 30.0
+
+
+def parameters(m, scale=2.0, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return scale * torch.randn(m, 7, generator=g, dtype=torch.float64)
+
+
+def case(numbers):
+    return numbers.requires_grad_(), LOW, HIGH
+
+
+def test_native_equals_reference():
+    cases = [case(parameters(m, scale)) for m, scale in ((5, 2.0), (64, 0.1), (67, 20.0), (0, 1.0))]
+    check_op(decode_lobes, decode_lobes_reference, cases)
+
+
+def test_many_lobes_cross_the_chunks():
+    check = parameters(3 * 4096 + 5)
+    for got, wanted in zip(
+        decode_lobes(check, LOW, HIGH), decode_lobes_reference(check, LOW, HIGH), strict=True
+    ):
+        torch.testing.assert_close(got, wanted, rtol=1e-13, atol=0)
+
+
+def test_opcheck():
+    torch.library.opcheck(_decode_lobes.defined, case(parameters(3)))
+
+
+def test_whole_graph_compiles():
+    numbers = parameters(4).requires_grad_()
+
+    @torch.compile(fullgraph=True)
+    def loss(numbers):
+        return sum(x.square().sum() for x in decode_lobes(numbers, LOW, HIGH))
+
+    wanted = sum(x.square().sum() for x in decode_lobes_reference(numbers, LOW, HIGH))
+    got, wanted = (torch.autograd.grad(x, numbers) for x in (loss(numbers), wanted))
+    torch.testing.assert_close(got, wanted)
+
+
+def test_strided_parameters():
+    wide = parameters(5).repeat(1, 2)
+    strided = wide[:, 3:10]
+    for got, wanted in zip(
+        decode_lobes(strided, LOW, HIGH),
+        decode_lobes_reference(strided, LOW, HIGH),
+        strict=True,
+    ):
+        torch.testing.assert_close(got, wanted)
+
+
+def test_closed_forms():
+    numbers = torch.tensor([[0.0, -3.0, 4.0, 0.0, 0.0, math.log(math.e - 1), -40.0]])
+    axis, sharpness, amplitude = decode_lobes(numbers, LOW, HIGH)
+    torch.testing.assert_close(axis, torch.tensor([[0.0, -0.6, 0.8]]))
+    torch.testing.assert_close(sharpness, torch.tensor([LOW + HIGH / 2]))
+    wanted = torch.tensor([[math.log(2), 1.0, math.exp(-40)]])
+    torch.testing.assert_close(amplitude, wanted, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("size", [1e4, 1e30])
+def test_extremes_are_finite(size):
+    numbers = torch.tensor([[0.0, 0.0, 0.0, size, size, -size, 0.0], [0.0] * 3 + [-size] * 4])
+    numbers.requires_grad_()
+    axis, sharpness, amplitude = decode_lobes(numbers, LOW, HIGH)
+    assert axis.eq(0).all()
+    torch.testing.assert_close(sharpness, torch.tensor([LOW + HIGH, LOW]))
+    torch.testing.assert_close(amplitude[0, :2], torch.tensor([size, 0.0]))
+    (grad,) = torch.autograd.grad(axis.sum() + sharpness.sum() + amplitude.sum(), numbers)
+    assert grad.isfinite().all()
+    assert grad[0, 4] == 1
+
+
+def test_what_is_no_number_stays_none():
+    numbers = torch.full((1, 7), math.nan)
+    for x in decode_lobes(numbers, LOW, HIGH):
+        assert x.isnan().all()
+
+
+def test_a_gradient_of_some_outputs():
+    numbers = parameters(6).requires_grad_()
+    for k in range(3):
+        got, wanted = (
+            torch.autograd.grad(op(numbers, LOW, HIGH)[k].square().sum(), numbers)[0]
+            for op in (decode_lobes, decode_lobes_reference)
+        )
+        torch.testing.assert_close(got, wanted)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([1.0] * 7, LOW, HIGH), "parameters must be a tensor"),
+        ((torch.zeros(2, 6), LOW, HIGH), r"parameters must be \[M, 7\]"),
+        ((torch.zeros(7), LOW, HIGH), r"parameters must be \[M, 7\]"),
+        ((torch.zeros(2, 7, dtype=torch.int64), LOW, HIGH), "parameters must be"),
+        ((torch.zeros(2, 7), -0.1, HIGH), "min_sharpness must be at least 0"),
+        ((torch.zeros(2, 7), math.nan, HIGH), "min_sharpness must be at least 0"),
+        ((torch.zeros(2, 7), LOW, 0.0), "max_sharpness must be above 0"),
+        ((torch.zeros(2, 7), LOW, math.inf), "max_sharpness must be above 0"),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        decode_lobes(*arguments)
