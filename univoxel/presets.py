@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 from univoxel.config import TrainConfig
@@ -32,13 +32,26 @@ class Work:
     voxels: float  # millions, of the finest grid
     steps: float  # of the fine stage; the others follow
     rays: float  # per step
-    lr_networks: float  # at the begin of a stage; few steps want larger ones
+    # Rates at the begin of a stage: few steps want larger ones
+    lr_networks: float
+    lr_sdf: float
+    # Of the joint solve under the hybrid light: normals and roughness want steps more than they
+    # want observations
+    joint_steps: float
+    observations: float  # per step
+    directions: float  # of the light at a point, per step; the hybrid light's turn at random
 
 
 PRESETS = {
-    "draft": Work(1.0, voxels=1.0, steps=400, rays=1024, lr_networks=6e-3),
-    "fast": Work(4.0, voxels=2.0, steps=900, rays=2048, lr_networks=6e-3),
-    "full": Work(12.0, voxels=4.0, steps=4200, rays=2048, lr_networks=3e-3),
+    "draft": Work(
+        1.0, 1.0, 400, 1024, 6e-3, 0.07, joint_steps=300, observations=2048, directions=64
+    ),
+    "fast": Work(
+        4.0, 2.0, 900, 2048, 6e-3, 0.07, joint_steps=675, observations=2048, directions=64
+    ),
+    "full": Work(
+        12.0, 4.0, 4200, 2048, 3e-3, 0.05, joint_steps=4200, observations=4096, directions=128
+    ),
 }
 
 
@@ -129,13 +142,15 @@ def work_in(minutes: float) -> Work:
     k = max(i for i, w in enumerate(known[:-1]) if i == 0 or w.minutes <= minutes)
     low, high = known[k], known[k + 1]
     x = math.log(minutes / low.minutes) / math.log(high.minutes / low.minutes)
-    voxels, steps, rays, lr_networks = (
-        getattr(low, name) * (getattr(high, name) / getattr(low, name)) ** x
-        for name in ("voxels", "steps", "rays", "lr_networks")
-    )
-    most = known[-1]
-    lr_networks = max(lr_networks, most.lr_networks)
-    return Work(minutes, min(voxels, most.voxels), steps, min(rays, most.rays), lr_networks)
+    between = {
+        f.name: getattr(low, f.name) * (getattr(high, f.name) / getattr(low, f.name)) ** x
+        for f in fields(Work)
+    }
+    # Beyond full more time buys steps, and nothing else
+    most = asdict(known[-1])
+    limits = {n: min(between[n], most[n]) for n in ("voxels", "rays", "observations", "directions")}
+    limits |= {n: max(between[n], most[n]) for n in ("lr_networks", "lr_sdf")}
+    return Work(**(between | limits | {"minutes": minutes}))
 
 
 def _configuration(
@@ -160,7 +175,7 @@ def _configuration(
         share=0.85,
         rays=rays,
         sharpness=(0.5, 0.3),
-        lr_sdf=(0.07, 0.005),
+        lr_sdf=(work.lr_sdf, 0.005),
         lr_networks=lr_networks,
         physical_from=0.3,
         field="hash",
@@ -172,8 +187,8 @@ def _configuration(
     match light:
         case "hybrid":
             coarse, fine, joint, refit = _hybrid_stages(work, coarse, fine)
-            # Directions that turn at random in every step: half of what lobes alone take does
-            scene, loss = SceneConfig(light=SGConfig(directions=64), varying=known), LossConfig()
+            lobes = SGConfig(directions=round(work.directions))
+            scene, loss = SceneConfig(light=lobes, varying=known), LossConfig()
             stages, capacity = (coarse, fine, joint, refit), "adaptive"
         case "baked":
             scene = SceneConfig(
@@ -215,9 +230,9 @@ def _hybrid_stages(
     coarse, fine = replace(coarse, share=0.11), replace(fine, share=0.41)
     # What Newton and tracing cost follows the steps, or little work would be nothing else
     joint = JointConfig(
-        iterations=max(1, 3 * steps // 4),
+        iterations=max(1, round(work.joint_steps)),
         share=0.27,
-        rays=2048,  # normals and roughness want steps more than they want observations
+        rays=round(work.observations),
         points=min(25 * steps, 15000 + 6 * steps),
         newton_points=min(4000, 1000 + steps),
         colors=work.minutes > COLORS_MINUTES,
