@@ -10,8 +10,7 @@ namespace univoxel {
 namespace {
 
 constexpr int64_t kNumbers = 7;  // of a lobe
-constexpr int64_t kBlock =
-    64;  // lobes whose numbers are side by side: columns, for loops over them
+constexpr int64_t kBlock = 64;   // lobes that are read into columns, for loops over them
 constexpr int64_t kLobesPerChunk = 4096;
 constexpr double kShortest = 1e-12;  // squared length of a vector, below which its axis is shorter
 
@@ -36,7 +35,7 @@ struct Block {
 
 template <class T>
 inline T exp_of_minus(T x, Clamp<T> clamp) {
-    return simd_exp2(T(-1.4426950408889634) * std::abs(x), clamp);
+    return simd_exp2(-T(kLog2E) * std::abs(x), clamp);
 }
 
 template <class T>

@@ -107,6 +107,16 @@ def test_more_minutes_are_more_work():
     for name in ("voxels", "iterations", "rays"):
         values = [getattr(s, name) for s in fine]
         assert values == sorted(values)
+    joint, lobes = [c.stages[2] for c in configs], [c.scene.light for c in configs]
+    for few, name in ((joint, "iterations"), (joint, "rays"), (lobes, "directions")):
+        values = [getattr(x, name) for x in few]
+        assert values == sorted(values)
+    for name in ("lr_networks", "lr_sdf"):  # few steps want larger ones
+        values = [getattr(s, name)[0] for s in fine]
+        assert values == sorted(values, reverse=True)
+        assert values[-1] == pytest.approx(values[-3])  # only steps grow beyond full
+    assert (joint[-1].rays, lobes[-1].directions) == (joint[-3].rays, lobes[-3].directions)
+    assert joint[-1].iterations > joint[-3].iterations
     assert len({s.iterations for s in fine}) == len(fine)
     between, low, high = (work_in(m) for m in (2.0, 1.0, 4.0))
     assert between.steps == pytest.approx((low.steps * high.steps) ** 0.5)

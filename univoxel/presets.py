@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from univoxel.config import TrainConfig
@@ -32,11 +32,10 @@ class Work:
     voxels: float  # millions, of the finest grid
     steps: float  # of the fine stage; the others follow
     rays: float  # per step
-    # Rates at the begin of a stage: few steps want larger ones
+    # Rates at the beginning of a stage: few steps want larger ones
     lr_networks: float
     lr_sdf: float
-    # Of the joint solve under the hybrid light: normals and roughness want steps more than they
-    # want observations
+    # Of the joint solve under the hybrid light: normals want steps more than observations
     joint_steps: float
     observations: float  # per step
     directions: float  # of the light at a point, per step; the hybrid light's turn at random
@@ -44,13 +43,37 @@ class Work:
 
 PRESETS = {
     "draft": Work(
-        1.0, 1.0, 400, 1024, 6e-3, 0.07, joint_steps=300, observations=2048, directions=64
+        minutes=1.0,
+        voxels=1.0,
+        steps=400,
+        rays=1024,
+        lr_networks=6e-3,
+        lr_sdf=0.07,
+        joint_steps=300,
+        observations=2048,
+        directions=64,
     ),
     "fast": Work(
-        4.0, 2.0, 900, 2048, 6e-3, 0.07, joint_steps=675, observations=2048, directions=64
+        minutes=4.0,
+        voxels=2.0,
+        steps=900,
+        rays=2048,
+        lr_networks=6e-3,
+        lr_sdf=0.07,
+        joint_steps=675,
+        observations=2048,
+        directions=64,
     ),
     "full": Work(
-        12.0, 4.0, 4200, 2048, 3e-3, 0.05, joint_steps=4200, observations=4096, directions=128
+        minutes=12.0,
+        voxels=4.0,
+        steps=4200,
+        rays=2048,
+        lr_networks=3e-3,
+        lr_sdf=0.05,
+        joint_steps=4200,
+        observations=4096,
+        directions=128,
     ),
 }
 
@@ -135,22 +158,19 @@ def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
 def work_in(minutes: float) -> Work:
     """Work on the geometric line between the presets on either side of a time.
 
-    Before draft and beyond full the nearest two lead on, except that the grid stays as fine and the
-    batch as large as in full: more would want more memory.
+    Before draft the nearest two lead on. Beyond full only steps do: a finer grid or a larger batch
+    would want more memory.
     """
     known = list(PRESETS.values())
     k = max(i for i, w in enumerate(known[:-1]) if i == 0 or w.minutes <= minutes)
     low, high = known[k], known[k + 1]
     x = math.log(minutes / low.minutes) / math.log(high.minutes / low.minutes)
-    between = {
-        f.name: getattr(low, f.name) * (getattr(high, f.name) / getattr(low, f.name)) ** x
-        for f in fields(Work)
-    }
-    # Beyond full more time buys steps, and nothing else
-    most = asdict(known[-1])
-    limits = {n: min(between[n], most[n]) for n in ("voxels", "rays", "observations", "directions")}
-    limits |= {n: max(between[n], most[n]) for n in ("lr_networks", "lr_sdf")}
-    return Work(**(between | limits | {"minutes": minutes}))
+
+    def between(name: str) -> float:
+        a, b = getattr(low, name), getattr(high, name)
+        return a * (b / a) ** (x if name in ("steps", "joint_steps") else min(x, 1.0))
+
+    return replace(Work(**{f.name: between(f.name) for f in fields(Work)}), minutes=minutes)
 
 
 def _configuration(
@@ -226,7 +246,7 @@ def _hybrid_stages(
 ) -> tuple[StageConfig, StageConfig, JointConfig, StageConfig]:
     """The stages of the hybrid light, from the two that geometry forms in."""
     steps = fine.iterations
-    # Shares are what the stages cost where none is cut
+    # Shares are what the stages of fast cost where none is cut
     coarse, fine = replace(coarse, share=0.11), replace(fine, share=0.41)
     # What Newton and tracing cost follows the steps, or little work would be nothing else
     joint = JointConfig(
@@ -234,7 +254,7 @@ def _hybrid_stages(
         share=0.27,
         rays=round(work.observations),
         points=min(25 * steps, 15000 + 6 * steps),
-        newton_points=min(4000, 1000 + steps),
+        newton_points=min(4000, 3 * steps, 1000 + steps),
         colors=work.minutes > COLORS_MINUTES,
     )
     refit = replace(

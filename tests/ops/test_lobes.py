@@ -83,6 +83,17 @@ def test_extremes_are_finite(size):
     assert grad[0, 4] == 1
 
 
+def test_short_vectors_are_scaled():
+    """The gradient to a vector below the shortest does not turn it: it is 1e6 times the axis's."""
+    numbers = torch.zeros(1, 7, dtype=torch.float64)
+    numbers[0, :3] = torch.tensor([3e-8, 4e-8, 0.0])
+    numbers.requires_grad_()
+    axis, *_ = decode_lobes(numbers, LOW, HIGH)
+    torch.testing.assert_close(axis, 1e6 * numbers[:, :3])
+    (grad,) = torch.autograd.grad(axis @ axis.new_tensor([1.0, 2.0, 3.0]), numbers)
+    torch.testing.assert_close(grad[0, :3], grad.new_tensor([1e6, 2e6, 3e6]))
+
+
 def test_what_is_no_number_stays_none():
     numbers = torch.full((1, 7), math.nan)
     for x in decode_lobes(numbers, LOW, HIGH):
