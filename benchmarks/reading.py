@@ -31,6 +31,12 @@ HERE = Path(__file__).parent
 DATA = HERE.parent / "univoxel" / "example_data" / "tiny"
 GRAIN = 3.0  # bytes, standard deviation
 QUALITY = 92  # of the JPEG files
+COLUMNS = [
+    {"name": "step"},
+    {"name": "wall", "unit": "s", "digits": 1},
+    {"name": "processor", "unit": "s", "digits": 1},
+    {"name": "memory", "unit": "GB", "digits": 2},
+]
 
 
 def main() -> None:
@@ -55,12 +61,12 @@ def main() -> None:
     for step in STEPS:
         command = [sys.executable, __file__, *sys.argv[1:], "--step", step]
         told = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
-        rows.append({"what": step, **json.loads(told.splitlines()[-1])})
+        rows.append({"step": step, **json.loads(told.splitlines()[-1])})
         print(rows[-1])
     result = made() | {
         "title": f"{args.count} photographs of {side}x{side} pixels",
-        "columns": list(rows[0]),
-        "rows": rows,
+        "columns": COLUMNS,
+        "rows": [list(row.values()) for row in rows],
     }
     if args.out:
         args.out.write_text(result_text(result))
@@ -90,9 +96,9 @@ STEPS = {"read": read, "read again": read, "train": train}
 def costs(seconds: float) -> dict[str, float]:
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return {
-        "seconds": round(seconds, 2),
-        "core seconds": round(usage.ru_utime + usage.ru_stime, 1),
-        "memory, GB": round(usage.ru_maxrss * 1024 / 1e9, 2),
+        "wall": seconds,
+        "processor": usage.ru_utime + usage.ru_stime,
+        "memory": usage.ru_maxrss * 1024 / 1e9,
     }
 
 

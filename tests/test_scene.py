@@ -4,6 +4,8 @@ import copy
 import json
 import math
 import os
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -71,6 +73,25 @@ def test_a_checkpoint_gives_the_same_scene(tmp_path, light):
         scene.state_dict().items(), again.state_dict().items(), strict=True
     ):
         assert torch.equal(a, b), name
+
+
+def test_reading_does_not_import_the_compiler(tmp_path):
+    """Operations on torch's meta device do: a second and a half of each command that reads one."""
+    runs = []
+    for light in LIGHTS:
+        run = tmp_path / light.kind
+        run.mkdir()
+        save_scene(small_scene(light), run, {})
+        runs.append(str(run))
+    program = """
+import sys
+from univoxel.checkpoint import load_checkpoint
+for run in sys.argv[1:]:
+    load_checkpoint(run)
+    if "torch._dynamo" in sys.modules:
+        sys.exit(run)
+"""
+    subprocess.run([sys.executable, "-c", program, *runs], check=True)
 
 
 def test_a_file_without_a_table_of_directions_is_one_from_before_there_were_any(tmp_path):

@@ -4,7 +4,7 @@ and the sides of an object, in words."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -29,7 +29,7 @@ def fibonacci_hemisphere(count: int, dtype: torch.dtype = torch.float32) -> Tens
     Source: Gonzalez 2010, "Measurement of areas on a sphere using Fibonacci and latitude-longitude
     lattices", offset by half a step.
     """
-    return _spiral(count, (torch.arange(count, dtype=torch.float64) + 0.5) / max(count, 1), dtype)
+    return _spiral(count, lambda i: (i + 0.5) / count, dtype)
 
 
 def fibonacci_sphere(count: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -38,15 +38,17 @@ def fibonacci_sphere(count: int, dtype: torch.dtype = torch.float32) -> Tensor:
     Raises:
         ValueError: count < 1.
     """
-    step = (2 * torch.arange(count, dtype=torch.float64) + 1) / max(count, 1)
-    return _spiral(count, 1 - step, dtype)
+    return _spiral(count, lambda i: 1 - (2 * i + 1) / count, dtype)
 
 
-def _spiral(count: int, z: Tensor, dtype: torch.dtype) -> Tensor:
+def _spiral(count: int, height: Callable[[Tensor], Tensor], dtype: torch.dtype) -> Tensor:
     """Turn by the golden angle from one height to the next."""
     if count < 1:
         raise ValueError(f"fibonacci: count must be at least 1, got {count}")
-    phi = torch.arange(count, dtype=torch.float64) * _GOLDEN_ANGLE
+    if torch.get_default_device().type == "meta":  # operations there import torch's compiler
+        return torch.empty(count, 3, dtype=dtype)
+    i = torch.arange(count, dtype=torch.float64)
+    z, phi = height(i), i * _GOLDEN_ANGLE
     radius = (1 - z * z).sqrt()
     return torch.stack([radius * phi.cos(), radius * phi.sin(), z], -1).to(dtype)
 

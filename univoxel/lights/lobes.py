@@ -35,7 +35,8 @@ def white_light(count: int, max_sharpness: float) -> Tensor:
     # One lobe integrates to 2 pi / s (1 - exp(-2 s)) over the sphere; the mean radiance is K times
     # that over 4 pi.
     amplitude = 0.5 * 2 * target / (count * -math.expm1(-2 * target))
-    axis = sphere.fibonacci_sphere(count)
-    sharpness = torch.full((count, 1), math.log(share / (1 - share)))
-    amplitudes = torch.full((count, 3), math.log(math.expm1(amplitude)))
-    return torch.cat([axis, sharpness, amplitudes], -1)
+    parameters = torch.empty(count, 7)
+    parameters[:, :3] = sphere.fibonacci_sphere(count)
+    parameters[:, 3] = math.log(share / (1 - share))
+    parameters[:, 4:] = math.log(math.expm1(amplitude))
+    return parameters

@@ -58,7 +58,7 @@ class EnvmapSGLight(AbstractLatLongLight):
         super().__init__()
         self.config = config = config or EnvmapSGConfig()
         start = lobes.white_light(config.lobes, config.max_sharpness)
-        self.raw: nn.Parameter = nn.Parameter(start / GAIN)  # [K, 7]
+        self.raw: nn.Parameter = nn.Parameter(start.div_(GAIN))  # [K, 7]
 
     @property
     def radiance(self) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -19,7 +21,7 @@ class DistantLight(nn.Module):
     def __init__(self, count: int, radiance: float = 1.0) -> None:
         super().__init__()
         self.log_radiance: nn.Parameter = nn.Parameter(
-            torch.full((count, 3), radiance).log()
+            torch.full((count, 3), math.log(radiance))
         )  # [D, 3]
         self.register_buffer("direction", sphere.fibonacci_sphere(count))  # [D, 3]
 
