@@ -1,5 +1,6 @@
 """Rough masks of a ball whose outline is known: what is doubted, what is moved, what is left."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -133,6 +134,25 @@ def test_most_masks_know_better_than_each_of_them(photos, monkeypatch):
     left = 1 - agreement(once[0].photos.alpha, photos.alpha)
     assert 1 - agreement(again, photos.alpha) < 0.8 * left
     assert draw(once[0], 0.01, ROUGH, PREPARATION) is once[0]  # a hundredth of a pixel
+
+
+@pytest.mark.parametrize(("lacking", "votes"), [((), 1), ((5,), ROUGH.votes)])
+def test_edges_that_move_for_nothing_go_back(photos, caplog, lacking, votes):
+    """Where pictures are shifted, masks are right as they are, and cameras or lenses wrong. One
+    view carves, unless another lacks a part."""
+    shifts = [round(3 * math.sin(2.4 * view)) for view in range(VIEWS)]
+    alpha, color = (
+        torch.stack([x.roll(shift, 1) for x, shift in zip(of_all, shifts, strict=True)])
+        for of_all in (photos.alpha, photos.color)
+    )
+    shifted = without_a_part(replace(photos, alpha=alpha, color=color), lacking)
+    wide = replace(PREPARATION, hull=replace(PREPARATION.hull, rough_pixels=4.0))
+    with caplog.at_level("INFO", "univoxel"):
+        found = mended(shifted, mask_distances(shifted.alpha), ROUGH, wide)
+    assert torch.equal(found.photos.alpha, shifted.alpha)
+    assert found.doubted.any() == bool(lacking)
+    assert found.belief.votes == votes
+    assert "edges of masks stay" in caplog.text
 
 
 def test_edges_move_as_far_as_the_rest_contradicts_itself(photos, monkeypatch):

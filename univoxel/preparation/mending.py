@@ -3,10 +3,12 @@
 A doubted pixel tells neither of the object nor of emptiness. So masks that lack a part no longer
 bite into the hull, and it tells better what else to doubt. What the rest still contradicts itself
 by is how far edges are off: nothing where only single masks are wrong, and then no edge is moved.
+Where moved edges contradict one another nearly as much, edges are not what is wrong, and stay.
 """
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import torch
@@ -24,6 +26,8 @@ from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hu
 from univoxel.preparation.masks import with_masks
 from univoxel.preparation.outlines import drawn_again, shows_nothing_else
 from univoxel.preparation.registration import contradiction
+
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,14 @@ def mended(
     reach = max(outlines.further * off, outlines.least)
     coverage = drawn_again(photos, distance, reach, doubted, outlines, cfg.masks)
     photos, distance = with_masks(photos, lambda view: coverage[view])
-    found = _doubted_again(photos, distance, doubted, belief, cfg)
+    found, given = _doubted_again(photos, distance, doubted, belief, cfg), found
+    if found.belief.off > outlines.kept * off:
+        log.info(
+            "edges of masks stay: moved to where colours change, they contradict one another by "
+            "%.1f pixels, as given by %.1f",
+            *(found.belief.off, off),
+        )
+        return _with_votes(given, belief.votes if given.doubted.any() else 1, cfg)
     found = _with_votes(found, 1 if _agree(found, cfg) else belief.votes, cfg)
     return _drawn_from_hull(found, reach, belief, cfg)
 
