@@ -93,7 +93,10 @@ def calls(monkeypatch):
     def with_field(config, kind):
         return replace_fields(config, stages=(config.stages[0], StageConfig(field=kind)))
 
-    stand_in("univoxel.presets", chosen=chosen, with_field=with_field)
+    def with_metal(config, metal):
+        return config
+
+    stand_in("univoxel.presets", chosen=chosen, with_field=with_field, with_metal=with_metal)
 
     def as_table(found):
         return f"table of {found}"

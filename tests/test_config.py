@@ -12,7 +12,7 @@ from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.joint.config import JointConfig
 from univoxel.lights.sg import SGConfig
 from univoxel.names import LIGHTS
-from univoxel.presets import budget, chosen, preset, with_field, work_in
+from univoxel.presets import budget, chosen, preset, with_field, with_metal, work_in
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
 
@@ -59,6 +59,17 @@ def test_all_stages_are_hashed_or_none():
         replace(CONFIG, stages=(STAGE, replace(STAGE, field="hash")))
     with pytest.raises(ValueError, match=r"scene.channels must be a multiple of that, got 7"):
         replace(config, scene=SceneConfig(channels=7, material_channels=3))
+
+
+def test_all_may_be_known_to_be_metal():
+    cfg = preset("draft", Path("data"), Path("out"))
+    assert with_metal(cfg, "auto") is cfg
+    known = [getattr(s, "only_metal", None) for s in with_metal(cfg, "all").stages]
+    assert known == [None, None, True, None]
+    lobes = preset("draft", Path("data"), Path("out"), "sg")
+    with pytest.raises(UserError, match=r"metal=all is for light=hybrid, .* got sg") as refused:
+        with_metal(lobes, "all")
+    assert refused.value.arguments == ("metal", "light")
 
 
 def test_capacity_adapts_unless_lights_are_compared():

@@ -43,6 +43,7 @@ from univoxel.names import (
     LightFrameOrAuto,
     LightName,
     MasksFrom,
+    Metal,
     Origin,
     PresetName,
     PresetOrAuto,
@@ -149,6 +150,7 @@ class Choices:
     light: LightName = "hybrid"
     varying: Differing = "auto"
     light_frame: LightFrameOrAuto = "auto"
+    metal: Metal = "auto"
     masks: MasksFrom = "auto"
     cameras: CamerasFrom = "auto"
     field: FieldName = "hash"
@@ -157,11 +159,11 @@ class Choices:
 
     def configuration(self, minutes: float | None, data: Path, out: Path) -> TrainConfig:
         """What they amount to."""
-        from univoxel.presets import chosen, with_field
+        from univoxel.presets import chosen, with_field, with_metal
 
         config = chosen(self.preset, minutes, data, out, self.light, self.varying)
         config = replace(config, masks=self.masks, cameras=self.cameras)
-        config = with_field(config, self.field)
+        config = with_metal(with_field(config, self.field), self.metal)
         if self.light_frame != "auto":
             config = replace(config, light_frame=self.light_frame)
         fits = self.budget_mb is not None and self.capacity == "auto"
@@ -274,6 +276,7 @@ def train(
     light: LightName = "hybrid",
     varying: Differing = "auto",
     light_frame: LightFrameOrAuto = "auto",
+    metal: Metal = "auto",
     masks: MasksFrom = "auto",
     cameras: CamerasFrom = "auto",
     downscale: Annotated[Downscale, arg(metavar="auto|N")] = "auto",
@@ -307,6 +310,7 @@ def train(
             the light itself too; auto is exposure where it is seen to differ, else none
         light_frame: world, where the light stood still, or turntable, where it turned with the
             camera; auto is what explains the photographs better
+        metal: all, if the whole object is metal, patina included; auto decides for each point
         masks: auto takes masks in that end outside of the object, as the photographs show it
         cameras: refined puts the photographs' cameras right, before training and in it; auto does
             so where their silhouettes contradict one another
@@ -339,8 +343,8 @@ def train(
     watched = {"timelapse": timelapse, "view": view_at(view, host, port)}
     if not resume and (out / "scene.safetensors").exists():
         raise ExistingFile(f"{out} holds a run already: add --resume, or choose another --out")
-    of_preset = preset, light, varying, light_frame, masks, cameras, field, capacity, budget_mb
-    asked = configuration_of(config, Choices(*of_preset), minutes, data, out)
+    of_preset = preset, light, varying, light_frame, metal, masks, cameras, field, capacity
+    asked = configuration_of(config, Choices(*of_preset, budget_mb), minutes, data, out)
     asked = replace(asked, downscale=check_downscale(downscale), allow_outside=allow_outside)
     asked = asked if seed is None else replace(asked, seed=seed)
     tell_run(task.train(changed(asked, set), resume=resume, **watched), no_page)

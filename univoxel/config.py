@@ -31,6 +31,7 @@ CHOICES = (
         "light",
         "varying",
         "light_frame",
+        "metal",
         "masks",
         "cameras",
         "downscale",

@@ -15,6 +15,7 @@ MasksFrom: TypeAlias = Literal["auto", "given"]
 Varying: TypeAlias = Literal["none", "exposure", "light"]
 Differing: TypeAlias = Literal["auto", "none", "exposure", "light"]
 LightFrame: TypeAlias = Literal["world", "turntable"]
+Metal: TypeAlias = Literal["auto", "all"]
 LightFrameOrAuto: TypeAlias = Literal["auto", "world", "turntable"]
 FIELDS: tuple[FieldName, ...] = get_args(FieldName)
 LIGHTS: tuple[LightName, ...] = get_args(LightName)

@@ -19,7 +19,7 @@ from univoxel.lights import (
     SGConfig,
     SHConfig,
 )
-from univoxel.names import LIGHTS, Differing, FieldName, LightName
+from univoxel.names import LIGHTS, Differing, FieldName, LightName, Metal
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
 
@@ -153,6 +153,24 @@ def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
         stages[0] = replace(stages[0], field="dense")
     capacity = "fixed" if kind == "sparse" else cfg.capacity
     return replace(cfg, stages=tuple(stages), capacity=capacity)
+
+
+def with_metal(cfg: TrainConfig, metal: Metal) -> TrainConfig:
+    """The same, with what is known of what is metal.
+
+    Raises:
+        UserError: all is, and there is no stage that solves for the map that it mirrors.
+    """
+    if metal == "auto":
+        return cfg
+    if not any(isinstance(s, JointConfig) for s in cfg.stages):
+        raise UserError(
+            f"metal=all is for light=hybrid, which finds what metal mirrors, got "
+            f"{cfg.scene.light.kind}",
+            *("metal", "light"),
+        )
+    stages = [replace(s, only_metal=True) if isinstance(s, JointConfig) else s for s in cfg.stages]
+    return replace(cfg, stages=tuple(stages))
 
 
 def work_in(minutes: float) -> Work:

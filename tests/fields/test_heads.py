@@ -48,6 +48,18 @@ def test_roughness_shifts_as_a_whole(median):
     assert torch.equal(after[2], before[2])
 
 
+def test_albedo_shifts_as_a_whole():
+    head, features = MaterialHead(4, 8), torch.randn(101, 6)
+    before, median = head(features), torch.tensor([0.1, 0.5, 0.9])
+    head.shift_albedo(features, median)
+    after = head(features)
+    torch.testing.assert_close(after[0].median(0).values, median)
+    order = before[0].argsort(0)
+    assert (after[0].gather(0, order).diff(dim=0) > -1e-6).all()
+    for a, b in zip(after[1:], before[1:], strict=True):
+        assert torch.equal(a, b)
+
+
 def test_materials_see_their_channels_only():
     head, features = MaterialHead(4, 8), torch.randn(10, 6)
     others = torch.cat([features[:, :4], torch.randn(10, 2)], 1)

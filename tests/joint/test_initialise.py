@@ -1,6 +1,7 @@
 """What the joint solve starts from before it knows the light: roughness and metal of a sphere."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from observed_points import lamps, no_metal, sphere_of
 
 from univoxel.joint import initialise
 from univoxel.joint.config import JointConfig
-from univoxel.joint.initialise import initialise_
+from univoxel.joint.initialise import initialise_, neutralise_
 from univoxel.joint.newton import NewtonRound
 
 CFG = JointConfig(newton_points=500, newton_views=8)
@@ -120,3 +121,33 @@ def test_metal_everywhere_has_to_be_convincing(monkeypatch, lowest, left, share,
     monkeypatch.setattr(initialise, "newton_round_", newton_round_)
     monkeypatch.setattr(initialise, "find_metal", find_metal)
     assert bool(initialised(scene, problem).metal.any()) == taken
+
+
+def test_of_metal_alone_nothing_is_tried_but_roughness(monkeypatch):
+    scene, problem = sphere_of((0.12, 0.08, 0.05), 1.0, 0.3)
+    tried = []
+
+    def newton_round_(scene, problem, decisions, *_):
+        tried.append(bool(decisions.metal.all()))
+        return NewtonRound([1.0])
+
+    monkeypatch.setattr(initialise, "newton_round_", newton_round_)
+    known = replace(CFG, only_metal=True)
+    decisions, _ = initialise_(scene, problem, no_metal(problem), known, math.inf)
+    assert decisions.metal.all()
+    assert tried == [True] * 4  # three roughnesses, and the best of them on more points
+
+
+def test_light_on_metal_alone_is_taken_for_neutral():
+    """What photographs show, the product of map and albedo, stays."""
+    scene, problem = sphere_of((0.12, 0.08, 0.05), 1.0, 0.3)
+    features = scene.field.features_at(problem.observations.position)
+    with torch.no_grad():
+        scene.sky.log_radiance += torch.tensor([0.5, 0.0, -0.5])
+    shown = scene.sky.radiance * scene.material(features)[0].median(0).values
+    neutralise_(scene, problem, CFG.metal)
+    albedo = scene.material(features)[0].median(0).values
+    torch.testing.assert_close(scene.sky.radiance * albedo, shown)
+    tint = scene.sky.radiance.mean(0)
+    torch.testing.assert_close(tint, tint.mean().expand(3))
+    torch.testing.assert_close(albedo.max(), torch.tensor(CFG.metal.only_metal_albedo))

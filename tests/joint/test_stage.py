@@ -572,6 +572,24 @@ def test_paint_is_asked_before_and_after_newton(monkeypatch, changed):
     assert calls == ["newton", "newton"]
 
 
+def test_light_on_metal_alone_is_neutral_in_every_round(monkeypatch):
+    calls = []
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+
+    def newton_round_(scene, problem, decisions, *_):
+        calls.append(bool(decisions.metal.all()))
+        return NewtonRound()
+
+    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
+    monkeypatch.setattr(stage, "neutralise_", lambda *_: calls.append("neutral"))
+    monkeypatch.setattr(stage, "newton_round_", newton_round_)
+    known = replace(CFG, rounds=2, colors=False, only_metal=True, newton_steps=1)
+    stage.solve(scene, photos_of(1, 8), known, 0, Steps(4))
+    # Where Newton solves nothing, before the first round, what was decided before is left
+    assert calls[-2:] == ["neutral", True]
+    assert calls.count("neutral") == 2
+
+
 def test_mirrors_are_taught_before_adam_in_every_round(monkeypatch):
     calls, found = [], torch.ones(5, dtype=torch.bool)
     scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)

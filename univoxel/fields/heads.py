@@ -48,6 +48,13 @@ class MaterialHead(nn.Module):
         wanted, now = torch.logit((medians - low) / (1 - low), eps=1e-4)
         self.net.linear[-1].bias[3] += wanted - now
 
+    @torch.no_grad()
+    def shift_albedo(self, features: Tensor, median: Tensor) -> None:
+        """Make every channel brighter or darker, to those medians [3] over features [N, C]."""
+        medians = torch.stack([median, self(features)[0].median(0).values])
+        wanted, now = torch.logit(medians, eps=1e-4)
+        self.net.linear[-1].bias[:3] += wanted - now
+
 
 class RadianceHead(nn.Module):
     """Outgoing radiance without any model of light: it lets geometry converge early.

@@ -92,6 +92,9 @@ class MetalConfig:
     alike: float = 0.5
     # bound, > 0, of the log ratio of one point: a single one does not decide for its neighbours
     max_evidence: float = 2.0
+    # median, (0, 1), of the brightest channel where all is metal: nothing else tells how bright the
+    # light is
+    only_metal_albedo: float = 0.3
     # log ratio of residuals, metal over dielectric, below which a point is metal: under the first
     # map and under the last. The first asks for more: the map is wrong yet, and metals make the
     # next one
@@ -99,6 +102,7 @@ class MetalConfig:
 
     def __post_init__(self) -> None:
         check_fields(self, *_FROM_ZERO, "metallic_before", "min_reflectance")
+        check_fields(self, "in (0, 1)", lambda x: 0 < x < 1, "only_metal_albedo")
         wanted = "numbers in (0, 1]"
         check_fields(
             self, wanted, lambda x: len(x) >= 1 and all(0 < v <= 1 for v in x), "roughness"
@@ -287,6 +291,8 @@ class JointConfig:
     points: int = 20000  # on the surface, >= 1
     tracing: int = 2  # visibility rays per point and direction, >= 1
     colors: bool = True  # whether the light minimises the entropy of albedo, see entropy
+    # whether all is metal, as dark as it looks: nothing is decided then, and the map is neutral
+    only_metal: bool = False
     lr_features: float = 0.03  # at the begin of a round; all rates > 0
     # at the begin of a round: of the materials' head and the views' gains
     lr_networks: float = 3e-3

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from univoxel.joint.config import JointConfig, TrialConfig
+from univoxel.joint.config import JointConfig, MetalConfig, TrialConfig
 from univoxel.joint.metals import find_metal
 from univoxel.joint.newton import newton_round_
 from univoxel.joint.observations import Decisions, JointProblem
@@ -78,7 +78,7 @@ def initialise_(
     bright that nothing looks like metal under it. So rounds of Newton start from what the stages
     before took for metal and from metal everywhere, each with the roughness of the stages before
     and with some others, as a whole. Metals are found under the best map of either, and the
-    residuals decide.
+    residuals decide. Where all is known to be metal, the best roughness is looked for alone.
 
     Args:
         seconds: that the rounds of Newton may take together.
@@ -88,15 +88,32 @@ def initialise_(
     before = [copy.deepcopy(part.state_dict()) for part in parts]
     round_seconds = seconds / cfg.trials.rounds
     trials = Trials(scene, problem, cfg, round_seconds, seed, parts, before, [])
-    best = best_roughness_(trials, decisions.metal)
-    everywhere = best_roughness_(trials, torch.ones_like(decisions.metal))
-    if all_metal(best, everywhere, cfg.trials):
-        best = everywhere
+    metal = torch.ones_like(decisions.metal)
+    best = best_roughness_(trials, metal if cfg.only_metal else decisions.metal)
+    if not cfg.only_metal:
+        everywhere = best_roughness_(trials, metal)
+        if all_metal(best, everywhere, cfg.trials):
+            best = everywhere
     if math.isinf(best.decisive):
         trials.restore_(before)
         return decisions, trials.troubles
     trials.restore_(best.states)
     return replace(decisions, metal=best.metal), trials.troubles
+
+
+@torch.no_grad()
+def neutralise_(scene: Scene, problem: JointProblem, cfg: MetalConfig) -> None:
+    """Make the map grey in the mean, and the albedo as bright as that of metals.
+
+    Of an object all of metal photographs show the product of map and albedo alone: in each channel
+    one may be brighter and the other darker.
+    """
+    features = scene.field.features_at(problem.observations.position)
+    median = scene.material(features)[0].median(0).values
+    wanted = median * problem.sky.radiance.mean(0)
+    wanted = wanted * (cfg.only_metal_albedo / wanted.max())
+    scene.material.shift_albedo(features, wanted)
+    problem.sky.log_radiance += (median / wanted).log()
 
 
 def best_roughness_(trials: Trials, metal: Tensor) -> Hypothesis:

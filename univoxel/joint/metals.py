@@ -29,6 +29,8 @@ def find_metal(scene: Scene, problem: JointProblem, cfg: JointConfig, done: floa
     Args:
         done: progress of the map in [0, 1], from the first round of Newton to the last.
     """
+    if cfg.only_metal:
+        return torch.ones(len(problem.observations.position), dtype=torch.bool)
     first, last = cfg.metal.threshold
     return evidence(scene, problem, cfg) < first + done * (last - first)
 

@@ -24,7 +24,7 @@ from univoxel.errors import NoSurface
 from univoxel.fields.heads import MaterialHead
 from univoxel.joint.albedo_entropy import diffuse_albedo, fit_sun_, minimise_entropy_
 from univoxel.joint.config import JointConfig
-from univoxel.joint.initialise import initialise_
+from univoxel.joint.initialise import initialise_, neutralise_
 from univoxel.joint.metals import find_metal
 from univoxel.joint.mirrors import find_mirrors
 from univoxel.joint.newton import newton_round_
@@ -165,6 +165,8 @@ def newton_phase_(
     if rounds_left == cfg.rounds:
         with progress.clock.off_pace():
             decisions = start_(scene, problem, decisions, cfg, seconds, progress)
+    if cfg.only_metal:
+        neutralise_(scene, problem, cfg.metal)
     with progress.clock.off_pace():
         newton = newton_round_(scene, problem, decisions, cfg, seconds)
         for trouble in newton.troubles:
