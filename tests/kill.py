@@ -226,12 +226,14 @@ def kill(name: str, kills: int, first: int, run: Path, place: Path, quality: flo
                 toll.lost = max(toll.lost, lost_seconds(folder / "run", time.time()))
             toll.broken += [f"{what.name}: {line}" for line in broken_files(folder)]
             arguments = command.again
-        last = start(arguments)
-        said = last.communicate()[1]
-        if last.returncode or not command.makes.exists():
-            toll.refused.append(said.strip()[-500:])
+        # What cutout has made whole it never writes over
+        if name != "cutout" or not command.makes.exists():
+            done = start(arguments)
+            said = done.communicate()[1]
+            if done.returncode or not command.makes.exists():
+                toll.refused.append(said.strip()[-500:])
         toll.broken += [f"left over: {line}" for line in left_over(folder)]
-        if name == "train" and not last.returncode:
+        if name == "train" and not done.returncode:
             now = measure(folder / "run")
             if abs(now - quality) > SCATTER_DB:
                 toll.differing.append(f"{now:.2f} dB, undisturbed {quality:.2f}")
