@@ -228,7 +228,7 @@ def kill(name: str, kills: int, first: int, run: Path, place: Path, quality: flo
             arguments = command.again
         # What cutout has made whole it never writes over
         if name != "cutout" or not command.makes.exists():
-            done = start(arguments)
+            done = start(command.again)  # also where it ended before the kill
             said = done.communicate()[1]
             if done.returncode or not command.makes.exists():
                 toll.refused.append(said.strip()[-500:])
