@@ -58,6 +58,7 @@ class Config:
     capacity: str = "as preset"
     budget_mb: float | None = None
     allow_outside: bool = False
+    metal: str = "auto"
     loss: LossConfig = LossConfig()
     stages: tuple[StageConfig, ...] = (StageConfig(), StageConfig())
 
@@ -94,7 +95,7 @@ def calls(monkeypatch):
         return replace_fields(config, stages=(config.stages[0], StageConfig(field=kind)))
 
     def with_metal(config, metal):
-        return config
+        return replace_fields(config, metal=metal)
 
     stand_in("univoxel.presets", chosen=chosen, with_field=with_field, with_metal=with_metal)
 
@@ -261,6 +262,11 @@ def test_downscale_out_of_range(calls, tmp_path, capsys, command, factor):
 def test_train_keeps_the_minutes_of_the_preset(calls, tmp_path):
     assert main(["train", "photos", "--out", str(tmp_path / "run")]) == 0
     assert calls.noted[0][1][0].minutes == 4.0
+
+
+def test_train_is_told_what_is_metal(calls, tmp_path):
+    assert main(["train", "photos", "--out", str(tmp_path / "run"), "--metal", "all"]) == 0
+    assert calls.noted[0][1][0].metal == "all"
 
 
 @pytest.mark.parametrize(

@@ -30,6 +30,7 @@ from univoxel.joint.config import (
         (NewtonConfig(), {"min_log_albedo": 0.5}, "min_log_albedo must be at most 0, got 0.5"),
         (MetalConfig(), {"metallic_before": 1.5}, "metallic_before must be in .*, got 1.5"),
         (MetalConfig(), {"min_reflectance": -0.1}, "min_reflectance must be in .*, got -0.1"),
+        (MetalConfig(), {"only_metal_albedo": 1.0}, "only_metal_albedo must be in .*, got 1.0"),
         (MetalConfig(), {"roughness": ()}, r"roughness must be numbers in .*, got \(\)"),
         (MetalConfig(), {"roughness": (0.0,)}, r"roughness must be numbers in .*, got \(0.0,\)"),
         (MetalConfig(), {"steps": 0}, "steps must be at least 1, got 0"),

@@ -8,10 +8,10 @@ import torch
 from analytic import RADIUS, photos_of
 
 from univoxel.data import Photos
-from univoxel.errors import DataError, UserError
+from univoxel.errors import ConfigError, DataError, UserError
 from univoxel.preparation import mending, prepare
 from univoxel.preparation.belief import Belief
-from univoxel.preparation.config import OUTLINES, PREPARATION, REGISTRATION
+from univoxel.preparation.config import OUTLINES, PREPARATION, REGISTRATION, OutlineConfig
 from univoxel.preparation.hull import hull_sdf, mask_distances
 from univoxel.preparation.mending import mended
 from univoxel.preparation.registration import contradiction
@@ -153,6 +153,12 @@ def test_edges_that_move_for_nothing_go_back(photos, caplog, lacking, votes):
     assert found.doubted.any() == bool(lacking)
     assert found.belief.votes == votes
     assert "edges of masks stay" in caplog.text
+
+
+@pytest.mark.parametrize("kept", [0.0, 1.5])
+def test_a_share_that_is_kept_is_one(kept):
+    with pytest.raises(ConfigError, match=rf"kept must be in \(0, 1\], got {kept}"):
+        OutlineConfig(kept=kept)
 
 
 def test_edges_move_as_far_as_the_rest_contradicts_itself(photos, monkeypatch):

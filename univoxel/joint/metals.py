@@ -24,7 +24,8 @@ from univoxel.scene import Scene
 
 
 def find_metal(scene: Scene, problem: JointProblem, cfg: JointConfig, done: float) -> Tensor:
-    """Which of the problem's points are metal under the present map: [P] bool.
+    """Which of the problem's points are metal under the present map: [P] bool. All are where that
+    is known.
 
     Args:
         done: progress of the map in [0, 1], from the first round of Newton to the last.
