@@ -14,7 +14,16 @@ from univoxel import sphere
 from univoxel.color import linear_to_srgb_unclipped
 from univoxel.joint import stage
 from univoxel.joint.config import JointConfig, MirrorConfig
-from univoxel.joint.mirrors import find_mirrors, reflect, smoothed
+from univoxel.joint.mirrors import (
+    ROWS,
+    NodeMap,
+    Sightings,
+    find_mirrors,
+    reflect,
+    reflectance,
+    regions_of,
+    smoothed,
+)
 from univoxel.joint.observations import Mirrors
 from univoxel.lights.turntable import Turntable
 
@@ -158,22 +167,77 @@ def test_base_colours_are_read_from_where_it_is_dark():
     assert (base / BASE - 1).abs().max() < 0.03
 
 
-def test_polished_surfaces_have_no_relief_and_thin_ones_stay():
+def test_polished_surfaces_have_no_relief():
     torch.manual_seed(0)
     normal = normalize(torch.randn(2000, 3), dim=1)
     bumpy = normalize(normal + 0.15 * torch.randn(2000, 3), dim=1)
     ball = 0.5 * normal
     everywhere = torch.ones(2000, dtype=torch.bool)
-    smooth = smoothed(ball, bumpy, everywhere, CFG.mirror)
+    sharp, smooth = smoothed(ball, bumpy, everywhere, CFG.mirror)
     before, after = (degrees(n, normal).mean() for n in (bumpy, smooth))
     assert after < 0.4 * before
-    around = normalize(bumpy * torch.tensor([1.0, 1.0, 0.0]), dim=1)
-    wire = 0.005 * around + torch.linspace(-0.5, 0.5, 2000)[:, None] * torch.tensor([0.0, 0, 1])
-    assert torch.equal(smoothed(wire, around, everywhere, CFG.mirror), around)
+    assert sharp.all()
     half = everywhere & (normal[:, 2] > 0)
-    assert torch.equal(smoothed(ball, bumpy, half, CFG.mirror)[~half], bumpy[~half])
+    sharp, smooth = smoothed(ball, bumpy, half, CFG.mirror)
+    assert torch.equal(smooth[~half], bumpy[~half])
+    assert torch.equal(sharp, half)
     few = torch.arange(2000) < CFG.mirror.neighbours - 1
-    assert torch.equal(smoothed(ball, bumpy, few, CFG.mirror), bumpy)
+    sharp, smooth = smoothed(ball, bumpy, few, CFG.mirror)
+    assert torch.equal(smooth, bumpy)
+    assert torch.equal(sharp, few)
+
+
+def test_thin_surfaces_keep_their_normals_and_are_not_called_sharp():
+    """Their normals are off by so much that the map explains little of what is mirrored, however
+    rough they are."""
+    torch.manual_seed(0)
+    around = normalize(torch.randn(2000, 3) * torch.tensor([1.0, 1.0, 0.0]), dim=1)
+    wire = 0.005 * around + torch.linspace(-0.5, 0.5, 2000)[:, None] * torch.tensor([0.0, 0, 1])
+    everywhere = torch.ones(2000, dtype=torch.bool)
+    sharp, normal = smoothed(wire, around, everywhere, CFG.mirror)
+    assert torch.equal(normal, around)
+    assert not sharp.any()
+
+
+def test_a_mirror_is_as_bright_where_it_mirrors_nothing_dark():
+    """Two polished metals of two colours each, in parts that show a half more or less, under a map
+    that is grey everywhere."""
+    direction = sphere.fibonacci_sphere(NODES)
+    grey = torch.full((ROWS, 2 * ROWS, 3), 0.5)
+    map = NodeMap.of(direction, grey, torch.full((NODES, 3), 0.5))
+    normal = torch.tensor([[0.0, 0.0, 1.0]]).repeat(8, 1)
+    wo = torch.tensor([0.0, 0.0, 1.0]).expand(8, 4, 3)
+    part = torch.tensor([0.4, 0.4, 0.8, 0.8, 0.3, 0.3, 0.5, 0.5])
+    red, golden = torch.tensor([1.0, 0.2, 0.2]), torch.tensor([1.0, 0.8, 0.4])
+    color = part[:, None] * torch.where(torch.arange(8)[:, None] % 4 < 2, golden, red)
+    is_open = torch.ones(8, 4, dtype=torch.bool)
+    shown = (0.5 * color)[:, None].expand(8, 4, 3)
+    seen = Sightings(torch.zeros(8, 6), normal, wo, shown, is_open)
+    everywhere = torch.ones(8, dtype=torch.bool)
+    # Each pair is of one colour; a link leads from the first pair of a metal to the second
+    nearest = torch.tensor([[0, 1], [1, 0], [2, 3], [3, 2], [4, 5], [5, 4], [6, 7], [7, 6]])
+    apart = reflectance(seen, map, everywhere, everywhere, nearest, CFG.mirror)
+    assert torch.allclose(apart, color, rtol=1e-4)
+    linked = nearest.clone()
+    linked[1], linked[5] = torch.tensor([1, 2]), torch.tensor([5, 6])
+    base = reflectance(seen, map, everywhere, everywhere, linked, CFG.mirror)
+    assert torch.allclose(base.amax(1), torch.tensor([0.6] * 4 + [0.4] * 4), rtol=1e-4)
+    own = color / color.amax(1, keepdim=True)
+    alone = torch.tensor([0, 2, 3, 4, 6, 7])  # whose neighbours are all of their colour
+    assert torch.allclose((base / base.amax(1, keepdim=True))[alone], own[alone], rtol=1e-4)
+    rough = torch.zeros(8, dtype=torch.bool)
+    as_seen = reflectance(seen, map, everywhere, rough, nearest, CFG.mirror)
+    assert torch.allclose(as_seen, color, rtol=1e-4)
+
+
+def test_regions_are_what_neighbours_link():
+    inside = torch.tensor([True, True, False, True, True])
+    nearest = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4], [4, 3]])
+    region, count = regions_of(inside, nearest)
+    assert count == 3
+    assert region[0] == region[1]
+    assert region[3] == region[4]
+    assert len({int(region[i]) for i in (0, 2, 3)}) == 3
 
 
 def test_what_is_rough_mirrors_but_is_not_sharp():

@@ -12,6 +12,8 @@ import math
 from dataclasses import dataclass
 
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -115,8 +117,8 @@ def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirro
     metal, sharp = (x[like].float().mean(1) > 0.5 for x in (found.metal, found.sharp))
     if not metal.any():
         return None
-    normal = smoothed(problem.observations.position, seen.normal, sharp & metal, cfg.mirror)
-    return Mirrors(metal, sharp & metal, normal, torch.where(metal[:, None], base, 0.0))
+    sharp, normal = smoothed(problem.observations.position, seen.normal, sharp & metal, cfg.mirror)
+    return Mirrors(metal, sharp, normal, torch.where(metal[:, None], base, 0.0))
 
 
 def sightings(scene: Scene, problem: JointProblem, map: NodeMap, cfg: JointConfig) -> Sightings:
@@ -164,7 +166,8 @@ def mirrors_among(seen: Sightings, map: NodeMap, cfg: MirrorConfig) -> Mirrors:
     unexplained = unexplained_change(seen, map)[nearest].sum(1)
     total = change(seen, seen.encoded)[nearest].sum(1)
     sharp = metal & (unexplained > cfg.sharp * total)
-    return Mirrors(metal, sharp, seen.normal, reflectance(seen, map, metal, nearest, cfg))
+    base = reflectance(seen, map, metal, sharp, nearest, cfg)
+    return Mirrors(metal, sharp, seen.normal, base)
 
 
 def change(seen: Sightings, color: Tensor) -> Tensor:
@@ -190,13 +193,14 @@ def bounded(factor: Tensor, brightest: float) -> Tensor:
 
 
 def reflectance(
-    seen: Sightings, map: NodeMap, metal: Tensor, nearest: Tensor, cfg: MirrorConfig
+    seen: Sightings, map: NodeMap, metal: Tensor, sharp: Tensor, nearest: Tensor, cfg: MirrorConfig
 ) -> Tensor:
     """Base colour [N, 3] of metals: what they and their neighbours show over what they mirror; 0
-    elsewhere.
+    elsewhere. How bright sharp ones are is that of their whole region, as polish is of one metal.
 
     Only of directions where all around is dark. Near a lamp the photographs are clipped and the map
-    is blurred, and normals that are off mistake the lamp for what is beside it.
+    is blurred, and normals that are off mistake the lamp for what is beside it. Parts of a mirror
+    see none that is dark.
     """
     mirrored, cosine = reflect(seen.normal, seen.wo)
     node = map.nearest(mirrored)
@@ -204,24 +208,58 @@ def reflectance(
     counted = seen.open & (cosine > 0.5) & metal[:, None]
     if counted.any():
         counted &= around <= around[counted].quantile(cfg.darkest)
-    shown = (counted[..., None] * seen.color).sum(1)[nearest].sum(1)
-    sent = (counted[..., None] * map.radiance[node]).sum(1)[nearest].sum(1)
-    base = bounded(shown / sent.clamp_min(1e-3), cfg.min_reflectance)
+    shown, sent = (
+        (counted[..., None] * color).sum(1) for color in (seen.color, map.radiance[node])
+    )
+    near = ratio(shown[nearest].sum(1), sent[nearest].sum(1), cfg)
+    region, regions = regions_of(sharp, nearest)
+    shown, sent = (
+        x.new_zeros(regions, 3).index_add(0, region, x * sharp[:, None])[region]
+        for x in (shown, sent)
+    )
+    bright = ratio(shown, sent, cfg).amax(1, keepdim=True)
+    base = torch.where(sharp[:, None], near * bright / near.amax(1, keepdim=True), near)
     return torch.where(metal[:, None], base, 0.0)
 
 
-def smoothed(position: Tensor, normal: Tensor, sharp: Tensor, cfg: MirrorConfig) -> Tensor:
-    """Normals [P, 3], those of sharp points averaged over their neighbours.
+def ratio(shown: Tensor, sent: Tensor, cfg: MirrorConfig) -> Tensor:
+    """Base colours [N, 3] that send on as much of what is sent [N, 3] as is shown [N, 3]."""
+    return bounded(shown / sent.clamp_min(1e-3), cfg.min_reflectance)
+
+
+def regions_of(inside: Tensor, nearest: Tensor) -> tuple[Tensor, int]:
+    """The connected parts of those inside [N] bool, by neighbours [N, K]: index [N] of each point's
+    part, and how many there are; every other point is a part of its own."""
+    point = torch.arange(len(inside)).repeat_interleave(nearest.shape[1])
+    other = nearest.flatten()
+    linked = inside[point] & inside[other]
+    count = len(inside)
+    links = coo_array(
+        (linked[linked].numpy(), (point[linked].numpy(), other[linked].numpy())), (count, count)
+    )
+    regions, region = connected_components(links, directed=False)
+    return torch.from_numpy(region).long(), regions
+
+
+def smoothed(
+    position: Tensor, normal: Tensor, sharp: Tensor, cfg: MirrorConfig
+) -> tuple[Tensor, Tensor]:
+    """Which of the sharp points [P] stay sharp, and normals [P, 3], those of sharp points averaged
+    over their neighbours.
 
     What is mirrored looks like relief while geometry forms; polished surfaces have none. Thin ones
-    stay, whose normals differ among neighbours.
+    stay, whose normals differ among neighbours. These are off by more than the map's nodes lie
+    apart, so that what the map leaves unexplained does not tell how sharply they mirror.
     """
     index = sharp.nonzero()[:, 0]
     if len(index) < cfg.neighbours:
-        return normal
+        return sharp, normal
     own = normal[index]
     around = own[neighbours(position[index], cfg.neighbours)]
     flat = around.mean(1).norm(dim=1, keepdim=True) > cfg.flat
     weight = ((own[:, None] * around).sum(2, keepdim=True) - cfg.alike).clamp_min(0)
     mean = normalize((weight * around).sum(1), dim=1)
-    return normal.index_copy(0, index, torch.where(flat, mean, own))
+    return (
+        sharp.index_copy(0, index, flat[:, 0]),
+        normal.index_copy(0, index, torch.where(flat, mean, own)),
+    )
