@@ -361,12 +361,13 @@ def test_envmap(calls, capsys):
         ("envmap", (Path("run"), Path("map.exr")), {"height": 128, "light_of": None})
     ]
     assert capsys.readouterr().out == "map.exr\n"
-    found = types.SimpleNamespace(ball_psnr=31.24, brightest_degrees=4.0)
+    found = types.SimpleNamespace(ball_psnr=31.24, brightest_degrees=4.0, mirror_psnr=18.06)
     calls.replace("envmap", found)
     assert main(["envmap", "run", "--out", "map.exr", "--height", "32", "--light-of", "2"]) == 0
     assert calls.noted[-1][2] == {"height": 32, "light_of": "2"}
-    _, ball, brightest = capsys.readouterr().out.splitlines()
+    _, ball, mirror, brightest = capsys.readouterr().out.splitlines()
     assert "31.2 dB" in ball
+    assert "18.1 dB" in mirror
     assert "4.0 degrees" in brightest
 
 

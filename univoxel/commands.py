@@ -797,6 +797,7 @@ def envmap(
     print(out)
     if found:
         print(f"grey ball under it: PSNR {found.ball_psnr:.1f} dB, a scale per channel")
+        print(f"mirror ball under it: PSNR {found.mirror_psnr:.1f} dB")
         print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
 
 

@@ -70,6 +70,7 @@ def test_the_truth_in_another_colour_is_met(run):
     write_map(folder / "data" / "envmaps" / "train.exr", map * torch.tensor([3.0, 2.0, 5.0]))
     found = envmap(folder, folder / "map.exr", height=32)
     assert found.ball_psnr > 60
+    assert found.mirror_psnr > 60
     assert found.brightest_degrees < 1e-3
     assert torch.equal(read_image(folder / "map.exr"), map)  # only the comparison is scaled
     picture = read_image(folder / "map.png").int()
@@ -85,6 +86,23 @@ def test_a_turned_light_is_noticed(run):
     angle = 2 * math.asin(math.cos(across) * math.sin(math.pi / 4))
     assert abs(found.brightest_degrees - math.degrees(angle)) < 5  # places lie 3 degrees apart
     assert found.ball_psnr < 30
+    assert found.mirror_psnr < 30
+
+
+def test_a_mirror_ball_tells_what_a_grey_one_does_not():
+    """The same light, in stripes that are finer than what a matte ball tells apart."""
+    flat = torch.full((128, 256, 3), 0.5)
+    striped = flat * torch.tensor([0.6, 1.4]).repeat_interleave(4).repeat(32)[:, None]
+    found = compare(striped, flat)
+    assert found.ball_psnr > 40
+    assert found.mirror_psnr < 20
+    lower = flat.clone()
+    lower[:64] = 0.25
+    # Half of the ball's mirrored directions look up; 0.25 against 0.5, of which 0.5 is drawn as 1
+    light = [0.5, 1.0]
+    half = float(torch.tensor(light).pow(1 / 2.4).mul(1.055).sub(0.055).diff())
+    expected = -10 * math.log10(half**2 / 2)
+    assert compare(lower, flat).mirror_psnr == pytest.approx(expected, abs=0.5)
 
 
 def test_the_brightest_direction_is_the_lamps(run):

@@ -24,6 +24,7 @@ from univoxel.sphere import fibonacci_sphere
 
 BLUR = math.radians(10.0)  # before the brightest direction is looked for: a light, not a texel
 NORMALS = 2048  # on the whole ball
+BALL = 200  # pixels of the mirror ball's diameter
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class Comparison:
 
     ball_psnr: float  # dB, sRGB of a grey ball seen from everywhere, brightest 1 under the truth
     brightest_degrees: float  # between the brightest directions
+    mirror_psnr: float  # dB, sRGB of a mirror ball seen from +X, as the picture has it
 
 
 @torch.no_grad()
@@ -78,7 +80,7 @@ def envmap(
     if true is not None:
         recovered = recovered * _scale(recovered, true)
         rows, result = [recovered, true], compare(recovered, true)
-    exposure = 1 / luminance(rows[-1]).quantile(0.9).clamp_min(1e-6)
+    exposure = _exposure(rows[-1])
     picture = [torch.cat(map_and_balls(row * exposure, height), 1) for row in rows]
     write_png(out.with_suffix(".png"), linear_to_srgb(torch.cat(picture)))
     return result
@@ -111,7 +113,16 @@ def compare(recovered: Tensor, true: Tensor) -> Comparison:
     a, b = brightest(recovered), brightest(true)
     angle = 2 * torch.atan2((a - b).norm(), (a + b).norm())  # exact at small angles too
     psnr = metrics.psnr(encoded[0][None], encoded[1][None])
-    return Comparison(psnr, float(angle.rad2deg()))
+    exposure = _exposure(true)
+    mirrors = [linear_to_srgb(map_and_balls(m * exposure, BALL)[2]) for m in (recovered, true)]
+    inside = torch.linspace(-1, 1, BALL).square()
+    disc = inside[:, None] + inside < 1
+    return Comparison(psnr, float(angle.rad2deg()), metrics.psnr(mirrors[0], mirrors[1], disc))
+
+
+def _exposure(map: Tensor) -> Tensor:
+    """What a map is multiplied by to be looked at."""
+    return 1 / luminance(map).quantile(0.9).clamp_min(1e-6)
 
 
 def brightest(map: Tensor) -> Tensor:
