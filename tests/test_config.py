@@ -9,7 +9,7 @@ import pytest
 
 from univoxel.config import TrainConfig, check_same, load_config, save_config
 from univoxel.errors import ConfigError, MissingFile, UserError
-from univoxel.joint.config import JointConfig
+from univoxel.joint.config import JointConfig, MirrorConfig
 from univoxel.lights.sg import SGConfig
 from univoxel.names import LIGHTS
 from univoxel.presets import budget, chosen, preset, with_field, with_metal, work_in
@@ -230,6 +230,9 @@ def test_the_file_holds_every_field(tmp_path):
         (SceneConfig(), {"material_channels": 99}, r"at most channels \(16\), got 99"),
         (SceneConfig(), {"mirror_levels": -1}, r"mirror_levels must be in \[0, 8\], got -1"),
         (SceneConfig(), {"mirror_levels": 9}, r"mirror_levels must be in \[0, 8\], got 9"),
+        (SceneConfig(), {"sky_rows": -1}, r"sky_rows must be in \[0, 8192\], got -1"),
+        (MirrorConfig(), {"rows": 100}, r"rows must be a multiple of 32 in \[0, 1024\], got 100"),
+        (MirrorConfig(), {"turns": (6.0, 0.0)}, "turns must be above 0 each, got"),
     ],
 )
 def test_values_out_of_range(config, change, message):

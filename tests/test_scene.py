@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 
 from univoxel.checkpoint import FILE, SHELL, load_checkpoint, load_scene, save_scene
 from univoxel.compression import prune
+from univoxel.errors import ConfigError
 from univoxel.fields import field as fields
 from univoxel.fields.bricks import BrickDistances
 from univoxel.fields.features import Levels
@@ -73,6 +74,25 @@ def test_a_checkpoint_gives_the_same_scene(tmp_path, light):
         scene.state_dict().items(), again.state_dict().items(), strict=True
     ):
         assert torch.equal(a, b), name
+
+
+def test_a_checkpoint_keeps_a_map_that_is_sharper_than_its_nodes(tmp_path):
+    scene = small_scene()
+    sky = torch.rand(32, 64, 3)
+    sky[3, 5] = 1e6  # a lamp beyond half precision
+    scene.sharpen_sky(sky)
+    save_scene(scene, tmp_path, {})
+    again = load_scene(tmp_path)
+    assert again.cfg.sky_rows == 32
+    assert torch.equal(again.sky.sharp, sky)
+    save_scene(scene, tmp_path, {}, slim=True)
+    with safe_open(tmp_path / "scene.safetensors", "pt") as file:
+        assert file.get_tensor("sky.sharp").dtype == torch.float16
+    slim = load_scene(tmp_path).sky.sharp
+    assert torch.allclose(slim, sky.clamp_max(65504), rtol=1e-3, atol=1e-6)
+    assert small_scene().cfg.sky_rows == 0
+    with pytest.raises(ConfigError, match="sky_rows must be in"):
+        SceneConfig(sky_rows=-1)
 
 
 def test_reading_does_not_import_the_compiler(tmp_path):

@@ -25,6 +25,7 @@ from univoxel.lights import (
     SGConfig,
     build,
 )
+from univoxel.lights.base import MOST_ROWS
 from univoxel.lights.mirrored import MirroredLight
 from univoxel.lights.nodes import DistantLight
 from univoxel.lights.turntable import Turntable
@@ -44,6 +45,8 @@ class SceneConfig:
     hidden: int = 64  # width of the material and radiance heads, >= 1
     mirror_levels: int = 5  # of the table of mirrored directions, 29 degrees and finer, [0, 8]
     sky_nodes: int = 512  # directions of the environment map, >= 0; 0: the scene has none
+    # rows of its texels, where polished things show it more sharply; training fills them in
+    sky_rows: int = 0
     mirrored: bool = True  # whether a local light gets a network for what is mirrored sharply
     # the light that photographs are rendered with, and its own sizes
     light: LightConfig = field(default_factory=SGConfig)
@@ -62,6 +65,7 @@ class SceneConfig:
         counts = ("channels", "material_channels", "hidden", "codes")
         check_fields(self, "at least 1", lambda x: x >= 1, *counts)
         check_fields(self, "in [0, 8]", lambda x: 0 <= x <= 8, "mirror_levels")
+        check_fields(self, f"in [0, {MOST_ROWS}]", lambda x: 0 <= x <= MOST_ROWS, "sky_rows")
         most = f"at most channels ({self.channels})"
         check_fields(self, most, lambda x: x <= self.channels, "material_channels")
         check_fields(self, "None or in (0, 1]", lambda x: x is None or 0 < x <= 1, "roughness")
@@ -100,7 +104,9 @@ class Scene(nn.Module):
         inputs = cfg.channels + codes  # of what draws photographs: features and the view's code
         self.radiance: RadianceHead = RadianceHead(inputs, cfg.hidden, cfg.mirror_levels)
         self.light: AbstractLight = build(inputs, cfg.light)
-        self.sky: DistantLight | None = DistantLight(cfg.sky_nodes) if cfg.sky_nodes else None
+        self.sky: DistantLight | None = None
+        if cfg.sky_nodes:
+            self.sky = DistantLight(cfg.sky_nodes, rows=cfg.sky_rows)
         self.mirrored = None
         if cfg.mirrored and isinstance(cfg.light, LocalLightConfig):
             known = self.radiance.directions.channels
@@ -161,6 +167,13 @@ class Scene(nn.Module):
                 "light_of",
                 "varying",
             )
+
+    def sharpen_sky(self, radiance: Tensor | None) -> None:
+        """Keep the texels [R, 2 R, 3] of the map, linear, beside its nodes; None: there are
+        none."""
+        assert self.sky is not None
+        self.sky.sharp = radiance
+        self.cfg = replace(self.cfg, sky_rows=0 if radiance is None else len(radiance))
 
     def occluder(self) -> VisibilityScene:
         """The present surface, ready for rays; within `surface_held`, the one that is held.

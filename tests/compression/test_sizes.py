@@ -25,6 +25,15 @@ def test_a_budget_leaves_room_for_some_mirror_levels(megabytes, levels):
     assert sizes.mirror_levels(SceneConfig(mirror_levels=1), megabytes, CFG) == 1
 
 
+@pytest.mark.parametrize(
+    ("megabytes", "rows"), [(None, 128), (40.0, 128), (1.0, 64), (0.3, 32), (0.02, 0)]
+)
+def test_a_budget_leaves_room_for_some_rows_of_the_map(megabytes, rows):
+    assert sizes.sky_rows(128, megabytes, CFG) == rows
+    assert sizes.sky_rows(32, megabytes, CFG) == min(rows, 32)
+    assert sizes.sky_rows(0, megabytes, CFG) == 0
+
+
 def test_a_budget_decides_on_the_rows_of_a_hash_table():
     scene = SceneConfig()  # 16 channels: 8 levels
     assert sizes.table_rows(scene, None, CFG) == ROWS

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from analytic import scene_of
+from fine_map import fine_map, of_nodes
 from observed_points import photographed, problem_on_a_sphere
 from torch.nn.functional import normalize
 
@@ -32,26 +33,13 @@ BASE = torch.tensor([0.9, 0.7, 0.5])
 CFG = JointConfig()
 
 
-def fine_map(direction):
-    """Radiance [..., 3] finer than the nodes are apart, and lamps."""
-    x, y, z = direction.unbind(-1)
-    pattern = 0.4 * (1.2 * (7 * x).sin() * (6 * y + 1).sin() + 1.2 * (7 * z + 2).sin()).exp()
-    tint = torch.stack([0.5 + 0.2 * x, 0.5 + 0.2 * y, 0.5 - 0.2 * z], -1)
-    return pattern[..., None] * tint
-
-
 def under_fine_map(metal, paint, off=0.0):
     """A scene with the map's nodes, and photographs of a sphere: mirrors where `metal` of the
     normals [P, 3] says so, else what `paint` makes; normals are off by degrees."""
     torch.manual_seed(0)
     scene = scene_of((0.5, 0.5, 0.5), 0.5, NODES)
     problem = problem_on_a_sphere(POINTS, VIEWS, NODES, scene)
-    nodes = torch.zeros(NODES, 3)
-    texels = sphere.latlong_directions(64).flatten(0, 1)
-    nearest = (texels @ scene.sky.direction.T).argmax(1)
-    area = sphere.texel_solid_angles(64, 128).reshape(-1, 1)
-    nodes.index_add_(0, nearest, fine_map(texels) * area)
-    nodes /= torch.zeros(NODES, 1).index_add(0, nearest, area)
+    nodes = of_nodes(fine_map, scene.sky.direction)
     with torch.no_grad():
         scene.sky.log_radiance.copy_(nodes.log())
     normal = problem.observations.normal

@@ -67,3 +67,12 @@ def test_the_map_takes_gradients():
     # Softmax weights sum to 1, and the radiance is 1: so do the derivatives of each channel
     assert torch.allclose(gradient.sum(0), torch.ones(3), rtol=1e-5)
     assert gradient.sum(1).argmax() == light.direction[:, 2].argmax()
+
+
+def test_texels_that_are_sharper_than_the_nodes_are_the_map():
+    light = DistantLight(32, 0.7, rows=8)
+    light.sharp += torch.arange(16.0)[:, None]
+    assert torch.allclose(light.latlong(8), light.sharp, atol=1e-5)
+    assert torch.allclose(light.latlong(4)[:, 0], torch.tensor(0.5))
+    assert torch.allclose(light.incident(light.direction), torch.tensor(0.7))
+    assert light.changed(torch.zeros(32, 3)).sharp is None

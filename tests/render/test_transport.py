@@ -245,3 +245,22 @@ def test_the_cameras_of_these_tests_stand_apart():
     eye = normalize(cameras_around(8, 64).camera_to_world[:, :, 3], dim=1)
     cosine = eye @ eye.T - 2 * torch.eye(8)
     assert cosine.max() < 0.9
+
+
+def test_observations_of_some_points_are_theirs_in_their_order():
+    torch.manual_seed(0)
+    offsets = torch.tensor([0, 2, 2, 5, 6])
+    wo, color, view = torch.randn(6, 3), torch.rand(6, 3), torch.arange(6)
+    everything = Observations(
+        torch.randn(4, 3), torch.randn(4, 3), offsets, wo, color, view, torch.zeros(1, 3)
+    )
+    some = everything.at(torch.tensor([2, 0, 1, 2]))
+    assert torch.equal(some.position, everything.position[[2, 0, 1, 2]])
+    assert torch.equal(some.normal, everything.normal[[2, 0, 1, 2]])
+    assert some.offsets.tolist() == [0, 3, 5, 5, 8]
+    index = [2, 3, 4, 0, 1, 2, 3, 4]
+    for part, whole in ((some.wo, wo), (some.color, color), (some.view, view)):
+        assert torch.equal(part, whole[index])
+    none = everything.at(torch.tensor([], dtype=torch.int64))
+    assert none.offsets.tolist() == [0]
+    assert not len(none.wo)

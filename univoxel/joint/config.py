@@ -13,6 +13,7 @@ _NOT_BELOW = ("at least 0", lambda x: 0 <= x < math.inf)
 _SHARE = ("in (0, 1]", lambda x: 0 < x <= 1)
 _FROM_ZERO = ("in [0, 1]", lambda x: 0 <= x <= 1)
 _SHARES = ("numbers in (0, 1)", lambda x: len(x) >= 1 and all(0 < v < 1 for v in x))
+_SKY_ROWS = ("a multiple of 32 in [0, 1024]", lambda x: x in range(0, 1025, 32))
 _RANGE = ("two numbers in [0, 1], rising", lambda x: len(x) == 2 and 0 <= x[0] < x[1] <= 1)
 
 
@@ -153,9 +154,16 @@ class MirrorConfig:
     alike: float = 0.3
     # weight, >= 0, of what was found of sharp points, in Adam
     weight: float = 1.0
+    # degrees, each > 0, by which normals of sharp points are turned at most, search by search
+    turns: tuple[float, ...] = (6.0, 3.0)
+    # rows of the map as sharp points show it, a multiple of 32; 0: it is not kept
+    rows: int = 128
 
     def __post_init__(self) -> None:
         check_fields(self, *_WHOLE, "views", "min_views", "neighbours", "voters")
+        check_fields(self, *_SKY_ROWS, "rows")
+        above = "above 0 each", lambda turns: all(0 < x < math.inf for x in turns)
+        check_fields(self, *above, "turns")
         check_fields(self, *_FROM_ZERO, "min_cosine", "min_reflectance", "flat", "alike")
         check_fields(self, *_NOT_BELOW, "change", "weight")
         check_fields(self, *_ABOVE, "turn", "around")

@@ -22,12 +22,14 @@ from univoxel import sphere
 from univoxel.color import linear_to_srgb_unclipped
 from univoxel.envmap import EnvMap, lookup
 from univoxel.joint.config import JointConfig, MirrorConfig
+from univoxel.joint.mirrored_map import MirrorViews
 from univoxel.joint.observations import (
     JointProblem,
     Mirrors,
     observations_of,
     without_exposure,
 )
+from univoxel.render.transport import Observations
 from univoxel.scene import Scene
 
 ROWS = 64  # of the map that is looked up: finer than the nodes lie apart
@@ -121,6 +123,42 @@ def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirro
     return Mirrors(metal, sharp, normal, torch.where(metal[:, None], base, 0.0))
 
 
+def open_views(
+    scene: Scene,
+    problem: JointProblem,
+    observations: Observations,
+    like: Tensor,
+    base: Tensor,
+    map: NodeMap,
+    cfg: JointConfig,
+) -> tuple[MirrorViews, Tensor]:
+    """What photographs show of N points that mirror the sky, and which of the observations these
+    are: [S] int64.
+
+    Args:
+        like: [N] int64, points of the problem that see of the sky what these do.
+        base: [N, 3] what the points reflect.
+    """
+    observations = without_exposure(scene, observations)
+    point = torch.repeat_interleave(observations.offsets.diff())
+    mirrored, cosine = reflect(observations.normal[point], observations.wo[:, None])
+    is_open = sees_sky(problem, map, like[point], mirrored[:, 0], cfg)
+    index = (is_open & (cosine[:, 0] > cfg.mirror.min_cosine)).nonzero()[:, 0]
+    wo, color = observations.wo[index], observations.color[index]
+    views = MirrorViews.of(point[index], wo, color, base, observations.normal)
+    return views, index
+
+
+def sees_sky(
+    problem: JointProblem, map: NodeMap, point: Tensor, direction: Tensor, cfg: JointConfig
+) -> Tensor:
+    """Whether the sky is where points [N] look [N, ..., 3], and around it: [N, ...] bool."""
+    visible, node = problem.transport.visibility == 255, map.nearest(direction)
+    row = point.view(-1, *[1] * (node.dim() - 1))
+    near = map.beside(cfg.newton.neighbours).unbind(1)
+    return torch.stack([visible[row, beside[node]] for beside in near]).all(0)
+
+
 def sightings(scene: Scene, problem: JointProblem, map: NodeMap, cfg: JointConfig) -> Sightings:
     """Of all points of the problem; those that no photograph sees have none that are open."""
     observations = without_exposure(scene, problem.observations)
@@ -129,10 +167,8 @@ def sightings(scene: Scene, problem: JointProblem, map: NodeMap, cfg: JointConfi
     observation = observation.clamp_max(len(observations.view) - 1)
     normal, wo = observations.normal, observations.wo[observation]
     mirrored, cosine = reflect(normal, wo)
-    visible, node = problem.transport.visibility == 255, map.nearest(mirrored)
     is_open = (cosine > cfg.mirror.min_cosine) & (counts > 0)[:, None]
-    for beside in map.beside(cfg.newton.neighbours).unbind(1):
-        is_open &= visible.gather(1, beside[node])
+    is_open &= sees_sky(problem, map, torch.arange(len(counts)), mirrored, cfg)
     unit = cfg.metal.near * problem.voxel_size
     key = torch.cat([observations.position / unit, normal / cfg.mirror.turn], 1)
     return Sightings(key, normal, wo, observations.color[observation], is_open)

@@ -39,6 +39,7 @@ from univoxel.joint.observations import (
     shade_observations,
     with_present_normals,
 )
+from univoxel.joint.sharp_sky import sharpen_sky_
 from univoxel.lights import priors
 from univoxel.optim import RowAdam, parameters_of
 from univoxel.scene import Scene
@@ -118,6 +119,9 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             save_scene(scene, progress.cfg.out, progress.state())
     progress.within = None
     scene.field.refresh()
+    if decisions.mirrors is not None:
+        problem = with_present_normals(scene, problem)
+        sharpen_sky_(scene, photos, problem, decisions.mirrors, cfg)
 
 
 def traced_problem(

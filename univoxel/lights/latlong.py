@@ -73,3 +73,10 @@ def resampled(radiance: Tensor, height: int) -> Tensor:
         pooled = torch.nn.functional.adaptive_avg_pool2d(weight, (height, 2 * height))
         return (pooled[:3] / pooled[3:]).movedim(0, 2)
     return envmap.lookup(envmap.EnvMap(radiance), latlong_directions(height).to(radiance))
+
+
+def finer(level: Tensor, factor: int) -> Tensor:
+    """A lat-long map [H, 2 H, C] with `factor` times as many rows and columns, interpolated."""
+    around = torch.cat([level[:, -1:], level, level[:, :1]], 1).movedim(2, 0)[None]
+    finer = torch.nn.functional.interpolate(around, scale_factor=factor, mode="bilinear")
+    return finer[0, :, :, factor:-factor].movedim(0, 2)

@@ -8,22 +8,33 @@ import torch
 from torch import Tensor, nn
 
 from univoxel import sphere
+from univoxel.lights.latlong import resampled
 
 NODES_AT_ONCE = 8192
 
 
 class DistantLight(nn.Module):
     """Radiance at D directions of a Fibonacci sphere, 4 pi / D steradians each; kept as logarithm,
-    so that it stays positive and a bright sun is as far away as a dark wall."""
+    so that it stays positive and a bright sun is as far away as a dark wall.
+
+    Where something polished showed the same map more sharply, its texels lie beside. They serve
+    pictures of it, and light for other things.
+    """
 
     direction: Tensor
+    sharp: Tensor | None  # [R, 2 R, 3] radiance, linear
 
-    def __init__(self, count: int, radiance: float = 1.0) -> None:
+    def __init__(self, count: int, radiance: float = 1.0, rows: int = 0) -> None:
+        """
+        Args:
+            rows: R of the texels, 0: there are none.
+        """
         super().__init__()
         self.log_radiance: nn.Parameter = nn.Parameter(
             torch.full((count, 3), math.log(radiance))
         )  # [D, 3]
         self.register_buffer("direction", sphere.fibonacci_sphere(count))  # [D, 3]
+        self.register_buffer("sharp", torch.zeros(rows, 2 * rows, 3) if rows else None)
 
     @property
     def radiance(self) -> Tensor:
@@ -49,5 +60,7 @@ class DistantLight(nn.Module):
 
     def latlong(self, height: int) -> Tensor:
         """The map [height, 2 height, 3], linear, in the axes of docs/reference/conventions.md."""
+        if self.sharp is not None:
+            return resampled(self.sharp, height)
         wi = sphere.latlong_directions(height)
         return self.incident(wi.flatten(0, 1)).reshape(height, 2 * height, 3)

@@ -67,7 +67,7 @@ class EnvmapLight(AbstractLatLongLight):
         fine, *coarse = self.levels
         total = fine
         for level in coarse:
-            total = total + _finer(level, len(fine) // len(level))
+            total = total + latlong.finer(level, len(fine) // len(level))
         return GAIN * total
 
     @property
@@ -84,10 +84,3 @@ class EnvmapLight(AbstractLatLongLight):
     def latlong(self, height: int) -> Tensor:
         """The map [height, 2 height, 3], linear, in the axes of docs/reference/conventions.md."""
         return latlong.resampled(self.radiance, height)
-
-
-def _finer(level: Tensor, factor: int) -> Tensor:
-    """A lat-long map [H, 2 H, 3] with `factor` times as many rows and columns, interpolated."""
-    around = torch.cat([level[:, -1:], level, level[:, :1]], 1).movedim(2, 0)[None]
-    finer = nn.functional.interpolate(around, scale_factor=factor, mode="bilinear")
-    return finer[0, :, :, factor:-factor].movedim(0, 2)

@@ -34,6 +34,17 @@ class Observations:
     view: Tensor  # [S] int64: which photograph
     eye: Tensor  # [V, 3] where the photographs were taken from
 
+    def at(self, points: Tensor) -> Observations:
+        """Those of some points, [N] int64, in their order."""
+        counts = self.offsets.diff()[points]
+        offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        within = torch.arange(int(offsets[-1])) - offsets[:-1].repeat_interleave(counts)
+        index = self.offsets[points].repeat_interleave(counts) + within
+        by_point = (x[index] for x in (self.wo, self.color, self.view))
+        return Observations(
+            self.position[points], self.normal[points], offsets, *by_point, eye=self.eye
+        )
+
 
 @dataclass(frozen=True)
 class Transport:
