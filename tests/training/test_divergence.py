@@ -121,12 +121,12 @@ def test_a_collapse_goes_back(data, tmp_path, monkeypatch):
     monkeypatch.setattr(divergence, "COPYING", 1e9)  # and a copy
     original, states = loop.held_out_psnr, []
 
-    def judged(scene, *rest):
+    def judged(scene, *rest, **named):
         states.append(scene.field.sdf.detach().clone())
         if len(states) == 10:
             with torch.no_grad():
                 scene.field.sdf.fill_(1.0)  # nothing is left
-        return original(scene, *rest)
+        return original(scene, *rest, **named)
 
     monkeypatch.setattr(loop, "held_out_psnr", judged)
     out = task.train(small(data, tmp_path / "run"))

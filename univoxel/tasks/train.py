@@ -13,7 +13,7 @@ import torch
 from univoxel import ranks, shelf
 from univoxel.build import build_scene
 from univoxel.checkpoint import FILE, load_checkpoint, save_scene
-from univoxel.compression import plan
+from univoxel.compression import plan, sizes
 from univoxel.compression.choices import chosen_reach
 from univoxel.confidence.report import numbers, words
 from univoxel.confidence.survey import survey
@@ -33,7 +33,7 @@ from univoxel.run import kept_photos
 from univoxel.scene import Scene
 from univoxel.training.clock import Clock
 from univoxel.training.config import StageConfig
-from univoxel.training.loop import run_stage
+from univoxel.training.loop import fit_sharpness_, run_stage
 from univoxel.training.memory import check_memory
 from univoxel.training.pixels import TrainingPixels, split_pixels
 from univoxel.training.progress import LOG, Progress, TrainingProgress
@@ -214,12 +214,16 @@ def make_stage_(
     if pinned is not None:
         pinned.pin_(scene.field)
     if isinstance(stage, JointConfig):
+        rows = sizes.sky_rows(stage.mirror.rows, cfg.budget_mb, cfg.compression)
+        stage = replace(stage, mirror=replace(stage.mirror, rows=rows))
         joint_stage.solve(scene, scene.registered(photos), stage, cfg.seed, progress)
     else:
         if cfg.capacity == "adaptive":
             stage = plan.on_grid(stage, box, scene.field.voxel_size)
         run_stage(scene, cfg, stage, pixels, progress)
     last = index + 1 == len(cfg.stages)
+    if last:
+        fit_sharpness_(scene, pixels)
     if cfg.capacity == "adaptive" and (last or not progress.clock.over):
         choices = plan.adapt_(scene, cfg, index, box, pixels, progress.clock.pace)
         progress.chosen += choices

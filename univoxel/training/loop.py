@@ -45,6 +45,8 @@ RATES = ("lr_sdf", "lr_features", "lr_networks")
 # Of so many rays one is compared with a place beside it, for which networks are evaluated again:
 # priors need no more
 COMPARED = 4
+# Sharpness of the density that is tried in the end, over that of the last stage
+SHARPNESS_FACTORS = (0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0)
 MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silhouette's fringe
 
 
@@ -316,6 +318,21 @@ def batch_at(photos: Photos, pixels: Tensor) -> Batch:
         color, alpha = unpacked(photos, pixels[:, 3:])
     centre = torch.stack([column, row], 1) + 0.5
     return Batch(view, pixel_rays(photos.cameras, view, centre), color, alpha)
+
+
+@torch.no_grad()
+def fit_sharpness_(scene: Scene, pixels: TrainingPixels) -> None:
+    """Give the density the sharpness with which held-out pixels are drawn best.
+
+    A stage ends with one that is even over the grid. How wide a silhouette's fringe has to be
+    depends on the pixels too, and on how well masks and surface agree.
+    """
+    before = scene.inv_s
+    found = {}
+    for factor in SHARPNESS_FACTORS:
+        scene.inv_s = factor * before
+        found[factor] = held_out_psnr(scene, pixels.photos, pixels.held_out, physical=True)
+    scene.inv_s = max(found, key=found.__getitem__) * before
 
 
 @torch.no_grad()
