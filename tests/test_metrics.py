@@ -70,7 +70,24 @@ def test_albedo_scale_is_the_median_ratio_in_the_mask():
 def test_albedo_scale_without_ratios():
     albedo = torch.tensor([[0.0, 0.2, 0.0], [0.1, 0.2, 0.0], [0.1, 0.2, 0.0]])
     scale = metrics.albedo_scale(2 * albedo + 0.1, albedo, torch.ones(3, dtype=torch.bool))
-    assert scale.tolist() == pytest.approx([3.0, 2.5, 1.0])
+    assert scale.tolist() == pytest.approx([3.0, 2.5, 2.5])  # of 3, 3, 2.5, 2.5, 2.5
+    black = torch.zeros(3, 3)
+    assert metrics.albedo_scale(black, albedo, torch.ones(3).bool()).tolist() == [1.0] * 3
+    assert metrics.albedo_scale(albedo, black, torch.ones(3).bool()).tolist() == [1.0] * 3
+
+
+@pytest.mark.parametrize("red", [0.0, 0.0005])
+def test_a_channel_that_is_black_in_the_truth_keeps_what_was_found_in_it(red):
+    """Blue cloth with a little of a red seam: not its scale, and not of all ratios the median."""
+    truth = torch.tensor([[red, 0.1, 0.6]]).repeat(1000, 1)
+    truth[:5, 0] = 0.5
+    albedo = torch.tensor([[0.01, 0.2, 0.4]]).repeat(1000, 1)
+    everywhere = torch.ones(1000, dtype=torch.bool)
+    assert metrics.albedo_scale(truth, albedo, everywhere).tolist() == [1.0, 0.5, 1.5]
+    truth[:20, 0] = 0.5  # enough of it
+    assert metrics.albedo_scale(truth, albedo, everywhere).tolist() == [50.0, 0.5, 1.5]
+    # 20 ratios of 50, 1000 each of 0.5 and 1.5
+    assert metrics.albedo_scale(truth, albedo, everywhere, 1).tolist() == [1.5] * 3
 
 
 def test_albedo_scale_has_one_or_three_channels():

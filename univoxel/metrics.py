@@ -17,6 +17,8 @@ from univoxel.errors import UserError
 from univoxel.records import Mesh
 
 BEST_PSNR = 100.0  # dB, where pictures are equal: keeps means finite
+BLACK, BLACK_TRUTH = 1e-4, 1e-3  # linear: albedo below has no ratio, estimated and true
+ENOUGH = 0.01  # share of the pixels that have to have a ratio in a channel
 
 
 def on_black(linear: Tensor, alpha: Tensor) -> Tensor:
@@ -68,8 +70,11 @@ def albedo_scale(truth: Tensor, albedo: Tensor, mask: Tensor, channels: int = 3)
     """The scale [3] that albedo and light share and pictures cannot fix.
 
     The median of truth / albedo over the pixels of all test views inside the mask, in linear RGB:
-    per channel (`channels` 3), or of the three channels together (1: three equal numbers). Values
-    below 1e-4 in the estimate have no ratio and do not count; a channel with none left has scale 1.
+    per channel (`channels` 3), or of the three channels together (1: three equal numbers).
+
+    Black has no ratio: values below 1e-4 in the estimate or 1e-3 in the truth do not count. Blue
+    cloth would else have the scale 0 in red, and its pictures no red at all. A channel of which
+    less than a hundredth is left takes the scale of the others together, or 1 if there are none.
 
     Args:
         truth, albedo: [..., 3] linear.
@@ -81,10 +86,15 @@ def albedo_scale(truth: Tensor, albedo: Tensor, mask: Tensor, channels: int = 3)
     above, below = truth[mask].double().numpy(), albedo[mask].double().numpy()
     if channels == 1:
         above, below = above.reshape(-1, 1), below.reshape(-1, 1)
-    scales = []
-    for a, b in zip(above.T, below.T, strict=True):
-        there = b > 1e-4
-        scales.append(float(np.median(a[there] / b[there])) if there.any() else 1.0)
+    there = (below > BLACK) & (above > BLACK_TRUTH)
+    ratio = np.divide(above, below, out=np.ones_like(above), where=there)
+    enough = there.sum(0) >= max(1.0, ENOUGH * len(there))
+    told = ratio[:, enough][there[:, enough]]
+    others = float(np.median(told)) if len(told) else 1.0
+    scales = [
+        float(np.median(r[t])) if e else others
+        for r, t, e in zip(ratio.T, there.T, enough, strict=True)
+    ]
     return torch.tensor(scales, dtype=torch.float32).expand(3).clone()
 
 
