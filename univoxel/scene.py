@@ -96,7 +96,7 @@ class Scene(nn.Module):
 
     def __init__(self, cfg: SceneConfig, field: Field, inv_s: float = 1.0) -> None:
         super().__init__()
-        self.cfg = cfg
+        self.cfg: SceneConfig = cfg
         self.inv_s = inv_s  # sharpness of the NeuS density, 1 / world units
         self.field = field
         self.material: MaterialHead = MaterialHead(cfg.material_channels, cfg.hidden, cfg.roughness)
