@@ -13,13 +13,14 @@ from torch.nn.functional import normalize
 
 from univoxel import sphere
 from univoxel.color import linear_to_srgb_unclipped
-from univoxel.joint import stage
+from univoxel.joint import mirrors, stage
 from univoxel.joint.config import JointConfig, MirrorConfig
 from univoxel.joint.mirrors import (
     ROWS,
     NodeMap,
     Sightings,
     find_mirrors,
+    neighbours,
     reflect,
     reflectance,
     regions_of,
@@ -124,6 +125,34 @@ def test_points_that_see_no_sky_are_as_their_neighbours():
     problem = replace(problem, transport=replace(problem.transport, visibility=visibility))
     found = find_mirrors(scene, problem, CFG)
     assert found.metal[blocked].float().mean() > 0.95
+
+
+def test_fewer_than_half_of_the_voters_are_not_asked(monkeypatch):
+    """Nor what is near them looked for, which takes most of the time where nothing mirrors."""
+    scene, problem = under_fine_map(lambda n: n[:, 2] > 2, white)
+    asked = []
+
+    def counted(key, count):
+        asked.append(count)
+        return neighbours(key, count)
+
+    monkeypatch.setattr(mirrors, "neighbours", counted)
+    assert find_mirrors(scene, problem, CFG) is None
+    assert asked == [CFG.mirror.neighbours]
+
+    def some(count):
+        def found(seen, *_):
+            metal = torch.arange(len(seen.key)) < count
+            return Mirrors(metal, metal, seen.normal, 0.5 * torch.ones_like(seen.normal))
+
+        return found
+
+    few = replace(CFG, mirror=MirrorConfig(voters=10))
+    for count, voted in ((5, False), (6, True)):
+        asked.clear()
+        monkeypatch.setattr(mirrors, "mirrors_among", some(count))
+        find_mirrors(scene, problem, few)
+        assert (10 in asked) == voted
 
 
 def test_light_that_turns_has_no_common_map():

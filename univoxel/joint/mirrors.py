@@ -111,9 +111,12 @@ def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirro
     if len(decided) < count:
         return None
     found = mirrors_among(seen.at(decided), map, cfg.mirror)
+    voters_count = min(cfg.mirror.voters, len(seen.key))
+    if 2 * found.metal.sum() <= voters_count:  # no point can have a majority
+        return None
     # Points that mirror the object, not the sky, are as their neighbours
     nearest = KDTree(seen.key[decided].numpy()).query(seen.key.numpy(), workers=-1)[1]
-    like = torch.from_numpy(nearest)[neighbours(seen.key, min(cfg.mirror.voters, len(seen.key)))]
+    like = torch.from_numpy(nearest)[neighbours(seen.key, voters_count)]
     voters = found.metal[like][..., None].float()
     base = (voters * found.base[like]).sum(1) / voters.sum(1).clamp_min(1)
     metal, sharp = (x[like].float().mean(1) > 0.5 for x in (found.metal, found.sharp))
