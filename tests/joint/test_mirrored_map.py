@@ -236,12 +236,17 @@ def test_mirrors_that_contradict_one_another_show_no_map(sharpened):
     assert scene.sky.sharp is None
 
 
-def test_few_points_or_one_photograph_show_no_map(sharpened):
+@pytest.mark.parametrize("one", [0, 1])
+def test_few_points_or_one_photograph_show_no_map(sharpened, one):
     scene, problem, _ = a_mirror()
     few = torch.arange(POINTS) < CFG.mirror.neighbours - 1
     assert not sharpened(scene, problem, few)
-    seen = replace(problem.observations, view=0 * problem.observations.view)
+    seen = replace(problem.observations, view=0 * problem.observations.view + one)
     assert not sharpened(scene, replace(problem, observations=seen))
+    shut = replace(problem.transport, visibility=torch.zeros_like(problem.transport.visibility))
+    assert not sharpened(scene, replace(problem, transport=shut))
+    none = replace(CFG, mirror=MirrorConfig(rows=0))
+    assert not sharpened(scene, problem, cfg=none)
 
 
 def test_points_beside_lie_on_the_surface():

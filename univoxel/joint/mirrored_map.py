@@ -26,6 +26,7 @@ COARSEST = 4  # rows of the coarsest of the levels that fill each other, at leas
 LEAST = 0.5  # sightings that a texel has to have before its own count more than those around
 SEARCHED = 64  # rows of the map that normals are searched under
 CANDIDATES = 5  # normals along each side of the square that is searched
+STIFFNESS = 0.03  # sRGB: what a turn by the most degrees has to gain
 UNLIKE = 0.3  # sRGB: what is further off is something else, however far
 LAMP = 0.97  # linear: from here on the photograph may have been clipped
 # Of a coarse map over a sharp one: a Gaussian of 17 degrees in which they are compared, the share
@@ -141,7 +142,7 @@ def turned_normals(
         change = x * tangent + y * bitangent
         error = errors(encoded, views, normalize(normal + change, dim=1))
         cost = torch.zeros(len(normal)).index_add(0, views.point, error)
-        cost += count * UNLIKE * 0.1 * (x * x + y * y) / reach**2
+        cost += STIFFNESS * count * (x * x + y * y) / reach**2
         better = cost < best
         best = torch.where(better, cost, best)
         turn = torch.where(better[:, None], change, turn)

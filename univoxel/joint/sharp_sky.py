@@ -42,9 +42,11 @@ def sharpen_sky_(
     nodes = NodeMap.of(sky.direction, sky.latlong(ROWS), sky.radiance)
     base = mirrors.base[parent]
     views, index = open_views(scene, problem, observations, parent, base, nodes, cfg)
+    first = observations.view[index] % 2 == 0
+    if not first.any() or first.all():  # too few to foretell others from
+        return False
     nearest = neighbours(observations.position, cfg.mirror.neighbours)
     normal = agreed_normals(views, observations.normal, nearest, cfg.mirror)
-    first = observations.view[index] % 2 == 0
     seen, told = views.at(first), views.at(~first)
     half = sharp_map(seen, normal, ROWS).encoded
     of_nodes, of_half = (errors(map, told, normal).mean() for map in (nodes.encoded, half))
