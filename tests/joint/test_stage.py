@@ -598,8 +598,13 @@ def test_mirrors_are_taught_before_adam_in_every_round(monkeypatch):
     monkeypatch.setattr(stage, "initialise_", lambda scene, problem, decisions, *_: (decisions, []))
     monkeypatch.setattr(stage, "newton_round_", lambda *_: calls.append("newton") or NewtonRound())
     monkeypatch.setattr(stage, "teach_mirrors_", lambda *_: calls.append("teach"))
-    stage.solve(scene, photos_of(1, 8), replace(CFG, rounds=2, colors=False), 0, Steps(4))
+    cfg, told = replace(CFG, rounds=2, colors=False), Steps(4)
+    stage.solve(scene, photos_of(1, 8), cfg, 0, told)
     assert calls == ["newton", "teach"] * 2
+    assert not told.said
+    monkeypatch.setattr(stage, "sharpen_sky_", lambda *args: args[3] is mirrors)
+    stage.solve(scene, photos_of(1, 8), cfg, 0, told)
+    assert told.said == ["the map of the light is as sharp as what is polished shows it"]
 
 
 def test_materials_follow_a_map_that_was_changed(monkeypatch):

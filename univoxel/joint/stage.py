@@ -121,7 +121,8 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     scene.field.refresh()
     if decisions.mirrors is not None:
         problem = with_present_normals(scene, problem)
-        sharpen_sky_(scene, photos, problem, decisions.mirrors, cfg)
+        if sharpen_sky_(scene, photos, problem, decisions.mirrors, cfg):
+            progress.say("the map of the light is as sharp as what is polished shows it")
 
 
 def traced_problem(
