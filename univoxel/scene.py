@@ -45,7 +45,8 @@ class SceneConfig:
     hidden: int = 64  # width of the material and radiance heads, >= 1
     mirror_levels: int = 5  # of the table of mirrored directions, 29 degrees and finer, [0, 8]
     sky_nodes: int = 512  # directions of the environment map, >= 0; 0: the scene has none
-    # rows of its texels, where polished things show it more sharply; training fills them in
+    # rows of the map's texels, >= 0, where polished things show it more sharply than its nodes do;
+    # training fills them in
     sky_rows: int = 0
     mirrored: bool = True  # whether a local light gets a network for what is mirrored sharply
     # the light that photographs are rendered with, and its own sizes
@@ -168,12 +169,11 @@ class Scene(nn.Module):
                 "varying",
             )
 
-    def sharpen_sky(self, radiance: Tensor | None) -> None:
-        """Keep the texels [R, 2 R, 3] of the map, linear, beside its nodes; None: there are
-        none."""
+    def sharpen_sky(self, radiance: Tensor) -> None:
+        """Keep texels [R, 2 R, 3] of the map, linear, beside its nodes."""
         assert self.sky is not None
         self.sky.sharp = radiance
-        self.cfg = replace(self.cfg, sky_rows=0 if radiance is None else len(radiance))
+        self.cfg = replace(self.cfg, sky_rows=len(radiance))
 
     def occluder(self) -> VisibilityScene:
         """The present surface, ready for rays; within `surface_held`, the one that is held.

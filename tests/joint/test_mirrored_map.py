@@ -135,6 +135,17 @@ def test_what_is_far_off_counts_no_more_than_so_much():
     assert errors(true, views, normal).mean() < 0.01
 
 
+def test_at_grazing_angles_metal_reflects_more():
+    """What is seen over the reflectance, as linear radiance, is what was sent."""
+    normal = torch.tensor([[0.0, 0.0, 1.0]])
+    cosine = torch.tensor([1.0, 0.3])
+    wo = torch.stack([(1 - cosine**2).sqrt(), torch.zeros(2), cosine], 1)
+    point = torch.zeros(2, dtype=torch.int64)
+    views = MirrorViews.of(point, wo, 0.4 * fresnel(cosine[:, None]), BASE[None], normal)
+    sent = linear_to_srgb_unclipped(torch.full((2, 3), 0.4))
+    assert torch.allclose(views.incident, sent, rtol=1e-5)
+
+
 def lit_by_a_lamp():
     """A sky, with a lamp that photographs clip, the nodes of it, and how mirrors show it."""
     direction = sphere.latlong_directions(ROWS)
@@ -220,10 +231,17 @@ def test_the_scene_keeps_the_map_that_its_mirrors_show(sharpened):
     assert scene.cfg.sky_rows == ROWS
     after = encoded_error(linear_to_srgb_unclipped(scene.sky.latlong(ROWS))).mean()
     assert after < 0.6 * before
-    scene.sharpen_sky(None)
-    assert scene.cfg.sky_rows == 0
-    again = encoded_error(linear_to_srgb_unclipped(scene.sky.latlong(ROWS))).mean()
-    assert again == before
+
+
+def test_a_map_that_the_nodes_tell_as_well_is_not_kept(sharpened):
+    """Mirrors that show the nodes' own map, which half of the photographs tell less well."""
+    scene, problem, normal = a_mirror()
+    seen = problem.observations
+    mirrored, cosine = reflect(normal, seen.wo.view(POINTS, VIEWS, 3))
+    shown = scene.sky.incident(mirrored.flatten(0, 1)).detach()
+    color = fresnel(cosine.flatten()[:, None]) * shown
+    assert not sharpened(scene, replace(problem, observations=replace(seen, color=color)))
+    assert scene.sky.sharp is None
 
 
 def test_mirrors_that_contradict_one_another_show_no_map(sharpened):

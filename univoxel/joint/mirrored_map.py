@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d, normalize, pad
 
 from univoxel import sphere
 from univoxel.brdf import schlick_f
-from univoxel.color import linear_to_srgb_unclipped, srgb_to_linear
+from univoxel.color import CLIPPED, linear_to_srgb_unclipped, srgb_to_linear
 from univoxel.envmap import EnvMap, lookup
 from univoxel.joint.config import MirrorConfig
 from univoxel.lights.latlong import finer
@@ -28,7 +28,6 @@ SEARCHED = 64  # rows of the map that normals are searched under
 CANDIDATES = 5  # normals along each side of the square that is searched
 STIFFNESS = 0.03  # sRGB: what a turn by the most degrees has to gain
 UNLIKE = 0.3  # sRGB: what is further off is something else, however far
-LAMP = 0.97  # linear: from here on the photograph may have been clipped
 # Of a coarse map over a sharp one: a Gaussian of 17 degrees in which they are compared, the share
 # of it that mirrors have to show, the share of lamps in it at most, and which quantile it is
 COMPARED_SHARPNESS, SHOWN, LAMPS, LOWEST = 12.0, 0.8, 0.01, 0.1
@@ -55,8 +54,9 @@ class MirrorViews:
         """
         cosine = (normal[point] * wo).sum(1, keepdim=True).clamp(0, 1)
         reflected = schlick_f(cosine, base[point])
+        clipped = (linear_to_srgb_unclipped(color) > CLIPPED).any(1)
         incident = linear_to_srgb_unclipped(color / reflected.clamp_min(1e-3))
-        return MirrorViews(point, wo, incident, (color > LAMP).any(1))
+        return MirrorViews(point, wo, incident, clipped)
 
     def at(self, index: Tensor) -> MirrorViews:
         return MirrorViews(**{name: value[index] for name, value in vars(self).items()})
