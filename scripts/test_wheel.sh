@@ -13,7 +13,7 @@ house=$PWD/build/wheelhouse/$name root=$PWD/build/wheel-root
 rm -rf "$root" && mkdir -p "$house" "$root"
 
 # What it depends on, and the tests', as files
-[ -e "$house/.complete" ] || "$python" -m pip download -q -d "$house" "$wheel" pytest hypothesis "$@"
+[ -e "$house/.complete" ] || "$python" -m pip download -q -d "$house" "$wheel" pytest pytest-timeout hypothesis "$@"
 touch "$house/.complete"
 cp "$wheel" "$house" # this build of it
 
@@ -52,7 +52,7 @@ inside /venv/bin/univoxel doctor
 echo "== univoxel demo"
 time inside /venv/bin/univoxel demo --out /tmp/demo
 echo "== the ops' tests"
-inside /venv/bin/python -m pip install -q --no-index --find-links /house pytest hypothesis
+inside /venv/bin/python -m pip install -q --no-index --find-links /house pytest pytest-timeout hypothesis
 # torch.compile calls a compiler
 inside /venv/bin/python -m pytest -q -c /tests/pyproject.toml --rootdir /tests -p no:cacheprovider \
     -k "not compile and not version and not cheap" /tests/tests/ops /tests/tests/test_build.py

@@ -2,6 +2,7 @@
 
 import json
 import math
+import threading
 
 import numpy as np
 import pytest
@@ -328,6 +329,17 @@ def test_broken_scenes(scene, case):
         load_photos(scene)
     assert "\n" not in str(caught.value)
     assert str(scene) in str(caught.value)
+
+
+def test_no_reader_outlives_an_error(scene):
+    """One that did would be ended by the garbage collector, in whichever thread that runs: a thread
+    that was just starting has hung in it."""
+    BROKEN["formats mixed"][0](scene)
+    before = threading.active_count()
+    with pytest.raises(DataError, match="expected the format of r_0") as caught:
+        load_photos(scene)
+    assert caught.value.__traceback__ is not None  # which holds all frames
+    assert threading.active_count() == before
 
 
 def test_missing_and_empty_folders(tmp_path):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -157,22 +158,25 @@ def _read_all(
     """Colour [V, H, W, 3] and alpha [V, H, W] of all photographs as `Photos` has them."""
     reading = Reading.resumed(origin)
     begin = reading.read if reading else 0
-    pictures = _read_each(shots[begin:], pinholes[begin:], factor, masks)
-    for view, (color, alpha) in enumerate(pictures, begin):
-        if reading is None:
-            size = len(shots), cameras.height, cameras.width
-            reading = Reading.begun(origin, color, alpha, size)
-        if color.dtype != reading.color.dtype:
-            raise DataError(
-                f"{shots[view].image}: expected the format of {shots[0].name} in all photographs"
-            )
-        if alpha.dtype != reading.alpha.dtype:
-            alpha, reading = coverage_of(alpha), reading.with_floating_alpha()
-        reading.empty &= not alpha.any()
-        reading.opaque &= bool((alpha == (1 if alpha.is_floating_point() else 255)).all())
-        cameras.cut(view, reading.color[view]).copy_(color)
-        cameras.cut(view, reading.alpha[view]).copy_(alpha)
-        reading.done(view)
+    # Closed here: a reader left to the garbage collector would be waited for in any thread, even in
+    # one that holds what the reader's end waits for
+    with closing(_read_each(shots[begin:], pinholes[begin:], factor, masks)) as pictures:
+        for view, (color, alpha) in enumerate(pictures, begin):
+            if reading is None:
+                size = len(shots), cameras.height, cameras.width
+                reading = Reading.begun(origin, color, alpha, size)
+            if color.dtype != reading.color.dtype:
+                raise DataError(
+                    f"{shots[view].image}: expected the format of {shots[0].name} in all "
+                    "photographs"
+                )
+            if alpha.dtype != reading.alpha.dtype:
+                alpha, reading = coverage_of(alpha), reading.with_floating_alpha()
+            reading.empty &= not alpha.any()
+            reading.opaque &= bool((alpha == (1 if alpha.is_floating_point() else 255)).all())
+            cameras.cut(view, reading.color[view]).copy_(color)
+            cameras.cut(view, reading.alpha[view]).copy_(alpha)
+            reading.done(view)
     assert reading is not None
     if reading.empty or (masks and reading.opaque):
         reading.drop()
@@ -185,7 +189,7 @@ def _read_all(
 
 def _read_each(
     shots: Sequence[Shot], pinholes: Sequence[Lens], factor: int, masks: bool
-) -> Iterator[tuple[Tensor, Tensor]]:
+) -> Generator[tuple[Tensor, Tensor], None, None]:
     """Colour and alpha of each photograph, in order; some are read at once."""
     grid_of = lru_cache(2)(sources)  # one lens often took all photographs, upright and across
 
