@@ -70,6 +70,16 @@ def test_a_map_is_resampled_to_what_it_is_in_the_world():
     assert (found - wanted).abs().max() < 0.05  # the nodes' Gaussians blur it a little
 
 
+def test_a_turned_map_has_no_weight_that_rounding_swallows():
+    """Times what a point sees of them they would be denormals, on which processors crawl."""
+    cameras = ring()
+    turntable = Turntable.of(cameras)
+    turn = turntable.turn(cameras.camera_to_world[:, :, 3])
+    weights = resampling(fibonacci_sphere(512), turntable, turn)
+    assert (weights == 0).double().mean() > 0.8
+    assert weights[weights > 0].min() >= torch.finfo(torch.float32).eps
+
+
 def test_cameras_that_are_not_level_say_nothing():
     tumbled = ring()
     turns = torch.from_numpy(Rotation.random(12, random_state=0).as_matrix()).float()

@@ -104,4 +104,8 @@ def resampling(direction: Tensor, turntable: Turntable, turn: tuple[Tensor, Tens
     sharpness = len(direction) / 5.0  # as wide as the nodes lie apart, as in `DistantLight`
     cosine, sine = (x[:, None] for x in turn)
     turned = turntable.into_light(direction.expand(len(cosine), -1, -1), (cosine, sine))
-    return torch.softmax(sharpness * (turned @ direction.T), -1)
+    weights = torch.softmax(sharpness * (turned @ direction.T), -1)
+    # What rounding swallows is nothing: processors take a hundred times as long over the tiniest
+    # numbers (denormals), of which half of the weights were, or became when multiplied
+    weights = weights.masked_fill(weights < torch.finfo(weights.dtype).eps, 0.0)
+    return weights / weights.sum(-1, keepdim=True)
