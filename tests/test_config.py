@@ -61,11 +61,14 @@ def test_all_stages_are_hashed_or_none():
         replace(config, scene=SceneConfig(channels=7, material_channels=3))
 
 
-def test_all_may_be_known_to_be_metal():
+def test_it_may_be_known_whether_all_is_metal():
     cfg = preset("draft", Path("data"), Path("out"))
     assert with_metal(cfg, "auto") is cfg
     known = [getattr(s, "only_metal", None) for s in with_metal(cfg, "all").stages]
     assert known == [None, None, True, None]
+    some = with_metal(cfg, "some").stages[2]
+    assert isinstance(some, JointConfig)
+    assert some.only_metal is False
     lobes = preset("draft", Path("data"), Path("out"), "sg")
     with pytest.raises(UserError, match=r"metal=all is for light=hybrid, .* got sg") as refused:
         with_metal(lobes, "all")

@@ -135,6 +135,7 @@ class Within:
     end: float
     rounds_after: int
     solved: bool
+    only_metal: bool = False
 
     def __post_init__(self) -> None:
         check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "begin", "end")

@@ -165,11 +165,12 @@ def with_metal(cfg: TrainConfig, metal: Metal) -> TrainConfig:
         return cfg
     if not any(isinstance(s, JointConfig) for s in cfg.stages):
         raise UserError(
-            f"metal=all is for light=hybrid, which finds what metal mirrors, got "
+            f"metal={metal} is for light=hybrid, which finds what metal mirrors, got "
             f"{cfg.scene.light.kind}",
             *("metal", "light"),
         )
-    stages = [replace(s, only_metal=True) if isinstance(s, JointConfig) else s for s in cfg.stages]
+    only = metal == "all"
+    stages = [replace(s, only_metal=only) if isinstance(s, JointConfig) else s for s in cfg.stages]
     return replace(cfg, stages=tuple(stages))
 
 

@@ -52,7 +52,9 @@ from univoxel.joint.config import (
         (EntropyConfig(), {"steps": (0.0,)}, r"steps must be numbers above 0, got \(0.0,\)"),
         (EntropyConfig(), {"albedo": (0.5, 0.5)}, "albedo must be two numbers in .*, rising, got"),
         (EntropyConfig(), {"teaching_steps": 0}, "teaching_steps must be at least 1, got 0"),
-        (TrialConfig(), {"deciding": 0}, "deciding must be at least 1, got 0"),
+        (TrialConfig(), {"points": 0}, "points must be at least 1, got 0"),
+        (TrialConfig(), {"only_metal": 0.0}, "only_metal must be above 0, got 0.0"),
+        (TrialConfig(), {"like_paint": 1.5}, "like_paint must be in .*, got 1.5"),
         (TrialConfig(), {"roughness": (1.0,)}, r"roughness must be numbers in .*, got \(1.0,\)"),
         (TrialConfig(), {"better": 0.0}, "better must be in .*, got 0.0"),
         (TrialConfig(), {"majority": -0.1}, "majority must be in .*, got -0.1"),
@@ -84,6 +86,5 @@ def test_every_number_is_checked(record):
 
 
 def test_rounds_are_what_the_trials_cost():
-    """For metal and for none: the present roughness, the others, and one round of more points."""
-    trials = TrialConfig(roughness=(0.2, 0.4, 0.6), deciding=5)
-    assert trials.rounds == 2 * (1 + 3 + 5)
+    """For metal and for none: the present roughness, the others, and one round of what is found."""
+    assert TrialConfig(roughness=(0.2, 0.4, 0.6)).rounds == 2 * (1 + 3 + 1)

@@ -11,6 +11,7 @@ from univoxel.joint import initialise
 from univoxel.joint.config import JointConfig
 from univoxel.joint.initialise import initialise_, neutralise_
 from univoxel.joint.newton import NewtonRound
+from univoxel.lights.views import ViewLights
 
 CFG = JointConfig(newton_points=500, newton_views=8)
 
@@ -71,15 +72,15 @@ def test_trials_are_as_many_as_time_is_kept_for(monkeypatch):
         points.append(torch.randperm(10).tolist())
         metals.append(bool(decisions.metal.all()))
         spent.append(seconds)
-        assert cfg.newton_points == CFG.trials.points * seconds / 3.0
-        return NewtonRound([1.0])
+        assert cfg.newton_points == CFG.trials.points
+        return NewtonRound([2.0 if metals[-1] else 1.0])
 
     monkeypatch.setattr(initialise, "newton_round_", newton_round_)
     rounds = CFG.trials.rounds
     initialised(scene, problem, 3.0 * rounds)
-    assert sum(spent) == 3.0 * rounds
+    assert spent == [3.0] * rounds
     assert all(p == points[0] for p in points)  # the trials differ in nothing but the hypothesis
-    assert metals == [False] * 4 + [True] * 3 + [False]  # the last with the metals that were found
+    assert metals == [True] * 3 + [False] * 5  # with what is found under the map of either at last
 
 
 def test_rounds_that_solve_nothing_change_nothing(monkeypatch):
@@ -93,34 +94,71 @@ def test_rounds_that_solve_nothing_change_nothing(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("lowest", "left", "share", "taken"),
-    [
-        (0.5, 0.9, 0.3, False),
-        (0.9, 0.7, 0.3, True),
-        (0.98, 0.98, 0.8, False),
-        (0.98, 0.9, 0.8, True),
-        (0.9, 1.2, 0.8, True),
-    ],
+    ("left", "share", "taken"),
+    [(0.9, 0.3, False), (0.7, 0.3, True), (0.98, 0.8, False), (0.9, 0.8, True)],
 )
-def test_metal_everywhere_has_to_be_convincing(monkeypatch, lowest, left, share, taken):
-    """What it leaves of the photographs, everywhere or only where metal was found: under a wrong
-    map that is less by chance. Less so where most of the surface is metal then."""
+def test_metals_that_are_found_from_metal_everywhere_have_to_be_better(
+    monkeypatch, left, share, taken
+):
+    """By what they leave of the photographs: under a wrong map that is less by chance. Less so
+    where most of the surface is metal then."""
     (scene, problem), supposed = sphere_of((0.5, 0.3, 0.2), 0.0, 0.4), []
 
     def newton_round_(scene, problem, decisions, *_):
         metal = decisions.metal
         supposed.append(metal)
-        return NewtonRound([lowest if metal.all() else left if metal.any() else 1.0])
+        return NewtonRound([2.0 if metal.all() else left if metal.any() else 1.0])
 
     def find_metal(scene, problem, cfg, done):
         """A share is, of what is taken for metal everywhere; surely so, from a map for metals."""
-        metal = supposed[-1]
-        assert done == float(metal.all())
-        return metal & (torch.linspace(0, 1, len(metal)) < share)
+        everywhere = done * torch.ones(len(supposed[0]), dtype=torch.bool)
+        return everywhere.bool() & (torch.linspace(0, 1, len(everywhere)) < share)
 
     monkeypatch.setattr(initialise, "newton_round_", newton_round_)
     monkeypatch.setattr(initialise, "find_metal", find_metal)
-    assert bool(initialised(scene, problem).metal.any()) == taken
+    found = initialised(scene, problem)
+    assert bool(found.metal.any()) == taken
+    assert not found.only_metal
+
+
+@pytest.mark.parametrize(
+    ("known", "smooth", "rough", "found", "varying", "taken"),
+    [
+        (None, 1.1, 9.0, 9.0, False, True),
+        (None, 1.2, 0.9, 9.0, False, False),  # as wide as diffuse light: it explains paint
+        (None, 1.1, 9.0, 0.9, False, False),  # what is found under the map of paint explains more
+        (None, 1.1, 9.0, 9.0, True, False),  # photographs that mirror a map each
+        (False, 0.9, 0.9, 9.0, False, False),
+        (True, 9.0, 9.0, 9.0, False, True),
+    ],
+)
+def test_where_metal_alone_explains_as_much_there_is_nothing_else(
+    monkeypatch, known, smooth, rough, found, varying, taken
+):
+    """Of fewer ways to explain the photographs, unless it is rough."""
+    scene, problem = sphere_of((0.12, 0.08, 0.05), 1.0, 0.3)
+    features = scene.field.features_at(problem.observations.position)
+    searched = []
+
+    def newton_round_(scene, problem, decisions, *_):
+        if decisions.metal.all():
+            return NewtonRound([rough if scene.material(features)[1].median() > 0.5 else smooth])
+        return NewtonRound([found if searched else 1.0])
+
+    def find_metal(scene, problem, cfg, done):
+        searched.append(done)
+        return no_metal(problem).metal
+
+    monkeypatch.setattr(initialise, "newton_round_", newton_round_)
+    monkeypatch.setattr(initialise, "find_metal", find_metal)
+    if varying:
+        scene.views = ViewLights(("a", "b", "c", "d"), 2, scene.sky.direction)
+    cfg = replace(CFG, only_metal=known)
+    decisions, _ = initialise_(scene, problem, no_metal(problem), cfg, math.inf)
+    assert decisions.only_metal == taken
+    assert bool(decisions.metal.all()) == taken
+    # What would be found from metal everywhere is of no use where there is nothing else
+    assert len(searched) == (0 if known else 1 if taken else 2)
 
 
 def test_of_metal_alone_nothing_is_tried_but_roughness(monkeypatch):
@@ -135,7 +173,7 @@ def test_of_metal_alone_nothing_is_tried_but_roughness(monkeypatch):
     known = replace(CFG, only_metal=True)
     decisions, _ = initialise_(scene, problem, no_metal(problem), known, math.inf)
     assert decisions.metal.all()
-    assert tried == [True] * 4  # three roughnesses, and the best of them on more points
+    assert tried == [True] * 3
 
 
 def test_light_on_metal_alone_is_taken_for_neutral():

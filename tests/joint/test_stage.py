@@ -1,7 +1,7 @@
 """The stage that solves for one map: its equations against autograd, its answers against truth."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -586,6 +586,41 @@ def test_light_on_metal_alone_is_neutral_in_every_round(monkeypatch):
     known = replace(CFG, rounds=2, colors=False, only_metal=True, newton_steps=1)
     stage.solve(scene, photos_of(1, 8), known, 0, Steps(4))
     assert calls == ["neutral", True] * 2
+
+
+def test_a_solve_that_found_nothing_but_metal_goes_on_with_it(monkeypatch):
+    calls = []
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+    objective = stage.objective
+
+    def looked_at(scene, problem, decisions, cfg):
+        calls.append(bool(decisions.metal.all()))
+        return objective(scene, problem, decisions, cfg)
+
+    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
+    monkeypatch.setattr(stage, "neutralise_", lambda *_: calls.append("neutral"))
+    monkeypatch.setattr(stage, "newton_round_", lambda *_: NewtonRound())
+    monkeypatch.setattr(stage, "objective", looked_at)
+    told = Steps(4)
+    told.within = asdict(stage.Round(0.0, 0.5, rounds_after=1, solved=True, only_metal=True))
+    stage.solve(scene, photos_of(1, 8), replace(CFG, rounds=2, colors=False), 0, told)
+    assert calls == [True, True, "neutral", True, True]
+
+
+def test_training_says_that_there_is_nothing_but_metal(monkeypatch):
+    scene, told = scene_of((0.5, 0.5, 0.5), 0.4, 12), Steps(4)
+    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
+    monkeypatch.setattr(stage, "newton_round_", lambda *_: NewtonRound())
+    monkeypatch.setattr(
+        stage, "initialise_", lambda s, p, decisions, *_: (replace(decisions, only_metal=True), [])
+    )
+    cfg = replace(CFG, rounds=2, colors=False)
+    stage.solve(scene, photos_of(1, 8), cfg, 0, told)
+    assert told.said[0].startswith("all of it is taken for metal")
+    assert told.said[0].endswith("see --metal")
+    told = Steps(4)
+    stage.solve(scene, photos_of(1, 8), replace(cfg, only_metal=True), 0, told)
+    assert not told.said  # it was asked for
 
 
 def test_mirrors_are_taught_before_adam_in_every_round(monkeypatch):

@@ -230,10 +230,8 @@ class EntropyConfig:
 class TrialConfig:
     """Short rounds of Newton from which the joint solve starts, see joint/initialise.py."""
 
-    # points of the rounds that compare roughnesses, >= 1
-    points: int = 100
-    # times as many points, >= 1, in the two rounds that decide whether all is metal
-    deciding: int = 3
+    # points of a round, >= 1. With a third of them residuals scatter by a tenth
+    points: int = 300
     # Newton steps of a round, >= 1; after three, from no map, too glossy still fits better than
     # right
     steps: int = 6
@@ -241,7 +239,12 @@ class TrialConfig:
     roughness: tuple[float, ...] = (0.25, 0.7)
     # share, (0, 1], of the lowest residual so far that another roughness must not exceed
     better: float = 0.9
-    # share, (0, 1], of the others' residual that metal everywhere must not exceed
+    # times the others' residual, > 0, that metal everywhere must not exceed for all to be metal:
+    # 0.8 to 1.1 where all is, 1.3 to 3 where some or nothing is
+    only_metal: float = 1.15
+    # median of roughness, (0, 1], from which metal looks like paint and does not count there
+    like_paint: float = 0.5
+    # share, (0, 1], of the others' residual that it must not exceed to start from its metals
     all_metal: float = 0.8
     # the same, (0, 1], where most is found to be metal under its map. Of objects all of metal 0.67
     # to 0.93 is; of dielectrics hardly ever as much
@@ -250,16 +253,17 @@ class TrialConfig:
     majority: float = 0.5
 
     def __post_init__(self) -> None:
-        check_fields(self, *_WHOLE, "points", "deciding", "steps")
+        check_fields(self, *_WHOLE, "points", "steps")
         wanted = "numbers in (0, 1)"
         check_fields(self, wanted, lambda x: all(0 < v < 1 for v in x), "roughness")
-        check_fields(self, *_SHARE, "better", "all_metal", "mostly_metal")
+        check_fields(self, *_SHARE, "better", "all_metal", "mostly_metal", "like_paint")
         check_fields(self, *_FROM_ZERO, "majority")
+        check_fields(self, *_ABOVE, "only_metal")
 
     @property
     def rounds(self) -> int:
         """Rounds of Newton on `points` points that take as long as all trials together."""
-        return 2 * (1 + len(self.roughness) + self.deciding)
+        return 2 * (1 + len(self.roughness) + 1)
 
 
 @dataclass(frozen=True)
@@ -299,8 +303,8 @@ class JointConfig:
     points: int = 20000  # on the surface, >= 1
     tracing: int = 2  # visibility rays per point and direction, >= 1
     colors: bool = True  # whether the light minimises the entropy of albedo, see entropy
-    # whether all is metal, as dark as it looks: nothing is decided then, and the map is neutral
-    only_metal: bool = False
+    # whether all is metal, as dark as it looks, and the map neutral; None: trials decide
+    only_metal: bool | None = None
     lr_features: float = 0.03  # at the begin of a round; all rates > 0
     # at the begin of a round: of the materials' head and the views' gains
     lr_networks: float = 3e-3

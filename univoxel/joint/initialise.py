@@ -22,10 +22,10 @@ from univoxel.scene import Scene
 class Hypothesis:
     """What is metal, the scene's state under it, and what it leaves of the photographs."""
 
-    lowest: float  # residual with the metal that was assumed, on TrialConfig.points
-    decisive: float  # residual with the metal as found, on more points; inf: nothing was solved
-    metal: Tensor  # [P] bool, as found
+    residual: float  # inf: nothing was solved
+    metal: Tensor  # [P] bool
     states: list[dict[str, Any]]  # of the scene's parts
+    roughness: float  # median, [0, 1]
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Trials:
     seconds: float  # of a round on TrialConfig.points
     seed: int  # of the points: the trials differ in nothing but the hypothesis
     parts: Sequence[nn.Module]  # of the scene, that a trial changes
-    before: list[dict[str, Any]]  # their states
+    initial: list[dict[str, Any]]  # their states
     troubles: list[str]
 
     def states(self) -> list[dict[str, Any]]:
@@ -49,20 +49,14 @@ class Trials:
         for part, state in zip(self.parts, states, strict=True):
             part.load_state_dict(state)
 
-    def residual_(self, metal: Tensor, times: int = 1) -> float:
-        """What is left after a round of Newton, which changes the map; inf: nothing was solved.
-
-        Args:
-            times: how many times as many points it takes.
-        """
+    def residual_(self, metal: Tensor) -> float:
+        """What is left after a round of Newton, which changes the map; inf: nothing was solved."""
         steps = self.cfg.trials.steps if self.cfg.newton_steps else 0
-        points = times * self.cfg.trials.points
+        points = self.cfg.trials.points
         cfg = replace(self.cfg, newton_steps=steps, newton_points=points, newton_roughness=0.0)
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(self.seed)
-            solved = newton_round_(
-                self.scene, self.problem, Decisions(metal), cfg, self.seconds * times
-            )
+            solved = newton_round_(self.scene, self.problem, Decisions(metal), cfg, self.seconds)
         self.troubles.extend(solved.troubles)
         return solved.costs[-1] if solved.costs else math.inf
 
@@ -78,27 +72,34 @@ def initialise_(
     bright that nothing looks like metal under it. So rounds of Newton start from what the stages
     before took for metal and from metal everywhere, each with the roughness of the stages before
     and with some others, as a whole. Metals are found under the best map of either, and the
-    residuals decide. Where all is known to be metal, the best roughness is looked for alone.
+    residuals decide, unless there is nothing but metal.
 
     Args:
         seconds: that the rounds of Newton may take together.
     """
     parts = [part for part in (scene.material, problem.sky, scene.views) if part is not None]
     seed = int(torch.randint(2**31, ()))
-    before = [copy.deepcopy(part.state_dict()) for part in parts]
+    initial = [copy.deepcopy(part.state_dict()) for part in parts]
     round_seconds = seconds / cfg.trials.rounds
-    trials = Trials(scene, problem, cfg, round_seconds, seed, parts, before, [])
-    metal = torch.ones_like(decisions.metal)
-    best = best_roughness_(trials, metal if cfg.only_metal else decisions.metal)
-    if not cfg.only_metal:
-        everywhere = best_roughness_(trials, metal)
-        if all_metal(best, everywhere, cfg.trials):
-            best = everywhere
-    if math.isinf(best.decisive):
-        trials.restore_(before)
+    trials = Trials(scene, problem, cfg, round_seconds, seed, parts, initial, [])
+    everywhere = tried_roughnesses_(trials, torch.ones_like(decisions.metal))
+    best, only_metal = the_best(everywhere, cfg.trials), bool(cfg.only_metal)
+    if not only_metal:
+        before = the_best(tried_roughnesses_(trials, decisions.metal), cfg.trials)
+        found = under_its_map_(trials, before)
+        # Under a light for each photograph what is mirrored may be anything
+        one_light = scene.views is None or scene.views.sky_weights is None
+        if cfg.only_metal is None and one_light:
+            explained = min(before.residual, found.residual)
+            only_metal = nothing_but_metal(explained, everywhere, cfg.trials)
+        if not only_metal:
+            best = under_its_map_(trials, best)
+            best = best if better_metals(found, best, cfg.trials) else found
+    if math.isinf(best.residual):
+        trials.restore_(initial)
         return decisions, trials.troubles
     trials.restore_(best.states)
-    return replace(decisions, metal=best.metal), trials.troubles
+    return replace(decisions, metal=best.metal, only_metal=only_metal), trials.troubles
 
 
 @torch.no_grad()
@@ -116,32 +117,54 @@ def neutralise_(scene: Scene, problem: JointProblem, cfg: MetalConfig) -> None:
     problem.sky.log_radiance += (median / wanted).log()
 
 
-def best_roughness_(trials: Trials, metal: Tensor) -> Hypothesis:
-    """The hypothesis of the best roughness with this metal, and of the metals under its map. It
-    leaves the scene in its state."""
-    scene, problem, cfg = trials.scene, trials.problem, trials.cfg
-    lowest, states = math.inf, trials.before
-    for roughness in (None, *cfg.trials.roughness):
-        trials.restore_(trials.before)
+@torch.no_grad()
+def tried_roughnesses_(trials: Trials, metal: Tensor) -> list[Hypothesis]:
+    """A hypothesis with this metal for the present roughness, and for each that is tried."""
+    scene, tried = trials.scene, []
+    features = scene.field.features_at(trials.problem.observations.position)
+    for roughness in (None, *trials.cfg.trials.roughness):
+        trials.restore_(trials.initial)
         if roughness is not None:
-            features = scene.field.features_at(problem.observations.position)
             scene.material.shift_roughness(features, roughness)
-        residual = trials.residual_(metal)
-        if residual < (lowest if roughness is None else cfg.trials.better * lowest):
-            lowest, states = residual, trials.states()
-    trials.restore_(states)
+        median = float(scene.material(features)[1].median())
+        tried.append(Hypothesis(trials.residual_(metal), metal, trials.states(), median))
+    return tried
+
+
+def the_best(tried: Sequence[Hypothesis], cfg: TrialConfig) -> Hypothesis:
+    """That of the lowest residual; another roughness than the first has to be worth it."""
+    best = tried[0]
+    for hypothesis in tried[1:]:
+        if hypothesis.residual < cfg.better * best.residual:
+            best = hypothesis
+    return best
+
+
+def nothing_but_metal(explained: float, everywhere: Sequence[Hypothesis], cfg: TrialConfig) -> bool:
+    """Whether metal everywhere explains the photographs about as well as metal as it was found.
+
+    It has no diffuse light to explain them with, and so the fewer ways. Where it is rough, its
+    highlights are as wide as diffuse light, and it explains paint.
+
+    Args:
+        explained: residual of metal as it was found.
+    """
+    smooth = [h.residual for h in everywhere if h.roughness < cfg.like_paint]
+    return min(smooth, default=math.inf) < cfg.only_metal * explained
+
+
+def under_its_map_(trials: Trials, assumed: Hypothesis) -> Hypothesis:
+    """The hypothesis of the metals that are found under the map of another one. It leaves the scene
+    in its state."""
+    trials.restore_(assumed.states)
     # Under a map for metals dielectrics stand out at once: the last threshold serves
-    metal = find_metal(scene, problem, cfg, float(metal.all()))
-    decisive = trials.residual_(metal, cfg.trials.deciding)
-    return Hypothesis(lowest, decisive, metal, trials.states())
+    done = float(assumed.metal.all())
+    metal = find_metal(trials.scene, trials.problem, trials.cfg, done)
+    return Hypothesis(trials.residual_(metal), metal, trials.states(), assumed.roughness)
 
 
-def all_metal(before: Hypothesis, everywhere: Hypothesis, cfg: TrialConfig) -> bool:
-    """Whether metal everywhere led to the better hypothesis."""
-    if everywhere.metal.float().mean() <= cfg.majority:
-        return everywhere.decisive < cfg.all_metal * before.decisive
-    # A round may end badly by chance: one good one is enough
-    return (
-        everywhere.decisive < cfg.mostly_metal * before.decisive
-        or everywhere.lowest < cfg.mostly_metal * before.lowest
-    )
+def better_metals(before: Hypothesis, everywhere: Hypothesis, cfg: TrialConfig) -> bool:
+    """Whether the metals that were found from metal everywhere are the better ones."""
+    mostly = everywhere.metal.float().mean() > cfg.majority
+    share = cfg.mostly_metal if mostly else cfg.all_metal
+    return everywhere.residual < share * before.residual

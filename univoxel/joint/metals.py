@@ -24,14 +24,11 @@ from univoxel.scene import Scene
 
 
 def find_metal(scene: Scene, problem: JointProblem, cfg: JointConfig, done: float) -> Tensor:
-    """Which of the problem's points are metal under the present map: [P] bool. All are where that
-    is known.
+    """Which of the problem's points are metal under the present map: [P] bool.
 
     Args:
         done: progress of the map in [0, 1], from the first round of Newton to the last.
     """
-    if cfg.only_metal:
-        return torch.ones(len(problem.observations.position), dtype=torch.bool)
     first, last = cfg.metal.threshold
     return evidence(scene, problem, cfg) < first + done * (last - first)
 

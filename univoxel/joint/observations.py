@@ -81,6 +81,7 @@ class Decisions:
     sun: Tensor | None = None  # [D, 3] what a sun adds to the log map, which else is smooth
     albedo: Tensor | None = None  # [P, 3] where the materials do not follow the map yet
     mirrors: Mirrors | None = None  # None: nothing mirrors the map
+    only_metal: bool = False  # whether nothing but metal is there
 
 
 @torch.no_grad()

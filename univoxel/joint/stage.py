@@ -62,6 +62,7 @@ class Round:
     end: float  # the same
     rounds_after: int
     solved: bool  # whether Newton has made a step
+    only_metal: bool = False  # as in Decisions
 
 
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
@@ -84,6 +85,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     if progress.within is not None:
         current_round = Round(**progress.within)
         done = rounds_done(cfg, current_round.rounds_after)
+        decisions = replace(decisions, only_metal=current_round.only_metal)
         decisions = with_metals(scene, problem, decisions, cfg, done)
         optimizer = adam(scene, problem)
         guard.follow(optimizer)
@@ -95,7 +97,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             # On a slow machine fewer and longer rounds
             rounds_after = progress.clock.blocks_that_fit(rounds_left - 1)
             end = done + (1 - done) / (1 + rounds_after)
-            current_round = Round(done, end, rounds_after, solved)
+            current_round = Round(done, end, rounds_after, solved, decisions.only_metal)
             progress.within = asdict(current_round)
             optimizer = adam(scene, problem)
             guard.follow(optimizer)
@@ -170,7 +172,7 @@ def newton_phase_(
     if rounds_left == cfg.rounds:
         with progress.clock.off_pace():
             decisions = start_(scene, problem, decisions, cfg, seconds, progress)
-    if cfg.only_metal:
+    if decisions.only_metal:
         neutralise_(scene, problem, cfg.metal)
     with progress.clock.off_pace():
         newton = newton_round_(scene, problem, decisions, cfg, seconds)
@@ -193,7 +195,9 @@ def with_metals(
 ) -> Decisions:
     """The decisions with the metals that are found under the present map; done as in
     `find_metal`."""
-    metal = find_metal(scene, problem, cfg, done)
+    metal = torch.ones_like(decisions.metal)
+    if not decisions.only_metal:
+        metal = find_metal(scene, problem, cfg, done)
     mirrors = find_mirrors(scene, problem, cfg)
     if mirrors is not None:
         metal = metal | mirrors.metal
@@ -221,6 +225,11 @@ def start_(
     decisions, troubles = initialise_(scene, problem, decisions, cfg, seconds)
     for trouble in troubles:
         progress.trouble(trouble)
+    if decisions.only_metal and cfg.only_metal is None:
+        progress.say(
+            "all of it is taken for metal: that explains the photographs as well as anything else; "
+            "see --metal"
+        )
     if not cfg.colors:
         return decisions
     sun = fit_sun_(scene, problem, decisions, cfg.entropy)
