@@ -1,7 +1,7 @@
 """Draws docs/images/real.jpg: a photograph of a real object, and its model in other light.
 
     univoxel poses ethiopian_head/images --masks ethiopian_head/masks --out HEAD
-    univoxel train HEAD --out RUN --preset fast --metal all
+    univoxel train HEAD --out RUN --preset fast
     python docs/figures/real.py RUN docs/images MAP.hdr MAP.hdr
 
 From the left: a photograph that training did not see, on black; the render; the albedo; the model
