@@ -310,8 +310,7 @@ def train(
             the light itself too; auto is exposure where it is seen to differ, else none
         light_frame: world, where the light stood still, or turntable, where it turned with the
             camera; auto is what explains the photographs better
-        metal: all, if the whole object is metal, patina included; some, if parts are or nothing is;
-            auto decides between them
+        metal: all, if the whole object is metal, patina included; some, if not; auto decides it
         masks: auto takes masks in that end outside of the object, as the photographs show it
         cameras: refined puts the photographs' cameras right, before training and in it; auto does
             so where their silhouettes contradict one another

@@ -607,6 +607,24 @@ def test_a_solve_that_found_nothing_but_metal_goes_on_with_it(monkeypatch):
     assert calls == [True, True, "neutral", True, True]
 
 
+def test_what_is_known_to_be_metal_stays_so_where_nothing_is_solved(monkeypatch):
+    """Without steps of Newton, and in a run that goes on from before that was noted."""
+    scene, metals, objective = scene_of((0.5, 0.5, 0.5), 0.4, 12), [], stage.objective
+
+    def looked_at(scene, problem, decisions, cfg):
+        metals.append(bool(decisions.metal.all()) and decisions.only_metal)
+        return objective(scene, problem, decisions, cfg)
+
+    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
+    monkeypatch.setattr(stage, "objective", looked_at)
+    cfg = replace(CFG, rounds=2, colors=False, only_metal=True, newton_steps=0)
+    stage.solve(scene, photos_of(1, 8), cfg, 0, Steps(4))
+    told = Steps(4)
+    told.within = asdict(stage.Round(0.0, 0.5, rounds_after=1, solved=True))
+    stage.solve(scene, photos_of(1, 8), cfg, 0, told)
+    assert metals == [True] * 8
+
+
 def test_training_says_that_there_is_nothing_but_metal(monkeypatch):
     scene, told = scene_of((0.5, 0.5, 0.5), 0.4, 12), Steps(4)
     monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))

@@ -126,9 +126,14 @@ def turned_maps(scene: Scene, observations: Observations) -> TurnedMaps | None:
 
 @torch.no_grad()
 def first_decisions(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Decisions:
-    """Decisions to start with: metal is what the stages before have made metallic."""
+    """Decisions to start with: metal is what the stages before have made metallic, or all if that
+    is known."""
     features = scene.field.features_at(problem.observations.position)
-    return Decisions(scene.material(features)[2] > cfg.metal.metallic_before)
+    metal, only_metal = (
+        scene.material(features)[2] > cfg.metal.metallic_before,
+        bool(cfg.only_metal),
+    )
+    return Decisions(metal | only_metal, only_metal=only_metal)
 
 
 @torch.no_grad()

@@ -85,7 +85,8 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     if progress.within is not None:
         current_round = Round(**progress.within)
         done = rounds_done(cfg, current_round.rounds_after)
-        decisions = replace(decisions, only_metal=current_round.only_metal)
+        only_metal = decisions.only_metal or current_round.only_metal
+        decisions = replace(decisions, only_metal=only_metal)
         decisions = with_metals(scene, problem, decisions, cfg, done)
         optimizer = adam(scene, problem)
         guard.follow(optimizer)
