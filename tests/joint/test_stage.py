@@ -625,16 +625,21 @@ def test_what_is_known_to_be_metal_stays_so_where_nothing_is_solved(monkeypatch)
     assert metals == [True] * 8
 
 
-def test_training_says_that_there_is_nothing_but_metal(monkeypatch):
+def test_training_says_and_keeps_that_there_is_nothing_but_metal(monkeypatch):
     scene, told = scene_of((0.5, 0.5, 0.5), 0.4, 12), Steps(4)
     monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
     monkeypatch.setattr(stage, "newton_round_", lambda *_: NewtonRound())
     monkeypatch.setattr(
         stage, "initialise_", lambda s, p, decisions, *_: (replace(decisions, only_metal=True), [])
     )
+    kept, set_rates_ = [], stage.set_rates_
+    monkeypatch.setattr(
+        stage, "set_rates_", lambda *a: kept.append(told.within["only_metal"]) or set_rates_(*a)
+    )
     cfg = replace(CFG, rounds=2, colors=False)
     stage.solve(scene, photos_of(1, 8), cfg, 0, told)
-    assert told.said[0].startswith("all of it is taken for metal")
+    assert kept == [True] * 4  # for a run that goes on within the stage
+    assert told.said[0].startswith("the whole object is taken for metal")
     assert told.said[0].endswith("see --metal")
     told = Steps(4)
     stage.solve(scene, photos_of(1, 8), replace(cfg, only_metal=True), 0, told)

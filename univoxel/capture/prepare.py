@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Generator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,7 +110,7 @@ def gather(files: Sequence[Path], masks: Path | None) -> tuple[Capture, list[str
 
 def write_pictures(
     capture: Capture, folders: Folders, size: int, margin: float
-) -> Generator[tuple[int, str | None], None, None]:
+) -> Iterator[tuple[int, str | None]]:
     """Write pictures and masks for structure from motion, those that are not there.
 
     Upright, then portrait turned to landscape; masks grown by a margin. Yields the index of each

@@ -230,7 +230,7 @@ class EntropyConfig:
 class TrialConfig:
     """Short rounds of Newton from which the joint solve starts, see joint/initialise.py."""
 
-    # points of a round, >= 1. With a third of them residuals scatter by a tenth
+    # points of a round, >= 1. Of a third of them residuals scatter more than they differ
     points: int = 300
     # Newton steps of a round, >= 1; after three, from no map, too glossy still fits better than
     # right
@@ -240,7 +240,7 @@ class TrialConfig:
     # share, (0, 1], of the lowest residual so far that another roughness must not exceed
     better: float = 0.9
     # times the others' residual, > 0, that metal everywhere must not exceed for all to be metal:
-    # 0.8 to 1.1 where all is, 1.3 to 3 where some or nothing is
+    # 0.9 to 1.1 where all is, 1.3 and more where some or nothing is
     only_metal: float = 1.15
     # median of roughness, (0, 1], from which metal looks like paint and does not count there
     like_paint: float = 0.5
@@ -262,8 +262,8 @@ class TrialConfig:
 
     @property
     def rounds(self) -> int:
-        """Rounds of Newton on `points` points that take as long as all trials together."""
-        return 2 * (1 + len(self.roughness) + 1)
+        """Rounds of Newton in all trials, at most."""
+        return 2 * (len(self.roughness) + 2)
 
 
 @dataclass(frozen=True)

@@ -228,8 +228,8 @@ def start_(
         progress.trouble(trouble)
     if decisions.only_metal and cfg.only_metal is None:
         progress.say(
-            "all of it is taken for metal: that explains the photographs as well as anything else; "
-            "see --metal"
+            "the whole object is taken for metal: that explains the photographs about as well as "
+            "anything else; see --metal"
         )
     if not cfg.colors:
         return decisions

@@ -7,7 +7,6 @@ import logging
 import platform
 import shutil
 from collections.abc import Iterable
-from contextlib import closing
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -221,11 +220,10 @@ def _search(
     total = len(capture.photographs)
     unreadable = {}
     task = progress.add_task("reading", total=total)
-    with closing(write_pictures(capture, folders, config.size, config.mask_margin)) as written:
-        for index, why in written:
-            progress.advance(task)
-            if why is not None:
-                unreadable[index] = why
+    for index, why in write_pictures(capture, folders, config.size, config.mask_margin):
+        progress.advance(task)
+        if why is not None:
+            unreadable[index] = why
     if unreadable:
         names = [capture.photographs[i].path.name for i in unreadable]
         log.warning(f"{len(names)} could not be read: {_some(names)}")
