@@ -104,6 +104,7 @@ AXES = {
             quick=(0, 2, 3),
         ),
         _scenes("thin", "diameter of rods", "amount", (0.16, 0.08, 0.04, 0.02), shape="rods"),
+        _scenes("fur", "length of hairs", "amount", (0.0, 0.02, 0.05, 0.1), shape="fur"),
         Axis(
             "turntable",
             "cameras in 2 rings or 1; light still, or turning with them",

@@ -14,7 +14,10 @@ Distance: TypeAlias = Callable[[np.ndarray], np.ndarray]  # points [..., 3] to s
 Pattern: TypeAlias = Callable[[np.ndarray], np.ndarray]  # points [..., 3] to base colour [..., 3]
 
 SPACING = 0.0125  # of the grid that surfaces are marched on, world units
-SHAPES = ("figure", "box", "rods")
+SHAPES = ("figure", "box", "rods", "fur")
+FUR_RADIUS = 0.55  # of the ball under the fur, world units
+HAIRS = 6000
+HAIR_RADIUS = 0.006  # at the root, world units: half of a pixel
 
 
 @dataclass(frozen=True)
@@ -35,8 +38,8 @@ def build(shape: str, amount: float, roughness: float, metals: int) -> list[Part
     Args:
         shape: "figure", a ball on a rounded box, a ring around its foot; "box", an open box of
             width 0.9 with coloured walls and a ball in it; "rods", two plates with a ball and
-            rods between them.
-        amount: depth of the box, or diameter of the rods; the figure has none.
+            rods between them; "fur", a ball with hairs.
+        amount: depth of the box, diameter of the rods, or length of the hairs; the figure has none.
         roughness: of all parts.
         metals: how many parts are metal, the smallest first.
 
@@ -50,6 +53,8 @@ def build(shape: str, amount: float, roughness: float, metals: int) -> list[Part
             parts = _box(amount, roughness)
         case "rods":
             parts = _rods(amount, roughness)
+        case "fur":
+            parts = _fur(amount, roughness)
         case _:
             raise ValueError(f"shape must be of {', '.join(SHAPES)}, got {shape!r}")
     return [replace(p, metallic=1.0) if i < metals else p for i, p in enumerate(parts)]
@@ -189,6 +194,47 @@ def _rods(diameter: float, roughness: float) -> list[Part]:
             )
         )
     return parts
+
+
+def _fur(length: float, roughness: float) -> list[Part]:
+    """A ball with hairs thinner than a pixel, each of the ball's colour at its root."""
+    skin = _part(ball(FUR_RADIUS), (FUR_RADIUS,) * 3, _swirl, roughness)
+    if not length:
+        return [skin]
+    z, turn = 1 - (2 * np.arange(HAIRS) + 1) / HAIRS, np.arange(HAIRS) * np.pi * (3 - np.sqrt(5))
+    out = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], -1)
+    # They lean by up to 37 degrees, each its own way and most of them down
+    lean = np.random.default_rng(0).normal(size=(HAIRS, 3)) + np.array([0.0, 0.0, -0.7])
+    axis = out + 0.6 * lean / np.linalg.norm(lean, axis=1, keepdims=True)
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    root = FUR_RADIUS * out
+    vertices, normals, faces = cones(root - 0.03 * axis, axis, length + 0.03, HAIR_RADIUS)
+    base = np.broadcast_to(_swirl(root)[:, None], vertices.shape)
+    flat = [x.reshape(-1, 3).astype(np.float32) for x in (vertices, normals, base)]
+    return [skin, Part(flat[0], faces.reshape(-1, 3), *flat[1:], roughness)]
+
+
+def cones(
+    root: np.ndarray, axis: np.ndarray, length: float, radius: float, sides: int = 6
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Slim cones, closed at their feet: vertices and unit normals [K, sides + 2, 3], int32 faces
+    [K, 2 sides, 3].
+
+    Args:
+        root, axis: [K, 3] middle of the foot, and unit direction to the tip.
+    """
+    count = len(root)
+    side = np.cross(axis, np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0, 1]], [[1.0, 0, 0]]))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    angle = 2 * np.pi * np.arange(sides)[:, None] / sides
+    around = np.cos(angle) * side[:, None] + np.sin(angle) * np.cross(axis, side)[:, None]
+    foot = root[:, None] + radius * around
+    vertices = np.concatenate([foot, (root + length * axis)[:, None], root[:, None]], 1)
+    normals = np.concatenate([around, axis[:, None], -axis[:, None]], 1)
+    a = np.arange(sides)
+    b, tip, middle = (a + 1) % sides, np.full(sides, sides), np.full(sides, sides + 1)
+    one = np.concatenate([np.stack([a, b, tip], -1), np.stack([b, a, middle], -1)])
+    return vertices, normals, (one + (sides + 2) * np.arange(count)[:, None, None]).astype(np.int32)
 
 
 def _triple(values: np.ndarray) -> Triple:
