@@ -88,6 +88,7 @@ HELPERS = {
             "pixels",
             "divergence",
             "exchange",
+            "patches",
             "plateau",
             "progress",
             "step",

@@ -81,6 +81,9 @@ PRESETS = {
 COLORS_MINUTES = 1.5  # up to which materials have no time to follow a map that colours changed
 
 
+PATCHES_MINUTES = 1.5  # up to which comparing patches costs more steps than it brings
+
+
 HOLLOWS = 0.04  # share of the time: where opening them takes more it costs more than it brings
 
 
@@ -199,6 +202,7 @@ def _configuration(
     exposures, known = varying == "auto", "none" if varying == "auto" else varying
     steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
     lr_networks = (work.lr_networks, 3e-4)
+    compared = work.minutes > PATCHES_MINUTES
     coarse = StageConfig(
         0.9,
         steps // 2,
@@ -206,6 +210,7 @@ def _configuration(
         rays=rays // 2,
         sharpness=(0.7, 0.35),
         lr_networks=lr_networks,
+        patches_from=0.2 if compared else 1.0,  # before, there is no surface yet
         field="hash",
     )
     fine = StageConfig(
@@ -217,6 +222,7 @@ def _configuration(
         lr_sdf=(work.lr_sdf, 0.005),
         lr_networks=lr_networks,
         physical_from=0.3,
+        patches_from=0.0 if compared else 1.0,
         field="hash",
     )
     alone: dict[str, LightConfig] = {
@@ -286,6 +292,7 @@ def _hybrid_stages(
         plate=0.0,
         diffusion=0.0,
         physical_from=0.0,
+        patches_from=1.0,
         refit=True,
     )
     return coarse, fine, joint, refit

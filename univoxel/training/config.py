@@ -28,6 +28,8 @@ class StageConfig:
     spread: int = 4  # passes that smooth the sdf's gradient before the optimiser, >= 0
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 0.25]
     physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
+    # progress in [0, 1] at which patches of the surface are compared between photographs; 1: never
+    patches_from: float = 1.0
     refit: bool = False  # materials stay; light, radiance and silhouettes follow them
     # sparse: only bricks around the surface are stored; hash: features come from a hash table
     field: FieldName = "dense"
@@ -45,7 +47,7 @@ class StageConfig:
         check_fields(self, "at least 0", lambda x: x >= 0, "spread")
         check_fields(self, "in [0, 0.125]", lambda x: 0 <= x <= 0.125, "plate")
         check_fields(self, "in [0, 0.25]", lambda x: 0 <= x <= 0.25, "diffusion")
-        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "physical_from")
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "physical_from", "patches_from")
         check_fields(self, "dense, sparse or hash", lambda x: x in FIELDS, "field")
 
 
@@ -63,6 +65,7 @@ class LossConfig:
     # light up to a colour only
     white_light: float = 0.01
     map_smoothness: float = 1e-3  # total variation of the log map
+    patches: float = 0.2  # what patches of the surface lack in correlation between photographs
 
     def __post_init__(self) -> None:
         names = [f.name for f in fields(self)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from univoxel import losses, ranks
+from univoxel import losses, ranks, shelf
 from univoxel.camera import pixel_rays
 from univoxel.checkpoint import save_scene
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
@@ -22,6 +22,7 @@ from univoxel.optim import RowAdam, parameters_of
 from univoxel.records import Rays, Surface
 from univoxel.render.pipeline import at_rays, radiance_of, shade, surface_at
 from univoxel.scene import Scene
+from univoxel.training import patches
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
 from univoxel.training.exchange import summed_over_ranks_
@@ -80,6 +81,9 @@ def run_stage(
     guard.follow(optimizer)
     parameters = parameters_of(optimizer)
     ranks.as_first_([*scene.state_dict().values()])
+    compared = None
+    if cfg.loss.patches and stage.patches_from < 1 and not shelf.on_disk(pixels.photos.color):
+        compared = patches.comparable(pixels.photos)
     with scene.surface_held():
         for done in progress.clock.steps():
             physical = done >= stage.physical_from
@@ -98,7 +102,8 @@ def run_stage(
                 scene.release_surface()
 
             parts = ranks.mine(parts_of(pixels.trained, stage.rays, ranks.count()))
-            terms = descend_(scene, cfg.loss, pixels, parts, physical, parameters)
+            brightness = compared if done >= stage.patches_from else None
+            terms = descend_(scene, cfg.loss, pixels, parts, physical, parameters, brightness)
             terms = summed_over_ranks_(parameters, terms)
             if not guard.sound(torch.stack(list(terms.values())).sum()):
                 continue
@@ -130,15 +135,20 @@ def descend_(
     parts: Sequence[Part],
     physical: bool,
     parameters: Sequence[Tensor],
+    brightness: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Give every parameter the gradient of the loss of the parts; the terms, weighted."""
+    """Give every parameter the gradient of the loss of the parts; the terms, weighted.
+
+    Args:
+        brightness: as of `part_terms`.
+    """
     features = scene.field.features
     wanted = [p for p in parameters if p.requires_grad]
     descents = []
     for part in parts:
         # What is read beside the surface has a gradient of its own: torch adds sparse ones slowly
         beside = features.detach().requires_grad_()
-        terms = part_terms(scene, weight, pixels.photos, part, physical, beside)
+        terms = part_terms(scene, weight, pixels.photos, part, physical, beside, brightness)
         descents.append(descent(terms, part.share, [*wanted, beside]))
     for parameter in parameters:  # of one that no longer is trained an old gradient may be there
         parameter.grad = None
@@ -157,12 +167,25 @@ def part_terms(
     part: Part,
     physical: bool,
     beside: Tensor | None = None,
+    brightness: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """`objective` of a part of a step; beside as there."""
+    """`objective` of a part of a step; beside as there.
+
+    Args:
+        brightness: of the photographs, as of `patches.comparable`, where the surface's patches are
+            compared too.
+    """
     draw = torch.Generator().manual_seed(part.seed)
-    batch = batch_at(scene.registered(photos), part.pixels)
+    photos = scene.registered(photos)
+    batch = batch_at(photos, part.pixels)
     surface = surface_at(scene, batch.rays, torch.rand(len(batch.view), generator=draw))
-    return objective(scene, weight, surface, batch, physical, draw, beside)
+    terms = objective(scene, weight, surface, batch, physical, draw, beside)
+    if brightness is not None:
+        differ = patches.disagreement(
+            scene, brightness, photos.cameras, surface, batch.wo, part.pixels
+        )
+        terms["patches"] = weight.patches * differ
+    return terms
 
 
 def restore_surface_(scene: Scene) -> None:
@@ -224,7 +247,8 @@ def rehearsal(
     torch.manual_seed(cfg.seed)  # all rehearsals see the same rays
     # From middling rates on: what has been learned must not be shaken
     rates = {n: (math.sqrt(a * b), b) for n in RATES for a, b in [getattr(stage, n)]}
-    stage, cfg = replace(stage, physical_from=1.0, **rates), replace(cfg, patience=0.0)
+    stage = replace(stage, physical_from=1.0, patches_from=1.0, **rates)
+    cfg = replace(cfg, patience=0.0)
     run_stage(scene, cfg, stage, pixels, Rehearsal(steps))
     return held_out_psnr(scene, pixels.photos, pixels.held_out, physical=False)
 
