@@ -198,7 +198,7 @@ def _rods(diameter: float, roughness: float) -> list[Part]:
 
 def _fur(length: float, roughness: float) -> list[Part]:
     """A ball with hairs thinner than a pixel, each of the ball's colour at its root."""
-    skin = _part(ball(FUR_RADIUS), (FUR_RADIUS,) * 3, _swirl, roughness)
+    skin = _part(ball(FUR_RADIUS), (FUR_RADIUS, FUR_RADIUS, FUR_RADIUS), _swirl, roughness)
     if not length:
         return [skin]
     z, turn = 1 - (2 * np.arange(HAIRS) + 1) / HAIRS, np.arange(HAIRS) * np.pi * (3 - np.sqrt(5))
@@ -210,8 +210,10 @@ def _fur(length: float, roughness: float) -> list[Part]:
     root = FUR_RADIUS * out
     vertices, normals, faces = cones(root - 0.03 * axis, axis, length + 0.03, HAIR_RADIUS)
     base = np.broadcast_to(_swirl(root)[:, None], vertices.shape)
-    flat = [x.reshape(-1, 3).astype(np.float32) for x in (vertices, normals, base)]
-    return [skin, Part(flat[0], faces.reshape(-1, 3), *flat[1:], roughness)]
+    vertices, normals, base = (
+        x.reshape(-1, 3).astype(np.float32) for x in (vertices, normals, base)
+    )
+    return [skin, Part(vertices, faces.reshape(-1, 3), normals, base, roughness)]
 
 
 def cones(
