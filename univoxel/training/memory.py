@@ -14,7 +14,7 @@ from univoxel.training.config import StageConfig
 from univoxel.training.pixels import MOST
 
 # Bytes, as trainings on 13 to 133 million pixels, 0.25 to 4 million voxels, were seen to take
-PER_PIXEL = 21  # distances, masks and orders of pixels, besides the photographs themselves
+PER_PIXEL = 23  # distances, masks, orders, brightness, besides the photographs themselves
 PER_DRAWN = 48  # of a pixel that is trained on, where the photographs lie on disk: its row, twice
 PER_VOXEL = 100  # distances and features with gradients and moments, hulls, meshes
 PER_RAY = 40_000  # of a step: samples and what is between them
