@@ -1,15 +1,21 @@
 """The training loop's losses, and the sharpness that it ends with."""
 
+import json
 import math
 from dataclasses import fields
 from types import SimpleNamespace
 
 import pytest
 import torch
+from analytic import write_scene
 
+from univoxel.config import TrainConfig
+from univoxel.lights import SGConfig
 from univoxel.lights.base import Regularisation
-from univoxel.training import loop
-from univoxel.training.config import LossConfig
+from univoxel.scene import SceneConfig
+from univoxel.tasks.train import train
+from univoxel.training import loop, progress
+from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.loop import weighted
 
 
@@ -34,3 +40,24 @@ def test_the_density_ends_as_sharp_as_held_out_pixels_want_it(monkeypatch, best)
     loop.fit_sharpness_(scene, SimpleNamespace(photos=None, held_out=None))
     assert scene.inv_s == pytest.approx(10.0 * best)
     assert min(asked) < 10 < max(asked)
+
+
+def test_patches_are_compared_in_every_second_step_and_told_in_all(tmp_path, monkeypatch):
+    compared = []
+
+    def disagreement(scene, brightness, cameras, surface, *_):
+        compared.append(len(surface.depth))
+        return 0.5 + 0 * surface.depth.sum()
+
+    monkeypatch.setattr(loop.patches, "disagreement", disagreement)
+    monkeypatch.setattr(progress, "REPORT_SECONDS", -1.0)
+    data = write_scene(tmp_path / "data", views=8, size=24)
+    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
+    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, sky_nodes=0, light=light)
+    stage = StageConfig(voxels=0.01, iterations=20, share=1.0, rays=64, patches_from=0.42)
+    cfg = TrainConfig(data, tmp_path / "run", (stage,), minutes=2.0, scene=sizes)
+    train(cfg)
+    assert len(compared) == 5
+    lines = [json.loads(line) for line in (cfg.out / "log.jsonl").read_text().splitlines()]
+    told = [line["losses"].get("patches") for line in lines]
+    assert told == [None] * 10 + [pytest.approx(0.5 * cfg.loss.patches)] * 10

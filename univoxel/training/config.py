@@ -65,7 +65,8 @@ class LossConfig:
     # light up to a colour only
     white_light: float = 0.01
     map_smoothness: float = 1e-3  # total variation of the log map
-    patches: float = 0.2  # what patches of the surface lack in correlation between photographs
+    # what patches of the surface lack in correlation between photographs, in every second step
+    patches: float = 0.4
 
     def __post_init__(self) -> None:
         names = [f.name for f in fields(self)]

@@ -41,6 +41,7 @@ from univoxel.training.surface_update import (
     smooth_touched_,
 )
 
+COMPARE_EVERY = 2  # steps: patches in each bring little more, and cost twice as much
 RETRACE = 100  # steps after which light is traced through the surface as it has become
 RATES = ("lr_sdf", "lr_features", "lr_networks")
 # Of so many rays one is compared with a place beside it, for which networks are evaluated again:
@@ -84,6 +85,7 @@ def run_stage(
     compared = None
     if cfg.loss.patches and stage.patches_from < 1 and not shelf.on_disk(pixels.photos.color):
         compared = patches.comparable(pixels.photos)
+    shown: dict[str, Tensor] = {}
     with scene.surface_held():
         for done in progress.clock.steps():
             physical = done >= stage.physical_from
@@ -102,11 +104,13 @@ def run_stage(
                 scene.release_surface()
 
             parts = ranks.mine(parts_of(pixels.trained, stage.rays, ranks.count()))
-            brightness = compared if done >= stage.patches_from else None
+            look = done >= stage.patches_from and progress.clock.step % COMPARE_EVERY == 0
+            brightness = compared if look else None
             terms = descend_(scene, cfg.loss, pixels, parts, physical, parameters, brightness)
             terms = summed_over_ranks_(parameters, terms)
             if not guard.sound(torch.stack(list(terms.values())).sum()):
                 continue
+            shown |= terms  # where patches are not compared, as they were last
             if stage.refit:
                 field.encoding.hold_channels_(scene.material.channels)
             if stage.spread:
@@ -120,7 +124,7 @@ def run_stage(
                     progress.clock.shorten()
             if progress.due():
                 quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
-                progress.report({k: v.item() for k, v in terms.items()}, quality)
+                progress.report({k: v.item() for k, v in shown.items()}, quality)
                 guard.judge(quality, physical)
             if progress.checkpoint_due():
                 save_scene(scene, cfg.out, progress.state())
