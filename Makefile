@@ -12,7 +12,7 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test page-test network-test fuzz kill-test lint format bench docs docs-check docs-write asan tsan audit wheel wheel-test clean
+.PHONY: help dev demo test page-test network-test fuzz kill-test lint format bench profile docs docs-check docs-write asan tsan audit wheel wheel-test clean
 .DELETE_ON_ERROR:
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo "make docs    build the documentation into build/docs; warnings are errors"
 	@echo "make docs-check  compare pages with results and code; docs-write brings them up to date"
 	@echo "make bench   time every op against its peers and draw the charts"
+	@echo "make profile  where a training's time goes: threads, stages, a flame graph; SCENE= PRESET="
 	@echo "make asan    the ops' tests under address and undefined-behaviour sanitizers"
 	@echo "make tsan    the ops' tests under the thread sanitizer"
 	@echo "make audit   ask the package index for known holes of what is installed; needs its network"
@@ -98,6 +99,21 @@ build/.bench: build/.installed benchmarks/bare_embree.cpp
 bench: dev .venv/.bench build/.bench
 	$(BIN)/python benchmarks/ops.py
 	$(BIN)/python benchmarks/charts.py
+
+# Three trainings' worth and more, with nothing else running. PROFILE=benchmarks/results is where
+# the pages read from.
+SCENE ?= univoxel/example_data/tiny
+PRESET ?= draft
+PROFILE ?= build/profile
+profile: dev .venv/.bench
+	mkdir -p $(PROFILE) build/profile
+	$(BIN)/python benchmarks/threads.py $(SCENE) --preset $(PRESET) --out $(PROFILE)/threads.json
+	$(BIN)/python benchmarks/profile_run.py $(SCENE) --preset $(PRESET) --minutes 60 --cpu \
+		--out $(PROFILE)/profile.json
+	rm -rf build/profile/run
+	$(BIN)/py-spy record --native --rate 50 --output $(PROFILE)/flame.svg -- $(BIN)/python \
+		-m univoxel.cli train $(SCENE) --preset $(PRESET) --minutes 60 --no-page \
+		--threads 1 --out build/profile/run
 
 .venv/.docs: $(SETUP)
 	scripts/venv.sh $(PYTHON) docs
