@@ -272,7 +272,7 @@ def test_a_scheduler_that_is_gone_is_said_and_its_work_ends(tmp_path):
     with scheduler(tmp_path) as (running, address), worker(address), machines(1, address) as client:
 
         def kill() -> None:
-            wait_for(lambda: begun(tmp_path, "mug"))
+            wait_for((tmp_path / "mug" / "at").exists)  # it has been at work
             running.kill()
 
         threading.Thread(target=kill).start()

@@ -16,7 +16,7 @@ from analytic import write_scene
 from clusters import scheduler, wait_for, worker
 
 from univoxel.batch.results import SceneResult, as_csv
-from univoxel.batch.scenes import Share, Wanted, bytes_of, named, piece_of, share
+from univoxel.batch.scenes import PER_PIXEL, Share, Wanted, bytes_of, named, piece_of, share
 from univoxel.batch.sheet import write_sheet
 from univoxel.checkpoint import FILE, load_checkpoint
 from univoxel.cli import main
@@ -24,6 +24,7 @@ from univoxel.config import save_config
 from univoxel.errors import ExistingFile, MissingExtra, ProcessFailed, UserError
 from univoxel.machine import Memory
 from univoxel.tasks import batch as task
+from univoxel.training.memory import PER_PIXEL as FURTHER
 
 TINY = (
     *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),
@@ -317,7 +318,8 @@ def test_a_machine_is_shared(scenes, tmp_path):
 def test_more_pictures_need_more_memory(scenes, tmp_path):
     config = Wanted().training(Path(), Path())
     many = write_scene(tmp_path / "many", views=12, size=64)
-    assert bytes_of(many, config) - bytes_of(scenes[0], config) == 28 * (14 * 64**2 - 8 * 16**2)
+    each = PER_PIXEL + FURTHER  # the photograph, and what training makes of it
+    assert bytes_of(many, config) - bytes_of(scenes[0], config) == each * (14 * 64**2 - 8 * 16**2)
     (many / "train" / "r_0.png").write_bytes(b"")  # the next one tells
     assert bytes_of(many, config) > bytes_of(scenes[0], config)
 
