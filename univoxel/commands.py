@@ -1018,7 +1018,7 @@ def stress(
     Renders small scenes with Mitsuba 3, made harder along one axis each, spoils their photographs,
     trains and measures. Writes DIR/stress.md with the breaking point of each axis, stress.json,
     stress.png and stress.svg.
-    Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, rough-masks, thin,
+    Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, rough-masks, thin, fur,
     turntable, noise, placement, dark, bright; light-varying is trained with --varying light. A
     training that fails is a result. What is done is kept: the same command goes on.
 

@@ -13,25 +13,36 @@ from univoxel.sphere import latlong_directions, texel_solid_angles
 
 GREY = 0.5  # albedo of the ball
 TEXELS = 64  # rows of the map that light is summed over
+BLOCK = 64  # normals at a time: what each gets of every texel stays in the cache
 
 
 def map_and_balls(map: Tensor, height: int) -> list[Tensor]:
     """A map, and a grey and a mirror ball under it, seen from +X: linear, `height` rows each."""
-    y, z = torch.meshgrid(*2 * [(2 * torch.arange(height) + 1) / height - 1], indexing="xy")
-    z = -z
-    inside = y * y + z * z < 1
-    normal = torch.stack([(1 - y * y - z * z).clamp_min(0).sqrt(), y, z], -1)
+    normal, inside = _ball(height)
+    grey = torch.zeros(height, height, 3)
+    grey[inside] = grey_ball(map, normal[inside])
+    return [lookup(EnvMap(map), latlong_directions(height)), grey, mirror_ball(map, height)]
+
+
+def mirror_ball(map: Tensor, height: int) -> Tensor:
+    """A ball [height, height, 3] that mirrors a map, seen from +X: linear, black around it."""
+    normal, inside = _ball(height)
     mirrored = 2 * normal[..., :1] * normal - torch.tensor([1.0, 0.0, 0.0])
-    light = EnvMap(map)
-    grey = grey_ball(map, normal.flatten(0, 1)).view(height, height, 3)
-    balls = [torch.where(inside[..., None], b, 0.0) for b in (grey, lookup(light, mirrored))]
-    return [lookup(light, latlong_directions(height)), *balls]
+    return torch.where(inside[..., None], lookup(EnvMap(map), mirrored), 0.0)
 
 
 def grey_ball(map: Tensor, normal: Tensor) -> Tensor:
     """Radiance [N, 3] of a Lambertian ball of albedo GREY at unit normals [N, 3]."""
     direction, light = summed_light(map)
-    return GREY / math.pi * (normal @ direction.T).clamp_min(0) @ light
+    reached = [(part @ direction.T).clamp_min_(0) @ light for part in normal.split(BLOCK)]
+    return GREY / math.pi * torch.cat(reached)
+
+
+def _ball(height: int) -> tuple[Tensor, Tensor]:
+    """Normals [height, height, 3] of a ball seen from +X, and where it is [height, height]."""
+    y, z = torch.meshgrid(*2 * [(2 * torch.arange(height) + 1) / height - 1], indexing="xy")
+    depth = 1 - y * y - z * z
+    return torch.stack([depth.clamp_min(0).sqrt(), y, -z], -1), depth > 0
 
 
 def summed_light(map: Tensor) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from univoxel.data.maps import true_map
 from univoxel.data.radiance import write_radiance
 from univoxel.errors import UserError
 from univoxel.names import MAP_ROWS
-from univoxel.pictures.balls import grey_ball, map_and_balls, summed_light
+from univoxel.pictures.balls import BLOCK, grey_ball, map_and_balls, mirror_ball, summed_light
 from univoxel.run import trained_on
 from univoxel.scene import Scene
 from univoxel.sphere import fibonacci_sphere
@@ -114,7 +114,7 @@ def compare(recovered: Tensor, true: Tensor) -> Comparison:
     angle = 2 * torch.atan2((a - b).norm(), (a + b).norm())  # exact at small angles too
     psnr = metrics.psnr(encoded[0][None], encoded[1][None])
     exposure = _exposure(true)
-    mirrors = [linear_to_srgb(map_and_balls(m * exposure, BALL)[2]) for m in (recovered, true)]
+    mirrors = [linear_to_srgb(mirror_ball(m * exposure, BALL)) for m in (recovered, true)]
     inside = torch.linspace(-1, 1, BALL).square()
     disc = inside[:, None] + inside < 1
     return Comparison(psnr, float(angle.rad2deg()), metrics.psnr(mirrors[0], mirrors[1], disc))
@@ -129,8 +129,9 @@ def brightest(map: Tensor) -> Tensor:
     """Unit direction [3] of the brightest place after a Gaussian blur."""
     direction, light = summed_light(map)
     place = fibonacci_sphere(2 * NORMALS)
-    near = ((place @ direction.T - 1) / BLUR**2).exp()
-    return place[(near @ luminance(light)).argmax()]
+    bright = luminance(light)
+    near = [((part @ direction.T - 1) / BLUR**2).exp_() @ bright for part in place.split(BLOCK)]
+    return place[torch.cat(near).argmax()]
 
 
 def _scale(recovered: Tensor, true: Tensor) -> Tensor:
