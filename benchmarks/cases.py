@@ -456,6 +456,35 @@ def semi_global(side: int = 200, steps: int = 48) -> Case:
     )
 
 
+def patch_correlation(patches: int = 256, others: int = 4, side: int = 5) -> Case:
+    """Patches of the table, all around its middle."""
+    size = 200
+    pictures, matrix, origin, direction, *_ = _table(9, size)
+    g = torch.Generator().manual_seed(0)
+    row, column = torch.randint(size // 4, 3 * size // 4, (2, patches), generator=g)
+    at = row * size + column
+    steps = torch.tensor([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).expand(patches, 2, 3) / size
+    rays = torch.cat([direction[at, None], steps], 1)
+    pixel = torch.arange(side) - side // 2
+    down, right = (t.flatten() for t in torch.meshgrid(pixel, pixel, indexing="ij"))
+    brightness = pictures[..., 0].float() / 255
+    own = brightness[0, row[:, None] + down, column[:, None] + right]
+    position = (origin[at] + 1.99 * direction[at]).requires_grad_()
+    normal = torch.tensor([0.05, 0.0, 1.0]).repeat(patches, 1).requires_grad_()
+    views = torch.randint(1, 9, (patches, others), generator=g)
+    samples = patches * others * side * side
+    return Case(
+        "patch_correlation",
+        f"{patches} patches of {side}x{side} pixels, {others} views",
+        lambda *seen: ops.patch_correlation(*seen[:5], views, *seen[5:])[0],
+        lambda *seen: ops.patch_correlation_reference(*seen[:5], views, *seen[5:])[0],
+        (brightness, matrix, origin[at], rays, own, position, normal),
+        # A pixel: its place, four corners, and its part in the sums, forward and backward
+        {"fma": 2.0 * 30 * samples},
+        tolerance=1e-3,  # positions of 100 pixels
+    )
+
+
 CASES: list[tuple[str, Callable[[], Case]]] = [
     ("composite", composite),
     ("sample_dense", lambda: sample_dense(160)),
@@ -477,4 +506,5 @@ CASES: list[tuple[str, Callable[[], Case]]] = [
     ("decode_lobes", decode_lobes),
     ("match_cost", match_cost),
     ("semi_global", semi_global),
+    ("patch_correlation", patch_correlation),
 ]

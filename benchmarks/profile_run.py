@@ -31,7 +31,7 @@ from univoxel.ops import VisibilityScene
 from univoxel.preparation import prepare
 from univoxel.presets import chosen
 from univoxel.tasks import train
-from univoxel.training import loop
+from univoxel.training import loop, patches
 from univoxel.training.config import StageConfig
 
 HERE = Path(__file__).parent
@@ -59,6 +59,7 @@ PARTS = {
     "cameras": [(prepare, "registered_poses")],
     "loading": [(train, "load_photos")],
     "mesh for rays": [(VisibilityScene, "__init__")],
+    "patches": [(patches, "comparable"), (patches, "disagreement")],
     **ONCE,
 }
 

@@ -1,8 +1,56 @@
 #include "stereo.h"
 
 #include "bindings/common.h"
+#include "patches.h"
 
 namespace univoxel {
+namespace {
+
+template <class T>
+void bind_patch_correlation(py::module_& m) {
+    def(m, "patch_correlation",
+        "brightness projection origin direction own views position normal correlation seen pulls "
+        "noise threads",
+        [](const std::variant<array<uint16_t>, array<T>>& brightness, In<T> projection,
+           In<T> origin, In<T> direction, In<T> own, In<int64_t> views, In<T> position,
+           In<T> normal, Out<T> correlation, Out<uint8_t> seen, Out<T> pulls, double noise,
+           int threads) {
+            Patches<T> in{{},
+                          projection.data(),
+                          origin.data(),
+                          direction.data(),
+                          own.data(),
+                          views.data(),
+                          position.data(),
+                          normal.data(),
+                          0,
+                          0,
+                          0,
+                          own.shape(0),
+                          own.shape(1),
+                          views.shape(1)};
+            std::visit(
+                [&](const auto& a) {
+                    in.brightness = a.data();
+                    in.V = a.shape(0), in.H = a.shape(1), in.W = a.shape(2);
+                },
+                brightness);
+            const int64_t n = in.N, k = in.K, v = in.V;
+            require(in.H >= 2 && in.W >= 2 && projection.size() == 12 * v &&
+                        origin.size() == 3 * n && direction.size() == 9 * n &&
+                        views.size() == n * k && position.size() == 3 * n &&
+                        normal.size() == 3 * n && correlation.size() == n * k &&
+                        seen.size() == n * k && pulls.size() == 6 * n * k,
+                    "patch_correlation: sizes do not fit");
+            require(all_of<int64_t>(views, [=](int64_t i) { return i >= 0 && i < v; }),
+                    "patch_correlation: views must lie in [0, V=" + std::to_string(v) + ")");
+            const PatchResult<T> out{correlation.mutable_data(), seen.mutable_data(),
+                                     pulls.mutable_data()};
+            patch_correlation(in, out, T(noise), threads);
+        });
+}
+
+}  // namespace
 
 void bind_stereo_ops(py::module_& m) {
     def(m, "match_cost",
@@ -29,6 +77,8 @@ void bind_stereo_ops(py::module_& m) {
             semi_global(cost.data(), rows.data(), rows.shape(0), rows.shape(1), cost.shape(0),
                         cost.shape(1), small, large, sum.mutable_data(), threads);
         });
+    bind_patch_correlation<float>(m);
+    bind_patch_correlation<double>(m);
 }
 
 }  // namespace univoxel

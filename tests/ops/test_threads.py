@@ -67,8 +67,24 @@ def march():
     return (least, samples.t, samples.connected, samples.offsets), []
 
 
+def patch_correlation():
+    g = torch.Generator().manual_seed(2)
+    pictures = torch.rand(3, 30, 40, generator=g)
+    views = torch.randint(0, 3, (N, 2), generator=g)
+    turn, position = normal(3, 3, 4, grad=False), normal(N, 3)
+    plane = [position, unit(N, seed=3)]
+    rays = normal(N, 3, 3, seed=4, grad=False)
+    own = torch.rand(N, 9, generator=g)
+    origin = normal(N, 3, seed=5, grad=False)
+    return ops.patch_correlation(pictures, turn, origin, rays, own, views, *plane), plane
+
+
 @pytest.mark.parametrize(
-    "op", [composite, shade_sg, decode_lobes, shade_radiance, specular_response, march]
+    "op",
+    [
+        *(composite, shade_sg, decode_lobes, shade_radiance, specular_response, march),
+        patch_correlation,
+    ],
 )
 def test_same_bits(op):
     before, runs = torch.get_num_threads(), []

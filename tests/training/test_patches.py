@@ -8,12 +8,10 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from univoxel.camera import Cameras, image_rays
+from univoxel.camera import Cameras, image_rays, projection_matrices
 from univoxel.data import Photos
-from univoxel.presets import preset
 from univoxel.records import Rays, Surface
 from univoxel.training import patches
-from univoxel.training.config import StageConfig
 
 EYES = torch.tensor(
     [[0.0, 0.0, 3.0], [0.9, 0.0, 3.0], [-0.9, 0.2, 2.9], [0.1, 0.8, 3.0], [0.0, -0.8, 3.1]]
@@ -170,19 +168,9 @@ def test_views_from_almost_the_same_place_are_left_out():
     pose[1:, :, 3] = eyes
     three = replace(cameras().of(torch.tensor([0, 0, 1, 2])), camera_to_world=pose)
     position, normal = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]])
-    others, seen = patches.views_beside(
-        nothing_hides(), three, position, normal, torch.zeros(1, dtype=torch.int64)
-    )
+    view, matrices = torch.zeros(1, dtype=torch.int64), projection_matrices(three)
+    others, seen = patches.views_beside(nothing_hides(), three, matrices, position, normal, view)
     assert set(others[seen].tolist()) == {2, 3}
-
-
-def test_presets_compare_patches_where_there_is_time():
-    def begins(name):
-        stages = preset(name, Path("data"), Path("out")).stages
-        return [s.patches_from for s in stages if isinstance(s, StageConfig)]
-
-    assert begins("draft") == [1.0, 1.0, 1.0]
-    assert begins("fast") == begins("full") == [0.2, 0.0, 1.0]
 
 
 def test_bytes_are_as_bright_as_what_they_stand_for():

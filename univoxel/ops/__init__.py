@@ -15,6 +15,7 @@ from univoxel.ops.lobes import decode_lobes, decode_lobes_reference
 from univoxel.ops.march import brick_minimum, march, march_reference
 from univoxel.ops.mlp import mlp, mlp_reference
 from univoxel.ops.native import NativeStatus, native_status, use_backend
+from univoxel.ops.patches import patch_correlation, patch_correlation_reference
 from univoxel.ops.response import specular_response, specular_response_reference
 from univoxel.ops.sg import shade_sg, shade_sg_reference
 from univoxel.ops.shade import (
@@ -66,6 +67,8 @@ __all__ = [
     "mlp_reference",
     "native_status",
     "occluded_reference",
+    "patch_correlation",
+    "patch_correlation_reference",
     "relight",
     "sample_dense",
     "sample_dense_reference",

@@ -19,6 +19,7 @@ from univoxel.camera import Cameras, projection_matrices
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.data.base import coverage_of
+from univoxel.ops import patch_correlation
 from univoxel.records import Surface
 from univoxel.scene import Scene
 
@@ -92,8 +93,9 @@ def disagreement(
         own, index = own[alike][:RAYS], index[alike][:RAYS]
         if not len(index):
             return torch.zeros(())
+        matrices = projection_matrices(cameras)
         others, seen = views_beside(
-            scene, cameras, surface.position[index], surface.normal[index], view[index]
+            scene, cameras, matrices, surface.position[index], surface.normal[index], view[index]
         )
         enough = seen.sum(1) >= FEWEST
         own, index, others, seen = own[enough], index[enough], others[enough], seen[enough]
@@ -101,12 +103,19 @@ def disagreement(
             return torch.zeros(())
         view, row, column, wo = view[index], row[index], column[index], wo.detach()[index]
         eye = cameras.camera_to_world[view, :, 3]
-    depth, normal = surface.depth[index], surface.normal[index]
-    along = patch_depths(cameras, view, row, column, eye - depth[:, None] * wo, normal)
-    x, y = projected(cameras, view, row, column, along, others)
-    other, least = brightness_at(brightness, others, x, y)
-    seen = seen & (least >= 0).all(2)
-    missing = torch.where(seen, 1 - correlation(own[:, None], other), 2.0)
+    correlation, shown = patch_correlation(
+        brightness,
+        matrices,
+        eye,
+        patch_directions(cameras, view, row, column),
+        own,
+        others,
+        eye - surface.depth[index, None] * wo,
+        surface.normal[index],
+        NOISE,
+    )
+    seen = seen & shown
+    missing = torch.where(seen, 1 - correlation, 2.0)
     # The better half of the views: one that sees something else has no say
     best = torch.arange(missing.shape[1]) < (seen.sum(1, keepdim=True) + 1) // 2
     missing = missing.sort(1).values.clamp_max(MOST)
@@ -127,19 +136,26 @@ def own_patches(
 
 
 def views_beside(
-    scene: Scene, cameras: Cameras, position: Tensor, normal: Tensor, view: Tensor
+    scene: Scene,
+    cameras: Cameras,
+    matrices: Tensor,
+    position: Tensor,
+    normal: Tensor,
+    view: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Views beside those that points [N, 3] are seen in: numbers [N, K], and whether they see the
-    points too [N, K] bool; those that do come first."""
+    points too [N, K] bool; those that do come first.
+
+    Args:
+        matrices: [V, 3, 4] as of `projection_matrices`.
+    """
     towards = normalize(cameras.camera_to_world[:, :, 3] - position[:, None], dim=-1)  # [N, V, 3]
     turned = (towards * towards[torch.arange(len(view)), view][:, None]).sum(-1)
     turned = turned.masked_fill(turned > MAX_COSINE, -2.0)
     near, others = turned.topk(min(NEAR, len(cameras)), dim=1)
     towards = towards.gather(1, others[..., None].expand(-1, -1, 3))
     homogeneous = torch.cat([position, torch.ones_like(position[:, :1])], 1)
-    x, y, z = (projection_matrices(cameras)[others] @ homogeneous[:, None, :, None])[..., 0].unbind(
-        2
-    )
+    x, y, z = (matrices[others] @ homogeneous[:, None, :, None])[..., 0].unbind(2)
     row, column = (y / z).floor().long(), (x / z).floor().long()
     width, height = cameras.size_of_each().expand(len(cameras), 2)[others].unbind(-1)
     seen = (near > -2) & (z > 0) & ((normal[:, None] * towards).sum(-1) > MIN_COSINE)
@@ -161,61 +177,19 @@ def patch_pixels(row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def patch_directions(cameras: Cameras, view: Tensor, row: Tensor, column: Tensor) -> Tensor:
-    """Directions [N, 3, M] through the pixels of patches; 1 along the camera's axis."""
-    rows, columns = patch_pixels(row, column)
-    pixel = torch.stack([columns, rows], 1) + 0.5
-    local = (pixel - cameras.centre[view][..., None]) / cameras.focal[view][..., None]
-    local = torch.stack([local[:, 0], -local[:, 1], -torch.ones_like(local[:, 0])], 1)
-    return cameras.camera_to_world[view, :, :3] @ local
-
-
-def patch_depths(
-    cameras: Cameras, view: Tensor, row: Tensor, column: Tensor, position: Tensor, normal: Tensor
-) -> Tensor:
-    """1 / depth [N, M] along the axis at which the pixels of patches meet the plane through
-    positions [N, 3] with normals [N, 3]."""
-    direction = patch_directions(cameras, view, row, column)
-    away = (normal * (position - cameras.camera_to_world[view, :, 3])).sum(1, keepdim=True)
-    return (normal[:, :, None] * direction).sum(1) / away
-
-
-def projected(
-    cameras: Cameras, view: Tensor, row: Tensor, column: Tensor, nearness: Tensor, others: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Pixel coordinates x and y [N, K, M] in other views [N, K] of what patches show at
-    1 / depth [N, M]."""
-    matrix = projection_matrices(cameras)[others]  # [N, K, 3, 4]
-    eye = cameras.camera_to_world[view, :, 3]
-    origin = (matrix[..., :3] @ eye[:, None, :, None]) + matrix[..., 3:]
-    far = matrix[..., :3] @ patch_directions(cameras, view, row, column)[:, None]
-    x, y, z = (origin * nearness[:, None, None] + far).unbind(2)
-    z = torch.where(z > 1e-6, z, torch.inf)  # behind the camera: a pixel in the corner
-    return x / z, y / z
-
-
-def brightness_at(brightness: Tensor, view: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Brightness [N, K, M] at pixel coordinates of views [N, K], with gradients to x and y, and
-    the least of the pixels beside them."""
-    height, width = brightness.shape[1:]
-    with torch.no_grad():
-        column = (x - 0.5).floor().clamp(0, width - 2)
-        row = (y - 0.5).floor().clamp(0, height - 2)
-        first = (view[..., None] * height + row.long()) * width + column.long()
-        flat = brightness.view(-1)
-        a, b, c, d = (flat[first + beside].float() for beside in (0, 1, width, width + 1))
-        least = torch.minimum(torch.minimum(a, b), torch.minimum(c, d))
-    u, v = x - 0.5 - column, y - 0.5 - row
-    return a + u * (b - a) + v * (c - a) + u * v * (a - b - c + d), least
+    """Directions [N, 3, 3] through the middles of patches, 1 along the camera's axis, and what a
+    column and a row add to them."""
+    right, up, back = cameras.camera_to_world[view, :, :3].unbind(2)
+    by_column, by_row = (
+        turn / f[:, None]
+        for turn, f in zip((right, -up), cameras.focal[view].unbind(1), strict=True)
+    )
+    away = torch.stack([column, row], 1) + 0.5 - cameras.centre[view]
+    middle = away[:, :1] * by_column + away[:, 1:] * by_row - back
+    return torch.stack([middle, by_column, by_row], 1)
 
 
 def pixels_at(brightness: Tensor, view: Tensor, row: Tensor, column: Tensor) -> Tensor:
     """Brightness of pixels, of the shape that view, row and column have together."""
     height, width = brightness.shape[1:]
     return brightness.view(-1)[(view * height + row) * width + column].float()
-
-
-def correlation(a: Tensor, b: Tensor) -> Tensor:
-    """Normalised cross-correlation over the last dimension, of brightness."""
-    a, b = a - a.mean(-1, keepdim=True), b - b.mean(-1, keepdim=True)
-    power = (a.square().mean(-1) + NOISE**2) * (b.square().mean(-1) + NOISE**2)
-    return (a * b).mean(-1) / power.sqrt()

@@ -1,0 +1,207 @@
+"""Patches between photographs: native against reference, a plane that is known, bad arguments."""
+
+import math
+
+import pytest
+import torch
+from check_op import check_op
+
+from univoxel.camera import Cameras, projection_matrices
+from univoxel.ops import patch_correlation, patch_correlation_reference
+from univoxel.ops.patches import _patch_correlation
+
+SIZE, FOCAL = 48, 60.0
+
+
+def cameras(views=4):
+    """On a circle about the origin, 3 away, looking at it."""
+    poses = []
+    for k in range(views):
+        angle = torch.tensor(0.35 * k)
+        back = torch.stack([angle.cos(), angle.sin(), torch.tensor(0.3)])
+        back = back / back.norm()
+        right = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), back)
+        right = right / right.norm()
+        up = torch.linalg.cross(back, right)
+        poses.append(torch.stack([right, up, back, 3 * back], 1))
+    lens = torch.full((views, 2), FOCAL), torch.full((views, 2), SIZE / 2)
+    return Cameras(torch.stack(poses), *lens, SIZE, SIZE)
+
+
+def rays_of(known, view, row, column):
+    """Origins, and directions through pixels with what columns and rows add to them."""
+    pose = known.camera_to_world[view].double()
+    local = torch.stack([(column + 0.5 - SIZE / 2) / FOCAL, -(row + 0.5 - SIZE / 2) / FOCAL], 1)
+    right, up, back = pose[:, :, :3].unbind(2)
+    middle = local[:, :1] * right + local[:, 1:] * up - back
+    return pose[:, :, 3].contiguous(), torch.stack([middle, right / FOCAL, -up / FOCAL], 1)
+
+
+def case(n=5, k=3, side=5, seed=0, noise=0.05):
+    g = torch.Generator().manual_seed(seed)
+    known = cameras()
+    view = torch.randint(0, 4, (n,), generator=g)
+    row, column = torch.randint(10, SIZE - 10, (2, n), generator=g)
+    origin, direction = rays_of(known, view, row, column)
+    depth = 2.9 + 0.2 * torch.rand(n, 1, generator=g, dtype=torch.float64)
+    position = origin + depth * direction[:, 0]
+    normal = -direction[:, 0] + 0.3 * torch.randn(n, 3, generator=g, dtype=torch.float64)
+    # Smooth, or coordinates in float32 lie in other cells than in float64, with other slopes
+    x = torch.arange(SIZE, dtype=torch.float64) / SIZE
+    phase = torch.rand(4, 1, 1, generator=g, dtype=torch.float64)
+    picture = 2 + torch.sin(9 * x + 6 * phase) * torch.cos(7 * x[:, None] - 3 * phase)
+    return (
+        picture,
+        projection_matrices(known).double(),
+        origin,
+        direction,
+        torch.rand(n, side * side, generator=g, dtype=torch.float64),
+        torch.randint(0, 4, (n, k), generator=g),
+        position.requires_grad_(),
+        normal.requires_grad_(),
+        noise,
+    )
+
+
+def counted(op):
+    """The op with 0 and 1 in place of what numbers cannot be taken from."""
+
+    def call(*arguments):
+        correlation, seen = op(*arguments)
+        return correlation, seen.long()
+
+    return call
+
+
+def test_native_equals_reference():
+    cases = [case(), case(40, 4, 3, seed=1), case(3, 1, 1, seed=2), case(0), case(2, 0)]
+    # Slopes of the picture change from cell to cell, where rounding may choose another
+    rtol = {torch.float32: 2e-4, torch.float64: 1e-11}
+    check_op(counted(patch_correlation), counted(patch_correlation_reference), cases, rtol)
+
+
+def test_halves_are_what_they_hold():
+    picture, *others = case()
+    picture = picture.half()
+    whole = patch_correlation(picture.double(), *others)
+    for got, wanted in zip(patch_correlation(picture, *others), whole, strict=True):
+        torch.testing.assert_close(got, wanted, rtol=1e-12, atol=0)
+
+
+def test_opcheck():
+    torch.library.opcheck(_patch_correlation.defined, case())
+
+
+def test_whole_graph_compiles():
+    arguments = case()
+
+    @torch.compile(fullgraph=True)
+    def loss(*arguments):
+        return patch_correlation(*arguments)[0].square().sum()
+
+    leaves = arguments[6:8]
+    wanted = patch_correlation_reference(*arguments)[0].square().sum()
+    got, wanted = (torch.autograd.grad(x, leaves) for x in (loss(*arguments), wanted))
+    torch.testing.assert_close(got, wanted)
+
+
+def textured(known, depth=0.0):
+    """Photographs of a plane x = depth with a pattern on it, and their matrices."""
+    matrix = projection_matrices(known).double()
+    row, column = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    pictures = []
+    for view in range(len(known)):
+        where = torch.full((SIZE * SIZE,), view)
+        origin, direction = rays_of(known, where, row.flatten(), column.flatten())
+        ray = direction[:, 0]
+        point = origin + ((depth - origin[:, :1]) / ray[:, :1]) * ray
+        pattern = 0.5 + 0.2 * (12 * point[:, 1]).sin() + 0.2 * (15 * point[:, 2]).cos()
+        pictures.append(pattern.view(SIZE, SIZE))
+    return torch.stack(pictures), matrix
+
+
+def on_plane(known, pictures, matrix, depth):
+    """Arguments for patches of the first view, on a plane x = depth."""
+    row, column = (t.flatten() for t in torch.meshgrid(*2 * [torch.arange(14, 34, 5)], indexing="ij"))
+    view = torch.zeros(len(row), dtype=torch.int64)
+    origin, direction = rays_of(known, view, row, column)
+    step = torch.arange(-2, 3)
+    down, right = (t.flatten() for t in torch.meshgrid(step, step, indexing="ij"))
+    own = pictures[0, row[:, None] + down, column[:, None] + right]
+    t = (depth - origin[:, :1]) / direction[:, 0, :1]
+    normal = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(len(row), 3)
+    views = torch.tensor([1, 2]).expand(len(row), 2)
+    return pictures, matrix, origin, direction, own, views, origin + t * direction[:, 0], normal
+
+
+def test_the_right_plane_correlates_best():
+    known = cameras()
+    pictures, matrix = textured(known)
+    found = {
+        depth: patch_correlation(*on_plane(known, pictures, matrix, depth))[0].mean().item()
+        for depth in (-0.2, -0.05, 0.0, 0.05, 0.2)
+    }
+    assert max(found, key=found.get) == 0.0
+    assert found[0.0] > 0.99
+    assert found[0.2] < 0.9
+
+
+def test_exposure_and_even_shading_change_nothing():
+    known = cameras()
+    pictures, matrix = textured(known)
+    arguments = on_plane(known, pictures, matrix, 0.03)
+    other = 0.1 + 0.5 * pictures
+    torch.testing.assert_close(
+        patch_correlation(other, *arguments[1:], 1e-9)[0],
+        patch_correlation(*arguments, 1e-9)[0],
+    )
+
+
+def test_what_shows_the_background_is_not_seen():
+    known = cameras()
+    pictures, matrix = textured(known)
+    arguments = on_plane(known, pictures, matrix, 0.0)
+    assert patch_correlation(*arguments)[1].all()
+    pictures = pictures.clone()
+    pictures[2] = -1
+    seen = patch_correlation(pictures, *arguments[1:])[1]
+    assert seen[:, 0].all()
+    assert not seen[:, 1].any()
+
+
+def test_a_view_that_looks_away_and_a_plane_along_the_ray():
+    """Finite numbers where no gradient is, and nothing read beyond the pictures."""
+    picture, matrix, *others = case()
+    behind = -matrix
+    behind[:, 2] *= 0  # z is 0 everywhere
+    correlation, _ = patch_correlation(picture, behind, *others)
+    assert correlation.isfinite().all()
+    origin, direction, own, views, position, normal, noise = others
+    along = torch.linalg.cross(position.detach() - origin, direction[:, 1])
+    patch_correlation(picture, matrix, origin, direction, own, views, position, along, noise)
+    far = position.detach() * 1e30
+    for at in (far, far * math.nan):
+        patch_correlation(picture, matrix, origin, direction, own, views, at, normal, noise)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({0: torch.zeros(4, 48)}, r"brightness must be \[V, H, W\]"),
+        ({0: torch.zeros(4, 1, 48, dtype=torch.float64)}, "at least 2 rows and columns"),
+        ({0: torch.zeros(3, 48, 48, dtype=torch.float64)}, r"projection must be \[V, 3, 4\]"),
+        ({4: torch.zeros(5, 24, dtype=torch.float64)}, "square of an odd number of pixels, got 24"),
+        ({4: torch.zeros(5, 16, dtype=torch.float64)}, "square of an odd number of pixels, got 16"),
+        ({5: torch.full((5, 3), 4)}, r"views must lie in \[0, V=4\)"),
+        ({5: torch.full((5, 3), -1)}, r"views must lie in \[0, V=4\)"),
+        ({5: torch.zeros(5, 3)}, "views must be .* int64"),
+        ({6: torch.zeros(4, 3, dtype=torch.float64)}, "must be"),
+        ({7: [0.0, 0.0, 1.0]}, "normal must be a tensor"),
+        ({8: 0.0}, "noise must be above 0, got 0.0"),
+        ({8: math.nan}, "noise must be above 0, got nan"),
+    ],
+)
+def test_bad_arguments(change, message):
+    arguments = [change.get(i, a) for i, a in enumerate(case())]
+    with pytest.raises((TypeError, ValueError), match=message):
+        patch_correlation(*arguments)
