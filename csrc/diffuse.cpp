@@ -56,27 +56,33 @@ void diffuse(T* values, const int64_t size[3], const Nodes& nodes, int64_t n_row
     for (int64_t k = 0; k < n; ++k) chosen.mark(rows[k]);
     chosen.number();
     DCHECK(chosen.count() == n && std::is_sorted(rows, rows + n));  // slot k is that of row k
-    // Neighbours by slot, looked up once for all passes; slot n holds the 0 of all other nodes.
+    // Neighbours by slot, looked up once for all passes; slot n holds the 0 of all other nodes, and
+    // beyond the border a node is its own. A pair of neighbours is found from its lower node.
     const std::unique_ptr<int32_t[]> near(new int32_t[6 * n]);
-    const auto slot = [&](int64_t row) { return static_cast<int32_t>(chosen.slot_or(row, n)); };
+    parallel_for(6 * n, 6 * kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
+        std::fill(near.get() + begin, near.get() + end, static_cast<int32_t>(n));
+    });
     parallel_for(n, kRowsPerChunk, threads, [&](int64_t begin, int64_t end) {
         Cursor node_of = cursor;
         for (int64_t k = begin; k < end; ++k) {
             const Node at = node_of(rows[k]);
-            const auto put = [&](int side, bool inside, int64_t x, int64_t y, int64_t z) {
-                near[side * n + k] = inside ? slot(nodes.row(x, y, z)) : static_cast<int32_t>(k);
+            const auto put = [&](int axis, int64_t place, int64_t x, int64_t y, int64_t z) {
+                int32_t *lower = near.get() + 2 * axis * n, *upper = lower + n;
+                if (place == 0) lower[k] = static_cast<int32_t>(k);
+                if (place + 1 == size[axis]) {
+                    upper[k] = static_cast<int32_t>(k);
+                } else if (const int64_t other = chosen.slot_or(nodes.row(x, y, z), n); other < n) {
+                    upper[k] = static_cast<int32_t>(other);
+                    lower[other] = static_cast<int32_t>(k);
+                }
             };
-            put(0, at.x > 0, at.x - 1, at.y, at.z);
-            put(1, at.x + 1 < size[0], at.x + 1, at.y, at.z);
-            put(2, at.y > 0, at.x, at.y - 1, at.z);
-            put(3, at.y + 1 < size[1], at.x, at.y + 1, at.z);
-            put(4, at.z > 0, at.x, at.y, at.z - 1);
-            put(5, at.z + 1 < size[2], at.x, at.y, at.z + 1);
+            put(0, at.x, at.x + 1, at.y, at.z);
+            put(1, at.y, at.x, at.y + 1, at.z);
+            put(2, at.z, at.x, at.y, at.z + 1);
         }
     });
-    std::vector<T> from(values, values + n), to(n + 1);
-    from.push_back(T(0));
-    to[n] = T(0);
+    std::vector<T> from(n + 1), to(n + 1);
+    std::copy(values, values + n, from.begin());
     const int32_t *a = near.get(), *b = a + n, *c = b + n, *d = c + n, *e = d + n, *f = e + n;
     for (int pass = 0; pass < passes; ++pass) {
         const T* v = from.data();
