@@ -709,7 +709,7 @@ def test_help_does_not_wait_for_torch():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-    assert "--preset {auto,draft,fast,full}" in run.stdout
+    assert "--preset {auto,draft,fast,full,best}" in run.stdout
 
 
 @pytest.mark.parametrize(

@@ -244,7 +244,8 @@ def train(
         data: folder of the photographs and their cameras; or the whole configuration, which says
             all but resume, timelapse, on_progress and view: then the folder of the run is returned.
         out: folder that the run is written to.
-        preset: how much work goes in: draft, fast or full; auto is what fits into minutes, or fast.
+        preset: how much work goes in: draft, fast, full or best; auto is what fits into minutes, or
+            fast.
         light, varying: as of `univoxel.presets.budget`.
         minutes: wall-clock limit, above 0; None: the preset's.
         changes: FIELD=VALUE of the configuration, as of --set.

@@ -300,8 +300,8 @@ def train(
     Args:
         data: folder of the photographs and their cameras
         out: folder that the run is written to
-        preset: how much work goes in: draft is a look, 1 minute on two cores, fast the usual, 4,
-            full the best, 12; auto is what fits into --minutes, or else fast
+        preset: how much work goes in: draft is a look, 1 minute on two cores, fast the usual, 2,
+            full finer, 5, best the finest, 8; auto is what fits into --minutes, or else fast
         light: sg, local lobes as published; hybrid, then one environment map with traced
             visibility, which cleans shadows from the albedo; others to compare with: sh and mlp,
             local too, envmap-sg and envmap, one map from the beginning, and baked, none: the
@@ -968,12 +968,12 @@ def chart(
 ) -> None:
     """Draw quality against training time, of presets and knobs.
 
-    Trains draft, fast, full, and --preset with one knob turned: voxels-x0.5 (half the voxels of the
-    finest grid), voxels-x2, rays-x0.5 (half the rays of a step), rays-x2, steps-, directions- and
-    lobes- alike, light-sg and so on. Writes DIR/chart.png, chart.svg and chart.json with every
-    measure, the log of each training, and the Pareto front of each measure: settings that no other
-    beats in both time and quality. Published figures, of other data and of GPUs, are marked.
-    Trainings are kept, and gone on with, as of compare.
+    Trains draft, fast, full, best, and --preset with one knob turned: voxels-x0.5 (half the voxels
+    of the finest grid), voxels-x2, rays-x0.5 (half the rays of a step), rays-x2, steps-,
+    directions- and lobes- alike, light-sg and so on. Writes DIR/chart.png, chart.svg and chart.json
+    with every measure, the log of each training, and the Pareto front of each measure: settings
+    that no other beats in both time and quality. Published figures, of other data and of GPUs, are
+    marked. Trainings are kept, and gone on with, as of compare.
 
     Args:
         scenes: folders of photographs
@@ -1018,9 +1018,9 @@ def stress(
     Renders small scenes with Mitsuba 3, made harder along one axis each, spoils their photographs,
     trains and measures. Writes DIR/stress.md with the breaking point of each axis, stress.json,
     stress.png and stress.svg.
-    Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, rough-masks, thin, fur,
-    turntable, noise, placement, dark, bright; light-varying is trained with --varying light. A
-    training that fails is a result. What is done is kept: the same command goes on.
+    Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, rough-masks, thin,
+    fur, turntable, noise, placement, dark, bright; light-varying is trained with --varying light.
+    A training that fails is a result. What is done is kept: the same command goes on.
 
     Args:
         out: folder for scenes, photographs, trainings and results

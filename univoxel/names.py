@@ -6,8 +6,8 @@ from typing import Literal, TypeAlias, get_args
 
 FieldName: TypeAlias = Literal["dense", "sparse", "hash"]
 LightName: TypeAlias = Literal["hybrid", "sg", "sh", "mlp", "envmap-sg", "envmap", "baked"]
-PresetName: TypeAlias = Literal["draft", "fast", "full"]
-PresetOrAuto: TypeAlias = Literal["auto", "draft", "fast", "full"]
+PresetName: TypeAlias = Literal["draft", "fast", "full", "best"]
+PresetOrAuto: TypeAlias = Literal["auto", "draft", "fast", "full", "best"]
 Capacity: TypeAlias = Literal["fixed", "adaptive"]
 CapacityOrAuto: TypeAlias = Literal["auto", "adaptive", "fixed"]
 CamerasFrom: TypeAlias = Literal["auto", "given", "refined"]

@@ -28,7 +28,7 @@ from univoxel.training.config import LossConfig, StageConfig
 class Work:
     """What a budget of time on two cores goes into."""
 
-    minutes: float
+    minutes: float  # that it takes on two quiet cores
     voxels: float  # millions, of the finest grid
     steps: float  # of the fine stage; the others follow
     rays: float  # per step
@@ -44,17 +44,17 @@ class Work:
 PRESETS = {
     "draft": Work(
         minutes=1.0,
-        voxels=1.0,
-        steps=400,
-        rays=1024,
+        voxels=1.25,
+        steps=530,
+        rays=1280,
         lr_networks=6e-3,
         lr_sdf=0.07,
-        joint_steps=300,
+        joint_steps=395,
         observations=2048,
         directions=64,
     ),
     "fast": Work(
-        minutes=4.0,
+        minutes=2.0,
         voxels=2.0,
         steps=900,
         rays=2048,
@@ -65,7 +65,18 @@ PRESETS = {
         directions=64,
     ),
     "full": Work(
-        minutes=12.0,
+        minutes=5.0,
+        voxels=3.3,
+        steps=2900,
+        rays=2048,
+        lr_networks=3.7e-3,
+        lr_sdf=0.056,
+        joint_steps=2500,
+        observations=3400,
+        directions=105,
+    ),
+    "best": Work(
+        minutes=8.0,
         voxels=4.0,
         steps=4200,
         rays=2048,
@@ -78,22 +89,22 @@ PRESETS = {
 }
 
 
-COLORS_MINUTES = 1.5  # up to which materials have no time to follow a map that colours changed
-
-
-PATCHES_MINUTES = 1.5  # up to which comparing patches costs more steps than it brings
-
-
-HOLLOWS = 0.04  # share of the time: where opening them takes more it costs more than it brings
+_NAMES = "draft, fast, full or best"
+SLOWER = 2.0  # a machine may be so many times as slow before a preset's steps are cut
+SHORTEST = (
+    1.0  # minutes; in fewer, comparing patches and teaching colours cost more than they bring
+)
+HOLLOWS = 0.1  # share of the minutes: where opening them takes more it costs more than it brings
 
 
 def preset(
     name: str, data: Path, out: Path, light: LightName = "hybrid", varying: Differing = "auto"
 ) -> TrainConfig:
-    """The configuration of a preset: draft (1 minute), fast (4) or full (12) on two cores.
+    """The configuration of a preset: draft (1 minute), fast (2), full (5) or best (8) on two cores.
 
     Its sizes are limits: capacity is adaptive under the hybrid light, and fixed under others, which
-    are there to be compared.
+    are there to be compared. So are its minutes, which are twice as many: a machine that is slower
+    makes all steps, too.
 
     Args:
         light, varying: see `budget`.
@@ -102,8 +113,10 @@ def preset(
         UserError: an unknown name, or varying light with a map from the beginning.
     """
     if name not in PRESETS:
-        raise UserError(f"preset must be draft, fast or full, got {name!r}", "preset")
-    return _configuration(PRESETS[name], data, out, light, varying)
+        raise UserError(f"preset must be {_NAMES}, got {name!r}", "preset")
+    work = PRESETS[name]
+    config = _configuration(work, data, out, light, varying)
+    return replace(config, minutes=SLOWER * work.minutes, hollows=HOLLOWS / SLOWER)
 
 
 def budget(
@@ -180,7 +193,7 @@ def with_metal(cfg: TrainConfig, metal: Metal) -> TrainConfig:
 def work_in(minutes: float) -> Work:
     """Work on the geometric line between the presets on either side of a time.
 
-    Before draft the nearest two lead on. Beyond full only steps do: a finer grid or a larger batch
+    Before draft the nearest two lead on. Beyond best only steps do: a finer grid or a larger batch
     would want more memory.
     """
     known = list(PRESETS.values())
@@ -202,7 +215,7 @@ def _configuration(
     exposures, known = varying == "auto", "none" if varying == "auto" else varying
     steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
     lr_networks = (work.lr_networks, 3e-4)
-    compared = work.minutes > PATCHES_MINUTES
+    compared = work.minutes >= SHORTEST
     coarse = StageConfig(
         0.9,
         steps // 2,
@@ -280,7 +293,7 @@ def _hybrid_stages(
         rays=round(work.observations),
         points=min(25 * steps, 15000 + 6 * steps),
         newton_points=min(4000, 3 * steps, 1000 + steps),
-        colors=work.minutes > COLORS_MINUTES,
+        colors=work.minutes >= SHORTEST,
     )
     refit = replace(
         fine,

@@ -16,8 +16,8 @@ from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
 from univoxel.training.config import StageConfig
 
-BETWEEN = (2, 8)  # minutes, where the curve is looked at between the presets
-PRESETS = ("draft", "fast", "full")
+BETWEEN = (3, 6)  # minutes, where the curve is looked at between the presets
+PRESETS = ("draft", "fast", "full", "best")
 SHOWN = (plots.NVS, plots.ALBEDO, plots.ROUGHNESS, plots.RELIT, plots.NORMAL)
 ACROSS = 3  # panels in a row
 QUICK = ("voxels-x0.5", "rays-x0.5", "light-sg", "light-baked")  # beside draft and the preset

@@ -245,7 +245,7 @@ class CarvingConfig:
     # photographs that are used, at most, >= 1: for time
     views: int = 100
     # seconds that a pixel of the object takes, about, on two cores, > 0
-    pixel_seconds: float = 1e-5
+    pixel_seconds: float = 6e-6
     # depths along a ray, >= 2, a voxel apart: deeper concavities are opened as far as this
     depths: int = 48
     # views that a view's depths come from, >= 1; as many again check them

@@ -37,8 +37,7 @@ SMALL = (
 )
 SMALL_HYBRID = (
     *("stages.2.iterations=100", "stages.2.rays=2048", "stages.2.points=4000"),
-    # as in all but the shortest of the presets, though draft leaves colours alone
-    *("stages.2.newton_points=1500", "stages.2.rounds=2", "stages.2.colors=True"),
+    *("stages.2.newton_points=1500", "stages.2.rounds=2"),
     *("stages.3.voxels=0.25", "stages.3.iterations=40", "stages.3.rays=1024"),
 )
 
