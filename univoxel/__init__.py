@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from univoxel.tasks.poses import poses as find_poses
     from univoxel.tasks.relight import relight_images as relight
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "Cancelled",
     "Run",
