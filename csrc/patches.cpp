@@ -117,7 +117,8 @@ T correlate(const T* direction, const T* normal, const Plane<T>& plane, int64_t 
         }
     }
     for (int i = 0; i < 3; ++i) {
-        const T steps = sum * direction[i] + by_column * direction[3 + i] + by_row * direction[6 + i];
+        const T steps =
+            sum * direction[i] + by_column * direction[3 + i] + by_row * direction[6 + i];
         pulls[i] = -by_nearness * normal[i] / plane.away;
         pulls[3 + i] = (steps - by_nearness * plane.to[i]) / plane.away;
     }
@@ -143,9 +144,9 @@ void compare(const Patches<T>& in, const Stored* brightness, const PatchResult<T
             }
             for (int64_t k = in.K * n; k < in.K * (n + 1); ++k) {
                 const int64_t view = in.views[k];
-                out.seen[k] = look_up(in, brightness + view * in.H * in.W,
-                                      in.projection + 12 * view, origin, direction, plane, half,
-                                      pixels);
+                out.seen[k] =
+                    look_up(in, brightness + view * in.H * in.W, in.projection + 12 * view, origin,
+                            direction, plane, half, pixels);
                 out.correlation[k] = correlate(direction, normal, plane, half, own_power, noise,
                                                pixels, out.pulls + 6 * k);
             }

@@ -122,7 +122,9 @@ def textured(known, depth=0.0):
 
 def on_plane(known, pictures, matrix, depth):
     """Arguments for patches of the first view, on a plane x = depth."""
-    row, column = (t.flatten() for t in torch.meshgrid(*2 * [torch.arange(14, 34, 5)], indexing="ij"))
+    row, column = (
+        t.flatten() for t in torch.meshgrid(*2 * [torch.arange(14, 34, 5)], indexing="ij")
+    )
     view = torch.zeros(len(row), dtype=torch.int64)
     origin, direction = rays_of(known, view, row, column)
     step = torch.arange(-2, 3)
