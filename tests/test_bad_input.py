@@ -180,7 +180,7 @@ def test_data_that_cannot_be_used(data, tmp_path, refused, change, message):
             "varying light needs hybrid or a local light",
         ),
         (["--varying", "weather"], "'weather' for argument '--varying'"),
-        (["--preset", "best"], "'best' for argument '--preset'"),
+        (["--preset", "quick"], "'quick' for argument '--preset'"),
         (["--minuts", "3"], "Unrecognized options: --minuts, 3"),
     ],
 )

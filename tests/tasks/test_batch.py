@@ -287,7 +287,7 @@ def test_a_preset_makes_all_its_steps_on_one_thread(tmp_path):
         return " ".join(map(str, train.arguments[5:]))
 
     assert "--preset fast --light hybrid --minutes 8" in options(1)
-    assert "--preset draft --light hybrid --minutes 2" in options(1, preset="draft")
+    assert "--preset draft --light hybrid --minutes 4" in options(1, preset="draft")
     assert "--preset auto --light hybrid" in options(2)
     assert "--minutes" not in options(2)
     assert "--minutes" not in options(None)

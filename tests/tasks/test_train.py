@@ -362,5 +362,5 @@ def test_pixels_are_those_in_and_near_silhouettes():
 
 
 def test_unknown_preset(tmp_path):
-    with pytest.raises(ValueError, match="preset must be draft, fast or full, got 'best'"):
-        preset("best", tmp_path, tmp_path)
+    with pytest.raises(ValueError, match="preset must be draft, fast, full or best, got 'quick'"):
+        preset("quick", tmp_path, tmp_path)
