@@ -62,7 +62,8 @@ def trainings(options: argparse.Namespace, threads: int, count: int = 1, **extra
     """`measure`, in processes of their own side by side."""
     from univoxel.cli import SPINS
 
-    environment = os.environ | (extra or {"GOMP_SPINCOUNT": SPINS})
+    environment = {k: v for k, v in os.environ.items() if k != "OMP_WAIT_POLICY"}  # of the caller
+    environment |= extra or {"GOMP_SPINCOUNT": SPINS}
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, __file__, str(options.scene), "--preset", options.preset]
         command += ["--threads", str(threads), "--run"]
