@@ -4,7 +4,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.installed
 CXX_SOURCES := CMakeLists.txt $(wildcard cmake/*.cmake csrc/*.* csrc/*/*)
-export OMP_WAIT_POLICY ?= passive
+# Tests run beside one another: a thread that waits should leave its core to them. Alone, a training
+# is faster as the command line has it.
+test page-test network-test fuzz kill-test asan tsan wheel-test: export OMP_WAIT_POLICY ?= passive
 # Where torch.compile finds Python's headers when they had to be unpacked there.
 DEPS := $(CURDIR)/.deps/usr/include
 export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE_PATH))
@@ -114,6 +116,7 @@ profile: dev .venv/.bench
 	$(BIN)/py-spy record --native --rate 50 --output $(PROFILE)/flame.svg -- $(BIN)/python \
 		-m univoxel.cli train $(SCENE) --preset $(PRESET) --minutes 60 --no-page \
 		--threads 1 --out build/profile/run
+	sed -i -E 's#py-spy record [^<]*#univoxel train --preset $(PRESET) --threads 1#' $(PROFILE)/flame.svg
 
 .venv/.docs: $(SETUP)
 	scripts/venv.sh $(PYTHON) docs
