@@ -116,7 +116,7 @@ profile: dev .venv/.bench
 	$(BIN)/py-spy record --native --rate 50 --output $(PROFILE)/flame.svg -- $(BIN)/python \
 		-m univoxel.cli train $(SCENE) --preset $(PRESET) --minutes 60 --no-page \
 		--threads 1 --out build/profile/run
-	sed -i -E 's#py-spy record [^<]*#univoxel train --preset $(PRESET) --threads 1#' $(PROFILE)/flame.svg
+	sed -i -E 's#[^ >]*py-spy record [^<]*#univoxel train --preset $(PRESET) --threads 1#' $(PROFILE)/flame.svg
 
 .venv/.docs: $(SETUP)
 	scripts/venv.sh $(PYTHON) docs

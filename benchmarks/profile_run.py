@@ -225,7 +225,7 @@ def table(result: dict) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, help="folder of photographs")
-    parser.add_argument("--preset", default="fast", help="draft, fast or full (default: fast)")
+    parser.add_argument("--preset", default="fast", help="such as draft (default: fast)")
     parser.add_argument("--minutes", type=float, help="limit (default: the preset's)")
     parser.add_argument(
         "--cpu", action="store_true", help="processor time: for one thread on a busy machine"

@@ -104,7 +104,7 @@ def result(one: list, two: list, pair: list, passive: list) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, help="folder of photographs")
-    parser.add_argument("--preset", default="fast", help="draft, fast or full (default: fast)")
+    parser.add_argument("--preset", default="fast", help="such as draft (default: fast)")
     parser.add_argument("--out", type=Path, default=HERE / "results" / "threads.json")
     parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)  # of one training: its folder
     parser.add_argument("--threads", type=int, help=argparse.SUPPRESS)

@@ -89,11 +89,8 @@ PRESETS = {
 }
 
 
-_NAMES = "draft, fast, full or best"
 SLOWER = 2.0  # a machine may be so many times as slow before a preset's steps are cut
-SHORTEST = (
-    1.0  # minutes; in fewer, comparing patches and teaching colours cost more than they bring
-)
+SHORTEST = 1.0  # minutes; in fewer, patches and taught colours cost more than they bring
 HOLLOWS = 0.1  # share of the minutes: where opening them takes more it costs more than it brings
 
 
@@ -113,7 +110,7 @@ def preset(
         UserError: an unknown name, or varying light with a map from the beginning.
     """
     if name not in PRESETS:
-        raise UserError(f"preset must be {_NAMES}, got {name!r}", "preset")
+        raise UserError(f"preset must be one of {', '.join(PRESETS)}, got {name!r}", "preset")
     work = PRESETS[name]
     config = _configuration(work, data, out, light, varying)
     return replace(config, minutes=SLOWER * work.minutes, hollows=HOLLOWS / SLOWER)

@@ -171,6 +171,15 @@ def test_what_shows_the_background_is_not_seen():
     assert not seen[:, 1].any()
 
 
+def test_one_pixel_of_background_beside_a_patch_is_enough():
+    picture, *others = case(60, 4)
+    draw = torch.Generator().manual_seed(3)
+    picture = torch.where(torch.rand(picture.shape, generator=draw) < 0.03, -1.0, picture)
+    seen = patch_correlation(picture, *others)[1]
+    assert torch.equal(seen, patch_correlation_reference(picture, *others)[1])
+    assert 0.1 < seen.float().mean() < 0.9
+
+
 def test_a_view_that_looks_away_and_a_plane_along_the_ray():
     """Finite numbers where no gradient is, and nothing read beyond the pictures."""
     picture, matrix, *others = case()
@@ -178,6 +187,8 @@ def test_a_view_that_looks_away_and_a_plane_along_the_ray():
     behind[:, 2] *= 0  # z is 0 everywhere
     correlation, _ = patch_correlation(picture, behind, *others)
     assert correlation.isfinite().all()
+    for gradient in torch.autograd.grad(correlation.sum(), others[4:6]):
+        assert torch.equal(gradient, torch.zeros_like(gradient))
     origin, direction, own, views, position, normal, noise = others
     along = torch.linalg.cross(position.detach() - origin, direction[:, 1])
     patch_correlation(picture, matrix, origin, direction, own, views, position, along, noise)

@@ -403,7 +403,7 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
         (pictures / "0.png", {}, DataError, "got a file of another kind"),
         (pictures, {"masks": "nothing here"}, DataError, "masks: expected rembg, none or a folder"),
         (pictures, {"masks": "rembg"}, MissingExtra, "need rembg"),
-        (pictures, {"preset": "quick"}, UserError, "preset must be draft, fast, full or best"),
+        (pictures, {"preset": "quick"}, UserError, "preset must be one of draft, fast, full, best"),
         (pictures, {"minutes": -1.0}, UserError, "minutes must be above 0"),
         (pictures, {"changes": ["colour=red"]}, UserError, "no field 'colour'"),
     ]

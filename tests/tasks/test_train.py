@@ -362,5 +362,7 @@ def test_pixels_are_those_in_and_near_silhouettes():
 
 
 def test_unknown_preset(tmp_path):
-    with pytest.raises(ValueError, match="preset must be draft, fast, full or best, got 'quick'"):
+    with pytest.raises(
+        ValueError, match="preset must be one of draft, fast, full, best, got 'quick'"
+    ):
         preset("quick", tmp_path, tmp_path)
