@@ -5,7 +5,12 @@ import torch
 from check_op import check_op
 
 from univoxel.ops import encode_hash, encode_hash_reference, use_backend
-from univoxel.ops.hash_grid import _encode_hash, _encode_hash_backward, lattice_sizes
+from univoxel.ops.hash_grid import (
+    _encode_hash,
+    _encode_hash_backward,
+    lattice_sizes,
+    rows_read,
+)
 
 LOWER, UPPER = [0.125, -0.25, 0.375], [1.125, 0.5, 1.875]
 
@@ -176,6 +181,28 @@ def test_whole_graph_compiles():
     loss(arguments[0]).backward()
     wanted = torch.autograd.grad(encode_hash_reference(*arguments).square().sum(), arguments[0])
     torch.testing.assert_close(arguments[0].grad, wanted[0])
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_rows_read_are_those_that_get_a_gradient(backend):
+    arguments = case((0.5, 0.05), rows=4096, m=40)
+    points = arguments[1].detach()
+    inside = points.clone()
+    points[7] = torch.nan
+    with use_backend("native"):
+        (grad,) = torch.autograd.grad(
+            encode_hash(arguments[0], points, *arguments[2:], sparse_grad=True).nansum(),
+            arguments[0],
+        )
+    with use_backend(backend):
+        got = rows_read(arguments[0], points, *arguments[2:])
+        more = rows_read(arguments[0], inside, *arguments[2:])
+        none = rows_read(arguments[0], points[:0], *arguments[2:])
+    assert torch.equal(got, grad.indices()[0])
+    assert len(more) > len(got)
+    assert (none.dtype, len(none)) == (torch.int64, 0)
+    with pytest.raises(ValueError, match="rows_read: lower must be at most upper"):
+        rows_read(arguments[0], points, [9.0] * 3, [0.0] * 3, [0.5])
 
 
 def test_second_order_raises():

@@ -14,6 +14,7 @@ from univoxel.errors import ConfigError
 from univoxel.fields.distances import BAND, AbstractDistances, nodes_within
 from univoxel.ops import encode_hash
 from univoxel.ops.composite_field import FieldAlongRays, Lattices
+from univoxel.ops.hash_grid import rows_read
 from univoxel.records import FieldSample, Rays, Samples
 from univoxel.validation import check_fields
 
@@ -237,10 +238,7 @@ class HashFeatures(AbstractFeatures):
         read = torch.zeros(len(self.values), dtype=torch.bool)
         for node in nodes_within(distances, far).nonzero().split(NODES_AT_ONCE):
             points = origin + distances.voxel_size * (node[:, None] + around).reshape(-1, 3)
-            with torch.enable_grad():
-                encoded = self.encode(points)
-            (grad,) = torch.autograd.grad(encoded, self.values, torch.ones_like(encoded))
-            read[grad._indices()[0]] = True
+            read[rows_read(self.values, points, *self._lattices)] = True
         return read
 
     @torch.no_grad()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TypeAlias
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -126,29 +126,68 @@ def encode_hash_reference(
     """The same in eager torch: level by level, corner by corner."""
     rows = len(table) // len(voxel_sizes)
     lost = points.isnan().any(1, keepdim=True)
-    start = torch.tensor(lower, dtype=torch.float64, device=points.device)
+    points = torch.where(lost, 0.0, points)
     outputs = []
     for level, (h, shape) in enumerate(
         zip(voxel_sizes, lattice_sizes(lower, upper, voxel_sizes), strict=True)
     ):
-        size = torch.tensor(shape, device=points.device)
         points = points.detach() if level == felt else points
-        # Locate in double, so that a float32 point far from the box's corner keeps its fraction.
-        at = (torch.where(lost, 0.0, points).double() - start) * (1 / h)
-        at = torch.minimum(at.clamp_min(0.0), (size - 1).double())
-        cell = torch.minimum(at.detach().long(), (size - 2).clamp_min(0))
-        t = (at - cell).to(points.dtype)
         total = table.new_zeros(len(points), table.shape[1])
-        for corner in torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3):
-            weight = torch.where(corner == 1, t, 1 - t).prod(1)
-            i, j, k = torch.minimum(cell + corner, size - 1).unbind(1)
-            if math.prod(shape) <= rows:
-                row = (i * shape[1] + j) * shape[2] + k
-            else:
-                row = (i ^ (j * PRIMES[1]) ^ (k * PRIMES[2])) & (rows - 1)
+        for row, weight in _corners(points, lower, h, shape, rows):
             total = total + weight[:, None] * table[level * rows + row]
         outputs.append(torch.where(lost, torch.nan, total))
     return torch.cat(outputs, 1)
+
+
+def _corners(
+    points: Tensor, lower: Sequence[float], h: float, shape: list[int], rows: int
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Row [M] in a level's table and weight [M] of each corner of the cells of points."""
+    start = torch.tensor(lower, dtype=torch.float64, device=points.device)
+    size = torch.tensor(shape, device=points.device)
+    # Locate in double, so that a float32 point far from the box's corner keeps its fraction.
+    at = (points.double() - start) * (1 / h)
+    at = torch.minimum(at.clamp_min(0.0), (size - 1).double())
+    cell = torch.minimum(at.detach().long(), (size - 2).clamp_min(0))
+    t = (at - cell).to(points.dtype)
+    for corner in torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3):
+        weight = torch.where(corner == 1, t, 1 - t).prod(1)
+        i, j, k = torch.minimum(cell + corner, size - 1).unbind(1)
+        if math.prod(shape) <= rows:
+            yield (i * shape[1] + j) * shape[2] + k, weight
+        else:
+            yield (i ^ (j * PRIMES[1]) ^ (k * PRIMES[2])) & (rows - 1), weight
+
+
+def rows_read(
+    table: Tensor,  # [L * R, F]
+    points: Tensor,  # [M, 3]
+    lower: Sequence[float],
+    upper: Sequence[float],
+    voxel_sizes: Sequence[float],
+) -> Tensor:
+    """Rows [K] int64 of the table that `encode_hash` reads for points, ascending.
+
+    Args:
+        table, points, lower, upper, voxel_sizes: as there. A NaN point reads none.
+
+    Raises:
+        TypeError, ValueError: as there.
+    """
+    sizes = check("rows_read", table=(table, "N F"), points=(points, "M 3"))
+    check_levels("rows_read", sizes["N"], lower, upper, voxel_sizes)
+    if native.serves(table):
+        place = _place([*lower], [*upper], [*voxel_sizes])
+        return _touched(table.contiguous(), points.contiguous(), place)[1]
+    rows = len(table) // len(voxel_sizes)
+    points = points[~points.isnan().any(1)]
+    levels = enumerate(zip(voxel_sizes, lattice_sizes(lower, upper, voxel_sizes), strict=True))
+    found = [
+        level * rows + row
+        for level, (h, shape) in levels
+        for row, _ in _corners(points, lower, h, shape, rows)
+    ]
+    return torch.cat(found).unique()
 
 
 @native.operator("encode_hash")
@@ -228,9 +267,7 @@ def _sparse_backward(
     if not needs[0]:
         _backward_into(table, points, grad_out, None, None, grad_points, place, felt)
         return None, grad_points
-    touched = native.require().hash_rows(*native.arrays(table, points), *place, native.threads())
-    rows = torch.empty(len(touched), dtype=torch.int64)
-    touched.write(rows.numpy(), native.threads())
+    touched, rows = _touched(table, points, place)
     values = table.new_empty(len(touched), table.shape[1])
     _backward_into(table, points, grad_out, values, touched, grad_points, place, felt)
     # The rows are distinct, in order and inside by construction: checking costs more than they do.
@@ -238,6 +275,14 @@ def _sparse_backward(
         rows[None], values, table.shape, is_coalesced=True, check_invariants=False
     )
     return grad, grad_points
+
+
+def _touched(table: Tensor, points: Tensor, place: Place) -> tuple[Any, Tensor]:
+    """The rows that points read, as the extension has them, and as [K] int64, ascending."""
+    touched = native.require().hash_rows(*native.arrays(table, points), *place, native.threads())
+    rows = torch.empty(len(touched), dtype=torch.int64)
+    touched.write(rows.numpy(), native.threads())
+    return touched, rows
 
 
 def backward(
