@@ -122,30 +122,37 @@ def test_metals_that_are_found_from_metal_everywhere_have_to_be_better(
 
 
 @pytest.mark.parametrize(
-    ("known", "smooth", "rough", "found", "varying", "taken"),
+    ("known", "smooth", "rough", "found", "varying", "alike", "taken"),
     [
-        (None, 1.1, 9.0, 9.0, False, True),
-        (None, 1.2, 0.9, 9.0, False, False),  # as wide as diffuse light: it explains paint
-        (None, 1.1, 9.0, 0.9, False, False),  # what is found under the map of paint explains more
-        (None, 1.1, 9.0, 9.0, True, False),  # photographs that mirror a map each
-        (False, 0.9, 0.9, 9.0, False, False),
-        (True, 9.0, 9.0, 9.0, False, True),
+        (None, 1.1, 9.0, 9.0, False, 0.9, True),
+        (None, 1.1, 9.0, 9.0, False, 0.3, False),  # grain leaves as much to either
+        (None, 1.2, 0.9, 9.0, False, 0.9, False),  # as wide as diffuse light: it explains paint
+        (None, 1.1, 9.0, 0.9, False, 0.9, False),  # what is found under the map of paint is better
+        (None, 1.1, 9.0, 9.0, True, 0.9, False),  # photographs that mirror a map each
+        (False, 0.9, 0.9, 9.0, False, 0.9, False),
+        (True, 9.0, 9.0, 9.0, False, 0.3, True),
     ],
 )
 def test_where_metal_alone_explains_as_much_there_is_nothing_else(
-    monkeypatch, known, smooth, rough, found, varying, taken
+    monkeypatch, known, smooth, rough, found, varying, alike, taken
 ):
-    """Of fewer ways to explain the photographs, unless it is rough."""
+    """Of fewer ways to explain the photographs, unless it is rough; and if most points look like
+    metal then, however dark."""
     scene, problem = sphere_of((0.12, 0.08, 0.05), 1.0, 0.3)
     features = scene.field.features_at(problem.observations.position)
-    searched = []
+    searched, of_metal = [], []
 
     def newton_round_(scene, problem, decisions, *_):
+        with torch.no_grad():
+            problem.sky.log_radiance[0, 0] = float(decisions.metal.all())  # tells the maps apart
         if decisions.metal.all():
             return NewtonRound([rough if scene.material(features)[1].median() > 0.5 else smooth])
         return NewtonRound([found if searched else 1.0])
 
     def find_metal(scene, problem, cfg, done):
+        if cfg.metal.min_reflectance == 0:
+            of_metal.append((float(problem.sky.log_radiance.detach()[0, 0]), done))
+            return torch.linspace(0, 1, len(problem.observations.position)) < alike
         searched.append(done)
         return no_metal(problem).metal
 
@@ -159,6 +166,9 @@ def test_where_metal_alone_explains_as_much_there_is_nothing_else(
     assert bool(decisions.metal.all()) == taken
     # What would be found from metal everywhere is of no use where there is nothing else
     assert len(searched) == (0 if known else 1 if taken else 2)
+    # Points are looked at under the map for metal, with the last threshold
+    asked = known is None and not varying and smooth < 1.15 * min(found, 1.0)
+    assert of_metal == ([(1.0, 1.0)] if asked else [])
 
 
 def test_of_metal_alone_nothing_is_tried_but_roughness(monkeypatch):

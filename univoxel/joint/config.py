@@ -240,7 +240,8 @@ class TrialConfig:
     # share, (0, 1], of the lowest residual so far that another roughness must not exceed
     better: float = 0.9
     # times the others' residual, > 0, that metal everywhere must not exceed for all to be metal:
-    # 0.9 to 1.1 where all is, 1.3 and more where some or nothing is
+    # 0.6 to 1.1 where all is, 1.2 and more where some or nothing is, unless grain, fur or mixed
+    # lights leave much to either. Most points have to look like metal then too, see majority
     only_metal: float = 1.15
     # median of roughness, (0, 1], from which metal looks like paint and does not count there
     like_paint: float = 0.5
@@ -249,7 +250,8 @@ class TrialConfig:
     # the same, (0, 1], where most is found to be metal under its map. Of objects all of metal 0.67
     # to 0.93 is; of dielectrics hardly ever as much
     mostly_metal: float = 0.95
-    # share, [0, 1], of the points that are most of them
+    # share, [0, 1], of the points that are most of them: look like metal for all to be metal, and
+    # for mostly_metal. Under a map for metal 0.9 do where all is, up to 0.3 where nothing is
     majority: float = 0.5
 
     def __post_init__(self) -> None:

@@ -91,7 +91,7 @@ def initialise_(
         one_light = scene.views is None or scene.views.sky_weights is None
         if cfg.only_metal is None and one_light:
             explained = min(before.residual, found.residual)
-            only_metal = nothing_but_metal(explained, everywhere, cfg.trials)
+            only_metal = nothing_but_metal_(trials, explained, everywhere)
         if not only_metal:
             best = under_its_map_(trials, best)
             best = best if better_metals(found, best, cfg.trials) else found
@@ -140,17 +140,29 @@ def the_best(tried: Sequence[Hypothesis], cfg: TrialConfig) -> Hypothesis:
     return best
 
 
-def nothing_but_metal(explained: float, everywhere: Sequence[Hypothesis], cfg: TrialConfig) -> bool:
-    """Whether metal everywhere explains the photographs about as well as metal as it was found.
+def nothing_but_metal_(
+    trials: Trials, explained: float, everywhere: Sequence[Hypothesis]
+) -> bool:
+    """Whether metal everywhere explains the photographs about as well as metal as it was found, and
+    most points, however dark, look like metal under its map. It leaves the scene in that state.
 
     It has no diffuse light to explain them with, and so the fewer ways. Where it is rough, its
-    highlights are as wide as diffuse light, and it explains paint.
+    highlights are as wide as diffuse light, and it explains paint. Grain, fur or lights that change
+    leave so much to either that their residuals are alike; point by point paint still looks no more
+    like metal.
 
     Args:
         explained: residual of metal as it was found.
     """
-    smooth = [h.residual for h in everywhere if h.roughness < cfg.like_paint]
-    return min(smooth, default=math.inf) < cfg.only_metal * explained
+    cfg = trials.cfg
+    smooth = [h for h in everywhere if h.roughness < cfg.trials.like_paint]
+    best = min(smooth, key=lambda h: h.residual, default=None)
+    if best is None or not best.residual < cfg.trials.only_metal * explained:
+        return False
+    trials.restore_(best.states)
+    however_dark = replace(cfg, metal=replace(cfg.metal, min_reflectance=0.0))
+    metal = find_metal(trials.scene, trials.problem, however_dark, 1.0)
+    return bool(metal.float().mean() > cfg.trials.majority)
 
 
 def under_its_map_(trials: Trials, assumed: Hypothesis) -> Hypothesis:
