@@ -140,9 +140,7 @@ def the_best(tried: Sequence[Hypothesis], cfg: TrialConfig) -> Hypothesis:
     return best
 
 
-def nothing_but_metal_(
-    trials: Trials, explained: float, everywhere: Sequence[Hypothesis]
-) -> bool:
+def nothing_but_metal_(trials: Trials, explained: float, everywhere: Sequence[Hypothesis]) -> bool:
     """Whether metal everywhere explains the photographs about as well as metal as it was found, and
     most points, however dark, look like metal under its map. It leaves the scene in that state.
 
