@@ -43,6 +43,7 @@ from univoxel.joint.config import (
         (MirrorConfig(), {"change": -1.0}, "change must be at least 0, got -1.0"),
         (MirrorConfig(), {"turn": 0.0}, "turn must be above 0, got 0.0"),
         (MirrorConfig(), {"reflected": 0.0}, "reflected must be in .*, got 0.0"),
+        (MirrorConfig(), {"reflected_at_most": 0.5}, "reflected_at_most must be .*, got 0.5"),
         (EntropyConfig(), {"points": 0}, "points must be at least 1, got 0"),
         (EntropyConfig(), {"min_paint": 2.0}, "min_paint must be in .*, got 2.0"),
         (EntropyConfig(), {"min_sky": 0.0}, "min_sky must be in .*, got 0.0"),

@@ -116,6 +116,17 @@ def test_lacquer_changes_less_than_what_it_mirrors():
     assert find_mirrors(scene, problem, lenient).metal.float().mean() > 0.9
 
 
+def test_what_changes_more_than_all_that_it_could_mirror_is_no_mirror():
+    """Paint under a sun that is one node of a dark map."""
+    scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
+    assert find_mirrors(scene, problem, CFG).metal.float().mean() > 0.9
+    with torch.no_grad():
+        scene.sky.log_radiance -= math.log(3)
+    assert find_mirrors(scene, problem, CFG) is None
+    lenient = replace(CFG, mirror=MirrorConfig(reflected_at_most=9.0))
+    assert find_mirrors(scene, problem, lenient).metal.float().mean() > 0.9
+
+
 def test_points_that_see_no_sky_are_as_their_neighbours():
     scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
     true_normal = normalize(problem.observations.position, dim=1)

@@ -140,6 +140,9 @@ class MirrorConfig:
     # part, (0, 1], of the change of what it mirrors. Metals of the scenes reach 0.6 to 1, glossy
     # paint 0.1 to 0.45
     reflected: float = 0.55
+    # the same, >= 1, at most: nothing mirrors more than it gets. Metals reach 1.15, whose normals
+    # are off; under a sun, which leaves the rest of the map dark, paint reaches 1.5 to 15
+    reflected_at_most: float = 1.25
     # part, (0, 1], of the change that the map leaves unexplained where metal mirrors sharply
     sharp: float = 0.6
     # brightest channel of a metal at least, [0, 1]
@@ -168,6 +171,7 @@ class MirrorConfig:
         check_fields(self, *_NOT_BELOW, "change", "weight")
         check_fields(self, *_ABOVE, "turn", "around")
         check_fields(self, *_SHARE, "reflected", "sharp", "darkest")
+        check_fields(self, "at least 1", lambda x: 1 <= x < math.inf, "reflected_at_most")
 
 
 @dataclass(frozen=True)

@@ -201,7 +201,7 @@ def mirrors_among(seen: Sightings, map: NodeMap, cfg: MirrorConfig) -> Mirrors:
         for radiance in (seen.color, map.radiance[node])
     )
     enough = shown > cfg.change * nearest.shape[1]
-    metal = enough & (shown > cfg.reflected * sent)
+    metal = enough & (shown > cfg.reflected * sent) & (shown < cfg.reflected_at_most * sent)
     unexplained = unexplained_change(seen, map)[nearest].sum(1)
     total = change(seen, seen.encoded)[nearest].sum(1)
     sharp = metal & (unexplained > cfg.sharp * total)
