@@ -203,6 +203,15 @@ def test_photographs_of_the_object_alone_keep_their_masks():
     assert torch.equal(found.photos.alpha, cut.alpha)
 
 
+def test_masks_that_were_mended_no_longer_end_where_they_were_given_to(
+    photos, tmp_path, monkeypatch
+):
+    cfg = replace(preset("draft", tmp_path / "mug", tmp_path), cameras="given")
+    assert prepare.find_silhouettes(photos, cfg).edges_given
+    monkeypatch.setattr(prepare, "weighed", lambda *_: ROUGH)
+    assert not prepare.find_silhouettes(photos, cfg).edges_given
+
+
 def test_masks_that_share_no_volume_once_mended_are_named(photos, tmp_path, monkeypatch):
     def fails(*_):
         raise UserError("the silhouettes share no volume")

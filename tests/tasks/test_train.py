@@ -141,13 +141,18 @@ def test_masks_that_are_too_wide_are_taken_in(tmp_path, monkeypatch, caplog, mas
         )
         both = torch.cat([color, torch.as_tensor(alpha)[..., None]], -1)
         write_png(path, (255 * both).round().byte().numpy())
+    trusted = []
     monkeypatch.setattr(task, "run_stage", lambda *_: None)
+    monkeypatch.setattr(
+        task, "fit_sharpness_", lambda _, pixels: trusted.append(pixels.edges_given)
+    )
     cfg = config(folder, tmp_path / "run", masks=masks)
     caplog.set_level("INFO", "univoxel")
     away = extract_mesh(load_scene(train(cfg))).vertices.norm(dim=1).mean()
     larger = 3 * 0.028 * (wide and masks == "given")
     assert away == pytest.approx(RADIUS + larger, abs=0.02)
     assert said in caplog.text if said else "too wide" not in caplog.text
+    assert trusted == [not (wide and masks == "auto")]
 
 
 @pytest.mark.parametrize(

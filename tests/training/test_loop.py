@@ -17,6 +17,7 @@ from univoxel.tasks.train import train
 from univoxel.training import loop, progress
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.loop import weighted
+from univoxel.training.pixels import TrainingPixels
 
 
 def test_every_term_of_a_light_has_its_own_weight():
@@ -37,9 +38,18 @@ def test_the_density_ends_as_sharp_as_held_out_pixels_want_it(monkeypatch, best)
         return -abs(math.log(scene.inv_s / (10.0 * best)))
 
     monkeypatch.setattr(loop, "held_out_psnr", quality)
-    loop.fit_sharpness_(scene, SimpleNamespace(photos=None, held_out=None))
+    loop.fit_sharpness_(scene, TrainingPixels(None, None, None))
     assert scene.inv_s == pytest.approx(10.0 * best)
     assert min(asked) < 10 < max(asked)
+
+
+def test_masks_whose_edges_were_moved_do_not_tell_how_sharp_the_density_is(monkeypatch):
+    scene = SimpleNamespace(inv_s=10.0)
+    monkeypatch.setattr(loop, "held_out_psnr", lambda scene, *_, **__: scene.inv_s)
+    loop.fit_sharpness_(scene, TrainingPixels(None, None, None, edges_given=False))
+    assert scene.inv_s == 10.0
+    loop.fit_sharpness_(scene, TrainingPixels(None, None, None))
+    assert scene.inv_s == 20.0
 
 
 def test_patches_are_compared_in_every_second_step_and_told_in_all(tmp_path, monkeypatch):

@@ -113,6 +113,7 @@ def _train(
     begin = ranks.tick()  # only now: how long reading takes is the photographs' affair
     silhouettes = find_silhouettes(photos, cfg)
     pixels = split_pixels(silhouettes.photos, silhouettes.distance, silhouettes.doubted)
+    pixels = replace(pixels, edges_given=silhouettes.edges_given)
     limited = plan.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
     scene, state, pinned = start(silhouettes, cfg, limited, resume)
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used

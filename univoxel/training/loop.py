@@ -353,8 +353,11 @@ def fit_sharpness_(scene: Scene, pixels: TrainingPixels) -> None:
     """Give the density the sharpness with which held-out pixels are drawn best.
 
     A stage ends with one that is even over the grid. How wide a silhouette's fringe has to be
-    depends on the pixels too, and on how well masks and surface agree.
+    depends on the pixels too, and on how well masks and surface agree. Masks whose edges were
+    moved, or are doubted and left out, do not tell it: every fringe looks too wide beside them.
     """
+    if not pixels.edges_given:
+        return
     before = scene.inv_s
     found = {}
     for factor in SHARPNESS_FACTORS:
