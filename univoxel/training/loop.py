@@ -354,7 +354,7 @@ def fit_sharpness_(scene: Scene, pixels: TrainingPixels) -> None:
 
     A stage ends with one that is even over the grid. How wide a silhouette's fringe has to be
     depends on the pixels too, and on how well masks and surface agree. Masks whose edges were
-    moved, or are doubted and left out, do not tell it: every fringe looks too wide beside them.
+    moved, or are doubted and left out, do not tell it: most fringes look too wide beside them.
     """
     if not pixels.edges_given:
         return
