@@ -10,10 +10,12 @@ from observed_points import lamps, no_metal, sphere_of
 from univoxel.joint import initialise
 from univoxel.joint.config import JointConfig
 from univoxel.joint.initialise import initialise_, neutralise_
+from univoxel.joint.metals import find_metal
 from univoxel.joint.newton import NewtonRound
 from univoxel.lights.views import ViewLights
 
 CFG = JointConfig(newton_points=500, newton_views=8)
+DARK = (0.12, 0.08, 0.05), 1.0, 0.3  # base colour, metallic and roughness of bronze with a patina
 
 
 def initialised(scene, problem, seconds=math.inf, before=None):
@@ -167,8 +169,28 @@ def test_where_metal_alone_explains_as_much_there_is_nothing_else(
     # What would be found from metal everywhere is of no use where there is nothing else
     assert len(searched) == (0 if known else 1 if taken else 2)
     # Points are looked at under the map for metal, with the last threshold
-    asked = known is None and not varying and smooth < 1.15 * min(found, 1.0)
+    asked = known is None and not varying and smooth < CFG.trials.only_metal * min(found, 1.0)
     assert of_metal == ([(1.0, 1.0)] if asked else [])
+
+
+def test_grain_makes_no_metal_of_paint(monkeypatch):
+    """Either leaves as much of noisy photographs; dark metal, without noise, is known as metal."""
+    for noise, material, metal in ((0.1, ((0.5, 0.3, 0.2), 0.0, 0.4), False), (0.0, DARK, True)):
+        torch.manual_seed(0)
+        scene, problem = sphere_of(*material)
+        with torch.no_grad():
+            scene.sky.log_radiance.zero_()
+        grain = noise * torch.randn(problem.target.shape)
+        problem = replace(problem, target=(problem.target + grain).clamp(0, 1))
+        asked = []
+
+        def recorded(scene, problem, cfg, done, asked=asked):
+            asked.append(cfg.metal.min_reflectance == 0)
+            return find_metal(scene, problem, cfg, done)
+
+        monkeypatch.setattr(initialise, "find_metal", recorded)
+        assert initialised(scene, problem).only_metal == metal
+        assert any(asked)  # the residuals alone would call either metal
 
 
 def test_of_metal_alone_nothing_is_tried_but_roughness(monkeypatch):

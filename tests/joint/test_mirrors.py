@@ -117,7 +117,7 @@ def test_lacquer_changes_less_than_what_it_mirrors():
 
 
 def test_what_changes_more_than_all_that_it_could_mirror_is_no_mirror():
-    """Paint under a sun that is one node of a dark map."""
+    """As paint under a sun does, beside which the map is dark; here the map is too dark."""
     scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
     assert find_mirrors(scene, problem, CFG).metal.float().mean() > 0.9
     with torch.no_grad():

@@ -255,7 +255,7 @@ class TrialConfig:
     # to 0.93 is; of dielectrics hardly ever as much
     mostly_metal: float = 0.95
     # share, [0, 1], of the points that are most of them: look like metal for all to be metal, and
-    # for mostly_metal. Under a map for metal 0.9 do where all is, up to 0.3 where nothing is
+    # for mostly_metal. Under a map for metal 0.9 do where all is, 0.34 at most elsewhere
     majority: float = 0.5
 
     def __post_init__(self) -> None:

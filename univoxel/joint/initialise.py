@@ -142,7 +142,7 @@ def the_best(tried: Sequence[Hypothesis], cfg: TrialConfig) -> Hypothesis:
 
 def nothing_but_metal_(trials: Trials, explained: float, everywhere: Sequence[Hypothesis]) -> bool:
     """Whether metal everywhere explains the photographs about as well as metal as it was found, and
-    most points, however dark, look like metal under its map. It leaves the scene in that state.
+    most points, however dark, look like metal under its map. It may change the scene's state.
 
     It has no diffuse light to explain them with, and so the fewer ways. Where it is rough, its
     highlights are as wide as diffuse light, and it explains paint. Grain, fur or lights that change

@@ -40,7 +40,7 @@ class Silhouettes:
     refined: bool  # whether the cameras are refined
     votes: int = 1  # views that have to carve a node of the hull, >= 1
     doubted: Tensor | None = None  # [V, H, W] bool: nothing is learned there; None: nowhere
-    edges_given: bool = True  # whether masks end where they were given to end
+    edges_given: bool = True  # whether masks are as given, and none of their edges doubted
 
 
 @dataclass(frozen=True)
@@ -67,19 +67,17 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
         say_strays(photos, cfg.preparation.light_frame)
     given = photos
     photos, distance = fitted_masks(given, cfg.masks, cfg.preparation.masks)
-    edges_given = photos is given
     try:
         belief = weighed(photos, distance, cfg.cameras, cfg.masks, cfg.preparation)
         found = mended(photos, distance, belief, cfg.preparation) if belief.votes > 1 else None
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
-    doubted = None
+    doubted, edges_given = None, photos is given and found is None
     if found is not None:
         photos, doubted = found.photos, found.doubted
         distance, belief = found.distance, found.belief
-        edges_given = False
-    votes = belief.votes
-    return Silhouettes(photos, distance, belief.box, belief.refined, votes, doubted, edges_given)
+    believed = belief.box, belief.refined, belief.votes
+    return Silhouettes(photos, distance, *believed, doubted, edges_given)
 
 
 def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:

@@ -29,7 +29,7 @@ class TrainingPixels:
     photos: Photos
     trained: Tensor  # [P, 3 and more]
     held_out: Tensor  # only looked at, to follow quality
-    edges_given: bool = True  # whether masks end where they were given to end
+    edges_given: bool = True  # whether masks are as given, and none of their edges doubted
 
 
 def split_pixels(photos: Photos, distance: Tensor, doubted: Tensor | None = None) -> TrainingPixels:
