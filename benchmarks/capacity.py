@@ -8,15 +8,13 @@ already is not done again. `ball` for DATA makes the scene of ball.py. A setting
 `dense-adaptive`, those on dense grids;
 `budget-X`, adaptive in X million bytes; `voxels-X`, dense with X million voxels in the fine stages;
 `channels-N`, dense with N feature channels, half of them of material. Parameters are counted as
-`univoxel info` does, in the model's file. Writes results/capacity.json, .png and .svg; the result
-names the command.
+`univoxel info` does, in the model's file. Writes results/capacity.json, .png and .svg.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -114,7 +112,6 @@ def main() -> None:
     arguments = parser.parse_args()
     plots.require()
     result = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {"runs": {}}
-    result["command"] = " ".join(["python", *sys.argv])
     for data in arguments.data:
         source = write(arguments.work / "data/ball") if str(data) == "ball" else data
         for setting in arguments.settings:

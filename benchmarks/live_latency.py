@@ -35,6 +35,7 @@ from univoxel.metrics import psnr
 from univoxel.page import PageOptions, lights_of
 from univoxel.pictures.viewpoints import orbit
 from univoxel.render.relight import Lighting
+from univoxel.run import trained_on
 from univoxel.viewer import denoise
 from univoxel.viewer.frames import Look, refined_pictures
 from univoxel.viewer.server import serving
@@ -180,8 +181,7 @@ def measured(run: Path, moves: int) -> list[str | float | None]:
             turn_light(tab, moves)
     assert min(len(camera.found), len(light.found)) > moves / 2, "moves were not answered"
     medians = [statistics.median(found) for found in (camera.found, light.found, decoded)]
-    name = run.parent.name if run.name == "run" else run.name
-    return [name, len(subject.traced.mesh.faces), *medians, rest_seconds(subject)]
+    return [trained_on(run).name, len(subject.traced.mesh.faces), *medians, rest_seconds(subject)]
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""When, and of which commit, a result is: the first keys of every file in results/."""
+"""When, and of which version, a result is: the first keys of every file in results/."""
 
 from __future__ import annotations
 
@@ -6,11 +6,24 @@ import subprocess
 from datetime import date
 from pathlib import Path
 
+# What decides a result. The commit is the last that changed any of it: pages and results may be
+# committed between two measurements of one version.
+MEASURED = [":/univoxel", ":/csrc", ":/cmake", ":/CMakeLists.txt"]
+
 
 def made() -> dict[str, str]:
-    """Today's date and the commit, with -dirty where files differ from it."""
-    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    """Today's date and the commit of package and kernels, with -dirty where they differ from it."""
+    commit = _git("log", "-1", "--format=%h", "--", *MEASURED) or "unknown"
+    changed = _git("status", "--porcelain", "--", *MEASURED)
+    return {"date": date.today().isoformat(), "commit": commit + ("-dirty" if changed else "")}
+
+
+def _git(*arguments: str) -> str:
     told = subprocess.run(
-        command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False
+        ["git", *arguments],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    return {"date": date.today().isoformat(), "commit": told.stdout.strip() or "unknown"}
+    return told.stdout.strip()

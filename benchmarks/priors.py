@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -147,7 +146,6 @@ def chart(result: dict, path: Path) -> None:
             axis.set_ylabel(f"{title}, dB")
             axis.spines[["top", "right"]].set_visible(False)
             axis.legend(fontsize=7)
-    figure.suptitle(result["command"], size=7)
     figure.tight_layout()
     for suffix in (".png", ".svg"):
         figure.savefig(path.with_suffix(suffix), dpi=100)
@@ -168,8 +166,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results/priors.json")
     arguments = parser.parse_args()
     result = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {"runs": {}}
-    if arguments.scenes:
-        result["command"] = " ".join(["python", *sys.argv])
     jobs = []  # scene, folder, light, loss
     default = LossConfig()
     for scene in arguments.scenes:

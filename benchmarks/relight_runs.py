@@ -109,7 +109,7 @@ def main() -> None:
     result = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {}
     result["threads"] = torch.get_num_threads()
     for run in arguments.runs:
-        own = result.setdefault(run.name, {})
+        own = result.setdefault(trained_on(run).name, {})
         if "scores" in arguments.only:
             own["scores"] = scores(run, arguments.every)
         if "noise" in arguments.only:

@@ -10,7 +10,7 @@ Makes data sets of one, in --work:
   the data set's mesh with the albedo and roughness of the nearest pixels of its test views;
 - turned: the same, with the map turning with the camera about +Z, as on a turntable.
 Test views and all ground truth stay as they are. Then trains each kind without and with --varying
-and evaluates; what is done already is not done again. The result names the command.
+and evaluates; what is done already is not done again.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import argparse
 import json
 import math
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -205,7 +204,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results/varying.json")
     arguments = parser.parse_args()
     result = json.loads(arguments.out.read_text()) if arguments.out.is_file() else {"runs": {}}
-    result["command"] = " ".join(["python", *sys.argv])
     for light in arguments.lights:
         for kind in arguments.kinds:
             data = make(arguments.data, kind, arguments.work / f"{arguments.data.name}_{kind}")
