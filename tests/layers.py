@@ -120,6 +120,7 @@ HELPERS = {
         *("config", "photographs", "grouping", "turning", "database", "pairs", "engine", "model"),
         *("prepare", "video", "evidence"),
     },
+    "commands": {"arguments"},
     "experiments.stress": {"axes", "damage", "render", "report", "rough", "scenes", "shapes"},
 }
 

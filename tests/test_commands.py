@@ -6,7 +6,7 @@ import sys
 import pytest
 
 import univoxel
-from univoxel.commands import parse_ground, point_light, sun_light
+from univoxel.commands.using import parse_ground, point_light, sun_light
 
 
 def test_suns_and_points():

@@ -73,6 +73,26 @@ def test_groups_of_dense_parameters_follow_adam():
         torch.testing.assert_close(a, b, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("which", ["gradient", "parameter", "slice", "both"])
+def test_memory_in_another_order_follows_adam(which):
+    """torch's fused step would read it as if it lay in order."""
+
+    def parameter():
+        values = grid(4, 6).detach()
+        return {"gradient": values, "slice": values[:, :3]}.get(which, values.T).requires_grad_()
+
+    mine, theirs = parameter(), parameter()
+    optimizer = RowAdam([mine], lr=0.05, betas=BETAS)
+    oracle = torch.optim.Adam([theirs], lr=0.05, betas=BETAS, foreach=False)
+    for step in range(3):
+        gradient = grid(*mine.shape[::-1], seed=step).detach().T
+        mine.grad = gradient.contiguous() if which == "parameter" else gradient
+        theirs.grad = gradient.clone()
+        optimizer.step()
+        oracle.step()
+    torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
+
+
 def _backward(params):
     loss = sum(p.square().sum() for p in params)
     loss.backward()

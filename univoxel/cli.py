@@ -16,7 +16,6 @@ from univoxel import __version__
 from univoxel.commands import (
     EVERYDAY,
     LABORATORY,
-    STDOUT,
     batch,
     capture,
     chart,
@@ -25,6 +24,7 @@ from univoxel.commands import (
     stress,
     train,
 )
+from univoxel.commands.arguments import STDOUT
 from univoxel.errors import UserError
 from univoxel.parsing import LAB, Call, Command, Common, Usage, overview, parse
 

@@ -123,26 +123,30 @@ class RowAdam(torch.optim.Optimizer):
         )
 
     def _step_dense(self, params: list[Tensor], group: dict[str, Any]) -> None:
-        if not params:
-            return
-        states = [self._state_of(p) for p in params]
         beta1, beta2 = group["betas"]
-        adam(
-            params,
-            [p.grad for p in params if p.grad is not None],
-            [s["exp_avg"] for s in states],
-            [s["exp_avg_sq"] for s in states],
-            [],
-            [s["step"] for s in states],
-            amsgrad=False,
-            beta1=beta1,
-            beta2=beta2,
-            lr=group["lr"],
-            weight_decay=0.0,
-            eps=group["eps"],
-            maximize=False,
-            fused=True,
-        )
+        # Fused, it takes all memory to be in order, and reads at wrong places what is laid out
+        # otherwise: gradients are put in order, and parameters that are not take its other step
+        for fused in (True, False):
+            own = [p for p in params if p.is_contiguous() == fused]
+            if not own:
+                continue
+            states = [self._state_of(p) for p in own]
+            adam(
+                own,
+                [p.grad.contiguous() for p in own if p.grad is not None],
+                [s["exp_avg"] for s in states],
+                [s["exp_avg_sq"] for s in states],
+                [],
+                [s["step"] for s in states],
+                amsgrad=False,
+                beta1=beta1,
+                beta2=beta2,
+                lr=group["lr"],
+                weight_decay=0.0,
+                eps=group["eps"],
+                maximize=False,
+                fused=fused,
+            )
 
     def _state_of(self, param: Tensor) -> dict[str, Any]:
         """Step and moments, zero at first; in torch.optim.Adam's names and types."""

@@ -1,6 +1,5 @@
-"""The stage that solves for one map: its equations against autograd, its answers against truth."""
+"""The stage that solves for one map: its answers against truth, its order, its ends."""
 
-import math
 from dataclasses import asdict, replace
 
 import pytest
@@ -10,10 +9,7 @@ from observed_points import (
     BLUE,
     RED,
     Steps,
-    facing,
-    in_double,
     lamps,
-    no_metal,
     photographed,
     photographs_under,
     problem_on_a_sphere,
@@ -23,313 +19,24 @@ from torch.nn.functional import normalize
 
 from univoxel import brdf
 from univoxel.checkpoint import load_checkpoint
-from univoxel.color import linear_to_srgb_unclipped
 from univoxel.config import TrainConfig
-from univoxel.joint import equations, newton, stage
-from univoxel.joint.config import JointConfig, NewtonConfig
-from univoxel.joint.newton import NewtonRound, newton_round_
+from univoxel.joint import stage
+from univoxel.joint.config import JointConfig
+from univoxel.joint.newton import NewtonRound
 from univoxel.joint.observations import (
     Decisions,
     Mirrors,
     prefiltered_roughness,
-    sample_observations,
 )
 from univoxel.lights.sg import SGConfig
-from univoxel.ops import shade_map
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig
-from univoxel.sphere import fibonacci_sphere
 from univoxel.tasks import train as train_task
 from univoxel.training import progress
 from univoxel.training.config import StageConfig
 
-CAUCHY = NewtonConfig().cauchy
-
-
-@pytest.fixture(params=["dielectric", "metal"])
-def transport_and_map(request):
-    """Transport in double, a map and albedos that do not explain it, some observations clipped."""
-    problem, metal = random_problem(), request.param == "metal"
-    map, albedo = 0.7 + 2.5 * torch.rand(12, 3), 0.2 + 0.6 * torch.rand(5, 3)
-    problem = photographed(problem, map, *of_metal(metal, albedo, torch.full((5,), 0.3)))
-    target = problem.target + 0.03 * torch.randn_like(problem.target)
-    target = target.clamp_max(1.0)  # as photographs are
-    problem = replace(problem, target=target)
-    point, observation = torch.arange(5), torch.arange(20).view(5, 4)
-    rough = torch.full((5,), 0.3)
-    transport = newton.linear_transport(problem, point, observation, rough, metal)
-    map = map * torch.linspace(1.6, 0.9, 12)[:, None]
-    return in_double(transport), map.double(), albedo.log().double()
-
-
-def of_metal(metal: bool, base: torch.Tensor, roughness: torch.Tensor):
-    """Diffuse albedo, roughness and F0."""
-    diffuse, f0 = brdf.split(base, torch.full((len(base),), float(metal)))
-    return diffuse, roughness, f0
-
-
-@pytest.mark.parametrize("metal", [False, True])
-def test_transport_makes_what_the_shading_makes(metal):
-    problem = random_problem()
-    map, albedo, roughness = torch.rand(12, 3), torch.rand(5, 3), 0.2 + 0.6 * torch.rand(5)
-    problem = photographed(problem, map, *of_metal(metal, albedo, roughness))
-    point, which = torch.tensor([0, 2, 4]), torch.tensor([[3, 1], [9, 8], [18, 18]])
-    transport = newton.linear_transport(problem, point, which, roughness[point], metal)
-    radiance = radiance_of(transport, map, albedo[point])
-    assert torch.allclose(radiance, problem.observations.color[which], rtol=1e-4, atol=1e-6)
-    assert torch.equal(transport.target, problem.target[which])
-
-
-def radiance_of(transport: equations.LinearTransport, map: torch.Tensor, albedo: torch.Tensor):
-    sky = transport.diffuse_factor[..., None] * (transport.diffuse @ map)
-    specular = transport.specular @ map + transport.specular_indirect
-    return albedo[:, None] * (sky + transport.diffuse_indirect) + specular
-
-
-def weights(transport: equations.LinearTransport, map: torch.Tensor, log_albedo: torch.Tensor):
-    residual = transport.target - linear_to_srgb_unclipped(
-        radiance_of(transport, map, log_albedo.exp())
-    )
-    weight = 1 / (1 + (residual / CAUCHY) ** 2)
-    return torch.where((transport.target > equations.CLIPPED) & (residual < 0), 0.0, weight)
-
-
-def test_equations_are_the_schur_complement_of_the_dense_system(transport_and_map):
-    transport, map, log_albedo = transport_and_map
-    weight = weights(transport, map, log_albedo)
-    assert 0 < int((weight == 0).sum()) < weight.numel() / 2  # clipped observations are among them
-    state = transport, map, log_albedo, CAUCHY
-    eliminated, right, back = equations.normal_equations(*state)
-    cost = 0.0
-    for c in range(3):
-
-        def encoded(x, a, c=c):
-            light, albedo = map.clone(), log_albedo.exp()
-            light[:, c], albedo[:, c] = x.exp(), a.exp()
-            return linear_to_srgb_unclipped(radiance_of(transport, light, albedo))[..., c].flatten()
-
-        x, a = map[:, c].log(), log_albedo[:, c]
-        j_map, j_albedo = torch.autograd.functional.jacobian(encoded, (x, a))
-        w = weight[..., c].flatten()
-        residual = transport.target[..., c].flatten() - encoded(x, a)
-        cost += (w * residual**2).sum()
-        full = torch.cat([j_map, j_albedo], 1)
-        hessian, gradient = full.T @ (w[:, None] * full), full.T @ (w * residual)
-        own = hessian[12:, 12:] + 1e-6 * torch.eye(5)
-        cross, inverse = hessian[:12, 12:], torch.linalg.inv(own)
-        exact = {"rtol": 1e-6, "atol": 1e-9}  # double, but for float32 constants of the curve
-        assert torch.allclose(eliminated[c], hessian[:12, :12] - cross @ inverse @ cross.T, **exact)
-        assert torch.allclose(right[c], gradient[:12] - cross @ inverse @ gradient[12:], **exact)
-        assert torch.allclose(back.gradient[c], gradient[12:], **exact)
-        assert torch.allclose(back.curvature[c], own.diagonal(), **exact)
-        assert torch.allclose(back.cross[c], cross.T, **exact)
-
-        # One step of the eliminated system and what it says of the albedo: the dense solution
-        damping = 1e-4 * torch.eye(12)
-        dense = hessian.clone()
-        dense[12:, 12:], dense[:12, :12] = own, hessian[:12, :12] + damping
-        solution = torch.linalg.solve(dense, gradient)
-        step = torch.linalg.solve(eliminated[c] + damping, right[c])
-        change = (back.gradient[c] - back.cross[c] @ step) / back.curvature[c]
-        assert torch.allclose(step, solution[:12], rtol=1e-4, atol=1e-7)
-        assert torch.allclose(change, solution[12:], rtol=1e-4, atol=1e-7)
-    assert back.cost == pytest.approx(float(cost), rel=1e-9)
-
-
-def test_the_gradient_is_that_of_the_cost_at_fixed_weights(transport_and_map):
-    transport, map, log_albedo = transport_and_map
-    weight = weights(transport, map, log_albedo)
-
-    def cost(log_map, log_albedo):
-        radiance = radiance_of(transport, log_map.exp(), log_albedo.exp())
-        residual = transport.target - linear_to_srgb_unclipped(radiance)
-        return (weight * residual**2).sum()
-
-    x, a = map.log(), log_albedo
-    _, right, back = equations.normal_equations(transport, map, log_albedo, CAUCHY)
-    h = 1e-5
-    for node, c in ((0, 0), (5, 1), (11, 2)):
-        step = torch.zeros_like(x)
-        step[node, c] = h
-        slope = (cost(x + step, a) - cost(x - step, a)) / (2 * h)
-        # The elimination's share of the gradient put back
-        g = right[c] + back.cross[c].T @ (back.gradient[c] / back.curvature[c])
-        assert g[node].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
-    step = torch.zeros_like(a)
-    step[3, 1] = h
-    slope = (cost(x, a + step) - cost(x, a - step)) / (2 * h)
-    assert back.gradient[1, 3].item() == pytest.approx(-slope.item() / 2, rel=1e-5, abs=1e-9)
-
-
-def test_roughness_is_eliminated_by_the_schur_complement_too():
-    """Of the dense system of three channels, which roughness ties to one another; in double."""
-    problem = random_problem()
-    true, albedo = 0.7 + 2.5 * torch.rand(12, 3), 0.2 + 0.6 * torch.rand(5, 3)
-    problem = photographed(problem, true, albedo, torch.full((5,), 0.5))
-    point, observation, by = torch.arange(5), torch.arange(20).view(5, 4), 0.02
-    transport, rougher = (
-        in_double(newton.linear_transport(problem, point, observation, rough, False))
-        for rough in (torch.full((5,), 0.3), torch.full((5,), 0.3 + by))
-    )
-    map, log_albedo = (true * 1.2).double(), (0.9 * albedo).log().double()
-    prior, deviation = 0.3, torch.linspace(-0.1, 0.2, 5).double()
-
-    def encoded(x, a, rough):  # linear in roughness, as the equations take it
-        state = x.view(12, 3).exp(), a.view(5, 3).exp()
-        now, then = (radiance_of(t, *state) for t in (transport, rougher))
-        return linear_to_srgb_unclipped(now + rough[:, None, None] / by * (then - now)).flatten()
-
-    state = map.log().flatten(), log_albedo.flatten(), torch.zeros(5).double()
-    jacobian = torch.cat(torch.autograd.functional.jacobian(encoded, state), 1)
-    w = weights(transport, map, log_albedo).flatten()
-    residual = transport.target.flatten() - encoded(*state)
-    hessian, gradient = jacobian.T @ (w[:, None] * jacobian), jacobian.T @ (w * residual)
-    hessian[36:51, 36:51] += 1e-6 * torch.eye(15)
-    hessian[51:, 51:] += prior * torch.eye(5)
-    gradient[51:] -= prior * deviation
-
-    step = equations.RoughnessStep(rougher, by, prior, deviation)
-    state = transport, map, log_albedo, CAUCHY
-    own, right, back = equations.normal_equations(*state, None, step)
-    coupling, from_gradient = equations.roughness_terms(back.roughness)
-    system, right = torch.block_diag(*own) - coupling, (right - from_gradient).flatten()
-    order = torch.arange(36).view(12, 3).T.flatten()  # channel after channel
-    cross, inverse = hessian[:36, 36:], torch.linalg.inv(hessian[36:, 36:])
-    exact = {"rtol": 1e-5, "atol": 1e-8}  # double, but for float32 constants of the curve
-    complement = (hessian[:36, :36] - cross @ inverse @ cross.T)[order][:, order]
-    assert torch.allclose(system, complement, **exact)
-    assert torch.allclose(right, (gradient[:36] - cross @ inverse @ gradient[36:])[order], **exact)
-    assert (own[0] - system[:12, :12]).abs().max() > 1e-3 * own[0].abs().max()  # it matters
-
-    hessian[:36, :36] += 1e-4 * torch.eye(36)
-    solution = torch.linalg.solve(hessian, gradient)
-    step = torch.linalg.solve(system + 1e-4 * torch.eye(36), right)
-    to_albedo, to_rough = back.back_substituted(step.view(3, 12))
-    found = {"rtol": 1e-4, "atol": 1e-7}
-    assert torch.allclose(step, solution[:36][order], **found)
-    assert torch.allclose(to_albedo.flatten(), solution[36:51], **found)
-    assert torch.allclose(to_rough, solution[51:], **found)
-
-
-@pytest.mark.parametrize(("count", "size"), [(30, 12), (3, 10), (5, 1), (0, 4)])
-def test_gram_is_the_product_with_the_transpose(count, size):
-    matrix = torch.randn(count, size, dtype=torch.float64)
-    torch.testing.assert_close(equations.gram(matrix), matrix.T @ matrix)
-
-
-def test_prefiltered_lobes_cover_the_gap_between_nodes():
-    roughness = torch.tensor([0.05, 0.3, 1.0])
-    wide = prefiltered_roughness(roughness, 64)
-    assert torch.allclose(wide**4 - roughness**4, torch.full((3,), 1 / 64), rtol=1e-4)
-    # The mean over a gap of what point lights of 64 nodes make of a mirror: near the right one
-    direction, normal = fibonacci_sphere(64), normalize(torch.randn(500, 3), dim=1)
-    wo = facing(normal, 0.5)
-    albedo, one = torch.zeros(500, 3), torch.ones(64, 3)
-    seen = shade_map(
-        one, torch.ones(500, 64), torch.zeros(500, 64, 3), torch.arange(500), normal, wo, albedo,
-        wide[:1].expand(500), direction, 4 * math.pi / 64,
-    )[:, 0]  # fmt: skip
-    assert seen.std() < 0.5 * seen.mean()
-
-
-def test_laplacian():
-    direction = fibonacci_sphere(200)
-    matrix = equations.graph_laplacian(direction, 6)
-    assert (matrix.sum(1) == 0).all()
-    assert torch.equal(matrix, matrix.T)
-    assert (matrix.diagonal() >= 6).all()
-    near = (direction[0] @ direction.T).topk(7).indices[1:]
-    assert (matrix[0, near] == -1).all()
-    assert (matrix - torch.diag(matrix.diagonal()) <= 0).all()
-    # A smooth function costs little, an uneven one much: x' L x sums squared differences
-    smooth, rough = direction[:, 2], torch.arange(200) % 2 * 2.0 - 1
-    edges = 0.5 * (matrix.diagonal().sum())
-    assert smooth @ matrix @ smooth < 0.1 * edges
-    assert rough @ matrix @ rough > edges
-
-
-def test_samples_are_points_that_are_seen_and_their_own_observations():
-    torch.manual_seed(0)
-    problem = problem_on_a_sphere(6, 1, 8)
-    counts = torch.tensor([3, 0, 1, 0, 0, 5])
-    offsets = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
-    seen = replace(problem.observations, offsets=offsets)
-    problem = replace(problem, observations=seen)
-    point, observation = sample_observations(problem, 300, 4)
-    assert point.shape == observation.shape == (1200,)
-    assert (point.view(300, 4) == point.view(300, 4)[:, :1]).all()
-    owner = torch.repeat_interleave(counts)
-    assert torch.equal(owner[observation], point)
-    assert set(observation.tolist()) == set(range(9))  # each is drawn at times
-
-
 CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
-
-
-def test_newton_recovers_a_known_map():
-    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
-    scene = scene_of(albedo, roughness, nodes)
-    problem = problem_on_a_sphere(400, 12, nodes, scene)
-    torch.manual_seed(2)
-    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
-    shown = prefiltered_roughness(torch.full((400,), roughness), nodes)  # a node is a patch of sky
-    problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
-    costs = newton_round_(scene, problem, no_metal(problem), CFG).costs
-    costs += newton_round_(scene, problem, no_metal(problem), CFG).costs
-    assert len(costs) == 2 * CFG.newton_steps
-    error = scene.sky.log_radiance.detach() - true.log()
-    assert costs[-1] < 1e-3 * costs[0]
-    # What is left is the smoothness, which this uneven map has none of
-    assert error.abs().mean() < 0.25 * true.log().abs().mean()
-
-
-def test_newton_finds_the_map_under_a_roughness_that_is_wrong():
-    """Where roughness may change, the map is right; where it stays, the map takes the error on."""
-    errors = []
-    for free in (0.0, CFG.newton_roughness):
-        nodes, albedo = 64, torch.tensor([0.5, 0.4, 0.3])
-        scene = scene_of(tuple(albedo.tolist()), 0.45, nodes)
-        problem = problem_on_a_sphere(400, 12, nodes, scene)
-        shown = prefiltered_roughness(torch.full((400,), 0.3), nodes)
-        problem = photographed(problem, lamps(nodes), albedo.expand(400, 3), shown)
-        for _ in range(2):
-            cfg = replace(CFG, newton_roughness=free)
-            newton_round_(scene, problem, no_metal(problem), cfg)
-        errors.append((scene.sky.log_radiance.detach() - lamps(nodes).log()).abs().mean())
-    assert errors[1] < 0.5 * errors[0]  # not all: roughness has a pull to where it was
-
-
-@pytest.mark.parametrize("views", [2, 3])
-def test_newton_learns_from_few_photographs(views):
-    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
-    scene = scene_of(albedo, roughness, nodes)
-    problem = problem_on_a_sphere(400, views, nodes, scene)
-    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
-    shown = prefiltered_roughness(torch.full((400,), roughness), nodes)
-    problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
-    costs = newton_round_(scene, problem, no_metal(problem), CFG).costs
-    assert len(costs) == CFG.newton_steps
-    assert costs[-1] < 0.1 * costs[0]
-
-
-def test_newton_in_no_time_takes_few_points(monkeypatch):
-    scene, counts = scene_of((0.5, 0.4, 0.3), 0.4, 32), []
-    problem = problem_on_a_sphere(100, 12, 32, scene)
-    equations = newton.normal_equations
-
-    def counted(transport, *arguments):
-        counts.append(len(transport.diffuse))
-        return equations(transport, *arguments)
-
-    monkeypatch.setattr(newton, "normal_equations", counted)
-    monkeypatch.setattr(newton, "NEWTON_CHUNK", 20)
-    cfg = replace(CFG, newton_steps=2)
-    newton_round_(scene, problem, no_metal(problem), cfg, seconds=0.0)
-    assert counts == [20] * (1 + cfg.newton_steps * cfg.newton.min_parts)  # one to measure
-    counts.clear()
-    newton_round_(scene, problem, no_metal(problem), cfg, seconds=1e3)
-    assert counts == [20] * (1 + cfg.newton_steps * 5)
 
 
 def test_a_run_that_was_cut_traces_fewer_points(monkeypatch):
@@ -345,54 +52,6 @@ def test_a_run_that_was_cut_traces_fewer_points(monkeypatch):
         steps.pace = pace
         stage.solve(sphere_scene(8), photos_of(1, 8), JointConfig(points=10000), 0, steps)
     assert asked == [10000, 5000, JointConfig().surface.min_points]
-
-
-def test_no_steps_of_newton_leave_the_map():
-    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
-    problem = problem_on_a_sphere(20, 8, 32, scene)
-    cfg = replace(CFG, newton_steps=0)
-    assert newton_round_(scene, problem, no_metal(problem), cfg, seconds=10.0) == NewtonRound()
-    assert (scene.sky.log_radiance == 0).all()
-
-
-def test_newton_without_rich_points_leaves_the_map():
-    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
-    problem = problem_on_a_sphere(
-        20, 1, 32, scene
-    )  # of one observation the albedo explains everything
-    assert newton_round_(scene, problem, no_metal(problem), CFG) == NewtonRound()
-    assert (scene.sky.log_radiance == 0).all()
-
-
-def test_parts_are_of_one_material(monkeypatch):
-    monkeypatch.setattr(newton, "NEWTON_CHUNK", 4)
-    point, metal = torch.randperm(30)[:22], torch.arange(30) % 3 == 0
-    order, parts = newton.in_parts(point, metal)
-    assert sorted(order.tolist()) == sorted(point.tolist())
-    assert torch.equal(torch.cat(parts), torch.arange(22))
-    for part in parts:
-        assert 1 <= len(part) <= 4
-        assert len(metal[order[part]].unique()) == 1
-
-
-def test_metals_show_the_map():
-    """Half of a sphere in copper: light is found, whose colour is not that of the metal."""
-    nodes, count = 64, 600
-    base, roughness = torch.tensor([0.9, 0.6, 0.4]), 0.3
-    scene = scene_of(tuple(base.tolist()), roughness, nodes)
-    problem = problem_on_a_sphere(count, 12, nodes, scene)
-    metal = problem.observations.normal[:, 0] > 0
-    torch.manual_seed(2)
-    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
-    shown = prefiltered_roughness(torch.full((count,), roughness), nodes)
-    diffuse, f0 = brdf.split(base.expand(count, 3), metal.float())
-    problem = photographed(problem, true, diffuse, shown, f0)
-    costs = newton_round_(scene, problem, Decisions(metal), CFG).costs
-    costs += newton_round_(scene, problem, Decisions(metal), CFG).costs
-    assert costs[-1] < 1e-3 * costs[0]
-    error = scene.sky.log_radiance.detach() - true.log()
-    # What is left is the smoothness, as above
-    assert error.abs().mean() < 0.25 * true.log().abs().mean()
 
 
 @pytest.mark.parametrize("metal", [False, True])
@@ -723,20 +382,6 @@ def test_without_paint_materials_stay(monkeypatch):
     stage.teach_albedo_(scene, problem, Decisions(torch.ones(50, dtype=torch.bool)), CFG)
     after = scene.state_dict()
     assert all(torch.equal(after[k], before[k]) for k in after)
-
-
-def test_newton_starts_from_the_albedo_that_it_is_given():
-    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
-    problem = random_problem(50, scene=scene)
-    cfg = replace(CFG, newton_points=20, newton_views=2)
-    albedo = torch.rand(50, 3)
-    nothing, given = no_metal(problem), replace(no_metal(problem), albedo=albedo)
-    points = newton.choose_points(scene, problem, given, cfg)
-    torch.testing.assert_close(points.log_albedo, albedo[points.point].clamp_min(1e-3).log())
-    torch.testing.assert_close(
-        newton.choose_points(scene, problem, nothing, cfg).log_albedo,
-        torch.full((20, 3), 0.5).log(),
-    )
 
 
 def test_a_solve_that_was_killed_goes_on_in_its_round(tmp_path, monkeypatch):

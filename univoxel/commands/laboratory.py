@@ -1,0 +1,167 @@
+"""Commands that measure the method: compare, chart, stress, submit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import arg
+
+from univoxel.commands.arguments import (
+    AtOnce,
+    Changes,
+    Minutes,
+    Run,
+    Scenes,
+    Scheduler,
+    check_minutes,
+)
+from univoxel.names import BOUNCES, LIGHTS, SAMPLES, LightName, PresetName, PresetOrAuto
+
+
+def submit(
+    run: Run,
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    samples: Annotated[int, arg(metavar="N")] = SAMPLES,
+    bounces: Annotated[int, arg(metavar="N")] = BOUNCES,
+) -> None:
+    """Write what the benchmark of Stanford-ORB measures, of a run.
+
+    The run was trained on a scene of it.
+
+    Args:
+        run: folder of a trained run
+        out: folder to write; its submission.json lists the files, as scripts/test.py of the
+            benchmark reads it
+        samples: light samples per pixel of relit pictures
+        bounces: reflections between parts of the object in relit pictures, 0 for none
+    """
+    from univoxel.tasks import submit as task
+
+    print(task.submit(run, out, samples, bounces))
+
+
+def compare(
+    scenes: Scenes,
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    preset: PresetOrAuto = "auto",
+    light: Annotated[tuple[str, ...], arg(metavar="LIGHT [LIGHT ...]")] = LIGHTS,
+    minutes: Minutes = None,
+    samples: int = SAMPLES,
+    set: Changes = (),
+    jobs: AtOnce = 1,
+    scheduler: Scheduler = None,
+) -> None:
+    """Train scenes with every model of light, side by side.
+
+    Writes DIR/compare.md, compare.json, compare.png and compare.svg. Every training is kept in
+    DIR/SCENE/LIGHT with all its measures (result.json); the same command again goes on after an
+    interruption and tries again what failed. Trainings run one after another, each in a process of
+    its own: leave the machine to them, or their times say little.
+
+    Args:
+        scenes: folders of photographs
+        out: folder for the results
+        preset: how much work goes into each training, as of train
+        light: models of light, as of train --light; sg:lobes=12 changes a field of the light's
+            configuration, sg:lobes=12,hidden=32 two
+        minutes: wall-clock limit of each training, above 0
+        samples: of the light, per pixel of relit pictures
+        set: one field of the configuration of all trainings, as of train
+        jobs: trainings at once; with more than one, their times say little
+        scheduler: of a Dask cluster whose workers train, as of batch
+    """
+    from univoxel.experiments import compare as experiment
+
+    check_minutes(minutes)
+    where = {"jobs": jobs, "scheduler": scheduler}
+    print(experiment.compare(scenes, out, preset, light, minutes, set, samples, **where))
+
+
+def chart(
+    scenes: Scenes,
+    /,
+    out: Annotated[Path, arg(metavar="DIR")],
+    preset: PresetName = "fast",
+    light: LightName = "hybrid",
+    quick: bool = False,
+    only: Annotated[
+        tuple[str, ...], arg(metavar="SETTING [SETTING ...]", help_behavior_hint="(default: all)")
+    ] = (),
+    samples: int = SAMPLES,
+    set: Changes = (),
+    jobs: AtOnce = 1,
+    scheduler: Scheduler = None,
+) -> None:
+    """Draw quality against training time, of presets and knobs.
+
+    Trains draft, fast, full, best, and --preset with one knob turned: voxels-x0.5 (half the voxels
+    of the finest grid), voxels-x2, rays-x0.5 (half the rays of a step), rays-x2, steps-,
+    directions- and lobes- alike, light-sg and so on. Writes DIR/chart.png, chart.svg and chart.json
+    with every measure, the log of each training, and the Pareto front of each measure: settings
+    that no other beats in both time and quality. Published figures, of other data and of GPUs, are
+    marked. Trainings are kept, and gone on with, as of compare.
+
+    Args:
+        scenes: folders of photographs
+        out: folder for the results
+        preset: what the knobs are turned around
+        light: of the presets and the knobs
+        quick: five settings instead of all
+        only: names of settings
+        samples: of the light, per pixel of relit pictures
+        set: one field of the configuration of all trainings, as of train
+        jobs: trainings at once; with more than one, their times say little
+        scheduler: of a Dask cluster whose workers train, as of batch
+    """
+    from univoxel.experiments import chart as experiment
+
+    where = {"jobs": jobs, "scheduler": scheduler}
+    print(experiment.chart(scenes, out, preset, light, quick, only, set, samples, **where))
+
+
+def stress(
+    out: Annotated[Path, arg(metavar="DIR")],
+    quick: bool = False,
+    only: Annotated[
+        tuple[str, ...], arg(metavar="AXIS [AXIS ...]", help_behavior_hint="(default: all)")
+    ] = (),
+    light: Annotated[
+        tuple[str, ...],
+        arg(
+            metavar="LIGHT [LIGHT ...]",
+            help_behavior_hint="(default: sg sh envmap hybrid; with --quick: hybrid)",
+        ),
+    ] = (),
+    seeds: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: 3; with --quick: 1)")
+    ] = None,
+    set: Changes = (),
+    jobs: AtOnce = 1,
+    scheduler: Scheduler = None,
+) -> None:
+    """Find out where the method breaks, on scenes of known truth.
+
+    Renders small scenes with Mitsuba 3, made harder along one axis each, spoils their photographs,
+    trains and measures. Writes DIR/stress.md with the breaking point of each axis, stress.json,
+    stress.png and stress.svg.
+    Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, rough-masks, thin,
+    fur, turntable, noise, placement, dark, bright; light-varying is trained with --varying light.
+    A training that fails is a result. What is done is kept: the same command goes on.
+
+    Args:
+        out: folder for scenes, photographs, trainings and results
+        quick: fewer severities of each axis
+        only: names of axes
+        light: models of light, as of train
+        seeds: trainings of each level, with other random numbers
+        set: one field of the configuration of all trainings, as of train
+        jobs: trainings at once; with more than one, their times say little
+        scheduler: of a Dask cluster whose workers train, as of batch
+    """
+    from univoxel.experiments.stress import suite
+
+    where = {"jobs": jobs, "scheduler": scheduler}
+    print(suite.stress(out, only, light, seeds, quick, set, **where))
