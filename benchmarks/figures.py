@@ -47,7 +47,7 @@ def script(name: str, minutes: int, arguments: str = "--out {work}/{name}.json")
 
 STRESS = "univoxel lab stress --out {work}/stress --jobs 2"
 ALL = "{sneaker} {tea_table} {metals}"
-CAPACITY = "ball {tiny} {sneaker} {tea_table} --settings hash adaptive dense sparse"
+CAPACITY = "ball {tiny} {sneaker} {tea_table}"
 KEPT = "--work {work}/{name} --out {work}/{name}.json"
 
 FIGURES = [

@@ -2,6 +2,8 @@
 is not there be replaced."""
 
 import os
+import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -73,3 +75,77 @@ def test_growth_writes_photographs_that_are_read_as_a_ball(monkeypatch, tmp_path
     lower, upper = estimate_bounds(mask_distances(photos.alpha), photos.cameras)
     for corner in (-lower, upper):
         assert corner.tolist() == pytest.approx([1.0] * 3, abs=0.25)  # with its margin
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
+    return pytest.importorskip("figures")
+
+
+def test_every_figure_can_be_made_anew(figures):
+    for figure in figures.FIGURES:
+        for command in figure.commands:
+            program, name, *_ = shlex.split(command)
+            assert program == "univoxel" or (figures.ROOT / name).is_file(), command
+
+
+@pytest.fixture
+def one_figure(figures, monkeypatch, tmp_path):
+    """A single figure, whose command is Python's, its folder, and the program's arguments."""
+    (tmp_path / "results").mkdir()
+    write = "open('{work}/f.json', 'w').write('{{\\\"error\\\": 1}}')"
+    figure = figures.Figure("f", 1, (f'python -c "{write}"',))
+    monkeypatch.setattr(figures, "FIGURES", [figure])
+    monkeypatch.setattr(figures, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr("sys.argv", ["figures.py", "data", "--work", str(tmp_path / "work")])
+    return figure
+
+
+def test_a_figure_is_made_once_of_each_version(figures, one_figure, monkeypatch, tmp_path, capfd):
+    made = {"date": "2026-01-01", "commit": "a"}
+    monkeypatch.setattr(figures, "made", lambda: made)
+    assert figures.main() == 0
+    result = tmp_path / "results/f.json"
+    assert figures.json.loads(result.read_text()) == made | {"error": 1}
+    assert "f: of None, to be of a; 1 min" in capfd.readouterr().out
+    assert figures.main() == 0
+    assert capfd.readouterr().out == ""
+    made["commit"] = "b"
+    assert figures.main() == 0
+    assert "f: of a, to be of b" in capfd.readouterr().out
+
+
+def test_a_figure_that_fails_leaves_the_old_one(figures, one_figure, monkeypatch, tmp_path, capfd):
+    result = tmp_path / "results/f.json"
+    result.write_text('{"commit": "old"}')
+    failing = figures.Figure("f", 1, ('python -c "raise SystemExit(3)"',))
+    monkeypatch.setattr(figures, "FIGURES", [failing])
+    assert figures.main() == 1
+    assert "returned non-zero exit status 3" in capfd.readouterr().err
+    assert figures.json.loads(result.read_text()) == {"commit": "old"}
+
+
+def test_the_version_is_that_of_package_and_kernels(figures, monkeypatch, tmp_path):
+    import made
+
+    def git(*arguments):
+        subprocess.run(["git", "-C", str(tmp_path), *arguments], check=True, capture_output=True)
+
+    git("init")
+    git("config", "user.email", "a@b")
+    git("config", "user.name", "a")
+    for folder in ("univoxel", "docs", "benchmarks"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "x").write_text("1")
+    git("add", ".")
+    git("commit", "-m", "one")
+    monkeypatch.setattr(made, "__file__", str(tmp_path / "benchmarks/made.py"))
+    first = made.made()["commit"]
+    (tmp_path / "docs/x").write_text("2")
+    git("commit", "-am", "two")
+    assert made.made()["commit"] == first
+    (tmp_path / "univoxel/x").write_text("2")
+    assert made.made()["commit"] == f"{first}-dirty"
+    git("commit", "-am", "three")
+    assert made.made()["commit"] not in (first, f"{first}-dirty")
