@@ -25,13 +25,12 @@ from statistics import median
 
 import torch
 from made import made
-from univoxel.render.density import section_alpha
 
 from univoxel.experiments.record import result_text
 from univoxel.fields.features import PER_LEVEL, Levels
 from univoxel.fields.field import Field, dense_field, hash_field
 from univoxel.grid import GridShape
-from univoxel.ops import composite
+from univoxel.ops import composite, section_alpha
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays
 from univoxel.training import surface_update
