@@ -83,6 +83,17 @@ def test_a_result_that_no_page_shows_is_found(copy):
     assert "benchmarks/results/chart.json: no page shows it" not in doc_blocks.unused(copy)
 
 
+def test_figures_of_several_versions_are_found(tmp_path):
+    results = tmp_path / "benchmarks/results"
+    (results / "ideas").mkdir(parents=True)
+    for name, commit in (("a", "1"), ("b", "1"), ("ideas/c", "2")):
+        (results / f"{name}.json").write_text(f'{{"commit": "{commit}"}}')
+    assert doc_blocks.several_versions(tmp_path) == []
+    (results / "d.json").write_text('{"commit": "3"}')
+    (fault,) = doc_blocks.several_versions(tmp_path)
+    assert fault.endswith("figures are of several versions: 1: a, b; 3: d")
+
+
 def test_a_block_that_does_not_end_is_found(copy):
     page = copy / "README.md"
     page.write_text(page.read_text().replace("<!-- end chart.json:small -->", ""))

@@ -1,9 +1,10 @@
 """Check the documentation against results and code, or bring it up to date.
 
-python scripts/docs [--write]
+python scripts/docs [--write] [--release]
 
 Without --write nothing is changed, every difference is told, and the exit code is 1 if there is
-one. With --write generated blocks are filled anew; what is left to mend by hand is told.
+one. With --write generated blocks are filled anew; what is left to mend by hand is told. With
+--release figures of several versions are a fault, too: `python benchmarks/figures.py` makes them.
 """
 
 from __future__ import annotations
@@ -22,9 +23,12 @@ sys.path.insert(0, str(ROOT))  # the package of this tree, wherever the command 
 def main() -> int:
     parser = argparse.ArgumentParser(description="check the documentation, or bring it up to date")
     parser.add_argument("--write", action="store_true", help="fill the generated blocks anew")
+    parser.add_argument("--release", action="store_true", help="figures must be of one version")
     options = parser.parse_args()
     faults = doc_blocks.update(ROOT, write=options.write)
     faults += doc_blocks.unused(ROOT) + doc_prose.faults(ROOT)
+    if options.release:
+        faults += doc_blocks.several_versions(ROOT)
     for fault in faults:
         print(fault)
     print(f"{len(faults)} faults" if faults else "documentation: pages, results and code agree")

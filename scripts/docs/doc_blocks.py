@@ -11,6 +11,7 @@ A NAME that ends in .json is the path of a result file below benchmarks/results:
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 from collections.abc import Callable
@@ -96,6 +97,18 @@ def unused(root: Path) -> list[str]:
     results = root / "benchmarks" / "results"
     files = sorted(path.relative_to(results).as_posix() for path in results.rglob("*.json"))
     return [f"benchmarks/results/{file}: no page shows it" for file in files if file not in shown]
+
+
+def several_versions(root: Path) -> list[str]:
+    """One line if the figures are not all of one version: what lies directly in results/."""
+    found: dict[str, list[str]] = {}
+    for path in sorted((root / "benchmarks" / "results").glob("*.json")):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        found.setdefault(record.get("commit", "none"), []).append(path.stem)
+    if len(found) < 2:
+        return []
+    told = "; ".join(f"{commit}: {', '.join(names)}" for commit, names in sorted(found.items()))
+    return [f"benchmarks/results: figures are of several versions: {told}"]
 
 
 def _first_difference(text: str, wanted: str) -> int:

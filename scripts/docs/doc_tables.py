@@ -174,12 +174,22 @@ def _trust(record: dict[str, Any], _: str) -> str:
     return measured(runs, ("scene", "preset"), columns)
 
 
-def _capacity(record: dict[str, Any], _: str) -> str:
+def _demo(record: dict[str, Any], _: str) -> str:
+    """What `univoxel eval --json` wrote of the demo."""
+    shown = record | {"mb": record["model_bytes"] / 1e6}
+    columns = (SECONDS, MEMORY, NVS, ALBEDO, ROUGHNESS, RELIT, NORMALS, ("file, MB", "mb", 1))
+    return measured([(("bundled scene",), shown)], ("scene",), columns)
+
+
+def _capacity(record: dict[str, Any], part: str) -> str:
+    """The preset's sizes against chosen ones; or `fields`: those sizes on every kind of field."""
     columns = (("parameters", "stored_parameters", 0), ("file, MB", "mb", 1), SECONDS, NVS, ALBEDO)
     columns = (*columns, ROUGHNESS, RELIT, NORMALS)
     runs = []
     for name, m in record["runs"].items():
         scene, _, setting = name.split(" ")
+        if setting != "hash" and (setting == "adaptive") == (part == "fields"):
+            continue
         runs.append(((_scene(scene), f"`{setting}`"), m | {"mb": m["model_bytes"] / 1e6}))
     scenes = list(dict.fromkeys(names[0] for names, _ in runs))
     runs.sort(key=lambda run: scenes.index(run[0][0]))
@@ -370,12 +380,13 @@ VARYING = {
 }
 
 
-def _varying(record: dict[str, Any], _: str) -> str:
+def _varying(record: dict[str, Any], light: str) -> str:
+    """The trainings with one of the lights."""
     runs = []
     for kind, meaning in VARYING.items():
         for name, m in record["runs"].items():
-            _, _, _, photographs, option = name.split(" ")
-            if photographs == kind:
+            _, _, its_light, photographs, option = name.split(" ")
+            if (photographs, its_light) == (kind, light):
                 runs.append(((meaning, f"`{option}`"), m))
     columns = (ALBEDO, RELIT, ROUGHNESS, NVS, ("gains off by, stops", "gain_stops", 2))
     return measured(runs, ("photographs", "`--varying`"), columns)
