@@ -512,6 +512,7 @@ KINDS: dict[str, Callable[[dict[str, Any], str], str]] = {
     "chart.json": _chart,
     "chart.json:small": _chart,
     "chart.json:trust": _trust,
+    "demo.json": _demo,
     "lights.json": _lights,
     "lights_full.json": _lights,
     "capacity.json": _capacity,
