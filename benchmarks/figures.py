@@ -22,6 +22,7 @@ from pathlib import Path
 
 from made import made
 
+from univoxel.experiments import plots
 from univoxel.experiments.record import result_text
 
 ROOT = Path(__file__).parent.parent
@@ -132,7 +133,8 @@ def make(figure: Figure, places: dict[str, Path]) -> None:
         arguments = [part.format(**places) for part in rest]
         subprocess.run([sys.executable, *start, *arguments], cwd=ROOT, check=True)
     written = places["work"] / f"{figure.written or figure.name}.json"
-    record = made() | json.loads(written.read_text(encoding="utf-8"))
+    about = made() | {"machine": plots.machine()}
+    record = about | json.loads(written.read_text(encoding="utf-8"))
     (RESULTS / f"{figure.name}.json").write_text(result_text(record), encoding="utf-8")
     if (picture := written.with_suffix(".png")).is_file():
         shutil.copy(picture, RESULTS / f"{figure.name}.png")

@@ -107,7 +107,8 @@ def test_a_figure_is_made_once_of_each_version(figures, one_figure, monkeypatch,
     monkeypatch.setattr(figures, "made", lambda: made)
     assert figures.main() == 0
     result = tmp_path / "results/f.json"
-    assert figures.json.loads(result.read_text()) == made | {"error": 1}
+    machine = {"machine": figures.plots.machine()}
+    assert figures.json.loads(result.read_text()) == made | machine | {"error": 1}
     assert "f: of None, to be of a; 1 min" in capfd.readouterr().out
     assert figures.main() == 0
     assert capfd.readouterr().out == ""

@@ -5,6 +5,7 @@ their own table, as written by hand or by a script of one day:
 
     title, date, commit   what was measured, when, and the commit that recorded it
     command, note         optional: how, and one sentence about it
+    machine               optional: a record of the `processor`, among others
     columns               name, unit and digits of each
     rows                  lists of values, None where nothing was measured
 """
@@ -41,7 +42,7 @@ def block(name: str, results: Path) -> str:
     if missing := [key for key in ("date", "commit") if not record.get(key)]:
         raise ValueError(f"{file}: has no {' and no '.join(missing)}")
     if kind := KINDS.get(name) or KINDS.get(file):
-        made = f"*{record['date']}, commit {record['commit']}.*"
+        made = f"*{version(record)}.*"
         return kind(record, part) if part == "small" else f"{made}\n\n{kind(record, part)}"
     if "columns" not in record:
         raise ValueError(f"{file}: no columns, and doc_tables.KINDS has no function for {name}")
@@ -79,10 +80,15 @@ def described(record: dict[str, Any]) -> str:
     return "\n\n".join([caption(record), table(heads, grouped(rows), numeric)])
 
 
+def version(record: dict[str, Any]) -> str:
+    """When and at which commit a result was measured, and on which processor if it says so."""
+    told = [record["date"], f"commit {record['commit']}"]
+    return ", ".join(told + [m["processor"] for m in [record.get("machine")] if m])
+
+
 def caption(record: dict[str, Any]) -> str:
     """What a table shows, when it was measured and how."""
-    when = f"{record['date']}, commit {record['commit']}"
-    parts = [f"*{record['title']}* ({when})."]
+    parts = [f"*{record['title']}* ({version(record)})."]
     if record.get("note"):
         parts.append(record["note"])
     text = textwrap.fill(" ".join(parts), COLUMNS, break_on_hyphens=False)
