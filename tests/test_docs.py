@@ -94,6 +94,29 @@ def test_figures_of_several_versions_are_found(tmp_path):
     assert fault.endswith("figures are of several versions: 1: a, b; 3: d")
 
 
+def test_a_table_says_on_which_processor_it_was_measured():
+    record = {"date": "2026-01-01", "commit": "a"}
+    assert doc_tables.version(record) == "2026-01-01, commit a"
+    processor = {"machine": {"processor": "P"}}
+    assert doc_tables.version(record | processor) == "2026-01-01, commit a, P"
+
+
+def test_tables_take_their_part_of_a_file():
+    def settings(table: str) -> list[str]:
+        return re.findall(r"`([\w-]+)` \|", table)
+
+    sizes = {
+        f"ball draft {name}": {"model_bytes": 1, "nvs_psnr": 1}
+        for name in ("dense", "hash", "adaptive")
+    }
+    capacity = doc_tables.KINDS["capacity.json"]
+    assert settings(capacity({"runs": sizes}, "")) == ["hash", "adaptive"]
+    assert settings(capacity({"runs": sizes}, "fields")) == ["dense", "hash"]
+    lights = {f"tiny draft {x} fixed none": {"nvs_psnr": n} for n, x in enumerate(("sg", "hybrid"))}
+    varying = doc_tables.KINDS["varying.json"]({"runs": lights}, "hybrid")
+    assert varying.endswith("| as they are | `none` | 1.0 |")
+
+
 def test_a_block_that_does_not_end_is_found(copy):
     page = copy / "README.md"
     page.write_text(page.read_text().replace("<!-- end chart.json:small -->", ""))

@@ -83,7 +83,9 @@ def described(record: dict[str, Any]) -> str:
 def version(record: dict[str, Any]) -> str:
     """When and at which commit a result was measured, and on which processor if it says so."""
     told = [record["date"], f"commit {record['commit']}"]
-    return ", ".join(told + [m["processor"] for m in [record.get("machine")] if m])
+    if "machine" in record:
+        told.append(record["machine"]["processor"])
+    return ", ".join(told)
 
 
 def caption(record: dict[str, Any]) -> str:
