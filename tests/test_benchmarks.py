@@ -149,4 +149,8 @@ def test_the_version_is_that_of_package_and_kernels(figures, monkeypatch, tmp_pa
     (tmp_path / "univoxel/x").write_text("2")
     assert made.made()["commit"] == f"{first}-dirty"
     git("commit", "-am", "three")
-    assert made.made()["commit"] not in (first, f"{first}-dirty")
+    third = made.made()["commit"]
+    assert third not in (first, f"{first}-dirty")
+    (tmp_path / "univoxel/x").write_text("3")
+    git("commit", "-am", "four\n\nA message.\n\nFigures: unchanged")
+    assert made.made()["commit"] == third

@@ -39,6 +39,20 @@ TRAIN = (
     *("--capacity", "fixed", "--no-page", *(x for change in FEW for x in ("--set", change))),
 )
 
+# The first rank fails while the other is not there to see it
+SLOW = """
+import time
+from univoxel import ranks
+try:
+    with ranks.joined():
+        if ranks.rank() == 0:
+            raise ValueError("a mistake")
+        time.sleep(2)
+        ranks.tick()
+except Exception as error:
+    print(error)
+"""
+
 # One process that draws what two ranks draw
 IN_TWO_PARTS = """
 import sys
@@ -153,6 +167,12 @@ def test_a_mistake_is_said_once(tmp_path):
     lines = [line for _, _, said in told for line in said.splitlines() if "univoxel" in line]
     assert len(lines) == 1, lines
     assert "expected photographs with their cameras" in lines[0]
+
+
+def test_a_mistake_is_said_once_to_a_rank_that_is_slow():
+    told = ended(begin_ranks([sys.executable, "-c", SLOW], 2))
+    assert told[0][:2] == (0, "a mistake\n"), told
+    assert told[1][:2] == (2, ""), told
 
 
 def test_a_look_at_the_training_is_of_one_process(tmp_path, monkeypatch):

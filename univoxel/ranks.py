@@ -9,6 +9,7 @@ what it was given.
 
 from __future__ import annotations
 
+import atexit
 import logging
 import os
 import signal
@@ -32,6 +33,9 @@ Item = TypeVar("Item")
 Tensors: TypeAlias = "tuple[Tensor, ...]"
 
 PATIENCE = timedelta(minutes=10)  # for a rank that does not answer; the first one writes meanwhile
+STAY = 5.0  # s that the first rank is there for the others, after an error
+
+ERRORS = "univoxel: errors"  # of the store: how many ranks have met one
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -88,19 +92,22 @@ def joined() -> Iterator[None]:
             raise ProcessFailed(f"expected {name} in the environment, as torchrun sets it")
     with _lost():
         store, number, size = next(rendezvous("env://", timeout=PATIENCE))
-        distributed.init_process_group(
-            "gloo", store=store, rank=number, world_size=size, timeout=PATIENCE
-        )
-    _group.store, disabled, before = store, log.disabled, None
-    log.disabled = disabled or number > 0
-    if threading.current_thread() is threading.main_thread():
-        before = signal.signal(signal.SIGTERM, _ended)
+    disabled, before = log.disabled, None
     try:
+        with _lost():
+            distributed.init_process_group(
+                "gloo", store=store, rank=number, world_size=size, timeout=PATIENCE
+            )
+        _group.store, log.disabled = store, disabled or number > 0
+        if threading.current_thread() is threading.main_thread():
+            before = signal.signal(signal.SIGTERM, _ended)
         tick()
         yield
         tick()  # none ends before all are done: torchrun would take that for a failure
     except (Exception, KeyboardInterrupt):
-        if _said_already():
+        if number == 0:
+            atexit.register(_stay, store, size)
+        if _said_already(store):
             raise SystemExit(2) from None
         raise
     finally:
@@ -108,8 +115,9 @@ def joined() -> Iterator[None]:
             signal.signal(signal.SIGTERM, before)
         log.disabled = disabled
         _group.store, _group.now = None, None
-        with suppress(RuntimeError):
-            distributed.destroy_process_group()
+        if distributed.is_initialized():
+            with suppress(RuntimeError):
+                distributed.destroy_process_group()
 
 
 @contextmanager
@@ -270,9 +278,17 @@ def _ended(_signal: int, _frame: FrameType | None) -> None:
     raise ProcessFailed(LOST, "resume")
 
 
-def _said_already() -> bool:
+def _said_already(store: Any) -> bool:
     """Whether another rank has met an error before; from now on one has."""
     try:
-        return _group.store.add("univoxel: errors", 1) > 1
+        return store.add(ERRORS, 1) > 1
     except RuntimeError:  # it has ended with the first one's machine
         return False
+
+
+def _stay(store: Any, size: int) -> None:
+    """Wait until all ranks have asked whether the error has been said: the store that they ask ends
+    with this process."""
+    end = time.monotonic() + STAY
+    while store.add(ERRORS, 0) < size and time.monotonic() < end:
+        time.sleep(0.05)
