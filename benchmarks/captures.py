@@ -33,7 +33,6 @@ COLUMNS = [
     {"name": "in light"},
     {"name": "novel views", "unit": "dB", "digits": 1},
     {"name": "SSIM", "digits": 3},
-    {"name": "training", "unit": "s", "digits": 0},
 ]
 
 
@@ -70,7 +69,7 @@ def rows_of(case: Case, real: Path, work: Path) -> list[list[str | float]]:
     rows = []
     for views, light, arguments in case.measured:
         found = evaluate(run, **arguments)
-        measures = [found["nvs_psnr"], found["nvs_ssim"], found["train_seconds"]]
+        measures = [found["nvs_psnr"], found["nvs_ssim"]]
         rows.append([case.folder, f"`{case.varying}`", views, light, *measures])
         print(rows[-1], flush=True)
     return rows

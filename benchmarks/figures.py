@@ -98,7 +98,8 @@ FIGURES = [
     script(
         "relight_runs",
         4,
-        "{work}/{name}.json {work}/chart/sneaker/full {work}/chart/tea_table/full --every 5",
+        "{work}/{name}.json {work}/chart/sneaker/full/run {work}/chart/tea_table/full/run "
+        "--every 5",
     ),
     Figure(
         "demo",
@@ -112,7 +113,7 @@ FIGURES = [
         "viewer",
         2,
         (
-            "python benchmarks/live_latency.py {work}/demo/run {work}/chart/sneaker/fast "
+            "python benchmarks/live_latency.py {work}/demo/run {work}/chart/sneaker/fast/run "
             "--out {work}/viewer.json",
         ),
     ),
