@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import torch
 from univoxel import __version__
 from univoxel.errors import MissingExtra
 from univoxel.files import replacing
+from univoxel.machine import processor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,14 +98,5 @@ def machine() -> dict[str, str | int]:
         "univoxel": __version__,
         "torch": torch.__version__,
         "threads": torch.get_num_threads(),
-        "processor": _processor(),
+        "processor": processor(),
     }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
