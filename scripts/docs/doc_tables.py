@@ -522,7 +522,6 @@ KINDS: dict[str, Callable[[dict[str, Any], str], str]] = {
     "chart.json:trust": _trust,
     "demo.json": _demo,
     "lights.json": _lights,
-    "lights_full.json": _lights,
     "capacity.json": _capacity,
     "capacity_fields.json": _capacity,
     "ops.json": _ops,
