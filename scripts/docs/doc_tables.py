@@ -505,14 +505,13 @@ def _relight_runs(record: dict[str, Any], part: str) -> str:
         ]
         return table(["samples", *map(str, sizes)], rows, [False] + [True] * len(sizes))
     rows, bounces = [], []
-    for scene in ("sneaker_full", "tea_table_full"):
+    for scene in ("sneaker", "tea_table"):
         scores = record[scene]["scores"]
         bounces = list(dict.fromkeys(s["bounces"] for s in scores))
         for exponent in dict.fromkeys(s["exponent"] for s in scores):
             at = {s["bounces"]: s["relit_psnr"] for s in scores if s["exponent"] == exponent}
-            name = _scene(scene.removesuffix("_full"))
-            title = name if exponent == 1 else f"{name}, roughness to the power of {exponent}"
-            rows.append([title, *[number(at[b], 2) for b in bounces]])
+            power = "" if exponent == 1 else f", roughness to the power of {exponent}"
+            rows.append([_scene(scene) + power, *[number(at[b], 2) for b in bounces]])
     return table(["relit, dB, by bounces", *map(str, bounces)], rows)
 
 
