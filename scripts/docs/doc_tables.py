@@ -522,7 +522,6 @@ KINDS: dict[str, Callable[[dict[str, Any], str], str]] = {
     "demo.json": _demo,
     "lights.json": _lights,
     "capacity.json": _capacity,
-    "capacity_fields.json": _capacity,
     "ops.json": _ops,
     "scaling.json": _scaling,
     "train_step.json": _train_step,
