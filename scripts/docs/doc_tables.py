@@ -529,7 +529,6 @@ KINDS: dict[str, Callable[[dict[str, Any], str], str]] = {
     "field_scaling.json": _field_scaling,
     "growth.json": _growth,
     "varying.json": _varying,
-    "varying_sg.json": _varying,
     "priors.json": _priors,
     "stress.json": _stress,
     "stress_hybrid.json": _stress,
