@@ -84,6 +84,8 @@ def figures(monkeypatch):
 
 
 def test_every_figure_can_be_made_anew(figures):
+    there = {path.stem for path in figures.RESULTS.glob("*.json")}
+    assert {figure.name for figure in figures.FIGURES} == there
     for figure in figures.FIGURES:
         for command in figure.commands:
             program, name, *_ = shlex.split(command)
