@@ -9,7 +9,7 @@ from pathlib import Path
 # What decides a result. The commit is the last that changed any of it: pages and results may be
 # committed between two measurements of one version.
 MEASURED = [":/univoxel", ":/csrc", ":/cmake", ":/CMakeLists.txt"]
-# So may what mends a message, or what no figure goes through, in a commit with this line.
+# A commit with this line changes no result, and does not count: CONTRIBUTING.md.
 COUNTED = ["--invert-grep", "--grep=^Figures: unchanged$"]
 
 

@@ -175,6 +175,32 @@ def test_a_mistake_is_said_once_to_a_rank_that_is_slow():
     assert told[1][:2] == (2, ""), told
 
 
+@pytest.mark.parametrize("said", [True, False])
+def test_an_error_while_ranks_find_each_other_is_said_once(said, monkeypatch):
+    store = torch.distributed.HashStore()
+    store.add(ranks.ERRORS, int(said))
+
+    def fail(*_, **__):
+        raise RuntimeError("connection closed")
+
+    for name in ("MASTER_ADDR", "MASTER_PORT", "TORCHELASTIC_RUN_ID", "RANK"):
+        monkeypatch.setenv(name, "1")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setattr(ranks, "rendezvous", lambda *_, **__: iter([(store, 1, 2)]))
+    monkeypatch.setattr(torch.distributed, "init_process_group", fail)
+    with pytest.raises(SystemExit if said else ProcessFailed), ranks.joined():
+        pass
+    assert store.add(ranks.ERRORS, 0) == 1 + said
+
+
+def test_a_store_that_has_ended_is_not_waited_for():
+    class Ended:
+        def add(self, *_):
+            raise RuntimeError("broken pipe")
+
+    ranks._stay(Ended(), 2)
+
+
 def test_a_look_at_the_training_is_of_one_process(tmp_path, monkeypatch):
     monkeypatch.delenv("MASTER_ADDR", raising=False)
     for name, value in {"TORCHELASTIC_RUN_ID": "x", "WORLD_SIZE": "2", "RANK": "1"}.items():

@@ -35,7 +35,7 @@ Tensors: TypeAlias = "tuple[Tensor, ...]"
 PATIENCE = timedelta(minutes=10)  # for a rank that does not answer; the first one writes meanwhile
 STAY = 5.0  # s that the first rank is there for the others, after an error
 
-ERRORS = "univoxel: errors"  # of the store: how many ranks have met one
+ERRORS = "univoxel: errors"  # key of the store: how many ranks have met an error
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -290,5 +290,6 @@ def _stay(store: Any, size: int) -> None:
     """Wait until all ranks have asked whether the error has been said: the store that they ask ends
     with this process."""
     end = time.monotonic() + STAY
-    while store.add(ERRORS, 0) < size and time.monotonic() < end:
-        time.sleep(0.05)
+    with suppress(RuntimeError):  # the store was another process's, which has ended
+        while store.add(ERRORS, 0) < size and time.monotonic() < end:
+            time.sleep(0.05)
