@@ -1,6 +1,6 @@
 """Draws the pictures of docs/guide and docs/explanation that show the bundled scene.
 
-    univoxel train univoxel/example_data/tiny --out RUN --preset fast --minutes 20 \\
+    univoxel train univoxel/example_data/tiny --out RUN --preset fast --minutes 4 \\
         --set stages.0.voxels=0.27 --set stages.1.voxels=0.6 --set stages.3.voxels=0.6 \\
         --timelapse RUN/film/
     python docs/figures/bundled.py RUN docs/images
