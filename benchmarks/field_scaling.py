@@ -152,6 +152,7 @@ def draw(found: dict, path: Path) -> None:
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.ticker import LogLocator
 
     figure, axes = pyplot.subplots(1, 2, figsize=(9, 3.6))
     for axis, cost, label in zip(
@@ -167,6 +168,8 @@ def draw(found: dict, path: Path) -> None:
             )
         sizes = sorted({r["size"] for r in found["cases"]})
         axis.set_xticks(sizes, [str(s) for s in sizes])
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # times span less than a decade
+        axis.yaxis.set_major_formatter("{x:g}")
         axis.minorticks_off()
         axis.set_xlabel("nodes along a side")
         axis.set_ylabel(label)
