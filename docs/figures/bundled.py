@@ -5,6 +5,7 @@
         --timelapse RUN/film/
     python docs/figures/bundled.py RUN docs/images
 
+A timelapse has a frame for each sixtieth of the minutes, and each stage needs one near its end.
 Commands of univoxel make the pictures. This script puts them side by side.
 """
 

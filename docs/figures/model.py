@@ -2,10 +2,10 @@
 
     univoxel poses ethiopian_head/images --masks ethiopian_head/masks --out HEAD
     univoxel train HEAD --out RUN --preset fast
-    python docs/figures/model.py RUN docs/images/real.jpg MAP.hdr MAP.hdr
+    python docs/figures/model.py RUN docs/images/real.jpg forest_slope.hdr sunset.hdr
 
     univoxel train sneaker --out RUN --preset fast
-    python docs/figures/model.py RUN docs/images/sneaker.png MAP.hdr MAP.hdr \\
+    python docs/figures/model.py RUN docs/images/sneaker.png forest_slope.hdr studio.hdr \\
         --layers albedo roughness normal
 
 From the left: a photograph that training did not see, on black; the render; the layers; the model
@@ -23,38 +23,24 @@ from PIL import Image
 from torch import Tensor
 
 import univoxel
-from univoxel.camera import Cameras
 from univoxel.color import linear_to_srgb
 from univoxel.pictures.layers import Layers, render_layers
 from univoxel.run import photos_of
 from univoxel.tasks.relight import relight_images
 
+VIEW = 0  # of the test views
+LAYERS = "albedo", "roughness", "normal"
 LONGER, GAP = 300, 4  # pixels of a picture's longer side, and between two
-MARGIN = 0.03  # of that side, around the object
+MARGIN = 0.03  # of the object's longer side, around it
 BRIGHT = 0.7  # sRGB of the picture's brightest hundredth; a light of other strength is scaled
 QUALITY = 85  # of a JPEG, which stays below 200 kB
 
 
-def one(cameras: Cameras, view: int) -> Cameras:
-    """The camera of one view."""
-    return Cameras(
-        cameras.camera_to_world[view : view + 1],
-        cameras.focal[view : view + 1],
-        cameras.centre[view : view + 1],
-        *cameras.size(view),
-    )
-
-
-def frame(alpha: Tensor) -> tuple[int, int, int, int]:
-    """The box around what is opaque in a photograph's alpha [H, W], for `Image.crop`."""
-    rows, columns = (alpha > 0.5).any(1).nonzero(), (alpha > 0.5).any(0).nonzero()
-    margin = round(MARGIN * max(alpha.shape))
-    return (
-        max(int(columns[0]) - margin, 0),
-        max(int(rows[0]) - margin, 0),
-        min(int(columns[-1]) + margin, alpha.shape[1]),
-        min(int(rows[-1]) + margin, alpha.shape[0]),
-    )
+def box_around(alpha: Tensor) -> tuple[int, int, int, int]:
+    """What is opaque in a photograph's alpha [H, W], and the margin, for `Image.crop`."""
+    left, top, right, bottom = encoded((alpha > 0.5).float()).getbbox()
+    margin = round(MARGIN * max(right - left, bottom - top))
+    return left - margin, top - margin, right + margin, bottom + margin
 
 
 def picture(linear: Tensor, exposed: bool = False) -> Image.Image:
@@ -66,36 +52,35 @@ def picture(linear: Tensor, exposed: bool = False) -> Image.Image:
 
 
 def encoded(values: Tensor) -> Image.Image:
-    """Values [H, W, 3] in [0, 1] as a picture."""
+    """Values [H, W] or [H, W, 3] in [0, 1] as a picture."""
     return Image.fromarray((255 * values).round().byte().numpy())
 
 
 def layer(layers: Layers, name: str) -> Image.Image:
-    """One of a view's layers, as `univoxel view` paints it."""
+    """One of a view's LAYERS: roughness from black, 0, to white, 1; normals of the world."""
     if name == "albedo":
         return picture(layers.albedo, exposed=True)
     if name == "roughness":
-        return encoded(layers.roughness.clamp(0, 1)[..., None].expand(-1, -1, 3).contiguous())
-    there = layers.alpha[..., None]
-    return encoded((0.5 * layers.normal + 0.5).clamp(0, 1) * there)
+        return encoded(layers.roughness.clamp(0, 1))
+    return encoded((0.5 + 0.5 * layers.normal).clamp(0, 1) * layers.alpha[..., None])
 
 
 @torch.no_grad()
-def main(path: Path, out: Path, maps: list[Path], names: list[str], view: int) -> None:
+def main(path: Path, out: Path, maps: list[Path], names: list[str]) -> None:
     """Render and put side by side."""
     run = univoxel.open_run(path)
     photos = photos_of(path)
-    color, alpha = photos.picture(view)
-    camera = one(photos.cameras, view)
+    color, alpha = photos.picture(VIEW)
+    camera = photos.cameras.of(torch.tensor([VIEW]))
     layers = render_layers(run.scene, camera, 0)
     pictures = [picture(color * alpha[..., None]), picture(layers.rgb)]
     pictures += [layer(layers, name) for name in names]
     for name in maps:
         relit = relight_images(path, name, camera, samples=256)[0, ..., :3]
         pictures.append(picture(relit, exposed=True))
-    box = frame(alpha)
-    scale = LONGER / max(box[2] - box[0], box[3] - box[1])
-    size = round(scale * (box[2] - box[0])), round(scale * (box[3] - box[1]))
+    box = left, top, right, bottom = box_around(alpha)
+    scale = LONGER / max(right - left, bottom - top)
+    size = round(scale * (right - left)), round(scale * (bottom - top))
     row = Image.new("RGB", (len(pictures) * (size[0] + GAP) - GAP, size[1]), "white")
     for i, shown in enumerate(pictures):
         small = shown.crop(box).resize(size, Image.Resampling.LANCZOS)
@@ -109,7 +94,6 @@ if __name__ == "__main__":
     parser.add_argument("run", type=Path, help="a run")
     parser.add_argument("out", type=Path, help="the picture to write, .jpg or .png")
     parser.add_argument("maps", type=Path, nargs="*", help="environment maps to light it with")
-    parser.add_argument("--layers", nargs="+", default=["albedo"], help="albedo, roughness, normal")
-    parser.add_argument("--view", type=int, default=0, help="which test view")
+    parser.add_argument("--layers", nargs="+", choices=LAYERS, default=["albedo"], help="of it")
     given = parser.parse_args()
-    main(given.run, given.out, given.maps, given.layers, given.view)
+    main(given.run, given.out, given.maps, given.layers)
