@@ -14,12 +14,13 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test page-test network-test fuzz kill-test lint format bench profile docs docs-check docs-write asan tsan audit wheel wheel-test clean
+.PHONY: help dev demo test net page-test network-test fuzz kill-test lint format bench profile docs docs-check docs-write asan tsan audit wheel wheel-test clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo    train, evaluate and relight the bundled scene; prints the page to open"
 	@echo "make test    all tests"
+	@echo "make net BASE=REV  whether this tree trains to the same bits as a commit, on this machine"
 	@echo "make page-test  the page in a browser; brings in Debian's chromium where none is"
 	@echo "make fuzz    thousands of damaged files for every reader; prints a table"
 	@echo "make kill-test  commands ended at any moment, and gone on with; half an hour"
@@ -53,6 +54,9 @@ demo: dev
 
 test: dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(TWO)
+
+net: dev
+	scripts/net.sh $(BASE)
 
 page-test: dev
 	scripts/browser.sh
