@@ -90,7 +90,6 @@ FIGURES = [
     script("train_step", 4),
     script("approximations", 1),
     script("field_scaling", 5, "--sizes 64 128 256 512 --steps 9 --out {work}/{name}.json"),
-    script("growth", 8, KEPT),
     script("capacity", 20, f"{CAPACITY} {KEPT}"),
     script("varying", 15, "{tiny} " + KEPT),
     script("priors", 5, "{tiny} --priors smooth " + KEPT),

@@ -8,9 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from univoxel.data import load_photos
-from univoxel.preparation.hull import estimate_bounds, mask_distances
-
 
 def test_a_dying_contender_leaves_the_run_alone(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
@@ -46,35 +43,6 @@ def test_rays_without_bare_embree_are_refused(monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit):
         benchmark.main()
     assert "none.so, which is not there: `make build/.bench`" in capsys.readouterr().err
-
-
-def test_growth_finds_the_powers_and_the_cost_of_exchange(monkeypatch):
-    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
-    growth = pytest.importorskip("growth")
-    rays = {n: {"step": 0.01 + 1e-4 * n, "touched": 1000 * n**0.5} for n in (256, 1024, 4096)}
-    assert growth.exponent([1, 2, 8], [3, 12, 192]) == pytest.approx(2)
-    model = growth.model({"rays": {str(n): case for n, case in rays.items()}})
-    assert model["fixed_ms"] == pytest.approx(10)
-    assert model["ray_us"] == pytest.approx(100)
-    assert model["touched_power"] == pytest.approx(0.5)
-    one, *_, four = (row for row in model["nodes"] if row["nodes"] <= 4)
-    assert one["exchange_ms"] == 0
-    assert one["faster"] == pytest.approx(1)
-    moved = 3 * 1000 * (2048 / 4) ** 0.5
-    expected = 1e3 * (moved / growth.BANDWIDTH + 3 * growth.LATENCY)
-    assert four["exchange_ms"] == pytest.approx(expected)
-    assert four["work_ms"] == pytest.approx(10 + 0.1 * 2048 / 4)
-
-
-def test_growth_writes_photographs_that_are_read_as_a_ball(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
-    growth = pytest.importorskip("growth")
-    growth.write_ball(tmp_path / "ball", 12, 0.01)
-    photos = load_photos(tmp_path / "ball", "train")
-    assert (len(photos), photos.cameras.width, photos.cameras.height) == (12, 115, 87)
-    lower, upper = estimate_bounds(mask_distances(photos.alpha), photos.cameras)
-    for corner in (-lower, upper):
-        assert corner.tolist() == pytest.approx([1.0] * 3, abs=0.25)  # with its margin
 
 
 @pytest.fixture

@@ -320,64 +320,6 @@ def _field_scaling(record: dict[str, Any], _: str) -> str:
     return table(heads, grouped(rows), [False] + [True] * 4)
 
 
-GROWING = {
-    "photographs": "photographs",
-    "megapixels": "megapixels of each",
-    "rays": "rays of a step",
-    "resolution": "voxels along a side",
-}
-
-
-def _growth(record: dict[str, Any], part: str) -> str:
-    cases = record["cases"]
-    if part == "ranks":
-        heads = ["ranks", "step of each, s", "step by the wall, s", "sent, MB", "touched, MB"]
-        rows = [
-            [
-                n,
-                f"{c['step']:.2f}",
-                f"{c['wall']:.2f}",
-                f"{c['sent'] / 1e6:.2f}",
-                f"{c['touched'] / 1e6:.2f}",
-            ]
-            for n, c in cases["ranks"].items()
-        ]
-        return table(heads, rows, [True] * 5)
-    if part == "nodes":
-        heads = [
-            *("nodes", "work, ms", "exchange, ms"),
-            *("times as fast", "times the rays in the same time"),
-        ]
-        rows = [
-            [
-                str(n["nodes"]),
-                f"{n['work_ms']:.0f}",
-                f"{n['exchange_ms']:.1f}",
-                f"{n['faster']:.1f}",
-                f"{n['rays_faster']:.1f}",
-            ]
-            for n in record["model"]["nodes"]
-        ]
-        return table(heads, rows, [True] * 5)
-    if part == "exponents":
-        heads = ["what grows", "preparation", "a step", "peak memory"]
-        rows = [
-            [GROWING[axis], *(f"{found[what]:.2f}" for what in ("preparation", "step", "peak_mb"))]
-            for axis, found in record["exponents"].items()
-        ]
-        return table(heads, rows, [False] + [True] * 3)
-    heads = ["what grows", "size", "preparation, s", "step, s", "touched, MB", "peak memory, MB"]
-    rows = [
-        [
-            *(GROWING[axis], size, f"{c['preparation']:.1f}", f"{c['step']:.2f}"),
-            *(f"{c['touched'] / 1e6:.2f}", f"{c['peak_mb']:.0f}"),
-        ]
-        for axis in record["exponents"]
-        for size, c in cases[axis].items()
-    ]
-    return table(heads, grouped(rows), [False] + [True] * 5)
-
-
 VARYING = {
     "fixed": "as they are",
     "exposure": "random exposure within 1 stop",
@@ -527,7 +469,6 @@ KINDS: dict[str, Callable[[dict[str, Any], str], str]] = {
     "train_step.json": _train_step,
     "profile.json": _profile,
     "field_scaling.json": _field_scaling,
-    "growth.json": _growth,
     "varying.json": _varying,
     "priors.json": _priors,
     "stress.json": _stress,

@@ -8,7 +8,6 @@ import torch
 from analytic import write_scene
 from PIL import Image
 
-from univoxel import ranks
 from univoxel.checkpoint import load_checkpoint, load_scene
 from univoxel.config import TrainConfig
 from univoxel.data.images import read_image
@@ -18,7 +17,9 @@ from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.pictures import timelapse as module
 from univoxel.pictures.timelapse import LABEL, Timelapse
 from univoxel.scene import SceneConfig
+from univoxel.tasks import train as task
 from univoxel.tasks.train import train
+from univoxel.training import clock as clock_module
 from univoxel.training.config import StageConfig
 
 
@@ -70,7 +71,8 @@ def test_frames_do_not_count_as_time(data, tmp_path, monkeypatch, often):
         clock.now += 1000
         return draw(*arguments)
 
-    monkeypatch.setattr(ranks, "time", clock)
+    monkeypatch.setattr(clock_module, "time", clock)
+    monkeypatch.setattr(task, "time", clock)
     monkeypatch.setattr(module, "frame", slow)
     run = train(config(data, tmp_path / "run"), timelapse=tmp_path / "frames")
     assert load_checkpoint(run)[1]["seconds"] == 0.0

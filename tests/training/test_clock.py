@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from univoxel import ranks
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
+from univoxel.training import clock as clock_module
 from univoxel.training.clock import HURRY, RESERVE_SECONDS, REST
 from univoxel.training.config import StageConfig
 from univoxel.training.progress import Progress
@@ -26,7 +26,7 @@ def clock(monkeypatch):
             return self.now
 
     clock = Clock()
-    monkeypatch.setattr(ranks, "time", clock)
+    monkeypatch.setattr(clock_module, "time", clock)
     return clock
 
 
@@ -296,6 +296,15 @@ def test_reports_and_checkpoints_come_by_the_clock(tmp_path, clock):
     assert line["losses"] == {"radiance": 0.25}
     assert line["held_out_psnr"] == 31.0
     assert line["rays_per_second"] == pytest.approx(5 * 2048 / 61)
+
+
+def test_a_run_that_several_processes_began_goes_on(tmp_path, clock):
+    """Version 0.2.0 noted what such a training exchanged."""
+    exchanged = {"count": 2, "steps": 7, "sent": 10.0, "touched": 8.0}
+    before = START | {"stage": 1, "step": 7, "made": [1.0], "ranks": exchanged}
+    progress = Progress(config(tmp_path, 0.5, 0.5), clock.now, before)
+    assert (progress.clock.stage, progress.clock.step) == (1, 7)
+    assert "ranks" not in progress.state()
 
 
 def test_a_line_is_appended_whole_or_not_at_all(tmp_path):

@@ -105,12 +105,10 @@ def configuration_of(
 
 
 def tell_run(run: Path, no_page: bool) -> None:
-    """Print where a trained run lies, with its page if it gets one; the first rank does so."""
-    from univoxel.ranks import leads
+    """Print where a trained run lies, with its page if it gets one."""
     from univoxel.tasks.view import with_page
 
-    if leads():
-        print(run if no_page else with_page(run))
+    print(run if no_page else with_page(run))
 
 
 def view_at(view: bool, host: str | None, port: int | None) -> tuple[str, int] | None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+import time
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from univoxel import brdf, ranks
+from univoxel import brdf
 from univoxel.fields.heads import MaterialHead
 from univoxel.joint.config import JointConfig, NewtonConfig
 from univoxel.joint.equations import (
@@ -63,22 +64,11 @@ class NewtonPoints:
     roughness: Tensor  # [P]
     prior_roughness: Tensor  # [P] roughness as it was
     prior_weight: float  # of the squared deviation from it, >= 0; 0: roughness stays
-    shared: int = 0  # observations of all ranks' points, where these are one rank's; see `count`
 
     @property
     def count(self) -> int:
         """Number of observations that the equations are a mean over."""
-        return self.shared or self.observation.numel()
-
-    def of_this_rank(self) -> NewtonPoints:
-        """Those whose equations this rank builds, and whose materials it follows."""
-        parts = ranks.mine(self.parts)
-        if len(parts) == len(self.parts):
-            return self
-        kept = torch.cat([*parts, torch.zeros(0, dtype=torch.int64)])
-        arrays = {name: getattr(self, name)[kept] for name in self.ARRAYS}
-        places = torch.arange(len(kept)).split([len(part) for part in parts])
-        return replace(self, **arrays, parts=list(places), shared=self.count)
+        return self.observation.numel()
 
     def keep_(self, parts: int) -> None:
         """Keep only the first parts."""
@@ -110,8 +100,6 @@ class NewtonPoints:
 
     def step_(self, eliminated: list[EliminatedAlbedo], light_step: Tensor) -> None:
         """Change albedo and roughness as it belongs to a step of the light [3, D + B]."""
-        if not eliminated:  # another rank has them
-            return
         steps = zip(*(e.back_substituted(light_step) for e in eliminated), strict=True)
         to_albedo, to_roughness = (torch.cat(x) for x in steps)
         limit = self.cfg.max_albedo_change
@@ -145,18 +133,17 @@ def newton_round_(
     Args:
         seconds: wall time that it may take, about: it takes fewer points where all would take more.
     """
-    begin = ranks.tick()
+    begin = time.monotonic()
     points = choose_points(scene, problem, decisions, cfg) if cfg.newton_steps else None
     if points is None:
         return NewtonRound()
     if seconds < math.inf:
-        part_begin = ranks.tick()
+        part_begin = time.monotonic()
         points.equations(points.parts[0], None)
-        part_end = ranks.tick()
+        part_end = time.monotonic()
         part_seconds = max(part_end - part_begin, 1e-6)
         parts_in_time = (seconds - (part_end - begin)) / (cfg.newton_steps * part_seconds)
-        points.keep_(max(cfg.newton.min_parts, int(ranks.count() * parts_in_time)))
-    points = points.of_this_rank()
+        points.keep_(max(cfg.newton.min_parts, int(parts_in_time)))
     laplacian = cfg.newton_smooth * graph_laplacian(problem.sky.direction, cfg.newton.neighbours)
     costs = []
     for _ in range(cfg.newton_steps):
@@ -241,7 +228,7 @@ def map_step_(
     if sun is not None:
         log_map = log_map - sun.T
     log_map = torch.nn.functional.pad(log_map, (0, unknowns - nodes))  # no gain is likelier than 1
-    system, right_side = ranks.once(laplacian), ranks.once(-log_map @ laplacian)
+    system, right_side = laplacian, -log_map @ laplacian
     eliminated = []
     coupling = torch.zeros(())  # of the channels, by roughness
     for part in points.parts:  # added up at once: all would take much memory
@@ -251,9 +238,6 @@ def map_step_(
             coupling, gradient = coupling + hessian_part / count, gradient - gradient_part
         system, right_side = system + hessian / count, right_side + gradient / count
         eliminated.append(albedo)
-    system, right_side = _total(system, 3, unknowns, unknowns), _total(right_side, 3, unknowns)
-    if points.prior_weight:
-        coupling = _total(coupling, 3 * unknowns, 3 * unknowns)
     system.diagonal(dim1=1, dim2=2).add_(damping)
     if points.prior_weight:
         system, right_side = torch.block_diag(*system) - coupling, right_side.flatten()
@@ -267,13 +251,7 @@ def map_step_(
     if scene.views is not None:
         sky.log_radiance.add_(scene.views.add(to_gain.T))
     points.step_(eliminated, step)
-    cost = torch.tensor(sum(albedo.cost for albedo in eliminated), dtype=torch.float64)
-    return ranks.total(cost).item() / count
-
-
-def _total(part: Tensor, *shape: int) -> Tensor:
-    """The sum over ranks of parts of that shape; one that has built no equations may be smaller."""
-    return part if ranks.count() == 1 else ranks.total(part.expand(shape))
+    return sum(albedo.cost for albedo in eliminated) / count
 
 
 def views_step_(
@@ -293,10 +271,6 @@ def views_step_(
         state = points.transport(part), sky.radiance, points.log_albedo[part], points.cfg.cauchy
         part_hessian, part_gradient = view_equations(*state, differences)
         hessian, gradient = hessian + part_hessian / count, gradient + part_gradient / count
-    assert differences.basis is not None
-    unknowns = len(differences.basis) + 1
-    hessian = _total(hessian, 3, len(views), unknowns, unknowns)
-    gradient = _total(gradient, 3, len(views), unknowns)
     weights = views.sky_weights - views.sky_weights.mean(0)  # [B, R, 3]
     weights = torch.nn.functional.pad(weights.permute(2, 0, 1), (0, 1))
     prior = points.cfg.view_prior * smooth

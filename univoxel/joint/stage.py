@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy, normalize
 
-from univoxel import brdf, losses, ranks
+from univoxel import brdf, losses
 from univoxel.checkpoint import save_scene
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped
 from univoxel.data import Photos
@@ -41,10 +41,9 @@ from univoxel.joint.observations import (
 )
 from univoxel.joint.sharp_sky import sharpen_sky_
 from univoxel.lights import priors
-from univoxel.optim import RowAdam, parameters_of
+from univoxel.optim import RowAdam
 from univoxel.scene import Scene
 from univoxel.training.divergence import Guard
-from univoxel.training.exchange import summed_over_ranks_
 from univoxel.training.progress import Progress
 from univoxel.training.surface_update import (
     EPS_FEATURES,
@@ -72,7 +71,6 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     time is over, or there is nothing to see, all stays. A run that was saved within the stage goes
     on there, on points of the surface as it is then.
     """
-    ranks.as_first_([*scene.state_dict().values()])
     problem = traced_problem(scene, photos, cfg, seed, progress)
     if problem is None:
         progress.within = None
@@ -107,9 +105,6 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         loss = torch.stack(list(terms.values())).sum()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        if ranks.count() > 1:
-            terms = summed_over_ranks_(parameters_of(optimizer), terms)
-            loss = torch.stack(list(terms.values())).sum()
         if not guard.sound(loss):
             continue
         if cfg.lr_sdf:
@@ -347,19 +342,12 @@ def set_rates_(
 def objective(
     scene: Scene, problem: JointProblem, decisions: Decisions, cfg: JointConfig
 ) -> dict[str, Tensor]:
-    """The weighted losses of a random batch of observations; of several ranks, this one's part of
-    them."""
+    """The weighted losses of a random batch of observations."""
     index, observation = sample_observations(problem, cfg.rays // cfg.views, cfg.views)
     point = index[:: cfg.views]
     position = problem.observations.position[point]
     distance = cfg.adam.beside * problem.voxel_size
     nearby = position + distance * torch.randn_like(position)
-    share = 1.0
-    if ranks.count() > 1:  # all draw the same
-        drawn, own = len(point), ranks.share()
-        point, position, nearby = (x[own] for x in (point, position, nearby))
-        index, observation = (x.view(drawn, cfg.views)[own].flatten() for x in (index, observation))
-        share = len(point) / drawn
     # One sampling, one gradient: adding up sparse ones costs more than either
     sample = scene.field.sample(torch.cat([position, nearby]))
     parts = (x.chunk(2) for x in scene.material(sample.features))
@@ -387,7 +375,7 @@ def objective(
         terms["mirrors"] = cfg.mirror.weight * mirror_loss(
             decisions.mirrors, point, normal, albedo, roughness
         )
-    return {name: share * term for name, term in terms.items()}
+    return terms
 
 
 def mirror_loss(

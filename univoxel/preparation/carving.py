@@ -19,7 +19,6 @@ from skimage import measure
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from univoxel import ranks
 from univoxel.camera import Cameras, looked_at, pixel_width, project, sizes_of, stacked
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
@@ -88,12 +87,10 @@ def _agreed_nodes(
     """Which nodes [N] inside the hull the views agree to see through."""
     solid = hull <= 0
     nodes = grid.nodes()[solid]
-    all_votes = torch.zeros(3, len(nodes))
-    free_votes, votes, better_votes = all_votes
+    free_votes, votes, better_votes = torch.zeros(3, len(nodes))
     colors = torch.stack([log_colors(picture, cfg) for picture in pictures])
-    views = ranks.mine(range(len(cameras)))
-    maps = depth_maps(colors, cameras, hull_depths, hull, grid, cfg, views)
-    for view, (depth, error, hull_error) in zip(views, maps, strict=True):
+    maps = depth_maps(colors, cameras, hull_depths, hull, grid, cfg)
+    for view, (depth, error, hull_error) in enumerate(maps):
         distance, pixel = _distance_and_pixel(nodes, cameras, view)
         clearance = depth.flatten()[pixel] - distance  # NaN: the view says nothing
         seen_through = clearance > 0
@@ -101,7 +98,6 @@ def _agreed_nodes(
         votes += clearance > -cfg.behind * grid.voxel_size
         better = hull_error - error > (cfg.better * hull_error).clamp_min(cfg.visible)
         better_votes += seen_through & better.flatten()[pixel]
-    free_votes, votes, better_votes = ranks.total(all_votes)
     agreed = (free_votes > cfg.agree * votes) & (free_votes > cfg.least * len(cameras))
 
     def around(values: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -66,7 +66,6 @@ def depth_maps(
     hull: Tensor,
     grid: GridShape,
     cfg: CarvingConfig = CARVING,
-    views: Sequence[int] | None = None,
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """View after view: distance along each pixel's ray, and colour difference of views that had no
     say in it, there and on the hull: three [H, W], NaN outside the object.
@@ -78,13 +77,12 @@ def depth_maps(
         hull_depths: V, [H, W], from `surface_depths`.
         hull: [X, Y, Z] sdf, world units.
         grid: of the hull.
-        views: that are wanted; None: all.
     """
     field, step = DenseDistances(grid, hull), grid.voxel_size
     matrix = projection_matrices(cameras)
     toward = normalize(cameras.camera_to_world[:, :, 3] - looked_at(cameras), dim=1)
     similarity = (toward @ toward.T).fill_diagonal_(-2.0)
-    for view in range(len(cameras)) if views is None else views:
+    for view in range(len(cameras)):
         inside = (pictures[view, :, :, 3] >= 128) & hull_depths[view].isfinite()
         rows = torch.where(inside, inside.flatten().cumsum(0).view(inside.shape) - 1, -1)
         rays, hull_depth = image_rays(cameras, view), hull_depths[view][inside]

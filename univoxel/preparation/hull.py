@@ -7,7 +7,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from univoxel import ranks, shelf
+from univoxel import shelf
 from univoxel.camera import Cameras, looked_at, project
 from univoxel.data.base import coverage_of
 from univoxel.errors import UserError
@@ -41,8 +41,7 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
         for array in (alpha, distances):
             shelf.release(array[view])
 
-    side_by_side(fill_, ranks.mine(range(len(alpha))))
-    ranks.spread_(distances)
+    side_by_side(fill_, range(len(alpha)))
     return distances
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from univoxel import ranks, shelf
+from univoxel import shelf
 from univoxel.camera import project
 from univoxel.color import srgb_to_linear
 from univoxel.data import Photos
@@ -108,7 +108,7 @@ def observe(
         of_view = torch.full((int(counted.sum()),), v)
         return facing[counted], towards[facing][counted], pixel_color[counted], of_view
 
-    point, wo, color, view = zip(*ranks.shared(seen_in, range(len(photos))), strict=True)
+    point, wo, color, view = zip(*map(seen_in, range(len(photos))), strict=True)
     index = torch.cat(point)
     order = torch.argsort(index, stable=True)
     counts = torch.bincount(index, minlength=len(position))
@@ -156,8 +156,7 @@ def trace(
     visibility = torch.zeros(count, nodes, dtype=torch.uint8)
     indirect = torch.zeros(count, nodes, 3, dtype=torch.float16)
     parts = [slice(b, min(b + POINTS_AT_ONCE, count)) for b in range(0, count, POINTS_AT_ONCE)]
-    own = ranks.mine(range(len(parts)))
-    for number, part in enumerate(parts):
+    for part in parts:
         above = observations.normal[part] @ direction.T > -spread
         point, node = above.nonzero().unbind(1)
         start = observations.position[part] + offset * observations.normal[part]
@@ -166,13 +165,9 @@ def trace(
         radiance = torch.zeros(len(point), 3)
         for _ in range(rays):
             jitter = spread * torch.randn(len(point), 3, generator=generator) / math.sqrt(2)
-            if number not in own:  # all draw the same
-                continue
             hit = scene.closest_hit(start, normalize(direction[node] + jitter, dim=1)).face
             sky += hit < 0
             radiance += torch.where((hit >= 0)[:, None], vertex_color[first[hit.clamp_min(0)]], 0.0)
         visibility[part][point, node] = (255 * sky / rays).round().to(torch.uint8)
         indirect[part][point, node] = (radiance / rays).clamp_max(HALF_MAX).half()
-    ranks.spread_([visibility[part] for part in parts])
-    ranks.spread_([indirect[part] for part in parts])
     return Transport(direction, visibility, indirect)

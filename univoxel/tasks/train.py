@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from univoxel import ranks, shelf
+from univoxel import shelf
 from univoxel.build import build_scene
 from univoxel.checkpoint import FILE, load_checkpoint, save_scene
 from univoxel.compression import plan, sizes
@@ -73,12 +74,9 @@ def train(
     """
     if not native.reference_asked():
         native.require_embree("train")  # now, and not minutes later
-    if ranks.began_by_torchrun() and (view is not None or timelapse is not None):
-        what = "timelapse" if view is None else "view"
-        raise UserError(f"{what} is of trainings in one process, not under torchrun", what)
     film = None if timelapse is None else Timelapse(timelapse, cfg)
     if view is None:
-        with ranks.joined(), shelf.shelved(cfg.out):
+        with shelf.shelved(cfg.out):
             return _train(cfg, resume, film, None, on_progress)
     from univoxel.viewer.training import watched
 
@@ -97,11 +95,7 @@ def _train(
     """`train`, with those who look at it between steps."""
     torch.manual_seed(cfg.seed)
     kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
-    with ranks.in_turn():
-        photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
-        if ranks.count() > 1 and ranks.leads():  # the others need not shrink them again
-            cfg.out.mkdir(parents=True, exist_ok=True)
-            keep_photos(photos, kept)
+    photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
     cfg = replace(cfg, downscale=photos.downscale)
     if not resume and (cfg.out / FILE).exists():
         raise ExistingFile(
@@ -110,18 +104,17 @@ def _train(
     log.info(photos.about)
     check_memory(photos, cfg)
 
-    begin = ranks.tick()  # only now: how long reading takes is the photographs' affair
+    begin = time.monotonic()  # only now: how long reading takes is the photographs' affair
     silhouettes = find_silhouettes(photos, cfg)
     pixels = split_pixels(silhouettes.photos, silhouettes.distance, silhouettes.doubted)
     pixels = replace(pixels, edges_given=silhouettes.edges_given)
     limited = plan.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
     scene, state, pinned = start(silhouettes, cfg, limited, resume)
     cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
-    if ranks.leads():
-        if not state:  # of a run that was killed before anything was saved
-            (cfg.out / LOG).unlink(missing_ok=True)
-        save_config(cfg)
-        keep_photos(photos, kept)
+    if not state:  # of a run that was killed before anything was saved
+        (cfg.out / LOG).unlink(missing_ok=True)
+    save_config(cfg)
+    keep_photos(photos, kept)
     begin -= state.get("seconds", 0.0)
     if spectators:
         spectators.show(pixels.photos)
@@ -132,14 +125,11 @@ def _train(
             for index in range(progress.clock.stage, len(cfg.stages)):
                 make_stage_(scene, limited, index, silhouettes.box, pinned, pixels, progress)
         except Cancelled:
-            if ranks.leads():
-                save_scene(scene, cfg.out, progress.state())
+            save_scene(scene, cfg.out, progress.state())
             raise
         if film:
             film.finish(scene, progress.clock)
-    if ranks.leads():
-        with ranks.alone():
-            save_trust(scene, pixels.photos, cfg, progress.troubles)
+    save_trust(scene, pixels.photos, cfg, progress.troubles)
     return cfg.out
 
 
@@ -230,12 +220,9 @@ def make_stage_(
         progress.chosen += choices
         if not last and plan.begun_in_rehearsal(scene, choices):
             progress.clock.count_as_done(cfg.compression.rehearsal_share)
-    if not ranks.leads():
-        return
     reach, state = chosen_reach(progress.chosen), progress.state()
-    with ranks.alone():
-        save_scene(scene, cfg.out, state, slim=last, reach=reach)
-        preview(scene, scene.registered(photos), cfg.out / "preview.png")
+    save_scene(scene, cfg.out, state, slim=last, reach=reach)
+    preview(scene, scene.registered(photos), cfg.out / "preview.png")
 
 
 def bring_to_grid_(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-from univoxel import ranks
 from univoxel.config import TrainConfig
 
 RESERVE_SECONDS = 4.0  # of the budget, kept for the last checkpoint and the preview
@@ -56,7 +56,7 @@ class Clock:
     def __init__(self, cfg: TrainConfig, begin: float, state: dict[str, Any]) -> None:
         """
         Args:
-            begin: of training, on the clock of `ranks.now`.
+            begin: of training, on the clock of `time.monotonic`.
             state: as `state` gave it; empty at the begin of a run.
         """
         self.cfg: TrainConfig = cfg
@@ -98,7 +98,7 @@ class Clock:
     @property
     def seconds(self) -> float:
         """Training time so far, over all sittings."""
-        now = ranks.now() if self._stopped is None else self._stopped
+        now = time.monotonic() if self._stopped is None else self._stopped
         return now - self.begin
 
     @property
@@ -157,7 +157,6 @@ class Clock:
 
     def _plan(self, off_pace: float) -> None:
         """How many steps are left of the stage, and when its time is over."""
-        ranks.tick()
         stage = self.cfg.stages[self.stage]
         allowed = self._allowed(max(self.limit - RESERVE_SECONDS - self._stage_begin, 0.0))
         self._planned, self._count = max(1, round((1 - self.done) * stage.iterations)), 0
@@ -209,7 +208,6 @@ class Clock:
         """A block between steps whose time says nothing of how long steps take."""
         begin = self.seconds
         yield
-        ranks.tick()
         self._last_block = self.seconds - begin
         self._off_pace += self._last_block
 
@@ -225,11 +223,11 @@ class Clock:
     @contextmanager
     def stopped(self) -> Iterator[None]:
         """A block whose time does not count at all."""
-        self._stopped = ranks.tick()
+        self._stopped = time.monotonic()
         try:
             yield
         finally:
-            spent, self._stopped = ranks.tick() - self._stopped, None
+            spent, self._stopped = time.monotonic() - self._stopped, None
             self.begin += spent
 
     def cut(self) -> str:

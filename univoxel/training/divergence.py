@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from univoxel import ranks
 from univoxel.optim import parameters_of
 from univoxel.training.progress import Listener
 
@@ -56,7 +56,7 @@ class Guard:
 
         They may have other sizes than before.
         """
-        begin = ranks.now()
+        begin = time.monotonic()
         if begin < self._next:
             return
         parameters = self._parameters()
@@ -64,7 +64,7 @@ class Guard:
             self._copy = [torch.empty_like(p) for p in parameters]
         for copy, parameter in zip(self._copy, parameters, strict=True):
             copy.copy_(parameter)
-        end = ranks.now()
+        end = time.monotonic()
         self._next = end + (end - begin) / COPYING
 
     def sound(self, loss: Tensor) -> bool:

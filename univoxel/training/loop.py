@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from univoxel import losses, ranks, shelf
+from univoxel import losses, shelf
 from univoxel.camera import pixel_rays
 from univoxel.checkpoint import save_scene
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
@@ -25,7 +25,6 @@ from univoxel.scene import Scene
 from univoxel.training import patches
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
-from univoxel.training.exchange import summed_over_ranks_
 from univoxel.training.pixels import TrainingPixels, unpacked
 from univoxel.training.plateau import Plateau
 from univoxel.training.progress import Listener, Rehearsal
@@ -81,7 +80,6 @@ def run_stage(
     guard = Guard(progress, restored=lambda: restore_surface_(scene))
     guard.follow(optimizer)
     parameters = parameters_of(optimizer)
-    ranks.as_first_([*scene.state_dict().values()])
     compared = None
     if cfg.loss.patches and stage.patches_from < 1 and not shelf.on_disk(pixels.photos.color):
         compared = patches.comparable(pixels.photos)
@@ -103,11 +101,10 @@ def run_stage(
             if progress.clock.step % RETRACE == 0 and not stage.refit:
                 scene.release_surface()
 
-            parts = ranks.mine(parts_of(pixels.trained, stage.rays, ranks.count()))
+            parts = parts_of(pixels.trained, stage.rays, 1)
             look = done >= stage.patches_from and progress.clock.step % COMPARE_EVERY == 0
             brightness = compared if look else None
             terms = descend_(scene, cfg.loss, pixels, parts, physical, parameters, brightness)
-            terms = summed_over_ranks_(parameters, terms)
             if not guard.sound(torch.stack(list(terms.values())).sum()):
                 continue
             shown |= terms  # where patches are not compared, as they were last

@@ -11,14 +11,12 @@ from typing import Any, Protocol
 import torch
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
-from univoxel import ranks
 from univoxel.bars import bar
 from univoxel.compression.choices import CapacityChoice
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
 from univoxel.machine import peak_memory_mb
 from univoxel.training.clock import Clock, CountedSteps, StepClock
-from univoxel.training.exchange import TRAFFIC
 
 LOG = "log.jsonl"  # in the folder of a run
 REPORT_SECONDS = 5.0
@@ -78,7 +76,7 @@ class Progress:
     ):
         """
         Args:
-            begin: of training, on the clock of `ranks.now`.
+            begin: of training, on the clock of `time.monotonic`.
             state: as `state` gave it; empty at the begin of a run.
             on_progress: called with each report.
         """
@@ -121,17 +119,13 @@ class Progress:
 
     def state(self) -> dict[str, Any]:
         """What a later sitting needs to go on, and what evaluation reports; JSON."""
-        return (
-            self.clock.state()
-            | {
-                "within": self.within,
-                "chosen": [choice.as_json() for choice in self.chosen],
-                "troubles": self.troubles,
-                "threads": torch.get_num_threads(),
-                "peak_rss_mb": peak_memory_mb(),
-            }
-            | ({"ranks": TRAFFIC.as_json()} if ranks.count() > 1 else {})
-        )
+        return self.clock.state() | {
+            "within": self.within,
+            "chosen": [choice.as_json() for choice in self.chosen],
+            "troubles": self.troubles,
+            "threads": torch.get_num_threads(),
+            "peak_rss_mb": peak_memory_mb(),
+        }
 
     def say(self, what: str) -> None:
         """Tell at once of something that was found."""
@@ -145,16 +139,15 @@ class Progress:
         self.say(what)
 
     def _append(self, line: dict[str, Any]) -> None:
-        if ranks.leads():
-            append_line(self._log, json.dumps(line))
+        append_line(self._log, json.dumps(line))
 
     def due(self) -> bool:
         """Whether it is time to report."""
         return self.clock.seconds - self._reported > REPORT_SECONDS
 
     def checkpoint_due(self) -> bool:
-        """Whether a checkpoint is due, for a run that may be killed: the first rank writes it."""
-        if self.clock.seconds - self._saved < CHECKPOINT_SECONDS or not ranks.leads():
+        """Whether a checkpoint is due, for a run that may be killed."""
+        if self.clock.seconds - self._saved < CHECKPOINT_SECONDS:
             return False
         self._saved = self.clock.seconds
         return True
