@@ -23,7 +23,7 @@ LAYERS = [
     {"envmap", "networks", "orbit", "poses"},
     {"data", "fields", "lights", "optim"},
     {"scene"},
-    {"checkpoint", "run"},
+    {"checkpoint", "run", "verdict"},
     {"losses"},
     {"assets", "metrics", "render"},
     {
@@ -86,6 +86,7 @@ HELPERS = {
             "clock",
             "pixels",
             "divergence",
+            "loop",
             "patches",
             "plateau",
             "progress",

@@ -1,10 +1,10 @@
 """The net under every move and rename: short trainings of the bundled scene with fixed steps.
 
-Three trainings, each with other parts of the program, on one thread and under a limit of time that
-cuts nothing. Rounding depends on the processor, the extension, torch, its instruction set and its
-libraries, and grows in training, so equal bits mean something on one machine and in one sitting
-alone: `make net BASE=REV` makes them for a commit and for the working tree and compares. What
-tests/test_net.py compares on any machine are pictures, with the small copies in tests/net.json.
+Three trainings, each with other parts of the program, on one thread and without a limit of time.
+Rounding depends on the processor, the extension, torch, its instruction set and its libraries, and
+grows in training, so equal bits mean something on one machine and in one sitting alone: `make net
+BASE=REV` makes them for a commit and for the working tree and compares. What tests/test_net.py
+compares on any machine are pictures, with the small copies in tests/net.json.
 
     python tests/net.py OUT.json    # hashes and pictures of what this tree makes
     python tests/net.py             # hold the pictures in tests/net.json
@@ -43,7 +43,7 @@ def short(cfg: TrainConfig, **changes) -> TrainConfig:
         else:
             few |= {"points": 2000, "newton_points": 300, "rounds": 2}
         stages.append(dataclasses.replace(stage, **few))
-    return dataclasses.replace(cfg, stages=tuple(stages), minutes=1e6, downscale=2, **changes)
+    return dataclasses.replace(cfg, stages=tuple(stages), minutes=None, downscale=2, **changes)
 
 
 def hybrid(out: Path) -> TrainConfig:

@@ -17,7 +17,7 @@ SMALL = (
     *(f"stages.{i}.{field}" for i in (0, 1, 3) for field in ("voxels=0.01", "rays=128")),
     *("stages.0.iterations=10", "stages.1.iterations=20", "stages.3.iterations=5"),
     *("stages.2.iterations=10", "stages.2.points=200", "stages.2.newton_points=50"),
-    *("stages.2.rays=64", "scene.sky_nodes=64", "voxel_pixels=0", "hollows=0"),
+    *("stages.2.rays=64", "scene.sky_nodes=64", "voxel_pixels=0", "carving_seconds=0"),
 )
 
 

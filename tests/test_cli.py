@@ -104,7 +104,9 @@ def calls(monkeypatch):
 
     replace("train", Path("run"))
     replace("poses", Path("scene"))
-    made = types.SimpleNamespace(page=Path("mug/index.html"), mesh=Path("mug/mug.glb"))
+    made = types.SimpleNamespace(
+        page=Path("mug/index.html"), mesh=Path("mug/mug.glb"), run=Path("mug/run")
+    )
     replace("capture", made)
     replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)

@@ -14,7 +14,8 @@ from univoxel.lights.sg import SGConfig
 from univoxel.names import LIGHTS
 from univoxel.presets import PRESETS, budget, chosen, preset, with_field, with_metal, work_in
 from univoxel.scene import SceneConfig
-from univoxel.training.config import LossConfig, StageConfig
+from univoxel.training.clock import expected_training
+from univoxel.training.config import PREPARATION, LossConfig, StageConfig
 
 STAGE = StageConfig(voxels=1.0, iterations=10, share=1.0)
 CONFIG = TrainConfig(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
@@ -84,28 +85,28 @@ def test_capacity_adapts_unless_lights_are_compared():
 @pytest.mark.parametrize("name", [*PRESETS])
 def test_a_preset_is_a_point_of_the_curve(name, light):
     config = preset(name, Path("photos"), Path("run"), light)
-    found = budget(PRESETS[name].minutes, Path("photos"), Path("run"), light)
-    # A machine of half the speed makes all steps, and opens the same hollows
-    assert config.minutes == 2 * found.minutes
-    assert config.minutes * config.hollows == found.minutes * found.hollows
-    assert replace(config, minutes=found.minutes, hollows=found.hollows) == found
+    limit = PRESETS[name].minutes / (1 - PREPARATION)
+    found = budget(limit, Path("photos"), Path("run"), light)
+    assert (config.minutes, found.minutes) == (None, limit)
+    assert found == replace(config, minutes=limit)
 
 
 def test_little_time_goes_into_neither_colours_nor_patches():
-    stages = {m: budget(m, Path("data"), Path("run")).stages for m in (0.5, 0.9, 1, 12)}
+    stages = {m: budget(m, Path("data"), Path("run")).stages for m in (0.5, 1, 1.4, 12)}
     assert {m: s[2].colors for m, s in stages.items()} == {
         0.5: False,
-        0.9: False,
-        1: True,
+        1: False,
+        1.4: True,
         12: True,
     }
     patches = {m: tuple(s[i].patches_from for i in (0, 1, 3)) for m, s in stages.items()}
-    assert patches == {0.5: (1, 1, 1), 0.9: (1, 1, 1), 1: (0.2, 0, 1), 12: (0.2, 0, 1)}
+    assert patches == {0.5: (1, 1, 1), 1: (1, 1, 1), 1.4: (0.2, 0, 1), 12: (0.2, 0, 1)}
 
 
 @pytest.mark.parametrize("light", ["hybrid", "sg"])
-def test_presets_open_hollows_in_a_small_share_of_their_time(light):
-    assert 0 < preset("fast", Path("a"), Path("b"), light).hollows < 0.1
+def test_presets_carve_where_it_takes_a_small_share_of_their_time(light):
+    seconds = preset("fast", Path("a"), Path("b"), light).carving_seconds
+    assert seconds == pytest.approx(0.1 * 60 * PRESETS["fast"].minutes)
 
 
 @pytest.mark.parametrize("light", ["hybrid", "sg"])
@@ -125,7 +126,7 @@ def test_exposures_are_looked_at_unless_it_is_said_what_differs(light):
 
 
 def test_more_minutes_are_more_work():
-    minutes = [0.05, 0.5, 1.0, 1.3, 1.9, 2.0, 2.1, 4.0, 5.0, 8.0, 9.0, 60.0]
+    minutes = [0.05, 0.5, 1.0, 1.3, 1.9, 2.0, 2.1, 4.0, 5.0, 11.0, 12.0, 60.0]
     configs = [budget(m, Path("photos"), Path("run")) for m in minutes]
     assert [c.minutes for c in configs] == minutes
     fine = [c.stages[1] for c in configs]
@@ -180,8 +181,10 @@ def test_an_unknown_light():
 
 
 def test_presets_differ_in_work():
-    minutes = [preset(n, Path("a"), Path("b")).minutes for n in PRESETS]
-    assert minutes == sorted(set(minutes))
+    seconds = [expected_training(preset(n, Path("a"), Path("b"))) for n in PRESETS]
+    assert seconds == sorted(set(seconds))
+    limited = replace(preset("best", Path("a"), Path("b")), minutes=0.5)
+    assert expected_training(limited) == 30.0
 
 
 def test_the_file_holds_every_field(tmp_path):
@@ -235,8 +238,8 @@ def test_the_file_holds_every_field(tmp_path):
         (CONFIG, {"patience": -0.1}, "patience must be at least 0, got -0.1"),
         (CONFIG, {"downscale": -1}, "downscale must be at least 0, got -1"),
         (CONFIG, {"voxel_pixels": -1}, "voxel_pixels must be at least 0, got -1"),
-        (CONFIG, {"hollows": -0.1}, "hollows must be at least 0, got -0.1"),
-        (CONFIG, {"minutes": 0.0}, "minutes must be above 0, got 0.0"),
+        (CONFIG, {"carving_seconds": -0.1}, "carving_seconds must be at least 0, got -0.1"),
+        (CONFIG, {"minutes": 0.0}, "minutes must be above 0 or None, got 0.0"),
         (CONFIG, {"masks": "wide"}, "masks must be auto or given, got 'wide'"),
         (CONFIG, {"cameras": "wrong"}, "cameras must be auto, given or refined, got 'wrong'"),
         (SceneConfig(), {"channels": 0}, "channels must be at least 1, got 0"),

@@ -138,17 +138,6 @@ def test_the_diagram_shows_the_layers():
     assert [row for row in rows if row in shown] == shown
 
 
-LONGEST = 80  # lines of a function, with its docstring: what a reader takes in at one sitting
-
-
-def test_functions_are_short():
-    for path in (ROOT / "univoxel").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                lines = (node.end_lineno or 0) - node.lineno + 1
-                assert lines <= LONGEST, f"{path}: {node.name} has {lines} lines"
-
-
 def test_tasks_are_commands():
     names = {path.stem for path in (ROOT / "univoxel" / "tasks").glob("*.py")} - {"__init__"}
     commands = {"poses", "cutout", "train", "eval", "relight", "export", "envmap", "inspect"}

@@ -31,6 +31,7 @@ from univoxel.tasks.relight import relight_images
 from univoxel.tasks.report import report
 from univoxel.tasks.train import train as train_config
 from univoxel.training.progress import LOG, TrainingProgress
+from univoxel.verdict import Verdict, load_verdict
 
 __all__ = ["Run", "TrainingProgress", "open_run", "train"]
 
@@ -171,6 +172,12 @@ class Run:
         return file.read_text(encoding="utf-8") if file.is_file() else ""
 
     @property
+    def verdict(self) -> Verdict | None:
+        """How training came out and what would help; None: it has not ended, or its version told
+        nothing."""
+        return load_verdict(self.path)
+
+    @property
     def log(self) -> list[dict[str, Any]]:
         """What training reported, every few seconds: time, losses, held-out quality."""
         file = self.path / LOG
@@ -247,7 +254,8 @@ def train(
         preset: how much work goes in: draft, fast, full or best; auto is what fits into minutes, or
             fast.
         light, varying: as of `univoxel.presets.budget`.
-        minutes: wall-clock limit, above 0; None: the preset's.
+        minutes: wall-clock limit, above 0, from the first photograph read to the end; None: all
+            steps are made.
         changes: FIELD=VALUE of the configuration, as of --set.
         on_progress: called every few seconds of training. Raise `univoxel.Cancelled` in it to end
             the training: it is saved, and goes on with resume.

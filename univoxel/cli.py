@@ -45,7 +45,8 @@ SPINS = "3000"
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code.
 
-    0; 1 where nobody reads the output to its end; 2 for a user's mistake; 130 when interrupted.
+    0; 1 where nobody reads the output to its end; 2 for a user's mistake; 3 where a stage of a
+    training made no step; 130 when interrupted.
 
     The hidden flag --traceback shows where an error came from.
     """
@@ -89,7 +90,7 @@ def _run(arguments: list[str]) -> int:
     take_threads(call.common.threads)
     try:
         with spoken(call.common, results_alone=call.run.keywords.get("json") == STDOUT):
-            call.run()
+            return call.run() or 0
     except KeyboardInterrupt:
         print(f"univoxel {call.name}: interrupted{_kept(call)}", file=sys.stderr)
         return 130
@@ -102,7 +103,6 @@ def _run(arguments: list[str]) -> int:
         message = message.removeprefix(f"{call.name.split()[-1]}: ")
         print(f"univoxel {call.name}: {message}", file=sys.stderr)
         return 2
-    return 0
 
 
 def help_screen(arguments: Sequence[str]) -> str | None:

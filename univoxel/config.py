@@ -47,7 +47,9 @@ class TrainConfig:
     out: Path  # folder of the run
     # in the order in which they are trained, >= 1: a StageConfig first, which makes the grid
     stages: tuple[StageConfig | JointConfig, ...]
-    minutes: float  # > 0; training ends in time, with what it has
+    # wall-clock limit from the first photograph read to the end, > 0: what does not fit is cut, in
+    # all stages alike; None: all steps are made, however long they take
+    minutes: float | None = None
     # pixels of the photographs along a side of one that is trained on, >= 1; 0: as many as leave
     # what grids can use, 1 for photographs of 1499 pixels and fewer. A run's config.json has the
     # number that was found
@@ -72,10 +74,10 @@ class TrainConfig:
     # camera stood still too; auto: which of the two explains better how colours change from
     # photograph to photograph. scene.turntable then holds the axis
     light_frame: LightFrameOrAuto = "world"
-    # share of the minutes, >= 0, that opening hollows before training may be expected to take, or
-    # they are left alone: hollows that no silhouette shows, where photographs agree on them. Never
-    # where their light varies, other than in exposure
-    hollows: float = 0.0
+    # seconds, >= 0, that carving concavities before training may be expected to take on two cores,
+    # or they are left alone: those that no silhouette shows, where photographs agree on them. Never
+    # where their light varies, other than in exposure; 0: never
+    carving_seconds: float = 0.0
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
     capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see compression/plan.py
@@ -123,8 +125,8 @@ class TrainConfig:
             raise ConfigError(
                 "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
             )
-        check_fields(self, "above 0", lambda x: x > 0, "minutes")
-        names = ("patience", "downscale", "voxel_pixels", "hollows")
+        check_fields(self, "above 0 or None", lambda x: x is None or x > 0, "minutes")
+        names = ("patience", "downscale", "voxel_pixels", "carving_seconds")
         check_fields(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
         check_fields(self, "fixed or adaptive", lambda x: x in get_args(Capacity), "capacity")
         frames = get_args(LightFrameOrAuto)

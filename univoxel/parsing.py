@@ -23,7 +23,7 @@ from tyro.conf import (
     subcommand,
 )
 
-Command: TypeAlias = Callable[..., None]
+Command: TypeAlias = Callable[..., int | None]  # the exit code; None: 0
 Shell: TypeAlias = Literal["bash", "zsh", "fish"]
 
 LAB = "lab"  # the word before commands of the laboratory
@@ -47,7 +47,7 @@ class Call:
     """A command with its arguments."""
 
     name: str  # as it is written: "train", "lab chart"
-    run: functools.partial[None]
+    run: functools.partial[int | None]
     common: Common
 
 
@@ -94,7 +94,7 @@ def parse(
     return Call(prefix + name, run, common)
 
 
-def deferred(command: Command) -> Callable[..., tuple[functools.partial[None], Any]]:
+def deferred(command: Command) -> Callable[..., tuple[functools.partial[int | None], Any]]:
     """A function of the same signature, and the common options, that returns the call."""
 
     def prepare(*args, common: Any, **kwargs):

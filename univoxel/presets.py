@@ -1,4 +1,4 @@
-"""Presets: how much work fits into a time on two cores."""
+"""Presets: amounts of work, and the work that fits into a time."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from univoxel.lights import (
 )
 from univoxel.names import LIGHTS, Differing, FieldName, LightName, Metal
 from univoxel.scene import SceneConfig
-from univoxel.training.config import LossConfig, StageConfig
+from univoxel.training.config import PREPARATION, LossConfig, StageConfig
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a budget of time on two cores goes into."""
+    """An amount of work."""
 
-    minutes: float  # that it takes on two quiet cores
+    minutes: float  # that its training takes on two quiet cores, on 80 photographs of 400 pixels
     voxels: float  # millions, of the finest grid
     steps: float  # of the fine stage; the others follow
     rays: float  # per step
@@ -89,9 +89,8 @@ PRESETS = {
 }
 
 
-SLOWER = 2.0  # a machine may be so many times as slow before a preset's steps are cut
 SHORTEST = 1.0  # minutes; in fewer, patches and taught colours cost more than they bring
-HOLLOWS = 0.1  # share of the minutes: where opening them takes more it costs more than it brings
+CARVING = 0.1  # share of the minutes: where carving takes more it costs more than it brings
 
 
 def preset(
@@ -99,9 +98,9 @@ def preset(
 ) -> TrainConfig:
     """The configuration of a preset: draft (1 minute), fast (2), full (5) or best (8) on two cores.
 
-    Its sizes are limits: capacity is adaptive under the hybrid light, and fixed under others, which
-    are there to be compared. So are its minutes, which are twice as many: a machine that is slower
-    makes all steps, too.
+    A preset is an amount of work: every machine makes all of its steps, however long they take. Its
+    sizes are limits: capacity is adaptive under the hybrid light, and fixed under others, which are
+    there to be compared.
 
     Args:
         light, varying: see `budget`.
@@ -111,18 +110,18 @@ def preset(
     """
     if name not in PRESETS:
         raise UserError(f"preset must be one of {', '.join(PRESETS)}, got {name!r}", "preset")
-    work = PRESETS[name]
-    config = _configuration(work, data, out, light, varying)
-    return replace(config, minutes=SLOWER * work.minutes, hollows=HOLLOWS / SLOWER)
+    return _configuration(PRESETS[name], data, out, light, varying)
 
 
 def budget(
     minutes: float, data: Path, out: Path, light: LightName = "hybrid", varying: Differing = "auto"
 ) -> TrainConfig:
-    """The configuration for any time, in minutes on two cores: the presets and what lies between.
+    """The configuration for a limit of time, in minutes on two cores: the presets and what lies
+    between.
 
     Args:
-        minutes: above 0.
+        minutes: above 0, from the first photograph read to the end. Reading and preparation are
+            left a quarter of them.
         light: "sg", local lobes as published; "hybrid", local lobes while geometry forms, then one
             environment map with traced visibility for the materials, then lobes that follow them;
             "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
@@ -137,7 +136,8 @@ def budget(
     """
     if not 0 < minutes < math.inf:
         raise UserError(f"minutes must be above 0, got {minutes:g}", "minutes")
-    return _configuration(work_in(minutes), data, out, light, varying)
+    work = work_in((1 - PREPARATION) * minutes)
+    return replace(_configuration(work, data, out, light, varying), minutes=minutes)
 
 
 def chosen(
@@ -208,7 +208,7 @@ def work_in(minutes: float) -> Work:
 def _configuration(
     work: Work, data: Path, out: Path, light: LightName, varying: Differing
 ) -> TrainConfig:
-    minutes, voxels = work.minutes, round(work.voxels, 3)
+    voxels = round(work.voxels, 3)
     exposures, known = varying == "auto", "none" if varying == "auto" else varying
     steps, rays = max(6, round(work.steps)), max(8, round(work.rays))
     lr_networks = (work.lr_networks, 3e-4)
@@ -262,14 +262,13 @@ def _configuration(
         data,
         out,
         stages,
-        minutes,
         masks="auto",
         cameras="auto",
         exposures=exposures,
         light_frame="auto"
         if isinstance(scene.light, LocalLightConfig) and known != "light"
         else "world",
-        hollows=HOLLOWS,
+        carving_seconds=CARVING * 60 * work.minutes,
         capacity=capacity,
         scene=scene,
         loss=loss,

@@ -67,7 +67,7 @@ def test_the_page_is_whole(text):
     assert not re.search(r'(?:src|href)\s*=\s*"(?!data:)', text)
     assert re.findall(r"url\((?!data:)", embedded_style(text)) == []
     assert "&quot;Balls&quot; &lt;/script&gt; &amp; more</h1>" in text
-    assert "trained in 32 s on the CPU \u00b7 held-out pixels 31.2 dB" in text
+    assert "trained in 32 s on the CPU \u00b7 validation 31.2 dB" in text
     assert "Nothing &lt;b&gt;is sure." in text
     assert "<td>novel views, PSNR, dB<td>32.1" in text
     assert "A note." in text

@@ -67,7 +67,7 @@ def data(tmp_path_factory):
 def run(data, tmp_path_factory):
     """A run with local light alone, and no map."""
     out = tmp_path_factory.mktemp("sphere") / "run"
-    changes = [*STAGES, "voxel_pixels=0", "hollows=0", "masks=given", "cameras=given"]
+    changes = [*STAGES, "voxel_pixels=0", "carving_seconds=0", "masks=given", "cameras=given"]
     changes += ["exposures=False", "light_frame=world", "confidence.points=1000"]
     return univoxel.train(data, out, light="sg", minutes=2, changes=changes)
 
@@ -93,7 +93,7 @@ def test_the_page_is_whole(text):
     assert not re.search(r'(?:src|href)\s*=\s*"(?!data:)', text)
     assert "url(" not in text
     assert "&lt;&quot;Ball&quot;&gt;</h1>" in text
-    assert text.count("<section>") == 6
+    assert text.count("<section>") == 7
     assert len(text) < 2e6
     for _, picture in pictures(text):
         assert picture.std() > 1
@@ -195,7 +195,7 @@ def test_baked_light_is_none():
 def test_training_is_told(run, text):
     said = section(text, "Training")
     assert said.count('<svg class="chart"') in (0, 2)  # of seconds: there may be no line of the log
-    assert "1: shape and materials, up to 0.01 million voxels<td>20<td>100%" in said
+    assert "1: coarse shape<td>20<td>100%" in said
     assert "whole" in said
     assert "The limit was 120 s." in said
     _, state = load_checkpoint(run.path)
@@ -212,12 +212,12 @@ def test_what_time_cut_is_told(tmp_path):
         *("whole", "cut by the time limit", "ended early: nothing was left to gain", "not ended"),
     ]
     assert [f.seconds for f in facts] == [10.0, 20.0, 15.0, None]
-    assert [f.name for f in facts][2:] == ["joint solve", "refit"]
+    assert [f.name for f in facts][2:] == ["materials and light", "polish"]
     assert training.prepared(state) == pytest.approx(7.0)
     assert training.ends(state) == pytest.approx([17.0, 37.0])
     told = training.remarks(cfg, state)
     assert told[0] == "Training has not ended: it stands in stage 4."
-    assert "of the planned steps it made 40% in stage 2" in told[1]
+    assert "of the planned steps it made 40% for shape" in told[1]
     assert "trouble 1 times, the last in a." in told[2]
     assert training.ends({}) == []
     assert training.prepared({}) is None
@@ -260,7 +260,7 @@ def test_a_run_whose_photographs_are_gone_shows_what_is_left(run, data, tmp_path
     assert "The photographs cannot be read, so this is left out: " in said
     assert "gone" in said
     assert re.findall(r"<h2>(.*?)</h2>", text) == [
-        *("What to photograph next", "Materials", "Light", "Training"),
+        *("Result", "What to photograph next", "Materials", "Light", "Training"),
     ]
     assert "no log of this training" in text
     # Where they are now
@@ -298,7 +298,10 @@ def test_a_training_that_was_cancelled_is_shown_too(data, tmp_path, monkeypatch)
     cfg = preset("draft", data, tmp_path / "run", "sg")
     small = [replace(s, voxels=0.01, rays=64, iterations=5) for s in cfg.stages]
     with pytest.raises(univoxel.Cancelled):
-        train(replace(cfg, stages=tuple(small), hollows=0.0, voxel_pixels=0.0), on_progress=cancel)
+        train(
+            replace(cfg, stages=tuple(small), carving_seconds=0.0, voxel_pixels=0.0),
+            on_progress=cancel,
+        )
     text = univoxel.open_run(tmp_path / "run").report(size=SIZE, views=0).read_text()
     said = section(text, "Training")
     assert "Training has not ended: it stands in stage 2." in said

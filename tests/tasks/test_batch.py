@@ -280,18 +280,16 @@ def test_steps_of_raw_photographs(tmp_path):
     assert (train.needed, page.needed) == (True, False)
 
 
-def test_a_preset_makes_all_its_steps_on_one_thread(tmp_path):
+def test_what_a_training_of_a_batch_is_asked_for(tmp_path):
     def options(threads, **changes) -> str:
         wanted = dataclasses.replace(Wanted(), **changes)
         train = piece_of("mug", tmp_path, tmp_path, wanted, threads).steps[0]
         return " ".join(map(str, train.arguments[5:]))
 
-    assert "--preset fast --light hybrid --minutes 8" in options(1)
-    assert "--preset draft --light hybrid --minutes 4" in options(1, preset="draft")
-    assert "--preset auto --light hybrid" in options(2)
-    assert "--minutes" not in options(2)
-    assert "--minutes" not in options(None)
-    assert "--preset auto --light hybrid --minutes 3" in options(1, minutes=3.0)
+    # A preset makes all its steps, on any number of threads
+    assert options(1).endswith("--preset auto --light hybrid")
+    assert options(2, preset="draft").endswith("--preset draft --light hybrid")
+    assert options(1, minutes=3.0).endswith("--preset auto --light hybrid --minutes 3")
     config = Wanted().training(tmp_path, tmp_path)
     save_config(config)
     alike = options(1, config=tmp_path / "config.json", changes=("seed=2",))

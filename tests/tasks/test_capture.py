@@ -142,7 +142,7 @@ def test_what_other_options_made_is_refused(captured, photographs):
         task.capture(photos, out, **options)
     options |= {"masks": masks, "changes": capturing.CHANGES}
     choices: list[dict[str, Any]] = [
-        {"preset": "fast", "light": "baked"},
+        {"preset": "full", "light": "baked"},
         {"preset": "draft", "light": "sg"},
         {"preset": "draft", "light": "baked", "minutes": 3.0},
     ]

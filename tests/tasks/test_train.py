@@ -11,8 +11,9 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from univoxel.checkpoint import FILE, load_scene
+from univoxel.cli import main
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.config import TrainConfig
+from univoxel.config import TrainConfig, save_config
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.joint.config import JointConfig
@@ -25,11 +26,12 @@ from univoxel.scene import SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.info import info
 from univoxel.tasks.train import train
-from univoxel.training import loop, surface_update
+from univoxel.training import clock, loop, surface_update
 from univoxel.training import pixels as pixels_module
 from univoxel.training.config import StageConfig
 from univoxel.training.loop import batch_at
 from univoxel.training.pixels import split_pixels
+from univoxel.verdict import load_verdict
 
 
 @pytest.fixture(scope="module")
@@ -156,13 +158,13 @@ def test_masks_that_are_too_wide_are_taken_in(tmp_path, monkeypatch, caplog, mas
 
 
 @pytest.mark.parametrize(
-    ("hollows", "varying", "wanted"),
-    [(0.5, "none", 60.0), (0.5, "exposure", 60.0), (0.5, "light", None), (0.0, "none", None)],
+    ("seconds", "varying", "wanted"),
+    [(60.0, "none", 60.0), (60.0, "exposure", 60.0), (60.0, "light", None), (0.0, "none", None)],
 )
 def test_hollows_are_opened_where_light_is_the_same(
-    data, tmp_path, monkeypatch, hollows, varying, wanted
+    data, tmp_path, monkeypatch, seconds, varying, wanted
 ):
-    """What training starts with is what carving makes of the hull in its share of 2 minutes."""
+    """What training starts with is what carving makes of the hull."""
     given = []
 
     def larger(hull, grid, photos, gains, seconds, cfg):
@@ -171,7 +173,7 @@ def test_hollows_are_opened_where_light_is_the_same(
 
     monkeypatch.setattr(task, "run_stage", lambda *_: None)
     monkeypatch.setattr(preparation, "carve_within_time", larger)
-    cfg = config(data, tmp_path / "run", hollows=hollows)
+    cfg = config(data, tmp_path / "run", carving_seconds=seconds)
     cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, varying=varying))
     away = extract_mesh(load_scene(train(cfg))).vertices.norm(dim=1)
     asked = wanted is not None
@@ -300,7 +302,7 @@ def test_what_is_pinned_is_so_on_the_grid_of_every_stage_and_after_a_kill(
 
     first, second = Pinned(), Pinned()
     monkeypatch.setattr(preparation, "find_pinned", lambda *_: first)
-    cfg = config(data, tmp_path / "run", hollows=0.0)
+    cfg = config(data, tmp_path / "run", carving_seconds=0.0)
     original = task.run_stage
 
     def killed(scene, cfg, stage, *rest):
@@ -371,3 +373,31 @@ def test_unknown_preset(tmp_path):
         ValueError, match="preset must be one of draft, fast, full, best, got 'quick'"
     ):
         preset("quick", tmp_path, tmp_path)
+
+
+def test_a_training_says_how_it_came_out(data, tmp_path, caplog):
+    caplog.set_level("INFO", "univoxel")
+    run = train(config(data, tmp_path / "run"))
+    verdict = load_verdict(run)
+    assert verdict.complete
+    assert verdict.evidence.steps == {}
+    assert 0 <= verdict.evidence.outline < 0.2
+    assert verdict.evidence.psnr > 10
+    assert (run / "trust.txt").read_text().startswith(verdict.sentence() + ". ")
+    assert any(message.startswith("Result: ") for message in caplog.messages)
+    assert "12 photographs of 0.001 MP: about" in caplog.text
+
+
+def test_a_stage_without_a_step_is_said_and_ends_with_code_3(data, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(clock, "LEAST", 0.0)
+    monkeypatch.setattr(clock.Clock, "hurried", property(lambda self: False))
+    cfg = config(data, tmp_path / "run", minutes=1e-4)
+    save_config(dataclasses.replace(cfg, out=tmp_path))
+    options = ["--out", str(tmp_path / "run"), "--config", str(tmp_path / "config.json")]
+    assert main(["train", str(data), *options]) == 3
+    said = capsys.readouterr().out
+    assert "Result: unfinished, the time was up: of the planned steps it made 0% for" in said
+    assert "minutes 0.0001 are enough for about 0% of the steps, --minutes 1 for all" in said
+    verdict = load_verdict(tmp_path / "run")
+    assert verdict.empty
+    assert verdict.remedies[0] == "`--minutes 1`"

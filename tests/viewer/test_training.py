@@ -162,7 +162,7 @@ def test_a_training_is_ended_from_a_browser(data, tmp_path, looking, caplog):
     assert state["made"][1:] == [1.0, 1.0]
     assert len(scene.field.isosurface()[0]) > 100
     assert "Doubt of albedo" in (run / "trust.txt").read_text()
-    assert "this training was stopped early: of the planned steps it made" in caplog.text
+    assert "Result: unfinished, it was stopped: of the planned steps it made" in caplog.text
 
 
 def test_light_that_varies_and_cameras_that_move(data, tmp_path, looking):
@@ -231,14 +231,14 @@ def test_reports_become_curves(data, tmp_path, monkeypatch):
     assert len(mine) == len(seen) > 15
     curves, status, share = seen[-1]
     assert curves.count("<svg") == 2
-    assert status.startswith("Stage 3 of 3, ")
+    assert status.startswith("Polish, stage 3 of 3, ")
     assert share == pytest.approx(100 * mine[-1].share)
     assert curves.count('class="stage"') == 4  # two ends in two charts
 
 
 def test_words():
-    now = TrainingProgress(2, 4, 0.41, 60.0, 75.0, {"a": 1.0}, 31.25, 1e4)
-    assert words(now, False) == "Stage 2 of 4, 41%, about 1:15 left, held-out pixels 31.2 dB."
+    now = TrainingProgress(2, 4, "shape", 0.41, 60.0, 75.0, {"a": 1.0}, 31.25, 1e4)
+    assert words(now, False) == "Shape, stage 2 of 4, 41%, about 1:15 left, validation 31.2 dB."
     assert words(now, True).endswith(f" {module.ENDING}")
     assert "dB" not in words(dataclasses.replace(now, held_out_psnr=None), False)
 

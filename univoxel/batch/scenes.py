@@ -28,12 +28,12 @@ from univoxel.names import (
 )
 from univoxel.overrides import changed
 from univoxel.presets import chosen
+from univoxel.training.clock import expected_training
 from univoxel.training.memory import needed_for
 from univoxel.training.progress import LOG
 
 LOGS = "logs"  # the folder in a batch's of what processes said, records and locks
 MODULE = ("-m", "univoxel.cli")
-PRESET_CORES = 2  # that the minutes of presets are of
 # Seconds that steps may take besides training, guesses for the bar
 GUESSES = {"poses": 240.0, "masks": 60.0, "eval": 40.0, "export": 15.0, "page": 15.0}
 PICTURES = {".png", ".jpg", ".jpeg", ".exr"}
@@ -116,10 +116,10 @@ def piece_of(name: str, data: Path, out: Path, wanted: Wanted, threads: int | No
     """
     out = out.absolute()
     project, logs = Project(out / name), out / LOGS
-    steps = _steps(project, data, wanted, threads)
+    steps = _steps(project, data, wanted)
     seconds = sum(GUESSES.get(step, 0.0) for step in wanted.steps)
     if "train" in wanted.steps:
-        seconds += 60 * wanted.training(data, project.run).minutes
+        seconds += expected_training(wanted.training(data, project.run))
     return Piece(
         name,
         tuple(steps[step] for step in BATCH_STEPS if step in wanted.steps),
@@ -137,9 +137,7 @@ def measures_file(project: Project) -> Path:
     return project.out / "measures.json"
 
 
-def _steps(
-    project: Project, data: Path, wanted: Wanted, threads: int | None
-) -> dict[BatchStep, Step]:
+def _steps(project: Project, data: Path, wanted: Wanted) -> dict[BatchStep, Step]:
     """All the steps that there are."""
     run, checkpoint, measures = str(project.run), project.run / FILE, measures_file(project)
     capture = (*MODULE, "capture", str(data), "--out", str(project.out), "--masks", wanted.masks)
@@ -154,7 +152,7 @@ def _steps(
         run,
         "--resume",
         "--no-page",
-        *_training(wanted, threads),
+        *_training(wanted),
     )
     evaluate = (*MODULE, "eval", run, "--json", str(measures), "--samples", str(wanted.samples))
     page = (*MODULE, "view", run, "--html", str(project.page), "--title", project.out.name)
@@ -176,20 +174,14 @@ def _steps(
     }
 
 
-def _training(wanted: Wanted, threads: int | None) -> list[str]:
+def _training(wanted: Wanted) -> list[str]:
     """The options of train."""
-    preset, minutes = wanted.preset, wanted.minutes
     if wanted.config is not None:
         options = ["--config", str(wanted.config.absolute())]
     else:
-        if minutes is None and threads is not None and threads < PRESET_CORES:
-            # All of the preset's steps, on fewer cores than its minutes are of
-            config = wanted.training(Path(), Path())
-            preset = "fast" if preset == "auto" else preset
-            minutes = config.minutes * PRESET_CORES / threads
-        options = ["--preset", preset, "--light", wanted.light]
-    if minutes is not None:
-        options += ["--minutes", f"{minutes:g}"]
+        options = ["--preset", wanted.preset, "--light", wanted.light]
+    if wanted.minutes is not None:
+        options += ["--minutes", f"{wanted.minutes:g}"]
     return [*options, *(f"--set={change}" for change in wanted.changes)]
 
 

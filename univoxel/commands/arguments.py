@@ -35,7 +35,7 @@ Points: TypeAlias = Annotated[
     arg(metavar="X Y Z INTENSITY"),
 ]
 Minutes: TypeAlias = Annotated[
-    float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
+    float | None, arg(metavar="MINUTES", help_behavior_hint="(default: none)")
 ]
 TimelapseFile: TypeAlias = Annotated[
     str | None, arg(metavar="FILE.gif|FILE.mp4|DIR/", help_behavior_hint="(default: none)")

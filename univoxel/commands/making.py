@@ -104,11 +104,20 @@ def configuration_of(
     return config if minutes is None else replace(config, minutes=minutes)
 
 
-def tell_run(run: Path, no_page: bool) -> None:
-    """Print where a trained run lies, with its page if it gets one."""
+def tell_run(run: Path, no_page: bool) -> int:
+    """Print where a trained run lies, with its page if it gets one; return the exit code."""
     from univoxel.tasks.view import with_page
 
     print(run if no_page else with_page(run))
+    return code_of(run)
+
+
+def code_of(run: Path) -> int:
+    """The exit code of a training: 3 where a stage made no step at all, or else 0."""
+    from univoxel.verdict import load_verdict
+
+    verdict = load_verdict(run)
+    return 3 if verdict is not None and verdict.empty else 0
 
 
 def view_at(view: bool, host: str | None, port: int | None) -> tuple[str, int] | None:
@@ -151,7 +160,7 @@ def train(
     config: ConfigFile = None,
     set: Changes = (),
     no_page: bool = False,
-) -> None:
+) -> int:
     """Recover geometry, materials and light from posed photographs.
 
     Args:
@@ -176,7 +185,8 @@ def train(
         field: hash takes features from a small table of many resolutions; dense stores them at
             every node of the grid, sparse in bricks around the surface alone, for finer grids than
             the presets', such as --set stages.1.voxels=30
-        minutes: wall-clock limit, above 0; training ends in time with what it has
+        minutes: wall-clock limit, above 0, from the first photograph read to the end: what does not
+            fit is cut, in all stages alike; without, all steps are made, however long they take
         capacity: adaptive makes no larger a model than the scene needs, as held-out pixels tell:
             coarser grid, fewer rows or channels of features, fewer lobes and hidden units. auto is
             that, but fixed for sparse fields and for lights other than hybrid
@@ -204,7 +214,7 @@ def train(
     asked = configuration_of(config, Choices(*of_preset, budget_mb), minutes, data, out)
     asked = replace(asked, downscale=check_downscale(downscale), allow_outside=allow_outside)
     asked = asked if seed is None else replace(asked, seed=seed)
-    tell_run(task.train(changed(asked, set), resume=resume, **watched), no_page)
+    return tell_run(task.train(changed(asked, set), resume=resume, **watched), no_page)
 
 
 def batch(
@@ -242,7 +252,7 @@ def batch(
         jobs: scenes at once; each runs on --threads, or its share of the cores
         scheduler: of a Dask cluster whose workers take the scenes, such as tcp://10.0.0.1:8786;
             they see the same folders. Whoever reaches a scheduler can run programs on its workers
-        preset: as of train; without --minutes on one thread, its training gets twice its time
+        preset: as of train
         light: as of train
         minutes: wall-clock limit of each training, above 0
         config: as of train
@@ -364,11 +374,11 @@ def capture(
     preset: PresetOrAuto = "auto",
     light: LightName = "hybrid",
     minutes: Annotated[
-        float | None, arg(metavar="MINUTES", help_behavior_hint="(default: the preset's)")
+        float | None, arg(metavar="MINUTES", help_behavior_hint="(default: none)")
     ] = None,
     set: Changes = (),
     until: Until = "page",
-) -> None:
+) -> int:
     """From photographs to a mesh with materials and a page, in one command.
 
     Finds cameras, makes masks, trains, exports DIR/DIR.glb, lights the object anew and writes
@@ -396,7 +406,7 @@ def capture(
         if (preset, light, minutes, set) != ("auto", "hybrid", None, ()):
             raise UserError(f"--until {until}: --preset, --light, --minutes, --set come after it")
         print(task.find_data(photographs, out, masks=masks, until=until))
-        return
+        return 0
     made = task.capture(
         photographs,
         out,
@@ -408,3 +418,4 @@ def capture(
     )
     print(made.page)
     print(made.mesh)
+    return code_of(made.run)

@@ -21,6 +21,7 @@ from univoxel.experiments.record import RESULT, Outcome, Setting, identity, load
 from univoxel.files import replacing
 from univoxel.machine import threads_asked
 from univoxel.training import progress
+from univoxel.training.clock import expected_training
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -172,7 +173,8 @@ def _job(data: Path, setting: Setting, out: Path, samples: int, seconds: float |
         raise UserError(f"samples must be at least 1, got {samples}", "samples")
     folder = out / data.name / setting.name
     config = setting.config(data, folder / worker.RUN)
-    seconds = 60 * config.minutes + EVALUATION_SECONDS if seconds is None else seconds
+    if seconds is None:
+        seconds = expected_training(config) + EVALUATION_SECONDS
     return Job(folder, data.name, data, setting, samples, identity(config, samples), seconds)
 
 

@@ -34,6 +34,7 @@ from univoxel.records import Mesh
 from univoxel.run import photos_of
 from univoxel.scene import Scene
 from univoxel.training.progress import LOG
+from univoxel.verdict import load_verdict
 
 FOLDER = Path(__file__).parent
 RECOVERED = "recovered"  # name of the light that the photographs were taken in
@@ -168,20 +169,22 @@ def first_view(run: Path) -> tuple[float, float]:
 
 
 def facts_of(run: Path, total: float | None = None) -> list[str]:
-    """What the run's log tells of it, in a few words each; empty where there is none.
+    """How the run came out and what its log tells, in a few words each; empty where neither is.
 
     Args:
         total: seconds of training; None: up to the log's last line.
     """
+    verdict = load_verdict(run)
+    known = [] if verdict is None else [f"result: {verdict.word}"]
     try:
         lines = [json.loads(line) for line in (run / LOG).read_text("utf-8").splitlines()]
         seconds = [line["seconds"] for line in lines]
         quality = [line["held_out_psnr"] for line in lines if line["held_out_psnr"] is not None]
         took = total or seconds[-1]
-        said = [f"trained in {took:.0f} s on the CPU"]
-        return said + ([f"held-out pixels {quality[-1]:.1f} dB"] if quality else [])
+        known.append(f"trained in {took:.0f} s on the CPU")
+        return known + ([f"validation {quality[-1]:.1f} dB"] if quality else [])
     except (OSError, ValueError, LookupError, TypeError):  # only told of where it can be read
-        return []
+        return known
 
 
 def about(run: Path, options: PageOptions, lights: Sequence[str]) -> str:

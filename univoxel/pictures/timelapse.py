@@ -27,7 +27,7 @@ from univoxel.scene import Scene
 from univoxel.training.clock import Clock
 from univoxel.training.config import StageConfig
 
-FRAMES = 60  # in the whole time of a training
+FRAMES = 60  # of a training, at equal shares of its work
 FRAMES_PER_SECOND = 10
 SIZE = 256  # pixels along a picture, at most
 LABEL = 18  # pixels above the pictures
@@ -66,14 +66,13 @@ class Timelapse:
         except DataError:
             cameras = load_photos(cfg.data, "train", size, allow_outside=outside).cameras
         self.cameras: Cameras = resize(cameras, min(cameras.width, SIZE))
-        self.every: float = 60 * cfg.minutes / FRAMES  # seconds
-        self._next = 0.0
+        self._next = 0.0  # share of the training at which the next frame is due
 
     def take_frame(self, scene: Scene, clock: Clock, last: bool = False) -> None:
         """Take a frame if it is time for one. The scene and the random numbers stay as they are."""
-        if clock.seconds < self._next and not last:
+        if clock.work_done < self._next and not last:
             return
-        self._next = clock.seconds + self.every
+        self._next = clock.work_done + 1 / FRAMES
         self.folder.mkdir(parents=True, exist_ok=True)
         with torch.random.fork_rng(devices=[]):
             picture = frame(scene, self.cameras, *shown(clock))

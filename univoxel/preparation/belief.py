@@ -81,6 +81,19 @@ def weighed(
     return Belief(_widened(box, distance, cameras, off, refined, cfg), refined)
 
 
+def unweighed(
+    photos: Photos, distance: Tensor, wanted: CamerasFrom, cfg: PreparationConfig = PREPARATION
+) -> Belief:
+    """`weighed` where there is no time to ask: single masks may be wrong, cameras are right.
+
+    Raises:
+        UserError: the silhouettes share no volume.
+    """
+    votes = votes_needed(len(photos), cfg.hull)
+    box = estimate_bounds(distance, photos.cameras, cfg.hull, votes)
+    return Belief(box, wanted == "refined", votes)
+
+
 def right(seen: Agreement | None, off: float, cfg: PreparationConfig = PREPARATION) -> bool:
     """Whether cameras are right and it is the masks that make silhouettes contradict one another by
     so many pixels."""

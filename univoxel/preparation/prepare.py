@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,7 +17,7 @@ from univoxel.grid import GridShape, fit_grid
 from univoxel.lights.turntable import Turntable
 from univoxel.names import Varying
 from univoxel.poses import PoseSteps
-from univoxel.preparation.belief import weighed
+from univoxel.preparation.belief import unweighed, weighed
 from univoxel.preparation.carving import carve_within_time
 from univoxel.preparation.config import PreparationConfig
 from univoxel.preparation.exposures import say_clipped, varying_and_gains
@@ -28,6 +30,15 @@ from univoxel.preparation.registration import registered_poses
 from univoxel.preparation.strays import say_strays
 from univoxel.scene import Scene
 from univoxel.training.config import StageConfig
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+MINUTES = {"arguments": ("minutes",)}  # of a message
+
+
+def unhurried(step: str) -> bool:
+    """There is time for every step, and nobody to tell."""
+    return True
 
 
 @dataclass(frozen=True)
@@ -57,8 +68,14 @@ class Prepared:
     pinned: PinnedHull | None  # where training leaves the hull as it is; None: nowhere
 
 
-def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
+def find_silhouettes(
+    photos: Photos, cfg: TrainConfig, begins: Callable[[str], bool] = unhurried
+) -> Silhouettes:
     """The photographs with the masks that are used, and the box around the object.
+
+    Args:
+        begins: told of each step, and says whether there is time for it: where there is not, masks
+            and cameras are taken as they are.
 
     Raises:
         DataError: the silhouettes share no volume.
@@ -66,10 +83,17 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
     if cfg.cameras == "auto":
         say_strays(photos, cfg.preparation.light_frame)
     given = photos
-    photos, distance = fitted_masks(given, cfg.masks, cfg.preparation.masks)
+    in_time = begins("masks")
+    photos, distance = fitted_masks(given, cfg.masks if in_time else "given", cfg.preparation.masks)
     try:
-        belief = weighed(photos, distance, cfg.cameras, cfg.masks, cfg.preparation)
-        found = mended(photos, distance, belief, cfg.preparation) if belief.votes > 1 else None
+        if begins("masks against cameras"):
+            belief = weighed(photos, distance, cfg.cameras, cfg.masks, cfg.preparation)
+        else:
+            belief = unweighed(photos, distance, cfg.cameras, cfg.preparation)
+            log.info("there is no time to compare masks and cameras: see minutes", extra=MINUTES)
+        found = None
+        if belief.votes > 1 and begins("rough masks"):
+            found = mended(photos, distance, belief, cfg.preparation)
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
     doubted, edges_given = None, photos is given and found is None
@@ -80,11 +104,14 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
     return Silhouettes(photos, distance, *believed, doubted, edges_given)
 
 
-def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
+def prepare(
+    silhouettes: Silhouettes, cfg: TrainConfig, begins: Callable[[str], bool] = unhurried
+) -> Prepared:
     """Cameras, carved hull and exposures that training begins with.
 
     Args:
         cfg: its first stage says how many voxels the hull's grid has.
+        begins: as of `find_silhouettes`.
     """
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)
@@ -92,20 +119,23 @@ def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
     photos, distance, box = silhouettes.photos, silhouettes.distance, silhouettes.box
     grid = fit_grid(*box, round(1e6 * stage.voxels))
     poses = None
-    if silhouettes.refined:
+    if silhouettes.refined and begins("cameras"):
         poses = registered_poses(distance, photos.cameras, box, constants.registration)
         photos = replace(photos, cameras=poses.corrected(photos.cameras))
+    begins("hull")
     hull = visual_hull(distance, photos.cameras, grid, constants.hull, silhouettes.votes)
+    begins("exposures")
     say_clipped(photos, constants.exposures)
     varying, gains = varying_and_gains(
         photos, hull, grid, cfg.scene.varying, cfg.exposures, constants.exposures
     )
     turntable = turntable_of(photos, hull, grid, cfg.light_frame, constants.light_frame)
     pinned = None
-    if varying == "none" and turntable is None:
+    if varying == "none" and turntable is None and begins("hull that stays"):
         pinned = find_pinned(silhouettes, photos.cameras, hull, grid, constants)
-    if cfg.hollows and varying != "light" and turntable is None:
-        seconds = cfg.hollows * 60 * cfg.minutes
+    carves = cfg.carving_seconds and varying != "light" and turntable is None
+    if carves and begins("concavities"):
+        seconds = cfg.carving_seconds
         carved = carve_within_time(hull, grid, photos, gains, seconds, constants.carving)
         hull = carved if pinned is None else torch.where(pinned.nodes(hull, grid), hull, carved)
     return Prepared(silhouettes, poses, grid, hull, varying, gains, turntable, pinned)

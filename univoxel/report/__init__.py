@@ -38,6 +38,7 @@ from univoxel.render.pipeline import extract_mesh
 from univoxel.report import drawing, light, photographs, sides, training
 from univoxel.run import photos_of
 from univoxel.scene import Scene
+from univoxel.verdict import load_verdict
 
 FOLDER = Path(__file__).parent
 RING_GAP = 60.0  # degrees between neighbouring azimuths that are worth a word, as of `poses`
@@ -135,7 +136,9 @@ def report_text(
     front = START[0] if known is None else known.advice.front
     doubts = None if known is None else Doubts(known.surveyed)
     pictures = sides.layers(scene, mesh, options.size, front, doubts)
+    verdict = load_verdict(run)
     sections = [
+        ("Result", paragraph(verdict.sentence() + ".") if verdict else ""),
         ("What to photograph next", next_section(known.advice) if known else paragraph(why)),
         ("Doubt", doubt_section(known, state, pictures.pop("doubt", [])) if known else ""),
         ("Photographs and render", views_section(scene, known, options) if known else ""),
@@ -289,7 +292,7 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
         )
     head = "<tr><th>stage<th>planned steps<th>made<th>time<th>"
     parts.append(f"<table>{head}{''.join(rows)}</table>")
-    limit = f"The limit was {60 * cfg.minutes:,.0f} s."
+    limit = "" if cfg.minutes is None else f"The limit was {60 * cfg.minutes:,.0f} s."
     told = [limit, *training.remarks(cfg, state)]
     return "\n".join([*parts, *(paragraph(line) for line in told)])
 

@@ -11,9 +11,8 @@ from typing import Any
 
 from univoxel.config import TrainConfig, load_config
 from univoxel.errors import UserError
-from univoxel.joint.config import JointConfig
 from univoxel.pictures.charts import Curve
-from univoxel.training.clock import ALL, Clock
+from univoxel.training.clock import ALL, Clock, stage_name
 from univoxel.training.progress import LOG
 
 log: logging.Logger = logging.getLogger("univoxel")
@@ -53,7 +52,7 @@ def curves(run: Path) -> list[Curve]:
         return []
     found = (
         Curve("loss: the sum of what is minimised", losses, logarithmic=True),
-        Curve("held-out pixels, PSNR in dB", qualities),
+        Curve("validation, PSNR in dB", qualities),
     )
     return [curve for curve in found if any(curve.pieces)]
 
@@ -82,7 +81,7 @@ def stages(cfg: TrainConfig, state: dict[str, Any]) -> list[StageFacts]:
         else:
             fate = "whole"
         seconds = took[k] if k < len(took) else None
-        found.append(StageFacts(_name(stage), stage.iterations, share, seconds, fate))
+        found.append(StageFacts(stage_name(cfg.stages, k), stage.iterations, share, seconds, fate))
     return found
 
 
@@ -116,11 +115,3 @@ def remarks(cfg: TrainConfig, state: dict[str, Any]) -> list[str]:
         told.append(f"Training met trouble {len(troubles)} times, the last in {troubles[-1]}.")
     chosen = [entry.get("said", "") for entry in state.get("chosen", ())]
     return told + [f"Size chosen: {said}." for said in chosen if said]
-
-
-def _name(stage: object) -> str:
-    if isinstance(stage, JointConfig):
-        return "joint solve"
-    if getattr(stage, "refit", False):
-        return "refit"
-    return f"shape and materials, up to {getattr(stage, 'voxels', 0):g} million voxels"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from json import dumps
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import torch
 from rich.table import Table
@@ -43,6 +44,7 @@ from univoxel.render.pipeline import extract_mesh
 from univoxel.render.relight import Lighting, traced_mesh
 from univoxel.run import photos_of
 from univoxel.scene import Scene
+from univoxel.verdict import load_verdict
 
 SHEET_ROWS = 12  # views on the contact sheet, at most
 
@@ -96,7 +98,8 @@ def evaluate(
             composited on black, with the albedo as it is; roughness, normal.* (world), doubt.albedo
             and doubt.roughness in [0, 1], 0 where nothing is; alpha; depth along -Z, 0 where
             nothing is.
-        json: file for the measures, and for the figures of trust.txt under the key trust.
+        json: file for the measures; `complete` and `verdict`, how training came out, None where
+            that is not known; and the figures of trust.txt under the key trust.
         samples: light samples per pixel of relit pictures.
         bounces: reflections between parts of the object in relit pictures, 0 for none.
         light_of: training view, by name or number, whose light novel views are rendered in, where
@@ -142,7 +145,7 @@ def evaluate(
     figures = _say_trust(surveyed, report.get("troubles", []), save)
     if json:
         with replacing(json) as temporary:
-            text = dumps(result | figures, indent=2)
+            text = dumps(result | _verdict(run) | figures, indent=2)
             temporary.write_text(text + "\n", encoding="utf-8")
     return result
 
@@ -178,6 +181,14 @@ def _costs(run: Path, scene: Scene, report: dict) -> dict[str, float | int | Non
         "parameters": sum(p.numel() for p in scene.parameters()),
         "model_bytes": (run / FILE).stat().st_size,
     }
+
+
+def _verdict(run: Path) -> dict[str, Any]:
+    """How training came out, for JSON."""
+    verdict = load_verdict(run)
+    if verdict is None:
+        return {"complete": None, "verdict": None}
+    return {"complete": verdict.complete, "verdict": verdict.word}
 
 
 def _relighting(

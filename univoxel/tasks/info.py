@@ -24,6 +24,7 @@ from univoxel.preparation.hull import mask_distances
 from univoxel.preparation.matches import agreement, find_matches
 from univoxel.run import photos_of
 from univoxel.scene import Scene
+from univoxel.verdict import as_json, load_verdict
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -71,7 +72,8 @@ def info(
         JSON: `parameters`, `bytes`, `parts` (name: parameters and bytes), `grid` (size, voxel_size,
         nodes, and shares of them: with distances, with features), `channels`,
         `material_channels`, `hidden`, `lobes` (None where there are none), `chosen`: what,
-        before, after, cost in dB and why; `cameras`, see `camera_check`.
+        before, after, cost in dB and why; `cameras`, see `camera_check`; `said`,
+        how training came out in words, `result`, as verdict.json has it, None where it has not.
 
     Raises:
         UserError: no model there, or one that cannot be read.
@@ -85,6 +87,10 @@ def info(
     found = facts(scene, parts(run), state)
     found["bytes"] = (run / FILE).stat().st_size
     found["cameras"] = camera_check(scene, run)
+    verdict = load_verdict(run)
+    unknown = "Result: unfinished, training has not ended. What helps: train it with --resume"
+    found["said"] = unknown if verdict is None else verdict.sentence()
+    found["result"] = None if verdict is None else as_json(verdict)
     for path in (json, picture):
         if path:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -156,8 +162,9 @@ def facts(scene: Scene, parts: dict[str, Part], state: dict[str, Any]) -> dict[s
     }
 
 
-def tables(found: dict[str, Any]) -> Iterable[Table]:
+def tables(found: dict[str, Any]) -> Iterable[Table | str]:
     """The facts as the command prints them."""
+    yield found["said"]
     table = Table("part", "parameters", "bytes", "share", title="Model")
     for column in table.columns[1:]:
         column.justify = "right"

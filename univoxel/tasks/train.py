@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,7 +18,7 @@ from univoxel.checkpoint import FILE, load_checkpoint, save_scene
 from univoxel.compression import plan, sizes
 from univoxel.compression.choices import chosen_reach
 from univoxel.confidence.report import numbers, words
-from univoxel.confidence.survey import survey
+from univoxel.confidence.survey import Survey, survey
 from univoxel.config import TrainConfig, check_same, save_config
 from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import Cancelled, ExistingFile, UserError
@@ -28,21 +29,28 @@ from univoxel.joint.config import JointConfig
 from univoxel.ops import native
 from univoxel.pictures.timelapse import Timelapse
 from univoxel.preparation.pinned import PinnedHull
-from univoxel.preparation.prepare import Silhouettes, find_silhouettes, pinned_in, prepare
+from univoxel.preparation.prepare import find_silhouettes, pinned_in, prepare
 from univoxel.render.picture import preview
+from univoxel.render.pipeline import surface_at
 from univoxel.run import kept_photos
 from univoxel.scene import Scene
-from univoxel.training.clock import Clock
-from univoxel.training.config import StageConfig
-from univoxel.training.loop import fit_sharpness_, run_stage
+from univoxel.training.clock import LEAST, RESERVE_SECONDS, Clock
+from univoxel.training.config import PREPARATION, StageConfig
+from univoxel.training.loop import batch_at, fit_sharpness_, held_out_psnr, run_stage
 from univoxel.training.memory import check_memory
 from univoxel.training.pixels import TrainingPixels, split_pixels
+from univoxel.training.probe import slowdown
 from univoxel.training.progress import LOG, Progress, TrainingProgress
+from univoxel.verdict import FILE as VERDICT
+from univoxel.verdict import Evidence, Verdict, judge, save_verdict
 
 if TYPE_CHECKING:
     from univoxel.viewer.training import Spectators
 
 log: logging.Logger = logging.getLogger("univoxel")
+
+# Of preparation, a million pixels that are trained on, on two quiet cores of a Xeon
+PREPARATION_SECONDS = 0.4
 
 
 def train(
@@ -52,7 +60,8 @@ def train(
     on_progress: Callable[[TrainingProgress], None] | None = None,
     view: tuple[str, int] | None = None,
 ) -> Path:
-    """Train a scene; leave model, log, preview, configuration and trust.txt in cfg.out; return it.
+    """Train a scene; leave model, log, preview, configuration, verdict.json and trust.txt in
+    cfg.out; return it.
 
     Args:
         resume: go on with the run in cfg.out from its last checkpoint; begin where there is none.
@@ -93,33 +102,43 @@ def _train(
     on_progress: Callable[[TrainingProgress], None] | None,
 ) -> Path:
     """`train`, with those who look at it between steps."""
+    begin = time.monotonic()
     torch.manual_seed(cfg.seed)
-    kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
-    photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
-    cfg = replace(cfg, downscale=photos.downscale)
     if not resume and (cfg.out / FILE).exists():
         raise ExistingFile(
             f"{cfg.out} holds a run already: pass resume or another out", "resume", "out"
         )
+    kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
+    photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
+    cfg = replace(cfg, downscale=photos.downscale)
     log.info(photos.about)
     check_memory(photos, cfg)
+    begun = resumed(cfg) if resume else None
+    state = begun[1] if begun else {}
+    (cfg.out / VERDICT).unlink(missing_ok=True)  # of a run that goes on
 
-    begin = time.monotonic()  # only now: how long reading takes is the photographs' affair
-    silhouettes = find_silhouettes(photos, cfg)
-    pixels = split_pixels(silhouettes.photos, silhouettes.distance, silhouettes.doubted)
-    pixels = replace(pixels, edges_given=silhouettes.edges_given)
-    limited = plan.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
-    scene, state, pinned = start(silhouettes, cfg, limited, resume)
-    cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what cannot be used
-    if not state:  # of a run that was killed before anything was saved
-        (cfg.out / LOG).unlink(missing_ok=True)
-    save_config(cfg)
-    keep_photos(photos, kept)
     begin -= state.get("seconds", 0.0)
-    if spectators:
-        spectators.show(pixels.photos)
     told = _told(spectators, on_progress)
-    with Progress(limited, begin, state, told) as progress:
+    with Progress(cfg, begin, state, told, slowdown(cfg)) as progress:
+        announce(progress, photos)
+        silhouettes = find_silhouettes(photos, cfg, progress.preparing)
+        pixels = split_pixels(silhouettes.photos, silhouettes.distance, silhouettes.doubted)
+        pixels = replace(pixels, edges_given=silhouettes.edges_given)
+        limited = plan.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
+        if begun:
+            scene = begun[0]
+            pinned = pinned_in(silhouettes, scene, limited)
+        else:
+            prepared = prepare(silhouettes, limited, progress.preparing)
+            scene, pinned = build_scene(prepared, limited), prepared.pinned
+        cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what fails
+        if not state:  # of a run that was killed before anything was saved
+            (cfg.out / LOG).unlink(missing_ok=True)
+        save_config(cfg)
+        keep_photos(photos, kept)
+        if spectators:
+            spectators.show(pixels.photos)
+        progress.prepared()
         progress.clock.watch = _between_steps(scene, progress.clock, film, spectators)
         try:
             for index in range(progress.clock.stage, len(cfg.stages)):
@@ -129,8 +148,75 @@ def _train(
             raise
         if film:
             film.finish(scene, progress.clock)
-    save_trust(scene, pixels.photos, cfg, progress.troubles)
+    surveyed = trusted(scene, pixels.photos, cfg)
+    verdict = judge(evidence(scene, pixels, progress, surveyed))
+    save_verdict(verdict, cfg.out)
+    save_trust(verdict, surveyed, progress.troubles, cfg)
+    for choice in progress.chosen:
+        log.info(choice.sentence)
     return cfg.out
+
+
+def resumed(cfg: TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
+    """The scene that a run goes on with, and its state; None where nothing was saved yet.
+
+    Raises:
+        UserError: the checkpoint cannot be read, or it belongs to another configuration.
+    """
+    if not (cfg.out / FILE).is_file():
+        log.info(f"nothing was saved in {cfg.out} yet: training begins")
+        return None
+    scene, state = load_checkpoint(cfg.out)
+    check_same(cfg)
+    return scene, state
+
+
+def announce(progress: Progress, photos: Photos) -> None:
+    """Say how long all will take on this machine, and what a limit leaves out."""
+    clock, cfg = progress.clock, progress.cfg
+    pixels = len(photos) * photos.cameras.width * photos.cameras.height / 1e6
+    before = clock.seconds + PREPARATION_SECONDS * progress.slower * pixels
+    whole = before + clock.planned + RESERVE_SECONDS
+    size = photos.downscale**2 * pixels / len(photos)
+    what = f"{len(photos)} photographs of {size:.2g} MP"
+    clock.preparation = min(before, PREPARATION * clock.limit)
+    if whole <= clock.limit:
+        log.info(f"{what}: about {duration(whole)} on this machine")
+        return
+    fits = max(clock.limit - clock.preparation - RESERVE_SECONDS, 0.0) / clock.planned
+    said = f"{what}: about {duration(whole)} on this machine; minutes={cfg.minutes:g} are enough "
+    said += f"for about {fits:.0%} of the steps"
+    if fits < LEAST:
+        said += f", minutes={math.ceil(whole / 60)} for all of them"
+    log.info(said, extra={"arguments": ("minutes",)})
+
+
+def duration(seconds: float) -> str:
+    """A duration for people: tens of seconds, or minutes."""
+    return f"{10 * math.ceil(seconds / 10)} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+def evidence(
+    scene: Scene, pixels: TrainingPixels, progress: Progress, surveyed: Survey | None
+) -> Evidence:
+    """What the verdict on a training rests on."""
+    clock, held_out = progress.clock, pixels.held_out
+    batch = batch_at(scene.registered(pixels.photos), held_out)
+    with torch.no_grad():
+        surface = surface_at(scene, batch.rays)
+    wrong = (surface.opacity - batch.alpha).abs() > 0.5
+    shares = numbers(surveyed) if surveyed else {}
+    return Evidence(
+        steps=clock.short(),
+        stopped=clock.finished,
+        minutes=clock.minutes_for_all(),
+        limit=progress.cfg.minutes,
+        psnr=held_out_psnr(scene, pixels.photos, held_out, physical=True),
+        outline=wrong.float().mean().item(),
+        hidden=shares.get("few_views"),
+        residual=shares.get("disagreeing"),
+        troubles=len(progress.troubles),
+    )
 
 
 def _told(
@@ -162,26 +248,6 @@ def _between_steps(
             spectators.look(scene, clock)
 
     return between
-
-
-def start(
-    silhouettes: Silhouettes, cfg: TrainConfig, limited: TrainConfig, resume: bool
-) -> tuple[Scene, dict[str, Any], PinnedHull | None]:
-    """The scene that training begins or goes on with, the state of its run, and what is pinned.
-
-    Args:
-        cfg: as it was asked for.
-        limited: the same with grids no finer than the photographs.
-    """
-    if resume and not (cfg.out / FILE).is_file():
-        log.info(f"nothing was saved in {cfg.out} yet: training begins")
-        resume = False
-    if not resume:
-        prepared = prepare(silhouettes, limited)
-        return build_scene(prepared, limited), {}, prepared.pinned
-    scene, state = load_checkpoint(cfg.out)
-    check_same(cfg)
-    return scene, state, pinned_in(silhouettes, scene, limited)
 
 
 def make_stage_(
@@ -236,13 +302,22 @@ def bring_to_grid_(
         scene.field = scene.field.resized(grid)
 
 
-def save_trust(scene: Scene, photos: Photos, cfg: TrainConfig, troubles: list[str]) -> None:
-    """Write to the run's trust.txt, and log, what the photographs leave open."""
+def trusted(scene: Scene, photos: Photos, cfg: TrainConfig) -> Survey | None:
+    """What the photographs leave open; None where there is no surface that they show."""
     try:
-        surveyed = survey(scene, photos, cfg.confidence.report_points, cfg.confidence)
-        text = words(numbers(surveyed), troubles, cfg.confidence)
+        return survey(scene, photos, cfg.confidence.report_points, cfg.confidence)
     except UserError as error:
-        text = f"No trust report: {error}."
+        log.info(f"no trust report: {error}")
+        return None
+
+
+def save_trust(
+    verdict: Verdict, surveyed: Survey | None, troubles: list[str], cfg: TrainConfig
+) -> None:
+    """Write to the run's trust.txt, and log, how it came out and what photographs leave open."""
+    text = verdict.sentence() + "."
+    if surveyed is not None:
+        text += " " + words(numbers(surveyed), troubles, cfg.confidence)
     with replacing(cfg.out / "trust.txt") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
     log.info(text)

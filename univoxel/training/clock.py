@@ -4,19 +4,54 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
 from univoxel.config import TrainConfig
+from univoxel.joint.config import JointConfig
+from univoxel.training.config import PREPARATION, StageConfig
 
-RESERVE_SECONDS = 4.0  # of the budget, kept for the last checkpoint and the preview
+RESERVE_SECONDS = 4.0  # of the limit, kept for the last checkpoint and the preview
+LEAST = 0.5  # of its share of the rest of a limit that every stage gets, whatever came before
 PACE = 0.1  # weight of the newest step in the mean time of a step
 UNSURE = 4  # first steps of a stage, whose time is no measure for the others
+# Share of the expected time of all steps that counts beside what was measured
+UNMEASURED = 0.02
 REST = 0.3  # of the steps that are left to a stage that is shortened: for its rates to fall
 HURRY = 0.15  # of the time that is left to a training that is stopped, for the rest of its schedule
 HURRY_SECONDS = 8.0  # and at least so much, if it is left: for some light and materials
+FEWEST = 0.02  # share of a stage's steps below which their time tells nothing of all of them
 ALL = 0.995  # share of the planned steps from which on a stage was not cut
+
+
+# Seconds on two quiet cores of a Xeon with AVX-512, as trainings of draft, fast and full were seen
+# to take: of a step, of a ray of a step, and how many times as long a refit's take
+STEP, RAY, REFIT = 0.003, 16e-6, 1.5
+JOINT, OBSERVATION = 0.010, 6e-6  # of a step of the joint solve, of an observation of a step
+
+
+def expected_seconds(stage: StageConfig | JointConfig) -> float:
+    """What the steps of a stage take on two quiet cores, about."""
+    if isinstance(stage, JointConfig):
+        return stage.iterations * (JOINT + OBSERVATION * stage.rays)
+    return stage.iterations * (STEP + RAY * stage.rays) * (REFIT if stage.refit else 1.0)
+
+
+def expected_training(cfg: TrainConfig) -> float:
+    """Seconds that the stages of a training take on two quiet cores, within its limit, about."""
+    limit = math.inf if cfg.minutes is None else 60 * cfg.minutes
+    return min(sum(map(expected_seconds, cfg.stages)), limit)
+
+
+def stage_name(stages: Sequence[StageConfig | JointConfig], index: int) -> str:
+    """What a stage of a training is for, in a few words."""
+    stage = stages[index]
+    if isinstance(stage, JointConfig):
+        return "materials and light"
+    if stage.refit:
+        return "polish"
+    return "coarse shape" if index == 0 and len(stages) > 1 else "shape"
 
 
 class StepClock(Protocol):
@@ -46,22 +81,30 @@ class StepClock(Protocol):
 
 
 class Clock:
-    """A whole run: its steps and its time, whichever is further along.
+    """A whole run: its steps, and its time from the first photograph on.
 
-    A schedule follows `steps`. On a slow machine a stage makes fewer steps and still runs through
-    the whole of its schedule. Every stage gets its share of the time that is left, so that a run
-    that is short of time is short in all its stages.
+    Without a limit every stage makes all its steps, however long that takes. Under a limit every
+    stage gets its share of the time that is left, and at least `LEAST` of what it would have had
+    after a preparation of usual length, so that none ends up with nothing. A stage that is cut
+    makes fewer steps and still runs through the whole of its schedule, which follows `steps`.
     """
 
-    def __init__(self, cfg: TrainConfig, begin: float, state: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        cfg: TrainConfig,
+        begin: float,
+        state: dict[str, Any],
+        slower: float = 1.0,
+    ) -> None:
         """
         Args:
-            begin: of training, on the clock of `time.monotonic`.
+            begin: of reading the photographs, by `time.monotonic`.
             state: as `state` gave it; empty at the begin of a run.
+            slower: how many times as long a step takes here as on the machine of the estimates.
         """
         self.cfg: TrainConfig = cfg
         self.begin: float = begin
-        self.limit: float = 60 * cfg.minutes  # seconds
+        self.limit: float = math.inf if cfg.minutes is None else 60 * cfg.minutes  # seconds
         self.finished: bool = state.get("finished", False)  # by hand, see `finish`
         self.stage: int = state.get("stage", 0)
         self.done: float = state.get("progress", 0.0)  # of the present stage, in [0, 1]
@@ -79,6 +122,8 @@ class Clock:
         self._stage_end = 0.0  # when its time is over
         self._off_pace, self._last_block = 0.0, 0.0  # seconds, see `off_pace`
         self._in_rounds = False  # whether the present stage has blocks off the pace
+        self._expected = [slower * expected_seconds(stage) for stage in cfg.stages]
+        self.preparation: float = 0.0  # seconds that preparation is expected to end at
 
     def state(self) -> dict[str, Any]:
         """What a later sitting needs to go on; JSON."""
@@ -97,7 +142,7 @@ class Clock:
 
     @property
     def seconds(self) -> float:
-        """Training time so far, over all sittings."""
+        """Time of the run so far, over all sittings: reading, preparation and training."""
         now = time.monotonic() if self._stopped is None else self._stopped
         return now - self.begin
 
@@ -118,12 +163,47 @@ class Clock:
         last = self.stage - 1
         return self.made[last] if 0 <= last < len(self.made) and last not in self.early else 1.0
 
+    def prepared(self) -> None:
+        """Note that the first stage begins now: what was before was reading and preparation."""
+        self._stage_begin, self.preparation = self.seconds, 0.0
+
+    @property
+    def planned(self) -> float:
+        """Seconds that the steps of all stages are expected to take."""
+        return sum(self._expected)
+
+    @property
+    def hurried(self) -> bool:
+        """Whether reading and preparation have had their part of a limit."""
+        return self.seconds >= PREPARATION * self.limit
+
+    @property
+    def remaining(self) -> float:
+        """Seconds until the end, about: what stages are expected to take, as measured so far."""
+        measured = sum(self.took) + self.done * self.stage_took
+        ended = self.stage if len(self.took) == self.stage else 0  # of a run of an older version
+        expected = sum(self._expected[:ended])
+        if self.stage < len(self._expected):
+            expected += self.done * self.done * self._expected[self.stage]
+        # Little was measured at first: then the estimate counts
+        unsure = UNMEASURED * sum(self._expected)
+        slower = (measured + unsure) / (expected + unsure)
+        left = (1 - self.done) * sum(self._expected[self.stage : self.stage + 1])
+        seconds = slower * (left + sum(self._expected[self.stage + 1 :])) + RESERVE_SECONDS
+        seconds += max(self.preparation - self.seconds, 0.0)
+        return min(seconds, max(self.limit - self.seconds, 0.0))
+
+    @property
+    def work_done(self) -> float:
+        """Share of the expected work of the stages that is done, in [0, 1]."""
+        done = sum(self._expected[: self.stage])
+        done += self.done * sum(self._expected[self.stage : self.stage + 1])
+        return done / self.planned
+
     @property
     def share_done(self) -> float:
-        """Of the whole run, in [0, 1], by stages or by time, whichever is further along."""
-        shares = [stage.share for stage in self.cfg.stages]
-        by_stage = sum(shares[: self.stage]) + shares[self.stage] * self.done
-        return max(by_stage / sum(shares), min(self.seconds / self.limit, 1.0))
+        """Of the whole run, in [0, 1], by time."""
+        return self.seconds / max(self.seconds + self.remaining, 1e-9)
 
     def steps(self, off_pace: float = 0.0) -> Iterator[float]:
         """Progress through the present stage in [0, 1), once a step; then the next stage is on.
@@ -143,10 +223,11 @@ class Clock:
             pace = spent if self._count == 0 else (1 - PACE) * pace + PACE * spent
             self.step, self._stage_steps = self.step + 1, self._stage_steps + 1
             self._count += 1
-            room = self._stage_end - self.seconds - self.reserved
             steps_left = self._planned - self._count + 1  # with the one that was made
-            if self._count > UNSURE and room < pace * (steps_left - 1):
-                steps_left = 1 + room / pace if room > 0 else 1
+            if math.isfinite(self._stage_end):
+                room = self._stage_end - self.seconds - self.reserved
+                if self._count > UNSURE and room < pace * (steps_left - 1):
+                    steps_left = 1 + room / pace if room > 0 else 1
             self.done += (1 - self.done) / max(steps_left, 1)
             if self.done > 1 - 1e-9:
                 self.done = 1.0
@@ -158,15 +239,22 @@ class Clock:
     def _plan(self, off_pace: float) -> None:
         """How many steps are left of the stage, and when its time is over."""
         stage = self.cfg.stages[self.stage]
-        allowed = self._allowed(max(self.limit - RESERVE_SECONDS - self._stage_begin, 0.0))
         self._planned, self._count = max(1, round((1 - self.done) * stage.iterations)), 0
-        self._stage_end, self.reserved = self._stage_begin + allowed, off_pace * allowed
         self._in_rounds = off_pace > 0
+        allowed = self._allowed(max(self.limit - RESERVE_SECONDS - self._stage_begin, 0.0))
+        shares = sum(s.share for s in self.cfg.stages)
+        usual = (1 - PREPARATION) * self.limit * (1 - self.done) * stage.share / shares
+        if not self.finished:
+            allowed = max(allowed, LEAST * usual)
+        self._stage_end = self._stage_begin + allowed
+        self.reserved = off_pace * allowed if off_pace else 0.0
 
     def _allowed(self, left: float) -> float:
         """Of so many seconds, those for the rest of the present stage."""
         stages = self.cfg.stages[self.stage :]
         shares = [(1 - self.done) * stages[0].share, *(s.share for s in stages[1:])]
+        if math.isinf(left):
+            return left
         return left * shares[0] / max(sum(shares), 1e-9)
 
     def skip(self) -> None:
@@ -196,7 +284,7 @@ class Clock:
         stages to come materials and light would lack. A stage of rounds is left as it is."""
         if self.finished:
             return
-        left = max(self.limit - RESERVE_SECONDS - self.seconds, 0.0)
+        left = max(min(self.limit - RESERVE_SECONDS - self.seconds, self.remaining), 0.0)
         hurried = min(left, max(HURRY * left, HURRY_SECONDS))
         self.limit, self.finished = self.seconds + hurried + RESERVE_SECONDS, True
         if self._in_rounds:  # one may take longer than all that is left
@@ -214,6 +302,8 @@ class Clock:
     def blocks_that_fit(self, blocks: int) -> int:
         """How many blocks as long as the last under `off_pace` fit into half of what is left of
         the stage, at most `blocks`; their time is kept for them."""
+        if math.isinf(self._stage_end):
+            return blocks
         left = max(self._stage_end - self.seconds, 0.0) / 2
         if self._last_block:
             blocks = min(blocks, int(left / self._last_block))
@@ -230,21 +320,29 @@ class Clock:
             spent, self._stopped = time.monotonic() - self._stopped, None
             self.begin += spent
 
+    def short(self) -> dict[str, float]:
+        """Shares of their steps that stages made which ended before all, by time or by hand."""
+        return {
+            stage_name(self.cfg.stages, i): made
+            for i, made in enumerate(self.made)
+            if made < ALL and i not in self.early
+        }
+
     def cut(self) -> str:
         """A line about the stages that ended before their steps, by time or by hand; empty if none
         did."""
-        short = [
-            (i + 1, made) for i, made in enumerate(self.made) if made < ALL and i not in self.early
-        ]
-        if not short:
+        if not (short := self.short()):
             return ""
-        stages = ", ".join(f"{made:.0%} in stage {i}" for i, made in short)
-        if self.finished:
-            return f"this training was stopped early: of the planned steps it made {stages}"
-        return (
-            f"time ended this training early: of the planned steps it made {stages}; "
-            "more minutes give more quality"
-        )
+        stages = ", ".join(f"{made:.0%} for {name}" for name, made in short.items())
+        why = "this training was stopped" if self.finished else "time ended this training"
+        return f"{why} early: of the planned steps it made {stages}"
+
+    def minutes_for_all(self) -> float:
+        """Minutes in which all steps would have been made, as those that were made went."""
+        seconds = self.seconds
+        for made, took in zip(self.made, self.took, strict=False):
+            seconds += took * (1 / max(made, FEWEST) - 1) if made < ALL else 0.0
+        return seconds / 60
 
 
 class CountedSteps:

@@ -8,6 +8,9 @@ from dataclasses import dataclass, fields
 from univoxel.names import FIELDS, FieldName
 from univoxel.validation import check_fields
 
+# Most of a limit of time that reading and preparation may take; stages share the rest
+PREPARATION = 0.25
+
 
 @dataclass(frozen=True)
 class StageConfig:
@@ -15,7 +18,7 @@ class StageConfig:
 
     voxels: float  # millions in the object's box at most, > 0; see TrainConfig.voxel_pixels
     iterations: int  # optimisation steps, >= 1; fewer when time runs out
-    share: float  # of the time budget, (0, 1]
+    share: float  # of the time that is left for stages under a limit, (0, 1]
     rays: int = 2048  # per step, >= 1
     sharpness: tuple[float, float] = (0.5, 0.5)  # s of the NeuS density at begin and end, voxels
     lr_sdf: tuple[float, float] = (0.2, 0.02)  # at begin and end, voxels per step; all rates > 0

@@ -16,7 +16,7 @@ from univoxel.compression.choices import CapacityChoice
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
 from univoxel.machine import peak_memory_mb
-from univoxel.training.clock import Clock, CountedSteps, StepClock
+from univoxel.training.clock import Clock, CountedSteps, StepClock, stage_name
 
 LOG = "log.jsonl"  # in the folder of a run
 REPORT_SECONDS = 5.0
@@ -31,6 +31,7 @@ class TrainingProgress:
 
     stage: int  # from 1
     stages: int
+    name: str  # what the stage is for, such as "shape"
     share: float  # of the whole run, in [0, 1]
     seconds: float  # of training so far
     remaining: float  # seconds, about
@@ -73,15 +74,21 @@ class Progress:
         begin: float,
         state: dict[str, Any],
         on_progress: Callable[[TrainingProgress], None] | None = None,
+        slower: float = 1.0,
     ):
         """
         Args:
-            begin: of training, on the clock of `time.monotonic`.
+            begin: of reading the photographs, on the clock of `time.monotonic`.
             state: as `state` gave it; empty at the begin of a run.
             on_progress: called with each report.
+            slower: as of `Clock`.
         """
         self.cfg: TrainConfig = cfg
-        self.clock: Clock = Clock(cfg, begin, state)
+        self.slower: float = slower
+        self.clock: Clock = Clock(cfg, begin, state, slower)
+        self._goes_on = bool(state)
+        # Steps of the preparation that a limit left no time for: those that go on leave them, too
+        self.skipped: list[str] = list(state.get("skipped", ()))
         self._on_progress = on_progress
         self.chosen: list[CapacityChoice] = [
             CapacityChoice.from_json(entry) for entry in state.get("chosen", ())
@@ -104,18 +111,30 @@ class Progress:
         self._bar.start()
         return self
 
-    def __exit__(self, kind: type | None, *_: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
-        if kind is not None:
-            return
-        for line in (*(c.sentence for c in self.chosen), self.clock.cut()):
-            if line:
-                self.say(line)
-        if self.troubles:
-            self.say(
-                f"training met trouble and went on, {len(self.troubles)} times: look at the result "
-                f"before you trust it; the last was in {self.troubles[-1]}"
-            )
+
+    def preparing(self, what: str) -> bool:
+        """Tell of a step of the preparation that begins; whether a limit leaves time for it."""
+        self._show(f"preparation: {what}", "")
+        if self.clock.hurried and not self._goes_on:
+            self.skipped.append(what)
+        return what not in self.skipped
+
+    def prepared(self) -> None:
+        """Let the first stage begin."""
+        self.clock.prepared()
+        self._reported = self._saved = self.clock.seconds
+
+    def _show(self, what: str, facts: str) -> None:
+        """Move the bar."""
+        minutes, seconds = divmod(round(self.clock.remaining), 60)
+        self._bar.update(
+            self._task,
+            completed=self.clock.share_done,
+            description=what,
+            facts=f"{facts}{minutes}:{seconds:02d} left ",
+        )
 
     def state(self) -> dict[str, Any]:
         """What a later sitting needs to go on, and what evaluation reports; JSON."""
@@ -123,6 +142,7 @@ class Progress:
             "within": self.within,
             "chosen": [choice.as_json() for choice in self.chosen],
             "troubles": self.troubles,
+            "skipped": self.skipped,
             "threads": torch.get_num_threads(),
             "peak_rss_mb": peak_memory_mb(),
         }
@@ -158,23 +178,20 @@ class Progress:
         now, stage = clock.seconds, self.cfg.stages[clock.stage]
         rate = (clock.step - self._reported_step) * stage.rays / (now - self._reported)
         self._reported, self._reported_step = now, clock.step
-        done = clock.share_done
+        name = stage_name(self.cfg.stages, clock.stage)
+        done, remaining = clock.share_done, clock.remaining
         line = self.state() | {"losses": losses, "held_out_psnr": psnr, "rays_per_second": rate}
-        self._append(line | {"share": done})
-        remaining = clock.seconds * (1 - done) / max(done, 1e-3)
+        self._append(line | {"share": done, "name": name})
         if self._on_progress is not None:
-            place = clock.stage + 1, len(self.cfg.stages), done, now, remaining
+            place = clock.stage + 1, len(self.cfg.stages), name, done, now, remaining
             with clock.stopped():  # its time is the caller's affair
                 self._on_progress(TrainingProgress(*place, losses, psnr, rate))
-        quality = "" if psnr is None else f"held-out {psnr:.1f} dB  "
+        quality = "" if psnr is None else f"validation {psnr:.1f} dB  "
         if self.troubles:
             quality += f"{len(self.troubles)} troubles  "
-        self._bar.update(
-            self._task,
-            completed=done,
-            description=f"stage {clock.stage + 1}/{len(self.cfg.stages)}",
-            facts=f"loss {sum(losses.values()):.4f}  {quality}"
-            f"{rate / 1e3:.0f}k rays/s  {remaining / 60:.0f}:{remaining % 60:02.0f} left ",
+        self._show(
+            f"{name} ({clock.stage + 1} of {len(self.cfg.stages)})",
+            f"loss {sum(losses.values()):.4f}  {quality}{rate / 1e3:.0f}k rays/s  ",
         )
 
 

@@ -125,7 +125,7 @@ class Spectators:
                 self._qualities[-1].append((now.seconds, now.held_out_psnr))
             curves = (
                 Curve("loss", self._losses, logarithmic=True),
-                Curve("held-out pixels, PSNR in dB", self._qualities),
+                Curve("validation, PSNR in dB", self._qualities),
             )
             self._curves.content = "".join(chart(curve, self._ends) for curve in curves)
             self._share.value = 100 * now.share
@@ -173,8 +173,9 @@ class Spectators:
 def words(now: TrainingProgress, asked: bool) -> str:
     """How far a training is, as Markdown."""
     left = f"about {now.remaining / 60:.0f}:{now.remaining % 60:02.0f} left"
-    quality = "" if now.held_out_psnr is None else f", held-out pixels {now.held_out_psnr:.1f} dB"
-    text = f"Stage {now.stage} of {now.stages}, {now.share:.0%}, {left}{quality}."
+    quality = "" if now.held_out_psnr is None else f", validation {now.held_out_psnr:.1f} dB"
+    text = f"{now.name}, stage {now.stage} of {now.stages}, {now.share:.0%}, {left}{quality}."
+    text = text[0].upper() + text[1:]
     return html.escape(text) + (f" {ENDING}" if asked else "")
 
 

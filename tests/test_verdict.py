@@ -1,0 +1,83 @@
+"""How a run is judged by evidence."""
+
+import dataclasses
+import json
+
+import pytest
+
+from univoxel.verdict import Evidence, as_json, judge, load_verdict, save_verdict
+
+CLEAN = Evidence(steps={}, psnr=31.0, outline=0.01, hidden=0.05, residual=0.02)
+
+
+def of(**changes):
+    return judge(dataclasses.replace(CLEAN, **changes))
+
+
+def test_a_good_run():
+    found = judge(CLEAN)
+    assert (found.word, found.complete, found.empty) == ("good", True, False)
+    assert found.sentence() == "Result: good, validation 31.0 dB"
+
+
+@pytest.mark.parametrize(
+    ("name", "usable", "retake", "reason", "remedy"),
+    [
+        ("psnr", 24.0, 15.0, "validation 24.0 dB", "sharp photographs"),
+        ("outline", 0.05, 0.2, "5% of the outline", "better masks"),
+        ("hidden", 0.4, 0.7, "40% of the surface is seen by fewer", "more photographs"),
+        ("residual", 0.3, 0.8, "30% of the surface differs", "--preset full"),
+    ],
+)
+def test_each_piece_of_evidence_counts(name, usable, retake, reason, remedy):
+    found = of(**{name: usable})
+    assert found.word == "usable"
+    assert reason in found.sentence()
+    assert remedy in found.sentence()
+    assert of(**{name: retake}).word == "retake"
+    assert of(**{name: None}).word == "good"
+
+
+def test_what_is_no_number_is_not_good():
+    assert of(psnr=float("nan")).word == "retake"
+    assert of(residual=float("nan")).word == "retake"
+
+
+def test_the_worst_comes_first_and_two_remedies_are_enough():
+    found = of(psnr=24.0, residual=0.8, outline=0.05, troubles=2)
+    assert found.word == "retake"
+    assert "80% of the surface" in found.reasons[0]
+    assert len(found.reasons) == 4
+    assert len(found.remedies) == 2
+    assert of(troubles=1).reasons == ("training met trouble once and went on",)
+
+
+def test_a_run_that_time_cut_is_unfinished():
+    found = of(steps={"shape": 0.6, "polish": 0.0}, minutes=2.4, limit=1.0, psnr=24.0)
+    assert (found.word, found.complete, found.empty) == ("unfinished", False, True)
+    assert found.sentence() == (
+        "Result: unfinished, the time was up: of the planned steps it made 60% for shape, 0% for "
+        "polish; validation 24.0 dB, where 26 and more are good. What helps: `--minutes 3`; or "
+        "sharp photographs of one exposure, with the object still and the light unchanged"
+    )
+    assert not of(steps={"shape": 0.6}).empty
+    # Never a limit that was too short
+    assert of(steps={"shape": 0.9}, minutes=0.5, limit=2.0).remedies == ("`--minutes 3`",)
+
+
+def test_a_run_that_was_stopped_is_unfinished():
+    found = of(steps={"shape": 0.6}, stopped=True, minutes=2.4, limit=1.0)
+    assert "it was stopped" in found.sentence()
+    assert found.remedies == ("train it to the end",)
+
+
+def test_it_is_kept_with_the_run(tmp_path):
+    found = of(steps={"shape": 0.5}, psnr=22.0, limit=1.0, minutes=1.7)
+    save_verdict(found, tmp_path)
+    assert load_verdict(tmp_path) == found
+    values = json.loads((tmp_path / "verdict.json").read_text())
+    assert values == json.loads(json.dumps(as_json(found)))
+    assert (values["complete"], values["verdict"]) == (False, "unfinished")
+    assert load_verdict(tmp_path / "none") is None
+    (tmp_path / "verdict.json").write_text("{}")
+    assert load_verdict(tmp_path) is None
