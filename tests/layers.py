@@ -89,7 +89,6 @@ HELPERS = {
             "patches",
             "plateau",
             "progress",
-            "step",
             "surface_update",
         ),
     },
