@@ -33,7 +33,7 @@ from univoxel.grid import GridShape
 from univoxel.ops import composite, section_alpha
 from univoxel.optim import RowAdam, rows_of
 from univoxel.records import Rays
-from univoxel.training import surface_update
+from univoxel.training import loop, surface_update
 
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "field_scaling.json"
@@ -106,7 +106,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
     optimizer = RowAdam([field.sdf, field.features], lr=0.01 * field.voxel_size, eps=1e-4)
     seconds, looks = [], []
     for i in range(steps):
-        if i % surface_update.REFRESH == 0:
+        if i % loop.REFRESH == 0:
             begin, old = time.perf_counter(), (field.sdf, field.features)
             field.refresh()
             for a, b in zip(old, (field.sdf, field.features), strict=True):
@@ -114,7 +114,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
             looks.append(time.perf_counter() - begin)
         begin = time.perf_counter()
         step(field, optimizer)
-        if i % surface_update.SMOOTH_EVERY == 0:
+        if i % loop.SMOOTH_EVERY == 0:
             assert field.sdf.grad is not None
             assert field.features.grad is not None
             touched, read = rows_of(field.sdf.grad), rows_of(field.features.grad)
@@ -131,7 +131,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
         "memory_mb": peak - before,
         "process_mb": peak,
         "make_seconds": made,
-        "step_ms": 1e3 * (median(seconds) + median(looks) / surface_update.REFRESH),
+        "step_ms": 1e3 * (median(seconds) + median(looks) / loop.REFRESH),
         "refresh_ms": 1e3 * median(looks),
         "isosurface_seconds": time.perf_counter() - begin,
         "faces": faces,

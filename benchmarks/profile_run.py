@@ -157,7 +157,6 @@ def profile(cfg: TrainConfig, now: Callable[[], float] = time.perf_counter) -> d
         for owner, attribute in places:
             patch(owner, attribute, lambda f, name=name: clock.timed(name, f))
     patch(torch.Tensor, "backward", clock.backward_pass)
-    patch(loop, "descent", clock.backward_pass)
     patch(train, "run_stage", clock.stage)
     patch(stage, "solve", clock.stage)
     begin = now()

@@ -44,7 +44,7 @@ STAGES = {
     "rays": [(loop, "batch_at")],
     "march": [(Field, "march")],
     "sample and composite": [(Field, "composite")],
-    "sums of gradients": [(loop, "total")],
+    "sums of gradients": [(loop, "add_gradient_")],
     "heads": [
         *((head, "forward") for head in (MaterialHead, RadianceHead, MirroredLight)),
         (LocalSG, "raw"),
@@ -134,7 +134,7 @@ def profile(scene: Scene, pixels: TrainingPixels, rays: int, count: int, divide:
     """Milliseconds a step, whole and by stage."""
     run_steps(scene, pixels, rays, 1)
     clock, originals = Clock(), []
-    for name, places in (STAGES | {BACKWARD: [(loop, "descent")]}).items():
+    for name, places in (STAGES | {BACKWARD: [(torch.Tensor, "backward")]}).items():
         for owner, attribute in places:
             originals.append((owner, attribute, getattr(owner, attribute)))
             setattr(owner, attribute, clock.timed(name, originals[-1][2]))

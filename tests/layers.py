@@ -90,7 +90,6 @@ HELPERS = {
             "patches",
             "plateau",
             "progress",
-            "step",
             "surface_update",
         ),
     },

@@ -74,7 +74,7 @@ def failing(monkeypatch, module, name, how, when):
 @pytest.mark.parametrize("how", [bad_loss, bad_gradient, huge_gradient])
 def test_one_bad_step_is_dropped(data, tmp_path, monkeypatch, caplog, how):
     caplog.set_level("INFO", "univoxel")
-    calls = failing(monkeypatch, loop, "objective", how, lambda i: i == 7)
+    calls = failing(monkeypatch, loop, "losses_of", how, lambda i: i == 7)
     out = task.train(small(data, tmp_path / "run"))
     assert len(calls) == 48
     assert finite(load_scene(out))
@@ -86,7 +86,7 @@ def test_one_bad_step_is_dropped(data, tmp_path, monkeypatch, caplog, how):
 
 
 def test_a_failure_that_stays_ends_its_stage(data, tmp_path, monkeypatch):
-    calls = failing(monkeypatch, loop, "objective", bad_gradient, lambda i: 7 <= i < 20)
+    calls = failing(monkeypatch, loop, "losses_of", bad_gradient, lambda i: 7 <= i < 20)
     out = task.train(small(data, tmp_path / "run"))
     told = events(out)
     assert len(told) == 2 * (LIMIT + 1)
@@ -109,7 +109,7 @@ def test_nothing_but_failure_leaves_the_state_it_began_with(data, tmp_path, monk
         states.append({k: v.clone() for k, v in scene.state_dict().items()})
 
     monkeypatch.setattr(task, "run_stage", watched)
-    failing(monkeypatch, loop, "objective", bad_loss, lambda i: True)
+    failing(monkeypatch, loop, "losses_of", bad_loss, lambda i: True)
     task.train(cfg)
     for before, after in (states[:2], states[2:]):
         assert all(torch.equal(before[k], after[k]) for k in before)

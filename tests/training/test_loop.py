@@ -1,8 +1,10 @@
 """The training loop's losses, and the sharpness that it ends with."""
 
+import copy
 import json
 import math
 from dataclasses import fields
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -10,22 +12,86 @@ import torch
 from analytic import write_scene
 
 from univoxel.config import TrainConfig
+from univoxel.data import load_photos
+from univoxel.fields.features import Levels
+from univoxel.fields.field import dense_field, hash_field
+from univoxel.grid import fit_grid
 from univoxel.lights import SGConfig
 from univoxel.lights.base import Regularisation
-from univoxel.scene import SceneConfig
+from univoxel.preparation.hull import mask_distances, visual_hull
+from univoxel.render.pipeline import surface_at
+from univoxel.scene import Scene, SceneConfig
 from univoxel.tasks.train import train
 from univoxel.training import loop, progress
 from univoxel.training.config import LossConfig, StageConfig
-from univoxel.training.loop import weighted
-from univoxel.training.pixels import TrainingPixels
+from univoxel.training.loop import add_gradient_, batch_at, light_priors, losses_of
+from univoxel.training.pixels import TrainingPixels, split_pixels
+
+STAGE = StageConfig(voxels=0.004, iterations=3, share=1.0, rays=600, physical_from=0.0)
 
 
 def test_every_term_of_a_light_has_its_own_weight():
     names = [f.name for f in fields(Regularisation)]
     weight = LossConfig(**{name: float(2 + i) for i, name in enumerate(names)})
     prior = Regularisation(**{name: torch.tensor(10.0) for name in names})
-    assert weighted(prior, weight) == {name: 10.0 * (2 + i) for i, name in enumerate(names)}
-    assert weighted(Regularisation(white_light=torch.tensor(1.0)), weight).keys() == {"white_light"}
+    assert light_priors(prior, weight) == {name: 10.0 * (2 + i) for i, name in enumerate(names)}
+    assert light_priors(Regularisation(white_light=torch.tensor(1.0)), weight).keys() == {
+        "white_light"
+    }
+
+
+@pytest.fixture(scope="module")
+def pixels(tmp_path_factory):
+    photos = load_photos(write_scene(tmp_path_factory.mktemp("loop") / "data", 4, 32), "train")
+    return split_pixels(photos, mask_distances(photos.coverage()))
+
+
+@pytest.fixture(params=["dense", "hash"])
+def scene(request, pixels):
+    torch.manual_seed(0)
+    grid = fit_grid(torch.full((3,), -1.0), torch.full((3,), 1.0), 4096)
+    distance = mask_distances(pixels.photos.coverage())
+    sdf = visual_hull(distance, pixels.photos.cameras, grid)
+    if request.param == "dense":
+        field = dense_field(grid, 4, sdf)
+    else:
+        field = hash_field(grid, Levels.of(grid.bounds(), grid.voxel_size, 2, 512), sdf)
+    torch.nn.init.normal_(field.features)
+    light = SGConfig(lobes=4, hidden=16, directions=32)
+    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
+    return Scene(sizes, field, 2 / grid.voxel_size).train()
+
+
+def test_what_is_read_beside_the_surface_adds_its_gradient(scene, pixels):
+    features, found = scene.field.features, []
+    batch = batch_at(pixels.photos, pixels.trained[:300])
+    for beside in (None, features.detach().requires_grad_()):
+        features.grad = None
+        with scene.surface_held():
+            surface, draw = surface_at(scene, batch.rays), torch.Generator().manual_seed(1)
+            terms = losses_of(scene, LossConfig(), surface, batch, True, draw, beside)
+            sum(terms.values()).backward()
+        if beside is not None:
+            add_gradient_(features, beside.grad)
+        found.append(features.grad.to_dense())
+    # Sums in another order, in float32
+    torch.testing.assert_close(found[1], found[0], rtol=1e-4, atol=1e-7)
+
+
+def test_bits_do_not_depend_on_threads(scene, pixels):
+    cfg = TrainConfig(Path("data"), Path("run"), (STAGE,), minutes=2.0)
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            torch.manual_seed(0)
+            trained = copy.deepcopy(scene)
+            loop.run_stage(trained, cfg, STAGE, pixels, progress.Rehearsal(3))
+            found.append([p.detach() for p in trained.parameters()])
+    finally:
+        torch.set_num_threads(before)
+    assert not torch.equal(trained.field.sdf, scene.field.sdf)
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
 
 
 @pytest.mark.parametrize("best", [0.7, 1.0, 1.4])

@@ -25,12 +25,11 @@ from univoxel.scene import Scene, SceneConfig
 from univoxel.segmentation.config import SegmentationConfig
 from univoxel.segmentation.distances import redistance_, surface_box
 from univoxel.training.config import StageConfig
+from univoxel.training.loop import REFRESH, SMOOTH_EVERY
 from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
     MOMENTS,
-    REFRESH,
-    SMOOTH_EVERY,
     geometric,
     smooth_sdf_gradient_,
     smooth_touched_,
@@ -177,7 +176,7 @@ def separate_(
         smooth_sdf_gradient_(field, stage.spread)
         optimizer.step()
         if step % SMOOTH_EVERY == 0:
-            smooth_touched_(field, stage)
+            smooth_touched_(field, stage, SMOOTH_EVERY)
         quality.append(psnr(rendered.detach(), target))
         watch(quality[-1])
     last = quality[-cfg.compared_steps :]

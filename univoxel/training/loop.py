@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,7 +17,8 @@ from univoxel.data import Photos
 from univoxel.lights import priors
 from univoxel.lights.base import Regularisation
 from univoxel.metrics import psnr
-from univoxel.optim import RowAdam, parameters_of
+from univoxel.ops import sum_rows
+from univoxel.optim import RowAdam, parameters_of, rows_of
 from univoxel.records import Rays, Surface
 from univoxel.render.pipeline import at_rays, radiance_of, shade, surface_at
 from univoxel.scene import Scene
@@ -28,20 +28,22 @@ from univoxel.training.divergence import Guard
 from univoxel.training.pixels import TrainingPixels, unpacked
 from univoxel.training.plateau import Plateau
 from univoxel.training.progress import Listener, Rehearsal
-from univoxel.training.step import Part, descent, parts_of, summed_terms, total
 from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
     MOMENTS,
-    REFRESH,
-    SMOOTH_EVERY,
     geometric,
     smooth_sdf_gradient_,
     smooth_touched_,
 )
 
-COMPARE_EVERY = 2  # steps: patches in each bring little more, and cost twice as much
-RETRACE = 100  # steps after which light is traced through the surface as it has become
+# Cadences: steps from one to the next. plateau.CHECK is a share of the schedule instead; reports
+# and checkpoints come by time, REPORT_SECONDS and CHECKPOINT_SECONDS in progress.py
+REFRESH = 16  # looks at which bricks are empty
+RETRACE = 100  # traces of light through the surface as it has become
+COMPARE_EVERY = 2  # comparisons of patches: in each step they bring little more, at twice the cost
+SMOOTH_EVERY = 4  # smoothings of what the step has touched
+
 RATES = ("lr_sdf", "lr_features", "lr_networks")
 # Of so many rays one is compared with a place beside it, for which networks are evaluated again:
 # priors need no more
@@ -66,59 +68,77 @@ class Batch:
 
 
 def run_stage(
-    scene: Scene,
-    cfg: TrainConfig,
-    stage: StageConfig,
-    pixels: TrainingPixels,
-    progress: Listener,
+    scene: Scene, cfg: TrainConfig, stage: StageConfig, pixels: TrainingPixels, progress: Listener
 ) -> None:
     """Optimise the scene on its present grid until the stage's steps or its time are over."""
-    field = scene.field
+    field, clock = scene.field, progress.clock
     scene.train()
     optimizer = build_optimizer(scene, stage.refit)
     plateau = Plateau(cfg.patience)
     guard = Guard(progress, restored=lambda: restore_surface_(scene))
     guard.follow(optimizer)
-    parameters = parameters_of(optimizer)
-    compared = None
+    brightness = None  # of photographs whose patches are compared
     if cfg.loss.patches and stage.patches_from < 1 and not shelf.on_disk(pixels.photos.color):
-        compared = patches.comparable(pixels.photos)
-    shown: dict[str, Tensor] = {}
+        brightness = patches.comparable(pixels.photos)
+    shown: dict[str, Tensor] = {}  # losses; where patches are not compared, as they were last
     with scene.surface_held():
-        for done in progress.clock.steps():
+        for done in clock.steps():
+            # The schedule
             physical = done >= stage.physical_from
             rates = learning_rates(stage, done, field.voxel_size)
             for group, rate in zip(optimizer.param_groups, rates, strict=True):
                 group["lr"] = rate * guard.scale
             scene.inv_s = 1 / (geometric(stage.sharpness, done) * field.voxel_size)
-            if progress.clock.step % REFRESH == 0:
+
+            # What follows the surface as it moves
+            if clock.step % REFRESH == 0:
                 before = field.sdf, field.features
                 if field.refresh():
                     guard.forget()
                 optimizer.follow(before[0], field.sdf)
                 optimizer.follow(before[1], field.features)
-                parameters = parameters_of(optimizer)
-            if progress.clock.step % RETRACE == 0 and not stage.refit:
+            if clock.step % RETRACE == 0 and not stage.refit:
                 scene.release_surface()
 
-            parts = parts_of(pixels.trained, stage.rays, 1)
-            look = done >= stage.patches_from and progress.clock.step % COMPARE_EVERY == 0
-            brightness = compared if look else None
-            terms = descend_(scene, cfg.loss, pixels, parts, physical, parameters, brightness)
-            if not guard.sound(torch.stack(list(terms.values())).sum()):
+            # A batch of rays, and the generator of all that is random in it
+            drawn = pixels.trained[torch.randint(len(pixels.trained), (stage.rays,))]
+            draw = torch.Generator().manual_seed(int(torch.randint(2**62, (1,))))
+            photos = scene.registered(pixels.photos)
+            batch = batch_at(photos, drawn)
+
+            # Losses. What is read beside the surface has a gradient of its own: torch adds sparse
+            # ones slowly
+            beside = field.features.detach().requires_grad_()
+            surface = surface_at(scene, batch.rays, torch.rand(stage.rays, generator=draw))
+            terms = losses_of(scene, cfg.loss, surface, batch, physical, draw, beside)
+            look = done >= stage.patches_from and clock.step % COMPARE_EVERY == 0
+            if look and brightness is not None:
+                seen = photos.cameras, surface, batch.wo, drawn
+                differ = patches.disagreement(scene, brightness, *seen)
+                terms["patches"] = cfg.loss.patches * differ
+            loss = torch.stack(list(terms.values())).sum()
+
+            # Backward, and a step if its numbers are sound
+            optimizer.zero_grad(set_to_none=True)
+            wanted = [p for p in parameters_of(optimizer) if p.requires_grad]
+            loss.backward(inputs=[*wanted, beside])
+            add_gradient_(field.features, beside.grad)
+            if not guard.sound(loss):
                 continue
-            shown |= terms  # where patches are not compared, as they were last
+            shown |= {name: term.detach() for name, term in terms.items()}
             if stage.refit:
                 field.encoding.hold_channels_(scene.material.channels)
             if stage.spread:
                 smooth_sdf_gradient_(field, stage.spread)
             optimizer.step()
-            if progress.clock.step % SMOOTH_EVERY == 0 and not stage.refit:
-                smooth_touched_(field, stage)
+            if clock.step % SMOOTH_EVERY == 0 and not stage.refit:
+                smooth_touched_(field, stage, SMOOTH_EVERY)
+
+            # Held-out pixels, the report, a checkpoint
             if plateau.due(done):
                 quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
                 if plateau.flat(done, quality, physical):
-                    progress.clock.shorten()
+                    clock.shorten()
             if progress.due():
                 quality = held_out_psnr(scene, pixels.photos, pixels.held_out, physical)
                 progress.report({k: v.item() for k, v in shown.items()}, quality)
@@ -129,64 +149,21 @@ def run_stage(
     scene.eval()
 
 
-def descend_(
-    scene: Scene,
-    weight: LossConfig,
-    pixels: TrainingPixels,
-    parts: Sequence[Part],
-    physical: bool,
-    parameters: Sequence[Tensor],
-    brightness: Tensor | None = None,
-) -> dict[str, Tensor]:
-    """Give every parameter the gradient of the loss of the parts; the terms, weighted.
-
-    Args:
-        brightness: as of `part_terms`.
-    """
-    features = scene.field.features
-    wanted = [p for p in parameters if p.requires_grad]
-    descents = []
-    for part in parts:
-        # What is read beside the surface has a gradient of its own: torch adds sparse ones slowly
-        beside = features.detach().requires_grad_()
-        terms = part_terms(scene, weight, pixels.photos, part, physical, beside, brightness)
-        descents.append(descent(terms, part.share, [*wanted, beside]))
-    for parameter in parameters:  # of one that no longer is trained an old gradient may be there
-        parameter.grad = None
-    for i, parameter in enumerate(wanted):
-        gradients = [d.gradients[i] for d in descents]
-        if parameter is features:
-            gradients += [d.gradients[-1] for d in descents]
-        parameter.grad = total(gradients)
-    return summed_terms(parts, descents)
-
-
-def part_terms(
-    scene: Scene,
-    weight: LossConfig,
-    photos: Photos,
-    part: Part,
-    physical: bool,
-    beside: Tensor | None = None,
-    brightness: Tensor | None = None,
-) -> dict[str, Tensor]:
-    """`objective` of a part of a step; beside as there.
-
-    Args:
-        brightness: of the photographs, as of `patches.comparable`, where the surface's patches are
-            compared too.
-    """
-    draw = torch.Generator().manual_seed(part.seed)
-    photos = scene.registered(photos)
-    batch = batch_at(photos, part.pixels)
-    surface = surface_at(scene, batch.rays, torch.rand(len(batch.view), generator=draw))
-    terms = objective(scene, weight, surface, batch, physical, draw, beside)
-    if brightness is not None:
-        differ = patches.disagreement(
-            scene, brightness, photos.cameras, surface, batch.wo, part.pixels
-        )
-        terms["patches"] = weight.patches * differ
-    return terms
+def add_gradient_(table: Tensor, gradient: Tensor | None) -> None:
+    """Add a sparse gradient to that of a table [..., C], which is sparse too; None: nothing."""
+    if gradient is None:
+        return
+    assert table.grad is not None
+    both = table.grad, gradient
+    rows, values = [rows_of(g) for g in both], [g._values() for g in both]
+    index, total = sum_rows(rows, values, table.shape[:-1])
+    table.grad = torch.sparse_coo_tensor(
+        index,
+        total,
+        table.shape,
+        is_coalesced=True,
+        check_invariants=False,  # ascending and inside by construction
+    )
 
 
 def restore_surface_(scene: Scene) -> None:
@@ -254,7 +231,7 @@ def rehearsal(
     return held_out_psnr(scene, pixels.photos, pixels.held_out, physical=False)
 
 
-def objective(
+def losses_of(
     scene: Scene,
     weight: LossConfig,
     surface: Surface,
@@ -263,7 +240,7 @@ def objective(
     draw: torch.Generator,
     features: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Every term that is minimised, weighted.
+    """Every loss of a batch but that of patches, weighted.
 
     Args:
         draw: of all that is random.
@@ -294,10 +271,10 @@ def objective(
         "metallic": weight.metallic * met.metallic.mean(),
     }
     some = torch.arange(0, len(hit), COMPARED)
-    return terms | evenness(scene, weight, at_rays(met, some), view[some], draw, features)
+    return terms | smoothness_losses(scene, weight, at_rays(met, some), view[some], draw, features)
 
 
-def evenness(
+def smoothness_losses(
     scene: Scene,
     weight: LossConfig,
     met: Surface,
@@ -305,11 +282,11 @@ def evenness(
     draw: torch.Generator,
     features: Tensor | None,
 ) -> dict[str, Tensor]:
-    """The terms by which material and light change little from points to places beside them.
+    """Weighted priors: material and light change little from points to places beside them.
 
     Args:
         view: [N] as of `shade`.
-        draw, features: as of `objective`.
+        draw, features: as of `losses_of`.
     """
     away = scene.field.voxel_size * torch.randn(met.position.shape, generator=draw)
     beside = met.position.detach() + away
@@ -321,11 +298,11 @@ def evenness(
         "albedo": weight.albedo_smoothness * priors.smoothness(met.albedo, albedo),
         "roughness": weight.roughness_smoothness * priors.smoothness(met.roughness, roughness),
     }
-    return terms | weighted(scene.light.regularisation(here, near), weight)
+    return terms | light_priors(scene.light.regularisation(here, near), weight)
 
 
-def weighted(prior: Regularisation, weight: LossConfig) -> dict[str, Tensor]:
-    """The terms that a light has, each times its weight."""
+def light_priors(prior: Regularisation, weight: LossConfig) -> dict[str, Tensor]:
+    """The priors that a light has, each times its weight."""
     terms = {
         "light_smoothness": (weight.light_smoothness, prior.light_smoothness),
         "map_smoothness": (weight.map_smoothness, prior.map_smoothness),

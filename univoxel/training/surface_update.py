@@ -6,9 +6,7 @@ from univoxel.fields.field import Field
 from univoxel.optim import rows_of
 from univoxel.training.config import StageConfig
 
-SMOOTH_EVERY = 4  # steps between smoothings of what the step has touched
 SPREAD = 0.8  # share of the neighbours' mean that a node's gradient takes on in a pass
-REFRESH = 16  # steps between looks at which bricks are empty
 MOMENTS = (0.9, 0.99)
 # Adam's epsilon for the grids. Far above 0 on purpose: a node's gradient is then scaled by the
 # batch, not by its own history, and nodes that few rays see do not jump.
@@ -27,12 +25,16 @@ def smooth_sdf_gradient_(field: Field, passes: int) -> None:
         grad._values()[pinned.flatten()[rows]] = 0
 
 
-def smooth_touched_(field: Field, stage: StageConfig) -> None:
-    """Regularise the nodes that the step has touched, beside the optimiser and not inside it."""
+def smooth_touched_(field: Field, stage: StageConfig, every: int) -> None:
+    """Regularise the nodes that the step has touched, beside the optimiser and not inside it.
+
+    Args:
+        every: steps between two calls, for which each makes up.
+    """
     sdf, features = field.sdf, field.features
     assert sdf.grad is not None
     assert features.grad is not None
-    plate, diffusion = stage.plate * SMOOTH_EVERY, stage.diffusion * SMOOTH_EVERY
+    plate, diffusion = stage.plate * every, stage.diffusion * every
     field.distances.smooth_rows_(sdf.detach(), rows_of(sdf.grad), plate, order=2)
     field.encoding.smooth_(field.distances, rows_of(features.grad), diffusion)
 
