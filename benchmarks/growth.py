@@ -29,7 +29,7 @@ import numpy as np
 from made import made
 from PIL import Image
 
-from univoxel.experiments.record import result_text
+from lab.record import result_text
 
 HERE = Path(__file__).parent
 STEPS = 16  # that are measured, of which the first are left out

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
+from lab import plots, runner
+from lab.plots import Measure
+from lab.record import Outcome, Setting, result_text
 from univoxel.errors import ProcessFailed, UserError
-from univoxel.experiments import plots, runner
-from univoxel.experiments.plots import Measure
-from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
 
