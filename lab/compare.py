@@ -46,7 +46,7 @@ def compare(
         scenes: folders of data sets, of different names.
         out: every training is kept in out/SCENE/LIGHT, and not done again by a later call.
         light: names as of --light; `NAME:FIELD=VALUE[,FIELD=VALUE]` changes fields of the light.
-        preset, minutes: how much work goes into each, as of config.chosen.
+        preset, minutes: how much work goes into each, as of presets.chosen.
         changes: FIELD=VALUE of the configuration, for all.
         samples: of the light per pixel of relit pictures in evaluation.
         jobs, scheduler: trainings at once here, or who else trains; as of runner.run_pairs.
