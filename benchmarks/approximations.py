@@ -21,8 +21,8 @@ import torch
 from made import made
 from torch import Tensor
 
+from lab.record import result_text
 from univoxel import sphere
-from univoxel.experiments.record import result_text
 from univoxel.ops import shade_sg
 
 HERE = Path(__file__).parent

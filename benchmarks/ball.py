@@ -14,11 +14,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from lab.stress.render import name_of
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data.images import write_png
 from univoxel.data.transforms import write_cameras
-from univoxel.experiments.stress.render import name_of
 
 SIZE, FINER, DISTANCE, RADIUS = 100, 8, 2.0, 0.5
 COLOR = torch.tensor([0.6, 0.4, 0.2])

@@ -21,10 +21,10 @@ from pathlib import Path
 from ball import write
 from made import made
 
+from lab import plots
+from lab.record import result_text
 from univoxel.checkpoint import FILE
 from univoxel.config import TrainConfig
-from univoxel.experiments import plots
-from univoxel.experiments.record import result_text
 from univoxel.files import replacing
 from univoxel.presets import preset, with_field
 from univoxel.tasks.evaluate import evaluate

@@ -18,8 +18,8 @@ from typing import Any
 
 from made import made
 
+from lab.record import result_text
 from univoxel.checkpoint import FILE
-from univoxel.experiments.record import result_text
 from univoxel.presets import preset
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.poses import poses

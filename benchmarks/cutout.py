@@ -27,13 +27,13 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from lab.record import result_text
 from univoxel.camera import Cameras, Rays, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
-from univoxel.experiments.record import result_text
 from univoxel.tasks.cutout import COLOURS, REMBG, cutout
 
 HERE = Path(__file__).parent

@@ -26,7 +26,7 @@ from statistics import median
 import torch
 from made import made
 
-from univoxel.experiments.record import result_text
+from lab.record import result_text
 from univoxel.fields.features import PER_LEVEL, Levels
 from univoxel.fields.field import Field, dense_field, hash_field
 from univoxel.grid import GridShape

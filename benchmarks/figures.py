@@ -22,8 +22,8 @@ from pathlib import Path
 
 from made import made
 
-from univoxel.experiments import plots
-from univoxel.experiments.record import result_text
+from lab import plots
+from lab.record import result_text
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"

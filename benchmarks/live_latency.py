@@ -28,9 +28,9 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from browser import browser
 from made import made
 
+from lab.record import result_text
 from univoxel import envmap
 from univoxel.camera import Cameras, resize
-from univoxel.experiments.record import result_text
 from univoxel.metrics import psnr
 from univoxel.page import PageOptions, lights_of
 from univoxel.pictures.viewpoints import orbit

@@ -8,7 +8,7 @@ from pathlib import Path
 
 # What decides a result. The commit is the last that changed any of it: pages and results may be
 # committed between two measurements of one version.
-MEASURED = [":/univoxel", ":/csrc", ":/cmake", ":/CMakeLists.txt"]
+MEASURED = [":/univoxel", ":/lab", ":/csrc", ":/cmake", ":/CMakeLists.txt", ":!/lab/tests"]
 # A commit with this line changes no result, and does not count: CONTRIBUTING.md.
 COUNTED = ["--invert-grep", "--grep=^Figures: unchanged$"]
 

@@ -27,7 +27,7 @@ import workers
 from made import made
 from torch import Tensor
 
-from univoxel.experiments.record import result_text
+from lab.record import result_text
 
 HERE = Path(__file__).parent
 SLOW_MS = 3000.0

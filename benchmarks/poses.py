@@ -35,10 +35,10 @@ from made import made
 from PIL import Image
 
 import univoxel
+from lab.record import result_text
 from univoxel.data.colmap import read_images
 from univoxel.data.shots import TEST_EVERY
 from univoxel.data.transforms import write_cameras
-from univoxel.experiments.record import result_text
 from univoxel.tasks.poses import poses
 
 HERE = Path(__file__).parent

@@ -24,11 +24,11 @@ from made import made
 from torch import Tensor
 from varying import exposed
 
+from lab.record import result_text
 from univoxel.checkpoint import FILE
 from univoxel.config import TrainConfig, save_config
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
-from univoxel.experiments.record import result_text
 from univoxel.files import replacing
 from univoxel.presets import preset
 from univoxel.tasks.evaluate import evaluate

@@ -22,8 +22,8 @@ import torch
 from made import made
 from train_step import OTHER, STAGES, Clock
 
+from lab.record import result_text
 from univoxel.config import TrainConfig
-from univoxel.experiments.record import result_text
 from univoxel.fields.field import Field
 from univoxel.joint import observations, stage
 from univoxel.joint.config import JointConfig

@@ -24,8 +24,8 @@ import numpy as np
 from made import made
 from PIL import Image
 
+from lab.record import result_text
 from univoxel.data import keep_photos, load_photos
-from univoxel.experiments.record import result_text
 
 HERE = Path(__file__).parent
 DATA = HERE.parent / "univoxel" / "example_data" / "tiny"

@@ -28,12 +28,12 @@ from relight_rays import ray_rates
 from relight_scenes import TESTS, Scene, mesh_scene, sphere_scene, true_mesh
 from torch import Tensor
 
+from lab.record import result_text
 from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.envmap import EnvMap, tables
-from univoxel.experiments.record import result_text
 from univoxel.ops import VisibilityScene, relight
 from univoxel.records import Mesh
 

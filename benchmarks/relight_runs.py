@@ -19,6 +19,7 @@ from statistics import fmean
 import torch
 from made import made
 
+from lab.record import result_text
 from univoxel.checkpoint import load_scene
 from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos, load_relit, relight_maps
@@ -26,7 +27,6 @@ from univoxel.data.base import decode
 from univoxel.data.maps import read_map
 from univoxel.envmap import tables
 from univoxel.evaluation.measures import albedo_scales
-from univoxel.experiments.record import result_text
 from univoxel.metrics import on_black, psnr
 from univoxel.records import Surface
 from univoxel.render.pipeline import extract_mesh, surface_of_view

@@ -25,7 +25,7 @@ import workers
 from made import made
 from ops import arguments_as, forward_backward
 
-from univoxel.experiments.record import result_text
+from lab.record import result_text
 
 OPS: dict[str, Callable[[], cases.Case]] = {
     "composite": cases.composite,

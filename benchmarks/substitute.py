@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from trimesh.triangles import closest_point
 
+from lab.record import result_text
 from univoxel import lights
 from univoxel.assets.bake import with_materials
 from univoxel.camera import image_rays
@@ -36,7 +37,6 @@ from univoxel.data.base import decode
 from univoxel.data.maps import read_map, true_map
 from univoxel.envmap import tables
 from univoxel.evaluation.measures import albedo_scales
-from univoxel.experiments.record import result_text
 from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape, fit_grid
 from univoxel.joint.config import JointConfig

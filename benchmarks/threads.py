@@ -112,7 +112,7 @@ def main() -> None:
     if options.run:
         print(json.dumps(measure(options.scene, options.preset, options.run, options.threads)))
         return
-    from univoxel.experiments.record import result_text
+    from lab.record import result_text
 
     (one,), (two,) = trainings(options, 1), trainings(options, 2)
     pair = trainings(options, 1, count=2)

@@ -22,9 +22,9 @@ from types import SimpleNamespace
 import torch
 from made import made
 
+from lab.record import result_text
 from univoxel import losses, ops
 from univoxel.data import load_photos
-from univoxel.experiments.record import result_text
 from univoxel.fields.field import Field, dense_field
 from univoxel.fields.heads import MaterialHead, RadianceHead
 from univoxel.grid import fit_grid

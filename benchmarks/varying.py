@@ -28,6 +28,7 @@ from made import made
 from scipy import ndimage, spatial
 from torch.nn.functional import normalize
 
+from lab.record import result_text
 from univoxel.camera import image_rays
 from univoxel.checkpoint import FILE, load_scene
 from univoxel.color import linear_to_srgb, luminance
@@ -36,7 +37,6 @@ from univoxel.data.images import write_png
 from univoxel.data.maps import read_map
 from univoxel.data.mesh import read_ply
 from univoxel.envmap import tables
-from univoxel.experiments.record import result_text
 from univoxel.files import replacing
 from univoxel.presets import preset
 from univoxel.records import Mesh, Surface

@@ -40,6 +40,7 @@ from analytic import cameras_around, sphere_scene
 from layouts import scene, write_colmap, write_llff, write_nerf, write_nerfstudio, write_tensoir
 from PIL import Image
 
+from lab.record import load_outcome
 from univoxel.assets.ply import write_ply
 from univoxel.checkpoint import load_checkpoint, save_scene
 from univoxel.config import check_same, save_config
@@ -48,7 +49,6 @@ from univoxel.data.images import image_size, read_image, write_exr
 from univoxel.data.maps import read_map
 from univoxel.data.mesh import read_ply
 from univoxel.errors import NoSurface, UserError
-from univoxel.experiments.record import load_outcome
 from univoxel.presets import preset
 from univoxel.records import Mesh
 from univoxel.render.pipeline import shade_hits, surface_of_view

@@ -1,5 +1,5 @@
-"""The layers of the package as data: test_layers.py holds every import to them, and
-docs/figures/diagrams.py draws them."""
+"""The layers of the package, and of the laboratory, as data: test_layers.py holds every import to
+them, and docs/figures/diagrams.py draws those of the package."""
 
 # From the bottom up. A module imports only from layers below its own and, inside its folder, the
 # helpers named here.
@@ -43,13 +43,9 @@ LAYERS = [
     {"build", "capture", "evaluation", "page", "segmentation"},
     {"batch", "report", "viewer"},
     {"tasks"},
-    {"tasks.demo", "tasks.submit"},
+    {"tasks.demo"},
     {"tasks.capture"},
     {"api"},
-    {"experiments.plots", "experiments.record"},
-    {"experiments.worker"},
-    {"experiments.runner"},
-    {"experiments"},
     {"parsing"},
     {"commands"},
     {"cli"},
@@ -119,8 +115,17 @@ HELPERS = {
         *("prepare", "video", "evidence"),
     },
     "commands": {"arguments"},
-    "experiments.stress": {"axes", "damage", "render", "report", "rough", "scenes", "shapes"},
 }
+
+# Of lab/, which imports from the package what it likes, and which the package does not import
+LAB_LAYERS = [
+    {"plots", "record"},
+    {"worker"},
+    {"runner"},
+    {"chart", "compare", "stress", "submit"},
+    {"commands"},
+]
+LAB_HELPERS = {"stress": {"axes", "damage", "render", "report", "rough", "scenes", "shapes"}}
 
 
 def drawn_layers() -> list[set[str]]:

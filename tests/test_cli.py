@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 import univoxel
-from univoxel import errors
+from univoxel import commands, errors
 from univoxel.cli import SPINS, main
-from univoxel.commands import COMMANDS, EVERYDAY, LABORATORY
+from univoxel.commands import COMMANDS, LABORATORY, laboratory
 from univoxel.errors import (
     ExistingFile,
     MissingExtra,
@@ -382,8 +382,8 @@ def test_inspect(calls, tmp_path, capsys):
 
 
 def test_experiments(calls, tmp_path, capsys):
-    calls.stand_in("univoxel.experiments.compare", compare=calls.task("compare", "table"))
-    calls.stand_in("univoxel.experiments.chart", chart=calls.task("chart", "picture"))
+    calls.stand_in("lab.compare", compare=calls.task("compare", "table"))
+    calls.stand_in("lab.chart", chart=calls.task("chart", "picture"))
     options = ["--preset", "draft", "--samples", "4", "--set", "seed=1"]
     more = ["--light", "sg", "sg:lobes=12", "--minutes", "2"]
     assert main(["compare", "cup", "shoe", "--out", "out", *options, *more]) == 0
@@ -397,7 +397,7 @@ def test_experiments(calls, tmp_path, capsys):
         ((Path("cup"),), Path("out"), "fast", "hybrid", False, ("draft", "fast"), (), 64),
     ]
     assert capsys.readouterr().out.split() == ["table", "picture", "picture"]
-    calls.stand_in("univoxel.experiments.stress.suite", stress=calls.task("stress", "breaks"))
+    calls.stand_in("lab.stress.suite", stress=calls.task("stress", "breaks"))
     options = ["--quick", "--only", "sun", "dark", "--light", "sg", "sh", "--seeds", "2"]
     assert main(["stress", "--out", "out", *options, "--set", "loss.radiance=2"]) == 0
     assert calls.noted[-1][1] == (
@@ -408,7 +408,7 @@ def test_experiments(calls, tmp_path, capsys):
     capsys.readouterr()
     assert main(["compare", "cup", "--out", "out", "--minutes", "-1"]) == 2
     assert "--minutes must be above 0, got -1" in capsys.readouterr().err
-    calls.stand_in("univoxel.experiments.chart", chart=calls.task("chart", KeyboardInterrupt()))
+    calls.stand_in("lab.chart", chart=calls.task("chart", KeyboardInterrupt()))
     assert main(["chart", "cup", "--out", "out"]) == 130
     assert "out keeps the trainings that are done" in capsys.readouterr().err
 
@@ -557,7 +557,7 @@ def test_help_is_one_screen_in_the_order_of_work(capsys, arguments):
     assert len(lines) <= 24
     assert max(map(len, lines)) < 80
     named = [line.split()[0] for line in lines if line.startswith("  ")]
-    assert set(named) == {*EVERYDAY, "lab"}
+    assert set(named) == {*COMMANDS, "lab"}
     order = ["poses", "cutout", "train", "eval", "relight", "export", "demo", "doctor", "lab"]
     assert [name for name in named if name in order] == order
     assert all(line.strip() != line.split()[0] for line in lines[2:-1])  # each says what it does
@@ -566,13 +566,25 @@ def test_help_is_one_screen_in_the_order_of_work(capsys, arguments):
 def test_the_laboratory_has_a_screen_of_its_own(capsys):
     assert main(["lab"]) == 0
     named = [line.split()[0] for line in capsys.readouterr().out.splitlines()[2:-1]]
-    assert named == list(LABORATORY)
-    assert "compare" not in EVERYDAY
+    assert named == list(LABORATORY) == list(laboratory())
+    assert not set(named) & set(COMMANDS)
+
+
+@pytest.mark.parametrize("arguments", [["lab"], ["lab", "chart", "--help"], ["chart", "cup"]])
+def test_without_a_clone_there_is_no_laboratory(calls, monkeypatch, tmp_path, capsys, arguments):
+    monkeypatch.setattr(commands, "CLONE", tmp_path)
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith("univoxel: compare, chart, stress, submit measure the method and are not")
+    assert err.count("\n") == 1
+    assert not out
+    assert main(["completion", "bash"]) == 0
+    assert "stress" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("word", [["lab"], []])
 def test_commands_of_the_laboratory_have_their_old_names_too(calls, word):
-    calls.stand_in("univoxel.experiments.stress.suite", stress=calls.task("stress", "breaks"))
+    calls.stand_in("lab.stress.suite", stress=calls.task("stress", "breaks"))
     assert main([*word, "stress", "--out", "out"]) == 0
     here = {"jobs": 1, "scheduler": None}
     assert calls.noted == [("stress", (Path("out"), (), (), None, False, ()), here)]
@@ -735,7 +747,7 @@ def test_version(capsys):
     assert capsys.readouterr().out.startswith("univoxel 0.")
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [*COMMANDS, *LABORATORY])
 def test_help_names_every_default(command, capsys):
     main([command, "--help"])
     assert "(default: )" not in " ".join(capsys.readouterr().out.split())

@@ -5,11 +5,13 @@ import re
 from pathlib import Path
 
 import pytest
-from layers import HELPERS, LAYERS, drawn_layers
+from layers import HELPERS, LAB_HELPERS, LAB_LAYERS, LAYERS, drawn_layers
 
 from univoxel.commands import COMMANDS
 
 ROOT = Path(__file__).parent.parent
+
+SOURCES = [*ROOT.glob("univoxel/**/*.py"), *ROOT.glob("lab/*.py"), *ROOT.glob("lab/stress/*.py")]
 
 # Extras: imported inside the function that needs one
 OPTIONAL = {"dask", "distributed", "drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh"}
@@ -18,13 +20,13 @@ OPTIONAL |= {"onnxruntime", "pillow_heif", "pycolmap", "rawpy", "rembg", "viser"
 INCLUDES = {r"embree\d?/": "visibility.cpp", r"pybind11/": "bindings"}
 
 
-def layer(module: str) -> int:
+def layer(module: str, layers: list[set[str]]) -> int:
     """Index of the layer of a module named without the package, such as `ops.composite`."""
     for name in (module, module.partition(".")[0]):
-        for i, names in enumerate(LAYERS):
+        for i, names in enumerate(layers):
             if name in names:
                 return i
-    raise AssertionError(f"univoxel.{module} stands in no layer: add it to tests/layers.py")
+    raise AssertionError(f"{module} stands in no layer: add it to tests/layers.py")
 
 
 def modules(package: Path) -> dict[str, Path]:
@@ -36,8 +38,12 @@ def modules(package: Path) -> dict[str, Path]:
     return found
 
 
-def imports(path: Path, known: set[str]) -> set[str]:
-    """What a file imports, anywhere in it: absolute names, modules of ours without the package."""
+def imports(path: Path, package: str, known: set[str]) -> set[str]:
+    """What a file of a package imports, anywhere in it, as absolute names.
+
+    Args:
+        known: modules of the package, without its name.
+    """
     names = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -46,42 +52,49 @@ def imports(path: Path, known: set[str]) -> set[str]:
             assert not node.level, f"{path}: imports are absolute"
             parent = node.module or ""
             for alias in node.names:
-                inner = f"{parent}.{alias.name}".removeprefix("univoxel.")
-                is_module = inner in known or inner == "_core"
-                names.add(f"univoxel.{inner}" if is_module else parent)
+                inner = f"{parent}.{alias.name}".removeprefix(f"{package}.")
+                is_module = parent.partition(".")[0] == package and inner in {*known, "_core"}
+                names.add(f"{package}.{inner}" if is_module else parent)
     return names
 
 
-def violations(package: Path) -> list[str]:
+def violations(
+    folder: Path,
+    package: str = "univoxel",
+    layers: list[set[str]] = LAYERS,
+    helpers: dict[str, set[str]] = HELPERS,
+) -> list[str]:
+    """A line for each import of a package that its layers do not have."""
     found = []
-    known = modules(package)
+    known = modules(folder)
     for module, path in known.items():
-        if not module:
+        if not module or module.startswith("tests"):
             continue
-        folder = module.rpartition(".")[0]
-        for name in sorted(imports(path, set(known))):
+        parent = module.rpartition(".")[0]
+        for name in sorted(imports(path, package, set(known))):
             if name.endswith("._core"):
                 found.append(f"{module} imports {name}: only ops/native.py loads it")
                 continue
-            if not name.startswith("univoxel."):
+            if package == "univoxel" and name.partition(".")[0] == "lab":
+                found.append(f"{module} imports {name}: a wheel has none")
+            if not name.startswith(f"{package}."):
                 continue
-            target = name.removeprefix("univoxel.")
+            target = name.removeprefix(f"{package}.")
             other, _, other_leaf = target.rpartition(".")
-            if layer(target) < layer(module):
+            own, theirs = layer(module, layers), layer(target, layers)
+            if theirs < own:
                 continue
-            own_folder = module == other and module in HELPERS  # a folder's __init__ gathers it
-            helper = folder and folder == other and other_leaf in HELPERS.get(folder, ())
+            own_folder = module == other and module in helpers  # a folder's __init__ gathers it
+            helper = parent and parent == other and other_leaf in helpers.get(parent, ())
             if not own_folder and not helper:
-                found.append(f"{module} imports {target}: {_direction(module, target)}")
+                direction = "up" if theirs > own else "sideways"
+                found.append(f"{module} imports {target}: {direction}")
     return found
-
-
-def _direction(module: str, target: str) -> str:
-    return "up" if layer(target) > layer(module) else "sideways"
 
 
 def test_imports_only_go_down():
     assert violations(ROOT / "univoxel") == []
+    assert violations(ROOT / "lab", "lab", LAB_LAYERS, LAB_HELPERS) == []
 
 
 @pytest.mark.parametrize(
@@ -95,6 +108,7 @@ def test_imports_only_go_down():
         ("color.py", "from univoxel.camera import Cameras", "sideways"),
         ("fields/dense.py", "import univoxel._core", "only ops"),
         ("fields/dense.py", "from univoxel import _core", "only ops"),
+        ("fields/dense.py", "from lab.record import Outcome", "a wheel has none"),
     ],
 )
 def test_a_wrong_import_is_found(tmp_path, file, line, fault):
@@ -116,7 +130,7 @@ def test_an_unknown_module_is_found(tmp_path):
 
 
 def test_extras_are_not_imported_at_the_top():
-    for path in (ROOT / "univoxel").rglob("*.py"):
+    for path in SOURCES:
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
@@ -141,5 +155,5 @@ def test_the_diagram_shows_the_layers():
 def test_tasks_are_commands():
     names = {path.stem for path in (ROOT / "univoxel" / "tasks").glob("*.py")} - {"__init__"}
     commands = {"poses", "cutout", "train", "eval", "relight", "export", "envmap", "inspect"}
-    commands |= {"batch", "capture", "info", "submit", "demo", "doctor", "view", "report"}
-    assert names - {"evaluate"} | {"eval"} == commands <= set(COMMANDS)
+    commands |= {"batch", "capture", "info", "demo", "doctor", "view", "report"}
+    assert names - {"evaluate"} | {"eval"} == commands == set(COMMANDS) - {"completion"}

@@ -13,19 +13,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from univoxel import __version__
-from univoxel.commands import (
-    EVERYDAY,
-    LABORATORY,
-    batch,
-    capture,
-    chart,
-    compare,
-    poses,
-    stress,
-    train,
-)
+from univoxel.commands import COMMANDS, LABORATORY, laboratory
 from univoxel.commands.arguments import STDOUT
-from univoxel.errors import UserError
+from univoxel.errors import MissingExtra, UserError
 from univoxel.parsing import LAB, Call, Command, Common, Usage, overview, parse
 
 # What a command may raise for a mistake of its user, see `is_mistake`; all else is a bug and keeps
@@ -76,13 +66,13 @@ def _run(arguments: list[str]) -> int:
     if (wrong := unusable(arguments)) is not None:
         print(f"univoxel: {wrong}; see univoxel --help", file=sys.stderr)
         return 2
-    if (screen := help_screen(arguments)) is not None:
-        print(screen)
-        return 0
     # Parse alone first: what a command raises must not pass for an error of its arguments.
     try:
-        call = parse(arguments, EVERYDAY, LABORATORY)
-    except Usage as wrong:
+        if (screen := help_screen(arguments)) is not None:
+            print(screen)
+            return 0
+        call = understood(arguments)
+    except (Usage, MissingExtra) as wrong:
         print(f"univoxel: {wrong}", file=sys.stderr)
         return 2
     if call is None:
@@ -105,15 +95,34 @@ def _run(arguments: list[str]) -> int:
         return 2
 
 
+def understood(arguments: Sequence[str]) -> Call | None:
+    """The call that arguments ask for; None: help was asked for and printed.
+
+    Raises:
+        Usage: they make no command.
+        MissingExtra: one of the laboratory, which is not there.
+    """
+    match arguments:
+        case [name, *_] if name in LABORATORY:
+            return parse(arguments, laboratory(), f"{LAB} ")
+        case [word, *rest] if word == LAB:
+            return parse(rest, laboratory(), f"{LAB} ")
+    return parse(arguments, COMMANDS)
+
+
 def help_screen(arguments: Sequence[str]) -> str | None:
-    """The overview that arguments ask for; None: they ask for something else."""
+    """The overview that arguments ask for; None: they ask for something else.
+
+    Raises:
+        MissingExtra: that of the laboratory, which is not there.
+    """
     match arguments:
         case [] | ["-h" | "--help" | "help"]:
             title = f"univoxel {__version__}: from photographs to a relightable object, on any CPU"
             return overview(title, groups(), "univoxel COMMAND --help says what a command takes.")
         case ["lab"] | ["lab", "-h" | "--help" | "help"]:
             end = f"univoxel {LAB} COMMAND --help says what a command takes."
-            return overview("Commands of the laboratory", {f"univoxel {LAB}": LABORATORY}, end)
+            return overview("Commands of the laboratory", {f"univoxel {LAB}": laboratory()}, end)
     return None
 
 
@@ -121,15 +130,15 @@ def groups() -> dict[str, dict[str, Command]]:
     """Commands in the order of work; what no group names is of a run."""
     first = ("capture", "poses", "cutout", "train", "batch")
     last = ("demo", "doctor", "completion")
-    run = [name for name in EVERYDAY if name not in first + last]
+    run = [name for name in COMMANDS if name not in first + last]
     named = {"From photographs": first, "Of a run": run, "Of the package": last}
-    found = {g: {n: EVERYDAY[n] for n in names if n in EVERYDAY} for g, names in named.items()}
-    found["Of the package"][LAB] = laboratory
+    found = {g: {n: COMMANDS[n] for n in names} for g, names in named.items()}
+    found["Of the package"][LAB] = lab
     return found
 
 
-def laboratory() -> None:
-    """Many trainings, compared and charted; submissions to benchmarks."""
+def lab() -> None:
+    """From a clone of the repository: what measures the method."""
 
 
 def take_threads(threads: int | None) -> None:
@@ -226,11 +235,11 @@ def spoken(common: Common, results_alone: bool) -> Iterator[None]:
 def _kept(call: Call) -> str:
     """What an interrupted command left behind."""
     out = call.run.keywords.get("out")
-    if call.run.func in (batch, compare, chart, stress):
+    if call.name in ("batch", "lab compare", "lab chart", "lab stress"):
         return f"; {out} keeps the trainings that are done: the same command goes on"
-    if call.run.func in (capture, poses):
+    if call.name in ("capture", "poses"):
         return f"; {out} keeps the steps that are done: the same command goes on"
-    if call.run.func is not train or not isinstance(out, Path):
+    if call.name != "train" or not isinstance(out, Path):
         return ""
     if (out / "scene.safetensors").exists():
         return f"; {out} keeps the last saved state: go on with --resume"

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import math
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
 
@@ -239,10 +238,3 @@ def _as_json(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)
     return json.loads(json.dumps(value, default=str))
-
-
-def __getattr__(name: str) -> Any:
-    """Where presets were before they had a module of their own."""
-    if name in ("budget", "chosen", "preset", "with_field"):
-        return getattr(import_module("univoxel.presets"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -56,32 +56,27 @@ class Usage(Exception):
 
 
 def parse(
-    arguments: Sequence[str], commands: Mapping[str, Command], lab: Mapping[str, Command]
+    arguments: Sequence[str], commands: Mapping[str, Command], prefix: str = ""
 ) -> Call | None:
     """The call that arguments ask for; None: help was asked for and printed.
 
     Args:
         commands: by name.
-        lab: those of the laboratory, also found without the word before them, as they once were.
+        prefix: what stands before their names.
 
     Raises:
         Usage: they make no command.
     """
     name, *rest = arguments
-    known, prefix = commands, ""
-    if name == LAB and rest:
-        (name, *rest), known, prefix = rest, lab, f"{LAB} "
-    elif name in lab:
-        known, prefix = lab, f"{LAB} "
-    if name not in known:
-        near = difflib.get_close_matches(name, [*known, *lab], n=1)
+    if name not in commands:
+        near = difflib.get_close_matches(name, commands, n=1)
         perhaps = f"; perhaps you meant {near[0]}" if near else ""
         raise Usage(f"no command {name!r}{perhaps}; see univoxel {prefix}--help")
     program, said = f"univoxel {prefix}{name}", io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             run, common = tyro.cli(
-                deferred(known[name]), prog=program, args=rest, config=(FlagCreatePairsOff,)
+                deferred(commands[name]), prog=program, args=rest, config=(FlagCreatePairsOff,)
             )
     except SystemExit as end:
         if not end.code:
@@ -143,16 +138,22 @@ def overview(title: str, groups: Mapping[str, Mapping[str, Command]], end: str) 
 
 
 def completion(shell: Shell, commands: Mapping[str, Command], lab: Mapping[str, Command]) -> str:
-    """The script that makes a shell complete commands, options and their choices."""
+    """The script that makes a shell complete commands, options and their choices.
+
+    Args:
+        lab: commands of the laboratory; none where it is not there.
+    """
 
     def laboratory(command):
         """Commands of the laboratory."""
 
-    laboratory.__annotations__["command"] = Annotated[_union(lab), OmitSubcommandPrefixes]
+    if lab:
+        laboratory.__annotations__["command"] = Annotated[_union(lab), OmitSubcommandPrefixes]
+        commands = {**commands, LAB: laboratory}
     said = io.StringIO()
     with contextlib.suppress(SystemExit), contextlib.redirect_stdout(said):
         tyro.cli(
-            _union({**commands, LAB: laboratory}),
+            _union(commands),
             prog="univoxel",
             args=["--tyro-write-completion", shell, "-"],
             config=(FlagCreatePairsOff, ConsolidateSubcommandArgs),

@@ -17,9 +17,9 @@ from typing import Any
 
 def command_line() -> str:
     """A section for each command: what it does, and a table of its options."""
-    from univoxel.commands import EVERYDAY, LABORATORY
+    from univoxel.commands import COMMANDS, laboratory
 
-    named = EVERYDAY | {f"lab {name}": function for name, function in LABORATORY.items()}
+    named = COMMANDS | {f"lab {name}": function for name, function in laboratory().items()}
     return "\n\n".join(_command(name, function) for name, function in named.items())
 
 

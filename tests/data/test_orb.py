@@ -7,12 +7,9 @@ import pytest
 import torch
 from layouts import HEIGHT, WIDTH, angle, scene, write_colmap
 
-from univoxel.camera import Cameras
 from univoxel.color import srgb_to_linear
 from univoxel.data import load_photos, load_truth
 from univoxel.data.images import write_exr, write_png
-from univoxel.data.orb import orb_light
-from univoxel.envmap import lookup
 from univoxel.errors import DataError
 
 
@@ -76,23 +73,6 @@ def test_other_scenes_lie_beside_the_scene(tmp_path, name):
     write_novel(folder, "x", scene_name=name)
     with pytest.raises(DataError, match="frame 0: expected scene_name as the name of a folder"):
         load_photos(folder, "novel", allow_outside=True)
-
-
-@pytest.mark.parametrize("column", [0, 8, 16, 24])
-def test_light_is_around_the_camera(tmp_path, column):
-    """From the left: behind, to the left, ahead and to the right of the camera."""
-    radiance = np.full((16, 32, 3), 0.25, np.float32)
-    radiance[7:9, column - 1 if column else -1] = radiance[7:9, column] = 4.0
-    write_exr(tmp_path / "0000.exr", dict(zip("RGB", np.moveaxis(radiance, 2, 0), strict=True)))
-    pose = torch.tensor(scene().poses[3], dtype=torch.float32)[None, :3]
-    camera = Cameras(pose, torch.ones(1, 2), torch.ones(1, 2), 2, 2)
-    light = orb_light(tmp_path / "0000.exr", camera)
-    right, up, back = pose[0, :, :3].T
-    seen = lookup(light, torch.stack([back, -right, -back, right, up, -up]))[:, 0]
-    wanted = torch.full((6,), 0.25)
-    wanted[column // 8] = 4.0
-    # Interpolated twice, at texels of 11 degrees
-    torch.testing.assert_close(seen, wanted, atol=0.9, rtol=0)
 
 
 def save(folder, place, array):

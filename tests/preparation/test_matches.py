@@ -9,10 +9,10 @@ import pytest
 import torch
 from analytic import RADIUS, look_at, photos_of
 
+from lab.stress.damage import turned
 from univoxel.camera import Cameras, image_rays, project
 from univoxel.data import Photos
 from univoxel.errors import UserError
-from univoxel.experiments.stress.damage import turned
 from univoxel.preparation import belief
 from univoxel.preparation.belief import Belief, doubted_pixels, right, weighed
 from univoxel.preparation.config import MatchesConfig, PreparationConfig

@@ -7,8 +7,8 @@ import pytest
 import torch
 from analytic import cameras_around, photos_of
 
+from lab.stress.damage import turned
 from univoxel.camera import project
-from univoxel.experiments.stress.damage import turned
 from univoxel.poses import PoseSteps
 from univoxel.preparation.hull import mask_distances
 from univoxel.preparation.registration import Edges, align_, contradiction

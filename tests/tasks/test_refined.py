@@ -8,13 +8,13 @@ import pytest
 import torch
 from analytic import LIGHTS, RADIUS, cameras_around, write_scene
 
+from lab.stress.damage import turned
 from univoxel.camera import project
 from univoxel.checkpoint import load_scene
 from univoxel.confidence.survey import survey
 from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
-from univoxel.experiments.stress.damage import turned
 from univoxel.lights import SGConfig
 from univoxel.preparation.prepare import find_silhouettes
 from univoxel.render.pipeline import extract_mesh

@@ -4,14 +4,11 @@ blender_HDR/<scene>/                                    photographs, in the layo
 ground_truth/<scene>/surface_normal/<name>.npy          [H, W, 3], axes of the camera
 ground_truth/<scene>/z_depth/<name>.npy                 [H, W] along -Z; 0 or less: nothing there
 ground_truth/<scene>/pseudo_gt_albedo/<name>.png        sRGB
-ground_truth/<scene>/env_map/<name>.exr                 the light in which <name> was photographed,
-                                                        around its camera: -Z in the middle, X to
-                                                        the right, Y on top
 
 Camera axes are x right, y up, z backwards.
 
-Source: the public code of Kuang et al. 2023 (Stanford-ORB), README, scripts/preprocess and
-orb/utils/env_map.py.
+Source: the public code of Kuang et al. 2023 (Stanford-ORB), README and
+scripts/preprocess.
 """
 
 from __future__ import annotations
@@ -22,49 +19,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from univoxel.camera import Cameras
 from univoxel.data.arrays import read_npy
 from univoxel.data.base import Photos
-from univoxel.data.maps import read_map
-from univoxel.envmap import EnvMap, lookup
 from univoxel.errors import DataError
-from univoxel.sphere import latlong_directions
 
 FILES = {
     "albedo": "pseudo_gt_albedo/{}.png",
     "normal": "surface_normal/{}.npy",
     "depth": "z_depth/{}.npy",
 }
-
-
-# From the axes of a camera to those of maps, where the middle is +X and the top +Z
-TO_MAP = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-
-
-def scene_folders(folder: Path) -> tuple[Path, Path]:
-    """The folder of a scene's linear photographs, and that of its truth.
-
-    Raises:
-        DataError: the folder is no scene of Stanford-ORB.
-    """
-    folder = folder.resolve()
-    root = folder.parent.parent
-    truth = root / "ground_truth" / folder.name
-    if not truth.is_dir():
-        raise DataError(f"{folder}: expected a scene of Stanford-ORB with {truth}, got none there")
-    return root / "blender_HDR" / folder.name, truth
-
-
-def orb_light(path: Path, camera: Cameras) -> EnvMap:
-    """The light around a camera, in the world.
-
-    Raises:
-        DataError: the file cannot be used.
-    """
-    local = read_map(path)
-    to_camera = camera.camera_to_world[0, :, :3].T
-    direction = latlong_directions(len(local.radiance)) @ (TO_MAP @ to_camera).T
-    return EnvMap(lookup(local, direction).clamp_min(0))
 
 
 def orb_files(photos: Photos, view: int) -> dict[str, Path]:

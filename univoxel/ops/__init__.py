@@ -35,8 +35,6 @@ from univoxel.ops.stereo import match_cost, match_cost_reference, semi_global, s
 from univoxel.ops.sum_rows import sum_rows, sum_rows_reference
 from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference, occluded_reference
 
-Lamp = PointLight  # its name before
-
 __all__ = [
     "EnvTables",
     "FieldAlongRays",

@@ -105,7 +105,7 @@ def relight_to_files(
         MissingExtra: an MP4 without imageio-ffmpeg.
         OSError: a file cannot be read or written.
     """
-    run, out, chosen = Path(run), Path(out), _options(options)
+    run, out, chosen = Path(run), Path(out), RelightOptions(**options)
     several = not isinstance(envmap, str | Path)
     paths = [Path(path) for path in envmap] if several else [Path(envmap)]
     if len({path.stem for path in paths}) != len(paths):
@@ -160,7 +160,7 @@ def relight_images(
     Raises:
         UserError: as of `relight_to_files`.
     """
-    chosen = _options({"cameras": cameras, **options})
+    chosen = RelightOptions(cameras=cameras, **options)
     light = lighting(envmap, chosen)
     studio = _studio(Path(run), chosen)
     frames = frames_of(studio.names, [NO_MAP], chosen.turn)
@@ -191,12 +191,6 @@ def lighting(
         tuple(replace(light, intensity=times(light.intensity)) for light in point_lights),
     )
     return rotated(lights, options.rotate)
-
-
-def _options(given: dict[str, Any]) -> RelightOptions:
-    """The record of keyword arguments; those of before have another name for point lights."""
-    names = {"lamps": "point_lights"}
-    return RelightOptions(**{names.get(name, name): value for name, value in given.items()})
 
 
 @dataclass(frozen=True)

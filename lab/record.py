@@ -28,7 +28,7 @@ class Setting:
     name: str  # of its folder and in tables; unique among the settings of an experiment
     preset: str = "auto"
     light: LightName = "hybrid"
-    minutes: float | None = None  # as of config.chosen
+    minutes: float | None = None  # as of presets.chosen
     changes: tuple[str, ...] = ()  # FIELD=VALUE of the configuration
 
     def config(self, data: Path, out: Path) -> TrainConfig:

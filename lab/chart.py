@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from lab import plots, runner
+from lab.plots import Measure
+from lab.record import Outcome, Setting, result_text
 from univoxel.config import TrainConfig
 from univoxel.errors import ProcessFailed, UserError
-from univoxel.experiments import plots, runner
-from univoxel.experiments.plots import Measure
-from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
 from univoxel.training.config import StageConfig

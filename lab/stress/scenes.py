@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lab.stress.shapes import Part, build
 from univoxel.camera import Cameras, pixel_rays
-from univoxel.experiments.stress.shapes import Part, build
 from univoxel.ops import VisibilityScene
 from univoxel.sphere import latlong_directions, texel_solid_angles
 

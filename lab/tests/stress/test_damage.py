@@ -8,15 +8,15 @@ import pytest
 import torch
 from scipy import ndimage
 
+from lab.stress import damage as module
+from lab.stress import render, scenes
+from lab.stress.damage import NO_MASK, Damage, damaged
+from lab.stress.scenes import Spec
 from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos, load_truth
 from univoxel.data.images import read_image, write_exr
 from univoxel.errors import DataError
-from univoxel.experiments.stress import damage as module
-from univoxel.experiments.stress import render, scenes
-from univoxel.experiments.stress.damage import NO_MASK, Damage, damaged
-from univoxel.experiments.stress.scenes import Spec
 
 SPEC = Spec(size=24, views=6, tests=2)
 MODES = ("train", "test", "relight/dusk", "relight/studio")

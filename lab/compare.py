@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
+from lab import plots, runner
+from lab.plots import Measure
+from lab.record import Outcome, Setting, result_text
 from univoxel.errors import ProcessFailed, UserError
-from univoxel.experiments import plots, runner
-from univoxel.experiments.plots import Measure
-from univoxel.experiments.record import Outcome, Setting, result_text
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
 
@@ -46,7 +46,7 @@ def compare(
         scenes: folders of data sets, of different names.
         out: every training is kept in out/SCENE/LIGHT, and not done again by a later call.
         light: names as of --light; `NAME:FIELD=VALUE[,FIELD=VALUE]` changes fields of the light.
-        preset, minutes: how much work goes into each, as of config.chosen.
+        preset, minutes: how much work goes into each, as of presets.chosen.
         changes: FIELD=VALUE of the configuration, for all.
         samples: of the light per pixel of relit pictures in evaluation.
         jobs, scheduler: trainings at once here, or who else trains; as of runner.run_pairs.

@@ -9,15 +9,15 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
+from lab import plots, runner
+from lab.record import Outcome, Setting, result_text
+from lab.stress import axes as of_axes
+from lab.stress import render, report
+from lab.stress.axes import BASE, INTACT, SECOND, Axis, Level
+from lab.stress.damage import Damage, clipped, damaged
+from lab.stress.report import Cell
+from lab.stress.scenes import Spec
 from univoxel.errors import UserError
-from univoxel.experiments import plots, runner
-from univoxel.experiments.record import Outcome, Setting, result_text
-from univoxel.experiments.stress import axes as of_axes
-from univoxel.experiments.stress import render, report
-from univoxel.experiments.stress.axes import BASE, INTACT, SECOND, Axis, Level
-from univoxel.experiments.stress.damage import Damage, clipped, damaged
-from univoxel.experiments.stress.report import Cell
-from univoxel.experiments.stress.scenes import Spec
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
 

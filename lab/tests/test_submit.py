@@ -6,13 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from analytic import cameras_around, write_scene
+from layouts import scene as layout
 from test_bad_input import SMALL
 
+from lab.submit import SIZE, orb_light, submit
+from univoxel.camera import Cameras
 from univoxel.cli import main
 from univoxel.data.images import read_exr, write_exr
+from univoxel.envmap import lookup
 from univoxel.errors import DataError, ExistingFile, UserError
-from univoxel.tasks.submit import SIZE, submit
 
 NAME, OTHER = "ball_scene001", "ball_scene002"
 
@@ -96,3 +100,20 @@ def test_runs_and_arguments_that_cannot_be_used(orb, tmp_path):
     with pytest.raises(DataError, match=r"c: expected a scene of Stanford-ORB with .*ground_truth"):
         submit(run, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("column", [0, 8, 16, 24])
+def test_light_is_around_the_camera(tmp_path, column):
+    """From the left: behind, to the left, ahead and to the right of the camera."""
+    radiance = np.full((16, 32, 3), 0.25, np.float32)
+    radiance[7:9, column - 1 if column else -1] = radiance[7:9, column] = 4.0
+    write_exr(tmp_path / "0000.exr", dict(zip("RGB", np.moveaxis(radiance, 2, 0), strict=True)))
+    pose = torch.tensor(layout().poses[3], dtype=torch.float32)[None, :3]
+    camera = Cameras(pose, torch.ones(1, 2), torch.ones(1, 2), 2, 2)
+    light = orb_light(tmp_path / "0000.exr", camera)
+    right, up, back = pose[0, :, :3].T
+    seen = lookup(light, torch.stack([back, -right, -back, right, up, -up]))[:, 0]
+    wanted = torch.full((6,), 0.25)
+    wanted[column // 8] = 4.0
+    # Interpolated twice, at texels of 11 degrees
+    torch.testing.assert_close(seen, wanted, atol=0.9, rtol=0)

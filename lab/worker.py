@@ -1,4 +1,4 @@
-"""The process of one training: `python -m univoxel.experiments.worker FOLDER`.
+"""The process of one training: `python -m lab.worker FOLDER`.
 
 FOLDER holds job.json; result.json is written into it, whole or not at all. A process of its own
 gives each training a fresh peak of memory, and takes nothing down with it when it dies. Who begins
@@ -15,10 +15,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from lab.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.checkpoint import load_checkpoint
 from univoxel.config import TrainConfig, check_same
 from univoxel.errors import UserError
-from univoxel.experiments.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.machine import load
 from univoxel.tasks.envmap import Comparison, envmap
 from univoxel.tasks.evaluate import evaluate

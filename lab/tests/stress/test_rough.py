@@ -6,8 +6,8 @@ import torch
 from analytic import photos_of
 from scipy import ndimage
 
-from univoxel.experiments.stress import rough
-from univoxel.experiments.stress.axes import AXES
+from lab.stress import rough
+from lab.stress.axes import AXES
 
 VIEWS, SIZE = 20, 64
 

@@ -12,6 +12,8 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from lab.stress.render import SPEC
+from lab.stress.rough import rough_masks, shifted
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos, load_photos
@@ -19,8 +21,6 @@ from univoxel.data.images import read_image, write_exr, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
 from univoxel.errors import NothingFound, UserError
-from univoxel.experiments.stress.render import SPEC
-from univoxel.experiments.stress.rough import rough_masks, shifted
 from univoxel.segmentation.distances import surroundings
 from univoxel.segmentation.separation import find_object, mask
 

@@ -5,13 +5,13 @@ import pydoc
 
 import pytest
 
+from lab import plots
+from lab.record import Outcome
+from lab.stress import report
+from lab.stress.axes import AXES, Axis, Level
+from lab.stress.report import Break, Cell, breaking_point, kind
 from univoxel import cli
 from univoxel.errors import DataError
-from univoxel.experiments import plots
-from univoxel.experiments.record import Outcome
-from univoxel.experiments.stress import report
-from univoxel.experiments.stress.axes import AXES, Axis, Level
-from univoxel.experiments.stress.report import Break, Cell, breaking_point, kind
 
 LEVELS = tuple(Level(v, f"{v:g}") for v in (0.0, 1.0, 2.0, 4.0))
 AXIS = Axis("fog", "fog, metres", LEVELS)

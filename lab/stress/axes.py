@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from lab.stress.damage import NO_MASK, Damage
+from lab.stress.scenes import Spec
 from univoxel.errors import UserError
-from univoxel.experiments.stress.damage import NO_MASK, Damage
-from univoxel.experiments.stress.scenes import Spec
 
 BASE = Spec(views=80)  # photographs are of its first 40 views unless an axis says otherwise
 SECOND = Spec(light="dusk", tests=0)  # the base scene again, in another light

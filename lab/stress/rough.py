@@ -72,7 +72,7 @@ def _drawn(alpha: np.ndarray, percent: float, random: np.random.Generator) -> np
 
 
 def _without_a_part(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    place = np.argwhere(mask & ~np.asarray(ndimage.binary_erosion(mask)))
+    place = np.argwhere(mask & ~np.asarray(ndimage.binary_erosion(mask), bool))
     return mask & ~_disc(mask, place[random.integers(len(place))], PART)
 
 

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lab import worker
+from lab.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.cluster.drive import drive
 from univoxel.cluster.machines import machines
 from univoxel.cluster.piece import Ended, Piece, Step
 from univoxel.data import load_photos
 from univoxel.errors import UserError
-from univoxel.experiments import worker
-from univoxel.experiments.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.files import replacing
 from univoxel.machine import threads_asked
 from univoxel.training import progress

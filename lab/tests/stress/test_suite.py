@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from lab.record import Outcome
+from lab.stress import axes, render, suite
+from lab.stress.axes import AXES, BASE, INTACT
+from lab.stress.scenes import Spec
 from univoxel.cli import main
-from univoxel.experiments.record import Outcome
-from univoxel.experiments.stress import axes, render, suite
-from univoxel.experiments.stress.axes import AXES, BASE, INTACT
-from univoxel.experiments.stress.scenes import Spec
 from univoxel.joint.config import JointConfig
 from univoxel.names import LIGHTS
 

@@ -9,7 +9,13 @@ DIR/depth/<name>.exr                along -Z
 DIR/albedo/<name>.exr               linear
 DIR/mesh.obj
 
-Source: the public code of Kuang et al. 2023 (Stanford-ORB), scripts/test.py and orb/pipelines.
+Read beside what univoxel.data.orb reads, for the light of other scenes:
+
+ground_truth/<scene>/env_map/<name>.exr    the light in which <name> was photographed, around its
+                                           camera: -Z in the middle, X to the right, Y on top
+
+Source: the public code of Kuang et al. 2023 (Stanford-ORB), scripts/test.py, orb/pipelines and
+orb/utils/env_map.py.
 """
 
 from __future__ import annotations
@@ -21,15 +27,15 @@ import torch
 from torch import Tensor
 
 from univoxel.bars import track
-from univoxel.camera import resize
+from univoxel.camera import Cameras, resize
 from univoxel.checkpoint import load_scene
 from univoxel.data import Photos
 from univoxel.data.images import write_exr
-from univoxel.data.orb import orb_light, scene_folders
+from univoxel.data.maps import read_map
 from univoxel.data.shots import cameras_of
 from univoxel.data.transforms import read_frames
-from univoxel.envmap import tables
-from univoxel.errors import ExistingFile, UserError
+from univoxel.envmap import EnvMap, lookup, tables
+from univoxel.errors import DataError, ExistingFile, UserError
 from univoxel.files import replacing
 from univoxel.names import BOUNCES, SAMPLES
 from univoxel.pictures.layers import Relighting, render_layers
@@ -38,11 +44,14 @@ from univoxel.render.pipeline import extract_mesh
 from univoxel.render.relight import Lighting, traced_mesh
 from univoxel.run import photos_of
 from univoxel.scene import Scene
+from univoxel.sphere import latlong_directions
 from univoxel.tasks.export import export
 
 SIZE = 512  # pixels along a side of the benchmark's pictures
 FILE = "submission.json"
 LIGHT = "light"  # name of the only one of a picture
+# From the axes of a camera to those of maps, where the middle is +X and the top +Z
+TO_MAP = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 @torch.no_grad()
@@ -87,6 +96,32 @@ def submit(
         text = json.dumps({"info": {folder.name: info}}, indent=1)
         temporary.write_text(text + "\n", encoding="utf-8")
     return out / FILE
+
+
+def scene_folders(folder: Path) -> tuple[Path, Path]:
+    """The folder of a scene's linear photographs, and that of its truth.
+
+    Raises:
+        DataError: the folder is no scene of Stanford-ORB.
+    """
+    folder = folder.resolve()
+    root = folder.parent.parent
+    truth = root / "ground_truth" / folder.name
+    if not truth.is_dir():
+        raise DataError(f"{folder}: expected a scene of Stanford-ORB with {truth}, got none there")
+    return root / "blender_HDR" / folder.name, truth
+
+
+def orb_light(path: Path, camera: Cameras) -> EnvMap:
+    """The light around a camera, in the world.
+
+    Raises:
+        DataError: the file cannot be used.
+    """
+    local = read_map(path)
+    to_camera = camera.camera_to_world[0, :, :3].T
+    direction = latlong_directions(len(local.radiance)) @ (TO_MAP @ to_camera).T
+    return EnvMap(lookup(local, direction).clamp_min(0))
 
 
 def _test_views(

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from univoxel.experiments import chart as module
-from univoxel.experiments.plots import pareto
-from univoxel.experiments.record import Outcome
+from lab import chart as module
+from lab.plots import pareto
+from lab.record import Outcome
 
 
 def test_the_front_is_what_no_other_beats():

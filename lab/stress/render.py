@@ -1,6 +1,6 @@
 """Scenes as photographs by Mitsuba 3, a path tracer of others, in the layout of our data sets.
 
-`python -m univoxel.experiments.stress.render FOLDER VARIANT` is the process that renders: Mitsuba's
+`python -m lab.stress.render FOLDER VARIANT` is the process that renders: Mitsuba's
 compiled variants end the process where the LLVM they find does not serve.
 """
 
@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from lab.stress import scenes
+from lab.stress.scenes import RELIGHT, Spec
+from lab.stress.shapes import Part
 from univoxel.camera import Cameras
 from univoxel.data.images import write_exr
 from univoxel.data.transforms import write_cameras
 from univoxel.errors import MissingExtra, ProcessFailed, UserError
-from univoxel.experiments.stress import scenes
-from univoxel.experiments.stress.scenes import RELIGHT, Spec
-from univoxel.experiments.stress.shapes import Part
 
 VARIANTS = ("llvm_ad_rgb", "scalar_rgb")  # the first is several times as fast and needs LLVM
 SPEC = "scene.json"

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from lab.stress import render, scenes, shapes
+from lab.stress.scenes import Spec
 from univoxel.camera import image_rays, project
 from univoxel.data import load_cameras, load_points, relight_maps
 from univoxel.envmap import EnvMap, lookup
-from univoxel.experiments.stress import render, scenes, shapes
-from univoxel.experiments.stress.scenes import Spec
 from univoxel.sphere import latlong_directions, texel_solid_angles
 
 SPECS = {

@@ -6,9 +6,9 @@ import json
 import pytest
 from analytic import write_scene
 
+from lab import compare as module
+from lab.record import Outcome
 from univoxel.cli import main
-from univoxel.experiments import compare as module
-from univoxel.experiments.record import Outcome
 
 
 def outcome(scene, light, psnr, error=None, **measures):

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any
 
+from lab import plots
+from lab.plots import Measure
+from lab.record import Outcome
+from lab.stress.axes import Axis, Level
 from univoxel.errors import UserError
-from univoxel.experiments import plots
-from univoxel.experiments.plots import Measure
-from univoxel.experiments.record import Outcome
-from univoxel.experiments.stress.axes import Axis, Level
 
 DROP = 3.0  # dB of relit PSNR below the reference: broken
 ACROSS = 4  # panels in a row

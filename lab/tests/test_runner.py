@@ -11,12 +11,12 @@ import pytest
 from analytic import write_scene
 from filelock import FileLock
 
+from lab import runner, worker
+from lab.record import Setting, load_outcome
 from univoxel.checkpoint import FILE
 from univoxel.cluster.piece import Ended
 from univoxel.errors import DataError
 from univoxel.evaluation.measures import MEASURES
-from univoxel.experiments import runner, worker
-from univoxel.experiments.record import Setting, load_outcome
 
 TINY = (
     *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),

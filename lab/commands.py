@@ -1,4 +1,4 @@
-"""Commands that measure the method: compare, chart, stress, submit."""
+"""Commands of the laboratory: `univoxel lab compare`, `chart`, `stress`, `submit`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from univoxel.commands.arguments import (
     check_minutes,
 )
 from univoxel.names import BOUNCES, LIGHTS, SAMPLES, LightName, PresetName, PresetOrAuto
+from univoxel.parsing import Command
 
 
 def submit(
@@ -37,7 +38,7 @@ def submit(
         samples: light samples per pixel of relit pictures
         bounces: reflections between parts of the object in relit pictures, 0 for none
     """
-    from univoxel.tasks import submit as task
+    from lab import submit as task
 
     print(task.submit(run, out, samples, bounces))
 
@@ -73,7 +74,7 @@ def compare(
         jobs: trainings at once; with more than one, their times say little
         scheduler: of a Dask cluster whose workers train, as of batch
     """
-    from univoxel.experiments import compare as experiment
+    from lab import compare as experiment
 
     check_minutes(minutes)
     where = {"jobs": jobs, "scheduler": scheduler}
@@ -116,7 +117,7 @@ def chart(
         jobs: trainings at once; with more than one, their times say little
         scheduler: of a Dask cluster whose workers train, as of batch
     """
-    from univoxel.experiments import chart as experiment
+    from lab import chart as experiment
 
     where = {"jobs": jobs, "scheduler": scheduler}
     print(experiment.chart(scenes, out, preset, light, quick, only, set, samples, **where))
@@ -161,7 +162,15 @@ def stress(
         jobs: trainings at once; with more than one, their times say little
         scheduler: of a Dask cluster whose workers train, as of batch
     """
-    from univoxel.experiments.stress import suite
+    from lab.stress import suite
 
     where = {"jobs": jobs, "scheduler": scheduler}
     print(suite.stress(out, only, light, seeds, quick, set, **where))
+
+
+COMMANDS: dict[str, Command] = {
+    "compare": compare,
+    "chart": chart,
+    "stress": stress,
+    "submit": submit,
+}

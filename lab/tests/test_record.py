@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from univoxel.experiments.record import Outcome, Setting, identity, load_outcome
+from lab.record import Outcome, Setting, identity, load_outcome
 
 
 def test_a_setting_is_a_preset_with_changes():
