@@ -4,7 +4,7 @@ docs/figures/diagrams.py draws them."""
 # From the bottom up. A module imports only from layers below its own and, inside its folder, the
 # helpers named here.
 LAYERS = [
-    {"errors"},
+    {"errors", "retired"},
     {
         "bars",
         "child",
@@ -31,7 +31,6 @@ LAYERS = [
         "joint.config",
         "preparation.config",
         "training.config",
-        "compression.config",
         "confidence.config",
     },
     {"compression.choices"},
@@ -106,7 +105,7 @@ HELPERS = {
         "observations",
         "sharp_sky",
     },
-    "compression": {"prune", "quality", "search", "sizes", "storage"},
+    "compression": {"search", "storage"},
     "confidence": {"survey"},
     "pictures": {"animation", "inline"},
     "evaluation": {"measures", "truth"},

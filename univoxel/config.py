@@ -10,7 +10,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
 
-from univoxel.compression.config import CompressionConfig
 from univoxel.confidence.config import ConfidenceConfig
 from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.fields.features import PER_LEVEL
@@ -19,6 +18,7 @@ from univoxel.joint.config import JointConfig
 from univoxel.lights import read_config
 from univoxel.names import CamerasFrom, Capacity, LightFrameOrAuto, MasksFrom
 from univoxel.preparation.config import PreparationConfig
+from univoxel.retired import without_retired
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.validation import check_fields, record
@@ -85,8 +85,6 @@ class TrainConfig:
     loss: LossConfig = field(default_factory=LossConfig)  # weights in each StageConfig
     # what happens before the first gradient: masks, hull, cameras, exposures, carving
     preparation: PreparationConfig = field(default_factory=PreparationConfig)
-    # how the model's sizes are chosen, where capacity is adaptive
-    compression: CompressionConfig = field(default_factory=CompressionConfig)
     # what is said of the scene afterwards; evaluation reads it from the run's config.json
     confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
 
@@ -202,7 +200,7 @@ def check_same(cfg: TrainConfig) -> None:
     now = _as_json(cfg)
     for one in (began, now):
         one["downscale"] = one["downscale"] or 1  # 0 was 1 before it was found
-    for name in ("stages", "scene", "preparation", "compression", *since):
+    for name in ("stages", "scene", "preparation", *since):
         if began.get(name) != now[name]:
             raise UserError(
                 f"{path}: the run began with other {name}: resume with the same "
@@ -212,7 +210,8 @@ def check_same(cfg: TrainConfig) -> None:
 
 
 def _completed(before: Any, now: Any) -> Any:
-    """A configuration from JSON with the defaults of fields that were added since.
+    """A configuration from JSON with the defaults of fields that were added since, and without
+    those that are retired.
 
     Args:
         now: a configuration of the same classes.
@@ -221,7 +220,7 @@ def _completed(before: Any, now: Any) -> Any:
         return [_completed(b, n) for b, n in zip(before, now, strict=True)]
     if not dataclasses.is_dataclass(now) or not isinstance(before, dict):
         return before
-    result = dict(before)
+    result = without_retired(type(now), before)
     for known in dataclasses.fields(now):
         if known.name in before:
             result[known.name] = _completed(before[known.name], getattr(now, known.name))

@@ -13,7 +13,7 @@ import torch
 from univoxel import ranks, shelf
 from univoxel.build import build_scene
 from univoxel.checkpoint import FILE, load_checkpoint, save_scene
-from univoxel.compression import plan, sizes
+from univoxel.compression import plan, storage
 from univoxel.compression.choices import chosen_reach
 from univoxel.confidence.report import numbers, words
 from univoxel.confidence.survey import survey
@@ -215,7 +215,7 @@ def make_stage_(
     if pinned is not None:
         pinned.pin_(scene.field)
     if isinstance(stage, JointConfig):
-        rows = sizes.sky_rows(stage.mirror.rows, cfg.budget_mb, cfg.compression)
+        rows = storage.sky_rows(stage.mirror.rows, cfg.budget_mb)
         stage = replace(stage, mirror=replace(stage.mirror, rows=rows))
         joint_stage.solve(scene, scene.registered(photos), stage, cfg.seed, progress)
     else:
@@ -226,10 +226,7 @@ def make_stage_(
     if last:
         fit_sharpness_(scene, pixels)
     if cfg.capacity == "adaptive" and (last or not progress.clock.over):
-        choices = plan.adapt_(scene, cfg, index, box, pixels, progress.clock.pace)
-        progress.chosen += choices
-        if not last and plan.begun_in_rehearsal(scene, choices):
-            progress.clock.count_as_done(cfg.compression.rehearsal_share)
+        progress.chosen += plan.adapt_(scene, cfg, index, pixels)
     if not ranks.leads():
         return
     reach, state = chosen_reach(progress.chosen), progress.state()
