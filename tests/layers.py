@@ -29,7 +29,6 @@ LAYERS = [
     {"assets", "metrics", "render"},
     {
         "joint.config",
-        "preparation.config",
         "training.config",
         "confidence.config",
     },

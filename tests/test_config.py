@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import univoxel
 from univoxel.config import TrainConfig, check_same, load_config, save_config
 from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.joint.config import JointConfig, MirrorConfig
@@ -188,6 +189,7 @@ def test_the_file_holds_every_field(tmp_path):
     config = replace(CONFIG, out=tmp_path, seed=7)
     save_config(config)
     stored = json.loads((tmp_path / "config.json").read_text())
+    assert stored["version"] == univoxel.__version__
     assert stored["seed"] == 7
     assert stored["data"] == "photos"
     assert stored["stages"][0]["lr_sdf"] == list(STAGE.lr_sdf)
@@ -298,7 +300,10 @@ def test_a_file_that_holds_no_configuration(tmp_path):
 
 def test_retired_fields_of_a_file_are_passed_over(tmp_path):
     """Runs of earlier versions are read, and go on."""
-    cfg = saved(tmp_path, lambda content: content.update(compression={"rehearsal_steps": 99}))
+    cfg = saved(
+        tmp_path,
+        lambda content: content.update(preparation={"carving": {"agree": 9.0}}, compression={}),
+    )
     check_same(cfg)
     assert load_config(tmp_path / "config.json") == cfg
 

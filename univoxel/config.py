@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
 
+from univoxel import __version__
 from univoxel.confidence.config import ConfidenceConfig
 from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.fields.features import PER_LEVEL
@@ -17,7 +18,6 @@ from univoxel.files import read_json, replacing
 from univoxel.joint.config import JointConfig
 from univoxel.lights import read_config
 from univoxel.names import CamerasFrom, Capacity, LightFrameOrAuto, MasksFrom
-from univoxel.preparation.config import PreparationConfig
 from univoxel.retired import without_retired
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
@@ -83,8 +83,6 @@ class TrainConfig:
     # sizes of the model, and what light it has
     scene: SceneConfig = field(default_factory=SceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)  # weights in each StageConfig
-    # what happens before the first gradient: masks, hull, cameras, exposures, carving
-    preparation: PreparationConfig = field(default_factory=PreparationConfig)
     # what is said of the scene afterwards; evaluation reads it from the run's config.json
     confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
 
@@ -149,10 +147,13 @@ def _is_utf8(path: Path) -> bool:
 def save_config(cfg: TrainConfig) -> None:
     """Write the resolved configuration to config.json in the run's folder, whole or not at all.
 
+    The version of the package stands before it: constants that are no fields are those of it.
+
     Raises:
         OSError: it cannot be written.
     """
-    text = json.dumps(dataclasses.asdict(cfg), indent=2, default=str)
+    values = {"version": __version__} | dataclasses.asdict(cfg)
+    text = json.dumps(values, indent=2, default=str)
     with replacing(cfg.out / "config.json") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
@@ -170,7 +171,7 @@ def load_config(path: Path) -> TrainConfig:
     try:
         if not isinstance(values, dict):
             raise ConfigError(f"expected an object with the configuration, got {values!r:.60}")
-        values = dict(values)
+        values = {name: value for name, value in values.items() if name != "version"}
         if isinstance(values.get("scene"), dict):
             values["scene"] = dict(values["scene"])
             values["scene"]["light"] = read_config(values["scene"].get("light", {}))
@@ -200,7 +201,7 @@ def check_same(cfg: TrainConfig) -> None:
     now = _as_json(cfg)
     for one in (began, now):
         one["downscale"] = one["downscale"] or 1  # 0 was 1 before it was found
-    for name in ("stages", "scene", "preparation", *since):
+    for name in ("stages", "scene", *since):
         if began.get(name) != now[name]:
             raise UserError(
                 f"{path}: the run began with other {name}: resume with the same "

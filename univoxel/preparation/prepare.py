@@ -17,7 +17,6 @@ from univoxel.names import Varying
 from univoxel.poses import PoseSteps
 from univoxel.preparation.belief import weighed
 from univoxel.preparation.carving import carve_within_time
-from univoxel.preparation.config import PreparationConfig
 from univoxel.preparation.exposures import say_clipped, varying_and_gains
 from univoxel.preparation.hull import visual_hull
 from univoxel.preparation.light_frame import turntable_of
@@ -64,12 +63,12 @@ def find_silhouettes(photos: Photos, cfg: TrainConfig) -> Silhouettes:
         DataError: the silhouettes share no volume.
     """
     if cfg.cameras == "auto":
-        say_strays(photos, cfg.preparation.light_frame)
+        say_strays(photos)
     given = photos
-    photos, distance = fitted_masks(given, cfg.masks, cfg.preparation.masks)
+    photos, distance = fitted_masks(given, cfg.masks)
     try:
-        belief = weighed(photos, distance, cfg.cameras, cfg.masks, cfg.preparation)
-        found = mended(photos, distance, belief, cfg.preparation) if belief.votes > 1 else None
+        belief = weighed(photos, distance, cfg.cameras, cfg.masks)
+        found = mended(photos, distance, belief) if belief.votes > 1 else None
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
     doubted, edges_given = None, photos is given and found is None
@@ -88,25 +87,22 @@ def prepare(silhouettes: Silhouettes, cfg: TrainConfig) -> Prepared:
     """
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)
-    constants = cfg.preparation
     photos, distance, box = silhouettes.photos, silhouettes.distance, silhouettes.box
     grid = fit_grid(*box, round(1e6 * stage.voxels))
     poses = None
     if silhouettes.refined:
-        poses = registered_poses(distance, photos.cameras, box, constants.registration)
+        poses = registered_poses(distance, photos.cameras, box)
         photos = replace(photos, cameras=poses.corrected(photos.cameras))
-    hull = visual_hull(distance, photos.cameras, grid, constants.hull, silhouettes.votes)
-    say_clipped(photos, constants.exposures)
-    varying, gains = varying_and_gains(
-        photos, hull, grid, cfg.scene.varying, cfg.exposures, constants.exposures
-    )
-    turntable = turntable_of(photos, hull, grid, cfg.light_frame, constants.light_frame)
+    hull = visual_hull(distance, photos.cameras, grid, silhouettes.votes)
+    say_clipped(photos)
+    varying, gains = varying_and_gains(photos, hull, grid, cfg.scene.varying, cfg.exposures)
+    turntable = turntable_of(photos, hull, grid, cfg.light_frame)
     pinned = None
     if varying == "none" and turntable is None:
-        pinned = find_pinned(silhouettes, photos.cameras, hull, grid, constants)
+        pinned = find_pinned(silhouettes, photos.cameras, hull, grid)
     if cfg.hollows and varying != "light" and turntable is None:
         seconds = cfg.hollows * 60 * cfg.minutes
-        carved = carve_within_time(hull, grid, photos, gains, seconds, constants.carving)
+        carved = carve_within_time(hull, grid, photos, gains, seconds)
         hull = carved if pinned is None else torch.where(pinned.nodes(hull, grid), hull, carved)
     return Prepared(silhouettes, poses, grid, hull, varying, gains, turntable, pinned)
 
@@ -119,8 +115,8 @@ def pinned_in(silhouettes: Silhouettes, scene: Scene, cfg: TrainConfig) -> Pinne
         return None
     cameras = scene.registered(silhouettes.photos).cameras
     grid = fit_grid(*silhouettes.box, round(1e6 * stage.voxels))
-    hull = visual_hull(silhouettes.distance, cameras, grid, cfg.preparation.hull)
-    return find_pinned(silhouettes, cameras, hull, grid, cfg.preparation)
+    hull = visual_hull(silhouettes.distance, cameras, grid)
+    return find_pinned(silhouettes, cameras, hull, grid)
 
 
 def find_pinned(
@@ -128,7 +124,6 @@ def find_pinned(
     cameras: Cameras,
     hull: Tensor,
     grid: GridShape,
-    cfg: PreparationConfig,
 ) -> PinnedHull | None:
     """`pinned_hull`; rough masks give no hull that could be right.
 
@@ -139,4 +134,4 @@ def find_pinned(
     if silhouettes.votes > 1:
         return None
     photos = replace(silhouettes.photos, cameras=cameras)
-    return pinned_hull(photos, silhouettes.distance, hull, grid, cfg.pinned, cfg.hull)
+    return pinned_hull(photos, silhouettes.distance, hull, grid)
