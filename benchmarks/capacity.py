@@ -4,8 +4,7 @@
 
 Trains and evaluates every DATA with every setting, all steps, relit with 16 samples; what is done
 already is not done again. `ball` for DATA makes the scene of ball.py. A setting is `dense`,
-`sparse` or `hash`, the preset's sizes on such a field; `adaptive`, its sizes as limits, and
-`dense-adaptive`, those on dense grids;
+`sparse` or `hash`, the preset's sizes on such a field; `adaptive`, its sizes as limits;
 `budget-X`, adaptive in X million bytes; `voxels-X`, dense with X million voxels in the fine stages;
 `channels-N`, dense with N feature channels, half of them of material. Parameters are counted as
 `univoxel info` does, in the model's file. Writes results/capacity.json, .png and .svg.
@@ -45,8 +44,6 @@ def configured(base: TrainConfig, setting: str) -> TrainConfig:
     """
     kind, _, value = setting.partition("-")
     match kind:
-        case "dense" if value == "adaptive":
-            return replace(with_field(base, "dense"), capacity="adaptive")
         case "dense" | "sparse" | "hash":
             return with_field(base, kind)
         case "voxels":

@@ -239,7 +239,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         cfg = chosen(options.preset, options.minutes, options.scene, Path(folder) / "run")
         stages = (part_of(s, options.part) for s in cfg.stages)
-        cfg = replace(cfg, stages=tuple(stages), capacity="fixed")  # rehearsals are no stages
+        cfg = replace(cfg, stages=tuple(stages), capacity="fixed")  # what chooses is no stage
         result = profile(cfg, time.process_time if options.cpu else time.perf_counter)
     result |= {
         "scene": options.scene.name,

@@ -4,7 +4,7 @@ them, and docs/figures/diagrams.py draws those of the package."""
 # From the bottom up. A module imports only from layers below its own and, inside its folder, the
 # helpers named here.
 LAYERS = [
-    {"errors"},
+    {"errors", "retired"},
     {
         "bars",
         "child",
@@ -28,9 +28,7 @@ LAYERS = [
     {"assets", "metrics", "render"},
     {
         "joint.config",
-        "preparation.config",
         "training.config",
-        "compression.config",
         "confidence.config",
     },
     {"compression.choices"},
@@ -100,7 +98,7 @@ HELPERS = {
         "observations",
         "sharp_sky",
     },
-    "compression": {"prune", "quality", "search", "sizes", "storage"},
+    "compression": {"search", "storage"},
     "confidence": {"survey"},
     "pictures": {"animation", "inline"},
     "evaluation": {"measures", "truth"},

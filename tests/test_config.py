@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import univoxel
 from univoxel.config import TrainConfig, check_same, load_config, save_config
 from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.joint.config import JointConfig, MirrorConfig
@@ -191,6 +192,7 @@ def test_the_file_holds_every_field(tmp_path):
     config = replace(CONFIG, out=tmp_path, seed=7)
     save_config(config)
     stored = json.loads((tmp_path / "config.json").read_text())
+    assert stored["version"] == univoxel.__version__
     assert stored["seed"] == 7
     assert stored["data"] == "photos"
     assert stored["stages"][0]["lr_sdf"] == list(STAGE.lr_sdf)
@@ -299,10 +301,14 @@ def test_a_file_that_holds_no_configuration(tmp_path):
         check_same(saved(tmp_path, lambda content: [content]))
 
 
-def test_a_run_does_not_go_on_under_other_constants_of_compression(tmp_path):
-    cfg = saved(tmp_path, lambda content: content["compression"].update(rehearsal_steps=99))
-    with pytest.raises(ValueError, match="the run began with other compression"):
-        check_same(cfg)
+def test_retired_fields_of_a_file_are_passed_over(tmp_path):
+    """Runs of earlier versions are read, and go on."""
+    cfg = saved(
+        tmp_path,
+        lambda content: content.update(preparation={"carving": {"agree": 9.0}}, compression={}),
+    )
+    check_same(cfg)
+    assert load_config(tmp_path / "config.json") == cfg
 
 
 @pytest.mark.parametrize("light", LIGHTS)

@@ -13,7 +13,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from univoxel.checkpoint import FILE, SHELL, load_checkpoint, load_scene, save_scene
-from univoxel.compression import prune
+from univoxel.compression.search import drop_mirror_levels_
 from univoxel.errors import ConfigError
 from univoxel.fields import field as fields
 from univoxel.fields.bricks import BrickDistances
@@ -116,7 +116,7 @@ for run in sys.argv[1:]:
 
 def test_a_file_without_a_table_of_directions_is_one_from_before_there_were_any(tmp_path):
     scene = small_scene()
-    prune.drop_mirror_levels_(scene, 0)
+    drop_mirror_levels_(scene, 0)
     path = save_scene(scene, tmp_path, {})
     with safe_open(path, "pt") as file:
         meta = json.loads(file.metadata()["univoxel"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from univoxel import lights
-from univoxel.compression import plan, sizes
+from univoxel.compression import plan, storage
 from univoxel.config import TrainConfig
 from univoxel.fields.features import PER_LEVEL, Levels
 from univoxel.fields.field import Field, dense_field, hash_field
@@ -34,7 +34,7 @@ def build_scene(prepared: Prepared, cfg: TrainConfig) -> Scene:
         turntable=prepared.turntable,
         refined=silhouettes.refined,
         views=views,
-        mirror_levels=sizes.mirror_levels(cfg.scene, cfg.budget_mb, cfg.compression),
+        mirror_levels=storage.mirror_levels(cfg.scene, cfg.budget_mb),
     )
     scene = Scene(sized, field)
     if prepared.poses:
@@ -42,7 +42,7 @@ def build_scene(prepared: Prepared, cfg: TrainConfig) -> Scene:
     if scene.views and prepared.gains is not None:
         scene.views.add(prepared.gains[:, None].expand(-1, 3))
     if cfg.budget_mb is not None:
-        sizes.check_budget(scene, cfg.budget_mb, cfg.compression)
+        storage.check_budget(scene, cfg.budget_mb)
     return scene
 
 
@@ -53,6 +53,6 @@ def build_field(prepared: Prepared, cfg: TrainConfig) -> Field:
     if stages[0].field != "hash":
         return dense_field(grid, cfg.scene.channels, hull)
     finest = min(fit_grid(*box, plan.stage_voxels(s, [])).voxel_size for s in stages)
-    rows = sizes.table_rows(cfg.scene, cfg.budget_mb, cfg.compression)
+    rows = storage.table_rows(cfg.scene, cfg.budget_mb)
     levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL, rows)
     return hash_field(grid, levels, hull)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from univoxel.compression.config import CompressionConfig
+from univoxel import __version__
 from univoxel.confidence.config import ConfidenceConfig
 from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.fields.features import PER_LEVEL
@@ -17,7 +17,7 @@ from univoxel.files import read_json, replacing
 from univoxel.joint.config import JointConfig
 from univoxel.lights import read_config
 from univoxel.names import CamerasFrom, Capacity, LightFrameOrAuto, MasksFrom
-from univoxel.preparation.config import PreparationConfig
+from univoxel.retired import without_retired
 from univoxel.scene import SceneConfig
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.validation import check_fields, record
@@ -84,10 +84,6 @@ class TrainConfig:
     # sizes of the model, and what light it has
     scene: SceneConfig = field(default_factory=SceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)  # weights in each StageConfig
-    # what happens before the first gradient: masks, hull, cameras, exposures, carving
-    preparation: PreparationConfig = field(default_factory=PreparationConfig)
-    # how the model's sizes are chosen, where capacity is adaptive
-    compression: CompressionConfig = field(default_factory=CompressionConfig)
     # what is said of the scene afterwards; evaluation reads it from the run's config.json
     confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
 
@@ -152,10 +148,13 @@ def _is_utf8(path: Path) -> bool:
 def save_config(cfg: TrainConfig) -> None:
     """Write the resolved configuration to config.json in the run's folder, whole or not at all.
 
+    The version of the package stands before it: constants that are no fields are those of it.
+
     Raises:
         OSError: it cannot be written.
     """
-    text = json.dumps(dataclasses.asdict(cfg), indent=2, default=str)
+    values = {"version": __version__} | dataclasses.asdict(cfg)
+    text = json.dumps(values, indent=2, default=str)
     with replacing(cfg.out / "config.json") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
@@ -173,7 +172,7 @@ def load_config(path: Path) -> TrainConfig:
     try:
         if not isinstance(values, dict):
             raise ConfigError(f"expected an object with the configuration, got {values!r:.60}")
-        values = dict(values)
+        values = {name: value for name, value in values.items() if name != "version"}
         if isinstance(values.get("scene"), dict):
             values["scene"] = dict(values["scene"])
             values["scene"]["light"] = read_config(values["scene"].get("light", {}))
@@ -203,7 +202,7 @@ def check_same(cfg: TrainConfig) -> None:
     now = _as_json(cfg)
     for one in (began, now):
         one["downscale"] = one["downscale"] or 1  # 0 was 1 before it was found
-    for name in ("stages", "scene", "preparation", "compression", *since):
+    for name in ("stages", "scene", *since):
         if began.get(name) != now[name]:
             raise UserError(
                 f"{path}: the run began with other {name}: resume with the same "
@@ -213,7 +212,8 @@ def check_same(cfg: TrainConfig) -> None:
 
 
 def _completed(before: Any, now: Any) -> Any:
-    """A configuration from JSON with the defaults of fields that were added since.
+    """A configuration from JSON with the defaults of fields that were added since, and without
+    those that are retired.
 
     Args:
         now: a configuration of the same classes.
@@ -222,7 +222,7 @@ def _completed(before: Any, now: Any) -> Any:
         return [_completed(b, n) for b, n in zip(before, now, strict=True)]
     if not dataclasses.is_dataclass(now) or not isinstance(before, dict):
         return before
-    result = dict(before)
+    result = without_retired(type(now), before)
     for known in dataclasses.fields(now):
         if known.name in before:
             result[known.name] = _completed(before[known.name], getattr(now, known.name))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from univoxel.errors import ConfigError
+from univoxel.retired import without_retired
 
 T = TypeVar("T")
 
@@ -38,7 +39,7 @@ def record(kind: type[T], values: object) -> T:
     """A dataclass from JSON: what dataclasses.asdict made of one and a file held.
 
     Tuples are lists in JSON, and paths are text; dataclasses are objects or, where they were read
-    before, instances.
+    before, instances. Retired fields are passed over.
 
     Raises:
         ConfigError: names class and field: one that is missing or unknown, or a value of another
@@ -47,6 +48,7 @@ def record(kind: type[T], values: object) -> T:
     name = kind.__name__
     if not isinstance(values, dict):
         raise ConfigError(f"{name}: expected an object, got {values!r:.60}")
+    values = without_retired(kind, values)
     hints, known = get_type_hints(kind), {f.name: f for f in _fields(kind) if f.init}
     if unknown := values.keys() - known.keys():
         raise ConfigError(f"{name}: no field {min(map(str, unknown))!r:.60}")
@@ -108,4 +110,4 @@ def _has_fields(kind: Any, value: Any) -> bool:
     """Whether a type is no dataclass, or one with all fields that an object of JSON has."""
     if not dataclasses.is_dataclass(kind) or not isinstance(value, dict):
         return True
-    return value.keys() <= {f.name for f in _fields(kind)}
+    return without_retired(kind, value).keys() <= {f.name for f in _fields(kind)}

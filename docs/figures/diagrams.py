@@ -104,9 +104,8 @@ def stages() -> Figure:
             arrow(axes, (x - 0.2, y + 0.75), (x, y + 0.75))
     axes.plot([1.68, 7.72], [3.0, 3.0], color=SOFT, lw=1)
     axes.text(4.7, 3.16, "TrainConfig.stages, within TrainConfig.minutes", ha="center", color=SOFT)
-    for x, word, color in ((3.14, "grid", RED), (4.7, "heads", RED)):
-        arrow(axes, (x, 0.62), (x, y - 0.02), color=color)
-        axes.text(x, 0.5, f"capacity: {word}", ha="center", color=color, size=8)
+    arrow(axes, (4.7, 0.62), (4.7, y - 0.02), color=RED)
+    axes.text(4.7, 0.5, "capacity: mirror levels", ha="center", color=RED, size=8)
     axes.text(0.8, 0.5, "no gradient yet", ha="center", color=SOFT, size=8)
     axes.text(8.6, 0.5, "nothing is trained", ha="center", color=SOFT, size=8)
     axes.text(

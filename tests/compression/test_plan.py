@@ -5,12 +5,12 @@ import json
 
 import pytest
 import torch
-from analytic import photos_of, sphere_scene, write_scene
+from analytic import photos_of, write_scene
 from spare_scene import LIGHT
 
 from univoxel.checkpoint import FILE, load_checkpoint, load_scene
 from univoxel.compression import plan
-from univoxel.compression.config import CompressionConfig
+from univoxel.compression.storage import FEWEST_VOXELS
 from univoxel.config import TrainConfig
 from univoxel.joint.config import JointConfig
 from univoxel.lights import EnvmapConfig
@@ -20,53 +20,6 @@ from univoxel.tasks.info import info
 from univoxel.tasks.train import train
 from univoxel.training import loop
 from univoxel.training.config import StageConfig
-from univoxel.training.pixels import TrainingPixels
-from univoxel.training.progress import Rehearsal
-
-CFG = CompressionConfig()
-
-
-@pytest.mark.parametrize(
-    ("quality", "chosen"),
-    [
-        # voxels: PSNR; a ninth at a time from 364,500, then a third of the chosen
-        ({364_500: 30.0, 40_500: 30.0, 4_500: 30.0}, 4_500),  # a plain scene: the coarsest
-        ({364_500: 30.0, 40_500: 29.8, 4_500: 29.0, 121_500: 29.8}, 364_500),  # finer pays
-        ({364_500: 30.0, 40_500: 29.8, 4_500: 29.0, 121_500: 29.95}, 121_500),  # a little less
-        ({364_500: 30.0, 40_500: 29.8, 4_500: 29.95}, 4_500),  # between, chance had it
-        ({364_500: 30.0, 40_500: 30.5, 4_500: 30.3, 13_500: 30.39}, 40_500),  # against the best
-    ],
-)
-def test_a_grid_is_as_coarse_as_its_rehearsal_allows(quality, chosen, tmp_path, monkeypatch):
-    scene = sphere_scene(0, voxel_size=0.1)
-    box = scene.field.bounds()
-    counts = {plan.fit_grid(*box, n): n for n in quality}
-
-    stage = StageConfig(voxels=0.3645, iterations=40, share=1.0)
-    cfg = TrainConfig(tmp_path, tmp_path, (stage, stage), minutes=1.0)
-    pixels = TrainingPixels(photos_of(2, 8), torch.zeros(1, 3), torch.zeros(1, 3))
-
-    def rehearse(cfg_, pixels_, tried, on_grid, steps):
-        assert (cfg_, pixels_, steps) == (cfg, pixels, 8)
-        assert on_grid == plan.on_grid(stage, box, tried.field.voxel_size)
-        with torch.no_grad():
-            tried.material.net.linear[-1].bias[0] = counts[tried.field.grid]
-        return quality[counts[tried.field.grid]]
-
-    monkeypatch.setattr(plan, "rehearsal", rehearse)
-    (choice,) = plan.choose_grid_(scene, cfg, stage, box, pixels, pace=1.0)
-    assert (choice.kind, choice.before, choice.after) == ("voxels", 364_500, chosen)
-    assert counts[scene.field.grid] == chosen
-    assert scene.material.net.linear[-1].bias[0] == chosen  # it goes on from that rehearsal
-    assert "364,500 30.00 dB" in choice.why
-
-
-def test_a_rehearsal_is_off_the_record():
-    rehearsal = Rehearsal(4)
-    assert list(rehearsal.clock.steps()) == [0, 0.25, 0.5, 0.75]
-    assert rehearsal.clock.step == 4
-    assert not rehearsal.due()
-    assert not rehearsal.checkpoint_due()
 
 
 def test_edges_stay_as_sharp_on_a_coarser_grid():
@@ -92,7 +45,7 @@ def test_no_grid_is_finer_than_the_photographs(tmp_path):
         grid = plan.fit_grid(*box, plan.stage_voxels(cut.stages[2], []))
         assert grid.voxel_size == pytest.approx(wide * pixel, rel=1e-3)
     cut = plan.limited_to_pixels(dataclasses.replace(cfg, voxel_pixels=99.0), photos.cameras, box)
-    assert plan.stage_voxels(cut.stages[2], []) == CFG.fewest_voxels
+    assert plan.stage_voxels(cut.stages[2], []) == FEWEST_VOXELS
     free = dataclasses.replace(cfg, voxel_pixels=0.0)
     assert plan.limited_to_pixels(free, photos.cameras, box) == free
 
@@ -122,11 +75,8 @@ def test_an_adapted_run_says_what_was_chosen_and_is_read_again(run, tmp_path):
     assert json.loads((tmp_path / "info.json").read_text()) == found
     assert (tmp_path / "picture.png").stat().st_size > 0
     kinds = [c["what"] for c in found["chosen"]]
-    assert kinds[:2] == ["voxels", "channels"]
-    assert "reach" in kinds
+    assert kinds == ["voxels", "mirror levels", "reach"]
     assert found["bytes"] == (run / FILE).stat().st_size <= 0.3e6
-    scene = load_scene(run)
-    assert scene.cfg.channels == found["channels"] == scene.field.features.shape[-1]
     assert found["grid"]["nodes"] <= 6e4
     assert found["grid"]["share_with_distance"] < 1
     assert any("reach 4 -> " in choice["said"] for choice in found["chosen"])
@@ -145,30 +95,26 @@ def test_the_log_tells_of_choices(run):
 
 
 def test_resume_goes_on_with_what_was_chosen(data, tmp_path, monkeypatch):
-    cfg = config(data, tmp_path / "run")
+    cfg = config(data, tmp_path / "run", budget_mb=0.3)
     original, counts = task.run_stage, []
 
     def killed(scene, cfg, stage, pixels, progress):
-        if not isinstance(progress, Rehearsal):
-            if progress.clock.stage == 1:
-                raise KeyboardInterrupt
-            original(scene, cfg, stage, pixels, progress)
-        # A rehearsal: the third grid serves as well as the first
         counts.append(scene.field.grid.nodes_count)
+        if progress.clock.stage == 1:
+            raise KeyboardInterrupt
+        original(scene, cfg, stage, pixels, progress)
 
-    for module in (task, loop):  # stages, and their rehearsals
-        monkeypatch.setattr(module, "run_stage", killed)
-    monkeypatch.setattr(loop, "held_out_psnr", lambda *_, **__: 20.0)
+    monkeypatch.setattr(task, "run_stage", killed)
     with pytest.raises(KeyboardInterrupt):
         train(cfg)
-    coarsest = counts[-1]
-    assert coarsest < counts[1]
-    with pytest.raises(ValueError, match="the run began with other capacity"):
-        train(dataclasses.replace(cfg, capacity="fixed"), resume=True)
+    fits = plan.fit_grid(*load_scene(cfg.out).field.bounds(), 50_000).nodes_count
+    assert counts[1] < fits
+    with pytest.raises(ValueError, match="the run began with other budget_mb"):
+        train(dataclasses.replace(cfg, budget_mb=1.0), resume=True)
     seen = []
     monkeypatch.setattr(task, "run_stage", lambda scene, *_: seen.append(scene.field.grid))
     train(cfg, resume=True)
-    assert [grid.nodes_count for grid in seen] == [coarsest]
+    assert [grid.nodes_count for grid in seen] == counts[1:]
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +143,7 @@ def test_a_light_without_networks_is_adapted_too(data, tmp_path):
     cfg = config(data, tmp_path / "run", light)
     stages = tuple(dataclasses.replace(s, iterations=8, rays=64) for s in cfg.stages)
     out = train(dataclasses.replace(cfg, stages=stages))
-    assert [c["what"] for c in load_checkpoint(out)[1]["chosen"]][:2] == ["voxels", "channels"]
+    assert [c["what"] for c in load_checkpoint(out)[1]["chosen"]] == ["mirror levels", "reach"]
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,8 @@ from cropped import cropped
 from univoxel.camera import Cameras, image_rays, pixel_rays
 from univoxel.data import Photos
 from univoxel.grid import fit_grid
-from univoxel.preparation import carving
+from univoxel.preparation import carving, depth_sweep
 from univoxel.preparation.carving import carve_concavities, carving_pictures
-from univoxel.preparation.config import CarvingConfig
 from univoxel.preparation.depth_sweep import log_colors
 from univoxel.preparation.hull import mask_distances, visual_hull
 
@@ -109,12 +108,12 @@ def test_a_pit_is_opened():
     assert (found >= hull).all()
 
 
-def test_a_dark_pit_is_opened():
+def test_a_dark_pit_is_opened(monkeypatch):
     hull, found, truth, voxel = opened(with_pit, dim, from_above())
     pit = (hull < -voxel) & (truth > voxel)
     assert (found[pit] > 0).float().mean() > 0.8
-    as_it_is = CarvingConfig(log_share=0.0)
-    as_it_is = carve_concavities(*hull_of(with_pit, dim, from_above()), as_it_is)
+    monkeypatch.setattr(depth_sweep, "LOG_SHARE", 0.0)
+    as_it_is = carve_concavities(*hull_of(with_pit, dim, from_above()))
     assert (as_it_is[pit] > 0).float().mean() < (found[pit] > 0).float().mean() - 0.2
 
 
@@ -152,12 +151,12 @@ def test_what_photographs_cannot_tell_stays(look):
 
 @pytest.mark.parametrize(
     ("rule", "strict"),
-    [("agree", 1.0), ("least", 1.0), ("enough", 1.0), ("better", 1.0), ("piece", 0.2)],
+    [("AGREE", 1.0), ("LEAST", 1.0), ("ENOUGH", 1.0), ("BETTER", 1.0), ("PIECE", 0.2)],
 )
-def test_each_rule_can_keep_the_pit_closed(rule, strict):
-    cfg = CarvingConfig(**{rule: strict})
+def test_each_rule_can_keep_the_pit_closed(rule, strict, monkeypatch):
+    monkeypatch.setattr(carving, rule, strict)
     case = hull_of(with_pit, checks, from_above())
-    assert torch.equal(carve_concavities(*case, cfg), case[0])
+    assert torch.equal(carve_concavities(*case), case[0])
 
 
 @cache
@@ -170,11 +169,12 @@ def mostly_from_below():
     return Cameras(torch.stack([look_at(p) for p in at]), cameras.focal, cameras.centre, SIZE, SIZE)
 
 
-def test_what_few_views_see_through_stays():
+def test_what_few_views_see_through_stays(monkeypatch):
     """They may all look at a lamp in something glossy."""
     case = hull_of(with_pit, checks, mostly_from_below())
     assert torch.equal(carve_concavities(*case), case[0])
-    assert not torch.equal(carve_concavities(*case, CarvingConfig(least=0.05)), case[0])
+    monkeypatch.setattr(carving, "LEAST", 0.05)
+    assert not torch.equal(carve_concavities(*case), case[0])
 
 
 def test_two_views_open_nothing():

@@ -9,7 +9,6 @@ from analytic import RADIUS, photos_of
 from univoxel.color import linear_to_srgb
 from univoxel.grid import fit_grid
 from univoxel.preparation import carving as task
-from univoxel.preparation.config import CARVING, CarvingConfig
 
 
 @pytest.fixture
@@ -31,7 +30,7 @@ def test_hollows_are_opened_where_little_time_is_expected(monkeypatch, hull, sha
     assert pictures.shape[1] == 32  # so that shrinking counts
     pixels = pictures[..., 3].float().sum() / 255
     found = task.carve_within_time(
-        sdf, grid, photos, None, share * CARVING.pixel_seconds * float(pixels)
+        sdf, grid, photos, None, share * task.PIXEL_SECONDS * float(pixels)
     )
     assert torch.equal(found, sdf + 0.25 if opens else sdf)
 
@@ -39,10 +38,10 @@ def test_hollows_are_opened_where_little_time_is_expected(monkeypatch, hull, sha
 def test_time_is_not_expected_of_photographs_that_are_left_out(monkeypatch, hull):
     sdf, grid = hull
     monkeypatch.setattr(task, "carve_concavities", lambda hull, *_: hull + 0.25)
-    few = CarvingConfig(views=4)
-    seconds = CARVING.pixel_seconds * 5 * 32**2  # of four whole pictures, and more
+    monkeypatch.setattr(task, "VIEWS", 4)
+    seconds = task.PIXEL_SECONDS * 5 * 32**2  # of four whole pictures, and more
     assert torch.equal(
-        task.carve_within_time(sdf, grid, photos_of(40, 64), None, seconds, few), sdf + 0.25
+        task.carve_within_time(sdf, grid, photos_of(40, 64), None, seconds), sdf + 0.25
     )
 
 
@@ -72,9 +71,10 @@ def test_pictures_are_as_one_exposure_would_have_them():
     assert (task.carving_pictures(exposed, 0.06)[0].int() - wanted).abs().max() > 10
 
 
-def test_of_many_photographs_some_say_what_is_hollow():
+def test_of_many_photographs_some_say_what_is_hollow(monkeypatch):
+    monkeypatch.setattr(task, "VIEWS", 4)
     photos = photos_of(10, 16)
-    pictures, cameras = task.carving_pictures(photos, 0.01, cfg=CarvingConfig(views=4))
+    pictures, cameras = task.carving_pictures(photos, 0.01)
     assert len(pictures) == len(cameras) == 4
     torch.testing.assert_close(cameras.camera_to_world, photos.cameras.camera_to_world[::3])
     assert torch.equal(pictures[2, ..., 3], (255 * photos.alpha[6]).round().byte())

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy import ndimage
 
-from univoxel.preparation.config import MASKS, MaskConfig
+from univoxel.preparation import masks as task
 from univoxel.preparation.hull import mask_distances
 from univoxel.preparation.masks import eroded, mask_excess, repeats_edge
 
@@ -38,8 +38,8 @@ def before(surroundings: torch.Tensor, disc: torch.Tensor) -> torch.Tensor:
     return inside * disc + (1 - inside) * surroundings
 
 
-def found(color: torch.Tensor, masks: torch.Tensor, cfg: MaskConfig = MASKS) -> int:
-    return mask_excess(color, masks, mask_distances(masks), cfg)
+def found(color: torch.Tensor, masks: torch.Tensor) -> int:
+    return mask_excess(color, masks, mask_distances(masks))
 
 
 @pytest.mark.parametrize("eight_bits", [False, True])
@@ -91,17 +91,18 @@ def test_no_edge_says_nothing(masks):
     assert found(torch.rand(2, 9, 9, 3), masks) == 0
 
 
-def test_wider_masks_than_are_looked_for_stay():
+def test_wider_masks_than_are_looked_for_stay(monkeypatch):
     color = before(patterned(0, 0.0, 0.4), patterned(1, 0.3, 0.9))
     assert found(color, coverage(9)) == 0
-    further = MaskConfig(reach_share=0.1)  # of 96 pixels
-    assert found(color, coverage(9), further) == 9
+    monkeypatch.setattr(task, "REACH_SHARE", 0.1)  # of 96 pixels
+    assert found(color, coverage(9)) == 9
 
 
-def test_of_many_photographs_some_are_looked_at():
+def test_of_many_photographs_some_are_looked_at(monkeypatch):
+    monkeypatch.setattr(task, "VIEWS", 2)
     color, alpha = before(patterned(0, 0.0, 0.4), patterned(1, 0.3, 0.9)), coverage(0)
     alpha[::3] = coverage(3)[::3]  # two of six
-    assert found(color, alpha, MaskConfig(views=2)) == 3
+    assert found(color, alpha) == 3
 
 
 def test_taken_in_masks_end_where_the_object_does():

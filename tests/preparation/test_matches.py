@@ -14,8 +14,8 @@ from univoxel.camera import Cameras, image_rays, project
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.preparation import belief
+from univoxel.preparation import matches as task
 from univoxel.preparation.belief import Belief, doubted_pixels, right, weighed
-from univoxel.preparation.config import MatchesConfig, PreparationConfig
 from univoxel.preparation.hull import mask_distances
 from univoxel.preparation.matches import (
     Agreement,
@@ -28,7 +28,15 @@ from univoxel.preparation.matches import (
 from univoxel.training.pixels import MARGIN, split_pixels
 
 VIEWS, SIZE = 8, 200
-FEW = PreparationConfig(matches=MatchesConfig(pairs=8, min_matches=40))  # for time
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few():
+    """Few pairs, for time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(task, "PAIRS", 8)
+        patch.setattr(task, "MIN_MATCHES", 40)
+        yield
 
 
 def cameras_on_a_ring(views=VIEWS, size=SIZE):
@@ -78,7 +86,7 @@ def distance(photos):
 
 @pytest.fixture(scope="module")
 def matches(photos, distance):
-    return find_matches(photos, distance, FEW.matches)
+    return find_matches(photos, distance)
 
 
 def wrong(photos, degrees):
@@ -101,7 +109,7 @@ def test_projections_of_a_point_lie_on_each_others_lines():
 def test_true_cameras_are_believed_and_turned_ones_are_not(photos, matches):
     found = agreement(photos.cameras, matches)
     assert found.median < 0.4  # what keypoints are placed to
-    assert found.matches == len(matches) >= FEW.matches.min_matches
+    assert found.matches == len(matches) >= task.MIN_MATCHES
     assert right(found, 5.0)
     before = found.median
     for degrees in (0.5, 1.0):
@@ -114,7 +122,7 @@ def test_true_cameras_are_believed_and_turned_ones_are_not(photos, matches):
 def test_matches_are_found_by_other_cameras_as_well(photos, distance):
     """Cameras choose neighbours only: wrong ones choose no matches that suit them."""
     cameras = wrong(photos, 1.0)
-    found = find_matches(replace(photos, cameras=cameras), distance, FEW.matches)
+    found = find_matches(replace(photos, cameras=cameras), distance)
     assert agreement(photos.cameras, found).median < 0.4
     assert not right(agreement(cameras, found), 100.0)
 
@@ -128,17 +136,18 @@ def test_cameras_are_to_blame_where_they_explain_the_contradiction():
 
 def test_plain_objects_leave_it_undecided(distance):
     plain = photographs(lambda points: torch.full_like(points, 0.5))
-    assert agreement(plain.cameras, find_matches(plain, distance, FEW.matches)) is None
+    assert agreement(plain.cameras, find_matches(plain, distance)) is None
 
 
 def test_photographs_without_an_object_have_no_matches(photos):
     empty = torch.full((VIEWS, SIZE, SIZE), 99.0)
-    assert len(find_matches(photos, empty, FEW.matches)) == 0
+    assert len(find_matches(photos, empty)) == 0
 
 
-def test_neighbours_see_the_object_from_near():
+def test_neighbours_see_the_object_from_near(monkeypatch):
+    monkeypatch.setattr(task, "PAIRS", 5)
     cameras = cameras_on_a_ring()
-    for one, other in neighbours(cameras, MatchesConfig(pairs=5)):
+    for one, other in neighbours(cameras):
         assert other - one == 1  # 15 degrees apart
     assert neighbours(cameras_on_a_ring(1)) == []
 
@@ -153,7 +162,7 @@ def bitten(photos):
 def test_a_mask_that_lacks_a_part_is_doubted_and_cameras_stay(photos, caplog):
     spoilt, distance = bitten(photos)
     with caplog.at_level("INFO"):
-        found = weighed(spoilt, distance, "auto", "auto", FEW)
+        found = weighed(spoilt, distance, "auto", "auto")
     assert (found.refined, found.votes) == (False, 2)
     assert "cameras are believed" in caplog.text
     assert "the masks are rough" in caplog.text
@@ -167,7 +176,7 @@ def test_a_mask_that_lacks_a_part_is_doubted_and_cameras_stay(photos, caplog):
 
 def test_masks_as_given_are_not_doubted(photos):
     spoilt, distance = bitten(photos)
-    found = weighed(spoilt, distance, "auto", "given", FEW)
+    found = weighed(spoilt, distance, "auto", "given")
     assert (found.refined, found.votes) == (False, 1)
     assert found.box[1][2] < 0.5 * RADIUS
 
@@ -175,17 +184,17 @@ def test_masks_as_given_are_not_doubted(photos):
 def test_cameras_that_photographs_contradict_are_refined(photos, distance, caplog):
     off = replace(photos, cameras=wrong(photos, 1.0))
     with caplog.at_level("INFO"):
-        found = weighed(off, distance, "auto", "auto", FEW)
+        found = weighed(off, distance, "auto", "auto")
     assert (found.refined, found.votes) == (True, 1)
     assert "from where the cameras put them; silhouettes contradict" in caplog.text
-    assert not weighed(off, distance, "given", "auto", FEW).refined
+    assert not weighed(off, distance, "given", "auto").refined
 
 
 def test_silhouettes_that_agree_are_not_asked_twice(photos, distance, monkeypatch):
     monkeypatch.setattr(belief, "find_matches", lambda *_: pytest.fail("nobody doubts anything"))
-    found = weighed(photos, distance, "auto", "auto", FEW)
+    found = weighed(photos, distance, "auto", "auto")
     assert (found.refined, found.votes) == (False, 1)
-    assert weighed(photos, distance, "refined", "auto", FEW).refined
+    assert weighed(photos, distance, "refined", "auto").refined
 
 
 def test_one_empty_place_in_masks_is_outvoted_or_refused(photos):
@@ -194,11 +203,11 @@ def test_one_empty_place_in_masks_is_outvoted_or_refused(photos):
     alpha[3] = 0
     alpha[3, :8, :8] = 1
     spoilt, distance = replace(photos, alpha=alpha), mask_distances(alpha)
-    found = weighed(spoilt, distance, "auto", "auto", FEW)
+    found = weighed(spoilt, distance, "auto", "auto")
     assert found.votes == 2
     assert found.box[1].min() > 0.9 * RADIUS
     with pytest.raises(UserError, match="share no volume"):
-        weighed(spoilt, distance, "auto", "given", FEW)
+        weighed(spoilt, distance, "auto", "given")
 
 
 def test_what_all_masks_show_is_nowhere_doubted():

@@ -8,13 +8,12 @@ import torch
 from analytic import RADIUS, photos_of
 
 from univoxel.data import Photos
-from univoxel.errors import ConfigError, DataError, UserError
-from univoxel.preparation import mending, prepare
+from univoxel.errors import DataError, UserError
+from univoxel.preparation import belief, mending, prepare, registration
 from univoxel.preparation.belief import Belief
-from univoxel.preparation.config import OUTLINES, PREPARATION, REGISTRATION, OutlineConfig
 from univoxel.preparation.hull import hull_sdf, mask_distances
 from univoxel.preparation.mending import mended
-from univoxel.preparation.registration import contradiction
+from univoxel.preparation.registration import MAX_CONTRADICTION, contradiction
 from univoxel.presets import preset
 
 VIEWS, SIZE = 24, 96
@@ -66,7 +65,7 @@ def test_exact_masks_beside_wrong_ones_stay_and_carve_alone(photos):
     found = mended(spoilt, mask_distances(spoilt.alpha), ROUGH)
     assert torch.equal(found.photos.alpha, spoilt.alpha)
     assert found.belief.votes == 1
-    assert found.belief.off <= REGISTRATION.max_contradiction
+    assert found.belief.off <= MAX_CONTRADICTION
     lost = (photos.alpha > 0.5) & (spoilt.alpha < 0.5)
     assert found.doubted[lost].float().mean() > 0.9
     assert found.doubted[~lost].float().mean() < 1e-3
@@ -91,7 +90,7 @@ def test_what_two_masks_lack_together_comes_back(photos):
     assert whole.max() < 0
 
 
-def test_ground_that_a_mask_keeps_is_doubted_and_no_edge(photos):
+def test_ground_that_a_mask_keeps_is_doubted_and_no_edge(photos, monkeypatch):
     alpha = photos.alpha.clone()
     alpha[5, -30:, 20:60] = 1
     spoilt = replace(photos, alpha=alpha)
@@ -99,12 +98,12 @@ def test_ground_that_a_mask_keeps_is_doubted_and_no_edge(photos):
     kept = (alpha > 0.5) & (photos.alpha < 0.5)
     assert found.doubted[kept].float().mean() > 0.9
     # The outline of what it keeps is no edge that others would have to show
-    most = replace(REGISTRATION, quantile=0.99)  # they are one in forty
+    monkeypatch.setattr(registration, "QUANTILE", 0.99)  # they are one in forty
     all_edges, edges = (
-        contradiction(found.distance, photos.cameras, BOX, most, doubted)
+        contradiction(found.distance, photos.cameras, BOX, doubted)
         for doubted in (None, found.doubted)
     )
-    assert edges <= REGISTRATION.max_contradiction < all_edges
+    assert edges <= MAX_CONTRADICTION < all_edges
     assert found.belief.votes == 1
 
 
@@ -112,7 +111,7 @@ def test_edges_that_waver_are_moved_by_colours(photos):
     rough = wavering(photos, 1.5)
     distance = mask_distances(rough.alpha)
     belief = replace(ROUGH, off=contradiction(distance, photos.cameras, BOX))
-    assert belief.off > 2 * REGISTRATION.max_contradiction
+    assert belief.off > 2 * MAX_CONTRADICTION
     found = mended(rough, distance, belief)
     sure = ~found.doubted
     before = agreement(rough.alpha[sure], photos.alpha[sure])
@@ -133,11 +132,11 @@ def test_most_masks_know_better_than_each_of_them(photos, monkeypatch):
     again = mended(rough, mask_distances(rough.alpha), ROUGH).photos.alpha
     left = 1 - agreement(once[0].photos.alpha, photos.alpha)
     assert 1 - agreement(again, photos.alpha) < 0.8 * left
-    assert draw(once[0], 0.01, ROUGH, PREPARATION) is once[0]  # a hundredth of a pixel
+    assert draw(once[0], 0.01, ROUGH) is once[0]  # a hundredth of a pixel
 
 
 @pytest.mark.parametrize(("lacking", "votes"), [((), 1), ((5,), ROUGH.votes)])
-def test_edges_that_move_for_nothing_go_back(photos, caplog, lacking, votes):
+def test_edges_that_move_for_nothing_go_back(photos, caplog, monkeypatch, lacking, votes):
     """Where pictures are shifted, masks are right as they are, and cameras or lenses wrong. One
     view carves, unless another lacks a part."""
     shifts = [round(3 * math.sin(2.4 * view)) for view in range(VIEWS)]
@@ -146,19 +145,13 @@ def test_edges_that_move_for_nothing_go_back(photos, caplog, lacking, votes):
         for of_all in (photos.alpha, photos.color)
     )
     shifted = without_a_part(replace(photos, alpha=alpha, color=color), lacking)
-    wide = replace(PREPARATION, hull=replace(PREPARATION.hull, rough_pixels=4.0))
+    monkeypatch.setattr(belief, "ROUGH_PIXELS", 4.0)
     with caplog.at_level("INFO", "univoxel"):
-        found = mended(shifted, mask_distances(shifted.alpha), ROUGH, wide)
+        found = mended(shifted, mask_distances(shifted.alpha), ROUGH)
     assert torch.equal(found.photos.alpha, shifted.alpha)
     assert found.doubted.any() == bool(lacking)
     assert found.belief.votes == votes
     assert "edges of masks stay" in caplog.text
-
-
-@pytest.mark.parametrize("kept", [0.0, 1.5])
-def test_a_share_that_is_kept_is_one(kept):
-    with pytest.raises(ConfigError, match=rf"kept must be in \(0, 1\], got {kept}"):
-        OutlineConfig(kept=kept)
 
 
 def test_edges_move_as_far_as_the_rest_contradicts_itself(photos, monkeypatch):
@@ -177,10 +170,9 @@ def test_edges_move_as_far_as_the_rest_contradicts_itself(photos, monkeypatch):
         distance,
         mending.doubted_pixels(distance, rough.cameras, ROUGH),
         ROUGH,
-        PREPARATION,
     )
     mended(rough, distance, replace(ROUGH, off=50.0))
-    wanted = max(OUTLINES.further * first.belief.off, OUTLINES.least)
+    wanted = max(mending.FURTHER * first.belief.off, mending.LEAST)
     assert reaches == [wanted, wanted]
     assert wanted < 10
 
@@ -192,7 +184,7 @@ def test_what_was_doubted_stays_so(photos):
     doubted = torch.zeros(rough.alpha.shape, dtype=torch.bool)
     doubted[3, 20:30, 20:30] = True
     found = mending.Mended(rough, doubted, distance, ROUGH)
-    assert mending._drawn_from_hull(found, 2.0, ROUGH, PREPARATION).doubted[doubted].all()
+    assert mending._drawn_from_hull(found, 2.0, ROUGH).doubted[doubted].all()
 
 
 def test_photographs_of_the_object_alone_keep_their_masks():

@@ -15,7 +15,7 @@ from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape, fit_grid
 from univoxel.lights.turntable import Turntable
 from univoxel.optim import rows_of
-from univoxel.preparation.config import PinnedConfig
+from univoxel.preparation import pinned as task
 from univoxel.preparation.hull import mask_distances, visual_hull
 from univoxel.preparation.pinned import grown, open_sightings, pinned_hull
 from univoxel.preparation.prepare import Silhouettes, pinned_in, prepare
@@ -24,7 +24,6 @@ from univoxel.render.transport import Observations
 from univoxel.training.surface_update import smooth_sdf_gradient_
 
 VIEWS, SIZE = 24, 64
-CFG = PinnedConfig(points=4000, classes=24)
 GRID = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 24**3)
 
 
@@ -80,11 +79,14 @@ def photographs(look) -> Photos:
     return Photos(Path("ball"), names, encoded, 255 * torch.stack(masks).byte(), cameras)
 
 
-def pinned(look, cfg=CFG):
+def pinned(look, **constants):
     photos = photographs(look)
     distance = mask_distances(photos.coverage())
     hull = visual_hull(distance, photos.cameras, GRID)
-    return pinned_hull(photos, distance, hull, GRID, cfg), hull
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in ({"POINTS": 4000, "CLASSES": 24} | constants).items():
+            patch.setattr(task, name, value)
+        return pinned_hull(photos, distance, hull, GRID), hull
 
 
 @pytest.fixture(scope="module")
@@ -105,43 +107,42 @@ def test_paint_and_hollows_are_not(look):
 
 def test_neighbours_that_agree_prove_nothing():
     """Without points that are turned away from one another there is no table."""
-    found, _ = pinned(mirror, replace(CFG, turn=180.0))
+    found, _ = pinned(mirror, TURN=180.0)
     assert found is None
 
 
 def test_a_few_points_that_agree_are_chance():
     assert pinned(half)[0] is not None
-    assert pinned(half, replace(CFG, least_share=0.9))[0] is None
+    assert pinned(half, LEAST_SHARE=0.9)[0] is None
 
 
 def test_paint_that_mirrors_a_part_is_not_pinned():
     """However small the changes that are asked for."""
-    weak = replace(CFG, change=0.02, strong_change=0.02, weak_change=9.0)
-    found, _ = pinned(half_glossy, weak)
+    weak = {"CHANGE": 0.02, "STRONG_CHANGE": 0.02, "WEAK_CHANGE": 9.0}
+    found, _ = pinned(half_glossy, **weak)
     height = found.position[:, 2]
     assert found.pinned[height > 0.2].float().mean() > 0.8
     below = height < -0.3  # regions grow some way across the border
     assert found.pinned[below].float().mean() < 0.1
-    all_agree, _ = pinned(half_glossy, replace(weak, gain=0.0))
+    all_agree, _ = pinned(half_glossy, **weak, GAIN=0.0)
     assert all_agree.pinned[below].float().mean() > 0.5
 
 
 def test_changes_that_hardly_follow_the_table_prove_nothing():
-    all_change = {"change": 0.05, "strong_change": 0.05, "weak_change": 0.05}
-    any_gain = replace(CFG, gain=0.0, **all_change)
-    assert pinned(noisy, replace(any_gain, correlation=0.9))[0] is None
-    assert pinned(noisy, any_gain)[0] is not None
+    any_gain = {"GAIN": 0.0, "CHANGE": 0.05, "STRONG_CHANGE": 0.05, "WEAK_CHANGE": 0.05}
+    assert pinned(noisy, **any_gain, CORRELATION=0.9)[0] is None
+    assert pinned(noisy, **any_gain)[0] is not None
 
 
 def test_regions_begin_with_the_strongest_changes():
-    assert pinned(mirror, replace(CFG, strong_change=0.9))[0] is None
+    assert pinned(mirror, STRONG_CHANGE=0.9)[0] is None
 
 
 def test_points_that_few_photographs_show_are_left_out():
-    assert pinned(mirror, replace(CFG, min_views=VIEWS))[0] is None
+    assert pinned(mirror, MIN_VIEWS=VIEWS)[0] is None
 
 
-def test_what_mirrors_the_object_tells_nothing():
+def test_what_mirrors_the_object_tells_nothing(monkeypatch):
     """Of two balls side by side: a place that faces the other one, seen so that it mirrors it."""
     nodes = GRID.nodes().view(*GRID.size, 3)
     balls = [(nodes - torch.tensor([x, 0.0, 0.0])).norm(dim=-1) - 0.2 for x in (-0.35, 0.35)]
@@ -150,7 +151,7 @@ def test_what_mirrors_the_object_tells_nothing():
         [[1.0, 0.0, 0.0], [0.6, 0.8, 0.0]]
     )  # mirrored at +X: the other ball, sky
     wo = towards * torch.tensor([1.0, -1.0, 1.0])
-    count = CFG.neighbours
+    count = task.NEIGHBOURS
     normal = torch.tensor([[1.0, 0.0, 0.0]]).expand(count, 3)
     position = torch.tensor([[-0.15, 0.0, 0.0]]) + 0.001 * torch.randn(
         count, 3, generator=torch.Generator().manual_seed(0)
@@ -164,12 +165,9 @@ def test_what_mirrors_the_object_tells_nothing():
         torch.arange(2).repeat(count),
         torch.zeros(2, 3),
     )
-    found = open_sightings(seen, hull, GRID, replace(CFG, min_views=1))
+    monkeypatch.setattr(task, "MIN_VIEWS", 1)
+    found = open_sightings(seen, hull, GRID)
     assert found.count.tolist() == [1.0] * count
-
-
-def test_nothing_is_looked_at_where_no_points_are_asked_for():
-    assert pinned(mirror, replace(CFG, points=0))[0] is None
 
 
 def test_regions_take_in_holes_and_what_is_weak_beside_them():
@@ -189,7 +187,7 @@ def test_regions_take_in_holes_and_what_is_weak_beside_them():
 def test_nodes_near_held_points_stay(ball):
     found, hull = ball
     nodes = found.nodes(hull, GRID)
-    near = hull.abs() < CFG.band * GRID.voxel_size
+    near = hull.abs() < task.BAND * GRID.voxel_size
     assert not (nodes & ~near).any()
     assert nodes.sum() > 0.8 * near.sum()
     upper = replace(found, pinned=found.position[:, 2] > 0)

@@ -11,7 +11,7 @@ from univoxel.camera import pixel_rays
 from univoxel.color import linear_to_srgb
 from univoxel.grid import fit_grid
 from univoxel.ops import VisibilityScene
-from univoxel.preparation.config import MaskConfig, RegistrationConfig
+from univoxel.preparation import masks, registration
 from univoxel.preparation.exposures import log_gains
 from univoxel.preparation.hull import estimate_bounds, hull_sdf, mask_distances, visual_hull
 from univoxel.preparation.masks import fitted_masks
@@ -69,8 +69,9 @@ def test_the_box_is_that_of_whole_pictures(whole, cut):
 
 
 @pytest.mark.parametrize("bits", [True, False])
-def test_masks_that_are_too_wide_are_taken_in_alike(bits):
+def test_masks_that_are_too_wide_are_taken_in_alike(bits, monkeypatch):
     """Wide masks and a bright background; what is beyond a picture is no background."""
+    monkeypatch.setattr(masks, "MIN_PIXELS", 5)
     sharp = photos_of(VIEWS, SIZE)
     wide = (0.5 + 4 - mask_distances(sharp.alpha)).clamp(0, 1)
     behind = 0.5 + 0.4 * torch.rand(sharp.color.shape, generator=torch.Generator().manual_seed(0))
@@ -79,20 +80,18 @@ def test_masks_that_are_too_wide_are_taken_in_alike(bits):
         color, wide = (255 * linear_to_srgb(color)).byte(), (255 * wide).round().byte()
     whole = dataclasses.replace(sharp, color=color, alpha=wide)
     cut = cropped(whole)
-    (wanted, far), (found, near) = (
-        fitted_masks(p, "auto", MaskConfig(min_pixels=5)) for p in (whole, cut)
-    )
+    (wanted, far), (found, near) = (fitted_masks(p, "auto") for p in (whole, cut))
     assert not torch.equal(wanted.alpha, whole.alpha)
     for view, where in enumerate(windows(whole.alpha)):
         assert torch.equal(found.stored(view)[1], wanted.alpha[view][where])
         assert torch.equal(cut.cameras.cut(view, near[view]), far[view][where])
     width, _ = cut.cameras.size(2)
     assert not found.alpha[2, :, width:].any()  # beyond a picture
-    _, as_given = fitted_masks(cut, "given", MaskConfig(min_pixels=5))
+    _, as_given = fitted_masks(cut, "given")
     assert as_given[2, :, width:].isinf().all()
 
 
-def test_contradictions_are_those_of_whole_pictures(whole, cut):
+def test_contradictions_are_those_of_whole_pictures(whole, cut, monkeypatch):
     generator = torch.Generator().manual_seed(0)
     shift = 0.02 * torch.randn(VIEWS, 3, generator=generator)
     pairs = []
@@ -112,10 +111,9 @@ def test_contradictions_are_those_of_whole_pictures(whole, cut):
     assert (less < more + 1e-3).float().mean() > 0.99
     assert ((less - more).abs() < 1e-3).float().mean() > 0.9
     # A ball may be turned as it likes, so its cameras end at other places, but as well
-    quick = RegistrationConfig(steps=60, rays=128, views=16)
-    rest = [
-        contradiction(d, registered_poses(d, c, BOX, quick).corrected(c), BOX) for d, c in pairs
-    ]
+    for name, few in {"STEPS": 60, "RAYS": 128, "VIEWS": 16}.items():
+        monkeypatch.setattr(registration, name, few)
+    rest = [contradiction(d, registered_poses(d, c, BOX).corrected(c), BOX) for d, c in pairs]
     assert rest[0] == pytest.approx(rest[1], abs=0.05)
     assert rest[1] < 0
 

@@ -9,15 +9,12 @@ from univoxel.errors import NothingFound
 from univoxel.fields.field import dense_field
 from univoxel.grid import fit_grid
 from univoxel.segmentation import distances
-from univoxel.segmentation.config import SegmentationConfig
-
-CFG = SegmentationConfig()
 
 
 def test_a_field_without_an_inside_is_nothing():
     grid = fit_grid(-torch.ones(3), torch.ones(3), 10**3)
     with pytest.raises(NothingFound, match="no object was found"):
-        distances.redistance_(dense_field(grid, 1, torch.ones(grid.size)), CFG)
+        distances.redistance_(dense_field(grid, 1, torch.ones(grid.size)))
 
 
 def test_what_cameras_look_at_is_the_box():
@@ -34,9 +31,9 @@ def test_small_parts_are_chaff():
     speck = (node + torch.tensor([0.8, 0.0, 0.0])).norm(dim=-1) - 0.08
     field = dense_field(grid, 1, torch.minimum(ball, speck))
     near = ball.abs() < 0.1
-    distances.redistance_(field, CFG)
+    distances.redistance_(field)
     assert (field.sdf[speck < 0] < 0).all()
-    distances.redistance_(field, CFG, whole=True)
+    distances.redistance_(field, whole=True)
     assert (field.sdf[speck < 0] > 0).all()
     assert torch.equal(field.sdf[near], ball[near])
     # Distances to the centres of voxels are off by up to half a diagonal

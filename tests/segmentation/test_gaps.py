@@ -74,10 +74,10 @@ def test_a_gap_that_others_contradict_stays(true):
     hull, _ = vote.elect(masks, seen, SMALL)
     before = hull.vote.clone()
     spoilt = [lost_part(m) if v == LOST else m for v, m in enumerate(masks)]
-    gaps.carve_gaps_(hull.vote, hull.threshold, spoilt, seen, hull.grid, SMALL)
+    gaps.carve_gaps_(hull.vote, hull.threshold, spoilt, seen, hull.grid)
     inside = before >= hull.threshold
     assert ((hull.vote < hull.threshold) & inside).sum() < 0.02 * inside.sum()
     # Where nearly all lose it, those that do not are outvoted
     spoilt = [m if v == LOST else lost_part(m) for v, m in enumerate(masks)]
-    gone = gaps.carve_gaps_(hull.vote, hull.threshold, spoilt, seen, hull.grid, SMALL)
+    gone = gaps.carve_gaps_(hull.vote, hull.threshold, spoilt, seen, hull.grid)
     assert gone > 0.1 * inside.sum()

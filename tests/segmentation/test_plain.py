@@ -1,6 +1,5 @@
 """Objects on a plain desk before plain walls, found by their edges."""
 
-import pytest
 import torch
 from analytic import cameras_around, look_at
 from sphere_in_room import behind
@@ -8,7 +7,6 @@ from spoilt_masks import TABLE, iou
 
 from univoxel.camera import Cameras, image_rays
 from univoxel.segmentation import plain
-from univoxel.segmentation.config import PlainConfig
 
 VIEWS, SIZE = 16, 96
 RADIUS = 0.4  # of a ball that lies on the desk
@@ -80,33 +78,15 @@ def test_nothing_but_a_wall_is_no_object():
     assert not plain.plain_mask(white, 0.02).any()
 
 
-def test_lines_and_specks_are_no_object():
+def test_lines_and_specks_are_no_object(monkeypatch):
     """The edge of a desk is thin; a mark on the wall is small."""
+    monkeypatch.setattr(plain, "SMALLEST_PART", 0.1)
     picture = torch.full((80, 80, 3), 200, dtype=torch.uint8)
     picture[40:] = 120
     picture[20:60, 20:60] = torch.tensor([200, 30, 30], dtype=torch.uint8)
     picture[5:12, 5:12] = 40
     true = torch.zeros(80, 80)
     true[20:60, 20:60] = 1
-    found = plain.plain_mask(picture, 0.02, PlainConfig(smallest_part=0.1))
+    found = plain.plain_mask(picture, 0.02)
     assert iou(found, true) > 0.93
     assert not found[:, :15].any()
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("blur", 0.0),
-        ("thresholds", ()),
-        ("thresholds", (0.0,)),
-        ("width", -1.0),
-        ("rim", 0.0),
-        ("share", 2.0),
-        ("around", 1.0),
-        ("agree", 0.0),
-        ("smallest_part", 2.0),
-    ],
-)
-def test_fields_out_of_range(field, value):
-    with pytest.raises(ValueError, match=f"PlainConfig: {field} must be"):
-        PlainConfig(**{field: value})

@@ -62,13 +62,6 @@ def test_the_start_that_draws_the_photographs_better_is_kept(tmp_path, monkeypat
     [
         ("radii", ()),
         ("radii", (1.5,)),
-        ("compared_steps", 0),
-        ("lr_backdrop", (0.1,)),
-        ("emptiness", (0.0, 0.1)),
-        ("redistance_every", 0),
-        ("near", -1.0),
-        ("smallest_part", 2.0),
-        ("margin", -0.1),
     ],
 )
 def test_fields_out_of_range(field, value):

@@ -188,8 +188,8 @@ def train(
         minutes: wall-clock limit, above 0, from the first photograph read to the end: what does not
             fit is cut, in all stages alike; without, all steps are made, however long they take
         capacity: adaptive makes no larger a model than the scene needs, as held-out pixels tell:
-            coarser grid, fewer rows or channels of features, fewer lobes and hidden units. auto is
-            that, but fixed for sparse fields and for lights other than hybrid
+            fewer rows of features, fewer levels of mirrored directions, fewer nodes far from the
+            surface. auto is that, but fixed for sparse fields and for lights other than hybrid
         budget_mb: most megabytes of the model's file; implies --capacity adaptive
         allow_outside: read photographs outside of DATA too, where its files or links name such
         resume: go on with the run in --out; where nothing was saved yet, it begins

@@ -6,9 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
-Kind: TypeAlias = Literal[
-    "voxels", "channels", "mirror levels", "lobes", "hidden units", "reach", "rows"
-]
+# Runs of version 0.2 and before may have channels, lobes and hidden units too
+Kind: TypeAlias = Literal["voxels", "mirror levels", "reach", "rows"]
 
 
 @dataclass(frozen=True)

@@ -111,10 +111,6 @@ class NodeFeatures(AbstractFeatures):
         assert self.values.grad is not None
         self.values.grad._values()[:, :count] = 0
 
-    def keep_channels(self, keep: Tensor) -> None:
-        """Have only the channels of these numbers [K], increasing; values are a new parameter."""
-        self.values = nn.Parameter(self.values.data[..., keep].contiguous())
-
     def smooth_(self, distances: AbstractDistances, rows: Tensor, amount: float) -> None:
         distances.smooth_rows_(self.values.detach(), rows, amount, order=1)
 

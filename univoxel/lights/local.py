@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import ABC
 
 import torch
 from torch import Tensor, nn
@@ -30,11 +30,6 @@ class AbstractLocalLight(AbstractLight):
     config: LocalLightConfig
     head: MLP  # from `encode` of the surface
     base: nn.Parameter
-
-    @abstractmethod
-    def narrowed(self, width: int) -> LocalLightConfig | None:
-        """Its configuration once no hidden layer of the head has more than `width` units; None
-        where the head cannot be made narrower alone."""
 
 
 def build_head(

@@ -113,9 +113,6 @@ class LocalMLP(AbstractLocalLight):
         """Radiance [N, 3] towards wo, summed over the whole sphere."""
         return quadrature.reflected_shared(self, surface, wo, occlusion, generator)
 
-    def narrowed(self, width: int) -> None:
-        """None: both networks have one width."""
-
     def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         here, beside = self.code(surface), self.code(near)
         wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)

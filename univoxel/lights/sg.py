@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -120,9 +120,6 @@ class LocalSG(AbstractLocalLight):
             quadrature.rotations(surface, generator),
             f0,
         )
-
-    def narrowed(self, width: int) -> SGConfig:
-        return replace(self.config, hidden=min(width, self.config.hidden))
 
     def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         raw = self.raw(surface)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -103,9 +103,6 @@ class LocalSH(AbstractLocalLight):
     ) -> Tensor:
         """Radiance [N, 3] towards wo, summed over the whole sphere."""
         return quadrature.reflected_shared(self, surface, wo, occlusion, generator)
-
-    def narrowed(self, width: int) -> SHConfig:
-        return replace(self.config, hidden=min(width, self.config.hidden))
 
     def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         here, beside = self.coefficients(surface), self.coefficients(near)

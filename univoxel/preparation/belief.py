@@ -17,12 +17,24 @@ from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.grid import fit_grid
 from univoxel.names import CamerasFrom, MasksFrom
-from univoxel.preparation.config import HULL, PREPARATION, HullConfig, PreparationConfig
 from univoxel.preparation.depth_sweep import surface_depths
-from univoxel.preparation.hull import estimate_bounds, visual_hull, votes_needed
+from univoxel.preparation.hull import BOX_NODES, estimate_bounds, visual_hull, votes_needed
 from univoxel.preparation.matches import Agreement, agreement, find_matches
-from univoxel.preparation.registration import contradiction
+from univoxel.preparation.registration import MAX_CONTRADICTION, contradiction
 from univoxel.threads import side_by_side
+
+# Half the width of what a doubted mask lacks or shows too much, in pixels: narrower pieces are
+# its jagged edge
+ROUGH_PIXELS = 1.5
+# The same as a share of a picture's larger side; the larger of both counts
+ROUGH_SHARE = 0.01
+# Pixels of the median match, up to which cameras can be right: those of structure from motion are
+# off by 0.2 to 0.8, those that are off by more are worth refining
+MAX_DISTANCE = 1.0
+# How many times further silhouettes contradict one another where masks are to blame: cameras
+# that are off make both large, the contradiction up to twice as much as the distance
+DOUBT = 4.0
+
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -42,7 +54,6 @@ def weighed(
     distance: Tensor,
     wanted: CamerasFrom,
     masks: MasksFrom,
-    cfg: PreparationConfig = PREPARATION,
 ) -> Belief:
     """The box around the object, and which of cameras and masks are believed.
 
@@ -59,47 +70,45 @@ def weighed(
     """
     cameras = photos.cameras
     try:
-        box, none_shared = estimate_bounds(distance, cameras, cfg.hull), None
-        off = contradiction(distance, cameras, box, cfg.registration)
+        box, none_shared = estimate_bounds(distance, cameras), None
+        off = contradiction(distance, cameras, box)
     except UserError as error:
         box, none_shared, off = None, error, math.inf
-    if off <= cfg.registration.max_contradiction and box is not None:
+    if off <= MAX_CONTRADICTION and box is not None:
         return Belief(
-            _widened(box, distance, cameras, off, wanted == "refined", cfg), wanted == "refined"
+            _widened(box, distance, cameras, off, wanted == "refined"), wanted == "refined"
         )
-    seen = agreement(cameras, find_matches(photos, distance, cfg.matches), cfg.matches)
-    believed = right(seen, off, cfg)
+    seen = agreement(cameras, find_matches(photos, distance))
+    believed = right(seen, off)
     refined = wanted == "refined" or (wanted == "auto" and not believed)
     if believed or box is not None:
         _say(seen, off, believed, refined)
     if believed and masks == "auto":
-        votes = votes_needed(len(cameras), cfg.hull)
-        return Belief(estimate_bounds(distance, cameras, cfg.hull, votes), refined, votes, off)
+        votes = votes_needed(len(cameras))
+        return Belief(estimate_bounds(distance, cameras, votes), refined, votes, off)
     if box is None:
         assert none_shared is not None
         raise none_shared
-    return Belief(_widened(box, distance, cameras, off, refined, cfg), refined)
+    return Belief(_widened(box, distance, cameras, off, refined), refined)
 
 
-def unweighed(
-    photos: Photos, distance: Tensor, wanted: CamerasFrom, cfg: PreparationConfig = PREPARATION
-) -> Belief:
+def unweighed(photos: Photos, distance: Tensor, wanted: CamerasFrom) -> Belief:
     """`weighed` where there is no time to ask: single masks may be wrong, cameras are right.
 
     Raises:
         UserError: the silhouettes share no volume.
     """
-    votes = votes_needed(len(photos), cfg.hull)
-    box = estimate_bounds(distance, photos.cameras, cfg.hull, votes)
+    votes = votes_needed(len(photos))
+    box = estimate_bounds(distance, photos.cameras, votes)
     return Belief(box, wanted == "refined", votes)
 
 
-def right(seen: Agreement | None, off: float, cfg: PreparationConfig = PREPARATION) -> bool:
+def right(seen: Agreement | None, off: float) -> bool:
     """Whether cameras are right and it is the masks that make silhouettes contradict one another by
     so many pixels."""
     if seen is None:
         return False
-    return seen.median <= min(cfg.matches.max_distance, off / cfg.matches.doubt)
+    return seen.median <= min(MAX_DISTANCE, off / DOUBT)
 
 
 def _widened(
@@ -108,12 +117,11 @@ def _widened(
     cameras: Cameras,
     off: float,
     refined: bool,
-    cfg: PreparationConfig,
 ) -> tuple[Tensor, Tensor]:
     """The box, or that of wider silhouettes: what wrong cameras share is too small."""
     if not (refined and off > 0):
         return box
-    return estimate_bounds(distance, cameras, cfg.hull, wider=off)
+    return estimate_bounds(distance, cameras, wider=off)
 
 
 def _say(seen: Agreement | None, off: float, believed: bool, refined: bool) -> None:
@@ -134,7 +142,6 @@ def doubted_pixels(
     distance: Tensor,
     cameras: Cameras,
     belief: Belief,
-    cfg: HullConfig = HULL,
     carving: Tensor | None = None,
 ) -> Tensor:
     """Where a mask lacks a part that the others show, or shows what they do not: [V, H, W] bool.
@@ -145,16 +152,16 @@ def doubted_pixels(
         distance: [V, H, W] from `hull.mask_distances`.
         carving: the same of masks that the hull is made of, where these are others.
     """
-    grid = fit_grid(*belief.box, cfg.box_nodes)
+    grid = fit_grid(*belief.box, BOX_NODES)
     silhouettes = distance if carving is None else carving
-    hull = visual_hull(silhouettes, cameras, grid, cfg, belief.votes)
+    hull = visual_hull(silhouettes, cameras, grid, belief.votes)
     doubted = shelf.zeros(distance.shape, torch.bool)
 
     def doubt_(view_and_depth: tuple[int, Tensor]) -> None:
         view, depth = view_and_depth
         shown = cameras.cut(view, distance[view] < 0)
         differs = (shown != cameras.cut(view, depth.isfinite())).numpy()
-        reach = max(cfg.rough_pixels, cfg.rough_share * max(shown.shape))
+        reach = max(ROUGH_PIXELS, ROUGH_SHARE * max(shown.shape))
         deep = np.asarray(ndimage.distance_transform_edt(np.pad(differs, 1)))[1:-1, 1:-1] > reach
         shelf.release(distance[view])
         if not deep.any():

@@ -23,8 +23,32 @@ from univoxel.camera import Cameras, looked_at, pixel_width, project, sizes_of, 
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.grid import GridShape
-from univoxel.preparation.config import CARVING, CarvingConfig
 from univoxel.preparation.depth_sweep import depth_maps, log_colors, surface_depths
+
+# Photographs that are used, at most: for time
+VIEWS = 100
+# Seconds that a pixel of the object takes, about, on two cores
+PIXEL_SECONDS = 6e-6
+# Voxels behind a view's depth up to which it has a say on nodes
+BEHIND = 2.5
+# Share of the views with a say, above which a node is carved that they see through
+AGREE = 0.6
+# Share of all views above which it is: fewer may see a lamp in something glossy
+LEAST = 0.2
+# Share of a pixel's disagreement on the hull by which the depth has to be better
+BETTER = 0.1
+# Colour difference by which it has to be better at least: a third of a step of 8 bits where it is
+# bright
+VISIBLE = 0.0007
+# Share of the pixels that see through a node above which the depth has to be better
+ENOUGH = 0.25
+# Voxels around a node within which that share is taken
+AROUND = 2.0
+# Share of the hull's nodes that a concavity has at least: smaller ones are left to training
+PIECE = 5e-4
+# Rounds in which nodes are put back whose absence uncovers a silhouette
+ROUNDS = 3
+
 
 COVERED = 0.9 * 255  # coverage above which a pixel shows the object alone
 
@@ -35,7 +59,6 @@ def carve_concavities(
     grid: GridShape,
     pictures: Tensor,
     cameras: Cameras,
-    cfg: CarvingConfig = CARVING,
 ) -> Tensor:
     """The SDF of a visual hull without the concavities that photographs agree on.
 
@@ -57,11 +80,11 @@ def carve_concavities(
         return hull
     nodes = grid.nodes()[solid]
     hull_depths = list(surface_depths(hull, grid, cameras))
-    agreed = _agreed_nodes(hull, grid, pictures, cameras, hull_depths, cfg)
+    agreed = _agreed_nodes(hull, grid, pictures, cameras, hull_depths)
     carved = torch.zeros_like(solid).masked_scatter(solid, agreed)
     covered = pictures[..., 3] > COVERED
-    min_nodes = cfg.piece * len(nodes)
-    for _ in range(cfg.rounds):
+    min_nodes = PIECE * len(nodes)
+    for _ in range(ROUNDS):
         carved = _open_pieces(carved, ~solid, min_nodes)
         if not carved.any():
             return hull
@@ -82,29 +105,28 @@ def _agreed_nodes(
     pictures: Tensor,
     cameras: Cameras,
     hull_depths: list[Tensor],
-    cfg: CarvingConfig,
 ) -> Tensor:
     """Which nodes [N] inside the hull the views agree to see through."""
     solid = hull <= 0
     nodes = grid.nodes()[solid]
     free_votes, votes, better_votes = torch.zeros(3, len(nodes))
-    colors = torch.stack([log_colors(picture, cfg) for picture in pictures])
-    maps = depth_maps(colors, cameras, hull_depths, hull, grid, cfg)
+    colors = torch.stack([log_colors(picture) for picture in pictures])
+    maps = depth_maps(colors, cameras, hull_depths, hull, grid)
     for view, (depth, error, hull_error) in enumerate(maps):
         distance, pixel = _distance_and_pixel(nodes, cameras, view)
         clearance = depth.flatten()[pixel] - distance  # NaN: the view says nothing
         seen_through = clearance > 0
         free_votes += seen_through
-        votes += clearance > -cfg.behind * grid.voxel_size
-        better = hull_error - error > (cfg.better * hull_error).clamp_min(cfg.visible)
+        votes += clearance > -BEHIND * grid.voxel_size
+        better = hull_error - error > (BETTER * hull_error).clamp_min(VISIBLE)
         better_votes += seen_through & better.flatten()[pixel]
-    agreed = (free_votes > cfg.agree * votes) & (free_votes > cfg.least * len(cameras))
+    agreed = (free_votes > AGREE * votes) & (free_votes > LEAST * len(cameras))
 
     def around(values: Tensor) -> Tensor:
         volume = torch.zeros(hull.shape).masked_scatter(solid, torch.where(agreed, values, 0.0))
-        return torch.from_numpy(ndimage.gaussian_filter(volume.numpy(), cfg.around))[solid]
+        return torch.from_numpy(ndimage.gaussian_filter(volume.numpy(), AROUND))[solid]
 
-    return agreed & (around(better_votes) > cfg.enough * around(free_votes))
+    return agreed & (around(better_votes) > ENOUGH * around(free_votes))
 
 
 def _distance_and_pixel(points: Tensor, cameras: Cameras, view: int) -> tuple[Tensor, Tensor]:
@@ -143,7 +165,6 @@ def carve_within_time(
     photos: Photos,
     gains: Tensor | None,
     seconds: float,
-    cfg: CarvingConfig = CARVING,
 ) -> Tensor:
     """The SDF [X, Y, Z] of `carve_concavities`, or the hull where that would take too long.
 
@@ -154,21 +175,21 @@ def carve_within_time(
         gains: [V] log gains of their exposures.
         seconds: that it may take; where more are expected the hull stays as it is.
     """
-    views, factor = _views_and_factor(photos.cameras, grid.voxel_size, cfg)
+    views, factor = _views_and_factor(photos.cameras, grid.voxel_size)
     pixels = int(photos.alpha[views].count_nonzero()) / factor**2
-    if cfg.pixel_seconds * pixels > seconds:
+    if PIXEL_SECONDS * pixels > seconds:
         return hull
-    pictures, cameras = carving_pictures(photos, grid.voxel_size, gains, cfg)
-    return carve_concavities(hull, grid, pictures, cameras, cfg)
+    pictures, cameras = carving_pictures(photos, grid.voxel_size, gains)
+    return carve_concavities(hull, grid, pictures, cameras)
 
 
 def carving_pictures(
-    photos: Photos, voxel_size: float, gains: Tensor | None = None, cfg: CarvingConfig = CARVING
+    photos: Photos, voxel_size: float, gains: Tensor | None = None
 ) -> tuple[Tensor, Cameras]:
-    """Photographs and cameras as `carve_concavities` takes them: cfg.views of them at most, without
+    """Photographs and cameras as `carve_concavities` takes them: VIEWS of them at most, without
     their log gains [V]. Their pixels are between half a voxel and a voxel wide, where those of the
     photographs are narrower."""
-    views, factor = _views_and_factor(photos.cameras, voxel_size, cfg)
+    views, factor = _views_and_factor(photos.cameras, voxel_size)
     pictures = []
     for view in views.tolist():
         color, alpha = photos.picture(view)
@@ -182,9 +203,7 @@ def carving_pictures(
     return stacked(pictures), cameras
 
 
-def _views_and_factor(
-    cameras: Cameras, voxel_size: float, cfg: CarvingConfig
-) -> tuple[Tensor, int]:
+def _views_and_factor(cameras: Cameras, voxel_size: float) -> tuple[Tensor, int]:
     """Which views [K] are used, and how many pixels make one along a side."""
-    views = torch.arange(0, len(cameras), -(-len(cameras) // cfg.views))
+    views = torch.arange(0, len(cameras), -(-len(cameras) // VIEWS))
     return views, max(1, int(voxel_size / pixel_width(cameras, looked_at(cameras))))

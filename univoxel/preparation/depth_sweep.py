@@ -13,15 +13,30 @@ from univoxel.camera import Cameras, image_rays, looked_at, pixel_rays, project,
 from univoxel.fields.dense import DenseDistances
 from univoxel.grid import GridShape
 from univoxel.ops import VisibilityScene, match_cost, semi_global
-from univoxel.preparation.config import CARVING, CarvingConfig
+
+# Depths along a ray, a voxel apart: deeper concavities are opened as far as this
+DEPTHS = 48
+# Views that a view's depths come from; as many again check them
+NEIGHBOURS = 8
+# Of them, views that agree best and count: others are occluded
+BEST = 4
+# Share of a logarithmic curve in the colours that are compared. Cloth inside of a shoe shows its
+# pattern in few steps of 8 bits: dark colours are taken further apart
+LOG_SHARE = 2 / 3
+# Steepness of that curve: how many times further apart black is taken than with log(1 + x)
+LOG_STEEPNESS = 40.0
+# Colour difference that a step of one depth between neighbouring pixels costs
+SLOPE = 0.0033
+# Colour difference that a larger step costs
+JUMP = 0.0133
 
 
-def log_colors(picture: Tensor, cfg: CarvingConfig = CARVING) -> Tensor:
+def log_colors(picture: Tensor) -> Tensor:
     """The same picture [H, W, 4] uint8 with dark colours further apart: 0 and 1 stay."""
     coverage = picture[..., 3:] / 255
     color = (picture[..., :3] / 255 / coverage.clamp_min(1e-3)).clamp_max(1)
-    logarithm = (cfg.log_steepness * color).log1p() / math.log1p(cfg.log_steepness)
-    color = torch.lerp(color, logarithm, cfg.log_share) * coverage
+    logarithm = (LOG_STEEPNESS * color).log1p() / math.log1p(LOG_STEEPNESS)
+    color = torch.lerp(color, logarithm, LOG_SHARE) * coverage
     return torch.cat([(255 * color).round().byte(), picture[..., 3:]], 2)
 
 
@@ -65,7 +80,6 @@ def depth_maps(
     hull_depths: list[Tensor],
     hull: Tensor,
     grid: GridShape,
-    cfg: CarvingConfig = CARVING,
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """View after view: distance along each pixel's ray, and colour difference of views that had no
     say in it, there and on the hull: three [H, W], NaN outside the object.
@@ -91,14 +105,14 @@ def depth_maps(
         premultiplied = pictures[view][inside].float()
         color = premultiplied[:, :3] / premultiplied[:, 3:]
         pixel_rays = pictures, matrix, origin, direction
-        nearest_views = similarity[view].topk(min(2 * cfg.neighbours, len(cameras) - 1)).indices
+        nearest_views = similarity[view].topk(min(2 * NEIGHBOURS, len(cameras) - 1)).indices
 
         def difference(start: Tensor, others: Tensor, depths: int) -> Tensor:
-            best = min(cfg.best, len(others))
+            best = min(BEST, len(others))
             return match_cost(*pixel_rays, start, color, rows, others, step, depths, best=best)  # noqa: B023
 
-        cost = difference(hull_depth, nearest_views[::2], cfg.depths)
-        depth = hull_depth + step * semi_global(cost, rows, cfg.slope, cfg.jump).argmin(1)
+        cost = difference(hull_depth, nearest_views[::2], DEPTHS)
+        depth = hull_depth + step * semi_global(cost, rows, SLOPE, JUMP).argmin(1)
         point = origin + depth[:, None] * direction
         depth = torch.where(field.sample(point).sdf > 0.5 * step, hull_depth, depth)
         maps = torch.full((3, *inside.shape), torch.nan)

@@ -12,8 +12,25 @@ from univoxel.camera import Cameras, looked_at, project
 from univoxel.data.base import coverage_of
 from univoxel.errors import UserError
 from univoxel.grid import GridShape, fit_coarse, fit_grid, resample
-from univoxel.preparation.config import HULL, HullConfig
 from univoxel.threads import side_by_side
+
+# The half of the first box over what the widest view shows at its distance
+FIRST_BOX = 1.2
+# Nodes of the grid that finds the box: a node is a 64th of the box
+BOX_NODES = 64**3
+# Grids in a row, each around what the one before found, and so finer
+BOX_ROUNDS = 2
+# Share of the box's diagonal, left free around the hull
+MARGIN = 0.03
+# Nodes at which the hull is evaluated, about; finer grids are interpolated, for time
+NODES = 1e6
+# Share of the views that have to carve a node where masks are doubted: one in ten may lack a
+# part, hardly ever the same part. Two views at least
+DOUBTED_VOTES = 0.07
+# Share of the views that have to see a node where masks are doubted. Orbits have the whole object
+# in nearly all of their pictures
+DOUBTED_SEEN = 0.25
+
 
 PIECE = (
     2**15
@@ -120,12 +137,12 @@ def _hull_sdf(
     return torch.where(voters < seen_by, torch.inf, sdf)
 
 
-def votes_needed(views: int, cfg: HullConfig = HULL) -> int:
+def votes_needed(views: int) -> int:
     """How many of so many views have to carve a point where their masks are doubted."""
-    return max(1, min(max(2, round(cfg.doubted_votes * views)), views // 3))
+    return max(1, min(max(2, round(DOUBTED_VOTES * views)), views // 3))
 
 
-def views_needed(views: int, votes: int, cfg: HullConfig = HULL) -> int:
+def views_needed(views: int, votes: int) -> int:
     """How many of so many views have to see a point of the object.
 
     Where masks are doubted, some end where the pictures do, or each at another place of what the
@@ -134,13 +151,12 @@ def views_needed(views: int, votes: int, cfg: HullConfig = HULL) -> int:
     Args:
         votes: see `hull_sdf`; with one, masks are believed.
     """
-    return 1 if votes == 1 else max(1, min(round(cfg.doubted_seen * views), views))
+    return 1 if votes == 1 else max(1, min(round(DOUBTED_SEEN * views), views))
 
 
 def estimate_bounds(
     distance: Tensor,
     cameras: Cameras,
-    cfg: HullConfig = HULL,
     votes: int = 1,
     wider: float = 0.0,
 ) -> tuple[Tensor, Tensor]:
@@ -156,12 +172,12 @@ def estimate_bounds(
     eye_distance = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
     longer_side = cameras.size_of_each().amax(1)
     field_of_view = longer_side / (2 * cameras.focal.min(1).values)
-    half = float((eye_distance * field_of_view).max()) * cfg.first_box
+    half = float((eye_distance * field_of_view).max()) * FIRST_BOX
     lower, upper = centre - half, centre + half
-    for _ in range(cfg.box_rounds):  # each round sees the hull at a finer grid
-        grid = fit_grid(lower, upper, cfg.box_nodes)
+    for _ in range(BOX_ROUNDS):  # each round sees the hull at a finer grid
+        grid = fit_grid(lower, upper, BOX_NODES)
         nodes = grid.nodes().reshape(-1, 3)
-        seen_by = views_needed(len(cameras), votes, cfg)
+        seen_by = views_needed(len(cameras), votes)
         sdf = hull_sdf(distance, cameras, nodes, votes, seen_by, wider)
         inside = nodes[sdf < grid.voxel_size]
         if not len(inside):
@@ -169,22 +185,20 @@ def estimate_bounds(
                 "the silhouettes of the photographs share no volume: check masks and cameras"
             )
         lower, upper = inside.amin(0), inside.amax(0)
-        margin = cfg.margin * (upper - lower).norm() + grid.voxel_size
+        margin = MARGIN * (upper - lower).norm() + grid.voxel_size
         lower, upper = lower - margin, upper + margin
     return lower, upper
 
 
-def visual_hull(
-    distance: Tensor, cameras: Cameras, grid: GridShape, cfg: HullConfig = HULL, votes: int = 1
-) -> Tensor:
-    """SDF of the visual hull on a grid: [X, Y, Z], world units; at about cfg.nodes evaluated.
+def visual_hull(distance: Tensor, cameras: Cameras, grid: GridShape, votes: int = 1) -> Tensor:
+    """SDF of the visual hull on a grid: [X, Y, Z], world units; at about NODES evaluated.
 
     Args:
         votes: see `hull_sdf`.
     """
-    stride = max(1, round((np.prod(grid.size) / cfg.nodes) ** (1 / 3)))
+    stride = max(1, round((np.prod(grid.size) / NODES) ** (1 / 3)))
     coarse = fit_coarse(grid, stride)
-    seen_by = views_needed(len(cameras), votes, cfg)
+    seen_by = views_needed(len(cameras), votes)
     sdf = hull_sdf(distance, cameras, coarse.nodes().reshape(-1, 3), votes, seen_by)
     sdf = sdf.reshape(coarse.size)
     far = sum(n * n for n in grid.size) ** 0.5 * grid.voxel_size

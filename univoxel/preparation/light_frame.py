@@ -22,11 +22,32 @@ from univoxel.errors import DataError
 from univoxel.grid import GridShape
 from univoxel.lights.turntable import Turntable
 from univoxel.names import LightFrameOrAuto
-from univoxel.preparation.config import LIGHT_FRAME, LightFrameConfig
 from univoxel.preparation.observed_hull import observe_hull
 from univoxel.preparation.surroundings import surroundings_stand_still
 from univoxel.render.transport import Observations
 from univoxel.sphere import real_harmonics
+
+# Points of the surface whose colours are compared
+POINTS = 1500
+# sRGB; darker colours are left out: rounding to 8 bits is too large a part of them
+DARK = 0.05
+# Natural log; the scale of the Cauchy cost of a colour that is not explained
+CAUCHY = 0.1
+# Rounds of iteratively reweighted least squares
+ROUNDS = 6
+# How many times as much a light that turns has to explain as one that stands still. Of four
+# rendered scenes under a still light it was 0.1 to 0.2 times, of a bronze head on a turntable 1.8
+# times
+BETTER = 1.0
+# Share of the cost that it has to explain at least, over `better`
+LEAST = 0.03
+# `better` where the surroundings do not say whether they stood still. Of objects on rings of
+# cameras it was up to 3 under a still light, and 60 under one that turned; of a shiny ball, 3.2
+BETTER_ALONE = 3.0
+# `least` there: times `better_alone` it is above the 14 % of the cost that a light taken to turn
+# explained under a still one, and below the 30 and 70 % under one that turned
+LEAST_ALONE = 0.07
+
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -44,7 +65,6 @@ def turntable_of(
     hull: Tensor,
     grid: GridShape,
     frame: LightFrameOrAuto,
-    cfg: LightFrameConfig = LIGHT_FRAME,
 ) -> Turntable | None:
     """The turntable that the photographs were taken on; None: the light stood still.
 
@@ -67,17 +87,17 @@ def turntable_of(
                 "light_frame",
             )
         return turntable
-    observations = None if turntable is None else observe_hull(photos, hull, grid, cfg.points)
+    observations = None if turntable is None else observe_hull(photos, hull, grid, POINTS)
     if turntable is None or observations is None:
         return None
-    found = explained(observations, turntable, cfg)
+    found = explained(observations, turntable)
     log.debug("light frame: %s", found)
-    still_around = surroundings_stand_still(photos, cfg)
+    still_around = surroundings_stand_still(photos)
     if still_around is False:  # the camera went around the object
         return None
-    better, least = cfg.better, cfg.least
+    better, least = BETTER, LEAST
     if still_around is None:
-        better, least = cfg.better_alone, cfg.least_alone
+        better, least = BETTER_ALONE, LEAST_ALONE
     if found.by_turning_light < better * max(found.by_still_light, least):
         return None
     log.info(
@@ -91,13 +111,11 @@ def turntable_of(
 
 
 @torch.no_grad()
-def explained(
-    observations: Observations, turntable: Turntable, cfg: LightFrameConfig = LIGHT_FRAME
-) -> Explained:
+def explained(observations: Observations, turntable: Turntable) -> Explained:
     """How much of the changes of points from photograph to photograph either light explains."""
     point = torch.repeat_interleave(observations.offsets.diff())
     encoded = linear_to_srgb(observations.color)
-    usable = (encoded.mean(1) > cfg.dark) & (encoded < CLIPPED).all(1)
+    usable = (encoded.mean(1) > DARK) & (encoded < CLIPPED).all(1)
     point, view, wo = point[usable], observations.view[usable], observations.wo[usable]
     log_color = observations.color[usable].mean(1).log()
     normal = observations.normal[point]
@@ -106,7 +124,7 @@ def explained(
     lit = turntable.into_light(normal, (cosine[view], sine[view]))
     nothing = normal[:, :0]
     none, still, turning = (
-        cost(log_color, basis, point, cfg) for basis in (nothing, smooth(mirrored), smooth(lit))
+        cost(log_color, basis, point) for basis in (nothing, smooth(mirrored), smooth(lit))
     )
     return Explained(1 - still / none, 1 - turning / none)
 
@@ -116,14 +134,14 @@ def smooth(direction: Tensor) -> Tensor:
     return real_harmonics(2, direction)[:, 1:]
 
 
-def cost(log_color: Tensor, basis: Tensor, point: Tensor, cfg: LightFrameConfig) -> float:
+def cost(log_color: Tensor, basis: Tensor, point: Tensor) -> float:
     """Cauchy cost of log colours [N] of points [N], each of which has an albedo of its own, after
     the best sum of the basis [N, K]."""
     log_color, basis = log_color.double(), basis.double()
     count = int(point.max()) + 1 if len(point) else 0
     weight = torch.ones_like(log_color)
     rest = log_color
-    for _ in range(cfg.rounds):
+    for _ in range(ROUNDS):
         total = weight.new_zeros(count).index_add_(0, point, weight).clamp_min(1e-9)
 
         def centred(values: Tensor, weight: Tensor = weight, total: Tensor = total) -> Tensor:
@@ -136,5 +154,5 @@ def cost(log_color: Tensor, basis: Tensor, point: Tensor, cfg: LightFrameConfig)
         weighted = weight[:, None] * shades
         system = weighted.T @ shades + 1e-6 * torch.eye(shades.shape[1], dtype=torch.double)
         rest = (rest - shades @ torch.linalg.solve(system, weighted.T @ rest))[:, 0]
-        weight = 1 / (1 + (rest / cfg.cauchy).square())
-    return max(float(torch.log1p((rest / cfg.cauchy).square()).sum()), 1e-9)
+        weight = 1 / (1 + (rest / CAUCHY).square())
+    return max(float(torch.log1p((rest / CAUCHY).square()).sum()), 1e-9)

@@ -15,9 +15,31 @@ from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.data.base import coverage_of
 from univoxel.names import MasksFrom
-from univoxel.preparation.config import MASKS, MaskConfig
 from univoxel.preparation.hull import mask_distances
 from univoxel.threads import side_by_side
+
+# Photographs that are looked at, at most: the excess is a mean over them
+VIEWS = 32
+# Share of a picture's larger side up to which an excess is looked for: wider masks stay as they
+# are
+REACH_SHARE = 0.015
+# Pixels up to which an excess is looked for at least, in small pictures
+REACH_PIXELS = 6
+# Pixels further in, from and to, whose colour change an outline is compared with
+COMPARISON = (3, 5)
+# Colour change at an outline over that at the masks' edge, and over that further in: less is the
+# object's pattern
+CONTRAST = 1.5
+# Pixels outside of the masks, from and to, that tell whether they repeat the colour of the edge
+RING = (1.0, 4.0)
+# Colour change away from the edge over change along it, below which the edge's colours are
+# repeated outside, as pictures for blending do: those show no surroundings
+REPEATED = 0.5
+# Share of the surroundings that have one colour, above which they are cut away
+ONE_COLOR = 0.9
+# Pixels at a depth below which their mean is noise and is left out
+MIN_PIXELS = 50
+
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -27,7 +49,6 @@ def mask_excess(
     color: Sequence[Tensor] | Tensor,
     coverage: Sequence[Tensor] | Tensor,
     distance: Sequence[Tensor] | Tensor,
-    cfg: MaskConfig = MASKS,
 ) -> int:
     """Pixels by which masks are too wide, all of them alike; 0 where they fit or nothing tells.
 
@@ -42,16 +63,16 @@ def mask_excess(
         distance: V, [H, W] from `hull.mask_distances`.
     """
     longest = max(max(d.shape) for d in distance)
-    reach = max(cfg.reach_pixels, round(cfg.reach_share * longest))
-    step = -(-len(color) // cfg.views)
-    near, far = cfg.comparison
-    change = _change(color[::step], coverage[::step], distance[::step], reach + far, cfg)
+    reach = max(REACH_PIXELS, round(REACH_SHARE * longest))
+    step = -(-len(color) // VIEWS)
+    near, far = COMPARISON
+    change = _change(color[::step], coverage[::step], distance[::step], reach + far)
     if change.isnan().all():
         return 0
     edge = change[int((~change.isnan()).nonzero()[0])]
     peak = int(change[: reach + 1].nan_to_num(0).argmax())
     further = change[peak + near : peak + far + 1].mean()
-    if not (change[peak] > cfg.contrast * edge and change[peak] > cfg.contrast * further):
+    if not (change[peak] > CONTRAST * edge and change[peak] > CONTRAST * further):
         return 0
     around = torch.arange(max(peak - 1, 0), peak + 2)
     weight = change[around].nan_to_num(0).square()
@@ -63,7 +84,6 @@ def _change(
     coverage: Sequence[Tensor] | Tensor,
     distance: Sequence[Tensor] | Tensor,
     deepest: int,
-    cfg: MaskConfig,
 ) -> Tensor:
     """How much colours change towards the masks' edges, in the mean over pixels whose depth inside
     is 0, 1, ... deepest: [deepest + 1] sRGB a pixel; NaN where there are few."""
@@ -71,7 +91,7 @@ def _change(
     def of_view(view: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         c, stored, d = view
         encoded, covered = as_srgb(c), coverage_of(stored)
-        away = cut_away(encoded, covered, d, cfg)
+        away = cut_away(encoded, covered, d)
         hidden = (covered < 0.99) if away else torch.zeros_like(covered, dtype=torch.bool)
         hidden = max_pool2d(hidden[None].float(), 3, 1, 1)[0] > 0
         depth = (0.5 - d).floor().long()
@@ -86,7 +106,7 @@ def _change(
     for change, pixels in side_by_side(of_view, zip(color, coverage, distance, strict=True)):
         total += change
         count += pixels
-    return torch.where(count >= cfg.min_pixels, total / count, torch.nan)
+    return torch.where(count >= MIN_PIXELS, total / count, torch.nan)
 
 
 def as_srgb(stored: Tensor) -> Tensor:
@@ -94,19 +114,19 @@ def as_srgb(stored: Tensor) -> Tensor:
     return stored.float() / 255 if stored.dtype == torch.uint8 else linear_to_srgb(stored)
 
 
-def cut_away(encoded: Tensor, covered: Tensor, distance: Tensor, cfg: MaskConfig = MASKS) -> bool:
+def cut_away(encoded: Tensor, covered: Tensor, distance: Tensor) -> bool:
     """Whether a photograph [H, W, 3] sRGB no longer shows what stands around the object."""
     around = encoded[covered < 0.01]
     same = (around == around.median(0).values).all(1) if len(around) else torch.ones(1)
-    return float(same.float().mean()) > cfg.one_color or repeats_edge(encoded, distance, cfg)
+    return float(same.float().mean()) > ONE_COLOR or repeats_edge(encoded, distance)
 
 
-def repeats_edge(encoded: Tensor, distance: Tensor, cfg: MaskConfig = MASKS) -> bool:
+def repeats_edge(encoded: Tensor, distance: Tensor) -> bool:
     """Whether what surrounds the object repeats its edge, outwards, as pictures that are meant for
     blending do: colours [H, W, 3] then change along the edge and hardly away from it."""
-    y, x = ((distance > cfg.ring[0]) & (distance < cfg.ring[1])).nonzero(as_tuple=True)
+    y, x = ((distance > RING[0]) & (distance < RING[1])).nonzero(as_tuple=True)
     away, along = _slopes(encoded, distance, y, x)
-    return len(y) >= cfg.min_pixels and float(away.sum()) < cfg.repeated * float(along.sum())
+    return len(y) >= MIN_PIXELS and float(away.sum()) < REPEATED * float(along.sum())
 
 
 def _slopes(encoded: Tensor, distance: Tensor, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -124,9 +144,7 @@ def eroded(distance: Tensor, pixels: int) -> Tensor:
     return (0.5 - pixels - distance).clamp(0, 1)
 
 
-def fitted_masks(
-    photos: Photos, wanted: MasksFrom, cfg: MaskConfig = MASKS
-) -> tuple[Photos, Tensor]:
+def fitted_masks(photos: Photos, wanted: MasksFrom) -> tuple[Photos, Tensor]:
     """The photographs with masks that fit, as far as those are too wide, and `mask_distances`.
 
     Args:
@@ -138,7 +156,7 @@ def fitted_masks(
         [cameras.cut(v, picture) for v, picture in enumerate(pictures)]
         for pictures in (photos.color, photos.alpha, distance)
     )
-    excess = mask_excess(colors, covered, away, cfg)
+    excess = mask_excess(colors, covered, away)
     shelf.release()
     if not excess:
         return photos, distance

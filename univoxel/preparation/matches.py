@@ -18,7 +18,27 @@ from torch.nn.functional import interpolate, normalize
 from univoxel.camera import Cameras, looked_at, projection_matrices
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
-from univoxel.preparation.config import MATCHES, MatchesConfig
+
+# Pairs of neighbouring photographs that are compared, at most: a second or two for each four of
+# them
+PAIRS = 16
+# Pixels along the longer side of what is searched: larger photographs are shrunk, for time
+LONGEST = 640
+# Pixels along the longer side up to which they are searched at twice their size
+SMALL = 320
+# Radii of a keypoint that it lies inside of the silhouette: outlines move over a surface
+CLEAR = 2.0
+# Difference of the best match over that of the second best: above it, it is a guess
+RATIO = 0.75
+# Matches of a pair that a fundamental matrix has to explain together: eight make one
+FITTED = 16
+# Pixels that a match may be off by what that matrix says
+RESIDUAL = 1.0
+# Matrices that are tried
+TRIALS = 200
+# Matches in all below which nothing is known: plain objects
+MIN_MATCHES = 60
+
 
 AROUND = 8  # pixels around the object in which its keypoints are described
 
@@ -44,9 +64,9 @@ class Agreement:
     matches: int
 
 
-def agreement(cameras: Cameras, matches: Matches, cfg: MatchesConfig = MATCHES) -> Agreement | None:
+def agreement(cameras: Cameras, matches: Matches) -> Agreement | None:
     """How far matches lie from their epipolar lines; None: there are too few to tell."""
-    if len(matches) < cfg.min_matches:
+    if len(matches) < MIN_MATCHES:
         return None
     distance = epipolar_distances(cameras, matches)
     median, most = distance.quantile(torch.tensor([0.5, 0.9], dtype=distance.dtype)).tolist()
@@ -88,7 +108,7 @@ def _homogeneous(x: Tensor) -> Tensor:
     return torch.cat([x.double(), torch.ones(len(x), 1, dtype=torch.float64)], 1)
 
 
-def find_matches(photos: Photos, distance: Tensor, cfg: MatchesConfig = MATCHES) -> Matches:
+def find_matches(photos: Photos, distance: Tensor) -> Matches:
     """Points that are found again in the nearest views.
 
     What the cameras say chooses which views are neighbours, and nothing else: matches stay that a
@@ -101,37 +121,35 @@ def find_matches(photos: Photos, distance: Tensor, cfg: MatchesConfig = MATCHES)
 
     Source: Lowe 2004, "Distinctive Image Features from Scale-Invariant Keypoints".
     """
-    pairs = neighbours(photos.cameras, cfg)
+    pairs = neighbours(photos.cameras)
     views = sorted({view for pair in pairs for view in pair})
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         found = dict(
-            zip(views, pool.map(lambda v: _keypoints(photos, distance, v, cfg), views), strict=True)
+            zip(views, pool.map(lambda v: _keypoints(photos, distance, v), views), strict=True)
         )
-    matched = [_matched(found[a], found[b], cfg) for a, b in pairs]
+    matched = [_matched(found[a], found[b]) for a, b in pairs]
     count = torch.tensor([len(m) for m, _ in matched])
     points = torch.from_numpy(np.concatenate([np.zeros((0, 4)), *(m for m, _ in matched)]))
     of = torch.tensor(pairs).reshape(-1, 2).repeat_interleave(count, 0)
     explained = torch.from_numpy(np.concatenate([np.zeros(0, bool), *(e for _, e in matched)]))
-    if explained.sum() >= cfg.min_matches:
+    if explained.sum() >= MIN_MATCHES:
         points, of = points[explained], of[explained]
     return Matches(of, points[:, :2], points[:, 2:])
 
 
-def neighbours(cameras: Cameras, cfg: MatchesConfig = MATCHES) -> list[tuple[int, int]]:
-    """Pairs of a view and the one that sees the object from the nearest direction, cfg.pairs at
+def neighbours(cameras: Cameras) -> list[tuple[int, int]]:
+    """Pairs of a view and the one that sees the object from the nearest direction, PAIRS at
     most: of views as evenly spread among all as they go."""
     away = normalize(cameras.camera_to_world[:, :, 3] - looked_at(cameras), dim=1)
     cosine = (away @ away.T).fill_diagonal_(-math.inf)
-    step = max(1.0, len(cameras) / cfg.pairs)
-    views = [int(k * step) for k in range(min(cfg.pairs, len(cameras)))]
+    step = max(1.0, len(cameras) / PAIRS)
+    views = [int(k * step) for k in range(min(PAIRS, len(cameras)))]
     nearest = cosine.argmax(1)
     pairs = [(view, int(nearest[view])) for view in views if len(cameras) > 1]
     return sorted({(min(pair), max(pair)) for pair in pairs})
 
 
-def _keypoints(
-    photos: Photos, distance: Tensor, view: int, cfg: MatchesConfig
-) -> tuple[np.ndarray, np.ndarray]:
+def _keypoints(photos: Photos, distance: Tensor, view: int) -> tuple[np.ndarray, np.ndarray]:
     """Places [K, 2], pixels, and descriptors [K, 128] of keypoints on the object."""
     none = np.zeros((0, 2)), np.zeros((0, 128), np.uint8)
     depth = photos.cameras.cut(view, distance[view])
@@ -144,12 +162,12 @@ def _keypoints(
     ]
     encoded = color.float() / 255 if color.dtype == torch.uint8 else linear_to_srgb(color)
     grey = encoded.mean(-1)
-    share = min(1.0, cfg.longest / max(grey.shape))
+    share = min(1.0, LONGEST / max(grey.shape))
     if share < 1:
         size = tuple(max(1, round(n * share)) for n in grey.shape)
         grey = interpolate(grey[None, None], size, mode="bilinear", antialias=True)[0, 0]
     # Details of a pixel or two count where there are few pixels
-    sift = SIFT(upsampling=2 if max(grey.shape) <= cfg.small else 1)
+    sift = SIFT(upsampling=2 if max(grey.shape) <= SMALL else 1)
     try:
         sift.detect_and_extract(grey.double().numpy())
     except (RuntimeError, ValueError):  # no keypoints, or fewer pixels than filters need
@@ -161,29 +179,29 @@ def _keypoints(
     place = (positions[:, ::-1] + 0.5) * scale + np.array([left, top])
     column, row = np.floor(place).astype(int).T
     inside = depth.numpy()[row.clip(0, depth.shape[0] - 1), column.clip(0, depth.shape[1] - 1)]
-    clear = inside < -cfg.clear * sigmas * scale.mean()
+    clear = inside < -CLEAR * sigmas * scale.mean()
     return place[clear], descriptors[clear]
 
 
 def _matched(
-    one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], cfg: MatchesConfig
+    one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places [M, 4] of points in two photographs that look alike, and which of them [M] a
     fundamental matrix explains."""
     if min(len(one[0]), len(other[0])) < 2:  # a ratio needs a second best
         return np.zeros((0, 4)), np.zeros(0, bool)
-    index = match_descriptors(one[1], other[1], max_ratio=cfg.ratio, cross_check=True)
+    index = match_descriptors(one[1], other[1], max_ratio=RATIO, cross_check=True)
     first, second = one[0][index[:, 0]], other[0][index[:, 1]]
     explained = np.zeros(len(index), bool)
-    if len(index) >= cfg.fitted:
+    if len(index) >= FITTED:
         _, inlier = ransac(
             (first, second),
             FundamentalMatrixTransform,
             min_samples=8,
-            residual_threshold=cfg.residual,
-            max_trials=cfg.trials,
+            residual_threshold=RESIDUAL,
+            max_trials=TRIALS,
             rng=0,
         )
-        if inlier is not None and np.sum(inlier) >= cfg.fitted:
+        if inlier is not None and np.sum(inlier) >= FITTED:
             explained = np.asarray(inlier, bool)
     return np.concatenate([first, second], 1), explained

@@ -16,9 +16,33 @@ from torch import Tensor
 from univoxel import shelf
 from univoxel.data import Photos
 from univoxel.data.base import coverage_of
-from univoxel.preparation.config import MASKS, OUTLINES, MaskConfig, OutlineConfig
 from univoxel.preparation.masks import as_srgb, cut_away
 from univoxel.threads import side_by_side
+
+# Share of a picture's larger side by which edges are moved at most
+MOST = 0.04
+# Pixels beyond what a mask may be off by, in which colours of the object and of what is around
+# are taken
+SAMPLES_WITHIN = 6.0
+# How many times so far a pixel may be from the nearest of these: others say nothing
+KNOWN_WITHIN = 2.0
+# Colours of the object that a pixel is compared with, the nearest ones: it has patterns
+OBJECT_SAMPLES = 200
+# The same of what is around
+OTHER_SAMPLES = 24
+# Pixels that a mask may be off by, for each pixel between the colours that are taken: of a wide
+# band fewer are enough, for time
+SPACING = 3.0
+# sRGB that colours of one thing differ by
+NOISE = 0.06
+# How much colours count that tell clearly
+COLORS = 4.0
+# How much the mask counts
+GIVEN = 0.5
+# How much a neighbour of the same colour counts
+SMOOTH = 3.0
+# How many times steeper the edge is made than the equations for it leave it: they draw it out
+STEEPER = 3.0
 
 
 def drawn_again(
@@ -26,8 +50,6 @@ def drawn_again(
     distance: Tensor,
     off: float,
     doubted: Tensor,
-    cfg: OutlineConfig = OUTLINES,
-    masks: MaskConfig = MASKS,
 ) -> Tensor:
     """Coverage [V, H, W] in [0, 1] by masks whose edges lie where colours change.
 
@@ -35,7 +57,7 @@ def drawn_again(
 
     Args:
         distance: [V, H, W] from `hull.mask_distances`.
-        off: pixels, > 0, that edges may be off by; at most cfg.most are moved.
+        off: pixels, > 0, that edges may be off by; at most MOST are moved.
         doubted: [V, H, W] bool, where a mask is not believed at all: it stays, and tells nothing.
     """
     coverage, cut = shelf.zeros(photos.alpha.shape, torch.float32), photos.cameras.cut
@@ -44,21 +66,19 @@ def drawn_again(
         coverage[view] = coverage_of(photos.alpha[view])
         color, covered = as_srgb(photos.stored(view)[0]), cut(view, coverage[view])
         away = cut(view, distance[view])
-        if shows_nothing_else(photos, distance, view, masks):
+        if shows_nothing_else(photos, distance, view):
             return
-        reach = min(off, cfg.most * max(covered.shape))
+        reach = min(off, MOST * max(covered.shape))
         believed = ~cut(view, doubted[view]).numpy()
         picture, mask, far = (x.numpy().astype(np.float64) for x in (color, covered, away))
-        covered.copy_(torch.from_numpy(outlined(picture, mask, far, believed, reach, cfg)))
+        covered.copy_(torch.from_numpy(outlined(picture, mask, far, believed, reach)))
 
     side_by_side(draw_, range(len(photos)))
     shelf.release()
     return coverage
 
 
-def shows_nothing_else(
-    photos: Photos, distance: Tensor, view: int, masks: MaskConfig = MASKS
-) -> bool:
+def shows_nothing_else(photos: Photos, distance: Tensor, view: int) -> bool:
     """Whether nothing but the object is left of a photograph.
 
     Args:
@@ -66,7 +86,7 @@ def shows_nothing_else(
     """
     color, stored = photos.stored(view)
     away = photos.cameras.cut(view, distance[view])
-    return cut_away(as_srgb(color), coverage_of(stored), away, masks)
+    return cut_away(as_srgb(color), coverage_of(stored), away)
 
 
 def outlined(
@@ -75,7 +95,6 @@ def outlined(
     distance: np.ndarray,
     believed: np.ndarray,
     reach: float,
-    cfg: OutlineConfig = OUTLINES,
 ) -> np.ndarray:
     """Coverage [H, W] in [0, 1] by a mask whose edge is moved, at most `reach` pixels.
 
@@ -86,14 +105,14 @@ def outlined(
     Source: the equations are those of Grady 2005, "Multilabel Random Walker Image Segmentation
     Using Prior Models".
     """
-    ring = reach + cfg.samples_within
+    ring = reach + SAMPLES_WITHIN
     band = (np.abs(distance) <= reach) & believed
     inside, around = (believed & (d > reach) & (d <= ring) for d in (-distance, distance))
     if not (band.any() and inside.any() and around.any()):
         return coverage
-    apart = max(1, int(reach / cfg.spacing))
-    share, tells = _likeness(color, band, inside, around, apart, cfg.known_within * ring, cfg)
-    return _smoothed(color, coverage, band, share, cfg.colors * tells, cfg)
+    apart = max(1, int(reach / SPACING))
+    share, tells = _likeness(color, band, inside, around, apart, KNOWN_WITHIN * ring)
+    return _smoothed(color, coverage, band, share, COLORS * tells)
 
 
 def _likeness(
@@ -103,13 +122,12 @@ def _likeness(
     around: np.ndarray,
     apart: int,
     known_within: float,
-    cfg: OutlineConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
     """How much pixels of the band [N] look like the object rather than like what is around, and
     how clearly; both in [0, 1]. Colours of either side are taken so many pixels apart, >= 1."""
     pixels, colors = np.argwhere(band), color[band]
     unlike, known = [], np.ones(len(pixels), bool)
-    for side, most in ((inside, cfg.object_samples), (around, cfg.other_samples)):
+    for side, most in ((inside, OBJECT_SAMPLES), (around, OTHER_SAMPLES)):
         places = np.argwhere(side)
         fewer = places[(places % apart == 0).all(1)]
         places = fewer if len(fewer) else places
@@ -118,7 +136,7 @@ def _likeness(
         away, index = (np.asarray(x).reshape(-1, count) for x in found)  # of one sample it is [N]
         unlike.append(_least_difference(colors, color[tuple(places.T)], index))
         known &= away[:, 0] <= known_within
-    tells = (unlike[1] - unlike[0]) / (2 * cfg.noise)
+    tells = (unlike[1] - unlike[0]) / (2 * NOISE)
     share = 1 / (1 + np.exp(-4 * tells.clip(-10, 10)))
     return share, np.where(known, np.minimum(np.abs(tells), 1) ** 2, 0)
 
@@ -137,21 +155,20 @@ def _smoothed(
     band: np.ndarray,
     share: np.ndarray,
     weight: np.ndarray,
-    cfg: OutlineConfig,
 ) -> np.ndarray:
     """Coverage [H, W] that follows shares [N] of the band, by weights, and the mask, and changes
     where colours do."""
     index = np.full(band.shape, -1)
     index[band] = np.arange(len(share))
     pixels = np.argwhere(band)
-    diagonal, right = weight + cfg.given, weight * share + cfg.given * given[band]
+    diagonal, right = weight + GIVEN, weight * share + GIVEN * given[band]
     rows, columns, entries = [], [], []
     for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
         beside = pixels + step
         here = np.flatnonzero(((beside >= 0) & (beside < band.shape)).all(1))
         own, other = tuple(pixels[here].T), tuple(beside[here].T)
-        unlike = ((color[own] - color[other]) ** 2).sum(-1) / (2 * cfg.noise**2)
-        alike = cfg.smooth * np.exp(-unlike)
+        unlike = ((color[own] - color[other]) ** 2).sum(-1) / (2 * NOISE**2)
+        alike = SMOOTH * np.exp(-unlike)
         there = index[other]
         fixed = there < 0  # beyond the band, where the mask stays
         diagonal[here] += alike
@@ -165,5 +182,5 @@ def _smoothed(
     # Well conditioned, since each pixel has a say of its own: some tens of products are enough
     found, _ = cg(system, right, given[band], rtol=1e-4, M=sparse.diags(1 / diagonal))
     result = given.copy()
-    result[band] = ((found - 0.5) * cfg.steeper + 0.5).clip(0, 1)
+    result[band] = ((found - 0.5) * STEEPER + 0.5).clip(0, 1)
     return result

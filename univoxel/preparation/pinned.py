@@ -24,10 +24,55 @@ from univoxel.fields.dense import DenseDistances
 from univoxel.fields.field import Field
 from univoxel.grid import GridShape
 from univoxel.ops import VisibilityScene
-from univoxel.preparation.config import HULL, PINNED, HullConfig, PinnedConfig
 from univoxel.preparation.hull import visual_hull
 from univoxel.preparation.observed_hull import observe_hull
 from univoxel.render.transport import Observations
+
+# Points of the hull that are looked at
+POINTS = 8000
+# Cosine of normal and direction to the camera below which sightings are left out
+MIN_COSINE = 0.25
+# Sightings that a point has at least
+MIN_VIEWS = 8
+# Voxels off the surface at which mirrored rays start
+OFF_SURFACE = 2.0
+# Rows, and twice as many columns, of the table of what directions send
+ROWS = 24
+# Sightings that have to tell what a direction sends
+LEAST = 3.0
+# Share of a neighbourhood's sightings that have to be told so
+SHARE = 0.3
+# Classes of normals, spread over the sphere
+CLASSES = 64
+# Degrees by which normals differ that are compared with one another
+TURN = 20.0
+# Points of a neighbourhood, over which sums are taken
+NEIGHBOURS = 32
+# Voxels that count in the search for neighbours as much as `bend`
+NEAR = 3.0
+# Difference of unit normals
+BEND = 0.5
+# Rounds in which points leave the table
+ROUNDS = 8
+# Root mean square, in sRGB, by which a neighbourhood changes from view to view at least
+CHANGE = 0.18
+# Times that points which stay in the table show its changes
+GAIN = 0.6
+# Share of all points that the table is made of at least: some agree by chance
+LEAST_SHARE = 0.05
+# Correlation of their changes with those of the table
+CORRELATION = 0.5
+# Change of points of the table from which regions grow that are pinned. Half of the chrome of a
+# scene changed by 0.30 to 0.43, half of its rough copper by 0.18 to 0.31: that is trained better
+# than it is pinned
+STRONG_CHANGE = 0.33
+# Change of points that they take in
+WEAK_CHANGE = 0.26
+# Correlation of such points
+WEAK_CORRELATION = 0.2
+# Voxels around the surface within which nodes stay
+BAND = 3.0
+
 
 # Shares of a point's neighbours that take it into a region, or, some, if it is weak; and rounds
 MOST, SOME = 0.5, 0.3
@@ -42,8 +87,6 @@ class PinnedHull:
     pinned: Tensor  # [P] bool
     distance: Tensor  # of masks, as of `visual_hull`
     cameras: Cameras
-    cfg: PinnedConfig
-    hull: HullConfig
 
     def nodes(self, sdf: Tensor, grid: GridShape) -> Tensor:
         """Which nodes of a grid stay, by the point next to each: [X, Y, Z] bool.
@@ -51,7 +94,7 @@ class PinnedHull:
         Args:
             sdf: [X, Y, Z] of the visual hull, world units.
         """
-        near = sdf.abs() < self.cfg.band * grid.voxel_size
+        near = sdf.abs() < BAND * grid.voxel_size
         point = _nearest(grid.nodes()[near], self.position, 1)[:, 0]
         return torch.zeros_like(near).masked_scatter(near, self.pinned[point])
 
@@ -64,7 +107,7 @@ class PinnedHull:
         distances = field.distances
         if not isinstance(distances, DenseDistances) or distances.pinned is not None:
             return
-        hull = visual_hull(self.distance, self.cameras, field.grid, self.hull)
+        hull = visual_hull(self.distance, self.cameras, field.grid)
         distances.pinned = self.nodes(hull, field.grid)
         distances.sdf[distances.pinned] = hull[distances.pinned]
         field.refresh()
@@ -76,8 +119,6 @@ def pinned_hull(
     distance: Tensor,
     hull: Tensor,
     grid: GridShape,
-    cfg: PinnedConfig = PINNED,
-    hull_cfg: HullConfig = HULL,
 ) -> PinnedHull | None:
     """Where training leaves the visual hull as it is; None: nowhere.
 
@@ -86,18 +127,16 @@ def pinned_hull(
         distance: of masks, as of `visual_hull`.
         hull: [X, Y, Z] sdf of the visual hull on the grid, world units.
     """
-    seen = observe_hull(photos, hull, grid, cfg.points) if cfg.points else None
+    seen = observe_hull(photos, hull, grid, POINTS)
     if seen is None:
         return None
-    pinned = mirroring(seen, hull, grid, cfg)
+    pinned = mirroring(seen, hull, grid)
     if not pinned.any():
         return None
-    return PinnedHull(seen.position, pinned, distance, photos.cameras, cfg, hull_cfg)
+    return PinnedHull(seen.position, pinned, distance, photos.cameras)
 
 
-def mirroring(
-    seen: Observations, hull: Tensor, grid: GridShape, cfg: PinnedConfig = PINNED
-) -> Tensor:
+def mirroring(seen: Observations, hull: Tensor, grid: GridShape) -> Tensor:
     """Which of N points change as others do that mirror the same direction: [N] bool.
 
     A table of what each direction sends is the mean of what points show that mirror it. A point is
@@ -105,24 +144,24 @@ def mirroring(
     would agree whatever they show. Points that change least as the table does leave it, round by
     round.
     """
-    sightings = open_sightings(seen, hull, grid, cfg)
+    sightings = open_sightings(seen, hull, grid)
     if sightings is None:
         return torch.zeros(len(seen.position), dtype=torch.bool)
     total, count = sightings.total, sightings.count
     change = sightings.centred(sightings.color, torch.ones(len(sightings.point)))
     rms = (sightings.around(total(change.square().sum(1))) / sightings.around(count)).sqrt()
-    in_table = rms > cfg.change
-    for i in range(cfg.rounds):
+    in_table = rms > CHANGE
+    for i in range(ROUNDS):
         gain, correlation = sightings.explained(in_table)
-        strictness = min(1.0, (i + 1) / (cfg.rounds / 2))
-        in_table = rms > cfg.change
-        in_table &= (gain > strictness * cfg.gain) & (correlation > strictness * cfg.correlation)
-        if in_table.sum() < cfg.least_share * len(in_table):
+        strictness = min(1.0, (i + 1) / (ROUNDS / 2))
+        in_table = rms > CHANGE
+        in_table &= (gain > strictness * GAIN) & (correlation > strictness * CORRELATION)
+        if in_table.sum() < LEAST_SHARE * len(in_table):
             return torch.zeros_like(in_table)
-    place = torch.cat([seen.position / (cfg.near * grid.voxel_size), seen.normal], 1)
-    weak = (rms > cfg.weak_change) & (correlation > cfg.weak_correlation)
-    nearest = _nearest(place, place, cfg.neighbours)
-    return grown(in_table & (rms > cfg.strong_change), weak, nearest)
+    place = torch.cat([seen.position / (NEAR * grid.voxel_size), seen.normal], 1)
+    weak = (rms > WEAK_CHANGE) & (correlation > WEAK_CORRELATION)
+    nearest = _nearest(place, place, NEIGHBOURS)
+    return grown(in_table & (rms > STRONG_CHANGE), weak, nearest)
 
 
 def grown(strong: Tensor, weak: Tensor, nearest: Tensor) -> Tensor:
@@ -204,35 +243,33 @@ class Sightings:
         return gain, torch.where(enough, both / (of_shown * of_sent).clamp_min(1e-12).sqrt(), 0.0)
 
 
-def open_sightings(
-    seen: Observations, hull: Tensor, grid: GridShape, cfg: PinnedConfig
-) -> Sightings | None:
+def open_sightings(seen: Observations, hull: Tensor, grid: GridShape) -> Sightings | None:
     """The sightings that can be compared; None: too few points have any."""
     point = torch.repeat_interleave(seen.offsets.diff())
     normal = seen.normal[point]
     cosine = (normal * seen.wo).sum(1)
     mirrored = 2 * cosine[:, None] * normal - seen.wo
     occluder = VisibilityScene(*DenseDistances(grid, hull).isosurface())
-    start = seen.position[point] + cfg.off_surface * grid.voxel_size * normal
-    usable = (cosine > cfg.min_cosine) & ~occluder.occluded(start, mirrored)
+    start = seen.position[point] + OFF_SURFACE * grid.voxel_size * normal
+    usable = (cosine > MIN_COSINE) & ~occluder.occluded(start, mirrored)
     point, mirrored = point[usable], mirrored[usable]
-    decided = torch.bincount(point, minlength=len(seen.normal)) >= cfg.min_views
+    decided = torch.bincount(point, minlength=len(seen.normal)) >= MIN_VIEWS
     decided = decided.nonzero()[:, 0]
-    if len(decided) < cfg.neighbours:
+    if len(decided) < NEIGHBOURS:
         return None
-    place = torch.cat([seen.position / (cfg.near * grid.voxel_size), seen.normal / cfg.bend], 1)
+    place = torch.cat([seen.position / (NEAR * grid.voxel_size), seen.normal / BEND], 1)
     u, v = sphere.direction_to_latlong(mirrored).unbind(1)
-    column = (u * 2 * cfg.rows).long() % (2 * cfg.rows)
-    classes = sphere.fibonacci_sphere(cfg.classes)
+    column = (u * 2 * ROWS).long() % (2 * ROWS)
+    classes = sphere.fibonacci_sphere(CLASSES)
     return Sightings(
         point,
         linear_to_srgb(seen.color[usable].clamp(0, 1)),
-        (v * cfg.rows).long().clamp_max(cfg.rows - 1) * 2 * cfg.rows + column,
+        (v * ROWS).long().clamp_max(ROWS - 1) * 2 * ROWS + column,
         (seen.normal @ classes.T).argmax(1),
-        (classes @ classes.T < math.cos(math.radians(cfg.turn))).float(),
-        decided[_nearest(place, place[decided], cfg.neighbours)],
-        cfg.least,
-        cfg.share,
+        (classes @ classes.T < math.cos(math.radians(TURN))).float(),
+        decided[_nearest(place, place[decided], NEIGHBOURS)],
+        LEAST,
+        SHARE,
     )
 
 

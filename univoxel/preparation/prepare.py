@@ -19,7 +19,6 @@ from univoxel.names import Varying
 from univoxel.poses import PoseSteps
 from univoxel.preparation.belief import unweighed, weighed
 from univoxel.preparation.carving import carve_within_time
-from univoxel.preparation.config import PreparationConfig
 from univoxel.preparation.exposures import say_clipped, varying_and_gains
 from univoxel.preparation.hull import visual_hull
 from univoxel.preparation.light_frame import turntable_of
@@ -33,6 +32,7 @@ from univoxel.training.config import StageConfig
 
 log: logging.Logger = logging.getLogger("univoxel")
 
+PINNED = "hull that stays"  # a step
 MINUTES = {"arguments": ("minutes",)}  # of a message
 
 
@@ -81,19 +81,19 @@ def find_silhouettes(
         DataError: the silhouettes share no volume.
     """
     if cfg.cameras == "auto":
-        say_strays(photos, cfg.preparation.light_frame)
+        say_strays(photos)
     given = photos
     in_time = begins("masks")
-    photos, distance = fitted_masks(given, cfg.masks if in_time else "given", cfg.preparation.masks)
+    photos, distance = fitted_masks(given, cfg.masks if in_time else "given")
     try:
         if begins("masks against cameras"):
-            belief = weighed(photos, distance, cfg.cameras, cfg.masks, cfg.preparation)
+            belief = weighed(photos, distance, cfg.cameras, cfg.masks)
         else:
-            belief = unweighed(photos, distance, cfg.cameras, cfg.preparation)
+            belief = unweighed(photos, distance, cfg.cameras)
             log.info("there is no time to compare masks and cameras: see minutes", extra=MINUTES)
         found = None
         if belief.votes > 1 and begins("rough masks"):
-            found = mended(photos, distance, belief, cfg.preparation)
+            found = mended(photos, distance, belief)
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
     doubted, edges_given = None, photos is given and found is None
@@ -115,42 +115,46 @@ def prepare(
     """
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)
-    constants = cfg.preparation
     photos, distance, box = silhouettes.photos, silhouettes.distance, silhouettes.box
     grid = fit_grid(*box, round(1e6 * stage.voxels))
     poses = None
     if silhouettes.refined and begins("cameras"):
-        poses = registered_poses(distance, photos.cameras, box, constants.registration)
+        poses = registered_poses(distance, photos.cameras, box)
         photos = replace(photos, cameras=poses.corrected(photos.cameras))
     begins("hull")
-    hull = visual_hull(distance, photos.cameras, grid, constants.hull, silhouettes.votes)
+    hull = visual_hull(distance, photos.cameras, grid, silhouettes.votes)
     begins("exposures")
-    say_clipped(photos, constants.exposures)
-    varying, gains = varying_and_gains(
-        photos, hull, grid, cfg.scene.varying, cfg.exposures, constants.exposures
-    )
-    turntable = turntable_of(photos, hull, grid, cfg.light_frame, constants.light_frame)
+    say_clipped(photos)
+    varying, gains = varying_and_gains(photos, hull, grid, cfg.scene.varying, cfg.exposures)
+    turntable = turntable_of(photos, hull, grid, cfg.light_frame)
     pinned = None
-    if varying == "none" and turntable is None and begins("hull that stays"):
-        pinned = find_pinned(silhouettes, photos.cameras, hull, grid, constants)
+    if varying == "none" and turntable is None and begins(PINNED):
+        pinned = find_pinned(silhouettes, photos.cameras, hull, grid)
     carves = cfg.carving_seconds and varying != "light" and turntable is None
     if carves and begins("concavities"):
         seconds = cfg.carving_seconds
-        carved = carve_within_time(hull, grid, photos, gains, seconds, constants.carving)
+        carved = carve_within_time(hull, grid, photos, gains, seconds)
         hull = carved if pinned is None else torch.where(pinned.nodes(hull, grid), hull, carved)
     return Prepared(silhouettes, poses, grid, hull, varying, gains, turntable, pinned)
 
 
-def pinned_in(silhouettes: Silhouettes, scene: Scene, cfg: TrainConfig) -> PinnedHull | None:
+def pinned_in(
+    silhouettes: Silhouettes,
+    scene: Scene,
+    cfg: TrainConfig,
+    begins: Callable[[str], bool] = unhurried,
+) -> PinnedHull | None:
     """What `prepare` pinned, of a scene that goes on."""
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)
     if scene.cfg.varying != "none" or scene.cfg.turntable is not None:
         return None
+    if not begins(PINNED):
+        return None
     cameras = scene.registered(silhouettes.photos).cameras
     grid = fit_grid(*silhouettes.box, round(1e6 * stage.voxels))
-    hull = visual_hull(silhouettes.distance, cameras, grid, cfg.preparation.hull)
-    return find_pinned(silhouettes, cameras, hull, grid, cfg.preparation)
+    hull = visual_hull(silhouettes.distance, cameras, grid)
+    return find_pinned(silhouettes, cameras, hull, grid)
 
 
 def find_pinned(
@@ -158,7 +162,6 @@ def find_pinned(
     cameras: Cameras,
     hull: Tensor,
     grid: GridShape,
-    cfg: PreparationConfig,
 ) -> PinnedHull | None:
     """`pinned_hull`; rough masks give no hull that could be right.
 
@@ -169,4 +172,4 @@ def find_pinned(
     if silhouettes.votes > 1:
         return None
     photos = replace(silhouettes.photos, cameras=cameras)
-    return pinned_hull(photos, silhouettes.distance, hull, grid, cfg.pinned, cfg.hull)
+    return pinned_hull(photos, silhouettes.distance, hull, grid)

@@ -13,8 +13,28 @@ from univoxel import shelf
 from univoxel.camera import Cameras, pixel_rays
 from univoxel.optim import RowAdam
 from univoxel.poses import PoseSteps
-from univoxel.preparation.config import REGISTRATION, RegistrationConfig
 from univoxel.records import Rays
+
+# Pixels to the silhouette, negative inside and rising, that count as its edge
+EDGE = (-1.6, -0.5)
+# Points along a ray, where silhouettes are looked up; twice, the second time closer
+RAY_SAMPLES = 48
+# Rays through edges that the contradiction is measured with
+TEST_RAYS = 1000
+# Share of these rays that miss by less than the contradiction
+QUANTILE = 0.95
+# Pixels above which cameras are refined. Exact ones contradict by -0.3 or less: measured -0.7 to
+# -0.4 in 19 of 20 scenes
+MAX_CONTRADICTION = 0.25
+# Steps of Adam
+STEPS = 150
+# Learning rate at begin and end, radians and radii of the object
+LR = (5e-3, 2.5e-4)
+# Rays of a step
+RAYS = 256
+# Silhouettes that the rays of a step are held against
+VIEWS = 32
+
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -33,7 +53,6 @@ class Edges:
         self,
         distance: Tensor,
         box: tuple[Tensor, Tensor],
-        cfg: RegistrationConfig = REGISTRATION,
         doubted: Tensor | None = None,
     ) -> None:
         """
@@ -42,8 +61,8 @@ class Edges:
             box: corners [3], [3] around the object.
             doubted: [V, H, W] bool, where an edge is none.
         """
-        low, high = cfg.edge
-        self.ray_samples: int = cfg.ray_samples
+        low, high = EDGE
+        self.ray_samples: int = RAY_SAMPLES
         self.distance = distance
         self.extended: Tensor = _extended(distance)
         edges = [((d > low) & (d < high)).nonzero() for d in _one_by_one(distance)]
@@ -115,21 +134,20 @@ def contradiction(
     distance: Tensor,
     cameras: Cameras,
     box: tuple[Tensor, Tensor],
-    cfg: RegistrationConfig = REGISTRATION,
     doubted: Tensor | None = None,
 ) -> float:
-    """Pixels that a cfg.quantile of the rays through silhouettes' edges miss the others by, at
+    """Pixels that a QUANTILE of the rays through silhouettes' edges miss the others by, at
     most: -0.3 or less where cameras and masks are exact, about their error where they are not.
 
     Args:
         distance, box, doubted: see `Edges`.
     """
-    edges, generator = Edges(distance, box, cfg, doubted), torch.Generator().manual_seed(0)
+    edges, generator = Edges(distance, box, doubted), torch.Generator().manual_seed(0)
     if not len(edges.pixels):
         return 0.0
-    pixels, views = edges.sample(cfg.test_rays, generator), torch.arange(len(cameras))
+    pixels, views = edges.sample(TEST_RAYS, generator), torch.arange(len(cameras))
     missed = edges.missed(cameras, pixels, views)
-    return float(missed.quantile(cfg.quantile))
+    return float(missed.quantile(QUANTILE))
 
 
 def align_(
@@ -137,7 +155,6 @@ def align_(
     distance: Tensor,
     cameras: Cameras,
     box: tuple[Tensor, Tensor],
-    cfg: RegistrationConfig = REGISTRATION,
 ) -> None:
     """Move the cameras, by steps of `poses`, to where their silhouettes agree.
 
@@ -146,19 +163,19 @@ def align_(
     Args:
         distance, box: see `Edges`.
     """
-    edges, generator = Edges(distance, box, cfg), torch.Generator().manual_seed(0)
+    edges, generator = Edges(distance, box), torch.Generator().manual_seed(0)
     if not len(edges.pixels):
         return
-    begin, end = cfg.lr
+    begin, end = LR
     optimizer = RowAdam(poses.parameters(), betas=(0.9, 0.99))
     poses.train()
-    for k in range(cfg.steps):
-        optimizer.param_groups[0]["lr"] = begin * (end / begin) ** (k / cfg.steps)
+    for k in range(STEPS):
+        optimizer.param_groups[0]["lr"] = begin * (end / begin) ** (k / STEPS)
         now = poses.corrected(cameras)
-        others = torch.randperm(len(cameras), generator=generator)[: cfg.views]
-        missed = edges.missed(now, edges.sample(cfg.rays, generator), others)
+        others = torch.randperm(len(cameras), generator=generator)[:VIEWS]
+        missed = edges.missed(now, edges.sample(RAYS, generator), others)
         # An edge pixel's own silhouette contains it by some 1: only more than that contradicts
-        off = (missed - sum(cfg.edge) / 2).clamp_min(0)
+        off = (missed - sum(EDGE) / 2).clamp_min(0)
         optimizer.zero_grad()
         (off.square() / (1 + off)).mean().backward()  # robust: some masks are wrong, not cameras
         optimizer.step()
@@ -192,12 +209,7 @@ def _seen(cameras: Cameras, points: Tensor, view: Tensor) -> tuple[Tensor, Tenso
     return torch.stack([x, -y], 1) / -z[:, None] * cameras.focal[view] + cameras.centre[view], -z
 
 
-def registered_poses(
-    distance: Tensor,
-    cameras: Cameras,
-    box: tuple[Tensor, Tensor],
-    cfg: RegistrationConfig = REGISTRATION,
-) -> PoseSteps:
+def registered_poses(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tensor]) -> PoseSteps:
     """Steps to cameras whose silhouettes agree, as far as these tell; logs how far they went.
 
     Args:
@@ -206,11 +218,11 @@ def registered_poses(
     half = (box[1] - box[0]) / 2
     poses = PoseSteps(len(cameras))
     poses.about(cameras, box[0] + half, float(half.max()))
-    align_(poses, distance, cameras, box, cfg)
+    align_(poses, distance, cameras, box)
     moved = poses.moved(cameras).square().mean().sqrt()
-    rest = contradiction(distance, poses.eval().corrected(cameras), box, cfg)
+    rest = contradiction(distance, poses.eval().corrected(cameras), box)
     result = "agree"
-    if rest > cfg.max_contradiction:
+    if rest > MAX_CONTRADICTION:
         result = f"still contradict one another by {rest:.1f} pixels"
     log.info("cameras moved the object by %.1f pixels on average: silhouettes %s", moved, result)
     return poses

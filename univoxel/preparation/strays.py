@@ -12,7 +12,6 @@ import math
 
 from univoxel.data import Photos
 from univoxel.orbit import Circle, circle_of
-from univoxel.preparation.config import LIGHT_FRAME, LightFrameConfig
 from univoxel.preparation.surroundings import surroundings_stand_still
 
 NAMED = 8  # photographs that the message names, at most
@@ -20,24 +19,24 @@ NAMED = 8  # photographs that the message names, at most
 log: logging.Logger = logging.getLogger("univoxel")
 
 
-def find_strays(photos: Photos, cfg: LightFrameConfig = LIGHT_FRAME) -> Circle | None:
+def find_strays(photos: Photos) -> Circle | None:
     """The circle of a turntable with photographs that were placed off it; None: none were.
 
     Only before surroundings that stood still is it known to be a circle: who walks around an object
     may well step aside.
     """
     circle = circle_of(photos.cameras)
-    if circle is None or not circle.strays().any() or not surroundings_stand_still(photos, cfg):
+    if circle is None or not circle.strays().any() or not surroundings_stand_still(photos):
         return None
     return circle
 
 
-def say_strays(photos: Photos, cfg: LightFrameConfig = LIGHT_FRAME) -> None:
+def say_strays(photos: Photos) -> None:
     """Warn of photographs that were placed off the circle of their turntable, and name them.
 
     They are trained on all the same: of what they alone show, wrong views are better than none.
     """
-    circle = find_strays(photos, cfg)
+    circle = find_strays(photos)
     if circle is None:
         return
     strays = circle.strays()

@@ -7,12 +7,23 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from univoxel.data import Photos
-from univoxel.preparation.config import LIGHT_FRAME, LightFrameConfig
 from univoxel.preparation.matches import neighbours
+
+# Pixels along the longer side of the pictures whose surroundings are compared
+SMALL = 128
+# Of those pixels, by which a camera that stands still may wobble, or be turned a little
+WOBBLE = 3
+# By which surroundings are shifted, to see whether that fits better: less than a camera sees them
+# shift that goes some 5 degrees around the object
+SHIFT = 10
+# Correlation that surroundings which stood still have at least
+ALIKE = 0.85
+# Correlation of a picture with itself shifted, above which it is too plain to tell
+PLAIN = 0.95
 
 
 @torch.no_grad()
-def surroundings_stand_still(photos: Photos, cfg: LightFrameConfig = LIGHT_FRAME) -> bool | None:
+def surroundings_stand_still(photos: Photos) -> bool | None:
     """Whether neighbouring photographs show the same around the object, at the same pixels.
 
     A camera that goes around an object sees its surroundings shift. None: they cannot tell, since
@@ -21,34 +32,32 @@ def surroundings_stand_still(photos: Photos, cfg: LightFrameConfig = LIGHT_FRAME
     stand_still = []
     for one, other in neighbours(photos.cameras):
         if photos.cameras.size(one) == photos.cameras.size(other):
-            first, second = _shrunk(photos, one, cfg), _shrunk(photos, other, cfg)
-            stand_still.append(_same(first, second, cfg))
+            first, second = _shrunk(photos, one), _shrunk(photos, other)
+            stand_still.append(_same(first, second))
     known = [same for same in stand_still if same is not None]
     if 2 * len(known) <= len(stand_still):
         return None
     return 2 * sum(known) > len(known)
 
 
-def _shrunk(photos: Photos, view: int, cfg: LightFrameConfig) -> tuple[Tensor, Tensor]:
+def _shrunk(photos: Photos, view: int) -> tuple[Tensor, Tensor]:
     """A small picture [h, w], grey sRGB or linear values, and where it shows no object [h, w]."""
     color, alpha = photos.stored(view)
-    factor = max(1, round(max(alpha.shape) / cfg.small))
+    factor = max(1, round(max(alpha.shape) / SMALL))
     grey = avg_pool2d(color.float().mean(-1)[None], factor)[0]
     shown = max_pool2d((alpha > 0).float()[None], factor)  # of the object, anywhere in a pixel
     return grey, max_pool2d(shown, 3, 1, 1)[0] == 0
 
 
-def _same(
-    one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], cfg: LightFrameConfig
-) -> bool | None:
+def _same(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> bool | None:
     """Whether two pictures agree around the object as they lie, and not better shifted far."""
     here = _correlation(one, other, 0, 0)
-    at_rest = [*([] if here is None else [here]), *_shifted(one, other, cfg.wobble)]
-    itself, far = _shifted(one, one, cfg.shift), _shifted(one, other, cfg.shift)
+    at_rest = [*([] if here is None else [here]), *_shifted(one, other, WOBBLE)]
+    itself, far = _shifted(one, one, SHIFT), _shifted(one, other, SHIFT)
     # Plain surroundings look alike wherever they are
-    if not (at_rest and itself and far) or max(itself) > cfg.plain:
+    if not (at_rest and itself and far) or max(itself) > PLAIN:
         return None
-    return max(at_rest) > max(cfg.alike, *far)
+    return max(at_rest) > max(ALIKE, *far)
 
 
 def _shifted(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], pixels: int) -> list[float]:

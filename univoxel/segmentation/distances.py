@@ -11,7 +11,11 @@ from torch import Tensor
 from univoxel.camera import Cameras, looked_at
 from univoxel.errors import NothingFound, UserError
 from univoxel.fields.field import Field
-from univoxel.segmentation.config import SegmentationConfig
+
+# Voxels from the surface within which the sdf is left as it is
+NEAR = 1.5
+# Share of the largest part's volume; smaller ones are dropped
+SMALLEST_PART = 0.02
 
 
 def corners(box: tuple[float, ...]) -> tuple[Tensor, Tensor]:
@@ -40,7 +44,7 @@ def surroundings(cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def redistance_(field: Field, cfg: SegmentationConfig, whole: bool = False) -> None:
+def redistance_(field: Field, whole: bool = False) -> None:
     """Make the sdf a distance again, but for what is near the surface.
 
     Args:
@@ -54,13 +58,13 @@ def redistance_(field: Field, cfg: SegmentationConfig, whole: bool = False) -> N
     if whole:
         parts = np.asarray(label(inside))
         volume = np.bincount(parts[inside], minlength=1)
-        inside &= (volume >= cfg.smallest_part * volume.max())[parts]
+        inside &= (volume >= SMALLEST_PART * volume.max())[parts]
     if not inside.any():
         raise NothingFound
     outside, depth = (ndimage.distance_transform_edt(m) for m in (~inside, inside))
     distance = np.asarray(outside) - np.asarray(depth)
     distance = (distance - 0.5 * np.sign(distance)) * field.voxel_size
-    near = cfg.near * field.voxel_size
+    near = NEAR * field.voxel_size
     keep = (np.abs(sdf) < near) & (np.abs(distance) < near)
     keep &= inside == (sdf < 0)
     field.sdf.copy_(torch.from_numpy(np.where(keep, sdf, distance)).float())

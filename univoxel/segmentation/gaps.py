@@ -20,7 +20,14 @@ from torch.nn.functional import interpolate
 from univoxel.bars import track
 from univoxel.camera import Cameras, project
 from univoxel.grid import GridShape
-from univoxel.segmentation.config import VoteConfig
+
+# Gaps are what few masks see through, and a vote fills. Voxels, of the pixels in which they are
+# looked for
+GAP_PIXEL = 1.5
+# Share of the silhouette's area that a gap has at least
+SMALLEST_GAP = 0.002
+# Rounds through all photographs, at most; one gap may open the next
+GAP_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -38,7 +45,6 @@ def carve_gaps_(
     masks: Sequence[Tensor],
     cameras: Cameras,
     grid: GridShape,
-    cfg: VoteConfig,
 ) -> int:
     """Take votes [X, Y, Z] away where a mask [H, W] sees through; return of how many nodes.
 
@@ -47,12 +53,12 @@ def carve_gaps_(
     """
     inside = vote >= threshold
     nodes = grid.nodes()[inside]
-    sights = [_sight(nodes, cameras, v, mask, grid, cfg) for v, mask in enumerate(masks)]
+    sights = [_sight(nodes, cameras, v, mask, grid) for v, mask in enumerate(masks)]
     kept = np.ones(len(nodes), bool)
-    for _ in range(cfg.gap_rounds):
+    for _ in range(GAP_ROUNDS):
         before = kept.sum()
         for one in track(sights, "looking through gaps"):
-            for gap in _gaps(one, cfg):
+            for gap in _gaps(one):
                 gone = kept & gap[one.pixel]
                 if gone.any() and _agrees(sights, gone):
                     kept &= ~gone
@@ -64,12 +70,10 @@ def carve_gaps_(
     return int((~kept).sum())
 
 
-def _sight(
-    nodes: Tensor, cameras: Cameras, view: int, mask: Tensor, grid: GridShape, cfg: VoteConfig
-) -> _Sight:
+def _sight(nodes: Tensor, cameras: Cameras, view: int, mask: Tensor, grid: GridShape) -> _Sight:
     where, depth = project(cameras, view, nodes)
     near = depth[depth > 0].median() if (depth > 0).any() else torch.ones(())
-    wide = cfg.gap_pixel * grid.voxel_size * float(cameras.focal[view].max() / near)
+    wide = GAP_PIXEL * grid.voxel_size * float(cameras.focal[view].max() / near)
     size = cameras.size(view)
     width, height = (
         min(of_mask, max(1, round(n / wide)))
@@ -82,7 +86,7 @@ def _sight(
     return _Sight(small.numpy() >= 0.5, pixel, np.bincount(pixel, minlength=height * width + 1))
 
 
-def _gaps(sight: _Sight, cfg: VoteConfig) -> list[np.ndarray]:
+def _gaps(sight: _Sight) -> list[np.ndarray]:
     """Parts of the silhouette [H W + 1], largest first, that the mask sees through."""
     silhouette = sight.nodes[:-1].reshape(sight.shown.shape) > 0
     through = silhouette & ~np.asarray(ndimage.binary_dilation(sight.shown), bool)
@@ -90,7 +94,7 @@ def _gaps(sight: _Sight, cfg: VoteConfig) -> list[np.ndarray]:
     area = np.bincount(parts.ravel())
     area[0] = 0
     order = np.argsort(-area)
-    large = order[area[order] >= max(1, cfg.smallest_gap * silhouette.sum())]
+    large = order[area[order] >= max(1, SMALLEST_GAP * silhouette.sum())]
     flat = np.append(parts.ravel(), 0)
     return [flat == part for part in large]
 

@@ -23,13 +23,76 @@ from torch.nn.functional import grid_sample, interpolate, max_pool2d, max_pool3d
 from univoxel.bars import track
 from univoxel.camera import Cameras, image_rays, pixel_width, project, resize
 from univoxel.grid import GridShape, fit_grid
-from univoxel.segmentation.config import GroundConfig
 from univoxel.segmentation.distances import surroundings
 from univoxel.segmentation.vote import largest_votes, overlaps, shrunk, votes
 
+# Pixels of the widest picture that is compared
+PIXELS = 480
+# Pictures that plane and its picture are found from, about
+VIEWS = 40
+# Heights that are tried in the search for the plane
+HEIGHTS = 61
+# Half width of the square looked at, in those of what is looked at
+SEARCHED = 1.5
+# Points along its sides
+POINTS = 48
+# Pixels of blur, from coarse to fine
+BLURS = (4.0, 2.0, 1.0)
+# Trials of planes at each of them
+TRIALS = 60
+# Pictures in which a point has to be
+SEEN = 4
+# Share of the pictures, and of the points
+SEEN_SHARE = 0.25
+# Quantile of the points that counts: the object hides others
+HIDDEN = 0.4
+# sRGB, of what plain surfaces differ by
+NOISE = 0.02
+# Share of the median's over all heights that the least disagreement may have: .1 on a patterned
+# floor
+CLEARLY = 0.4
+# Disagreement between pictures over that between points, at most: .07 on that floor
+AGREE = 0.35
+# Half of the places of the plane's picture are within so many half widths of what is looked at;
+# the others are the wider, the farther away
+NEAR = 2.0
+# Places along it
+SIDE = 512
+# Pixels of blur, of pictures that are compared with it
+BLUR = 1.0
+# Pictures whose colour others are asked to share, about
+CANDIDATES = 20
+# sRGB, within which colours are alike
+TOLERANCE = 0.08
+# Share of the pictures that see a place: so many share its colour
+ALIKE = 0.3
+# Half widths of what is looked at, by which a place is lifted
+ABOVE = 0.15
+# Times as many pictures share its colour as then: what has one colour has no height
+BETTER = 1.25
+# Pixels along a square whose majority decides
+PATCH = 5
+# Voxels along the sides of the box of the object's hull, about
+VOXELS = 64
+# Pixels of the longer side of the pictures that make it
+ROUGH = 96
+# Share of the pictures that see no floor behind a node: from FIRST on what hangs together is
+# the object, and the silhouettes that agree best are of one in between
+FIRST = 0.9
+LOWEST = 0.7
+HIGHEST = 0.98
+# Share from which on it is the object's whatever a picture shows
+CERTAIN = 0.96
+# Pixels of ROUGH beside the first silhouette that are compared
+BAND = 4
+# Median IoU with the hull from which on masks are believed
+OVERLAP = 0.85
+# Share of the mask's area: smaller parts and holes are none
+SPECK = 0.005
+
+
 log: logging.Logger = logging.getLogger("univoxel")
 
-GROUND = GroundConfig()
 THRESHOLDS = 40  # that are tried
 
 
@@ -77,69 +140,63 @@ class Ground:
     threshold: float  # the vote from which on a node belongs to the object
 
 
-def find_ground(
-    photographs: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig = GROUND
-) -> Ground | None:
+def find_ground(photographs: Sequence[Tensor], cameras: Cameras) -> Ground | None:
     """What an object stands on, in photographs [H, W, 3] uint8 of a world with +Z up.
 
     None where there is no plane on which photographs agree, or no object on it.
     """
-    small = resize(cameras, min(cameras.width, cfg.pixels))
+    small = resize(cameras, min(cameras.width, PIXELS))
     sharp = [_small(one, small.size(v)) for v, one in enumerate(photographs)]
-    plane = find_plane(sharp, small, cfg)
+    plane = find_plane(sharp, small)
     if plane is None:
         return None
     box = surroundings(small)
-    soft = [_blurred(one, cfg.blur) for one in sharp]
-    floor = _floor(plane, cfg.near * float((box[1] - box[0]).max()) / 2, soft, small, cfg)
-    seen = [_seen(floor, one, small, v, cfg) for v, one in enumerate(soft)]
-    return _carved(floor, seen, small, box, cfg)
+    soft = [_blurred(one, BLUR) for one in sharp]
+    floor = _floor(plane, NEAR * float((box[1] - box[0]).max()) / 2, soft, small)
+    seen = [_seen(floor, one, small, v) for v, one in enumerate(soft)]
+    return _carved(floor, seen, small, box)
 
 
-def ground_mask(
-    ground: Ground, photograph: Tensor, cameras: Cameras, view: int, cfg: GroundConfig = GROUND
-) -> Tensor:
+def ground_mask(ground: Ground, photograph: Tensor, cameras: Cameras, view: int) -> Tensor:
     """The mask [H, W], 0 or 1, of a photograph [H, W, 3] uint8 by what stands on the ground."""
-    small = resize(cameras, min(cameras.width, cfg.pixels))
-    picture = _blurred(_small(photograph, small.size(view)), cfg.blur)
-    found = _object(ground, *_seen(ground.floor, picture, small, view, cfg), small, view, cfg)
+    small = resize(cameras, min(cameras.width, PIXELS))
+    picture = _blurred(_small(photograph, small.size(view)), BLUR)
+    found = _object(ground, *_seen(ground.floor, picture, small, view), small, view)
     whole = interpolate(found[None, None], photograph.shape[:2], mode="bilinear")[0, 0]
     return (whole >= 0.5).float()
 
 
-def find_plane(
-    pictures: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig = GROUND
-) -> Plane | None:
+def find_plane(pictures: Sequence[Tensor], cameras: Cameras) -> Plane | None:
     """The plane on which pictures [3, H, W] agree best; None where they agree on no one clearly.
 
     It may lean by a few degrees from the horizontal, and is below the cameras.
     """
     lower, upper = surroundings(cameras)
     middle, half = (lower + upper) / 2, float((upper - lower).max()) / 2
-    chosen = torch.arange(0, len(cameras), max(1, len(cameras) // cfg.views))
+    chosen = torch.arange(0, len(cameras), max(1, len(cameras) // VIEWS))
     some, cams = [pictures[v] for v in chosen.tolist()], cameras.of(chosen)
-    side = cfg.searched * half * _places(cfg.points)
+    side = SEARCHED * half * _places(POINTS)
 
     def disagreement(values: Sequence[float], blurred: Sequence[Tensor]) -> float:
         plane = Plane(middle[:2], float(values[0]), (float(values[1]), float(values[2])))
-        return _disagreement(plane.points(side), blurred, cams, cfg)
+        return _disagreement(plane.points(side), blurred, cams)
 
-    coarse = [_blurred(one, cfg.blurs[0]) for one in some]
+    coarse = [_blurred(one, BLURS[0]) for one in some]
     top = min(float(middle[2]) + half, float(cameras.camera_to_world[:, 2, 3].min()))
-    heights = np.linspace(float(middle[2]) - 2 * half, top, cfg.heights).tolist()
+    heights = np.linspace(float(middle[2]) - 2 * half, top, HEIGHTS).tolist()
     found = [disagreement((z, 0, 0), coarse) for z in track(heights, "looking for the ground")]
     best = int(np.argmin(found))
-    if found[best] > cfg.clearly * float(np.median(found)):
+    if found[best] > CLEARLY * float(np.median(found)):
         return None
     values = np.array([heights[best], 0.0, 0.0])
-    for blur in cfg.blurs:
+    for blur in BLURS:
         blurred = [_blurred(one, blur) for one in some]
         step = blur * pixel_width(cameras, middle) * np.array([1, 1 / half, 1 / half])
         simplex = np.concatenate([values[None], values + np.diag(step)])
-        options = {"initial_simplex": simplex, "maxfev": cfg.trials, "xatol": 1e-5, "fatol": 1e-4}
+        options = {"initial_simplex": simplex, "maxfev": TRIALS, "xatol": 1e-5, "fatol": 1e-4}
         result = minimize(disagreement, values, (blurred,), "Nelder-Mead", options=options)
         values = result.x
-    if result.fun > cfg.agree:
+    if result.fun > AGREE:
         return None
     return Plane(middle[:2], float(values[0]), (float(values[1]), float(values[2])))
 
@@ -178,9 +235,7 @@ def _looked_up(
     return torch.stack(colors), torch.stack(seen)
 
 
-def _disagreement(
-    points: Tensor, pictures: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig
-) -> float:
+def _disagreement(points: Tensor, pictures: Sequence[Tensor], cameras: Cameras) -> float:
     """How much colours of a point differ between pictures, over how much they do between points.
 
     Large where too few points are seen, or all look alike: that says nothing.
@@ -189,36 +244,34 @@ def _disagreement(
     colors = torch.where(seen[..., None], colors, torch.nan)
     usual = colors.nanmedian(0).values
     differs = (colors - usual).abs().sum(2).nanmedian(0).values
-    enough = seen.sum(0) >= max(cfg.seen, cfg.seen_share * len(pictures))
-    if enough.float().mean() < cfg.seen_share:
+    enough = seen.sum(0) >= max(SEEN, SEEN_SHARE * len(pictures))
+    if enough.float().mean() < SEEN_SHARE:
         return torch.inf
     usual = usual[enough]
     spread = (usual - usual.median(0).values).abs().sum(1).median()
     # Half of the points may be hidden by the object from half of the cameras
-    return float(differs[enough].quantile(cfg.hidden) / (spread + cfg.noise))
+    return float(differs[enough].quantile(HIDDEN) / (spread + NOISE))
 
 
-def _floor(
-    plane: Plane, near: float, pictures: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig
-) -> Floor:
+def _floor(plane: Plane, near: float, pictures: Sequence[Tensor], cameras: Cameras) -> Floor:
     """A plane with what most pictures show at each place of it."""
-    chosen = torch.arange(0, len(cameras), max(1, len(cameras) // cfg.views))
+    chosen = torch.arange(0, len(cameras), max(1, len(cameras) // VIEWS))
     some, cams = [pictures[v] for v in chosen.tolist()], cameras.of(chosen)
-    side = _places(cfg.side)
+    side = _places(SIDE)
     points = plane.points(near * side / (1 - side.abs()))
-    above = cfg.above * near / cfg.near
+    above = ABOVE * near / NEAR
     value, known = torch.zeros(len(points), 3), torch.zeros(len(points))
     parts = list(torch.arange(len(points)).split(1 << 14))
     for part in track(parts, "drawing the ground"):
-        value[part], known[part] = _agreed(points[part], above, some, cams, cfg)
-    shape = cfg.side, cfg.side
+        value[part], known[part] = _agreed(points[part], above, some, cams)
+    shape = SIDE, SIDE
     known = known.reshape(shape)
     within = torch.from_numpy(ndimage.binary_fill_holes(known.numpy() > 0)).float()
     return Floor(plane, near, value.T.reshape(3, *shape), known, within)
 
 
 def _agreed(
-    points: Tensor, above: float, pictures: Sequence[Tensor], cameras: Cameras, cfg: GroundConfig
+    points: Tensor, above: float, pictures: Sequence[Tensor], cameras: Cameras
 ) -> tuple[Tensor, Tensor]:
     """The colour [N, 3] that pictures share at points [N, 3], and whether it is of the floor [N].
 
@@ -227,15 +280,14 @@ def _agreed(
     """
     found, seen = _looked_up(pictures, cameras, points)
     higher, _ = _looked_up(pictures, cameras, points + torch.tensor([0, 0, above]))
-    enough = torch.clamp_min(cfg.alike * seen.sum(0), cfg.seen)
+    enough = torch.clamp_min(ALIKE * seen.sum(0), SEEN)
     best, color, floor = (torch.zeros(len(points), *shape) for shape in ((), (3,), ()))
-    for v in range(0, len(pictures), max(1, len(pictures) // cfg.candidates)):
+    for v in range(0, len(pictures), max(1, len(pictures) // CANDIDATES)):
         here, there = (
-            ((one - found[v]).abs().amax(2) < cfg.tolerance) & seen & seen[v]
-            for one in (found, higher)
+            ((one - found[v]).abs().amax(2) < TOLERANCE) & seen & seen[v] for one in (found, higher)
         )
         number = here.sum(0)
-        more = number - cfg.better * there.sum(0)
+        more = number - BETTER * there.sum(0)
         better = (more > best) & (number >= enough)
         mean = (found * here[..., None]).sum(0) / number.clamp_min(1)[:, None]
         color = torch.where(better[:, None], mean, color)
@@ -244,9 +296,7 @@ def _agreed(
     return color, floor
 
 
-def _seen(
-    floor: Floor, picture: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
-) -> tuple[Tensor, Tensor]:
+def _seen(floor: Floor, picture: Tensor, cameras: Cameras, view: int) -> tuple[Tensor, Tensor]:
     """Pixels [H, W] of a blurred picture [3, H, W] that do not show the floor, and those before it:
     0 or 1."""
     width, height = cameras.size(view)
@@ -266,8 +316,8 @@ def _seen(
             for j in range(3)
         ]
     ).amin(0)
-    alike = ((differs < cfg.tolerance) & (known > 0.5)).float().numpy()
-    shown = torch.from_numpy(ndimage.uniform_filter(alike, cfg.patch)) < 0.5
+    alike = ((differs < TOLERANCE) & (known > 0.5)).float().numpy()
+    shown = torch.from_numpy(ndimage.uniform_filter(alike, PATCH)) < 0.5
     return shown.float(), (within > 0.5).float()
 
 
@@ -276,7 +326,6 @@ def _carved(
     seen: Sequence[tuple[Tensor, Tensor]],
     cameras: Cameras,
     box: tuple[Tensor, Tensor],
-    cfg: GroundConfig,
 ) -> Ground | None:
     """The ground with the hull of what hides it; None where that is not one object within the box.
 
@@ -285,23 +334,23 @@ def _carved(
     """
     lower, upper = box
     lower = torch.cat([lower[:2], lower.new_tensor([floor.plane.height])])
-    grid = fit_grid(lower, upper, cfg.voxels**3)
-    shown, within = ([shrunk(one[i], cfg.rough).round() for one in seen] for i in (0, 1))
+    grid = fit_grid(lower, upper, VOXELS**3)
+    shown, within = ([shrunk(one[i], ROUGH).round() for one in seen] for i in (0, 1))
     vote = votes(shown, cameras, grid)
-    part = _largest_part(vote >= cfg.first)
+    part = _largest_part(vote >= FIRST)
     if part is None:
         return None
     around = max_pool3d(part[None].float(), 3, 1, 1)[0]
     vote = torch.where(around > 0, vote, 0.0)
-    levels = torch.linspace(cfg.lowest, cfg.highest, THRESHOLDS)
+    levels = torch.linspace(LOWEST, HIGHEST, THRESHOLDS)
     agreed = []
     for view, (one, behind) in enumerate(zip(shown, within, strict=True)):
         largest = largest_votes(grid, vote, cameras, view, one.shape)
-        beside = behind * one * _grown(largest >= cfg.first, cfg.band)
+        beside = behind * one * _grown(largest >= FIRST, BAND)
         agreed.append(overlaps(largest * behind, beside, levels))
     medians = torch.stack(agreed).quantile(0.5, 0)
     log.debug("the hull on the ground agrees to %.3f", float(medians.max()))
-    if medians.max() < cfg.overlap:
+    if medians.max() < OVERLAP:
         return None
     return Ground(floor, grid, vote, float(levels[medians.argmax()]))
 
@@ -321,24 +370,22 @@ def _grown(mask: Tensor, pixels: int) -> Tensor:
     return max_pool2d(mask[None].float(), 2 * pixels + 1, 1, pixels)[0]
 
 
-def _object(
-    ground: Ground, shown: Tensor, within: Tensor, cameras: Cameras, view: int, cfg: GroundConfig
-) -> Tensor:
+def _object(ground: Ground, shown: Tensor, within: Tensor, cameras: Cameras, view: int) -> Tensor:
     """Of pixels that do not show the floor [H, W] those of the object: 0 or 1.
 
     Before the floor they are believed; elsewhere the silhouette is, and where hardly any picture
     sees floor behind: what looks like it by chance does in one picture.
     """
-    small = shrunk(shown, cfg.rough).shape
+    small = shrunk(shown, ROUGH).shape
     largest = largest_votes(ground.grid, ground.vote, cameras, view, small)
-    hidden = largest < cfg.certain
+    hidden = largest < CERTAIN
     parts = largest, _grown(largest >= ground.threshold, 1), _grown(hidden, 1)
     largest, grown, hidden = (
         interpolate(one[None, None], shown.shape, mode="bilinear")[0, 0] for one in parts
     )
     silhouette = torch.where(within > 0, grown >= 0.5, largest >= ground.threshold)
     found = ((silhouette & (shown > 0)) | (hidden < 0.5)).numpy()
-    return torch.from_numpy(_without_specks(found, cfg.speck)).float()
+    return torch.from_numpy(_without_specks(found, SPECK)).float()
 
 
 def _without_specks(found: np.ndarray, share: float) -> np.ndarray:

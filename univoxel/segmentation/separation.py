@@ -35,6 +35,20 @@ from univoxel.training.surface_update import (
     smooth_touched_,
 )
 
+# Last steps, whose mean PSNR decides which radius is kept
+COMPARED_STEPS = 50
+# Learning rate at begin and end, of the backdrop's logits
+LR_BACKDROP = (0.05, 0.01)
+# Weight of the mean opacity at begin and end: what object and backdrop explain alike goes to the
+# backdrop, and the ball is carved before it grows. More at the begin loses what looks like the
+# room
+EMPTINESS = (0.02, 0.0005)
+# Steps between turning the sdf back into distances
+REDISTANCE_EVERY = 50
+# Share of the found box's diagonal, left free around it
+MARGIN = 0.05
+
+
 DEFAULTS = SegmentationConfig()
 
 
@@ -67,16 +81,16 @@ def find_object(
     for radius in cfg.radii:
         with suppress(NothingFound):
             parts = _ball(radius, lower, upper, cfg)
-            trials.append((parts, separate_(parts, cfg.coarse, photos, watch, cfg)))
+            trials.append((parts, separate_(parts, cfg.coarse, photos, watch)))
     if not trials:
         raise NothingFound
     parts, _ = max(trials, key=lambda trial: trial[1])
-    redistance_(parts.field, cfg, whole=True)
-    box = surface_box(parts.field, lower, upper, cfg.margin)
+    redistance_(parts.field, whole=True)
+    box = surface_box(parts.field, lower, upper, MARGIN)
     field = parts.field.resized(fit_grid(*box, round(1e6 * cfg.fine.voxels)))
     parts.scene.field = field
-    separate_(replace(parts, field=field), cfg.fine, photos, watch, cfg)
-    redistance_(field, cfg, whole=True)
+    separate_(replace(parts, field=field), cfg.fine, photos, watch)
+    redistance_(field, whole=True)
     return parts.scene.eval()
 
 
@@ -123,7 +137,6 @@ def separate_(
     stage: StageConfig,
     photos: Photos,
     watch: Callable[[float], None],
-    cfg: SegmentationConfig,
 ) -> float:
     """Fit scene and backdrop to the photographs for a stage.
 
@@ -150,14 +163,14 @@ def separate_(
             geometric(stage.lr_sdf, done) * field.voxel_size,
             geometric(stage.lr_features, done),
             geometric(stage.lr_networks, done),
-            geometric(cfg.lr_backdrop, done),
+            geometric(LR_BACKDROP, done),
         )
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
         scene.inv_s = 1 / (geometric(stage.sharpness, done) * field.voxel_size)
-        redistanced = step % cfg.redistance_every == 0
+        redistanced = step % REDISTANCE_EVERY == 0
         if redistanced:
-            redistance_(field, cfg)
+            redistance_(field)
         if redistanced or step % REFRESH == 0:
             field.refresh()
         view, row, column = _random_pixels(photos, stage.rays)
@@ -168,9 +181,7 @@ def separate_(
         # The same from all directions: what looks different from each would pass for the backdrop
         front = scene.radiance(surface.features, surface.normal, surface.normal)
         rendered = front * opacity + backdrop(rays) * (1 - opacity)
-        loss = (
-            losses.photometric(rendered, target) + geometric(cfg.emptiness, done) * opacity.mean()
-        )
+        loss = losses.photometric(rendered, target) + geometric(EMPTINESS, done) * opacity.mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         smooth_sdf_gradient_(field, stage.spread)
@@ -179,5 +190,5 @@ def separate_(
             smooth_touched_(field, stage, SMOOTH_EVERY)
         quality.append(psnr(rendered.detach(), target))
         watch(quality[-1])
-    last = quality[-cfg.compared_steps :]
+    last = quality[-COMPARED_STEPS:]
     return sum(last) / len(last)

@@ -23,6 +23,26 @@ from univoxel.segmentation.config import VoteConfig
 from univoxel.segmentation.distances import surroundings
 from univoxel.segmentation.gaps import carve_gaps_
 
+# Sides of the first grid, in those of what half of the pictures show whole
+ROOM = 1.6
+# Share of its largest vote: what may be the object
+AROUND = 0.5
+# Share of the photographs that have to see a voxel: what few see, few decide on
+SEEN_BY = 0.25
+# Least and largest vote from which on a voxel may belong to the hull. The best depends on how many
+# masks are wrong: it is searched
+LOWEST = 0.3
+HIGHEST = 0.99
+# IoU below the median's, from where on a mask is wrong. As much of it has to be more than a pixel
+# off
+BELOW = 0.08
+# IoU with its silhouette below which a mask is wrong whatever the others have. If more than half
+# are, it is the hull that is wrong
+LEAST = 0.75
+# Voxels beside the silhouette within which a mended mask is kept
+BAND = 1.5
+
+
 VOTE = VoteConfig()
 BESIDE, MISSING = "keeps something beside the object", "misses a part"
 THRESHOLDS = 70  # that are tried
@@ -61,20 +81,20 @@ def elect(
     """
     small = [shrunk(mask, cfg.pixels) for mask in masks]
     lower, upper = surroundings(cameras)
-    middle, half = (lower + upper) / 2, cfg.room * (upper - lower) / 2
+    middle, half = (lower + upper) / 2, ROOM * (upper - lower) / 2
     first = fit_grid(middle - half, middle + half, cfg.first_voxels**3)
-    vote = votes(small, cameras, first, cfg)
+    vote = votes(small, cameras, first)
     if not float(vote.max()):
         raise UserError("the masks of the photographs have nothing in common: check masks, cameras")
-    second = _around(first, vote >= cfg.around * vote.max(), (cfg.voxels // 2) ** 3)
+    second = _around(first, vote >= AROUND * vote.max(), (cfg.voxels // 2) ** 3)
     smaller = [shrunk(mask, cfg.pixels // 2) for mask in small]
-    vote = votes(smaller, cameras, second, cfg)
-    threshold, _, _ = _compared(second, vote, smaller, cameras, cfg)
+    vote = votes(smaller, cameras, second)
+    threshold, _, _ = _compared(second, vote, smaller, cameras)
     grid = _around(second, vote >= threshold, cfg.voxels**3)
-    vote = votes(small, cameras, grid, cfg)
-    threshold, usual, largest = _compared(grid, vote, small, cameras, cfg)
-    if carve_gaps_(vote, threshold, small, cameras, grid, cfg):
-        threshold, usual, largest = _compared(grid, vote, small, cameras, cfg)
+    vote = votes(small, cameras, grid)
+    threshold, usual, largest = _compared(grid, vote, small, cameras)
+    if carve_gaps_(vote, threshold, small, cameras, grid):
+        threshold, usual, largest = _compared(grid, vote, small, cameras)
     return Hull(grid, vote, threshold, usual), largest
 
 
@@ -85,10 +105,10 @@ def _around(grid: GridShape, inside: Tensor, voxels: int) -> GridShape:
 
 
 def _compared(
-    grid: GridShape, vote: Tensor, masks: Sequence[Tensor], cameras: Cameras, cfg: VoteConfig
+    grid: GridShape, vote: Tensor, masks: Sequence[Tensor], cameras: Cameras
 ) -> tuple[float, float, list[Tensor]]:
     """The threshold whose silhouettes agree best with masks, their median IoU, `largest_votes`."""
-    levels = torch.linspace(cfg.lowest, cfg.highest, THRESHOLDS)
+    levels = torch.linspace(LOWEST, HIGHEST, THRESHOLDS)
     largest = [
         largest_votes(grid, vote, cameras, view, mask.shape)
         for view, mask in enumerate(track(masks, "comparing masks"))
@@ -120,15 +140,13 @@ def judge(
     # Edges that are a pixel off are no fault, though they are much of an object that is seen flat
     beside, missing = (shown & ~_grown(silhouette)).sum(), (silhouette & ~_grown(shown)).sum()
     differs = (beside + missing) / (silhouette | shown).sum().clamp_min(1)
-    if agreement >= max(hull.usual - cfg.below, cfg.least) or differs <= cfg.below:
+    if agreement >= max(hull.usual - BELOW, LEAST) or differs <= BELOW:
         return Verdict(agreement, "", mask)
     fault = BESIDE if beside > missing else MISSING
     return Verdict(agreement, fault, _mended(mask, silhouette, hull, cameras, view, cfg))
 
 
-def votes(
-    masks: Sequence[Tensor], cameras: Cameras, grid: GridShape, cfg: VoteConfig = VOTE
-) -> Tensor:
+def votes(masks: Sequence[Tensor], cameras: Cameras, grid: GridShape) -> Tensor:
     """Mean of the masks [H, W] over the cameras that see a node: [X, Y, Z] in [0, 1].
 
     It is 0 where fewer than their share see it.
@@ -144,7 +162,7 @@ def votes(
         )
         total += torch.where(seen, found[0, 0, 0], 0.0)
         seen_by += seen
-    enough = seen_by >= max(cfg.seen_by * len(masks), 1)
+    enough = seen_by >= max(SEEN_BY * len(masks), 1)
     return torch.where(enough, total / seen_by.clamp_min(1), 0.0).reshape(grid.size)
 
 
@@ -215,13 +233,13 @@ def _mended(
     voxel = float(hull.grid.voxel_size * cameras.focal[view].mean() * scale / depth)  # pixels
     small = shrunk(mask, cfg.pixels)
     away = mask_distances(silhouette.float()[None])[0] / voxel
-    kernel = 2 * max(1, round(2 * cfg.band * voxel)) + 1
-    sides = [(side >= cfg.band) & (side <= 3 * cfg.band) for side in (-away, away)]
+    kernel = 2 * max(1, round(2 * BAND * voxel)) + 1
+    sides = [(side >= BAND) & (side <= 3 * BAND) for side in (-away, away)]
     inner, outer = (_mean_near(small, side, kernel) for side in sides)
     believed = ((inner - outer - 0.5) / 0.25).clamp(0, 1)
     shape = (mask.shape[0], mask.shape[1])
     fine = interpolate(torch.stack([away, believed])[None], shape, mode="bilinear")[0]
-    grown, middle, core = (0.5 - fine[0] + s for s in (cfg.band, 0.0, -cfg.band))
+    grown, middle, core = (0.5 - fine[0] + s for s in (BAND, 0.0, -BAND))
     within = torch.maximum(torch.minimum(mask, grown.clamp(0, 1)), core.clamp(0, 1))
     return torch.lerp(middle.clamp(0, 1), within, fine[1])
 

@@ -36,6 +36,10 @@ from univoxel.segmentation.plain import plain_mask, plain_threshold
 from univoxel.segmentation.separation import DEFAULTS, find_object, mask
 from univoxel.segmentation.vote import BESIDE, MISSING, VOTE, Verdict, elect, judge
 
+# Photographs at least, for a vote; fewer do not outvote one another
+PHOTOGRAPHS = 12
+
+
 log: logging.Logger = logging.getLogger("univoxel")
 
 COLOURS, REMBG = "none", "rembg"  # where masks come from, if not from a folder
@@ -94,9 +98,9 @@ def cutout(
         for name in splits_of(data)
     }
     log.info(photos.about)
-    without_box = None if box or origin != COLOURS else _from_edges(splits, vote)
+    without_box = None if box or origin != COLOURS else _from_edges(splits)
     if without_box is None and origin == COLOURS and not box:
-        without_box = _from_ground(splits, vote)
+        without_box = _from_ground(splits)
     if without_box:
         masks = without_box
         verdicts, told = _judged(splits, masks, vote)
@@ -138,10 +142,10 @@ def _from_colours(
     return _of_all(splits, lambda split, view: mask(scene, split, view))
 
 
-def _from_edges(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
+def _from_edges(splits: dict[str, Photos]) -> Masks | None:
     """Masks of what stands before plain surroundings; None where they are not plain."""
     train = splits["train"]
-    if len(train) < cfg.photographs:
+    if len(train) < PHOTOGRAPHS:
         return None
     photographs = [_encoded(train, view) for view in range(len(train))]
     threshold = plain_threshold(photographs, train.cameras)
@@ -151,10 +155,10 @@ def _from_edges(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
     return _of_all(splits, lambda split, view: plain_mask(_encoded(split, view), threshold))
 
 
-def _from_ground(splits: dict[str, Photos], cfg: VoteConfig) -> Masks | None:
+def _from_ground(splits: dict[str, Photos]) -> Masks | None:
     """Masks of what stands on a patterned ground; None where there is none."""
     train = splits["train"]
-    if len(train) < cfg.photographs:
+    if len(train) < PHOTOGRAPHS:
         return None
     photographs = [_encoded(train, view) for view in range(len(train))]
     ground = find_ground(photographs, train.cameras)
@@ -196,14 +200,14 @@ def _judged(
         UserError: the masks have nothing in common.
     """
     train, count = splits["train"], len(splits["train"])
-    if count < cfg.photographs:
+    if count < PHOTOGRAPHS:
         for name, split in splits.items():
             for stem, one in zip(split.names, masks[name], strict=True):
                 if not bool((one >= 128).any()):
                     raise DataError(f"{split.folder}: the mask of {stem} shows nothing")
         log.warning(
             "masks are taken as they are: a vote needs %d photographs, there are %d",
-            *(cfg.photographs, count),
+            *(PHOTOGRAPHS, count),
         )
         verdicts = {name: [Verdict(None, "", m) for m in those] for name, those in masks.items()}
         return verdicts, "too few photographs for a vote: masks as they came"

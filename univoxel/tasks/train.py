@@ -15,7 +15,7 @@ import torch
 from univoxel import shelf
 from univoxel.build import build_scene
 from univoxel.checkpoint import FILE, load_checkpoint, save_scene
-from univoxel.compression import plan, sizes
+from univoxel.compression import plan, storage
 from univoxel.compression.choices import chosen_reach
 from univoxel.confidence.report import numbers, words
 from univoxel.confidence.survey import Survey, survey
@@ -127,7 +127,7 @@ def _train(
         limited = plan.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
         if begun:
             scene = begun[0]
-            pinned = pinned_in(silhouettes, scene, limited)
+            pinned = pinned_in(silhouettes, scene, limited, progress.preparing)
         else:
             prepared = prepare(silhouettes, limited, progress.preparing)
             scene, pinned = build_scene(prepared, limited), prepared.pinned
@@ -271,7 +271,7 @@ def make_stage_(
     if pinned is not None:
         pinned.pin_(scene.field)
     if isinstance(stage, JointConfig):
-        rows = sizes.sky_rows(stage.mirror.rows, cfg.budget_mb, cfg.compression)
+        rows = storage.sky_rows(stage.mirror.rows, cfg.budget_mb)
         stage = replace(stage, mirror=replace(stage.mirror, rows=rows))
         joint_stage.solve(scene, scene.registered(photos), stage, cfg.seed, progress)
     else:
@@ -282,10 +282,7 @@ def make_stage_(
     if last:
         fit_sharpness_(scene, pixels)
     if cfg.capacity == "adaptive" and (last or not progress.clock.over):
-        choices = plan.adapt_(scene, cfg, index, box, pixels, progress.clock.pace)
-        progress.chosen += choices
-        if not last and plan.begun_in_rehearsal(scene, choices):
-            progress.clock.count_as_done(cfg.compression.rehearsal_share)
+        progress.chosen += plan.adapt_(scene, cfg, index, pixels)
     reach, state = chosen_reach(progress.chosen), progress.state()
     save_scene(scene, cfg.out, state, slim=last, reach=reach)
     preview(scene, scene.registered(photos), cfg.out / "preview.png")

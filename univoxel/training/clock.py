@@ -264,11 +264,6 @@ class Clock:
         self.stage, self.done, self._stage_steps = self.stage + 1, 0.0, 0
         self._stage_begin, self._stage_before = self.seconds, 0.0
 
-    def count_as_done(self, share: float) -> None:
-        """Count a share of the coming stage's steps as made."""
-        self.done = share
-        self._stage_steps = round(share * self.cfg.stages[self.stage].iterations)
-
     def shorten(self) -> None:
         """Run through the rest of the stage's schedule in fewer steps."""
         self._planned = self._count + math.ceil(REST * (self._planned - self._count))
@@ -343,23 +338,3 @@ class Clock:
         for made, took in zip(self.made, self.took, strict=False):
             seconds += took * (1 / max(made, FEWEST) - 1) if made < ALL else 0.0
         return seconds / 60
-
-
-class CountedSteps:
-    """A clock of a few steps through the whole schedule of a stage, whatever time they take."""
-
-    def __init__(self, count: int) -> None:
-        self.stage: int = 0
-        self.step: int = 0
-        self._count = count
-
-    def steps(self) -> Iterator[float]:
-        while self.step < self._count:
-            yield self.step / self._count
-            self.step += 1
-
-    def shorten(self) -> None:
-        """A rehearsal makes all its steps: they are compared with another's."""
-
-    def abandon(self) -> None:
-        self._count = 0

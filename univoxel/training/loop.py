@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -27,7 +26,7 @@ from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
 from univoxel.training.pixels import TrainingPixels, unpacked
 from univoxel.training.plateau import Plateau
-from univoxel.training.progress import Listener, Rehearsal
+from univoxel.training.progress import Listener
 from univoxel.training.surface_update import (
     EPS_FEATURES,
     EPS_SDF,
@@ -43,8 +42,6 @@ REFRESH = 16  # looks at which bricks are empty
 RETRACE = 100  # traces of light through the surface as it has become
 COMPARE_EVERY = 2  # comparisons of patches: in each step they bring little more, at twice the cost
 SMOOTH_EVERY = 4  # smoothings of what the step has touched
-
-RATES = ("lr_sdf", "lr_features", "lr_networks")
 # Of so many rays one is compared with a place beside it, for which networks are evaluated again:
 # priors need no more
 COMPARED = 4
@@ -212,23 +209,6 @@ def learning_rates(stage: StageConfig, done: float, voxel_size: float) -> tuple[
         geometric(stage.lr_networks, done),
         geometric(stage.lr_poses, done),
     )
-
-
-def rehearsal(
-    cfg: TrainConfig,
-    pixels: TrainingPixels,
-    scene: Scene,
-    stage: StageConfig,
-    steps: int,
-) -> float:
-    """Hurry a scene through a stage, without light; PSNR of its held-out pixels."""
-    torch.manual_seed(cfg.seed)  # all rehearsals see the same rays
-    # From middling rates on: what has been learned must not be shaken
-    rates = {n: (math.sqrt(a * b), b) for n in RATES for a, b in [getattr(stage, n)]}
-    stage = replace(stage, physical_from=1.0, patches_from=1.0, **rates)
-    cfg = replace(cfg, patience=0.0)
-    run_stage(scene, cfg, stage, pixels, Rehearsal(steps))
-    return held_out_psnr(scene, pixels.photos, pixels.held_out, physical=False)
 
 
 def losses_of(

@@ -16,7 +16,7 @@ from univoxel.compression.choices import CapacityChoice
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
 from univoxel.machine import peak_memory_mb
-from univoxel.training.clock import Clock, CountedSteps, StepClock, stage_name
+from univoxel.training.clock import Clock, StepClock, stage_name
 
 LOG = "log.jsonl"  # in the folder of a run
 REPORT_SECONDS = 5.0
@@ -193,25 +193,3 @@ class Progress:
             f"{name} ({clock.stage + 1} of {len(self.cfg.stages)})",
             f"loss {sum(losses.values()):.4f}  {quality}{rate / 1e3:.0f}k rays/s  ",
         )
-
-
-class Rehearsal:
-    """A few steps of a stage off the record, in place of a run's progress."""
-
-    def __init__(self, steps: int) -> None:
-        self.clock: CountedSteps = CountedSteps(steps)
-
-    def due(self) -> bool:
-        return False
-
-    def report(self, losses: dict[str, float], psnr: float | None) -> None:
-        """Nobody listens."""
-
-    def checkpoint_due(self) -> bool:
-        return False
-
-    def state(self) -> dict[str, Any]:
-        return {}
-
-    def trouble(self, what: str) -> None:
-        """A rehearsal that fails shows it in its quality."""
