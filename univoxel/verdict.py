@@ -137,7 +137,7 @@ def save_verdict(verdict: Verdict, run: Path) -> None:
 
 def as_json(verdict: Verdict) -> dict[str, Any]:
     """`complete`, `verdict`, `reasons`, `remedies`, `evidence`."""
-    values = asdict(verdict)
+    values = json.loads(json.dumps(asdict(verdict)))  # lists for tuples
     return {"complete": values.pop("complete"), "verdict": values.pop("word"), **values}
 
 

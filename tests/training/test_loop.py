@@ -3,7 +3,8 @@
 import copy
 import json
 import math
-from dataclasses import fields
+import time
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,6 +27,7 @@ from univoxel.training import loop, progress
 from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.loop import add_gradient_, batch_at, light_priors, losses_of
 from univoxel.training.pixels import TrainingPixels, split_pixels
+from univoxel.training.progress import Progress
 
 STAGE = StageConfig(voxels=0.004, iterations=3, share=1.0, rays=600, physical_from=0.0)
 
@@ -78,15 +80,16 @@ def test_what_is_read_beside_the_surface_adds_its_gradient(scene, pixels):
     torch.testing.assert_close(found[1], found[0], rtol=1e-4, atol=1e-7)
 
 
-def test_bits_do_not_depend_on_threads(scene, pixels):
-    cfg = TrainConfig(Path("data"), Path("run"), (STAGE,), minutes=2.0)
+def test_bits_do_not_depend_on_threads(scene, pixels, tmp_path):
+    stage = replace(STAGE, iterations=3)
+    cfg = TrainConfig(Path("data"), tmp_path, (stage,))
     before, found = torch.get_num_threads(), []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             torch.manual_seed(0)
             trained = copy.deepcopy(scene)
-            loop.run_stage(trained, cfg, STAGE, pixels, progress.Rehearsal(3))
+            loop.run_stage(trained, cfg, stage, pixels, Progress(cfg, time.monotonic(), {}))
             found.append([p.detach() for p in trained.parameters()])
     finally:
         torch.set_num_threads(before)
