@@ -24,8 +24,7 @@ from univoxel.bars import track
 from univoxel.camera import Cameras, image_rays, pixel_width, project, resize
 from univoxel.grid import GridShape, fit_grid
 from univoxel.segmentation.config import GroundConfig
-from univoxel.segmentation.distances import surroundings
-from univoxel.segmentation.vote import largest_votes, overlaps, shrunk, votes
+from univoxel.segmentation.vote import largest_votes, overlaps, shrunk, surroundings, votes
 
 log: logging.Logger = logging.getLogger("univoxel")
 
