@@ -34,7 +34,7 @@ from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
-from univoxel.tasks.cutout import COLOURS, REMBG, cutout
+from univoxel.tasks.cutout import GROUND, REMBG, cutout
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "tests"))
@@ -140,7 +140,7 @@ def overlap(found: Tensor, true: Tensor) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--from", dest="sources", nargs="+", default=[REMBG, COLOURS])
+    parser.add_argument("--from", dest="sources", nargs="+", default=[REMBG])
     parser.add_argument("--only", nargs="+", choices=list(ROOMS), default=list(ROOMS))
     parser.add_argument("--views", type=int, default=40)
     parser.add_argument("--work", type=Path, default=Path("runs/cutout"))
@@ -161,7 +161,7 @@ def main() -> None:
                 overlap(masks.picture(masks.names.index(name))[1], mask)
                 for name, mask in zip(names, true, strict=True)
             ]
-            label = "a network" if source == REMBG else "colours"
+            label = {REMBG: "a network", GROUND: "the ground"}.get(source, source)
             rows.append([room, label, sum(found) / len(found), min(found), used])
             print(rows[-1], flush=True)
     record = {

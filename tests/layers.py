@@ -102,7 +102,7 @@ HELPERS = {
     "confidence": {"survey"},
     "pictures": {"animation", "inline"},
     "evaluation": {"measures", "truth"},
-    "segmentation": {"config", "distances", "gaps", "vote"},
+    "segmentation": {"config", "gaps", "vote"},
     "page": {"maps", "transfer"},
     "cluster": {"piece", "shown", "work"},
     "batch": {"results", "scenes"},

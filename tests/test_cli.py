@@ -23,7 +23,6 @@ from univoxel.errors import (
     ExistingFile,
     MissingExtra,
     MissingFile,
-    NothingFound,
     ProcessFailed,
     UserError,
 )
@@ -239,17 +238,15 @@ def test_sizes_of_poses_out_of_range(calls, capsys, option):
 
 
 def test_cutout(calls, capsys):
-    options = ["--box", "-1", "-2", "0", "1", "2", "0.5", "--downscale", "2", "--seed", "5"]
-    assert main(["cutout", "photos", "--out", "cut", *options]) == 0
-    given = {"box": (-1.0, -2.0, 0.0, 1.0, 2.0, 0.5), "downscale": 2, "allow_outside": False}
-    given |= {"seed": 5}
-    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "none"), given)]
+    assert main(["cutout", "photos", "--out", "cut", "--downscale", "2"]) == 0
+    given = {"downscale": 2, "allow_outside": False}
+    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "rembg"), given)]
     assert capsys.readouterr().out == "cut\n"
 
 
 def test_cutout_from_masks(calls, capsys):
     assert main(["cutout", "photos", "--out", "cut", "--from", "masks"]) == 0
-    given = {"box": None, "downscale": 0, "allow_outside": False, "seed": 0}
+    given = {"downscale": 0, "allow_outside": False}
     assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "masks"), given)]
 
 
@@ -416,8 +413,7 @@ def test_experiments(calls, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        *((kind("bad\n  input"), "bad input") for kind in KINDS if kind is not NothingFound),
-        (NothingFound(), "no object was found where the cameras look: say where it is with --box"),
+        *((kind("bad\n  input"), "bad input") for kind in KINDS),
         (UserError("eval: samples must be above 0", "samples"), "--samples must be above 0"),
         (UserError("light_of: none; see light_of", "light_of"), "--light-of: none; see light_of"),
         (UserError("changes=seed=x: bad", "changes"), "--set seed=x: bad"),

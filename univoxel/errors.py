@@ -55,16 +55,6 @@ class NoSurface(UserError):
     """A scene without a surface, or none of it in any photograph."""
 
 
-class NothingFound(UserError):
-    """There is no surface in the box."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "no object was found where the cameras look: say where it is with box, or make masks",
-            "box",
-        )
-
-
 class FileError(UserError, OSError):
     """A file of the user that cannot be written."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from lab.stress.damage import NO_MASK, Damage
+from lab.stress.damage import Damage
 from lab.stress.scenes import Spec
 from univoxel.errors import UserError
 
@@ -55,10 +55,8 @@ def _photos(name: str, title: str, field: str, values: Sequence[float], sign=1, 
     """An axis along a field of what befalls the photographs; the first is the base scene's."""
     levels = [Level(values[0], f"{values[0]:g}")]
     for value in values[1:]:
-        label = "none" if value == NO_MASK else f"{value:g}"
-        levels.append(
-            Level(value, label, damage=replace(INTACT, **{field: sign * value}), changes=changes)
-        )
+        damage = replace(INTACT, **{field: sign * value})
+        levels.append(Level(value, f"{value:g}", damage=damage, changes=changes))
     return Axis(name, title, tuple(levels))
 
 
@@ -95,10 +93,7 @@ AXES = {
             _SHARES,
             changes=("scene.varying=light",),
         ),
-        replace(
-            _photos("masks", "masks too wide, pixels", "dilation", (0.0, 1.0, 3.0, NO_MASK)),
-            quick=(0, 2, 3),
-        ),
+        _photos("masks", "masks too wide, pixels", "dilation", (0.0, 1.0, 3.0)),
         replace(
             _photos("rough-masks", "masks drawn by hand, % of the picture", "rough", _ROUGH),
             quick=(0, 2, 3),

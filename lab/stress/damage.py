@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,11 +19,7 @@ from univoxel.data import Photos, load_photos
 from univoxel.data.images import read_image, write_exr, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
-from univoxel.errors import NothingFound, UserError
-from univoxel.segmentation.distances import surroundings
-from univoxel.segmentation.separation import find_object, mask
-
-NO_MASK = math.inf  # as a dilation: masks are found by `cutout`
+from univoxel.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -35,7 +30,7 @@ class Damage:
     pose: float = 0.0  # standard deviation of a camera's turn about each of its axes, degrees
     stops: float = 0.0  # exposures differ by up to so many, from -stops to +stops
     light: float = 0.0  # largest share of the second light in a photograph, in [0, 1]
-    dilation: float = 0.0  # of the masks, pixels; NO_MASK: there are none, and `cutout` finds some
+    dilation: float = 0.0  # of the masks, pixels
     rough: float = 0.0  # masks as people draw them, see rough.py: percent of the picture
     noise: float = 0.0  # standard deviation, of sRGB in [0, 1]
     exposure: float = 0.0  # stops, of all photographs and of the test views
@@ -81,8 +76,6 @@ def damaged(
             shown, alpha = photos.picture(view)
         pictures.append(photographed(shown * gain[view], damage.noise, random))
         alphas.append(alpha)
-    if damage.dilation == NO_MASK:
-        alphas = cut_out(replace(photos, color=torch.stack(pictures)))
     if damage.rough:
         alphas = torch.from_numpy(rough_masks(torch.stack(alphas).numpy(), damage.rough, random))
     for name, picture, alpha in zip(photos.names, pictures, alphas, strict=True):
@@ -90,16 +83,6 @@ def damaged(
         write_png(out / "train" / f"{name}.png", rgba.numpy())
     _copy_tests(scene, out, 2**damage.exposure)
     return out
-
-
-def cut_out(photos: Photos) -> list[Tensor]:
-    """Masks [H, W] as `univoxel cutout` finds them; all of them opaque where it finds none."""
-    torch.manual_seed(0)
-    try:
-        found = find_object(photos, *surroundings(photos.cameras), watch=lambda _: None)
-    except NothingFound:
-        return list(torch.ones(photos.color.shape[:3]))
-    return [mask(found, photos, view) for view in range(len(photos))]
 
 
 def turned(cameras: Cameras, degrees: float, random: np.random.Generator) -> Cameras:
@@ -132,8 +115,6 @@ def masked(photos: Photos, view: int, dilation: float) -> tuple[Tensor, Tensor]:
     behind = lookup(EnvMap(read_image(photos.folder / "envmaps" / "train.exr")), rays.direction)
     behind = behind.reshape(color.shape)
     shown = alpha[..., None] * color + (1 - alpha[..., None]) * behind
-    if dilation == NO_MASK:
-        return shown, torch.ones_like(alpha)
     reach = int(dilation)
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     disc = np.hypot(x, y) <= dilation

@@ -70,16 +70,12 @@ class Break:
     share: float
 
     @property
-    def value(self) -> float | None:
-        """On the axis: geometric between values above 0, else linear; None next to no limit."""
+    def value(self) -> float:
+        """On the axis: geometric between values above 0, else linear."""
         a, b = self.before.value, self.after.value
-        if not math.isfinite(a + b):
-            return None
         return a * (b / a) ** self.share if a > 0 and b > 0 else a + (b - a) * self.share
 
     def __str__(self) -> str:
-        if self.value is None:
-            return f"between {self.before.label} and {self.after.label}"
         return f"{self.value:.2g}"
 
 

@@ -122,3 +122,9 @@ def test_overlaps_at_each_level():
 def test_fields_out_of_range(field, value):
     with pytest.raises(ValueError, match=f"VoteConfig: {field} must be"):
         VoteConfig(**{field: value})
+
+
+def test_what_cameras_look_at_is_a_cube():
+    lower, upper = vote.surroundings(cameras_around(16, 40))
+    torch.testing.assert_close(lower, -upper, atol=1e-4, rtol=0)
+    assert 0.8 < float(upper[0]) < 0.9  # a sphere of 0.8 is seen whole, at distance 2

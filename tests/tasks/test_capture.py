@@ -269,17 +269,24 @@ def pictures(tmp_path) -> Path:
     return folder
 
 
-def test_without_a_network_masks_come_from_colours(steps, pictures, tmp_path, monkeypatch, caplog):
+def test_without_a_network_or_masks_there_is_one_line(steps, pictures, tmp_path, monkeypatch):
+    """Cameras are kept: the same call with masks goes on."""
     out = tmp_path / "mug"
     monkeypatch.setattr(task, "load_photos", without_masks)
-    with caplog.at_level(logging.INFO, "univoxel"):
+    monkeypatch.setattr(task, "cutout", lambda data, out, source: no_network())
+    with pytest.raises(MissingExtra, match=r"pip install 'univoxel\[masks\]'"):
         task.capture(pictures, out)
+    assert steps == [("poses", pictures, None)]
+
+
+def test_masks_of_ones_own_go_on(steps, pictures, tmp_path):
+    out = tmp_path / "mug"
+    task.capture(pictures, out, masks=pictures)
     assert steps == [
         ("poses", pictures, None),
-        ("cutout", out / "scene", "none"),
+        ("cutout", out / "scene", pictures),
         ("train", (out / "cut").absolute(), False),
     ]
-    assert "pip install 'univoxel[masks]'; without, masks come from colours" in caplog.text
     page = (out / "index.html").read_text("utf-8")
     assert "Made of 0.png and 2 others" in page
     assert "31.25" in page
@@ -392,7 +399,7 @@ def test_a_turntable_without_anything_for_masks_is_one_line(steps, pictures, tmp
     monkeypatch.setattr(task, "poses", still)
     with pytest.raises(MissingExtra, match="need rembg"):
         task.capture(pictures, tmp_path / "mug")
-    with pytest.raises(UserError, match=r"colours alone make no masks before .*masks=rembg"):
+    with pytest.raises(UserError, match=r"and its ground with it: expected masks=rembg"):
         task.capture(pictures, tmp_path / "mug", masks="none")
 
 

@@ -281,15 +281,10 @@ def cutout(
     /,
     out: Annotated[Path, arg(metavar="DIR")],
     source: Annotated[
-        str, arg(name="from", metavar="rembg|FOLDER|none", help_behavior_hint="(default: none)")
-    ] = "none",
-    box: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: around what cameras look at)"),
-    ] = None,
+        str, arg(name="from", metavar="rembg|FOLDER|none", help_behavior_hint="(default: rembg)")
+    ] = "rembg",
     downscale: Annotated[Downscale, arg(metavar="auto|N")] = "auto",
     allow_outside: bool = False,
-    seed: int = 0,
 ) -> None:
     """Cut the object out of photographs without masks.
 
@@ -300,19 +295,16 @@ def cutout(
         data: folder of the photographs and their cameras; masks in it are not looked at
         out: folder to write
         source: where masks come from: rembg, a network on single photographs; a folder of masks
-            with the stems of the photographs; or none, colours alone. Masks vote for a hull, and
-            those that it contradicts are mended
-        box: with colours alone: lower and upper corner of where the object is, in the world of the
-            cameras; what lies in it, such as a table, is part of the object
+            with the stems of the photographs; or none, the pattern of the ground that the object
+            stands on, which it hides. Masks vote for a hull, and those that it contradicts are
+            mended
         downscale: write photographs of 1/N of their width and height; auto as of train
         allow_outside: as of train
-        seed: of all random choices
     """
     from univoxel.tasks import cutout as task
 
     options = {"downscale": check_downscale(downscale), "allow_outside": allow_outside}
-    options["seed"] = seed
-    print(task.cutout(data, out, source, box=box, **options))
+    print(task.cutout(data, out, source, **options))
 
 
 def poses(
@@ -389,9 +381,8 @@ def capture(
         photographs: what to begin with: a folder of photographs or a video; photographs with
             cameras, as train reads them; or the folder of a trained run
         out: folder to write: scene/, cut/, run/, pictures/, the mesh and the page
-        masks: where masks come from: rembg, a network; a folder of masks; none, colours alone; auto
-            takes those that the photographs bring, else the network, if it is installed, else
-            colours
+        masks: where masks come from: rembg, a network; a folder of masks; none, the pattern of the
+            ground, as of cutout; auto takes those that the photographs bring, else the network
         preset: as of train
         light: as of train
         minutes: of training, above 0; as of train

@@ -4,35 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from univoxel.training.config import StageConfig
 from univoxel.validation import check_fields
-
-COARSE = StageConfig(0.25, 1500, 0.5, 1536, sharpness=(2.0, 0.7), lr_sdf=(1.0, 0.1), plate=0.02)
-FINE = StageConfig(1.0, 300, 0.5, 2048, sharpness=(0.7, 0.35), lr_sdf=(0.1, 0.01))
-
-
-@dataclass(frozen=True)
-class SegmentationConfig:
-    """How the object is found in its box.
-
-    Raises:
-        ConfigError: a field is out of range.
-    """
-
-    coarse: StageConfig = COARSE  # from a ball, once for each radius
-    fine: StageConfig = FINE  # of the better one, around what was found
-    # Radii of the balls that the object may be at first, shares of the box's half, in (0, 1]. A
-    # small one has to grow, and may end before the object does; a large one is carved, and may
-    # keep what is not object. The one from which the photographs are rendered better is kept
-    radii: tuple[float, ...] = (0.5, 0.65)
-
-    def __post_init__(self) -> None:
-        check_fields(
-            self,
-            "one or more shares in (0, 1]",
-            lambda x: len(x) > 0 and all(0 < r <= 1 for r in x),
-            "radii",
-        )
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from torch.nn.functional import grid_sample, interpolate, max_pool2d, max_pool3d
 from univoxel.bars import track
 from univoxel.camera import Cameras, image_rays, pixel_width, project, resize
 from univoxel.grid import GridShape, fit_grid
-from univoxel.segmentation.distances import surroundings
-from univoxel.segmentation.vote import largest_votes, overlaps, shrunk, votes
+from univoxel.segmentation.vote import largest_votes, overlaps, shrunk, surroundings, votes
 
 # Pixels of the widest picture that is compared
 PIXELS = 480

@@ -56,7 +56,8 @@ def _by_onnxruntime(weights: Path) -> Callable[[Tensor], Tensor]:
     if onnxruntime is None or not weights.is_file():
         raise MissingExtra(
             "masks from a network need rembg: pip install 'univoxel[masks]'; or onnxruntime, and "
-            f"the network's weights as {weights}"
+            f"the network's weights as {weights}; or masks of your own: cutout --from FOLDER, "
+            "capture --masks FOLDER"
         )
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()

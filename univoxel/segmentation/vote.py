@@ -15,12 +15,11 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, max_pool2d
 
 from univoxel.bars import track
-from univoxel.camera import Cameras, pixel_rays, project
+from univoxel.camera import Cameras, looked_at, pixel_rays, project
 from univoxel.errors import UserError
 from univoxel.grid import GridShape, fit_grid
 from univoxel.preparation.hull import mask_distances
 from univoxel.segmentation.config import VoteConfig
-from univoxel.segmentation.distances import surroundings
 from univoxel.segmentation.gaps import carve_gaps_
 
 # Sides of the first grid, in those of what half of the pictures show whole
@@ -96,6 +95,15 @@ def elect(
     if carve_gaps_(vote, threshold, small, cameras, grid):
         threshold, usual, largest = _compared(grid, vote, small, cameras)
     return Hull(grid, vote, threshold, usual), largest
+
+
+def surroundings(cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """A cube around what the cameras look at, as large as half of their pictures show whole."""
+    centre = looked_at(cameras)
+    away = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
+    tangent = cameras.size_of_each().amin(1) / (2 * cameras.focal.max(1).values)
+    half = float((away * tangent / (1 + tangent.square()).sqrt()).median())
+    return centre - half, centre + half
 
 
 def _around(grid: GridShape, inside: Tensor, voxels: int) -> GridShape:

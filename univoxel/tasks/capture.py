@@ -25,7 +25,6 @@ from univoxel.data import keep_photos, load_photos
 from univoxel.errors import (
     DataError,
     ExistingFile,
-    MissingExtra,
     StillBackground,
     UserError,
     WithoutMasks,
@@ -39,7 +38,7 @@ from univoxel.page import write_page
 from univoxel.presets import chosen
 from univoxel.run import kept_photos, trained_on
 from univoxel.segmentation.network import network
-from univoxel.tasks.cutout import COLOURS, REMBG, cutout
+from univoxel.tasks.cutout import GROUND, REMBG, cutout
 from univoxel.tasks.demo import MAPS, SCENE
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.export import export
@@ -50,7 +49,7 @@ from univoxel.training.progress import TrainingProgress
 
 log: logging.Logger = logging.getLogger("univoxel")
 
-AUTO = "auto"  # masks that the photographs have, or else of a network, or else of colours
+AUTO = "auto"  # masks that the photographs have, or else of a network
 STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
 
 
@@ -99,8 +98,8 @@ def capture(
         photographs: a folder of photographs or a video; or photographs with cameras, of any layout
             that `train` reads; or a trained run.
         out: folder to write.
-        masks: a folder of masks; rembg, a network; none, colours alone; auto: what the photographs
-            bring, else a network where there is one, else colours.
+        masks: a folder of masks; rembg, a network; none, the pattern of the ground, as of `cutout`;
+            auto: what the photographs bring, else a network.
         preset, minutes, light, changes, on_progress: as of `univoxel.train`.
         config: how cameras are found.
         pictures: how many are made, and how large.
@@ -200,9 +199,9 @@ def _check_machine(given: Given, masks: str | Path) -> None:
         find_engine()
     if str(masks) == REMBG:
         network()
-    elif str(masks) not in (AUTO, COLOURS) and not Path(masks).is_dir():
+    elif str(masks) not in (AUTO, GROUND) and not Path(masks).is_dir():
         raise DataError(
-            f"masks: expected {REMBG}, {COLOURS} or a folder of masks, got {masks}", "masks"
+            f"masks: expected {REMBG}, {GROUND} or a folder of masks, got {masks}", "masks"
         )
 
 
@@ -234,15 +233,15 @@ def _masks_before_cameras(project: Project, given: Given, masks: str | Path) -> 
     Raises:
         UserError: there is nothing to make them with.
     """
-    if str(masks) not in (AUTO, REMBG, COLOURS):
+    if str(masks) not in (AUTO, REMBG, GROUND):
         return Path(masks)
     if project.masks.exists():
         _skip("masks", project.masks)
         return project.masks
-    if str(masks) == COLOURS:
+    if str(masks) == GROUND:
         raise UserError(
-            f"{given.path}: the object was turned before a still camera, and colours alone make no "
-            f"masks before there are cameras: expected masks={REMBG} or a folder, got {masks}",
+            f"{given.path}: the object was turned before a still camera, and its ground with it: "
+            f"expected masks={REMBG} or a folder, got {masks}",
             "masks",
         )
     _say("masks", "of single photographs, from a network")
@@ -291,11 +290,9 @@ def _find_masks(project: Project, scene: Path, masks: str | Path) -> Path:
     project.remember(masks=asked)
     if turned:
         source = scene / "masks"  # those that the cameras were found with
-    elif asked == AUTO:
-        source = _best_source()
     else:
-        source = masks
-    words = {REMBG: "from a network", COLOURS: "from colours alone"}
+        source = REMBG if asked == AUTO else masks
+    words = {REMBG: "from a network", GROUND: "from the pattern of the ground"}
     _say("masks", words.get(str(source), f"from {source}"))
     return cutout(scene, project.cut, source)
 
@@ -316,16 +313,6 @@ def _have_masks(project: Project, scene: Path) -> bool:
     kept.parent.mkdir(exist_ok=True)
     keep_photos(photos, kept)  # training need not read them again
     return True
-
-
-def _best_source() -> str:
-    """A network where there is one."""
-    try:
-        network()
-    except (MissingExtra, DataError) as error:
-        log.info(f"{error}; without, masks come from colours")
-        return COLOURS
-    return REMBG
 
 
 def _train(wanted: TrainConfig, on_progress: Callable[[TrainingProgress], None] | None) -> Path:

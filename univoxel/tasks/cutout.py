@@ -1,11 +1,8 @@
 """Cut an object out of photographs without masks.
 
-Masks come from colours alone, from a network, or from a folder. Colours: before plain walls and on
-plain desks the object is what edges shut off from the picture's border; on a patterned ground it is
-what hides that. Elsewhere a coarse surface within a box and a backdrop around it explain the
-photographs together; what cameras all around agree on inside the box is the object, and its
-silhouettes are the masks. Masks of single photographs vote for a hull, and those that it
-contradicts are mended.
+Masks come from a network, from a folder, or, of what stands on a patterned ground, from the colours
+of all photographs: it hides the pattern. They vote for a hull, and those that it contradicts are
+mended.
 """
 
 from __future__ import annotations
@@ -18,22 +15,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
-from univoxel.bars import bar, track
+from univoxel.bars import track
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
-from univoxel.errors import DataError, ExistingFile, UserError
+from univoxel.errors import DataError, ExistingFile
 from univoxel.pictures.mask_sheet import MaskTile, darkened, mask_sheet, worst_first, write_page
-from univoxel.segmentation.config import SegmentationConfig, VoteConfig
-from univoxel.segmentation.distances import corners, surroundings
+from univoxel.segmentation.config import VoteConfig
 from univoxel.segmentation.ground import find_ground, ground_mask
 from univoxel.segmentation.network import network
-from univoxel.segmentation.plain import plain_mask, plain_threshold
-from univoxel.segmentation.separation import DEFAULTS, find_object, mask
 from univoxel.segmentation.vote import BESIDE, MISSING, VOTE, Verdict, elect, judge
 
 # Photographs at least, for a vote; fewer do not outvote one another
@@ -42,7 +35,7 @@ PHOTOGRAPHS = 12
 
 log: logging.Logger = logging.getLogger("univoxel")
 
-COLOURS, REMBG = "none", "rembg"  # where masks come from, if not from a folder
+GROUND, REMBG = "none", "rembg"  # where masks come from, if not from a folder
 NAMED = 5  # photographs in a message, at most
 Masks = dict[str, list[Tensor]]  # [H, W] uint8 of each photograph of each split
 
@@ -50,46 +43,35 @@ Masks = dict[str, list[Tensor]]  # [H, W] uint8 of each photograph of each split
 def cutout(
     data: str | Path,
     out: str | Path,
-    source: str | Path = COLOURS,
-    box: tuple[float, ...] | None = None,
+    source: str | Path = REMBG,
     downscale: int = 0,
-    seed: int = 0,
-    config: SegmentationConfig = DEFAULTS,
     allow_outside: bool = False,
     vote: VoteConfig = VOTE,
 ) -> Path:
     """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
 
     All splits are written, in the layout of NeRF-synthetic scenes, without lens distortion, beside
-    masks.png and masks.html, which show the masks, worst first. The object is found from the
-    training photographs alone.
+    masks.png and masks.html, which show the masks, worst first. Hull and ground are found from
+    the training photographs alone.
 
     Args:
         out: folder to write.
-        source: where masks come from: none, from colours alone; rembg, from a network; else a
-            folder of masks with the stems of the photographs.
-        box: lower and upper corner of where the object is, world units; by default a cube around
-            what the cameras look at, as large as their pictures. For masks from colours; plain
-            surroundings and a ground are then not looked for.
+        source: where masks come from: rembg, from a network; none, from the pattern of the ground
+            that the object stands on; else a folder of masks with the stems of the photographs.
         downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
-        config: how the object is found from colours.
         allow_outside: as of `load_photos`.
-        vote: how other masks are judged and mended.
+        vote: how masks are judged and mended.
 
     Raises:
-        DataError: photographs or masks that cannot be used.
+        DataError: photographs or masks that cannot be used, or no patterned ground in them.
         ExistingFile: out is there already.
         MissingExtra: there is no network.
-        UserError: the box is none, or goes with masks; or, as NothingFound, no object is in it.
+        UserError: the masks have nothing in common.
         OSError: a file cannot be written.
     """
     data, out, origin = Path(data), Path(out), str(source)
     if out.exists():
         raise ExistingFile(f"{out} is there already: choose another out", "out")
-    if box and origin != COLOURS:
-        raise UserError(
-            f"box goes with masks from colours alone, not with those of {origin}", "box"
-        )
     masked = network() if origin == REMBG else None
     load = functools.partial(load_photos, data, allow_outside=allow_outside)
     photos = load("train", downscale, masks=False)
@@ -98,72 +80,33 @@ def cutout(
         for name in splits_of(data)
     }
     log.info(photos.about)
-    without_box = None if box or origin != COLOURS else _from_edges(splits)
-    if without_box is None and origin == COLOURS and not box:
-        without_box = _from_ground(splits)
-    if without_box:
-        masks = without_box
-        verdicts, told = _judged(splits, masks, vote)
-    elif origin == COLOURS:
-        masks = _from_colours(splits, box, seed, config)
-        verdicts = {name: [Verdict(None, "", m) for m in those] for name, those in masks.items()}
-        told = "masks from colours alone"
-    elif masked:
+    if masked:
         masks = _from_network(splits, masked)
-        verdicts, told = _judged(splits, masks, vote)
+    elif origin == GROUND:
+        masks = _from_ground(splits)
     else:  # of shrunk photographs those with masks are black outside of them
         masks = _as_read({n: load(n, photos.downscale, masks=Path(origin)) for n in splits})
-        verdicts, told = _judged(splits, masks, vote)
+    verdicts, told = _judged(splits, masks, vote)
     _write(out, splits, masks, verdicts, told)
     return out
 
 
-def _from_colours(
-    splits: dict[str, Photos], box: tuple[float, ...] | None, seed: int, config: SegmentationConfig
-) -> Masks:
-    photos = splits["train"]
-    lower, upper = corners(box) if box else surroundings(photos.cameras)
-    torch.manual_seed(seed)
-    with bar(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:3.0f} %  {task.fields[facts]}"),
-        TimeRemainingColumn(),
-    ) as progress:
-        steps = len(config.radii) * config.coarse.iterations + config.fine.iterations
-        task = progress.add_task("object", total=steps, facts="")
-        scene = find_object(
-            photos,
-            lower,
-            upper,
-            lambda db: progress.update(task, advance=1, facts=f"{db:.1f} dB"),
-            config,
-        )
-    return _of_all(splits, lambda split, view: mask(scene, split, view))
+def _from_ground(splits: dict[str, Photos]) -> Masks:
+    """Masks of what stands on a patterned ground.
 
-
-def _from_edges(splits: dict[str, Photos]) -> Masks | None:
-    """Masks of what stands before plain surroundings; None where they are not plain."""
+    Raises:
+        DataError: there is none.
+    """
     train = splits["train"]
-    if len(train) < PHOTOGRAPHS:
-        return None
     photographs = [_encoded(train, view) for view in range(len(train))]
-    threshold = plain_threshold(photographs, train.cameras)
-    if threshold is None:
-        return None
-    log.info("plain surroundings: the object is what edges of %g a pixel shut off", threshold)
-    return _of_all(splits, lambda split, view: plain_mask(_encoded(split, view), threshold))
-
-
-def _from_ground(splits: dict[str, Photos]) -> Masks | None:
-    """Masks of what stands on a patterned ground; None where there is none."""
-    train = splits["train"]
-    if len(train) < PHOTOGRAPHS:
-        return None
-    photographs = [_encoded(train, view) for view in range(len(train))]
-    ground = find_ground(photographs, train.cameras)
+    enough = len(train) >= PHOTOGRAPHS
+    ground = find_ground(photographs, train.cameras) if enough else None
     if ground is None:
-        return None
+        raise DataError(
+            f"{train.folder}: no object on a patterned ground was found, and colours tell no other "
+            f"from its room: expected source={REMBG} or a folder of masks, got {GROUND}",
+            "source",
+        )
     log.info("patterned ground: the object is what stands on it")
     return _of_all(
         splits,
@@ -225,8 +168,7 @@ def _judged(
         told += ": none is mended, as it may be the hull that is wrong"
         log.warning(
             f"{told}. The masks keep or miss the same everywhere, or the cameras are wrong; "
-            "source=none finds the object without them",
-            extra={"arguments": ("source",)},
+            "look at masks.html",
         )
         for name, those in verdicts.items():
             kept = zip(those, masks[name], strict=True)

@@ -10,13 +10,12 @@ from scipy import ndimage
 
 from lab.stress import damage as module
 from lab.stress import render, scenes
-from lab.stress.damage import NO_MASK, Damage, damaged
+from lab.stress.damage import Damage, damaged
 from lab.stress.scenes import Spec
 from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos, load_truth
 from univoxel.data.images import read_image, write_exr
-from univoxel.errors import DataError
 
 SPEC = Spec(size=24, views=6, tests=2)
 MODES = ("train", "test", "relight/dusk", "relight/studio")
@@ -108,38 +107,6 @@ def test_a_mask_grows_and_shows_what_is_behind(scene):
     # Soft windows of 4 degrees, seen through texels of 1.4
     np.testing.assert_allclose(shown.numpy()[beyond], behind[beyond], rtol=0.15, atol=0.15)
     torch.testing.assert_close(shown[alpha == 1], color[alpha == 1])
-    assert (module.masked(photos, 0, NO_MASK)[1] == 1).all()
-
-
-def test_without_masks_the_loader_may_refuse_but_the_suite_goes_on(scene, tmp_path, monkeypatch):
-    def find_object(photos, lower, upper, watch):
-        raise module.NothingFound
-
-    monkeypatch.setattr(module, "find_object", find_object)
-    out = damaged(scene, tmp_path / "out", Damage(views=2, dilation=NO_MASK))
-    with pytest.raises(DataError, match="fully opaque"):
-        load_photos(out, "train")
-    assert 0 < module.clipped(out) < 1
-
-
-def test_without_masks_the_suite_cuts_out(scene, tmp_path, monkeypatch):
-    """From what the photographs show, with the room behind the object."""
-    before = load_photos(scene, "train")
-
-    def find_object(photos, lower, upper, watch):
-        outside = before.coverage()[:2] == 0
-        assert photos.color[outside].any()
-        assert not before.color[:2][outside].any()
-        return photos
-
-    def mask(found, photos, view):
-        assert found is photos
-        return torch.full((24, 24), 0.2 * (view + 1))
-
-    monkeypatch.setattr(module, "find_object", find_object)
-    monkeypatch.setattr(module, "mask", mask)
-    photos = load_photos(damaged(scene, tmp_path / "out", Damage(views=2, dilation=NO_MASK)))
-    assert [int(a) for a in photos.alpha.flatten(1).unique(dim=1)[:, 0]] == [51, 102]
 
 
 def test_a_damaged_scene(scene, tmp_path):
