@@ -249,8 +249,8 @@ def bring_to_grid_(
 def save_trust(scene: Scene, photos: Photos, cfg: TrainConfig, troubles: list[str]) -> None:
     """Write to the run's trust.txt, and log, what the photographs leave open."""
     try:
-        surveyed = survey(scene, photos, cfg.confidence.report_points, cfg.confidence)
-        text = words(numbers(surveyed), troubles, cfg.confidence)
+        surveyed = survey(scene, photos, cfg.confidence.report_points)
+        text = words(numbers(surveyed), troubles)
     except UserError as error:
         text = f"No trust report: {error}."
     with replacing(cfg.out / "trust.txt") as temporary:
