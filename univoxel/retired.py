@@ -7,6 +7,33 @@ from typing import Any
 # By class. What they said is a constant now, beside the code that uses it, or gone with that code
 RETIRED: dict[str, frozenset[str]] = {
     "TrainConfig": frozenset({"compression", "hollows", "preparation"}),
+    "ConfidenceConfig": frozenset(
+        (
+            "black directions enough_views few_views max_disagreement min_share min_visibility "
+            "neighbours noise normal_scale observations one_side roughness_step"
+        ).split()
+    ),
+    "JointConfig": frozenset(
+        "adam albedo_smoothness metallic newton roughness_smoothness surface trials".split()
+    ),
+    "MetalConfig": frozenset(
+        (
+            "alike base max_evidence metallic_before near neighbours only_metal_albedo roughness "
+            "steps threshold"
+        ).split()
+    ),
+    "MirrorConfig": frozenset(
+        (
+            "alike around change darkest flat min_cosine min_reflectance min_views neighbours "
+            "reflected reflected_at_most sharp turn turns views voters weight"
+        ).split()
+    ),
+    "EntropyConfig": frozenset(
+        (
+            "albedo albedo_views cell degree min_color min_gain min_paint min_points min_reach "
+            "min_sky min_views points steps sun_gain sun_shares sweeps teaching_weight"
+        ).split()
+    ),
 }
 
 

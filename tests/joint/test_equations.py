@@ -13,10 +13,8 @@ from observed_points import (
 from univoxel import brdf
 from univoxel.color import linear_to_srgb_unclipped
 from univoxel.joint import equations, newton
-from univoxel.joint.config import NewtonConfig
+from univoxel.joint.newton import CAUCHY
 from univoxel.sphere import fibonacci_sphere
-
-CAUCHY = NewtonConfig().cauchy
 
 
 @pytest.fixture(params=["dielectric", "metal"])

@@ -9,7 +9,14 @@ from observed_points import lamps, no_metal, sphere_of
 
 from univoxel.joint import initialise
 from univoxel.joint.config import JointConfig
-from univoxel.joint.initialise import initialise_, neutralise_
+from univoxel.joint.initialise import (
+    ONLY_METAL,
+    ONLY_METAL_ALBEDO,
+    TRIAL_POINTS,
+    TRIAL_ROUNDS,
+    initialise_,
+    neutralise_,
+)
 from univoxel.joint.metals import find_metal
 from univoxel.joint.newton import NewtonRound
 from univoxel.lights.views import ViewLights
@@ -74,11 +81,11 @@ def test_trials_are_as_many_as_time_is_kept_for(monkeypatch):
         points.append(torch.randperm(10).tolist())
         metals.append(bool(decisions.metal.all()))
         spent.append(seconds)
-        assert cfg.newton_points == CFG.trials.points
+        assert cfg.newton_points == TRIAL_POINTS
         return NewtonRound([2.0 if metals[-1] else 1.0])
 
     monkeypatch.setattr(initialise, "newton_round_", newton_round_)
-    rounds = CFG.trials.rounds
+    rounds = TRIAL_ROUNDS
     initialised(scene, problem, 3.0 * rounds)
     assert spent == [3.0] * rounds
     assert all(p == points[0] for p in points)  # the trials differ in nothing but the hypothesis
@@ -169,7 +176,7 @@ def test_where_metal_alone_explains_as_much_there_is_nothing_else(
     # What would be found from metal everywhere is of no use where there is nothing else
     assert len(searched) == (0 if known else 1 if taken else 2)
     # Points are looked at under the map for metal, with the last threshold
-    asked = known is None and not varying and smooth < CFG.trials.only_metal * min(found, 1.0)
+    asked = known is None and not varying and smooth < ONLY_METAL * min(found, 1.0)
     assert of_metal == ([(1.0, 1.0)] if asked else [])
 
 
@@ -215,9 +222,9 @@ def test_light_on_metal_alone_is_taken_for_neutral():
     with torch.no_grad():
         scene.sky.log_radiance += torch.tensor([0.5, 0.0, -0.5])
     shown = scene.sky.radiance * scene.material(features)[0].median(0).values
-    neutralise_(scene, problem, CFG.metal)
+    neutralise_(scene, problem)
     albedo = scene.material(features)[0].median(0).values
     torch.testing.assert_close(scene.sky.radiance * albedo, shown)
     tint = scene.sky.radiance.mean(0)
     torch.testing.assert_close(tint, tint.mean().expand(3))
-    torch.testing.assert_close(albedo.max(), torch.tensor(CFG.metal.only_metal_albedo))
+    torch.testing.assert_close(albedo.max(), torch.tensor(ONLY_METAL_ALBEDO))

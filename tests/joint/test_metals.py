@@ -7,7 +7,7 @@ import torch
 from observed_points import COUNT, NODES, photographed, sphere_of
 
 from univoxel.color import linear_to_srgb_unclipped
-from univoxel.joint import metals
+from univoxel.joint import metals, newton
 from univoxel.joint.config import JointConfig
 from univoxel.joint.metals import evidence, find_metal, fitted
 
@@ -49,7 +49,7 @@ def test_one_observation_says_nothing():
     scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3, views=1)
     assert torch.equal(evidence(scene, problem, CFG), torch.zeros(COUNT))
     assert not find_metal(scene, problem, CFG, 1.0).any()
-    assert max(CFG.metal.threshold) < 0
+    assert max(metals.THRESHOLD) < 0
 
 
 def test_one_point_speaks_for_all():
@@ -65,8 +65,8 @@ def test_fitted_finds_the_best_base_within_its_bounds():
     torch.manual_seed(0)
     constant, slope = 0.1 * torch.rand(6, 5, 3), torch.rand(6, 5, 3)
     target = torch.rand(6, 5, 3).clamp(0.1, 0.9)
-    cauchy = CFG.newton.cauchy
-    cost = fitted(constant, slope, target, CFG, 0.0)
+    cauchy = newton.CAUCHY
+    cost = fitted(constant, slope, target, 0.0)
     grey = torch.linspace(0.005, 1, 200)
     for p in range(6):
         best = 0.0
@@ -77,8 +77,8 @@ def test_fitted_finds_the_best_base_within_its_bounds():
         # Gauss-Newton on Cauchy costs may end in a neighbouring valley, never below the best
         assert cost[p] >= best - 1e-5
         assert cost[p] < 1.5 * best + 1e-5
-    held = fitted(constant, slope, torch.zeros(6, 5, 3), CFG, CFG.metal.min_reflectance)
-    assert (held > fitted(constant, slope, torch.zeros(6, 5, 3), CFG, 0.0)).all()
+    held = fitted(constant, slope, torch.zeros(6, 5, 3), CFG.metal.min_reflectance)
+    assert (held > fitted(constant, slope, torch.zeros(6, 5, 3), 0.0)).all()
 
 
 def test_metal_takes_stronger_evidence_while_the_map_is_wrong(monkeypatch):

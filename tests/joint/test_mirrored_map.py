@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 from univoxel import sphere
 from univoxel.color import linear_to_srgb_unclipped
 from univoxel.envmap import EnvMap, lookup
-from univoxel.joint import sharp_sky
+from univoxel.joint import mirrored_map, sharp_sky
 from univoxel.joint.config import JointConfig, MirrorConfig
 from univoxel.joint.mirrored_map import (
     MirrorViews,
@@ -26,7 +26,7 @@ from univoxel.joint.mirrored_map import (
     unit_of,
     with_energy,
 )
-from univoxel.joint.mirrors import reflect
+from univoxel.joint.mirrors import NEIGHBOURS, reflect
 from univoxel.joint.observations import Mirrors
 from univoxel.lights.nodes import DistantLight
 
@@ -114,15 +114,16 @@ def test_where_nothing_is_mirrored_texels_are_as_those_around():
     assert found.encoded[below].amax() <= inside.amax()
 
 
-def test_map_and_normals_find_each_other():
+def test_map_and_normals_find_each_other(monkeypatch):
     _, problem, normal = a_mirror(off=4)
     off = problem.observations.normal
     assert 3 < degrees(off, normal).mean() < 6
     nearest = around(problem.observations.position)
-    found = agreed_normals(views_of(problem), off, nearest, CFG.mirror)
+    found = agreed_normals(views_of(problem), off, nearest)
     assert torch.allclose(found.norm(dim=1), torch.ones(POINTS), atol=1e-5)
     assert degrees(found, normal).mean() < 0.6 * degrees(off, normal).mean()
-    stay = agreed_normals(views_of(problem), off, nearest, replace(CFG.mirror, turns=()))
+    monkeypatch.setattr(mirrored_map, "TURNS", ())
+    stay = agreed_normals(views_of(problem), off, nearest)
     assert torch.equal(stay, off)
 
 
@@ -257,7 +258,7 @@ def test_mirrors_that_contradict_one_another_show_no_map(sharpened):
 @pytest.mark.parametrize("one", [0, 1])
 def test_few_points_or_one_photograph_show_no_map(sharpened, one):
     scene, problem, _ = a_mirror()
-    few = torch.arange(POINTS) < CFG.mirror.neighbours - 1
+    few = torch.arange(POINTS) < NEIGHBOURS - 1
     assert not sharpened(scene, problem, few)
     seen = replace(problem.observations, view=0 * problem.observations.view + one)
     assert not sharpened(scene, replace(problem, observations=seen))

@@ -84,7 +84,7 @@ def test_newton_in_no_time_takes_few_points(monkeypatch):
     monkeypatch.setattr(newton, "NEWTON_CHUNK", 20)
     cfg = replace(CFG, newton_steps=2)
     newton_round_(scene, problem, no_metal(problem), cfg, seconds=0.0)
-    assert counts == [20] * (1 + cfg.newton_steps * cfg.newton.min_parts)  # one to measure
+    assert counts == [20] * (1 + cfg.newton_steps * newton.MIN_PARTS)  # one to measure
     counts.clear()
     newton_round_(scene, problem, no_metal(problem), cfg, seconds=1e3)
     assert counts == [20] * (1 + cfg.newton_steps * 5)

@@ -51,7 +51,7 @@ def test_a_run_that_was_cut_traces_fewer_points(monkeypatch):
         steps = Steps(0)
         steps.pace = pace
         stage.solve(sphere_scene(8), photos_of(1, 8), JointConfig(points=10000), 0, steps)
-    assert asked == [10000, 5000, JointConfig().surface.min_points]
+    assert asked == [10000, 5000, stage.MIN_POINTS]
 
 
 @pytest.mark.parametrize("metal", [False, True])

@@ -194,7 +194,7 @@ def test_what_stands_on_a_pattern(tmp_path, with_masks, monkeypatch, caplog):
 def test_where_no_pattern_is_the_way_out_is_told(tmp_path, with_masks, monkeypatch, least):
     """Or too few photographs to find one."""
     monkeypatch.setattr(task, "find_ground", lambda *_: least > VIEWS or None)
-    vote = replace(SMALL, photographs=least)
+    monkeypatch.setattr(task, "PHOTOGRAPHS", least)
     with pytest.raises(DataError, match="expected source=rembg or a folder of masks, got none"):
-        task.cutout(with_masks[0], tmp_path / "cut", "none", vote=vote)
+        task.cutout(with_masks[0], tmp_path / "cut", "none", vote=SMALL)
     assert not (tmp_path / "cut").exists()

@@ -95,7 +95,7 @@ def test_equations_know_what_differs():
     specular = torch.einsum("pvd,pvdc->pvc", transport.specular, light)
     shaded = a.exp()[:, None] * diffuse + specular + transport.specular_indirect
     residual = transport.target - linear_to_srgb_unclipped(g.exp()[transport.view] * shaded)
-    cauchy = JointConfig().newton.cauchy
+    cauchy = newton.CAUCHY
     weight = 1 / (1 + (residual.detach() / cauchy) ** 2)
     weight = weight.masked_fill((transport.target > equations.CLIPPED) & (residual < 0), 0.0)
     cost = (weight * residual.square()).sum()

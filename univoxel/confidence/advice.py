@@ -22,6 +22,17 @@ from univoxel.render.transport import MIN_COSINE
 from univoxel.sphere import fibonacci_sphere, gaps, side_of
 from univoxel.validation import check_fields
 
+# Directions that are weighed, on the whole sphere
+CANDIDATES = 600
+# Degrees; photographs nearer to one another show much the same
+APART = 25.0
+# Degrees to the nearest photograph; directions beyond are a gap
+GAP = 30.0
+# Degrees below which nobody is sent, unless a photograph was taken from there: things stand on
+# something
+LOWEST = 0.0
+
+
 STEEP = 65.0  # degrees above or below the horizon, from where on a view has no side
 BEST = 0.9  # quantile of the agreement of render and photographs that counts as the best
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
@@ -31,23 +42,15 @@ COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", 
 class AdviceConfig:
     """How directions for more photographs are chosen."""
 
-    candidates: int = 600  # directions that are weighed, on the whole sphere, >= 1
     most: int = 6  # directions that are advised, >= 1
     # worth of a photograph, in [0, 1], from which on it is advised: the share of the surface, times
     # its doubt, that it would show as well as many photographs
     least: float = 0.006
     share: float = 0.5  # of the best one's worth, in [0, 1]; less is not worth the walk
-    apart: float = 25.0  # degrees, > 0; photographs nearer to one another show much the same
-    gap: float = 30.0  # degrees to the nearest photograph, > 0; directions beyond are a gap
-    # degrees, in [-90, 90], below which nobody is sent, unless a photograph was taken from there:
-    # things stand on something
-    lowest: float = 0.0
 
     def __post_init__(self) -> None:
-        check_fields(self, "at least 1", lambda x: x >= 1, "candidates", "most")
+        check_fields(self, "at least 1", lambda x: x >= 1, "most")
         check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "least", "share")
-        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "apart", "gap")
-        check_fields(self, "in [-90, 90]", lambda x: -90 <= x <= 90, "lowest")
 
 
 ADVICE = AdviceConfig()
@@ -98,20 +101,20 @@ def advise(
     middle = (low + high) / 2
     away = cameras.camera_to_world[:, :, 3] - middle
     taken, distance = normalize(away, dim=1), float(away.norm(dim=1).median())
-    lowest = min(cfg.lowest, float(elevations(taken).min()))
-    weighed = fibonacci_sphere(cfg.candidates)
+    lowest = min(LOWEST, float(elevations(taken).min()))
+    weighed = fibonacci_sphere(CANDIDATES)
     weighed = weighed[elevations(weighed) >= min(lowest, 89.0)]
     shown = torch.stack([_shown(surveyed, surface, middle + distance * w) for w in weighed])
 
     straight, agreeing = surveyed.straight.clone(), _agreeing(surveyed)
     nearest = _degrees(weighed, taken).amin(1)
-    gap, first = nearest > cfg.gap, None
+    gap, first = nearest > GAP, None
     chosen, gains = [], []
     while True:
         gain = (surveyed.seen_with(straight + shown) - surveyed.seen_with(straight)) @ (
             1 - surveyed.seen_with(straight) * agreeing
         )
-        gain = gain / len(straight) * (nearest / cfg.apart).clamp_max(1)
+        gain = gain / len(straight) * (nearest / APART).clamp_max(1)
         first = gain if first is None else first
         best = int(gain.argmax())
         least = max(cfg.least, cfg.share * gains[0]) if gains else cfg.least

@@ -4,8 +4,19 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from univoxel.confidence.config import CONFIDENCE, ConfidenceConfig
 from univoxel.confidence.survey import Survey
+
+# Views; a material that fewer see is reported as a guess
+FEW_VIEWS = 3
+# Degrees of spread; views within are reported as one direction
+ONE_SIDE = 15.0
+# Share of a point's light; where less comes from outside, that is reported
+MIN_VISIBILITY = 0.5
+# Mean absolute difference of render and photographs, sRGB; where it is more, that is reported:
+# surface, material or light is wrong
+MAX_DISAGREEMENT = 0.05
+# Share of the surface below which nothing is reported about it
+MIN_SHARE = 0.01
 
 
 def numbers(surveyed: Survey) -> dict[str, float]:
@@ -14,29 +25,26 @@ def numbers(surveyed: Survey) -> dict[str, float]:
     def share(where: Tensor) -> float:
         return where.float().mean().item()
 
-    cfg, seen = surveyed.cfg, surveyed.views > 0
+    seen = surveyed.views > 0
     return {
         "doubt_albedo": surveyed.albedo.mean().item(),
         "doubt_roughness": surveyed.roughness.mean().item(),
         "unseen": share(~seen),
-        "few_views": share(surveyed.views < cfg.few_views),
-        "one_side": share(seen & (surveyed.spread < cfg.one_side)),
+        "few_views": share(surveyed.views < FEW_VIEWS),
+        "one_side": share(seen & (surveyed.spread < ONE_SIDE)),
         "clipped": share(surveyed.clipped > 0.5),
         "black": share(surveyed.black > 0.5),
-        "shut": share(surveyed.visibility < cfg.min_visibility),
-        "disagreeing": share(surveyed.disagreement > cfg.max_disagreement),
+        "shut": share(surveyed.visibility < MIN_VISIBILITY),
+        "disagreeing": share(surveyed.disagreement > MAX_DISAGREEMENT),
         "dull": share(surveyed.information < 1),
     }
 
 
-def words(
-    figures: dict[str, float], troubles: list[str], cfg: ConfidenceConfig = CONFIDENCE
-) -> str:
+def words(figures: dict[str, float], troubles: list[str]) -> str:
     """The figures as a paragraph, without what is not the case.
 
     Args:
         troubles: what went wrong in training, from its state.
-        cfg: that the figures were computed with.
     """
     sentences = [
         f"Doubt of albedo {figures['doubt_albedo']:.2f}, of roughness "
@@ -44,19 +52,19 @@ def words(
         "guess)."
     ]
     shares = {
-        "few_views": f"is seen by fewer than {cfg.few_views} cameras: its materials are a guess",
-        "one_side": f"is seen from about one direction, within {cfg.one_side:g} degrees of it: "
+        "few_views": f"is seen by fewer than {FEW_VIEWS} cameras: its materials are a guess",
+        "one_side": f"is seen from about one direction, within {ONE_SIDE:g} degrees of it: "
         "colour and highlight are hard to tell apart there",
         "clipped": "is clipped in most photographs: shorter exposures would help",
         "black": "is black in most photographs: more light would help",
-        "shut": f"gets less than {cfg.min_visibility:.0%} of its light from outside: what parts of "
+        "shut": f"gets less than {MIN_VISIBILITY:.0%} of its light from outside: what parts of "
         "the object send to each other may be left in its albedo",
-        "disagreeing": f"differs from its photographs by more than {cfg.max_disagreement:g} in "
+        "disagreeing": f"differs from its photographs by more than {MAX_DISAGREEMENT:g} in "
         "sRGB: its surface, material or light is wrong",
         "dull": "shows no highlight that tells its roughness",
     }
     for name, text in shares.items():
-        if figures[name] >= cfg.min_share:
+        if figures[name] >= MIN_SHARE:
             sentences.append(f"{figures[name]:.0%} of the surface {text}.")
     sentences.append(
         "Albedo and light share a factor that photographs cannot fix: compare albedos with one "

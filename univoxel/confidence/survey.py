@@ -14,7 +14,6 @@ from torch import Tensor
 
 from univoxel import brdf
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped
-from univoxel.confidence.config import CONFIDENCE, ConfidenceConfig
 from univoxel.data import Photos
 from univoxel.joint.observations import (
     JointProblem,
@@ -36,6 +35,19 @@ from univoxel.render.transport import (
 from univoxel.scene import Scene
 from univoxel.sphere import fibonacci_sphere
 
+# Observations of a point that are rendered again, at most
+OBSERVATIONS = 8
+# Directions that visibility is measured in where the scene has no map with its own
+DIRECTIONS = 64
+# Roughness over which the slope of the render is taken
+ROUGHNESS_STEP = 0.05
+# Views straight from above that determine an albedo to a doubt of one half
+ENOUGH_VIEWS = 3.0
+# sRGB; disagreement with the photographs that means a doubt of one half
+NOISE = 0.02
+# sRGB; darker pixels are noise
+BLACK = 0.02
+
 
 @dataclass(frozen=True)
 class Survey:
@@ -52,7 +64,6 @@ class Survey:
     visibility: Tensor  # share of the light's directions, by cosine, that the object leaves open
     disagreement: Tensor  # mean absolute difference of photographs and render, sRGB
     gloss: Tensor  # root of the sum over the views of (change of sRGB by roughness)^2
-    cfg: ConfidenceConfig = CONFIDENCE  # with its scales doubts are computed
 
     @property
     def albedo(self) -> Tensor:
@@ -62,12 +73,12 @@ class Survey:
 
     def seen_with(self, straight: Tensor) -> Tensor:
         """How well points are seen, [..., P] in [0, 1], with such sums of squared cosines."""
-        return straight / (straight + self.cfg.enough_views)
+        return straight / (straight + ENOUGH_VIEWS)
 
     @property
     def agreeing(self) -> Tensor:
         """How well render and photographs agree, in (0, 1]."""
-        return self.cfg.noise / (self.disagreement + self.cfg.noise)
+        return NOISE / (self.disagreement + NOISE)
 
     @property
     def roughness(self) -> Tensor:
@@ -82,12 +93,12 @@ class Survey:
     @property
     def information(self) -> Tensor:
         """That photographs have of roughness, over that of knowing [0, 1] alone, whose variance is
-        1/12: each sRGB value has the noise cfg.noise."""
-        return (self.gloss / self.cfg.noise).square() / 12
+        1/12: each sRGB value has the noise NOISE."""
+        return (self.gloss / NOISE).square() / 12
 
 
 @torch.no_grad()
-def survey(scene: Scene, photos: Photos, points: int, cfg: ConfidenceConfig = CONFIDENCE) -> Survey:
+def survey(scene: Scene, photos: Photos, points: int) -> Survey:
     """What the photographs that were trained on fix of points of the surface.
 
     Args:
@@ -101,7 +112,7 @@ def survey(scene: Scene, photos: Photos, points: int, cfg: ConfidenceConfig = CO
     mesh, tracer, offset = extract_mesh(scene), scene.occluder(), scene.field.voxel_size
     position, normal = surface_points(mesh, points, generator)
     observations = observe(position, normal, photos, tracer, offset)
-    direction = scene.sky.direction if scene.sky else fibonacci_sphere(cfg.directions)
+    direction = scene.sky.direction if scene.sky else fibonacci_sphere(DIRECTIONS)
     # What occludes light is as bright as the nearest point is in the photographs
     nearest = KDTree(position.numpy()).query(mesh.vertices.numpy(), workers=-1)[1]
     point_color = mean_colors(without_exposure(scene, observations))
@@ -113,7 +124,7 @@ def survey(scene: Scene, photos: Photos, points: int, cfg: ConfidenceConfig = CO
     counts = observations.offsets.diff()
     point = torch.repeat_interleave(counts)
     encoded = linear_to_srgb_unclipped(observations.color)
-    clipped, black = (encoded > CLIPPED).any(1), (encoded < cfg.black).all(1)
+    clipped, black = (encoded > CLIPPED).any(1), (encoded < BLACK).all(1)
     usable = ~(clipped | black)
     straight = (observations.wo * normal[point]).sum(1).square()
 
@@ -123,8 +134,8 @@ def survey(scene: Scene, photos: Photos, points: int, cfg: ConfidenceConfig = CO
     at_least_one = counts.clamp_min(1)
     mean_length = (total(observations.wo).norm(dim=1) / at_least_one).clamp(0, 1)
     spread = torch.where(counts > 0, mean_length.acos().rad2deg(), 0.0)
-    compared = spread_observations(observations, cfg.observations)
-    disagreement, gloss = compare(scene, observations, transport, compared, cfg.roughness_step)
+    compared = spread_observations(observations, OBSERVATIONS)
+    disagreement, gloss = compare(scene, observations, transport, compared, ROUGHNESS_STEP)
     return Survey(
         position=position,
         normal=normal,
@@ -137,7 +148,6 @@ def survey(scene: Scene, photos: Photos, points: int, cfg: ConfidenceConfig = CO
         visibility=visibility,
         disagreement=disagreement,
         gloss=gloss * counts.sqrt(),
-        cfg=cfg,
     )
 
 

@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from univoxel import brdf
-from univoxel.joint.config import EntropyConfig
 from univoxel.joint.observations import (
     Decisions,
     JointProblem,
@@ -34,6 +33,41 @@ from univoxel.lights.nodes import DistantLight
 from univoxel.render.transport import mean_colors
 from univoxel.scene import Scene
 from univoxel.sphere import real_harmonics
+
+# Points whose colours are compared, at most
+POINTS = 3000
+# Points below which nothing is compared
+MIN_POINTS = 300
+# Observations that each of them has at least
+MIN_VIEWS = 3
+# Linear radiance of the darkest channel of a point; less is noise of 8 bits
+MIN_COLOR = 2e-3
+# Share of the points that are no metal, at least: a few may be metal that was not recognised
+MIN_PAINT = 0.5
+# Log albedo whose colours count as one: the side of a cell
+CELL = 0.15
+# Shares of the light that a sun is tried to send, from every direction
+SUN_SHARES = (0.35, 0.5, 0.65, 0.8, 0.9, 0.95)
+# Nats of entropy that a sun has to save. Suns of half of the light or more save 0.12 to 0.3; of
+# 46 trainings of the stress suite without one, one found a sun, in grainy photographs
+SUN_GAIN = 0.08
+# Share of the light of a point, in the mean, that an even sky sends at least
+MIN_SKY = 0.1
+# Mean cosine that counts for a node that hardly reaches any of the surface
+MIN_REACH = 0.02
+# Degree of the spherical harmonics that change the log map: halves and quarters of the sky
+DEGREE = 2
+# Log radiance by which each harmonic is changed, both ways, one after the other
+STEPS = (0.5, 0.25, 0.12, 0.06)
+# Passes over all harmonics with each step
+SWEEPS = 2
+# Nats of entropy that a change has to save: 15 for all of the points
+MIN_GAIN = 0.005
+# Observations of a point that its albedo is averaged over once the light is known
+ALBEDO_VIEWS = 2
+# Bounds of a diffuse albedo: coal and snow
+ALBEDO = (0.01, 0.95)
+
 
 DARK = 1e-6  # irradiance of a point that nothing seems to reach
 TABLE = 2**14  # entries for the occupied cells, by hash
@@ -80,7 +114,7 @@ class Sun:
 
 
 def painted_points(
-    scene: Scene, problem: JointProblem, decisions: Decisions, cfg: EntropyConfig
+    scene: Scene, problem: JointProblem, decisions: Decisions
 ) -> PaintedPoints | None:
     """Some points that are no metal, not dark and seen often.
 
@@ -93,41 +127,39 @@ def painted_points(
         return None
     observations = without_exposure(scene, problem.observations)
     color = mean_colors(observations)
-    usable = (observations.offsets.diff() >= cfg.min_views) & (color.amin(1) > cfg.min_color)
+    usable = (observations.offsets.diff() >= MIN_VIEWS) & (color.amin(1) > MIN_COLOR)
     point = (usable & ~decisions.metal).nonzero()[:, 0]
-    if len(point) < max(cfg.min_points, cfg.min_paint * int(usable.sum())):
+    if len(point) < max(MIN_POINTS, MIN_PAINT * int(usable.sum())):
         return None
-    point = point[torch.randperm(len(point))[: cfg.points]]
-    return PaintedPoints(point, color[point], *_reach(problem, point), cfg.cell)
+    point = point[torch.randperm(len(point))[:POINTS]]
+    return PaintedPoints(point, color[point], *_reach(problem, point), CELL)
 
 
 @torch.no_grad()
-def fit_sun_(
-    scene: Scene, problem: JointProblem, decisions: Decisions, cfg: EntropyConfig
-) -> Sun | None:
+def fit_sun_(scene: Scene, problem: JointProblem, decisions: Decisions) -> Sun | None:
     """Change the scene's map to an even sky and a sun, if one leaves the points fewer colours, and
     return the sun; None: the map stays.
 
     Compared are the map as it is, an even sky, and an even sky with a sun, for every direction of
     the map and some shares of the light.
     """
-    points = painted_points(scene, problem, decisions, cfg)
+    points = painted_points(scene, problem, decisions)
     if points is None:
         return None
     sky, indirect = problem.sky, points.indirect
     irradiance = points.irradiance(sky.radiance)
     mean = irradiance.mean(0)
-    mean_from_sky = (mean - indirect.mean(0)).clamp_min(cfg.min_sky * mean)
+    mean_from_sky = (mean - indirect.mean(0)).clamp_min(MIN_SKY * mean)
     even_radiance = mean_from_sky / points.reach.sum(1).mean()  # [3] radiance of an even sky
     overcast = points.reach.sum(1, keepdim=True) * even_radiance + indirect
-    min_reach = cfg.min_reach * problem.solid_angle / math.pi
+    min_reach = MIN_REACH * problem.solid_angle / math.pi
     power = mean / points.reach.mean(0).clamp_min(min_reach)[:, None]  # [D, 3] for all of the light
     entropy_without_sun = points.entropy(torch.stack([irradiance, overcast], 1)).min()
-    entropy = sun_entropies(points, overcast, power, cfg.sun_shares)
-    if entropy.min() > entropy_without_sun - cfg.sun_gain:
+    entropy = sun_entropies(points, overcast, power, SUN_SHARES)
+    if entropy.min() > entropy_without_sun - SUN_GAIN:
         return None
     best_share, node = divmod(int(entropy.argmin()), len(power))
-    share = cfg.sun_shares[best_share]
+    share = SUN_SHARES[best_share]
     radiance = ((1 - share) * even_radiance).repeat(len(power), 1)
     log_excess = torch.zeros_like(radiance)
     log_excess[node] = (1 + share * power[node] / radiance[node]).log()
@@ -156,30 +188,28 @@ def sun_entropies(
 
 
 @torch.no_grad()
-def minimise_entropy_(
-    scene: Scene, problem: JointProblem, decisions: Decisions, cfg: EntropyConfig
-) -> bool:
+def minimise_entropy_(scene: Scene, problem: JointProblem, decisions: Decisions) -> bool:
     """Change the scene's map slowly over the sphere, and a sun's brightness, so that the albedos
     have the fewest colours; return whether it changed.
 
     Changes are harmonics of the log map, of one channel or of all three. Each is tried by itself,
     in smaller and smaller steps. The light on the surface stays as bright as it was.
     """
-    points = painted_points(scene, problem, decisions, cfg)
+    points = painted_points(scene, problem, decisions)
     if points is None:
         return False
     sky = problem.sky
-    basis = slow_changes(sky, decisions.sun, cfg.degree)
+    basis = slow_changes(sky, decisions.sun, DEGREE)
     log_map = sky.log_radiance.detach()
     brightness = points.irradiance(log_map.exp()).log().mean(0)
     lowest = initial = float(points.entropy(points.irradiance(log_map.exp())[:, None]))
     channels = torch.cat([torch.ones(1, 3), torch.eye(3)])
-    for step in (s for s in cfg.steps for _ in range(cfg.sweeps)):
+    for step in (s for s in STEPS for _ in range(SWEEPS)):
         for change in step * basis.T[..., None]:
             candidates = [log_map + sign * c * change for sign in (1, -1) for c in channels]
             irradiance = torch.stack([points.irradiance(m.exp()) for m in candidates], 1)
             entropy, best = points.entropy(irradiance).min(0)
-            if float(entropy) < lowest - cfg.min_gain:
+            if float(entropy) < lowest - MIN_GAIN:
                 lowest, log_map = float(entropy), candidates[int(best)]
     # Colours do not determine the scale of light against albedo
     sky.log_radiance.copy_(log_map + brightness - points.irradiance(log_map.exp()).log().mean(0))
@@ -196,7 +226,7 @@ def slow_changes(sky: DistantLight, sun: Tensor | None, degree: int) -> Tensor:
 
 
 @torch.no_grad()
-def diffuse_albedo(scene: Scene, problem: JointProblem, cfg: EntropyConfig) -> Tensor:
+def diffuse_albedo(scene: Scene, problem: JointProblem) -> Tensor:
     """Albedo [P, 3] of all points, from some photographs of each under the scene's map and without
     the specular layer; NaN where none sees a point."""
     observations = problem.observations
@@ -211,15 +241,15 @@ def diffuse_albedo(scene: Scene, problem: JointProblem, cfg: EntropyConfig) -> T
         reach, indirect = _reach(problem, point)
         irradiance = reach @ problem.sky.radiance + indirect
         total = torch.zeros_like(normal)
-        for observation in observations_of(problem, point, cfg.albedo_views).unbind(1):
+        for observation in observations_of(problem, point, ALBEDO_VIEWS).unbind(1):
             specular = shade_observations(scene, problem, point, observation, *specular_layer)
             exposure = scene.exposed(torch.ones_like(specular), observations.view[observation])
             cosine = (normal * observations.wo[observation]).sum(1)
             factor = 1 - brdf.specular_albedo(cosine, roughness)
             diffuse = (observations.color[observation] - specular) / exposure
             white_radiance = (irradiance * factor[:, None]).clamp_min(DARK)
-            total += (diffuse / white_radiance).clamp(*cfg.albedo)
-        albedo[point] = total / cfg.albedo_views
+            total += (diffuse / white_radiance).clamp(*ALBEDO)
+        albedo[point] = total / ALBEDO_VIEWS
     return albedo
 
 

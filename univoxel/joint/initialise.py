@@ -11,11 +11,38 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from univoxel.joint.config import JointConfig, MetalConfig, TrialConfig
+from univoxel.joint.config import JointConfig
 from univoxel.joint.metals import find_metal
 from univoxel.joint.newton import newton_round_
 from univoxel.joint.observations import Decisions, JointProblem
 from univoxel.scene import Scene
+
+# Points of a round. Of a third of them residuals scatter more than they differ
+TRIAL_POINTS = 300
+# Newton steps of a round; after three, from no map, too glossy still fits better than right
+TRIAL_STEPS = 6
+# Medians of roughness that are tried beside the present one
+TRIAL_ROUGHNESS = (0.25, 0.7)
+# Rounds of Newton in all trials, at most
+TRIAL_ROUNDS = 2 * (len(TRIAL_ROUGHNESS) + 2)
+# Share of the lowest residual so far that another roughness must not exceed
+BETTER = 0.9
+# Times the others' residual that metal everywhere must not exceed for all to be metal: 0.6 to 1.1
+# where all is, 1.2 and more where some or nothing is, unless grain, fur or mixed lights leave
+# much to either. Most points have to look like metal then too, see MAJORITY
+ONLY_METAL = 1.15
+# Median of roughness from which metal looks like paint and does not count there
+LIKE_PAINT = 0.5
+# Share of the others' residual that it must not exceed to start from its metals
+ALL_METAL = 0.8
+# The same, where most is found to be metal under its map. Of objects all of metal 0.67 to 0.93
+# is; of dielectrics hardly ever as much
+MOSTLY_METAL = 0.95
+# Share of the points that are most of them: look like metal for all to be metal, and for
+# MOSTLY_METAL. Under a map for metal 0.9 do where all is, 0.34 at most elsewhere
+MAJORITY = 0.5
+# Median of the brightest channel where all is metal: nothing else tells how bright the light is
+ONLY_METAL_ALBEDO = 0.3
 
 
 @dataclass(frozen=True)
@@ -35,7 +62,7 @@ class Trials:
     scene: Scene
     problem: JointProblem
     cfg: JointConfig
-    seconds: float  # of a round on TrialConfig.points
+    seconds: float  # of a round on TRIAL_POINTS
     seed: int  # of the points: the trials differ in nothing but the hypothesis
     parts: Sequence[nn.Module]  # of the scene, that a trial changes
     initial: list[dict[str, Any]]  # their states
@@ -51,8 +78,8 @@ class Trials:
 
     def residual_(self, metal: Tensor) -> float:
         """What is left after a round of Newton, which changes the map; inf: nothing was solved."""
-        steps = self.cfg.trials.steps if self.cfg.newton_steps else 0
-        points = self.cfg.trials.points
+        steps = TRIAL_STEPS if self.cfg.newton_steps else 0
+        points = TRIAL_POINTS
         cfg = replace(self.cfg, newton_steps=steps, newton_points=points, newton_roughness=0.0)
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(self.seed)
@@ -80,12 +107,12 @@ def initialise_(
     parts = [part for part in (scene.material, problem.sky, scene.views) if part is not None]
     seed = int(torch.randint(2**31, ()))
     initial = [copy.deepcopy(part.state_dict()) for part in parts]
-    round_seconds = seconds / cfg.trials.rounds
+    round_seconds = seconds / TRIAL_ROUNDS
     trials = Trials(scene, problem, cfg, round_seconds, seed, parts, initial, [])
     everywhere = tried_roughnesses_(trials, torch.ones_like(decisions.metal))
-    best, only_metal = the_best(everywhere, cfg.trials), bool(cfg.only_metal)
+    best, only_metal = the_best(everywhere), bool(cfg.only_metal)
     if not only_metal:
-        before = the_best(tried_roughnesses_(trials, decisions.metal), cfg.trials)
+        before = the_best(tried_roughnesses_(trials, decisions.metal))
         found = under_its_map_(trials, before)
         # Under a light for each photograph what is mirrored may be anything
         one_light = scene.views is None or scene.views.sky_weights is None
@@ -94,7 +121,7 @@ def initialise_(
             only_metal = nothing_but_metal_(trials, explained, everywhere)
         if not only_metal:
             best = under_its_map_(trials, best)
-            best = best if better_metals(found, best, cfg.trials) else found
+            best = best if better_metals(found, best) else found
     if math.isinf(best.residual):
         trials.restore_(initial)
         return decisions, trials.troubles
@@ -103,7 +130,7 @@ def initialise_(
 
 
 @torch.no_grad()
-def neutralise_(scene: Scene, problem: JointProblem, cfg: MetalConfig) -> None:
+def neutralise_(scene: Scene, problem: JointProblem) -> None:
     """Make the map grey in the mean, and the albedo as bright as that of metals.
 
     Of an object all of metal photographs show the product of map and albedo alone: in each channel
@@ -112,7 +139,7 @@ def neutralise_(scene: Scene, problem: JointProblem, cfg: MetalConfig) -> None:
     features = scene.field.features_at(problem.observations.position)
     median = scene.material(features)[0].median(0).values
     wanted = median * problem.sky.radiance.mean(0)
-    wanted = wanted * (cfg.only_metal_albedo / wanted.max())
+    wanted = wanted * (ONLY_METAL_ALBEDO / wanted.max())
     scene.material.shift_albedo(features, wanted)
     problem.sky.log_radiance += (median / wanted).log()
 
@@ -122,7 +149,7 @@ def tried_roughnesses_(trials: Trials, metal: Tensor) -> list[Hypothesis]:
     """A hypothesis with this metal for the present roughness, and for each that is tried."""
     scene, tried = trials.scene, []
     features = scene.field.features_at(trials.problem.observations.position)
-    for roughness in (None, *trials.cfg.trials.roughness):
+    for roughness in (None, *TRIAL_ROUGHNESS):
         trials.restore_(trials.initial)
         if roughness is not None:
             scene.material.shift_roughness(features, roughness)
@@ -131,11 +158,11 @@ def tried_roughnesses_(trials: Trials, metal: Tensor) -> list[Hypothesis]:
     return tried
 
 
-def the_best(tried: Sequence[Hypothesis], cfg: TrialConfig) -> Hypothesis:
+def the_best(tried: Sequence[Hypothesis]) -> Hypothesis:
     """That of the lowest residual; another roughness than the first has to be worth it."""
     best = tried[0]
     for hypothesis in tried[1:]:
-        if hypothesis.residual < cfg.better * best.residual:
+        if hypothesis.residual < BETTER * best.residual:
             best = hypothesis
     return best
 
@@ -153,14 +180,14 @@ def nothing_but_metal_(trials: Trials, explained: float, everywhere: Sequence[Hy
         explained: residual of metal as it was found.
     """
     cfg = trials.cfg
-    smooth = [h for h in everywhere if h.roughness < cfg.trials.like_paint]
+    smooth = [h for h in everywhere if h.roughness < LIKE_PAINT]
     best = min(smooth, key=lambda h: h.residual, default=None)
-    if best is None or not best.residual < cfg.trials.only_metal * explained:
+    if best is None or not best.residual < ONLY_METAL * explained:
         return False
     trials.restore_(best.states)
     however_dark = replace(cfg, metal=replace(cfg.metal, min_reflectance=0.0))
     metal = find_metal(trials.scene, trials.problem, however_dark, 1.0)
-    return bool(metal.float().mean() > cfg.trials.majority)
+    return bool(metal.float().mean() > MAJORITY)
 
 
 def under_its_map_(trials: Trials, assumed: Hypothesis) -> Hypothesis:
@@ -173,8 +200,8 @@ def under_its_map_(trials: Trials, assumed: Hypothesis) -> Hypothesis:
     return Hypothesis(trials.residual_(metal), metal, trials.states(), assumed.roughness)
 
 
-def better_metals(before: Hypothesis, everywhere: Hypothesis, cfg: TrialConfig) -> bool:
+def better_metals(before: Hypothesis, everywhere: Hypothesis) -> bool:
     """Whether the metals that were found from metal everywhere are the better ones."""
-    mostly = everywhere.metal.float().mean() > cfg.majority
-    share = cfg.mostly_metal if mostly else cfg.all_metal
+    mostly = everywhere.metal.float().mean() > MAJORITY
+    share = MOSTLY_METAL if mostly else ALL_METAL
     return everywhere.residual < share * before.residual

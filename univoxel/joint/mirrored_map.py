@@ -18,9 +18,12 @@ from univoxel import sphere
 from univoxel.brdf import schlick_f
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped, srgb_to_linear
 from univoxel.envmap import EnvMap, lookup
-from univoxel.joint.config import MirrorConfig
 from univoxel.lights.latlong import finer
 from univoxel.lights.nodes import DistantLight
+
+# Degrees by which normals of sharp points are turned at most, search by search
+TURNS = (6.0, 3.0)
+
 
 COARSEST = 4  # rows of the coarsest of the levels that fill each other, at least
 LEAST = 0.5  # sightings that a texel has to have before its own count more than those around
@@ -149,16 +152,14 @@ def turned_normals(
     return normalize(normal + turn[nearest].mean(1), dim=1)
 
 
-def agreed_normals(
-    views: MirrorViews, normal: Tensor, nearest: Tensor, cfg: MirrorConfig
-) -> Tensor:
+def agreed_normals(views: MirrorViews, normal: Tensor, nearest: Tensor) -> Tensor:
     """Normals [N, 3] under which all views show one map, found with it in turns.
 
     Args:
         normal: to start from.
         nearest: as of `turned_normals`.
     """
-    for degrees in cfg.turns:
+    for degrees in TURNS:
         encoded = sharp_map(views, normal, SEARCHED).encoded
         normal = turned_normals(views, encoded, normal, nearest, degrees)
     return normal

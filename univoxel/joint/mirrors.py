@@ -21,8 +21,9 @@ from torch.nn.functional import normalize
 from univoxel import sphere
 from univoxel.color import linear_to_srgb_unclipped
 from univoxel.envmap import EnvMap, lookup
-from univoxel.joint.config import JointConfig, MirrorConfig
+from univoxel.joint.metals import NEAR
 from univoxel.joint.mirrored_map import MirrorViews
+from univoxel.joint.newton import NODE_NEIGHBOURS
 from univoxel.joint.observations import (
     JointProblem,
     Mirrors,
@@ -31,6 +32,40 @@ from univoxel.joint.observations import (
 )
 from univoxel.render.transport import Observations
 from univoxel.scene import Scene
+
+# Observations of a point that are compared
+VIEWS = 16
+# Of them, that mirror the sky, at least; other points are as their neighbours
+MIN_OPEN_VIEWS = 3
+# Cosine between normal and eye of an observation, at least
+MIN_COSINE = 0.2
+# Points whose changes, colours and normals are averaged
+NEIGHBOURS = 32
+# Points, most of which decide for each among them
+VOTERS = 96
+# Difference of unit normals that counts as one unit of distance between points
+TURN = 0.5
+# Change of metal from view to view, linear, at least: mean deviation from the mean
+CHANGE = 0.05
+# Part of the change of what it mirrors. Metals of the scenes reach 0.6 to 1, glossy paint 0.1 to
+# 0.45
+REFLECTED = 0.55
+# The same at most: nothing mirrors more than it gets. Metals reach 1.15, whose normals are off;
+# under a sun, which leaves the rest of the map dark, paint reaches 1.5 to 15
+REFLECTED_AT_MOST = 1.25
+# Part of the change that the map leaves unexplained where metal mirrors sharply
+SHARP = 0.6
+# Brightest channel of a metal at least
+MIN_REFLECTANCE = 0.25
+# Degrees around a direction, whose brightest node tells how dark it is
+AROUND = 27.0
+# Share of the directions, the darkest, that base colours are read from
+DARKEST = 0.25
+# Length of the mean of neighbouring normals, above which a surface is not thin
+FLAT = 0.7
+# Cosine between normals above which they are averaged
+ALIKE = 0.3
+
 
 ROWS = 64  # of the map that is looked up: finer than the nodes lie apart
 
@@ -94,7 +129,7 @@ class NodeMap:
 
 
 @torch.no_grad()
-def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirrors | None:
+def find_mirrors(scene: Scene, problem: JointProblem) -> Mirrors | None:
     """Points that mirror the present map; None: there are none, or light differs between
     photographs, so that no map is common to them.
 
@@ -102,16 +137,16 @@ def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirro
     """
     if problem.turned is not None or (scene.views and scene.views.sky_change() is not None):
         return None
-    sky, count = problem.sky, cfg.mirror.neighbours
+    sky, count = problem.sky, NEIGHBOURS
     map = NodeMap.of(sky.direction, sky.latlong(ROWS), sky.radiance)
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(0)
-        seen = sightings(scene, problem, map, cfg)
-    decided = (seen.open.sum(1) >= cfg.mirror.min_views).nonzero()[:, 0]
+        seen = sightings(scene, problem, map)
+    decided = (seen.open.sum(1) >= MIN_OPEN_VIEWS).nonzero()[:, 0]
     if len(decided) < count:
         return None
-    found = mirrors_among(seen.at(decided), map, cfg.mirror)
-    voters_count = min(cfg.mirror.voters, len(seen.key))
+    found = mirrors_among(seen.at(decided), map)
+    voters_count = min(VOTERS, len(seen.key))
     if 2 * found.metal.sum() <= voters_count:  # no point can have a majority
         return None
     # Points that mirror the object, not the sky, are as their neighbours
@@ -122,7 +157,7 @@ def find_mirrors(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mirro
     metal, sharp = (x[like].float().mean(1) > 0.5 for x in (found.metal, found.sharp))
     if not metal.any():
         return None
-    sharp, normal = smoothed(problem.observations.position, seen.normal, sharp & metal, cfg.mirror)
+    sharp, normal = smoothed(problem.observations.position, seen.normal, sharp & metal)
     return Mirrors(metal, sharp, normal, torch.where(metal[:, None], base, 0.0))
 
 
@@ -133,7 +168,6 @@ def open_views(
     like: Tensor,
     base: Tensor,
     map: NodeMap,
-    cfg: JointConfig,
 ) -> tuple[MirrorViews, Tensor]:
     """What photographs show of N points that mirror the sky, and which of the observations these
     are: [S] int64.
@@ -145,35 +179,33 @@ def open_views(
     observations = without_exposure(scene, observations)
     point = torch.repeat_interleave(observations.offsets.diff())
     mirrored, cosine = reflect(observations.normal[point], observations.wo[:, None])
-    is_open = sees_sky(problem, map, like[point], mirrored[:, 0], cfg)
-    index = (is_open & (cosine[:, 0] > cfg.mirror.min_cosine)).nonzero()[:, 0]
+    is_open = sees_sky(problem, map, like[point], mirrored[:, 0])
+    index = (is_open & (cosine[:, 0] > MIN_COSINE)).nonzero()[:, 0]
     wo, color = observations.wo[index], observations.color[index]
     views = MirrorViews.of(point[index], wo, color, base, observations.normal)
     return views, index
 
 
-def sees_sky(
-    problem: JointProblem, map: NodeMap, point: Tensor, direction: Tensor, cfg: JointConfig
-) -> Tensor:
+def sees_sky(problem: JointProblem, map: NodeMap, point: Tensor, direction: Tensor) -> Tensor:
     """Whether the sky is where points [N] look [N, ..., 3], and around it: [N, ...] bool."""
     visible, node = problem.transport.visibility == 255, map.nearest(direction)
     row = point.view(-1, *[1] * (node.dim() - 1))
-    near = map.beside(cfg.newton.neighbours).unbind(1)
+    near = map.beside(NODE_NEIGHBOURS).unbind(1)
     return torch.stack([visible[row, beside[node]] for beside in near]).all(0)
 
 
-def sightings(scene: Scene, problem: JointProblem, map: NodeMap, cfg: JointConfig) -> Sightings:
+def sightings(scene: Scene, problem: JointProblem, map: NodeMap) -> Sightings:
     """Of all points of the problem; those that no photograph sees have none that are open."""
     observations = without_exposure(scene, problem.observations)
     counts = observations.offsets.diff()
-    observation = observations_of(problem, torch.arange(len(counts)), cfg.mirror.views)
+    observation = observations_of(problem, torch.arange(len(counts)), VIEWS)
     observation = observation.clamp_max(len(observations.view) - 1)
     normal, wo = observations.normal, observations.wo[observation]
     mirrored, cosine = reflect(normal, wo)
-    is_open = (cosine > cfg.mirror.min_cosine) & (counts > 0)[:, None]
-    is_open &= sees_sky(problem, map, torch.arange(len(counts)), mirrored, cfg)
-    unit = cfg.metal.near * problem.voxel_size
-    key = torch.cat([observations.position / unit, normal / cfg.mirror.turn], 1)
+    is_open = (cosine > MIN_COSINE) & (counts > 0)[:, None]
+    is_open &= sees_sky(problem, map, torch.arange(len(counts)), mirrored)
+    unit = NEAR * problem.voxel_size
+    key = torch.cat([observations.position / unit, normal / TURN], 1)
     return Sightings(key, normal, wo, observations.color[observation], is_open)
 
 
@@ -189,23 +221,23 @@ def neighbours(key: Tensor, count: int) -> Tensor:
     return torch.from_numpy(nearest).reshape(len(key), -1)
 
 
-def mirrors_among(seen: Sightings, map: NodeMap, cfg: MirrorConfig) -> Mirrors:
+def mirrors_among(seen: Sightings, map: NodeMap) -> Mirrors:
     """Which of N points change from view to view as much as what they mirror.
 
     Metal that the map explains with the present normals is rough: it blurs what is wrong with them.
     """
-    nearest = neighbours(seen.key, cfg.neighbours)
+    nearest = neighbours(seen.key, NEIGHBOURS)
     node = map.nearest(reflect(seen.normal, seen.wo)[0])
     shown, sent = (
         change(seen, radiance.clamp(0, 1))[nearest].sum(1)
         for radiance in (seen.color, map.radiance[node])
     )
-    enough = shown > cfg.change * nearest.shape[1]
-    metal = enough & (shown > cfg.reflected * sent) & (shown < cfg.reflected_at_most * sent)
+    enough = shown > CHANGE * nearest.shape[1]
+    metal = enough & (shown > REFLECTED * sent) & (shown < REFLECTED_AT_MOST * sent)
     unexplained = unexplained_change(seen, map)[nearest].sum(1)
     total = change(seen, seen.encoded)[nearest].sum(1)
-    sharp = metal & (unexplained > cfg.sharp * total)
-    base = reflectance(seen, map, metal, sharp, nearest, cfg)
+    sharp = metal & (unexplained > SHARP * total)
+    base = reflectance(seen, map, metal, sharp, nearest)
     return Mirrors(metal, sharp, seen.normal, base)
 
 
@@ -232,7 +264,7 @@ def bounded(factor: Tensor, brightest: float) -> Tensor:
 
 
 def reflectance(
-    seen: Sightings, map: NodeMap, metal: Tensor, sharp: Tensor, nearest: Tensor, cfg: MirrorConfig
+    seen: Sightings, map: NodeMap, metal: Tensor, sharp: Tensor, nearest: Tensor
 ) -> Tensor:
     """Base colour [N, 3] of metals: what they and their neighbours show over what they mirror; 0
     elsewhere. How bright sharp ones are is that of their whole region, as polish is of one metal.
@@ -243,27 +275,27 @@ def reflectance(
     """
     mirrored, cosine = reflect(seen.normal, seen.wo)
     node = map.nearest(mirrored)
-    around = map.brightest_within(cfg.around)[node]
+    around = map.brightest_within(AROUND)[node]
     counted = seen.open & (cosine > 0.5) & metal[:, None]
     if counted.any():
-        counted &= around <= around[counted].quantile(cfg.darkest)
+        counted &= around <= around[counted].quantile(DARKEST)
     shown, sent = (
         (counted[..., None] * color).sum(1) for color in (seen.color, map.radiance[node])
     )
-    near = ratio(shown[nearest].sum(1), sent[nearest].sum(1), cfg)
+    near = ratio(shown[nearest].sum(1), sent[nearest].sum(1))
     region, regions = regions_of(sharp, nearest)
     shown, sent = (
         x.new_zeros(regions, 3).index_add(0, region, x * sharp[:, None])[region]
         for x in (shown, sent)
     )
-    bright = ratio(shown, sent, cfg).amax(1, keepdim=True)
+    bright = ratio(shown, sent).amax(1, keepdim=True)
     base = torch.where(sharp[:, None], near * bright / near.amax(1, keepdim=True), near)
     return torch.where(metal[:, None], base, 0.0)
 
 
-def ratio(shown: Tensor, sent: Tensor, cfg: MirrorConfig) -> Tensor:
+def ratio(shown: Tensor, sent: Tensor) -> Tensor:
     """Base colours [N, 3] that send on as much of what is sent [N, 3] as is shown [N, 3]."""
-    return bounded(shown / sent.clamp_min(1e-3), cfg.min_reflectance)
+    return bounded(shown / sent.clamp_min(1e-3), MIN_REFLECTANCE)
 
 
 def regions_of(inside: Tensor, nearest: Tensor) -> tuple[Tensor, int]:
@@ -280,9 +312,7 @@ def regions_of(inside: Tensor, nearest: Tensor) -> tuple[Tensor, int]:
     return torch.from_numpy(region).long(), regions
 
 
-def smoothed(
-    position: Tensor, normal: Tensor, sharp: Tensor, cfg: MirrorConfig
-) -> tuple[Tensor, Tensor]:
+def smoothed(position: Tensor, normal: Tensor, sharp: Tensor) -> tuple[Tensor, Tensor]:
     """Which of the sharp points [P] stay sharp, and normals [P, 3], those of sharp points averaged
     over their neighbours.
 
@@ -291,12 +321,12 @@ def smoothed(
     apart, so that what the map leaves unexplained does not tell how sharply they mirror.
     """
     index = sharp.nonzero()[:, 0]
-    if len(index) < cfg.neighbours:
+    if len(index) < NEIGHBOURS:
         return sharp, normal
     own = normal[index]
-    around = own[neighbours(position[index], cfg.neighbours)]
-    flat = around.mean(1).norm(dim=1, keepdim=True) > cfg.flat
-    weight = ((own[:, None] * around).sum(2, keepdim=True) - cfg.alike).clamp_min(0)
+    around = own[neighbours(position[index], NEIGHBOURS)]
+    flat = around.mean(1).norm(dim=1, keepdim=True) > FLAT
+    weight = ((own[:, None] * around).sum(2, keepdim=True) - ALIKE).clamp_min(0)
     mean = normalize((weight * around).sum(1), dim=1)
     return (
         sharp.index_copy(0, index, flat[:, 0]),

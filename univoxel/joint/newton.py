@@ -12,7 +12,7 @@ from torch import Tensor
 
 from univoxel import brdf
 from univoxel.fields.heads import MaterialHead
-from univoxel.joint.config import JointConfig, NewtonConfig
+from univoxel.joint.config import JointConfig
 from univoxel.joint.equations import (
     EliminatedAlbedo,
     LinearTransport,
@@ -33,6 +33,31 @@ from univoxel.joint.observations import (
 )
 from univoxel.ops import specular_response
 from univoxel.scene import Scene
+
+# Observations that a point needs: in a single one its colour explains everything
+MIN_VIEWS = 2
+# sRGB; the scale of the Cauchy weights: residuals beyond are what no model explains
+CAUCHY = 0.05
+# sRGB; what is left of an observation under the true map and materials. It weighs the prior of
+# roughness against the observations
+NOISE = 0.02
+# Roughness over which slopes by roughness are taken
+ROUGHNESS_STEP = 0.02
+# Log radiance by which a step changes a node of the map, or a view's gain, at most
+MAX_MAP_CHANGE = 1.0
+# Log albedo by which a step changes a point at most
+MAX_ALBEDO_CHANGE = 0.5
+# Roughness by which a step changes a point at most
+MAX_ROUGHNESS_CHANGE = 0.1
+# Log albedo below which no point goes: what is blacker does not determine the light
+MIN_LOG_ALBEDO = -7.0
+# Weight of the prior on changes of a view's own map, in units of newton_smooth
+VIEW_PRIOR = 10.0
+# Nearest nodes of the map that the smoothness ties a node to: as many as lie around one
+NODE_NEIGHBOURS = 6
+# Parts of the points that a step builds its equations from on a machine however slow
+MIN_PARTS = 2
+
 
 NEWTON_CHUNK = 256  # points whose equations are built at once
 UNSOLVABLE = "the equations for the map have no solution: it stays as it is in this round"
@@ -55,7 +80,6 @@ class NewtonPoints:
     )
 
     problem: JointProblem
-    cfg: NewtonConfig
     metal: Tensor  # [P] bool
     point: Tensor  # [P] int64, those of one material together
     observation: Tensor  # [P, V] int64
@@ -89,11 +113,11 @@ class NewtonPoints:
         self, part: Tensor, differences: ViewDifferences | None
     ) -> tuple[Tensor, Tensor, EliminatedAlbedo]:
         """Of a part under the present map, see `normal_equations`."""
-        sky, cauchy = self.problem.sky.radiance, self.cfg.cauchy
+        sky, cauchy = self.problem.sky.radiance, CAUCHY
         state = self.transport(part), sky, self.log_albedo[part], cauchy, differences
         if not self.prior_weight:
             return normal_equations(*state)
-        step = self.cfg.roughness_step
+        step = ROUGHNESS_STEP
         deviation = (self.roughness - self.prior_roughness)[part]
         rougher = self.transport(part, step)
         return normal_equations(*state, RoughnessStep(rougher, step, self.prior_weight, deviation))
@@ -102,10 +126,10 @@ class NewtonPoints:
         """Change albedo and roughness as it belongs to a step of the light [3, D + B]."""
         steps = zip(*(e.back_substituted(light_step) for e in eliminated), strict=True)
         to_albedo, to_roughness = (torch.cat(x) for x in steps)
-        limit = self.cfg.max_albedo_change
+        limit = MAX_ALBEDO_CHANGE
         log_albedo = self.log_albedo + to_albedo.clamp(-limit, limit)
-        self.log_albedo = log_albedo.clamp(self.cfg.min_log_albedo, 0.0)
-        limit = self.cfg.max_roughness_change
+        self.log_albedo = log_albedo.clamp(MIN_LOG_ALBEDO, 0.0)
+        limit = MAX_ROUGHNESS_CHANGE
         roughness = self.roughness + to_roughness.clamp(-limit, limit)
         self.roughness = roughness.clamp(MaterialHead.min_roughness, 1.0)
 
@@ -143,8 +167,8 @@ def newton_round_(
         part_end = time.monotonic()
         part_seconds = max(part_end - part_begin, 1e-6)
         parts_in_time = (seconds - (part_end - begin)) / (cfg.newton_steps * part_seconds)
-        points.keep_(max(cfg.newton.min_parts, int(parts_in_time)))
-    laplacian = cfg.newton_smooth * graph_laplacian(problem.sky.direction, cfg.newton.neighbours)
+        points.keep_(max(MIN_PARTS, int(parts_in_time)))
+    laplacian = cfg.newton_smooth * graph_laplacian(problem.sky.direction, NODE_NEIGHBOURS)
     costs = []
     for _ in range(cfg.newton_steps):
         differences = view_differences(scene)
@@ -166,7 +190,7 @@ def choose_points(
     counts = problem.observations.offsets.diff()
     # Points that are seen as often as usual: of few photographs that is less than is wanted
     usual_count = float(counts[counts > 0].float().median())
-    min_count = max(cfg.newton.min_views, min(cfg.newton_views // 2, usual_count))
+    min_count = max(MIN_VIEWS, min(cfg.newton_views // 2, usual_count))
     candidates = (counts >= min_count).nonzero()[:, 0]
     point = candidates[torch.randperm(len(candidates))[: cfg.newton_points]]
     if not len(point):
@@ -176,10 +200,9 @@ def choose_points(
     albedo, roughness, _ = scene.material(features)
     if decisions.albedo is not None:
         albedo = decisions.albedo[point]
-    prior = (cfg.newton.noise / cfg.newton_roughness) ** 2 if cfg.newton_roughness else 0.0
+    prior = (NOISE / cfg.newton_roughness) ** 2 if cfg.newton_roughness else 0.0
     return NewtonPoints(
         problem,
-        cfg.newton,
         decisions.metal[point],
         point,
         observations_of(problem, point, cfg.newton_views),
@@ -244,7 +267,7 @@ def map_step_(
     step = solve_damped(system, right_side)
     if step is None:
         return None
-    limit = points.cfg.max_map_change
+    limit = MAX_MAP_CHANGE
     step = step.view(3, unknowns).clamp(-limit, limit)
     to_map, to_gain = step.split([nodes, unknowns - nodes], 1)
     sky.log_radiance.add_(to_map.T)
@@ -268,17 +291,17 @@ def views_step_(
     assert views.sky_weights is not None
     hessian = gradient = torch.zeros(())
     for part in points.parts:
-        state = points.transport(part), sky.radiance, points.log_albedo[part], points.cfg.cauchy
+        state = points.transport(part), sky.radiance, points.log_albedo[part], CAUCHY
         part_hessian, part_gradient = view_equations(*state, differences)
         hessian, gradient = hessian + part_hessian / count, gradient + part_gradient / count
     weights = views.sky_weights - views.sky_weights.mean(0)  # [B, R, 3]
     weights = torch.nn.functional.pad(weights.permute(2, 0, 1), (0, 1))
-    prior = points.cfg.view_prior * smooth
+    prior = VIEW_PRIOR * smooth
     hessian.diagonal(dim1=2, dim2=3).add_(prior)
     step = solve_damped(hessian, gradient - prior * weights)
     if step is None:
         return False
-    limit = points.cfg.max_map_change
+    limit = MAX_MAP_CHANGE
     step = step.clamp(-limit, limit).permute(1, 2, 0)
     sky.log_radiance.add_(views.add(step[:, -1], step[:, :-1]))
     return True

@@ -29,6 +29,13 @@ from univoxel.render.transport import (
 )
 from univoxel.scene import Scene
 
+# Vertices of the mesh whose colour is looked up in the photographs; the others of a larger mesh
+# take that of the nearest, for memory. Meshes of the presets have fewer
+VERTICES = 300_000
+# Metallic from which on the stages before have taken a point for metal
+METALLIC_BEFORE = 0.2
+
+
 TURNS = 64  # positions of a turntable that are told apart: closer than the map's nodes
 
 
@@ -97,7 +104,7 @@ def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> 
     mesh = extract_mesh(scene)
     tracer = scene.occluder()
     offset = scene.field.voxel_size
-    vertex_color = vertex_colors(scene, mesh, photos, cfg.surface.vertices)
+    vertex_color = vertex_colors(scene, mesh, photos, VERTICES)
     position, normal = surface_points(mesh, cfg.points, generator)
     observations = observe(position, normal, photos, tracer, offset)
     if not len(observations.view):
@@ -130,7 +137,7 @@ def first_decisions(scene: Scene, problem: JointProblem, cfg: JointConfig) -> De
     is known."""
     features = scene.field.features_at(problem.observations.position)
     metal, only_metal = (
-        scene.material(features)[2] > cfg.metal.metallic_before,
+        scene.material(features)[2] > METALLIC_BEFORE,
         bool(cfg.only_metal),
     )
     return Decisions(metal | only_metal, only_metal=only_metal)

@@ -14,7 +14,7 @@ from univoxel.joint.mirrored_map import (
     sharp_map,
     with_energy,
 )
-from univoxel.joint.mirrors import ROWS, NodeMap, neighbours, open_views
+from univoxel.joint.mirrors import NEIGHBOURS, ROWS, NodeMap, neighbours, open_views
 from univoxel.joint.observations import JointProblem, Mirrors
 from univoxel.render.transport import Observations, observe
 from univoxel.scene import Scene
@@ -34,19 +34,19 @@ def sharpen_sky_(
     much better than one colour.
     """
     parent = mirrors.sharp.nonzero()[:, 0]
-    if not cfg.mirror.rows or len(parent) < cfg.mirror.neighbours:
+    if not cfg.mirror.rows or len(parent) < NEIGHBOURS:
         return False
     parent = parent.repeat(-(-POINTS // len(parent)))
     observations = points_beside(scene, photos, problem, parent)
     sky = problem.sky
     nodes = NodeMap.of(sky.direction, sky.latlong(ROWS), sky.radiance)
     base = mirrors.base[parent]
-    views, index = open_views(scene, problem, observations, parent, base, nodes, cfg)
+    views, index = open_views(scene, problem, observations, parent, base, nodes)
     first = observations.view[index] % 2 == 0
     if not first.any() or first.all():  # too few to foretell others from
         return False
-    nearest = neighbours(observations.position, cfg.mirror.neighbours)
-    normal = agreed_normals(views, observations.normal, nearest, cfg.mirror)
+    nearest = neighbours(observations.position, NEIGHBOURS)
+    normal = agreed_normals(views, observations.normal, nearest)
     seen, told = views.at(first), views.at(~first)
     half = sharp_map(seen, normal, ROWS).encoded
     of_nodes, of_half = (errors(map, told, normal).mean() for map in (nodes.encoded, half))

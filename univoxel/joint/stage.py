@@ -24,7 +24,13 @@ from univoxel.errors import NoSurface
 from univoxel.fields.heads import MaterialHead
 from univoxel.joint.albedo_entropy import diffuse_albedo, fit_sun_, minimise_entropy_
 from univoxel.joint.config import JointConfig
-from univoxel.joint.initialise import initialise_, neutralise_
+from univoxel.joint.initialise import (
+    TRIAL_POINTS,
+    TRIAL_ROUNDS,
+    TRIAL_STEPS,
+    initialise_,
+    neutralise_,
+)
 from univoxel.joint.metals import find_metal
 from univoxel.joint.mirrors import find_mirrors
 from univoxel.joint.newton import newton_round_
@@ -51,6 +57,36 @@ from univoxel.training.surface_update import (
     MOMENTS,
     smooth_sdf_gradient_,
 )
+
+# Points that are traced on a machine however slow; on a fast one JointConfig.points
+MIN_POINTS = 2000
+# Seconds of an observation in a Newton step over one in an Adam step; measured, with the trials
+# and the search for metals. Only a first guess of the time to reserve
+NEWTON_COST = 6.5
+# Learning rates at the end of a round over those at its begin
+DECAY = 0.1
+# Learning rate of the map after a Newton step, times JointConfig.lr_map. Light is then better
+# than what Adam would make of it while the albedo follows
+MAP_AFTER_NEWTON = 0.1
+# Learning rate of the views' gains after a Newton step, times lr_networks; 0: they stay
+GAINS_AFTER_NEWTON = 0.0
+# Passes that smooth the gradient of the sdf: fewer than where geometry forms
+SDF_PASSES = 2
+# Weight of the squared distance, in voxels, between the surface and its points
+SURFACE_WEIGHT = 3e-3
+# Voxels: standard deviation of where materials are compared, for their smoothness
+BESIDE = 2.0
+# Weight of what was found of sharp points, in Adam
+MIRROR_WEIGHT = 1.0
+# Weight of the loss by which materials learn albedos, against the epsilon of Adam; no other was
+# tried
+TEACHING_WEIGHT = 0.1
+# Weight of the change of the albedo near each point, see BESIDE
+ALBEDO_SMOOTHNESS = 0.005
+# Weight of the change of the roughness there
+ROUGHNESS_SMOOTHNESS = 0.02
+# Weight of the cross entropy of metallic and the metal decision
+METALLIC_WEIGHT = 0.01
 
 
 @dataclass(frozen=True)
@@ -108,7 +144,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
         if not guard.sound(loss):
             continue
         if cfg.lr_sdf:
-            smooth_sdf_gradient_(scene.field, cfg.adam.sdf_passes)
+            smooth_sdf_gradient_(scene.field, SDF_PASSES)
         optimizer.step()
         if progress.due():
             progress.report({k: v.item() for k, v in terms.items()}, None)
@@ -131,7 +167,7 @@ def traced_problem(
     if progress.clock.over:
         return None
     # What does not fit is cut alike: points here, steps of Adam by `steps`, points of Newton there
-    points = min(cfg.points, max(cfg.surface.min_points, round(progress.clock.pace * cfg.points)))
+    points = min(cfg.points, max(MIN_POINTS, round(progress.clock.pace * cfg.points)))
     try:
         scene.occluder()
         return build_problem(scene, photos, replace(cfg, points=points), seed)
@@ -145,8 +181,8 @@ def newton_share(cfg: JointConfig) -> float:
     if not cfg.newton_steps:
         return 0.0
     points = cfg.rounds * cfg.newton_steps * cfg.newton_points
-    points += cfg.trials.rounds * cfg.trials.steps * cfg.trials.points
-    newton = cfg.newton.cost * (points * cfg.newton_views)
+    points += TRIAL_ROUNDS * TRIAL_STEPS * TRIAL_POINTS
+    newton = NEWTON_COST * (points * cfg.newton_views)
     return newton / (newton + cfg.iterations * cfg.rays)
 
 
@@ -169,13 +205,13 @@ def newton_phase_(
         with progress.clock.off_pace():
             decisions = start_(scene, problem, decisions, cfg, seconds, progress)
     if decisions.only_metal:
-        neutralise_(scene, problem, cfg.metal)
+        neutralise_(scene, problem)
     with progress.clock.off_pace():
         newton = newton_round_(scene, problem, decisions, cfg, seconds)
         for trouble in newton.troubles:
             progress.trouble(trouble)
         if cfg.colors:
-            minimise_entropy_(scene, problem, decisions, cfg.entropy)
+            minimise_entropy_(scene, problem, decisions)
         done = rounds_done(cfg, rounds_left - 1)
         decisions = with_metals(scene, problem, decisions, cfg, done)
         if decisions.albedo is not None:
@@ -194,7 +230,7 @@ def with_metals(
     metal = torch.ones_like(decisions.metal)
     if not decisions.only_metal:
         metal = find_metal(scene, problem, cfg, done)
-    mirrors = find_mirrors(scene, problem, cfg)
+    mirrors = find_mirrors(scene, problem)
     if mirrors is not None:
         metal = metal | mirrors.metal
     return replace(decisions, metal=metal, mirrors=mirrors)
@@ -228,12 +264,12 @@ def start_(
         )
     if not cfg.colors:
         return decisions
-    sun = fit_sun_(scene, problem, decisions, cfg.entropy)
+    sun = fit_sun_(scene, problem, decisions)
     if sun is not None:
         progress.say(str(sun))
         decisions = replace(decisions, sun=sun.log_excess)
-    if minimise_entropy_(scene, problem, decisions, cfg.entropy) or sun is not None:
-        albedo = diffuse_albedo(scene, problem, cfg.entropy)
+    if minimise_entropy_(scene, problem, decisions) or sun is not None:
+        albedo = diffuse_albedo(scene, problem)
         decisions = replace(decisions, albedo=albedo)
     return decisions
 
@@ -247,7 +283,7 @@ def teach_albedo_(
     of another light, times this one, is far from them, and short trainings would end before. Metal,
     roughness and metallic stay.
     """
-    target = diffuse_albedo(scene, problem, cfg.entropy)
+    target = diffuse_albedo(scene, problem)
     diffuse = target.isfinite().all(1) & ~decisions.metal
     if not diffuse.any():
         return
@@ -283,14 +319,14 @@ def teach_(scene: Scene, problem: JointProblem, target: Sequence[Tensor], cfg: J
     for step in range(steps):
         rates = cfg.lr_features, cfg.lr_networks
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * cfg.adam.decay ** (step / steps)
+            group["lr"] = rate * DECAY ** (step / steps)
         point = torch.randint(len(position), (cfg.rays,))
         material = scene.material(scene.field.features_at(position[point]))
         loss = (material[0].clamp_min(1e-3).log() - log_albedo[point]).abs().mean()
         for value, wanted in zip(material[1:], others, strict=True):
             loss = loss + (value - wanted[point]).abs().mean()
         optimizer.zero_grad(set_to_none=True)
-        (cfg.entropy.teaching_weight * loss).backward()
+        (TEACHING_WEIGHT * loss).backward()
         optimizer.step()
 
 
@@ -325,9 +361,9 @@ def set_rates_(
         scale: factor on all of them.
     """
     length = current_round.end - current_round.begin
-    fade = cfg.adam.decay ** ((done - current_round.begin) / length)
-    map_factor = cfg.adam.map_after_newton if current_round.solved else 1.0
-    gains_factor = cfg.adam.gains_after_newton if current_round.solved else 1.0
+    fade = DECAY ** ((done - current_round.begin) / length)
+    map_factor = MAP_AFTER_NEWTON if current_round.solved else 1.0
+    gains_factor = GAINS_AFTER_NEWTON if current_round.solved else 1.0
     rates = (
         cfg.lr_features,
         cfg.lr_networks,
@@ -346,7 +382,7 @@ def objective(
     index, observation = sample_observations(problem, cfg.rays // cfg.views, cfg.views)
     point = index[:: cfg.views]
     position = problem.observations.position[point]
-    distance = cfg.adam.beside * problem.voxel_size
+    distance = BESIDE * problem.voxel_size
     nearby = position + distance * torch.randn_like(position)
     # One sampling, one gradient: adding up sparse ones costs more than either
     sample = scene.field.sample(torch.cat([position, nearby]))
@@ -366,13 +402,13 @@ def objective(
     squared_distance = (sample.sdf[: len(point)] / problem.voxel_size).square().mean()
     terms = {
         "joint": losses.photometric(encoded, target, clipped=CLIPPED),
-        "surface": cfg.adam.surface * squared_distance,
-        "albedo": cfg.albedo_smoothness * priors.smoothness(albedo, albedo_nearby),
-        "roughness": cfg.roughness_smoothness * priors.smoothness(roughness, roughness_nearby),
-        "metallic": cfg.metallic * binary_cross_entropy(metallic, metal),
+        "surface": SURFACE_WEIGHT * squared_distance,
+        "albedo": ALBEDO_SMOOTHNESS * priors.smoothness(albedo, albedo_nearby),
+        "roughness": ROUGHNESS_SMOOTHNESS * priors.smoothness(roughness, roughness_nearby),
+        "metallic": METALLIC_WEIGHT * binary_cross_entropy(metallic, metal),
     }
     if decisions.mirrors is not None:
-        terms["mirrors"] = cfg.mirror.weight * mirror_loss(
+        terms["mirrors"] = MIRROR_WEIGHT * mirror_loss(
             decisions.mirrors, point, normal, albedo, roughness
         )
     return terms

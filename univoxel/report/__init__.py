@@ -165,7 +165,7 @@ def what_is_known(run: Path, scene: Scene, options: ReportOptions) -> Known:
     """
     data = None if options.data is None else Path(options.data)
     photos, cfg = photos_of(run, data, "train"), confidence_of(run)
-    surveyed = survey(scene, photos, cfg.points, cfg)
+    surveyed = survey(scene, photos, cfg.points)
     photos = scene.registered(photos)
     occluder = scene.occluder()
     advice = advise(surveyed, photos.cameras, photos.names, occluder, options.advice)
@@ -220,7 +220,7 @@ def next_section(advice: Advice) -> str:
 def doubt_section(known: Known, state: dict[str, Any], pictures: Sequence[Tensor]) -> str:
     """What photographs leave open, in words and painted on the object."""
     surveyed = known.surveyed
-    text = words(numbers(surveyed), list(state.get("troubles", [])), surveyed.cfg)
+    text = words(numbers(surveyed), list(state.get("troubles", [])))
     legend = "Doubt of the albedo: black is well determined, white is a guess."
     return paragraph(text) + gallery(zip(sides.SIDES, pictures, strict=True), legend)
 

@@ -245,7 +245,7 @@ def _survey(scene: Scene, run: Path, data: Path | None) -> Survey | None:
     """What the photographs that were trained on fix; None, with a line, where they are missing."""
     try:
         photos, cfg = photos_of(run, data, "train"), confidence_of(run)
-        return survey(scene, photos, cfg.points, cfg)
+        return survey(scene, photos, cfg.points)
     except UserError as error:  # no photographs to train on, or no surface
         log.info("no trust report: %s", error, extra={"arguments": error.arguments})
         return None
@@ -258,7 +258,7 @@ def _say_trust(
     if surveyed is None:
         return {}
     figures = numbers(surveyed)
-    paragraph = words(figures, troubles, surveyed.cfg)
+    paragraph = words(figures, troubles)
     log.info(paragraph)
     if save:
         with replacing(save / "trust.txt") as temporary:

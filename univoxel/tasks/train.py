@@ -302,7 +302,7 @@ def bring_to_grid_(
 def trusted(scene: Scene, photos: Photos, cfg: TrainConfig) -> Survey | None:
     """What the photographs leave open; None where there is no surface that they show."""
     try:
-        return survey(scene, photos, cfg.confidence.report_points, cfg.confidence)
+        return survey(scene, photos, cfg.confidence.report_points)
     except UserError as error:
         log.info(f"no trust report: {error}")
         return None
@@ -314,7 +314,7 @@ def save_trust(
     """Write to the run's trust.txt, and log, how it came out and what photographs leave open."""
     text = verdict.sentence() + "."
     if surveyed is not None:
-        text += " " + words(numbers(surveyed), troubles, cfg.confidence)
+        text += " " + words(numbers(surveyed), troubles)
     with replacing(cfg.out / "trust.txt") as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
     log.info(text)

@@ -62,7 +62,7 @@ class Subject:
         photos = self.photos  # without them there is no run to ask either
         assert self.run is not None
         cfg = confidence_of(self.run)
-        found = Doubts(survey(self.scene, photos, cfg.points, cfg))
+        found = Doubts(survey(self.scene, photos, cfg.points))
         mesh = self.traced.mesh
         assert mesh.normals is not None
         return found.at(mesh.vertices, mesh.normals)[:, 0].clamp(0, 1)
