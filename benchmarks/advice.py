@@ -23,8 +23,7 @@ from torch.nn.functional import normalize
 from univoxel.camera import looked_at
 from univoxel.checkpoint import FILE, load_scene
 from univoxel.confidence.advice import ADVICE, Advice, advise, azimuths
-from univoxel.confidence.config import confidence_of
-from univoxel.confidence.survey import Survey, survey
+from univoxel.confidence.survey import POINTS, Survey, survey
 from univoxel.data import Photos, load_photos
 from univoxel.files import replacing
 from univoxel.presets import preset
@@ -69,9 +68,9 @@ def trained(data: Path, run: Path, name: str, seed: int) -> Path:
 
 def looked_through(run: Path, most: int) -> tuple[Survey, Advice]:
     """What the photographs of a run fix, and what to photograph next."""
-    scene, cfg = load_scene(run), confidence_of(run)
+    scene = load_scene(run)
     photos = photos_of(run, split="train")
-    found = survey(scene, photos, cfg.points, cfg)
+    found = survey(scene, photos, POINTS)
     asked = replace(ADVICE, most=most, least=0.0, share=0.0)
     cameras = scene.registered(photos).cameras
     return found, advise(found, cameras, photos.names, scene.occluder(), asked)

@@ -23,13 +23,12 @@ from made import made
 from lab import plots
 from lab.record import result_text
 from univoxel.checkpoint import FILE
-from univoxel.config import TrainConfig
+from univoxel.config import StageConfig, TrainConfig
 from univoxel.files import replacing
 from univoxel.presets import preset, with_field
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.info import info
 from univoxel.tasks.train import train
-from univoxel.training.config import StageConfig
 
 SETTINGS = ["dense", "sparse", "hash", "adaptive"]
 PANELS = [plots.NVS, plots.ALBEDO, plots.RELIT]

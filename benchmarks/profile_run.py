@@ -23,16 +23,14 @@ from made import made
 from train_step import OTHER, STAGES, Clock
 
 from lab.record import result_text
-from univoxel.config import TrainConfig
+from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.fields.field import Field
 from univoxel.joint import observations, stage
-from univoxel.joint.config import JointConfig
 from univoxel.ops import VisibilityScene
 from univoxel.preparation import prepare
 from univoxel.presets import chosen
 from univoxel.tasks import train
 from univoxel.training import loop, patches
-from univoxel.training.config import StageConfig
 
 HERE = Path(__file__).parent
 ONCE = {

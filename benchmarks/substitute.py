@@ -31,7 +31,7 @@ from univoxel.assets.bake import with_materials
 from univoxel.camera import image_rays
 from univoxel.checkpoint import load_scene, save_scene
 from univoxel.color import linear_to_srgb
-from univoxel.config import TrainConfig, save_config
+from univoxel.config import JointConfig, StageConfig, TrainConfig, save_config
 from univoxel.data import load_photos, load_relit, load_truth, relight_maps
 from univoxel.data.base import decode
 from univoxel.data.maps import read_map, true_map
@@ -39,7 +39,6 @@ from univoxel.envmap import tables
 from univoxel.evaluation.measures import albedo_scales
 from univoxel.fields.field import dense_field
 from univoxel.grid import GridShape, fit_grid
-from univoxel.joint.config import JointConfig
 from univoxel.lights.nodes import DistantLight
 from univoxel.metrics import on_black, psnr
 from univoxel.ops import VisibilityScene
@@ -52,7 +51,6 @@ from univoxel.scene import Scene
 from univoxel.sphere import latlong_directions, texel_solid_angles
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
-from univoxel.training.config import StageConfig
 
 TERMS = ("none", "geometry", "light", "both")
 NEIGHBOURS = 4  # samples of the surface whose triangles a node is measured to

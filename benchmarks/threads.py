@@ -29,7 +29,7 @@ def measure(scene: Path, preset: str, folder: Path, threads: int) -> list[list]:
     """Name, seconds on the clock and seconds of the processor of each stage of a training here."""
     import torch
 
-    from univoxel.joint.config import JointConfig
+    from univoxel.config import JointConfig
     from univoxel.presets import chosen
     from univoxel.tasks import train
 

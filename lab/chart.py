@@ -10,11 +10,10 @@ from typing import Any
 from lab import plots, runner
 from lab.plots import Measure
 from lab.record import Outcome, Setting, result_text
-from univoxel.config import TrainConfig
+from univoxel.config import StageConfig, TrainConfig
 from univoxel.errors import ProcessFailed, UserError
 from univoxel.files import replacing
 from univoxel.names import LIGHTS, LightName
-from univoxel.training.config import StageConfig
 
 BETWEEN = (3, 6)  # minutes, where the curve is looked at between the presets
 PRESETS = ("draft", "fast", "full", "best")

@@ -181,8 +181,7 @@ def test_capture(calls, capsys):
 
 
 def test_train_as_another_run_was_trained(calls, tmp_path, capsys):
-    from univoxel.config import TrainConfig, save_config
-    from univoxel.training.config import StageConfig
+    from univoxel.config import StageConfig, TrainConfig, save_config
 
     (tmp_path / "before").mkdir()
     stages = (StageConfig(voxels=1.0, iterations=10, share=1.0),)

@@ -8,15 +8,23 @@ from pathlib import Path
 import pytest
 
 import univoxel
-from univoxel.config import TrainConfig, check_same, load_config, save_config
+from univoxel.config import (
+    PREPARATION,
+    JointConfig,
+    LossConfig,
+    MirrorConfig,
+    StageConfig,
+    TrainConfig,
+    check_same,
+    load_config,
+    save_config,
+)
 from univoxel.errors import ConfigError, MissingFile, UserError
-from univoxel.joint.config import JointConfig, MirrorConfig
 from univoxel.lights.sg import SGConfig
 from univoxel.names import LIGHTS
 from univoxel.presets import PRESETS, budget, chosen, preset, with_field, with_metal, work_in
 from univoxel.scene import SceneConfig
 from univoxel.training.clock import expected_training
-from univoxel.training.config import PREPARATION, LossConfig, StageConfig
 
 STAGE = StageConfig(voxels=1.0, iterations=10, share=1.0)
 CONFIG = TrainConfig(Path("photos"), Path("run"), (STAGE,), minutes=1.0)

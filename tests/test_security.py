@@ -106,7 +106,7 @@ from univoxel.cli import main
 from univoxel.config import TrainConfig
 from univoxel.lights import SGConfig
 from univoxel.scene import SceneConfig
-from univoxel.training.config import StageConfig
+from univoxel.config import StageConfig
 here, run = Path(sys.argv[1]), str(Path(sys.argv[1]) / "run")
 light = SGConfig(lobes=1, hidden=4, directions=8, directions_eval=8)
 scene = SceneConfig(channels=2, material_channels=1, hidden=4, light=light, sky_nodes=0)

@@ -6,13 +6,12 @@ from dataclasses import replace
 
 from univoxel import lights
 from univoxel.compression import plan, storage
-from univoxel.config import TrainConfig
+from univoxel.config import StageConfig, TrainConfig
 from univoxel.fields.features import PER_LEVEL, Levels
 from univoxel.fields.field import Field, dense_field, hash_field
 from univoxel.grid import fit_grid
 from univoxel.preparation.prepare import Prepared
 from univoxel.scene import Scene
-from univoxel.training.config import StageConfig
 
 
 def build_scene(prepared: Prepared, cfg: TrainConfig) -> Scene:

@@ -5,21 +5,18 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, get_args
 
 from univoxel import __version__
-from univoxel.confidence.config import ConfidenceConfig
 from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.fields.features import PER_LEVEL
 from univoxel.files import read_json, replacing
-from univoxel.joint.config import JointConfig
 from univoxel.lights import read_config
-from univoxel.names import CamerasFrom, Capacity, LightFrameOrAuto, MasksFrom
+from univoxel.names import FIELDS, CamerasFrom, Capacity, FieldName, LightFrameOrAuto, MasksFrom
 from univoxel.retired import without_retired
 from univoxel.scene import SceneConfig
-from univoxel.training.config import LossConfig, StageConfig
 from univoxel.validation import check_fields, record
 
 # Arguments that a configuration is made of
@@ -38,6 +35,153 @@ CHOICES = (
     ),
     *("budget_mb", "changes"),
 )
+
+
+# Most of a limit of time that reading and preparation may take; stages share the rest
+PREPARATION = 0.25
+_WHOLE = ("at least 1", lambda x: x >= 1)
+_ABOVE = ("above 0", lambda x: 0 < x < math.inf)
+_NOT_BELOW = ("at least 0", lambda x: 0 <= x < math.inf)
+_SHARE = ("in (0, 1]", lambda x: 0 < x <= 1)
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """One stage of training, on a grid of its own resolution."""
+
+    voxels: float  # millions in the object's box at most, > 0; see TrainConfig.voxel_pixels
+    iterations: int  # optimisation steps, >= 1; fewer when time runs out
+    share: float  # of the time that is left for stages under a limit, (0, 1]
+    rays: int = 2048  # per step, >= 1
+    sharpness: tuple[float, float] = (0.5, 0.5)  # s of the NeuS density at begin and end, voxels
+    lr_sdf: tuple[float, float] = (0.2, 0.02)  # at begin and end, voxels per step; all rates > 0
+    # at begin and end: of features, and of the table of mirrored directions
+    lr_features: tuple[float, float] = (0.1, 0.01)
+    # at begin and end: of the networks, the light, and what differs from view to view
+    lr_networks: tuple[float, float] = (3e-3, 3e-4)
+    lr_poses: tuple[float, float] = (1e-3, 1e-4)  # radians, radii; of cameras that are refined
+    plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.125]
+    spread: int = 4  # passes that smooth the sdf's gradient before the optimiser, >= 0
+    diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 0.25]
+    physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
+    # progress in [0, 1] at which patches of the surface are compared between photographs; 1: never
+    patches_from: float = 1.0
+    refit: bool = False  # materials stay; light, radiance and silhouettes follow them
+    # sparse: only bricks around the surface are stored; hash: features come from a hash table
+    field: FieldName = "dense"
+
+    def __post_init__(self) -> None:
+        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "voxels")
+        check_fields(self, "at least 1", lambda x: x >= 1, "iterations", "rays")
+        check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "share")
+        check_fields(
+            self,
+            "two numbers above 0",
+            lambda x: len(x) == 2 and all(0 < v < math.inf for v in x),
+            *("sharpness", "lr_sdf", "lr_features", "lr_networks", "lr_poses"),
+        )
+        check_fields(self, "at least 0", lambda x: x >= 0, "spread")
+        check_fields(self, "in [0, 0.125]", lambda x: 0 <= x <= 0.125, "plate")
+        check_fields(self, "in [0, 0.25]", lambda x: 0 <= x <= 0.25, "diffusion")
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "physical_from", "patches_from")
+        check_fields(self, "dense, sparse or hash", lambda x: x in FIELDS, "field")
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights >= 0 of the losses; the photometric loss of the physically based render has 1."""
+
+    radiance: float = 1.0  # photometric loss of what the radiance head shows
+    silhouette: float = 0.1  # rays' opacity against the masks
+    albedo_smoothness: float = 0.005  # change of the albedo over about a voxel, L1
+    roughness_smoothness: float = 0.02  # change of the roughness over about a voxel, L1
+    metallic: float = 0.01  # what the mean metallic costs: metal is for where nothing else serves
+    light_smoothness: float = 0.1  # change of a local light over about a voxel, L1
+    # distance of the light from grey on the whole, as a share of it: photographs fix albedo and
+    # light up to a colour only
+    white_light: float = 0.01
+    map_smoothness: float = 1e-3  # total variation of the log map
+    # what patches of the surface lack in correlation between photographs, in every second step
+    patches: float = 0.4
+
+    def __post_init__(self) -> None:
+        names = [f.name for f in fields(self)]
+        check_fields(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
+
+
+@dataclass(frozen=True)
+class MetalConfig:
+    """Which points are metal, see joint/metals.py."""
+
+    # brightest channel of a metal at least, [0, 1]: metals in use reflect 0.4 and more
+    min_reflectance: float = 0.25
+
+    def __post_init__(self) -> None:
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "min_reflectance")
+
+
+@dataclass(frozen=True)
+class MirrorConfig:
+    """The map that mirrors show, see joint/sharp_sky.py."""
+
+    # rows of the map as sharp points show it, a multiple of 32; 0: it is not kept
+    rows: int = 128
+
+    def __post_init__(self) -> None:
+        rows = range(0, 1025, 32)
+        check_fields(self, "a multiple of 32 in [0, 1024]", lambda x: x in rows, "rows")
+
+
+@dataclass(frozen=True)
+class EntropyConfig:
+    """The prior that paint comes in few colours, see joint/albedo_entropy.py."""
+
+    # steps, >= 1, in which the materials learn the albedos under a map that was changed
+    teaching_steps: int = 60
+
+    def __post_init__(self) -> None:
+        check_fields(self, *_WHOLE, "teaching_steps")
+
+
+@dataclass(frozen=True)
+class JointConfig:
+    """The stage that solves for one map, the materials and normals, see joint/stage.py."""
+
+    iterations: int = 700  # Adam steps in all rounds, >= 1; fewer when time runs out
+    share: float = 0.4  # of the time budget, (0, 1]
+    rays: int = 4096  # observations per step, >= views
+    views: int = 4  # observations of a point per step, >= 1
+    rounds: int = 4  # of Newton steps on the map and then of Adam, >= 1
+    points: int = 20000  # on the surface, >= 1
+    tracing: int = 2  # visibility rays per point and direction, >= 1
+    colors: bool = True  # whether the light minimises the entropy of albedo, see entropy
+    # whether all is metal, as dark as it looks, and the map neutral; None: trials decide
+    only_metal: bool | None = None
+    lr_features: float = 0.03  # at the begin of a round; all rates > 0
+    # at the begin of a round: of the materials' head and the views' gains
+    lr_networks: float = 3e-3
+    lr_map: float = 0.05  # of the log map
+    lr_sdf: float = 0.04  # of the surface, voxels per step, >= 0; 0: it stays
+    newton_steps: int = 3  # at the begin of a round, >= 0
+    newton_points: int = 4000  # of the points, >= 1
+    newton_views: int = 8  # observations of each, >= 2
+    newton_roughness: float = 0.1  # standard deviation that roughness follows the map with; 0: none
+    newton_smooth: float = 1e-7  # Laplacian on the log map against the mean squared residual, > 0
+    # how points are decided to be metal
+    metal: MetalConfig = field(default_factory=MetalConfig)
+    # the map that mirrors show
+    mirror: MirrorConfig = field(default_factory=MirrorConfig)
+    # the prior on few colours, where colors is set
+    entropy: EntropyConfig = field(default_factory=EntropyConfig)
+
+    def __post_init__(self) -> None:
+        counts = ("iterations", "views", "rounds", "points", "tracing", "newton_points")
+        check_fields(self, *_WHOLE, *counts)
+        check_fields(self, *_SHARE, "share")
+        check_fields(self, "at least views", lambda x: x >= self.views, "rays")
+        check_fields(self, *_ABOVE, "lr_features", "lr_networks", "lr_map", "newton_smooth")
+        check_fields(self, *_NOT_BELOW, "lr_sdf", "newton_steps", "newton_roughness")
+        check_fields(self, "at least 2", lambda x: x >= 2, "newton_views")
 
 
 @dataclass(frozen=True)
@@ -84,8 +228,6 @@ class TrainConfig:
     # sizes of the model, and what light it has
     scene: SceneConfig = field(default_factory=SceneConfig)
     loss: LossConfig = field(default_factory=LossConfig)  # weights in each StageConfig
-    # what is said of the scene afterwards; evaluation reads it from the run's config.json
-    confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
 
     def __post_init__(self) -> None:
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
-from univoxel.config import TrainConfig
+from univoxel.config import PREPARATION, JointConfig, LossConfig, StageConfig, TrainConfig
 from univoxel.errors import UserError
-from univoxel.joint.config import JointConfig
 from univoxel.lights import (
     BakedConfig,
     EnvmapConfig,
@@ -21,7 +20,6 @@ from univoxel.lights import (
 )
 from univoxel.names import LIGHTS, Differing, FieldName, LightName, Metal
 from univoxel.scene import SceneConfig
-from univoxel.training.config import PREPARATION, LossConfig, StageConfig
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,7 @@ from typing import Any
 
 # By class. What they said is a constant now, beside the code that uses it, or gone with that code
 RETIRED: dict[str, frozenset[str]] = {
-    "TrainConfig": frozenset({"compression", "hollows", "preparation"}),
-    "ConfidenceConfig": frozenset(
-        (
-            "black directions enough_views few_views max_disagreement min_share min_visibility "
-            "neighbours noise normal_scale observations one_side roughness_step"
-        ).split()
-    ),
+    "TrainConfig": frozenset({"compression", "confidence", "hollows", "preparation"}),
     "JointConfig": frozenset(
         "adam albedo_smoothness metallic newton roughness_smoothness surface trials".split()
     ),

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 
 sys.path.append(str(Path(__file__).parents[2] / "tests"))
-from layers import drawn_layers
+from layers import LAYERS
 
 INK, SOFT, PALE = "#22333b", "#5b6f7a", "#eef2f4"
 BLUE, GREEN, ORANGE, RED = "#3a6ea5", "#4f8f5b", "#c9822b", "#b0413e"
@@ -295,7 +295,7 @@ def fields() -> Figure:
 
 def layers() -> Figure:
     """The folders of the package, from the bottom up, as tests/layers.py has them."""
-    rows = drawn_layers()
+    rows = LAYERS
     begins = [next(k for k, row in enumerate(rows) if first in row) for _, first, _ in BANDS]
     height = 0.3
     figure, axes = blank(7.9, height * len(rows) + 0.75)
@@ -304,7 +304,8 @@ def layers() -> Figure:
         color = BANDS[bisect_right(begins, k) - 1][2]
         axes.add_patch(Rectangle((0.7, y), 5.4, height - 0.05, fc=PALE, ec=color, lw=1.2))
         text = ", ".join(sorted(names))
-        axes.text(3.4, y + height / 2 - 0.03, text, ha="center", va="center")
+        size = 9 if len(text) < 90 else 5.5
+        axes.text(3.4, y + height / 2 - 0.03, text, ha="center", va="center", size=size)
     axes.add_patch(Rectangle((0.7, 0.1), 5.4, 0.3, fc="#dfe6ea", ec=INK, lw=1.2))
     axes.text(3.4, 0.25, "csrc: C++ kernels, loaded by ops.native alone", ha="center", va="center")
     arrow(axes, (0.4, 0.5 + height * len(rows)), (0.4, 0.5), color=INK)

@@ -2,9 +2,9 @@
 
 import json
 
-from univoxel.compression.choices import CapacityChoice, chosen_reach, chosen_voxels
 from univoxel.compression.plan import stage_voxels
-from univoxel.training.config import StageConfig
+from univoxel.config import StageConfig
+from univoxel.training.choices import CapacityChoice, chosen_reach, chosen_voxels
 
 # As runs have it in their checkpoints and logs
 ENTRY = {

@@ -11,15 +11,13 @@ from spare_scene import LIGHT
 from univoxel.checkpoint import FILE, load_checkpoint, load_scene
 from univoxel.compression import plan
 from univoxel.compression.storage import FEWEST_VOXELS
-from univoxel.config import TrainConfig
-from univoxel.joint.config import JointConfig
+from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.lights import EnvmapConfig
 from univoxel.scene import SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.info import info
 from univoxel.tasks.train import train
 from univoxel.training import loop
-from univoxel.training.config import StageConfig
 
 
 def test_edges_stay_as_sharp_on_a_coarser_grid():

@@ -9,18 +9,11 @@ from observed_points import RED, lamps, photographs_under
 
 from univoxel.confidence import report
 from univoxel.confidence import survey as task
-from univoxel.confidence.config import CONFIDENCE, ConfidenceConfig, confidence_of
 from univoxel.confidence.doubts import Doubts
 from univoxel.confidence.report import numbers, words
 from univoxel.confidence.survey import spread_observations, survey
-from univoxel.config import check_same, save_config
 from univoxel.data import Photos
-from univoxel.errors import ConfigError, DataError
-from univoxel.overrides import changed
-from univoxel.presets import preset
 from univoxel.render.transport import MIN_COSINE, Observations
-from univoxel.tasks import train as training
-from univoxel.tasks.train import save_trust
 
 NODES, ROUGHNESS = 64, 0.4
 
@@ -148,62 +141,6 @@ def test_the_report_names_its_thresholds(surveyed, monkeypatch):
     assert "0% of the surface differs from its photographs by more than 0.5 in sRGB" in said
     monkeypatch.setattr(report, "MIN_SHARE", 1.0)
     assert "0% of the surface differs" not in words(figures, [])
-
-
-def test_evaluation_reads_what_a_run_was_trained_with(tmp_path):
-    assert confidence_of(tmp_path) == CONFIDENCE
-    path = tmp_path / "config.json"
-    # From before there was any, and from when there was more
-    for older in ('{"data": "photos"}', '{"confidence": {"noise": 0.02}}'):
-        path.write_text(older)
-        assert confidence_of(tmp_path) == CONFIDENCE
-    cfg = preset("draft", tmp_path / "photos", tmp_path)
-    save_config(changed(cfg, ["confidence.points=300"]))
-    assert confidence_of(tmp_path) == replace(CONFIDENCE, points=300)
-    check_same(cfg)  # it changes no training: a run goes on under another
-
-
-def test_training_reports_with_its_own_configuration(tmp_path, scene, photos, monkeypatch):
-    cfg = preset("draft", tmp_path / "photos", tmp_path)
-    asked = []
-
-    def surveyed(scene, photos, points):
-        asked.append(points)
-        return survey(scene, photos, 200)
-
-    monkeypatch.setattr(training, "survey", surveyed)
-    save_trust(scene, photos, changed(cfg, ["confidence.report_points=200"]), [])
-    save_trust(scene, photos, cfg, ["stage 1: a"])
-    assert asked == [200, CONFIDENCE.report_points]
-    assert "trouble 1 times, the last in stage 1: a." in trust_text(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ('{"confidence": {"points": 0}}', "points must be at least 1, got 0"),
-        ('{"confidence": {"loudness": 1}}', "loudness"),
-        ('{"confidence": 3}', "expected JSON with fields of confidence"),
-        ("[]", "expected JSON with fields of confidence"),
-        ("{", "expected JSON with fields of confidence"),
-    ],
-)
-def test_a_config_that_holds_something_else(tmp_path, content, message):
-    (tmp_path / "config.json").write_text(content)
-    with pytest.raises(DataError, match=rf"config\.json: .*{message}"):
-        confidence_of(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"points": 0}, "points must be at least 1, got 0"),
-        ({"report_points": 0}, "report_points must be at least 1, got 0"),
-    ],
-)
-def test_ranges(change, message):
-    with pytest.raises(ConfigError, match=f"^ConfidenceConfig: {message}"):
-        ConfidenceConfig(**change)
 
 
 def test_some_observations_are_spread_over_all():

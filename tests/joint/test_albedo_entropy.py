@@ -10,6 +10,7 @@ from analytic import scene_of
 from observed_points import lamps, no_metal, photographed, problem_on_a_sphere
 from torch.nn.functional import normalize
 
+from univoxel.config import JointConfig
 from univoxel.joint import albedo_entropy
 from univoxel.joint.albedo_entropy import (
     CELL,
@@ -19,7 +20,6 @@ from univoxel.joint.albedo_entropy import (
     painted_points,
     palette_entropy,
 )
-from univoxel.joint.config import JointConfig
 from univoxel.joint.newton import newton_round_
 from univoxel.joint.observations import prefiltered_roughness
 from univoxel.lights.views import ViewLights

@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import pytest
 
-from univoxel.joint.config import EntropyConfig, MetalConfig, MirrorConfig
+from univoxel.config import EntropyConfig, MetalConfig, MirrorConfig
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pytest
 import torch
 from observed_points import lamps, no_metal, sphere_of
 
+from univoxel.config import JointConfig
 from univoxel.joint import initialise
-from univoxel.joint.config import JointConfig
 from univoxel.joint.initialise import (
     ONLY_METAL,
     ONLY_METAL_ALBEDO,

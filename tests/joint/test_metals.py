@@ -7,8 +7,8 @@ import torch
 from observed_points import COUNT, NODES, photographed, sphere_of
 
 from univoxel.color import linear_to_srgb_unclipped
+from univoxel.config import JointConfig
 from univoxel.joint import metals, newton
-from univoxel.joint.config import JointConfig
 from univoxel.joint.metals import evidence, find_metal, fitted
 
 CFG = JointConfig(newton_points=500, newton_views=8)

@@ -13,9 +13,9 @@ from torch.nn.functional import normalize
 
 from univoxel import sphere
 from univoxel.color import linear_to_srgb_unclipped
+from univoxel.config import JointConfig, MirrorConfig
 from univoxel.envmap import EnvMap, lookup
 from univoxel.joint import mirrored_map, sharp_sky
-from univoxel.joint.config import JointConfig, MirrorConfig
 from univoxel.joint.mirrored_map import (
     MirrorViews,
     agreed_normals,

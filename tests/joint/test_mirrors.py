@@ -13,8 +13,8 @@ from torch.nn.functional import normalize
 
 from univoxel import sphere
 from univoxel.color import linear_to_srgb_unclipped
+from univoxel.config import JointConfig
 from univoxel.joint import mirrors, stage
-from univoxel.joint.config import JointConfig
 from univoxel.joint.mirrors import (
     ROWS,
     NodeMap,

@@ -14,8 +14,8 @@ from observed_points import (
 )
 
 from univoxel import brdf
+from univoxel.config import JointConfig
 from univoxel.joint import newton
-from univoxel.joint.config import JointConfig
 from univoxel.joint.newton import NewtonRound, newton_round_
 from univoxel.joint.observations import (
     Decisions,

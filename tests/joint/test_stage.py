@@ -19,9 +19,8 @@ from torch.nn.functional import normalize
 
 from univoxel import brdf
 from univoxel.checkpoint import load_checkpoint
-from univoxel.config import TrainConfig
+from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.joint import stage
-from univoxel.joint.config import JointConfig
 from univoxel.joint.newton import NewtonRound
 from univoxel.joint.observations import (
     Decisions,
@@ -34,7 +33,6 @@ from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig
 from univoxel.tasks import train as train_task
 from univoxel.training import progress
-from univoxel.training.config import StageConfig
 
 CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
 

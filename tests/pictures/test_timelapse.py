@@ -9,10 +9,9 @@ from analytic import write_scene
 from PIL import Image
 
 from univoxel.checkpoint import load_checkpoint, load_scene
-from univoxel.config import TrainConfig
+from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.data.images import read_image
 from univoxel.errors import DataError
-from univoxel.joint.config import JointConfig
 from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.pictures import timelapse as module
 from univoxel.pictures.timelapse import LABEL, Timelapse
@@ -20,7 +19,6 @@ from univoxel.scene import SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.train import train
 from univoxel.training import clock as clock_module
-from univoxel.training.config import StageConfig
 
 
 @pytest.fixture(scope="module")

@@ -68,7 +68,7 @@ def run(data, tmp_path_factory):
     """A run with local light alone, and no map."""
     out = tmp_path_factory.mktemp("sphere") / "run"
     changes = [*STAGES, "voxel_pixels=0", "carving_seconds=0", "masks=given", "cameras=given"]
-    changes += ["exposures=False", "light_frame=world", "confidence.points=1000"]
+    changes += ["exposures=False", "light_frame=world"]
     return univoxel.train(data, out, light="sg", minutes=2, changes=changes)
 
 

@@ -6,7 +6,7 @@ import json
 import pytest
 from analytic import write_scene
 
-from univoxel.config import TrainConfig
+from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import kept, load_photos, shots
 from univoxel.errors import UserError
 from univoxel.lights import SGConfig
@@ -14,7 +14,6 @@ from univoxel.run import kept_photos, photos_of
 from univoxel.scene import SceneConfig
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
-from univoxel.training.config import StageConfig
 
 
 @pytest.fixture

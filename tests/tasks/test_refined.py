@@ -12,7 +12,7 @@ from lab.stress.damage import turned
 from univoxel.camera import project
 from univoxel.checkpoint import load_scene
 from univoxel.confidence.survey import survey
-from univoxel.config import TrainConfig
+from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
 from univoxel.lights import SGConfig
@@ -21,7 +21,6 @@ from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.train import train
-from univoxel.training.config import StageConfig
 
 
 @pytest.fixture(scope="module")

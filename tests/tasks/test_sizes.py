@@ -10,7 +10,7 @@ from analytic import write_scene
 from cropped import windows, write_cropped
 from PIL import Image
 
-from univoxel.config import TrainConfig
+from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import load_photos, load_truth
 from univoxel.data.images import image_size, read_exr, read_image, write_exr, write_png
 from univoxel.errors import DataError, UserError
@@ -23,7 +23,6 @@ from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.inspect import inspect
 from univoxel.tasks.relight import relight_images, relight_to_files
 from univoxel.tasks.train import train
-from univoxel.training.config import StageConfig
 
 VIEWS, SIZE = 12, 40
 

@@ -13,10 +13,9 @@ from scipy.spatial.transform import Rotation
 from univoxel.checkpoint import FILE, load_scene
 from univoxel.cli import main
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.config import TrainConfig, save_config
+from univoxel.config import JointConfig, StageConfig, TrainConfig, save_config
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
-from univoxel.joint.config import JointConfig
 from univoxel.lights import SGConfig
 from univoxel.preparation import prepare as preparation
 from univoxel.presets import preset, with_field
@@ -28,7 +27,6 @@ from univoxel.tasks.info import info
 from univoxel.tasks.train import train
 from univoxel.training import clock, loop, surface_update
 from univoxel.training import pixels as pixels_module
-from univoxel.training.config import StageConfig
 from univoxel.training.loop import batch_at
 from univoxel.training.pixels import split_pixels
 from univoxel.verdict import load_verdict

@@ -15,10 +15,10 @@ from observed_points import (
 )
 
 from univoxel.checkpoint import load_scene, save_scene
+from univoxel.config import JointConfig
 from univoxel.errors import ConfigError, DataError
 from univoxel.grid import fit_grid
 from univoxel.joint import stage
-from univoxel.joint.config import JointConfig
 from univoxel.joint.equations import channel_radiance
 from univoxel.joint.newton import linear_transport
 from univoxel.joint.observations import shade_observations, turned_maps

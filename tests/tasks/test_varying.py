@@ -22,11 +22,10 @@ from observed_points import (
 from univoxel.checkpoint import load_checkpoint, load_scene, save_scene
 from univoxel.cli import main
 from univoxel.color import linear_to_srgb_unclipped
-from univoxel.config import TrainConfig
+from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.joint import equations, newton, stage
-from univoxel.joint.config import JointConfig
 from univoxel.joint.newton import newton_round_
 from univoxel.joint.observations import prefiltered_roughness, shade_observations
 from univoxel.lights import SGConfig
@@ -34,7 +33,6 @@ from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import Scene, SceneConfig
 from univoxel.tasks import train as task
 from univoxel.tasks.train import train
-from univoxel.training.config import StageConfig
 from univoxel.training.loop import held_out_psnr
 
 NODES = 12

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from univoxel.config import TrainConfig
+from univoxel.config import PREPARATION, StageConfig, TrainConfig
 from univoxel.files import append_line
 from univoxel.training import clock as clock_module
 from univoxel.training.clock import HURRY, LEAST, RESERVE_SECONDS, REST, expected_seconds
-from univoxel.training.config import PREPARATION, StageConfig
 from univoxel.training.progress import Progress
 
 START = {"stage": 0, "progress": 0.0, "step": 0}

@@ -12,7 +12,7 @@ import pytest
 import torch
 from analytic import write_scene
 
-from univoxel.config import TrainConfig
+from univoxel.config import LossConfig, StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.fields.features import Levels
 from univoxel.fields.field import dense_field, hash_field
@@ -24,7 +24,6 @@ from univoxel.render.pipeline import surface_at
 from univoxel.scene import Scene, SceneConfig
 from univoxel.tasks.train import train
 from univoxel.training import loop, progress
-from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.loop import add_gradient_, batch_at, light_priors, losses_of
 from univoxel.training.pixels import TrainingPixels, split_pixels
 from univoxel.training.progress import Progress

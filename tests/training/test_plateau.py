@@ -6,11 +6,10 @@ import pytest
 from analytic import write_scene
 
 from univoxel.checkpoint import load_checkpoint
-from univoxel.config import TrainConfig
+from univoxel.config import StageConfig, TrainConfig
 from univoxel.lights import SGConfig
 from univoxel.scene import SceneConfig
 from univoxel.tasks.train import train
-from univoxel.training.config import StageConfig
 from univoxel.training.plateau import CHECK, WINDOW, Plateau
 
 

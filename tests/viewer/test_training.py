@@ -14,17 +14,15 @@ from browser import browser, installed
 
 from univoxel.checkpoint import load_checkpoint, load_scene
 from univoxel.cli import main
-from univoxel.config import TrainConfig
+from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.errors import MissingExtra, UserError
-from univoxel.joint.config import JointConfig
 from univoxel.lights import SGConfig
 from univoxel.pictures.timelapse import LABEL
 from univoxel.scene import SceneConfig
 from univoxel.tasks.train import train
 from univoxel.training import progress as progress_module
 from univoxel.training.clock import Clock
-from univoxel.training.config import StageConfig
 from univoxel.training.progress import TrainingProgress
 from univoxel.viewer import training as module
 from univoxel.viewer.training import Spectators, fitted, watched, words

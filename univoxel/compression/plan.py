@@ -15,7 +15,6 @@ from torch import Tensor
 from univoxel.camera import Cameras, pixel_width
 from univoxel.checkpoint import SHELL
 from univoxel.compression import search
-from univoxel.compression.choices import CapacityChoice, chosen_reach, chosen_voxels
 from univoxel.compression.search import ReferenceRays, random_reference_rays, reference_rays
 from univoxel.compression.storage import (
     FEWEST_VOXELS,
@@ -23,13 +22,13 @@ from univoxel.compression.storage import (
     shortest_reach,
     voxels_that_fit,
 )
-from univoxel.config import TrainConfig
+from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import Photos
 from univoxel.fields.dense import DenseDistances
 from univoxel.fields.features import NodeFeatures
 from univoxel.grid import fit_grid
 from univoxel.scene import Scene
-from univoxel.training.config import StageConfig
+from univoxel.training.choices import CapacityChoice, chosen_reach, chosen_voxels
 from univoxel.training.pixels import TrainingPixels
 
 # Rays of the training photographs in a batch whose gradients weigh rows: what memory of one

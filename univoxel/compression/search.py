@@ -15,12 +15,12 @@ import torch
 from torch import Tensor, nn
 
 from univoxel.color import linear_to_srgb
-from univoxel.compression.choices import CapacityChoice
 from univoxel.data import Photos
 from univoxel.networks import MLP
 from univoxel.records import Rays, Surface
 from univoxel.render.pipeline import radiance_of, shade, surface_at
 from univoxel.scene import Scene
+from univoxel.training.choices import CapacityChoice
 from univoxel.training.loop import batch_at
 
 # dB that mirror levels, and rows, may cost. Below what is visible, even both together

@@ -7,13 +7,13 @@ import math
 import torch
 
 from univoxel.checkpoint import SHELL, stored
-from univoxel.compression.choices import CapacityChoice
 from univoxel.compression.search import Decoded, ReferenceRays, last_within_limit
 from univoxel.errors import UserError
 from univoxel.fields.features import FEWEST_ROWS, PER_LEVEL, ROWS, NodeFeatures
 from univoxel.grid import fit_grid
 from univoxel.networks import DirectionTable
 from univoxel.scene import Scene, SceneConfig
+from univoxel.training.choices import CapacityChoice
 
 # Voxels of the coarsest grid. 16^3: below, no object keeps its parts
 FEWEST_VOXELS = 16**3

@@ -35,6 +35,9 @@ from univoxel.render.transport import (
 from univoxel.scene import Scene
 from univoxel.sphere import fibonacci_sphere
 
+POINTS = 20_000  # of the surface that evaluation surveys, for its maps of doubt
+REPORT_POINTS = 2_000  # of the surface that are surveyed after training, for words alone
+
 # Observations of a point that are rendered again, at most
 OBSERVATIONS = 8
 # Directions that visibility is measured in where the scene has no map with its own

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from univoxel.joint.config import JointConfig
+from univoxel.config import JointConfig
 from univoxel.joint.metals import find_metal
 from univoxel.joint.newton import newton_round_
 from univoxel.joint.observations import Decisions, JointProblem

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from univoxel.brdf import F0
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped, srgb_slope, srgb_to_linear
-from univoxel.joint.config import JointConfig
+from univoxel.config import JointConfig
 from univoxel.joint.newton import CAUCHY, MIN_VIEWS
 from univoxel.joint.observations import (
     JointProblem,

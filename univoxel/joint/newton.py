@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from univoxel import brdf
+from univoxel.config import JointConfig
 from univoxel.fields.heads import MaterialHead
-from univoxel.joint.config import JointConfig
 from univoxel.joint.equations import (
     EliminatedAlbedo,
     LinearTransport,

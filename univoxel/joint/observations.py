@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from univoxel.color import linear_to_srgb_unclipped
+from univoxel.config import JointConfig
 from univoxel.data import Photos
 from univoxel.errors import NoSurface
-from univoxel.joint.config import JointConfig
 from univoxel.lights.nodes import DistantLight
 from univoxel.lights.turntable import resampling
 from univoxel.ops import shade_map

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from univoxel.config import JointConfig
 from univoxel.data import Photos
-from univoxel.joint.config import JointConfig
 from univoxel.joint.mirrored_map import (
     agreed_normals,
     errors,

@@ -19,11 +19,11 @@ from torch.nn.functional import binary_cross_entropy, normalize
 from univoxel import brdf, losses
 from univoxel.checkpoint import save_scene
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped
+from univoxel.config import JointConfig
 from univoxel.data import Photos
 from univoxel.errors import NoSurface
 from univoxel.fields.heads import MaterialHead
 from univoxel.joint.albedo_entropy import diffuse_albedo, fit_sun_, minimise_entropy_
-from univoxel.joint.config import JointConfig
 from univoxel.joint.initialise import (
     TRIAL_POINTS,
     TRIAL_ROUNDS,

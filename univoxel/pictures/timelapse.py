@@ -13,19 +13,17 @@ from torch import Tensor
 
 from univoxel.camera import Cameras, resize
 from univoxel.color import linear_to_srgb
-from univoxel.config import TrainConfig
+from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import write_png
 from univoxel.envmap import EnvMap, tables
 from univoxel.errors import DataError, UserError
-from univoxel.joint.config import JointConfig
 from univoxel.names import ANIMATIONS
 from univoxel.pictures.animation import require, write_animation
 from univoxel.render.pipeline import extract_mesh, radiance_of, shade_hits, surface_of_view
 from univoxel.render.relight import Lighting, relight_surface, traced_mesh
 from univoxel.scene import Scene
 from univoxel.training.clock import Clock
-from univoxel.training.config import StageConfig
 
 FRAMES = 60  # of a training, at equal shares of its work
 FRAMES_PER_SECOND = 10

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from univoxel.camera import Cameras
-from univoxel.config import TrainConfig
+from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import Photos
 from univoxel.errors import DataError, UserError
 from univoxel.grid import GridShape, fit_grid
@@ -28,7 +28,6 @@ from univoxel.preparation.pinned import PinnedHull, pinned_hull
 from univoxel.preparation.registration import registered_poses
 from univoxel.preparation.strays import say_strays
 from univoxel.scene import Scene
-from univoxel.training.config import StageConfig
 
 log: logging.Logger = logging.getLogger("univoxel")
 

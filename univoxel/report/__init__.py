@@ -24,10 +24,9 @@ from univoxel.confidence.advice import (
     missing,
     place,
 )
-from univoxel.confidence.config import confidence_of
 from univoxel.confidence.doubts import Doubts
 from univoxel.confidence.report import numbers, words
-from univoxel.confidence.survey import Survey, survey
+from univoxel.confidence.survey import POINTS, Survey, survey
 from univoxel.errors import UserError
 from univoxel.files import replacing
 from univoxel.page import START, facts_of
@@ -164,8 +163,8 @@ def what_is_known(run: Path, scene: Scene, options: ReportOptions) -> Known:
         UserError: they cannot be used; OSError: they cannot be read.
     """
     data = None if options.data is None else Path(options.data)
-    photos, cfg = photos_of(run, data, "train"), confidence_of(run)
-    surveyed = survey(scene, photos, cfg.points)
+    photos = photos_of(run, data, "train")
+    surveyed = survey(scene, photos, POINTS)
     photos = scene.registered(photos)
     occluder = scene.occluder()
     advice = advise(surveyed, photos.cameras, photos.names, occluder, options.advice)

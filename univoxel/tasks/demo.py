@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from univoxel.checkpoint import FILE
+from univoxel.config import StageConfig
 from univoxel.evaluation.measures import in_words
 from univoxel.page import write_page
 from univoxel.presets import preset
@@ -13,7 +14,6 @@ from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.export import export
 from univoxel.tasks.relight import relight_to_files
 from univoxel.tasks.train import train
-from univoxel.training.config import StageConfig
 
 SCENE = Path(__file__).parent.parent / "example_data" / "tiny"
 MAPS = ("city", "sunset")

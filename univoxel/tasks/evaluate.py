@@ -14,10 +14,9 @@ from rich.table import Table
 
 from univoxel.bars import track
 from univoxel.checkpoint import FILE, load_checkpoint
-from univoxel.confidence.config import confidence_of
 from univoxel.confidence.doubts import Doubts
 from univoxel.confidence.report import numbers, words
-from univoxel.confidence.survey import Survey, survey
+from univoxel.confidence.survey import POINTS, Survey, survey
 from univoxel.data import Photos
 from univoxel.data.images import write_exr, write_png
 from univoxel.envmap import tables
@@ -244,8 +243,7 @@ def _measure_views(
 def _survey(scene: Scene, run: Path, data: Path | None) -> Survey | None:
     """What the photographs that were trained on fix; None, with a line, where they are missing."""
     try:
-        photos, cfg = photos_of(run, data, "train"), confidence_of(run)
-        return survey(scene, photos, cfg.points)
+        return survey(scene, photos_of(run, data, "train"), POINTS)
     except UserError as error:  # no photographs to train on, or no surface
         log.info("no trust report: %s", error, extra={"arguments": error.arguments})
         return None

@@ -16,16 +16,21 @@ from univoxel import shelf
 from univoxel.build import build_scene
 from univoxel.checkpoint import FILE, load_checkpoint, save_scene
 from univoxel.compression import plan, storage
-from univoxel.compression.choices import chosen_reach
 from univoxel.confidence.report import numbers, words
-from univoxel.confidence.survey import Survey, survey
-from univoxel.config import TrainConfig, check_same, save_config
+from univoxel.confidence.survey import REPORT_POINTS, Survey, survey
+from univoxel.config import (
+    PREPARATION,
+    JointConfig,
+    StageConfig,
+    TrainConfig,
+    check_same,
+    save_config,
+)
 from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import Cancelled, ExistingFile, UserError
 from univoxel.files import replacing
 from univoxel.grid import fit_grid
 from univoxel.joint import stage as joint_stage
-from univoxel.joint.config import JointConfig
 from univoxel.ops import native
 from univoxel.pictures.timelapse import Timelapse
 from univoxel.preparation.pinned import PinnedHull
@@ -34,8 +39,8 @@ from univoxel.render.picture import preview
 from univoxel.render.pipeline import surface_at
 from univoxel.run import kept_photos
 from univoxel.scene import Scene
+from univoxel.training.choices import chosen_reach
 from univoxel.training.clock import LEAST, RESERVE_SECONDS, Clock
-from univoxel.training.config import PREPARATION, StageConfig
 from univoxel.training.loop import batch_at, fit_sharpness_, held_out_psnr, run_stage
 from univoxel.training.memory import check_memory
 from univoxel.training.pixels import TrainingPixels, split_pixels
@@ -148,7 +153,7 @@ def _train(
             raise
         if film:
             film.finish(scene, progress.clock)
-    surveyed = trusted(scene, pixels.photos, cfg)
+    surveyed = trusted(scene, pixels.photos)
     verdict = judge(evidence(scene, pixels, progress, surveyed))
     save_verdict(verdict, cfg.out)
     save_trust(verdict, surveyed, progress.troubles, cfg)
@@ -299,10 +304,10 @@ def bring_to_grid_(
         scene.field = scene.field.resized(grid)
 
 
-def trusted(scene: Scene, photos: Photos, cfg: TrainConfig) -> Survey | None:
+def trusted(scene: Scene, photos: Photos) -> Survey | None:
     """What the photographs leave open; None where there is no surface that they show."""
     try:
-        return survey(scene, photos, cfg.confidence.report_points)
+        return survey(scene, photos, REPORT_POINTS)
     except UserError as error:
         log.info(f"no trust report: {error}")
         return None

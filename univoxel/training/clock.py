@@ -8,9 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
-from univoxel.config import TrainConfig
-from univoxel.joint.config import JointConfig
-from univoxel.training.config import PREPARATION, StageConfig
+from univoxel.config import PREPARATION, JointConfig, StageConfig, TrainConfig
 
 RESERVE_SECONDS = 4.0  # of the limit, kept for the last checkpoint and the preview
 LEAST = 0.5  # of its share of the rest of a limit that every stage gets, whatever came before

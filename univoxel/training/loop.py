@@ -11,7 +11,7 @@ from univoxel import losses, shelf
 from univoxel.camera import pixel_rays
 from univoxel.checkpoint import save_scene
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
-from univoxel.config import TrainConfig
+from univoxel.config import LossConfig, StageConfig, TrainConfig
 from univoxel.data import Photos
 from univoxel.lights import priors
 from univoxel.lights.base import Regularisation
@@ -22,7 +22,6 @@ from univoxel.records import Rays, Surface
 from univoxel.render.pipeline import at_rays, radiance_of, shade, surface_at
 from univoxel.scene import Scene
 from univoxel.training import patches
-from univoxel.training.config import LossConfig, StageConfig
 from univoxel.training.divergence import Guard
 from univoxel.training.pixels import TrainingPixels, unpacked
 from univoxel.training.plateau import Plateau

@@ -6,11 +6,10 @@ import logging
 import math
 
 from univoxel import shelf
-from univoxel.config import TrainConfig
+from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.machine import Memory, memory
-from univoxel.training.config import StageConfig
 from univoxel.training.pixels import MOST
 
 # Bytes, as trainings on 13 to 133 million pixels, 0.25 to 4 million voxels, were seen to take

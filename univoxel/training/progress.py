@@ -12,10 +12,10 @@ import torch
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
 from univoxel.bars import bar
-from univoxel.compression.choices import CapacityChoice
 from univoxel.config import TrainConfig
 from univoxel.files import append_line
 from univoxel.machine import peak_memory_mb
+from univoxel.training.choices import CapacityChoice
 from univoxel.training.clock import Clock, StepClock, stage_name
 
 LOG = "log.jsonl"  # in the folder of a run

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from univoxel.config import StageConfig
 from univoxel.fields.field import Field
 from univoxel.optim import rows_of
-from univoxel.training.config import StageConfig
 
 SPREAD = 0.8  # share of the neighbours' mean that a node's gradient takes on in a pass
 MOMENTS = (0.9, 0.99)

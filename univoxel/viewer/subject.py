@@ -13,9 +13,8 @@ from univoxel.assets.topology import clean, simplify
 from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.checkpoint import load_scene
-from univoxel.confidence.config import confidence_of
 from univoxel.confidence.doubts import Doubts
-from univoxel.confidence.survey import survey
+from univoxel.confidence.survey import POINTS, survey
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.ops.visibility import Hit
@@ -59,10 +58,7 @@ class Subject:
         Raises:
             UserError: the photographs are not there any more.
         """
-        photos = self.photos  # without them there is no run to ask either
-        assert self.run is not None
-        cfg = confidence_of(self.run)
-        found = Doubts(survey(self.scene, photos, cfg.points))
+        found = Doubts(survey(self.scene, self.photos, POINTS))
         mesh = self.traced.mesh
         assert mesh.normals is not None
         return found.at(mesh.vertices, mesh.normals)[:, 0].clamp(0, 1)

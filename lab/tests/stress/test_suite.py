@@ -14,7 +14,7 @@ from lab.stress import axes, render, suite
 from lab.stress.axes import AXES, BASE, INTACT
 from lab.stress.scenes import Spec
 from univoxel.cli import main
-from univoxel.joint.config import JointConfig
+from univoxel.config import JointConfig
 from univoxel.names import LIGHTS
 
 TINY = (
