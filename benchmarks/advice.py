@@ -71,7 +71,7 @@ def looked_through(run: Path, most: int) -> tuple[Survey, Advice]:
     """What the photographs of a run fix, and what to photograph next."""
     scene, cfg = load_scene(run), confidence_of(run)
     photos = photos_of(run, split="train")
-    found = survey(scene, photos, cfg.points, cfg)
+    found = survey(scene, photos, cfg.points)
     asked = replace(ADVICE, most=most, least=0.0, share=0.0)
     cameras = scene.registered(photos).cameras
     return found, advise(found, cameras, photos.names, scene.occluder(), asked)

@@ -165,7 +165,7 @@ def test_hollows_are_opened_where_light_is_the_same(
     """What training starts with is what carving makes of the hull in its share of 2 minutes."""
     given = []
 
-    def larger(hull, grid, photos, gains, seconds, cfg):
+    def larger(hull, grid, photos, gains, seconds):
         given.append(seconds)
         return hull + 0.25
 
