@@ -39,6 +39,7 @@ help:
 	@echo "make dev     set up only"
 
 dev: build/.installed
+	@git config core.hooksPath scripts/hooks 2>/dev/null || true
 
 $(SETUP): pyproject.toml constraints.txt scripts/system.sh scripts/venv.sh
 	scripts/system.sh $(PYTHON)
@@ -82,6 +83,7 @@ network-test: dev build/network/u2netp.onnx
 		$(BIN)/python -m pytest -q tests/segmentation/test_network.py
 
 lint: $(SETUP)
+	$(BIN)/python scripts/house.py
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/clang-format --dry-run -Werror csrc/*.* csrc/*/*
