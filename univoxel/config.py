@@ -59,7 +59,6 @@ class StageConfig:
     lr_features: tuple[float, float] = (0.1, 0.01)
     # at begin and end: of the networks, the light, and what differs from view to view
     lr_networks: tuple[float, float] = (3e-3, 3e-4)
-    lr_poses: tuple[float, float] = (1e-3, 1e-4)  # radians, radii; of cameras that are refined
     plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.125]
     spread: int = 4  # passes that smooth the sdf's gradient before the optimiser, >= 0
     diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 0.25]
@@ -78,7 +77,7 @@ class StageConfig:
             self,
             "two numbers above 0",
             lambda x: len(x) == 2 and all(0 < v < math.inf for v in x),
-            *("sharpness", "lr_sdf", "lr_features", "lr_networks", "lr_poses"),
+            *("sharpness", "lr_sdf", "lr_features", "lr_networks"),
         )
         check_fields(self, "at least 0", lambda x: x >= 0, "spread")
         check_fields(self, "in [0, 0.125]", lambda x: 0 <= x <= 0.125, "plate")
@@ -93,8 +92,6 @@ class LossConfig:
 
     radiance: float = 1.0  # photometric loss of what the radiance head shows
     silhouette: float = 0.1  # rays' opacity against the masks
-    albedo_smoothness: float = 0.005  # change of the albedo over about a voxel, L1
-    roughness_smoothness: float = 0.02  # change of the roughness over about a voxel, L1
     metallic: float = 0.01  # what the mean metallic costs: metal is for where nothing else serves
     light_smoothness: float = 0.1  # change of a local light over about a voxel, L1
     # distance of the light from grey on the whole, as a share of it: photographs fix albedo and

@@ -7,6 +7,8 @@ from typing import Any
 # By class. What they said is a constant now, beside the code that uses it, or gone with that code
 RETIRED: dict[str, frozenset[str]] = {
     "TrainConfig": frozenset({"compression", "confidence", "hollows", "preparation"}),
+    "LossConfig": frozenset({"albedo_smoothness", "roughness_smoothness"}),
+    "StageConfig": frozenset({"lr_poses"}),
     "JointConfig": frozenset(
         "adam albedo_smoothness metallic newton roughness_smoothness surface trials".split()
     ),

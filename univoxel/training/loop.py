@@ -48,6 +48,11 @@ COMPARED = 4
 SHARPNESS_FACTORS = (0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0)
 MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silhouette's fringe
 
+# Rate of cameras that are refined, at the begin and the end of a stage: radians, radii
+LR_POSES = (1e-3, 1e-4)
+# Weights of how much materials change over about a voxel, L1
+ALBEDO_SMOOTHNESS, ROUGHNESS_SMOOTHNESS = 0.005, 0.02
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -206,7 +211,7 @@ def learning_rates(stage: StageConfig, done: float, voxel_size: float) -> tuple[
         geometric(stage.lr_sdf, done) * voxel_size,
         geometric(stage.lr_features, done),
         geometric(stage.lr_networks, done),
-        geometric(stage.lr_poses, done),
+        geometric(LR_POSES, done),
     )
 
 
@@ -274,8 +279,8 @@ def smoothness_losses(
     here = replace(met, features=scene.coded(met.features, view))
     near = replace(met, features=scene.coded(near, view), position=beside)
     terms = {
-        "albedo": weight.albedo_smoothness * priors.smoothness(met.albedo, albedo),
-        "roughness": weight.roughness_smoothness * priors.smoothness(met.roughness, roughness),
+        "albedo": ALBEDO_SMOOTHNESS * priors.smoothness(met.albedo, albedo),
+        "roughness": ROUGHNESS_SMOOTHNESS * priors.smoothness(met.roughness, roughness),
     }
     return terms | light_priors(scene.light.regularisation(here, near), weight)
 
