@@ -1,23 +1,27 @@
-"""Short trainings of the bundled scene end in the pictures that they should."""
-
-import json
+"""Short trainings of the bundled scene come as near to its true pictures as they should."""
 
 import net
 import pytest
+import torch
 
-# Rounding that differs grows in training. Builds of the extension and instruction sets of torch
-# make pictures that are 31 dB and more apart; a training whose light or materials are broken falls
-# below this.
-ALIKE_DB = 25.0
+from univoxel.data.images import read_image
+
+# dB at least. Rounding decides what little steps leave open, such as what is metal: with kernels
+# and torch for AVX-512, for AVX2 and for any processor the same case ends up to 8 dB apart. The
+# worst of the three had 24.4, 23.8 and 20.2; a grey silhouette, without material or light, 18.0.
+LEAST = {"hybrid": 22.0, "varying": 21.5, "sparse": 18.5}
 
 
 @pytest.mark.parametrize("name", net.CASES)
-def test_training_ends_in_the_held_pictures(name, tmp_path):
-    held, found = json.loads(net.HELD.read_text())[name], net.made(name, tmp_path)["pictures"]
+def test_training_ends_near_the_truth(name, tmp_path):
+    found, true = net.made(name, tmp_path)["pictures"], net.truth()
     for of, copy in found.items():
-        assert net.distance_db(copy, held[of]) > ALIKE_DB, of
+        assert net.distance_db(copy, true[of]) > LEAST[name], of
 
 
-def test_a_picture_that_differs_is_seen():
-    assert net.distance_db("00ff", "00ff") == 90
-    assert net.distance_db("00ff", "0f0f") < ALIKE_DB
+def test_a_grey_silhouette_is_not_near_enough():
+    true = net.truth()["render"]
+    assert net.distance_db(true, true) == 90
+    alpha = torch.as_tensor(read_image(net.DATA / "test/r_000.png"))[..., 3:] / 255
+    grey = net.small((0.3 * alpha).expand(-1, -1, 3).numpy())
+    assert net.distance_db(grey, true) < min(LEAST.values())
