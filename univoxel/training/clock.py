@@ -189,7 +189,14 @@ class Clock:
         left = (1 - self.done) * sum(self._expected[self.stage : self.stage + 1])
         seconds = slower * (left + sum(self._expected[self.stage + 1 :])) + RESERVE_SECONDS
         seconds += max(self.preparation - self.seconds, 0.0)
-        return min(seconds, max(self.limit - self.seconds, 0.0))
+        shares = [stage.share for stage in self.cfg.stages]
+        begun = sum(shares[: self.stage]) + self.done * sum(shares[self.stage : self.stage + 1])
+        least = LEAST * (1 - PREPARATION) * self.limit * (1 - begun / sum(shares))
+        return (
+            seconds
+            if math.isinf(self.limit)
+            else min(seconds, max(self.limit - self.seconds, least))
+        )
 
     @property
     def work_done(self) -> float:

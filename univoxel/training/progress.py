@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import torch
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TextColumn
 
 from univoxel.bars import bar
 from univoxel.config import TrainConfig
@@ -103,7 +103,6 @@ class Progress:
             TextColumn("{task.description}"),
             BarColumn(),
             TextColumn("{task.percentage:3.0f} %  {task.fields[facts]}"),
-            TimeElapsedColumn(),
         )
         self._task = self._bar.add_task("", total=1.0, facts="")
 
@@ -128,12 +127,12 @@ class Progress:
 
     def _show(self, what: str, facts: str) -> None:
         """Move the bar."""
-        minutes, seconds = divmod(round(self.clock.remaining), 60)
+        times = f"{_clock(self.clock.seconds)} gone, {_clock(self.clock.remaining)} left "
         self._bar.update(
             self._task,
             completed=self.clock.share_done,
             description=what,
-            facts=f"{facts}{minutes}:{seconds:02d} left ",
+            facts=facts + times,
         )
 
     def state(self) -> dict[str, Any]:
@@ -193,3 +192,8 @@ class Progress:
             f"{name} ({clock.stage + 1} of {len(self.cfg.stages)})",
             f"loss {sum(losses.values()):.4f}  {quality}{rate / 1e3:.0f}k rays/s  ",
         )
+
+
+def _clock(seconds: float) -> str:
+    """Minutes and seconds, such as 2:05."""
+    return f"{round(seconds) // 60}:{round(seconds) % 60:02d}"
