@@ -37,7 +37,7 @@ body {{ font: 15px/1.4 sans-serif; margin: 2em; background: #202020; color: #eee
 table {{ border-collapse: collapse }}
 th, td {{ padding: 4px 12px; text-align: right; border-bottom: 1px solid #444 }}
 th {{ position: sticky; top: 0; background: #202020 }}
-th:nth-child(2), td:nth-child(2), td:last-child {{ text-align: left }}
+:is(th, td):is(:nth-child(2), :nth-child(3)), td:last-child {{ text-align: left }}
 td img {{ display: block }}
 a {{ color: #9cf }}
 .failed td {{ color: #ffb347 }}
@@ -61,7 +61,7 @@ def write_sheet(results: Sequence[SceneResult], out: Path) -> Path:
         OSError: it cannot be written.
     """
     shown = [key for key in COLUMNS if any(r.measures.get(key) is not None for r in results)]
-    heads = ["", "scene", *(COLUMNS[key][0] for key in shown)]
+    heads = ["", "scene", "verdict", *(COLUMNS[key][0] for key in shown)]
     heads += ["doubt of albedo", "of roughness", "training", "all", ""]
     ordered = sorted(results, key=lambda r: (WORSE_FIRST[r.state], r.name))
     counts = [(state, sum(r.state == state for r in results)) for state in WORSE_FIRST]
@@ -80,6 +80,7 @@ def write_sheet(results: Sequence[SceneResult], out: Path) -> Path:
 def _row(result: SceneResult, shown: Sequence[str], out: Path) -> str:
     project = Project(out / result.folder)
     cells = [_thumbnail(project.run / "preview.png"), _link(project.page, result.name, out)]
+    cells.append(result.verdict or "-")
     cells += [_number(result.measures.get(key), COLUMNS[key][1]) for key in shown]
     cells += [_number(result.doubts.get(key), 2) for key in ("doubt_albedo", "doubt_roughness")]
     whole = sum(result.seconds.values()) if result.seconds else None
