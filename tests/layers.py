@@ -100,7 +100,7 @@ HELPERS = {
     },
     "compression": {"search", "storage"},
     "confidence": {"survey"},
-    "pictures": {"animation", "inline"},
+    "pictures": {"animation", "html"},
     "evaluation": {"measures", "truth"},
     "segmentation": {"config", "gaps", "vote"},
     "page": {"maps", "transfer"},

@@ -374,8 +374,8 @@ def test_what_is_not_known_is_a_dash_or_empty(tmp_path):
     page = write_sheet(results, tmp_path).read_text()
     assert "a&lt;b" in page
     assert "train: x &lt; y" in page
-    assert "<td>30.0</td>" in page
-    assert "<td>62 s</td>" in page
+    assert "<td>30.0" in page
+    assert "<td>62 s" in page
     assert "albedo, dB" not in page
     write_results(results, {}, tmp_path)
     rows = list(csv.DictReader((tmp_path / "batch.csv").read_text().splitlines()))
