@@ -3,45 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from lab import worker
 from lab.record import RESULT, Outcome, Setting, identity, load_outcome
-from univoxel.cluster.drive import drive
-from univoxel.cluster.machines import machines
-from univoxel.cluster.piece import Ended, Piece, Step
 from univoxel.data import load_photos
 from univoxel.errors import UserError
-from univoxel.files import replacing
+from univoxel.jobs.job import Job, Result, Step
+from univoxel.jobs.scheduler import connect, run_jobs
 from univoxel.machine import threads_asked
-from univoxel.training import progress
-from univoxel.training.clock import expected_training
+from univoxel.training.progress import LOG
 
 log: logging.Logger = logging.getLogger("univoxel")
 
-OUTPUT = "output.txt"  # what the process said
-LOCK = "lock"  # held by who is at work in the folder
 NAME = re.compile(r"[\w.+=-]*\w[\w.+=-]*")
-EVALUATION_SECONDS = 60.0  # a guess, until runs of this sitting say better
-
-
-@dataclass(frozen=True)
-class Job:
-    """A training that is still to be done."""
-
-    folder: Path
-    scene: str
-    data: Path
-    setting: Setting
-    samples: int
-    identity: dict[str, Any]
-    seconds: float  # that it may take, a guess
 
 
 def run(
@@ -62,7 +40,7 @@ def run(
     """
     settings = _distinct(settings)
     pairs = [(data, setting) for data in _named(scenes) for setting in settings]
-    jobs = [_job(data, setting, out, samples, None) for data, setting in pairs]
+    jobs = [_job(data, setting, out, samples) for data, setting in pairs]
     for data in scenes:
         for split in ("train", "test"):
             config = settings[0].config(data, out)
@@ -74,21 +52,19 @@ def run_pairs(
     pairs: Sequence[tuple[Path, Setting]],
     out: Path,
     samples: int = 64,
-    seconds: float | None = None,
     *,
     at_once: int = 1,
     scheduler: str | None = None,
 ) -> list[Outcome]:
     """Train scenes with settings of their own.
 
-    out/SCENE/SETTING/ holds the run, what it said (output.txt) and result.json, an `Outcome`. A
+    out/SCENE/SETTING/ holds the run, what it said (job.txt) and result.json, an `Outcome`. A
     training whose result.json is there already is not done again; one that failed is. A failure is
     an outcome like others, that of a scene that cannot be read too: the rest goes on.
 
     Args:
         pairs: scenes are told apart by the names of their folders.
         samples: of the light per pixel of relit pictures in evaluation, >= 1.
-        seconds: what one may take, a guess for the bar; the configuration's time when left out.
         at_once: how many at once on this machine; more than one, and their times say little.
         scheduler: address of a scheduler of Dask, whose workers train; they see the same folders.
 
@@ -102,39 +78,28 @@ def run_pairs(
     _named(dict.fromkeys(data for data, _ in pairs))
     for scene in dict.fromkeys(data for data, _ in pairs):
         _distinct([setting for data, setting in pairs if data == scene])
-    jobs = [_job(data.resolve(), s, out, samples, seconds) for data, s in pairs]
+    jobs = [_job(data.resolve(), setting, out, samples) for data, setting in pairs]
     return _run(jobs, at_once, scheduler)
 
 
 def _run(jobs: Sequence[Job], at_once: int, scheduler: str | None) -> list[Outcome]:
-    before = {job.folder: load_outcome(job.folder) for job in jobs}
+    done = {}
     for job in jobs:
-        found = before[job.folder]
-        if found is not None and found.identity != job.identity:
+        found = load_outcome(job.files.parent)
+        if found is not None and found.identity != job.identity["training"]:
             raise UserError(
-                f"{job.folder / RESULT}: is of another configuration or data set: remove it, or "
-                "choose another out",
+                f"{job.files.parent / RESULT}: is of another configuration or data set: remove it, "
+                "or choose another out",
                 "out",
             )
-    done = {folder: found for folder, found in before.items() if found and not found.error}
-    missing = [job for job in jobs if job.folder not in done]
+        if found is not None and not found.error:
+            done[job.name] = found
+    missing = {job.name: job for job in jobs if job.name not in done}
     if missing:
-        done |= _train(missing, len(jobs), at_once, scheduler)
-    return [done[job.folder] for job in jobs]
-
-
-def _train(
-    missing: Sequence[Job], total: int, at_once: int, scheduler: str | None
-) -> dict[Path, Outcome]:
-    """Outcomes of jobs by their folders."""
-    work = {piece.name: (piece, job) for job in missing for piece in [_begin(job)]}
-    pieces = [piece for piece, _ in work.values()]
-    found = {}
-    with machines(at_once, scheduler) as client:
-        for ended in drive(client, pieces, total, tries=1):
-            job = work[ended.name][1]
-            found[job.folder] = _outcome(job, ended)
-    return found
+        with connect(at_once, scheduler) as client:
+            for result in run_jobs(client, [*missing.values()], len(jobs), tries=1):
+                done[result.name] = _outcome(missing[result.name], result)
+    return [done[job.name] for job in jobs]
 
 
 def failures(outcomes: Sequence[Outcome]) -> str:
@@ -168,43 +133,31 @@ def _distinct(settings: Sequence[Setting]) -> Sequence[Setting]:
     return settings
 
 
-def _job(data: Path, setting: Setting, out: Path, samples: int, seconds: float | None) -> Job:
+def _job(data: Path, setting: Setting, out: Path, samples: int) -> Job:
+    """A training as a job of one step, whose identity says what the process is to do."""
     if samples < 1:
         raise UserError(f"samples must be at least 1, got {samples}", "samples")
-    folder = out / data.name / setting.name
+    folder = out.absolute() / data.name / setting.name
     config = setting.config(data, folder / worker.RUN)
-    if seconds is None:
-        seconds = expected_training(config) + EVALUATION_SECONDS
-    return Job(folder, data.name, data, setting, samples, identity(config, samples), seconds)
-
-
-def _begin(job: Job) -> Piece:
-    """The work on a job, which is written into its folder."""
-    job.folder.mkdir(parents=True, exist_ok=True)
-    fields = {"data": str(job.data), "setting": job.setting, "samples": job.samples}
-    with replacing(job.folder / worker.JOB) as temporary:
-        temporary.write_text(json.dumps(fields, default=dataclasses.asdict), encoding="utf-8")
-    folder = job.folder.absolute()
-    step = Step(
-        "training", ("-m", worker.__name__, str(folder)), log=folder / worker.RUN / progress.LOG
-    )
-    return Piece(
-        f"{job.scene}/{job.setting.name}",
+    asked = {"data": str(data), "setting": dataclasses.asdict(setting), "samples": samples}
+    step = Step("training", ("-m", worker.__name__, str(folder)), log=config.out / LOG)
+    return Job(
+        f"{data.name}/{setting.name}",
         (step,),
-        folder / LOCK,
-        folder / OUTPUT,
-        threads=threads_asked(),
-        seconds=job.seconds,
+        folder / worker.JOB,
+        {"job": asked, "training": identity(config, samples)},
+        threads_asked(),
     )
 
 
-def _outcome(job: Job, ended: Ended) -> Outcome:
+def _outcome(job: Job, result: Result) -> Outcome:
     """What came out of a job, which is recorded in its folder."""
-    found = load_outcome(job.folder)
-    if ended.state == "done" and found is not None:
+    found = load_outcome(job.files.parent)
+    if result.state == "done" and found is not None:
         return found
-    error = "; ".join(ended.errors.values()) or f"left no {RESULT}"
-    log.info("%s/%s failed: %s", job.scene, job.setting.name, error)
-    failed = Outcome(job.scene, job.setting.name, job.identity, error=error)
-    failed.save(job.folder)
+    error = "; ".join(result.errors.values()) or f"left no {RESULT}"
+    log.info("%s failed: %s", job.name, error)
+    scene, _, setting = job.name.partition("/")
+    failed = Outcome(scene, setting, job.identity["training"], error=error)
+    failed.save(job.files.parent)
     return failed

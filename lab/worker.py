@@ -1,8 +1,8 @@
 """The process of one training: `python -m lab.worker FOLDER`.
 
-FOLDER holds job.json; result.json is written into it, whole or not at all. A process of its own
-gives each training a fresh peak of memory, and takes nothing down with it when it dies. Who begins
-it holds the folder's lock.
+FOLDER holds job.json, the record of the job; result.json is written into it, whole or not at all. A
+process of its own gives each training a fresh peak of memory, and takes nothing down with it when
+it dies. Who begins it holds the folder's lock.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from lab.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.checkpoint import load_checkpoint
 from univoxel.config import TrainConfig, check_same
 from univoxel.errors import UserError
+from univoxel.jobs.job import Job
 from univoxel.machine import load
 from univoxel.tasks.envmap import Comparison, envmap
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.train import train
 
-JOB = "job.json"
+JOB = "job"  # beginning of the names of its record, its lock and what it said
 RUN = "run"  # the training's own folder
 MAP = "envmap.exr"  # the recovered light, where the run has one
 
@@ -36,7 +37,7 @@ def work(folder: Path) -> None:
     figures expects. One that was finished is only evaluated; what came through in the meantime, in
     another process, stays.
     """
-    job = json.loads((folder / JOB).read_text(encoding="utf-8"))
+    job = Job(folder.name, (), folder / JOB).record().identity["job"]
     setting = Setting(**job["setting"] | {"changes": tuple(job["setting"]["changes"])})
     config = setting.config(Path(job["data"]), folder / RUN)
     samples = job["samples"]

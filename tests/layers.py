@@ -4,8 +4,8 @@ them, and docs/figures/diagrams.py draws those of the package."""
 # From the bottom up. A folder or file imports only from layers below its own; inside a folder
 # anything goes that is no circle.
 LAYERS = [
-    {"bars", "child", "errors", "installation", "machine", "names", "records", "retired", "shelf"}
-    | {"threads", "files", "overrides", "validation", "cluster", "parsing"},
+    {"bars", "errors", "guard", "installation", "machine", "names", "records", "retired", "shelf"}
+    | {"threads", "files", "overrides", "validation", "jobs", "parsing"},
     {"brdf", "camera", "color", "grid", "losses", "metrics", "orbit", "sphere"},
     {"ops"},
     {"envmap", "networks", "optim", "poses"},

@@ -28,7 +28,6 @@ SEEDS = 3
 SAMPLES = 64  # of the light, per pixel of relit pictures
 # So many that no machine is too slow for all steps: results shall not depend on the load
 MINUTES = 60.0
-SECONDS = 30.0  # that a training may take, a guess
 IDENTITY = "damage.json"
 SMALL = (
     "capacity=fixed",
@@ -161,7 +160,7 @@ def _train(
             else:
                 wanted[place, one.name] = one
     pairs = [(place, one) for (place, _), one in wanted.items()]
-    trained = train(pairs, out, SAMPLES, SECONDS)
+    trained = train(pairs, out, SAMPLES)
     done |= dict(zip(wanted, trained, strict=True))
 
     def outcomes(level: Level, light: LightName) -> tuple[Outcome, ...]:

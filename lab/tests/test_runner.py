@@ -14,9 +14,9 @@ from filelock import FileLock
 from lab import runner, worker
 from lab.record import Setting, load_outcome
 from univoxel.checkpoint import FILE
-from univoxel.cluster.piece import Ended
 from univoxel.errors import DataError
 from univoxel.evaluation.measures import MEASURES
+from univoxel.jobs.job import Result
 
 TINY = (
     *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),
@@ -47,14 +47,15 @@ def trained(monkeypatch):
     """The names of the settings whose process was started, in place of the process."""
     names = []
 
-    def note(client, pieces, total, tries):
-        for piece in pieces:
-            scene, _, setting = piece.name.partition("/")
+    def note(client, jobs, total, tries):
+        for job in jobs:
+            scene, _, setting = job.name.partition("/")
             names.append(setting)
-            runner.Outcome(scene, setting, {}).save(piece.output.parent)
-            yield Ended(piece.name, "done")
+            job.files.parent.mkdir(parents=True, exist_ok=True)
+            runner.Outcome(scene, setting, {}).save(job.files.parent)
+            yield Result(job.name, "done")
 
-    monkeypatch.setattr(runner, "drive", note)
+    monkeypatch.setattr(runner, "run_jobs", note)
     return names
 
 
@@ -127,7 +128,7 @@ def test_two_processes_do_not_share_a_folder(data, out, tmp_path):
     shutil.copytree(out / "ball" / "small", folder)
     result = folder / "result.json"
     result.rename(folder / "later")
-    lock = FileLock(folder / runner.LOCK, thread_local=False)
+    lock = FileLock(folder / f"{worker.JOB}.lock", thread_local=False)
 
     def leave() -> None:
         (folder / "later").rename(result)
@@ -184,7 +185,7 @@ def test_scenes_with_settings_of_their_own(data, tmp_path, trained):
     other.mkdir()  # cannot be read: its process says so, the rest goes on
     twice = dataclasses.replace(SMALL, name="twice")
     pairs = [(data, SMALL), (other, twice), (data, twice)]
-    found = runner.run_pairs(pairs, tmp_path / "out", samples=1, seconds=5.0)
+    found = runner.run_pairs(pairs, tmp_path / "out", samples=1)
     assert [(o.scene, o.setting) for o in found] == [(d.name, s.name) for d, s in pairs]
     assert trained == ["small", "twice", "twice"]
     with pytest.raises(ValueError, match="settings of different names, got"):

@@ -15,13 +15,14 @@ import pytest
 from analytic import write_scene
 from clusters import scheduler, wait_for, worker
 
-from univoxel.batch.results import SceneResult, as_csv
-from univoxel.batch.scenes import PER_PIXEL, Share, Wanted, bytes_of, named, piece_of, share
+from univoxel.batch.results import SceneResult, write_results
+from univoxel.batch.scenes import PER_PIXEL, BatchOptions, bytes_of, job_of, named, share
 from univoxel.batch.sheet import write_sheet
 from univoxel.checkpoint import FILE, load_checkpoint
 from univoxel.cli import main
 from univoxel.config import save_config
 from univoxel.errors import ExistingFile, MissingExtra, ProcessFailed, UserError
+from univoxel.jobs.job import Record
 from univoxel.machine import Memory
 from univoxel.tasks import batch as task
 from univoxel.training.memory import PER_PIXEL as FURTHER
@@ -33,9 +34,9 @@ TINY = (
     *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
 )
 # Its steps take a moment; draft's minute would cut them on a busy machine
-WANTED = Wanted(("train",), "auto", "draft", "sg", 30.0, changes=TINY, samples=1)
+OPTIONS = BatchOptions(("train",), "auto", "draft", "sg", 30.0, changes=TINY, samples=1)
 # The first stage is saved at once; the second takes long enough to be killed in
-SLOW = dataclasses.replace(WANTED, changes=(*TINY, "stages.1.iterations=1500"))
+SLOW = dataclasses.replace(OPTIONS, changes=(*TINY, "stages.1.iterations=1500"))
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +45,8 @@ def scenes(tmp_path_factory):
     return [write_scene(root / name, views=6, size=16) for name in ("ball", "cup")]
 
 
-def run_batch(scenes, out, wanted=WANTED, **options):
-    return task.batch(scenes, out, wanted, **{"jobs": 2, "threads": 1} | options)
+def run_batch(scenes, out, options=OPTIONS, **how):
+    return task.batch(scenes, out, options, **{"jobs": 2, "threads": 1} | how)
 
 
 def said(out: Path, name: str) -> str:
@@ -112,10 +113,13 @@ def test_each_scene_has_all_of_its_results(night):
     assert record["options"]["preset"] == "draft"
     ball, cup = record["scenes"]
     assert (ball["name"], ball["state"], ball["errors"]) == ("ball", "done", {})
+    words = {"good", "usable", "retake", "unfinished"}
+    assert {ball["verdict"], cup["verdict"]} <= words
     assert set(ball["seconds"]) == {"train", "eval", "export", "page"}
     assert 0 <= ball["doubts"]["doubt_albedo"] <= 1
     rows = list(csv.DictReader((out / "batch.csv").read_text().splitlines()))
     assert [row["name"] for row in rows] == ["ball", "cup"]
+    assert [row["verdict"] for row in rows] == [ball["verdict"], cup["verdict"]]
     assert float(rows[1]["nvs_psnr"]) == pytest.approx(cup["measures"]["nvs_psnr"], rel=1e-5)
 
 
@@ -249,30 +253,30 @@ def test_two_batches_on_one_folder_train_each_scene_once(scenes, tmp_path):
 
 def test_masks_that_photographs_bring_are_taken(scenes, tmp_path):
     """Then nothing is cut out; what made no file is looked at again only until it was trained."""
-    wanted = dataclasses.replace(WANTED, steps=("masks", "train"))
-    assert run_batch(scenes[:1], tmp_path, wanted)[0].state == "done"
+    options = dataclasses.replace(OPTIONS, steps=("masks", "train"))
+    assert run_batch(scenes[:1], tmp_path, options)[0].state == "done"
     assert not (tmp_path / "ball" / "cut").exists()
     assert whole(tmp_path, "ball")
     words = said(tmp_path, "ball")
-    assert run_batch(scenes[:1], tmp_path, wanted)[0].state == "done"
+    assert run_batch(scenes[:1], tmp_path, options)[0].state == "done"
     assert said(tmp_path, "ball") == words
 
 
 def test_steps_of_raw_photographs(tmp_path):
-    wanted = dataclasses.replace(WANTED, steps=("page", "train", "poses", "masks"), masks="none")
-    piece = piece_of("mug", tmp_path / "mug", tmp_path / "night", wanted, 1)
-    assert [step.name for step in piece.steps] == ["poses", "masks", "train", "page"]
-    poses, masks, train, page = piece.steps
+    options = dataclasses.replace(OPTIONS, steps=("page", "train", "poses", "masks"), masks="none")
+    job = job_of("mug", tmp_path / "mug", tmp_path / "night", options, 1)
+    assert [step.name for step in job.steps] == ["poses", "masks", "train", "page"]
+    poses, masks, train, page = job.steps
     folder = tmp_path / "night" / "mug"
-    assert [str(a) for a in poses.arguments[2:]] == [
+    assert poses.words()[2:] == [
         *("capture", str(tmp_path / "mug"), "--out", str(folder), "--masks", "none"),
         *("--until", "cameras"),
     ]
-    assert masks.arguments[-2:] == ("--until", "masks")
-    assert str(train.arguments[3]) == str(tmp_path / "mug")
+    assert masks.words()[-2:] == ["--until", "masks"]
+    assert train.words()[3] == str(tmp_path / "mug")
     for name in ("scene", "cut"):  # each takes the place of those before
         (folder / name).mkdir(parents=True)
-        assert str(train.arguments[3]) == str(folder / name)
+        assert train.words()[3] == str(folder / name)
     assert masks.done()
     assert not poses.done()
     (folder / "scene" / "poses.json").touch()
@@ -282,44 +286,43 @@ def test_steps_of_raw_photographs(tmp_path):
 
 def test_what_a_training_of_a_batch_is_asked_for(tmp_path):
     def options(threads, **changes) -> str:
-        wanted = dataclasses.replace(Wanted(), **changes)
-        train = piece_of("mug", tmp_path, tmp_path, wanted, threads).steps[0]
-        return " ".join(map(str, train.arguments[5:]))
+        asked = dataclasses.replace(BatchOptions(), **changes)
+        train = job_of("mug", tmp_path, tmp_path, asked, threads).steps[0]
+        return " ".join(train.words()[5:])
 
     # A preset makes all its steps, on any number of threads
     assert options(1).endswith("--preset auto --light hybrid")
     assert options(2, preset="draft").endswith("--preset draft --light hybrid")
     assert options(1, minutes=3.0).endswith("--preset auto --light hybrid --minutes 3")
-    config = Wanted().training(tmp_path, tmp_path)
+    config = dataclasses.replace(BatchOptions().training(), out=tmp_path)
     save_config(config)
     alike = options(1, config=tmp_path / "config.json", changes=("seed=2",))
     assert f"--config {tmp_path / 'config.json'} --set=seed=2" in alike
-    assert Wanted(config=tmp_path / "config.json", minutes=2.0).training(
-        tmp_path, tmp_path
-    ) == dataclasses.replace(config, minutes=2.0)
+    asked = BatchOptions(config=tmp_path / "config.json", minutes=2.0)
+    assert asked.training() == dataclasses.replace(config, minutes=2.0)
 
 
 def test_a_machine_is_shared(scenes, tmp_path):
-    known = {f"s{i}": scene for i, scene in enumerate(scenes * 4)}
-    config = Wanted().training(Path(), Path())
+    known = scenes * 4
+    config = BatchOptions().training()
     plenty = Memory(10**13, 10**13)
-    assert share(known, config, 16.0, plenty) == Share(8, 2)
-    assert share(known, config, 4.0, plenty) == Share(4, 1)
-    assert share(known, config, 4.0, None, threads=2) == Share(2, 2)
-    assert share(known, config, 4.0, plenty, jobs=3) == Share(3, 1)
-    assert share(known, config, 0.5, plenty) == Share(1, 1)
+    assert share(known, config, 16.0, plenty) == (8, 2)
+    assert share(known, config, 4.0, plenty) == (4, 1)
+    assert share(known, config, 4.0, None, threads=2) == (2, 2)
+    assert share(known, config, 4.0, plenty, jobs=3) == (3, 1)
+    assert share(known, config, 0.5, plenty) == (1, 1)
     most = bytes_of(scenes[0], config)
-    assert share(known, config, 16.0, Memory(10**13, int(3.5 * most))) == Share(3, 5)
-    assert share(known, config, 16.0, Memory(most // 2, None)) == Share(1, 16)
+    assert share(known, config, 16.0, Memory(10**13, int(3.5 * most))) == (3, 5)
+    assert share(known, config, 16.0, Memory(most // 2, None)) == (1, 16)
 
 
 def test_more_pictures_need_more_memory(scenes, tmp_path):
-    config = Wanted().training(Path(), Path())
+    config = BatchOptions().training()
     many = write_scene(tmp_path / "many", views=12, size=64)
     each = PER_PIXEL + FURTHER  # the photograph, and what training makes of it
     assert bytes_of(many, config) - bytes_of(scenes[0], config) == each * (14 * 64**2 - 8 * 16**2)
-    (many / "train" / "r_0.png").write_bytes(b"")  # the next one tells
-    assert bytes_of(many, config) > bytes_of(scenes[0], config)
+    (many / "train" / "r_0.png").write_bytes(b"")
+    assert bytes_of(many, config) - bytes_of(scenes[0], config) == each * (13 * 64**2 - 8 * 16**2)
 
 
 def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypatch):
@@ -344,16 +347,16 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
         ("changes", ("seed=x",), "changes=seed=x: expected a int"),
         ("config", tmp_path / "none.json", "got both: .*none.json says them"),
     ):
-        refused(UserError, match, wanted=dataclasses.replace(WANTED, **{field: value}))
+        refused(UserError, match, options=dataclasses.replace(OPTIONS, **{field: value}))
     refused(UserError, "expected jobs or scheduler, got both", scheduler="tcp://x:1")
     monkeypatch.setitem(sys.modules, "distributed", None)
     refused(MissingExtra, r"univoxel\[cluster\]")
 
 
 def test_records_of_other_options_are_refused(scenes, tmp_path):
-    piece = piece_of("ball", scenes[0], tmp_path, WANTED, 1)
-    piece.record.parent.mkdir()
-    piece.record.write_text(json.dumps({"identity": piece.identity | {"data": "/elsewhere"}}))
+    job = job_of("ball", scenes[0], tmp_path, OPTIONS, 1)
+    job.files.parent.mkdir()
+    job.save(Record({**job.identity, "data": "/elsewhere"}))
     with pytest.raises(ExistingFile, match=r"ball\.json is of another data: choose another out"):
         run_batch(scenes[:1], tmp_path)
 
@@ -365,16 +368,18 @@ def test_a_video_is_a_scene(tmp_path):
 
 def test_what_is_not_known_is_a_dash_or_empty(tmp_path):
     results = [
-        SceneResult("a<b", "/a", "a<b", "failed", {"train": "x < y"}, {}, "here"),
-        SceneResult("c", "/c", "c", "done", {}, {"train": 61.5}, "here", {"nvs_psnr": 30.04}),
+        SceneResult("a<b", "/a", "a<b", "failed", {"train": "x < y"}, {}),
+        SceneResult("c", "/c", "c", "done", {}, {"train": 61.5}, "good", {"nvs_psnr": 30.04}),
     ]
     page = write_sheet(results, tmp_path).read_text()
     assert "a&lt;b" in page
     assert "train: x &lt; y" in page
-    assert "<td>30.0</td>" in page
-    assert "<td>62 s</td>" in page
+    assert "<td>30.0" in page
+    assert "<td>62 s" in page
     assert "albedo, dB" not in page
-    rows = list(csv.DictReader(as_csv(results).splitlines()))
+    write_results(results, {}, tmp_path)
+    rows = list(csv.DictReader((tmp_path / "batch.csv").read_text().splitlines()))
+    assert [row["verdict"] for row in rows] == ["", "good"]
     assert (rows[0]["nvs_psnr"], rows[0]["train_s"], rows[0]["error"]) == ("", "", "train: x < y")
     with pytest.raises(ProcessFailed, match=r"1 of 2 scenes failed \(a<b\)"):
         task.check(results)

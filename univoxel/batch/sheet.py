@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
@@ -14,10 +11,9 @@ from PIL import Image
 from univoxel.batch.results import SceneResult
 from univoxel.batch.scenes import LOGS
 from univoxel.capture.project import Project
-from univoxel.files import replacing
+from univoxel.pictures.html import DARK_STYLE, document, escape, image, paragraph, table, write_html
 
 TILE = 120  # pixels of the longer side
-QUALITY = 85  # of JPEG
 COLUMNS = {  # measures that the page shows, by key, with their digits
     "nvs_psnr": ("novel views, dB", 1),
     "albedo_psnr_3ch": ("albedo, dB", 1),
@@ -27,31 +23,14 @@ COLUMNS = {  # measures that the page shows, by key, with their digits
 }
 WORSE_FIRST = {"failed": 0, "left": 1, "done": 2}
 
-_PAGE = """<!doctype html>
-<html lang="en">
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width">
-<title>{title}</title>
-<style>
-body {{ font: 15px/1.4 sans-serif; margin: 2em; background: #202020; color: #eee }}
+_STYLE = f"""{DARK_STYLE}
 table {{ border-collapse: collapse }}
 th, td {{ padding: 4px 12px; text-align: right; border-bottom: 1px solid #444 }}
 th {{ position: sticky; top: 0; background: #202020 }}
-th:nth-child(2), td:nth-child(2), td:last-child {{ text-align: left }}
+:is(th, td):is(:nth-child(2), :nth-child(3)), td:last-child {{ text-align: left }}
 td img {{ display: block }}
 a {{ color: #9cf }}
-.failed td {{ color: #ffb347 }}
-</style>
-<h1>{title}</h1>
-<p>{about}</p>
-<table>
-<thead><tr>{heads}</tr></thead>
-<tbody>
-{rows}
-</tbody>
-</table>
-</html>
-"""
+.failed td {{ color: #ffb347 }}"""
 
 
 def write_sheet(results: Sequence[SceneResult], out: Path) -> Path:
@@ -61,37 +40,33 @@ def write_sheet(results: Sequence[SceneResult], out: Path) -> Path:
         OSError: it cannot be written.
     """
     shown = [key for key in COLUMNS if any(r.measures.get(key) is not None for r in results)]
-    heads = ["", "scene", *(COLUMNS[key][0] for key in shown)]
+    heads = ["", "scene", "verdict", *(COLUMNS[key][0] for key in shown)]
     heads += ["doubt of albedo", "of roughness", "training", "all", ""]
     ordered = sorted(results, key=lambda r: (WORSE_FIRST[r.state], r.name))
     counts = [(state, sum(r.state == state for r in results)) for state in WORSE_FIRST]
-    page = out / "index.html"
-    text = _PAGE.format(
-        title=html.escape(out.absolute().name),
-        about=html.escape(", ".join(f"{count} {state}" for state, count in counts if count)),
-        heads="".join(f"<th>{head}</th>" for head in heads),
-        rows="\n".join(_row(result, shown, out) for result in ordered),
-    )
-    with replacing(page) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    about = ", ".join(f"{count} {state}" for state, count in counts if count)
+    rows = table((_row(r, shown, out) for r in ordered), heads, [r.state for r in ordered])
+    title, page = out.absolute().name, out / "index.html"
+    body = f"<h1>{escape(title)}</h1>\n{paragraph(about)}\n{rows}"
+    write_html(page, document(title, _STYLE, body))
     return page
 
 
-def _row(result: SceneResult, shown: Sequence[str], out: Path) -> str:
+def _row(result: SceneResult, shown: Sequence[str], out: Path) -> list[str]:
     project = Project(out / result.folder)
     cells = [_thumbnail(project.run / "preview.png"), _link(project.page, result.name, out)]
+    cells.append(result.verdict or "-")
     cells += [_number(result.measures.get(key), COLUMNS[key][1]) for key in shown]
     cells += [_number(result.doubts.get(key), 2) for key in ("doubt_albedo", "doubt_roughness")]
     whole = sum(result.seconds.values()) if result.seconds else None
     cells += [_seconds(result.seconds.get("train")), _seconds(whole)]
-    said = html.escape(result.error)
-    cells.append(f"{said} {_link(out / LOGS / f'{result.name}.txt', 'what it said', out)}")
-    return f'<tr class="{result.state}">{"".join(f"<td>{cell}</td>" for cell in cells)}</tr>'
+    output = _link(out / LOGS / f"{result.name}.txt", "what it said", out)
+    return [*cells, f"{escape(result.error)} {output}"]
 
 
 def _link(path: Path, text: str, out: Path) -> str:
     """The text, as a link where there is something."""
-    said = html.escape(text)
+    said = escape(text)
     if not path.exists():
         return said
     return f'<a href="{quote(path.relative_to(out).as_posix())}">{said}</a>'
@@ -113,7 +88,4 @@ def _thumbnail(path: Path) -> str:
     except (OSError, ValueError):  # none yet
         return ""
     small.thumbnail((TILE * 4, TILE), Image.Resampling.BOX)
-    encoded = io.BytesIO()
-    small.save(encoded, format="JPEG", quality=QUALITY)
-    data = base64.b64encode(encoded.getbuffer()).decode()
-    return f'<img alt="" src="data:image/jpeg;base64,{data}">'
+    return image(small)

@@ -79,9 +79,9 @@ def run(
     begin = time.monotonic()
     grace = GRACE if request.step == "map" else 0.0
     with log.open("wb") as file:
-        child = [sys.executable, "-m", "univoxel.child", str(os.getpid()), "-"]
+        guard = [sys.executable, "-m", "univoxel.guard", str(os.getpid())]
         process = subprocess.Popen(
-            [*child, *command_of(engine, request, log)],
+            [*guard, *command_of(engine, request, log)],
             **{"stdin": subprocess.DEVNULL, "stdout": file, "stderr": file},
         )
         try:

@@ -262,14 +262,14 @@ def batch(
         tries: how often a scene whose process is killed is tried before it counts as failed
         json: another file for what batch.json holds; - prints it in place of the table
     """
-    from univoxel.batch.scenes import Wanted
+    from univoxel.batch.scenes import BatchOptions
     from univoxel.tasks import batch as task
 
     check_minutes(minutes)
-    wanted = Wanted(steps, masks, preset, light, minutes, config, set, samples)
-    options = {"jobs": jobs, "threads": threads_asked(), "scheduler": scheduler, "tries": tries}
+    options = BatchOptions(steps, masks, preset, light, minutes, config, set, samples)
+    how = {"jobs": jobs, "threads": threads_asked(), "scheduler": scheduler, "tries": tries}
     with json_file(json) as file:
-        results = task.batch(scenes, out, wanted, **options, json=file)
+        results = task.batch(scenes, out, options, **how, json=file)
     if json != STDOUT:
         rich.print(task.table(results))
         print(out / "index.html")

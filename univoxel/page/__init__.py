@@ -6,8 +6,6 @@ and a few others.
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 import math
 import string
@@ -26,10 +24,18 @@ from univoxel.assets.topology import clean, simplify
 from univoxel.camera import looked_at
 from univoxel.checkpoint import load_checkpoint
 from univoxel.errors import UserError
-from univoxel.files import replacing
 from univoxel.names import MAP_ROWS, TEXTURE_SIZE
 from univoxel.page.maps import PHOTOGRAPHED, Light, as_json, light_of_file, usual_lights
 from univoxel.page.transfer import Transfer, transfer
+from univoxel.pictures.html import (
+    VIEWPORT,
+    base64_text,
+    document,
+    escape,
+    paragraph,
+    table,
+    write_html,
+)
 from univoxel.records import Mesh
 from univoxel.run import photos_of
 from univoxel.scene import Scene
@@ -43,6 +49,10 @@ JPEG_QUALITY = 92  # of textures
 START = (30.0, 18.0)  # azimuth and elevation of the first view, degrees, where photographs lack
 ELEVATIONS = (5.0, 40.0)  # that a first view is brought to, degrees
 FACES = 12_000  # most triangles: the texture holds what they are too coarse for
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data: blob:; connect-src data: blob:"
+)
 LICENCE = "Drawn with three.js, \u00a9 three.js authors, MIT licence, in the page's source."
 SOURCES = {name: f"Map {name!r}: Greg Zaal, Poly Haven, CC0." for name in PHOTOGRAPHED}
 KEYS = """1 to 5: layers
@@ -93,8 +103,7 @@ def write_page(run: str | Path, path: str | Path, **options: Any) -> Path:
     scene, state = load_checkpoint(run)
     text = page_text(run, scene, PageOptions(**options), state.get("seconds"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_html(path, text)
     return path
 
 
@@ -119,17 +128,16 @@ def page_text(
         "lights": [as_json(light) for light in lights],
     }
     parts = {
-        "title": html.escape(title),
-        "facts": html.escape(" \u00b7 ".join(facts)),
+        "title": escape(title),
+        "facts": escape(" \u00b7 ".join(facts)),
         "about": about(run, options, [light.name for light in lights]),
-        "generator": f"univoxel {__version__}",
-        "model": base64.b64encode(model(scene, options)).decode(),
+        "model": base64_text(model(scene, options)),
         "scene": json.dumps(described, separators=(",", ":")).replace("<", "\\u003c"),
-        "style": _source("page.css"),
         "three": f"/*! {_source('vendor/LICENSE').strip()} */\n{_source('vendor/three.min.js')}",
         "viewer": _source("viewer.js"),
     }
-    return string.Template(_source("page.html")).substitute(parts)
+    body = string.Template(_source("page.html").rstrip()).substitute(parts)
+    return document(title, _source("page.css"), body, POLICY, f"{VIEWPORT}, viewport-fit=cover")
 
 
 def model(scene: Scene, options: PageOptions) -> bytes:
@@ -189,21 +197,18 @@ def facts_of(run: Path, total: float | None = None) -> list[str]:
 
 def about(run: Path, options: PageOptions, lights: Sequence[str]) -> str:
     """The page's panel: notes, measures, what photographs leave open, where all comes from."""
-    parts = [f"<p>{html.escape(options.notes)}</p>"] if options.notes else []
+    parts = [paragraph(options.notes)] if options.notes else []
     if options.measures:
-        rows = "".join(
-            f"<tr><td>{html.escape(what)}<td>{html.escape(value)}"
-            for what, value in options.measures.items()
-        )
-        parts.append(f"<h2>Measures on the test views</h2><table>{rows}</table>")
+        rows = [(escape(what), escape(value)) for what, value in options.measures.items()]
+        parts.append(f"<h2>Measures on the test views</h2>{table(rows)}")
     trust = run / "trust.txt"
     if trust.is_file():
         text = trust.read_text(encoding="utf-8", errors="replace").strip()
-        parts.append(f"<h2>What the photographs leave open</h2><p>{html.escape(text)}</p>")
+        parts.append(f"<h2>What the photographs leave open</h2>{paragraph(text)}")
     parts.append(f"<h2>Keys</h2><p>{KEYS}</p>")
     sources = [SOURCES[name] for name in lights if name in SOURCES]
     text = " ".join([f"Made by univoxel {__version__}.", LICENCE, *sources])
-    return "\n".join([*parts, f"<h2>Sources</h2><p>{html.escape(text)}</p>"])
+    return "\n".join([*parts, f"<h2>Sources</h2>{paragraph(text)}"])
 
 
 def _source(name: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from univoxel.data.maps import read_map
 from univoxel.page.transfer import DEGREE
+from univoxel.pictures.html import base64_text
 from univoxel.records import HALF_MAX
 from univoxel.sphere import (
     latlong_direction,
@@ -141,6 +141,6 @@ def as_json(light: Light) -> dict[str, Any]:
     return {
         "name": light.name,
         "height": len(stored),
-        "texels": base64.b64encode(stored.half().numpy().astype("<f2").tobytes()).decode(),
+        "texels": base64_text(stored.half().numpy().astype("<f2").tobytes()),
         "harmonics": [[round(x, 6) for x in row] for row in harmonics(stored).tolist()],
     }

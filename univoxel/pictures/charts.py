@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+from univoxel.pictures.html import escape
 
 WIDTH, HEIGHT = 560.0, 190.0
 LEFT, BOTTOM, TOP = 56.0, 24.0, 12.0  # for numbers
@@ -43,7 +44,7 @@ def chart(curve: Curve, ends: Sequence[float]) -> str:
         down = TOP + (HEIGHT - TOP - BOTTOM) * (high - _scaled(curve, y)) / (high - low)
         return f"{across:.1f},{down:.1f}"
 
-    title = html.escape(curve.title)
+    title = escape(curve.title)
     parts = [f'<text x="{LEFT:.0f}" y="10" text-anchor="start" fill="{INK}">{title}</text>']
     floor = HEIGHT - BOTTOM
     for value in _ticks(low, high):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,32 +12,17 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from univoxel.files import replacing
-from univoxel.pictures.inline import inline
+from univoxel.pictures.html import DARK_STYLE, document, escape, image, paragraph, write_html
 
 TILE = 240  # pixels of the longer side
 GAP, LABEL = 6, 34  # pixels
 COLUMNS = 6  # tiles in a row of the picture, at most
 DARK = 0.25  # of the light is left outside of a mask
 
-_PAGE = """<!doctype html>
-<html lang="en">
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width">
-<title>masks</title>
-<style>
-body {{ font: 15px/1.4 sans-serif; margin: 2em; background: #202020; color: #eee }}
+_STYLE = f"""{DARK_STYLE}
 main {{ display: flex; flex-wrap: wrap; gap: 16px }}
 figure {{ margin: 0 }}
-figure.wrong figcaption {{ color: #ffb347 }}
-</style>
-<h1>Masks</h1>
-<p>{about}</p>
-<main>
-{figures}
-</main>
-</html>
-"""
+figure.wrong figcaption {{ color: #ffb347 }}"""
 
 
 @dataclass(frozen=True)
@@ -111,15 +95,15 @@ def write_page(path: Path, tiles: Sequence[MaskTile], about: str) -> None:
     """
     figures = []
     for tile in tiles:
-        words = html.escape(f"{tile.name}{_number(tile)} {tile.fault}")
-        images = [inline(picture) for picture in (tile.before, tile.after) if picture is not None]
+        words = escape(f"{tile.name}{_number(tile)} {tile.fault}")
+        images = [image(picture) for picture in (tile.before, tile.after) if picture is not None]
         kind = ' class="wrong"' if tile.fault else ""
         mended = "" if tile.after is None else "; mended on the right"
         caption = f"<figcaption>{words}{mended}</figcaption>"
         figures.append(f"<figure{kind}>{''.join(images)}{caption}</figure>")
-    text = _PAGE.format(about=html.escape(about), figures="\n".join(figures))
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    main = "\n".join(["<main>", *figures, "</main>"])
+    body = f"<h1>Masks</h1>\n{paragraph(about)}\n{main}"
+    write_html(path, document("masks", _STYLE, body))
 
 
 def _number(tile: MaskTile) -> str:

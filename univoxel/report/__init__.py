@@ -3,8 +3,6 @@ where it is in doubt, and what to photograph next. No truth is read."""
 
 from __future__ import annotations
 
-import html
-import string
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,10 +26,9 @@ from univoxel.confidence.doubts import Doubts
 from univoxel.confidence.report import numbers, words
 from univoxel.confidence.survey import POINTS, Survey, survey
 from univoxel.errors import UserError
-from univoxel.files import replacing
 from univoxel.page import START, facts_of
 from univoxel.pictures.charts import chart
-from univoxel.pictures.inline import inline
+from univoxel.pictures.html import document, escape, image, paragraph, table, write_html
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh
 from univoxel.report import drawing, light, photographs, sides, training
@@ -41,6 +38,7 @@ from univoxel.verdict import load_verdict
 
 FOLDER = Path(__file__).parent
 RING_GAP = 60.0  # degrees between neighbouring azimuths that are worth a word, as of `poses`
+TRUTH = "No truth was read: all of this is computed from the photographs and the model."
 CHARTS = (
     "Stages minimise different sums, so the loss jumps between them. Held-out pixels are shown by "
     "the radiance head first, and by light and materials once those are trained."
@@ -104,8 +102,7 @@ def write_report(run: str | Path, path: str | Path, **options: Any) -> Path:
     scene, state = load_checkpoint(run)
     text = report_text(run, scene, state, asked)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_html(path, text)
     return path
 
 
@@ -145,15 +142,14 @@ def report_text(
         ("Light", light_section(scene, mesh)),
         ("Training", training_section(run, state)),
     ]
-    return string.Template(_source("report.html")).substitute(
-        title=html.escape(title),
-        facts=html.escape(" · ".join(facts_of(run, state.get("seconds")))),
-        generator=f"univoxel {__version__}",
-        style=_source("report.css"),
-        sections="\n".join(
-            f"<section><h2>{name}</h2>\n{text}\n</section>" for name, text in sections if text
-        ),
-    )
+    facts = " · ".join(facts_of(run, state.get("seconds")))
+    shown = (f"<section><h2>{name}</h2>\n{text}\n</section>" for name, text in sections if text)
+    body = [
+        f"<header>\n  <h1>{escape(title)}</h1>\n  <p>{escape(facts)}</p>\n</header>",
+        *("<main>", *shown, "</main>"),
+        f"<footer>Made by univoxel {__version__}. {TRUTH}</footer>",
+    ]
+    return document(title, (FOLDER / "report.css").read_text("utf-8"), "\n".join(body))
 
 
 def what_is_known(run: Path, scene: Scene, options: ReportOptions) -> Known:
@@ -181,16 +177,14 @@ def next_section(advice: Advice) -> str:
     parts = []
     told = in_words(advice)
     if told:
-        text = "".join(f"<li>{html.escape(line)}" for line in told)
+        text = "".join(f"<li>{escape(line)}" for line in told)
         parts.append(f'<ul class="advice">{text}</ul>')
-        rows = "".join(
-            f"<tr><td>{k + 1}<td>{_direction(advice, k)}<td>{html.escape(near)}<td>{gain:.1%}"
-            for k, (near, gain) in enumerate(
-                zip(advice.nearest, advice.gains.tolist(), strict=True)
-            )
-        )
-        head = "<tr><th><th>from<th>nearest so far<th>worth"
-        parts.append(f"<table>{head}{rows}</table>")
+        worth = enumerate(zip(advice.nearest, advice.gains.tolist(), strict=True))
+        rows = [
+            (f"{k + 1}", _direction(advice, k), escape(near), f"{gain:.1%}")
+            for k, (near, gain) in worth
+        ]
+        parts.append(table(rows, ("", "from", "nearest so far", "worth")))
     else:
         parts.append(
             paragraph("Nothing stands out: photographs are all around what can be seen from there.")
@@ -230,8 +224,8 @@ def views_section(scene: Scene, known: Known, options: ReportOptions) -> str:
     if not found:
         return ""
     rows = "".join(
-        f'<figure class="row">{"".join(inline(tile, words) for tile in tiles)}'
-        f"<figcaption>{html.escape(words)}</figcaption></figure>"
+        f'<figure class="row">{"".join(image(tile, words) for tile in tiles)}'
+        f"<figcaption>{escape(words)}</figcaption></figure>"
         for words, tiles in photographs.rows(found)
     )
     said = (
@@ -282,15 +276,12 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
         return "\n".join([*parts, paragraph("config.json cannot be read: stages are not told.")])
     rows = []
     if (before := training.prepared(state)) is not None:
-        rows.append(f"<tr><td>preparation<td><td><td>{before:.1f} s<td>")
+        rows.append(("preparation", "", "", f"{before:.1f} s", ""))
     for k, fact in enumerate(training.stages(cfg, state)):
         made = "" if fact.made is None else f"{fact.made:.0%}"
         took = "" if fact.seconds is None else f"{fact.seconds:.1f} s"
-        rows.append(
-            f"<tr><td>{k + 1}: {fact.name}<td>{fact.planned:,}<td>{made}<td>{took}<td>{fact.fate}"
-        )
-    head = "<tr><th>stage<th>planned steps<th>made<th>time<th>"
-    parts.append(f"<table>{head}{''.join(rows)}</table>")
+        rows.append((f"{k + 1}: {fact.name}", f"{fact.planned:,}", made, took, fact.fate))
+    parts.append(table(rows, ("stage", "planned steps", "made", "time", "")))
     limit = "" if cfg.minutes is None else f"The limit was {60 * cfg.minutes:,.0f} s."
     told = [limit, *training.remarks(cfg, state)]
     return "\n".join([*parts, *(paragraph(line) for line in told)])
@@ -299,14 +290,10 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
 def gallery(named: Any, legend: str, kind: str = "") -> str:
     """Pictures in a row under their names."""
     figures = "".join(
-        f"<figure>{inline(picture, name)}<figcaption>{name}</figcaption></figure>"
+        f"<figure>{image(picture, name)}<figcaption>{name}</figcaption></figure>"
         for name, picture in named
     )
-    return f'<p class="legend">{html.escape(legend)}</p><div class="gallery {kind}">{figures}</div>'
-
-
-def paragraph(text: str) -> str:
-    return f"<p>{html.escape(text)}</p>" if text else ""
+    return f'<p class="legend">{escape(legend)}</p><div class="gallery {kind}">{figures}</div>'
 
 
 def _direction(advice: Advice, k: int) -> str:
@@ -314,7 +301,3 @@ def _direction(advice: Advice, k: int) -> str:
     direction = advice.chosen[k]
     up = float(torch.rad2deg(direction[2].clamp(-1, 1).asin()))
     return f"{place(advice, direction)}, {abs(up):.0f}° {'above' if up >= 0 else 'below'}"
-
-
-def _source(name: str) -> str:
-    return (FOLDER / name).read_text(encoding="utf-8")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Sequence
 
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from univoxel.confidence.advice import Advice, azimuths, elevations
 from univoxel.pictures.contact_sheet import heat
+from univoxel.pictures.html import escape
 
 RADIUS = 200.0  # of the drawn sphere
 ROOM = 34.0  # around it, for words
@@ -49,7 +49,7 @@ def sphere(advice: Advice) -> str:
             parts.append(f'<circle r="{ring:.1f}" class="{kind}"/>')
             parts.append(f'<text y="{-ring - 2:.1f}" class="small">{up}°</text>')
     for (x, y), name in zip(at(advice.taken), advice.names, strict=True):
-        title = f"<title>{html.escape(name)}</title>"
+        title = f"<title>{escape(name)}</title>"
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" class="taken">{title}</circle>')
     for k, (x, y) in enumerate(at(advice.chosen)):
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="10" class="next"/>')

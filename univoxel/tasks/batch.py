@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.table import Table
 
 from univoxel import machine
-from univoxel.batch.results import SceneResult, as_json, result_of, write_results
-from univoxel.batch.scenes import LOGS, Wanted, named, piece_of, share
+from univoxel.batch.results import SceneResult, result_of, write_results
+from univoxel.batch.scenes import BatchOptions, job_of, named, share
 from univoxel.batch.sheet import write_sheet
-from univoxel.cluster.drive import drive
-from univoxel.cluster.machines import machines, require
-from univoxel.cluster.piece import Ended, Piece, load_record
-from univoxel.errors import ExistingFile, ProcessFailed, UserError
-from univoxel.files import replacing
+from univoxel.errors import ProcessFailed, UserError
+from univoxel.jobs.job import Result
+from univoxel.jobs.scheduler import connect, run_jobs
 from univoxel.names import BATCH_STEPS
 
-USUAL = Wanted()
+USUAL = BatchOptions()
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -28,7 +26,7 @@ log: logging.Logger = logging.getLogger("univoxel")
 def batch(
     scenes: Sequence[Path],
     out: Path,
-    wanted: Wanted = USUAL,
+    options: BatchOptions = USUAL,
     *,
     jobs: int | None = None,
     threads: int | None = None,
@@ -58,38 +56,51 @@ def batch(
         ProcessFailed: the scheduler does not answer, or is gone.
         OSError: out cannot be written.
     """
-    require()
-    _check(wanted, jobs, threads, tries)
-    known = named([Path(scene) for scene in scenes])
-    config = wanted.training(Path(), Path())
+    unknown = [step for step in options.steps if step not in BATCH_STEPS]
+    if unknown or not options.steps:
+        got = ", ".join(unknown) or "none"
+        raise UserError(f"steps must be of {', '.join(BATCH_STEPS)}, got {got}", "steps")
+    numbers = {"jobs": jobs, "threads": threads, "tries": tries, "samples": options.samples}
+    for name, number in numbers.items():
+        if number is not None and number < 1:
+            raise UserError(f"{name} must be at least 1, got {number}", name)
+    known, config = named([Path(scene) for scene in scenes]), options.training()
     if scheduler is None:
-        here = share(known, config, machine.cores(), machine.memory(), jobs, threads)
-        jobs, threads = here.jobs, here.threads
+        here = (machine.cores(), machine.memory())
+        jobs, threads = share(known.values(), config, *here, jobs, threads)
         log.info("scenes at once: %d, threads of each: %d", jobs, threads)
     elif jobs is not None:
         raise UserError("expected jobs or scheduler, got both", "jobs", "scheduler")
-    pieces = [piece_of(name, data, out, wanted, threads) for name, data in known.items()]
-    for piece in pieces:
-        _check_same(piece)
-    (out / LOGS).mkdir(parents=True, exist_ok=True)
-    before = {p.name: result_of(p, known[p.name], out) for p in pieces}
-    missing = [piece for piece in pieces if before[piece.name].state != "done"]
-    options = dataclasses.asdict(wanted)
-    ended: dict[str, Ended] = {}
-    with machines(jobs or 1, scheduler) as client:
-        for found in drive(client, missing, len(pieces), tries):
+    every = [job_of(name, data, out, options, threads) for name, data in known.items()]
+    for job in every:
+        job.check_same()
+    ended: dict[str, Result] = {}
+
+    def results() -> list[SceneResult]:
+        return [result_of(job, known[job.name], out, ended.get(job.name)) for job in every]
+
+    missing = [job for job, r in zip(every, results(), strict=True) if r.state != "done"]
+    with connect(jobs or 1, scheduler) as client:
+        out.mkdir(parents=True, exist_ok=True)
+        for found in run_jobs(client, missing, len(every), tries):
             ended[found.name] = found
-            _tell(found)
+            if found.state == "done":
+                log.info("%s: done in %.0f s", found.name, found.seconds)
+            for step, said in found.errors.items():
+                log.warning("%s: failed in %s: %s", found.name, step, said)
             try:
-                _write(_results(pieces, known, out, ended), options, out)
+                _write(results(), options, out)
             except OSError as error:  # the disk may have room again when the last one ends
                 log.warning("%s", error)
-    results = _results(pieces, known, out, ended)
-    _write(results, options, out)
-    if json is not None:
-        with replacing(json) as temporary:
-            temporary.write_text(as_json(results, options), encoding="utf-8")
-    return results
+    _write(results(), options, out, json)
+    return results()
+
+
+def _write(
+    results: Sequence[SceneResult], options: BatchOptions, out: Path, json: Path | None = None
+) -> None:
+    write_results(results, dataclasses.asdict(options), out, json)
+    write_sheet(results, out)
 
 
 def check(results: Sequence[SceneResult]) -> None:
@@ -98,81 +109,29 @@ def check(results: Sequence[SceneResult]) -> None:
     Raises:
         ProcessFailed: some did.
     """
-    failed = [result for result in results if result.state != "done"]
+    failed = [result.name for result in results if result.state != "done"]
     if failed:
         raise ProcessFailed(
-            f"{len(failed)} of {len(results)} scenes failed ({', '.join(r.name for r in failed)}): "
+            f"{len(failed)} of {len(results)} scenes failed ({', '.join(failed)}): "
             "the same command tries them again"
         )
 
 
 def table(results: Sequence[SceneResult]) -> Table:
     """What came out, as the command prints it."""
-    rows = Table("scene", "state", "novel views, dB", "doubt of albedo", "seconds", "error")
+    rows = Table("scene", "state", "verdict", "novel views, dB", "doubt of albedo", "seconds")
+    rows.add_column("error")
     for result in results:
         quality, doubt = result.measures.get("nvs_psnr"), result.doubts.get("doubt_albedo")
         rows.add_row(
             result.name,
             result.state,
+            result.verdict or "-",
             "-" if quality is None else f"{quality:.1f}",
             "-" if doubt is None else f"{doubt:.2f}",
             f"{sum(result.seconds.values()):.0f}",
             result.error,
         )
-    for column in rows.columns[2:5]:
+    for column in rows.columns[3:6]:
         column.justify = "right"
     return rows
-
-
-def _check(wanted: Wanted, jobs: int | None, threads: int | None, tries: int) -> None:
-    """Refuse what is out of range.
-
-    Raises:
-        UserError: something is.
-    """
-    unknown = [step for step in wanted.steps if step not in BATCH_STEPS]
-    if unknown or not wanted.steps:
-        raise UserError(
-            f"steps must be of {', '.join(BATCH_STEPS)}, got {', '.join(unknown) or 'none'}",
-            "steps",
-        )
-    numbers = {"jobs": jobs, "threads": threads, "tries": tries, "samples": wanted.samples}
-    for name, number in numbers.items():
-        if number is not None and number < 1:
-            raise UserError(f"{name} must be at least 1, got {number}", name)
-
-
-def _check_same(piece: Piece) -> None:
-    """Refuse to go on with a scene that other options began.
-
-    Raises:
-        ExistingFile: they are others.
-    """
-    before = load_record(piece.record).identity
-    other = [key for key, value in piece.identity.items() if before and before.get(key) != value]
-    if other:
-        raise ExistingFile(
-            f"{piece.name}: {piece.record} is of another {' and '.join(other)}: choose another "
-            "out, or remove that file and the scene's folder",
-            "out",
-        )
-
-
-def _results(
-    pieces: Sequence[Piece], known: Mapping[str, Path], out: Path, ended: Mapping[str, Ended]
-) -> list[SceneResult]:
-    return [result_of(p, known[p.name], out, ended.get(p.name)) for p in pieces]
-
-
-def _write(results: Sequence[SceneResult], options: Mapping, out: Path) -> None:
-    write_results(results, options, out)
-    write_sheet(results, out)
-
-
-def _tell(found: Ended) -> None:
-    """Say how a scene ended, in a line."""
-    if found.state == "done":
-        log.info("%s: done in %.0f s", found.name, found.seconds)
-        return
-    for step, said in found.errors.items():
-        log.warning("%s: failed in %s: %s", found.name, step, said)

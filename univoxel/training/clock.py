@@ -36,12 +36,6 @@ def expected_seconds(stage: StageConfig | JointConfig) -> float:
     return stage.iterations * (STEP + RAY * stage.rays) * (REFIT if stage.refit else 1.0)
 
 
-def expected_training(cfg: TrainConfig) -> float:
-    """Seconds that the stages of a training take on two quiet cores, within its limit, about."""
-    limit = math.inf if cfg.minutes is None else 60 * cfg.minutes
-    return min(sum(map(expected_seconds, cfg.stages)), limit)
-
-
 def stage_name(stages: Sequence[StageConfig | JointConfig], index: int) -> str:
     """What a stage of a training is for, in a few words."""
     stage = stages[index]

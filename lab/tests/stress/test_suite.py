@@ -86,7 +86,7 @@ def stood_in(monkeypatch):
         noted["damaged"].append((scene.name, place.name, damage, seed, second))
         place.mkdir(parents=True)
 
-    def trained(pairs, out, samples, seconds, at_once, scheduler):
+    def trained(pairs, out, samples, at_once, scheduler):
         noted["trained"] += [(data.name, one.name) for data, one in pairs]
         return [
             Outcome(d.name, s.name, {}, {"relit_psnr": 30.0 - 5 * ("6" in d.name)})

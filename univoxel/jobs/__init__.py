@@ -1,0 +1,1 @@
+"""Many jobs, each in processes of its own, on one machine or on many."""
