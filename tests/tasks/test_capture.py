@@ -418,12 +418,12 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
         with pytest.raises(error, match=message):
             task.capture(photographs, out, **options)
         assert not out.exists()
-    monkeypatch.setattr(task, "find_engine", no_network)
+    monkeypatch.setattr(task, "require_pycolmap", no_network)
     with pytest.raises(MissingExtra):
         task.capture(pictures, out)
     assert not out.exists()
     out.touch()
-    monkeypatch.setattr(task, "find_engine", lambda: "pycolmap")
+    monkeypatch.setattr(task, "require_pycolmap", lambda: None)
     with pytest.raises(ExistingFile, match="is a file"):
         task.capture(pictures, out)
     with pytest.raises(ExistingFile, match=r"holds other files \(0.png\): choose another out"):

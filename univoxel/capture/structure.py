@@ -11,17 +11,15 @@ import torch
 
 from univoxel.capture import database
 from univoxel.capture.config import CaptureConfig
-from univoxel.capture.engine import Engine, Request, run
 from univoxel.capture.model import Model, read_models
 from univoxel.capture.pairs import all_pairs, choose, features_each, similarities
 from univoxel.capture.photographs import fitted
 from univoxel.capture.prepare import Capture, Folders
+from univoxel.capture.sfm import Request, run
 from univoxel.files import replacing
 
 
-def extract(
-    engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig
-) -> Iterator[int]:
+def extract(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Find features, camera by camera; yields how many photographs have theirs."""
     pictures = capture.pictures
     for g, members in enumerate(capture.groups):
@@ -42,7 +40,6 @@ def extract(
             existing_camera=first,
         )
         yield from run(
-            engine,
             request,
             folders.work / f"extract{g}.log",
             lambda: database.count(folders.database, "descriptors"),
@@ -74,14 +71,11 @@ def select(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterato
         temporary.write_text("".join(lines), encoding="utf-8")
 
 
-def match(
-    engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig
-) -> Iterator[int]:
+def match(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Match the chosen pairs and verify them; yields how many are done."""
     if folders.matched.exists():
         return
     yield from run(
-        engine,
         _request("match", capture, folders, config),
         folders.work / "match.log",
         lambda: database.count(folders.database, "two_view_geometries"),
@@ -94,16 +88,14 @@ def pair_count(folders: Folders) -> int:
     return len(folders.pairs.read_text(encoding="utf-8").splitlines())
 
 
-def place(
-    engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig
-) -> Iterator[int]:
+def place(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Find the cameras; yields how many photographs were placed, in all tries together."""
     done = folders.models / "done"
     if done.exists():
         return
     shutil.rmtree(folders.models, ignore_errors=True)
     folders.models.mkdir(parents=True)
-    yield from run(engine, _request("map", capture, folders, config), folders.work / "map.log")
+    yield from run(_request("map", capture, folders, config), folders.work / "map.log")
     done.touch()
 
 

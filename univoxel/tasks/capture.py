@@ -14,11 +14,11 @@ from PIL import Image
 
 from univoxel.bars import track
 from univoxel.capture.config import DEFAULTS, CaptureConfig
-from univoxel.capture.engine import find_engine
 from univoxel.capture.photographs import read_upright, require_readers
 from univoxel.capture.prepare import Folders
 from univoxel.capture.project import Given, Project, begin, discard_older, look_at
 from univoxel.capture.scene import REPORT
+from univoxel.capture.sfm import require_pycolmap
 from univoxel.checkpoint import FILE
 from univoxel.config import TrainConfig, check_same
 from univoxel.data import keep_photos, load_photos
@@ -196,7 +196,7 @@ def _check_machine(given: Given, masks: str | Path) -> None:
     if not native.reference_asked():
         native.require_embree("capture")
     if given.kind == "photographs":
-        find_engine()
+        require_pycolmap()
     if str(masks) == REMBG:
         network()
     elif str(masks) not in (AUTO, GROUND) and not Path(masks).is_dir():

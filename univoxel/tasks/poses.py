@@ -18,7 +18,6 @@ from univoxel import __version__
 from univoxel.bars import bar
 from univoxel.capture import checks, database, evidence, structure, video
 from univoxel.capture.config import DEFAULTS, CaptureConfig
-from univoxel.capture.engine import Engine, find_engine
 from univoxel.capture.grouping import in_words
 from univoxel.capture.model import Model, without
 from univoxel.capture.photographs import find_photographs, require_readers
@@ -33,6 +32,7 @@ from univoxel.capture.scene import (
     write_scene,
     written_name,
 )
+from univoxel.capture.sfm import require_pycolmap
 from univoxel.capture.world import moved, settle
 from univoxel.errors import DataError, ExistingFile, StillBackground
 from univoxel.files import replacing
@@ -78,7 +78,7 @@ def poses(
         config: how cameras are found.
 
     Raises:
-        MissingExtra: no pycolmap and no `colmap`, or no reader of a format.
+        MissingExtra: no pycolmap, or no reader of a format.
         DataError: photographs that cannot be used, or too few that can be placed; as
             StillBackground where an object was turned before a still camera, and there are no
             masks.
@@ -88,7 +88,7 @@ def poses(
     """
     source, out = Path(photographs), Path(out)
     masks = None if masks is None else Path(masks)
-    engine = find_engine()
+    require_pycolmap()
     folders = Folders(out / WORK)
     _check_free(out, folders)
     files, others, doubles = photographs_of(source, folders, every)
@@ -96,7 +96,7 @@ def poses(
     capture, unread = gather(files, masks)
     unread += others
     log.info(in_words(capture.photographs, capture.groups) + _aside(unread, doubles))
-    settings = _settings(engine, source, masks, every, config, capture)
+    settings = _settings(source, masks, every, config, capture)
     if _begin(out, folders, settings, {"keep_size": keep_size, "keep_weak": keep_weak}):
         log.info(f"{out} is done")
         return out
@@ -106,7 +106,7 @@ def poses(
         TextColumn("{task.completed:.0f}/{task.total:.0f}"),
         TimeRemainingColumn(),
     ) as progress:
-        unreadable = _search(engine, capture, folders, config, progress)
+        unreadable = _search(capture, folders, config, progress)
         found = _judge(capture, folders, config, unreadable)
         _say(capture, found, len(capture.photographs), keep_weak)
         left_out = set() if keep_weak else set(found.weak)
@@ -168,7 +168,6 @@ def photographs_of(
 
 
 def _settings(
-    engine: Engine,
     source: Path,
     masks: Path | None,
     every: float | None,
@@ -178,7 +177,7 @@ def _settings(
     """What decides the cameras: the same settings go on with the same work."""
     files = [p.path for p in capture.photographs] + list(capture.masks or [])
     return {
-        "engine": engine,
+        "engine": "pycolmap",
         "source": str(source.absolute()),
         "masks": None if masks is None else str(masks.absolute()),
         "every": every,
@@ -209,7 +208,7 @@ def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
 
 
 def _search(
-    engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig, progress: Progress
+    capture: Capture, folders: Folders, config: CaptureConfig, progress: Progress
 ) -> dict[int, str]:
     """All steps up to the models; returns why photographs could not be read, by index.
 
@@ -227,18 +226,18 @@ def _search(
     if unreadable:
         names = [capture.photographs[i].path.name for i in unreadable]
         log.warning(f"{len(names)} could not be read: {_some(names)}")
-    found = structure.extract(engine, capture, folders, config)
+    found = structure.extract(capture, folders, config)
     _follow(progress, "features", found, total)
     _follow(progress, "choosing pairs", structure.select(capture, folders, config), total)
     pairs = structure.pair_count(folders)
-    _follow(progress, "matching", structure.match(engine, capture, folders, config), pairs)
+    _follow(progress, "matching", structure.match(capture, folders, config), pairs)
     still, matching = checks.still(database.verified_pairs(folders.database))
     if still > config.still_share * matching:
         stands = f"the background stands still in {still} of {matching} pairs"
         if capture.masks is None:
             raise StillBackground(stands)
         raise DataError(f"{stands}: masks hold a part of it, make them tighter", "masks")
-    _follow(progress, "placing", structure.place(engine, capture, folders, config), total)
+    _follow(progress, "placing", structure.place(capture, folders, config), total)
     return unreadable
 
 
