@@ -17,7 +17,7 @@ LAYERS = [
         "threads",
         "validation",
     },
-    {"cluster"},
+    {"cluster", "steps"},
     {"brdf", "camera", "color", "grid", "sphere"},
     {"ops"},
     {"envmap", "networks", "orbit", "poses"},

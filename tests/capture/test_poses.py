@@ -18,6 +18,7 @@ import textured_room
 from PIL import Image
 
 import univoxel
+from univoxel import steps
 from univoxel.capture import database, evidence, sfm, structure
 from univoxel.capture.config import CaptureConfig
 from univoxel.capture.photographs import find_photographs
@@ -202,6 +203,54 @@ def test_a_search_goes_on_from_what_is_there(scene, photographs, tmp_path, monke
     assert {max(lens.width, lens.height) for lens in lenses} == {200}
     centres, _ = aligned(again, {v: _view(v) for v in range(VIEWS)})
     assert centres.max() < 0.01 * 2.2
+
+
+def as_of_0_2(work: Path) -> None:
+    """Put the notes of version 0.2 in the place of ours."""
+    settings = steps.recorded(work, "search")
+    (work / "request.json").write_text(json.dumps(settings))
+    for name in ("matched", "models/done"):
+        (work / name).touch()
+    (work / steps.FILE).unlink()
+
+
+def test_a_search_of_version_0_2_is_gone_on_with(scene, photographs, tmp_path, monkeypatch):
+    out, _ = scene
+    before, begun = tmp_path / "before", tmp_path / "begun"
+    shutil.copytree(out, before)
+    shutil.copytree(out / "sfm", begun / "sfm")
+    for folder in (before, begun):
+        as_of_0_2(folder / "sfm")
+    (begun / "sfm/models/done").unlink()
+    ran, run = [], structure.run
+    monkeypatch.setattr(structure, "run", lambda r, *rest: ran.append(r.step) or run(r, *rest))
+    images = (before / "sparse/0/images.bin").stat().st_mtime_ns
+    poses(photographs, before, config=SMALL)
+    assert ran == []
+    assert (before / "sparse/0/images.bin").stat().st_mtime_ns == images
+    with pytest.raises(ExistingFile, match="holds another scene"):
+        poses(photographs, before)
+    poses(photographs, begun, config=SMALL)
+    assert ran == ["map"]
+    centres, _ = aligned(begun, {v: _view(v) for v in range(VIEWS)})
+    assert centres.max() < 0.01 * 2.2
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_an_unfinished_search_with_other_settings_begins_anew(
+    scene, photographs, tmp_path, monkeypatch, older
+):
+    work = tmp_path / "sfm"
+    shutil.copytree(scene[0] / "sfm", work)
+    if older:
+        as_of_0_2(work)
+    monkeypatch.setattr(subprocess, "Popen", None)
+    with pytest.raises(TypeError):  # it is about to find features
+        poses(photographs, tmp_path, config=replace(SMALL, features=500))
+    assert not (work / "database.db").exists()
+    assert not (work / "models").exists()
+    assert steps.recorded(work, "search")["config"]["features"] == 500
+    assert steps.recorded(work, "matches") is None
 
 
 def test_features_are_found_once_in_the_camera_that_was_begun(scene, photographs, tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -38,11 +37,6 @@ class Folders:
     work: Path
 
     @property
-    def request(self) -> Path:
-        """What the work was begun with."""
-        return self.work / "request.json"
-
-    @property
     def frames(self) -> Path:
         """Of a video."""
         return self.work / "frames"
@@ -62,11 +56,6 @@ class Folders:
     @property
     def pairs(self) -> Path:
         return self.work / "pairs.txt"
-
-    @property
-    def matched(self) -> Path:
-        """There when all pairs are matched."""
-        return self.work / "matched"
 
     @property
     def models(self) -> Path:
@@ -150,14 +139,6 @@ def read_mask(capture: Capture, index: int) -> Image.Image:
             f"{photograph.width}x{photograph.height} pixels, got {mask.width}x{mask.height}"
         )
     return mask
-
-
-def start_over(folders: Folders) -> None:
-    """Remove all work but the frames of a video."""
-    for path in (folders.pictures, folders.masks, folders.models):
-        shutil.rmtree(path, ignore_errors=True)
-    for path in (*folders.work.glob("database.db*"), folders.pairs, folders.matched):
-        path.unlink(missing_ok=True)
 
 
 def _write_picture(

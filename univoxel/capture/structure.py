@@ -1,4 +1,4 @@
-"""Features, pairs, matches and models of a capture. Each step goes on where it stopped."""
+"""Features, pairs, matches and models of a capture. Features go on where they stopped."""
 
 from __future__ import annotations
 
@@ -48,8 +48,6 @@ def extract(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterat
 
 def select(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Write which pairs to match; yields how many photographs were compared with all others."""
-    if folders.pairs.exists():
-        return
     pictures = capture.pictures
     numbers = database.images(folders.database)
     there = [i for i, name in enumerate(pictures) if name in numbers]
@@ -73,14 +71,11 @@ def select(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterato
 
 def match(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Match the chosen pairs and verify them; yields how many are done."""
-    if folders.matched.exists():
-        return
     yield from run(
         _request("match", capture, folders, config),
         folders.work / "match.log",
         lambda: database.count(folders.database, "two_view_geometries"),
     )
-    folders.matched.touch()
 
 
 def pair_count(folders: Folders) -> int:
@@ -90,13 +85,9 @@ def pair_count(folders: Folders) -> int:
 
 def place(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Find the cameras; yields how many photographs were placed, in all tries together."""
-    done = folders.models / "done"
-    if done.exists():
-        return
     shutil.rmtree(folders.models, ignore_errors=True)
     folders.models.mkdir(parents=True)
     yield from run(_request("map", capture, folders, config), folders.work / "map.log")
-    done.touch()
 
 
 def models(folders: Folders) -> list[Model]:

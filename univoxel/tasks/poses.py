@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import platform
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -14,14 +13,14 @@ from pathlib import Path
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from univoxel import __version__
+from univoxel import __version__, steps
 from univoxel.bars import bar
 from univoxel.capture import checks, database, evidence, structure, video
 from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.capture.grouping import in_words
 from univoxel.capture.model import Model, without
 from univoxel.capture.photographs import find_photographs, require_readers
-from univoxel.capture.prepare import Capture, Folders, gather, start_over, write_pictures
+from univoxel.capture.prepare import Capture, Folders, gather, write_pictures
 from univoxel.capture.scene import (
     PARTIAL,
     REPORT,
@@ -35,13 +34,16 @@ from univoxel.capture.scene import (
 from univoxel.capture.sfm import require_pycolmap
 from univoxel.capture.world import moved, settle
 from univoxel.errors import DataError, ExistingFile, StillBackground
-from univoxel.files import replacing
+from univoxel.files import read_json
 from univoxel.names import KEEP_SIZE
 from univoxel.sphere import gaps
 
 log: logging.Logger = logging.getLogger("univoxel")
 
 WORK = "sfm"  # folder in the scene that the steps keep their results in
+# Steps that are noted in it: those of the search, with its settings, and what stands by itself
+SEARCH, FRAMES, SCENE = "search", "frames", "scene"
+PARTS = FEATURES, PAIRS, MATCHES, MODELS = "features", "pairs", "matches", "models"
 NAMED = 5  # photographs that a message names at most
 
 
@@ -89,7 +91,7 @@ def poses(
     source, out = Path(photographs), Path(out)
     masks = None if masks is None else Path(masks)
     require_pycolmap()
-    folders = Folders(out / WORK)
+    folders = folders_of(out)
     _check_free(out, folders)
     files, others, doubles = photographs_of(source, folders, every)
     require_readers(files)
@@ -97,7 +99,8 @@ def poses(
     unread += others
     log.info(in_words(capture.photographs, capture.groups) + _aside(unread, doubles))
     settings = _settings(source, masks, every, config, capture)
-    if _begin(out, folders, settings, {"keep_size": keep_size, "keep_weak": keep_weak}):
+    used = {"keep_size": keep_size, "keep_weak": keep_weak}
+    if _begin(out, folders, settings, used):
         log.info(f"{out} is done")
         return out
     with bar(
@@ -106,7 +109,7 @@ def poses(
         TextColumn("{task.completed:.0f}/{task.total:.0f}"),
         TimeRemainingColumn(),
     ) as progress:
-        unreadable = _search(capture, folders, config, progress)
+        unreadable = _search(capture, folders, config, settings, progress)
         found = _judge(capture, folders, config, unreadable)
         _say(capture, found, len(capture.photographs), keep_weak)
         left_out = set() if keep_weak else set(found.weak)
@@ -123,12 +126,31 @@ def poses(
         centres = np.stack([image.centre for image in model.images])
         for gap in gaps(centres, names, config.gap):
             log.info(gap)
+        steps.forget(folders.work, SCENE)
         written = write_scene(out, capture, model, wanted, keep_size)
         _follow(progress, "writing", written, len(wanted))
-    used = {"keep_size": keep_size, "keep_weak": keep_weak}
     reports = [_written(r, wanted, i, capture) for i, r in enumerate(found.reports)]
     write_report(out, {**settings, **used, "versions": _versions()}, model, reports)
+    steps.finish(folders.work, SCENE, used)
     return out
+
+
+def folders_of(out: Path) -> Folders:
+    """Where the work of a scene lies; what version 0.2 left files for is noted as steps."""
+    folders = Folders(out / WORK)
+    noted, begun = {}, folders.work / "request.json"
+    if (frames := folders.frames / "done").exists():
+        noted[FRAMES] = read_json(frames)
+    if begun.exists():
+        settings = read_json(begun)
+        marks = {PAIRS: "pairs.txt", MATCHES: "matched", MODELS: "models/done"}
+        done = [step for step, name in marks.items() if (folders.work / name).exists()]
+        noted |= dict.fromkeys((SEARCH, *done), settings)
+    if begun.exists() and (out / REPORT).exists():
+        report = read_json(out / REPORT)
+        noted[SCENE] = {key: report.get(key) for key in ("keep_size", "keep_weak")}
+    steps.adopt(folders.work, noted)
+    return folders
 
 
 def _check_free(out: Path, folders: Folders) -> None:
@@ -140,7 +162,7 @@ def _check_free(out: Path, folders: Folders) -> None:
     if not out.exists() or (out / REPORT).exists():
         return
     # Written last, one after the other
-    begun = WRITTEN if folders.request.exists() else ()
+    begun = WRITTEN if steps.recorded(folders.work, SEARCH) else ()
     foreign = [p.name for p in out.iterdir() if p.name not in (WORK, PARTIAL, *begun)]
     if foreign:
         raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
@@ -152,13 +174,13 @@ def photographs_of(
     """Photographs of a folder or frames of a video; other files; how many came twice."""
     if video.is_video(source):
         video.require_ffmpeg()
-        stamp = json.dumps([source.name, source.stat().st_size, source.stat().st_mtime, every])
-        done = folders.frames / "done"
-        if not done.exists() or done.read_text(encoding="utf-8") != stamp:
+        stamp = [source.name, source.stat().st_size, source.stat().st_mtime, every]
+        if steps.recorded(folders.work, FRAMES) != stamp:
             log.info(f"{source}: choosing frames")
+            steps.forget(folders.work, FRAMES)
             shutil.rmtree(folders.frames, ignore_errors=True)
             video.write_frames(source, folders.frames, every)
-            done.write_text(stamp, encoding="utf-8")
+            steps.finish(folders.work, FRAMES, stamp)
         return sorted(folders.frames.glob("*.jpg")), [], 0
     if every is not None:
         raise DataError(f"{source}: every is for videos ({' '.join(video.SUFFIXES)})", "every")
@@ -187,28 +209,37 @@ def _settings(
 
 
 def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
-    """Make the folders; whether all is done already.
+    """Begin a search, or go on with it; whether all is done already.
 
     Raises:
         ExistingFile: out holds what is not of this search.
     """
-    asked, report = folders.request, out / REPORT
-    same = asked.exists() and json.loads(asked.read_text(encoding="utf-8")) == settings
-    if report.exists():
-        record = json.loads(report.read_text(encoding="utf-8"))
-        if not same:
-            raise ExistingFile(f"{out} holds another scene: choose another out", "out")
-        return all(record.get(key) == value for key, value in written.items())
-    if not same:
-        start_over(folders)
-        folders.work.mkdir(parents=True, exist_ok=True)
-        with replacing(asked) as temporary:
-            temporary.write_text(json.dumps(settings), encoding="utf-8")
+    if (out / REPORT).exists():
+        other = ExistingFile(f"{out} holds another scene: choose another out", "out")
+        if not steps.done(folders.work, SEARCH, settings, lambda _: other):
+            raise other
+        return steps.recorded(folders.work, SCENE) == written
+    if steps.recorded(folders.work, SEARCH) != steps.as_json(settings):  # and nothing came of it
+        _start_over(folders)
+        steps.finish(folders.work, SEARCH, settings)
     return False
 
 
+def _start_over(folders: Folders) -> None:
+    """Remove all work but the frames of a video."""
+    steps.forget(folders.work, SEARCH, *PARTS)
+    for path in (folders.pictures, folders.masks, folders.models):
+        shutil.rmtree(path, ignore_errors=True)
+    for path in (*folders.work.glob("database.db*"), folders.pairs):
+        path.unlink(missing_ok=True)
+
+
 def _search(
-    capture: Capture, folders: Folders, config: CaptureConfig, progress: Progress
+    capture: Capture,
+    folders: Folders,
+    config: CaptureConfig,
+    settings: dict,
+    progress: Progress,
 ) -> dict[int, str]:
     """All steps up to the models; returns why photographs could not be read, by index.
 
@@ -226,18 +257,22 @@ def _search(
     if unreadable:
         names = [capture.photographs[i].path.name for i in unreadable]
         log.warning(f"{len(names)} could not be read: {_some(names)}")
-    found = structure.extract(capture, folders, config)
-    _follow(progress, "features", found, total)
-    _follow(progress, "choosing pairs", structure.select(capture, folders, config), total)
-    pairs = structure.pair_count(folders)
-    _follow(progress, "matching", structure.match(capture, folders, config), pairs)
+
+    def do(step: str, part: Callable[..., Iterator[int]], total: int) -> None:
+        if not steps.done(folders.work, step, settings):
+            _follow(progress, step, part(capture, folders, config), total)
+            steps.finish(folders.work, step, settings)
+
+    do(FEATURES, structure.extract, total)
+    do(PAIRS, structure.select, total)
+    do(MATCHES, structure.match, structure.pair_count(folders))
     still, matching = checks.still(database.verified_pairs(folders.database))
     if still > config.still_share * matching:
         stands = f"the background stands still in {still} of {matching} pairs"
         if capture.masks is None:
             raise StillBackground(stands)
         raise DataError(f"{stands}: masks hold a part of it, make them tighter", "masks")
-    _follow(progress, "placing", structure.place(capture, folders, config), total)
+    do(MODELS, structure.place, total)
     return unreadable
 
 
