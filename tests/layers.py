@@ -109,8 +109,7 @@ HELPERS = {
     "report": {"drawing", "light", "photographs", "sides", "training"},
     "viewer": {"subject", "denoise", "frames", "film", "hosting", "incident", "studio"},
     "capture": {
-        *("config", "photographs", "grouping", "turning", "database", "pairs", "sfm", "model"),
-        *("prepare", "video", "evidence"),
+        *("config", "photographs", "database", "sfm", "model", "prepare", "video"),
     },
     "commands": {"arguments"},
 }

@@ -19,12 +19,13 @@ from PIL import Image
 
 import univoxel
 from univoxel import steps
-from univoxel.capture import database, evidence, sfm, structure
+from univoxel.capture import database, pose_validation, sfm, structure
 from univoxel.capture.config import CaptureConfig
 from univoxel.capture.photographs import find_photographs
 from univoxel.capture.prepare import Folders, gather
 from univoxel.data.colmap import read_cameras, read_images
 from univoxel.errors import DataError, ExistingFile, MissingExtra, ProcessFailed
+from univoxel.tasks import poses as poses_task
 from univoxel.tasks.poses import poses
 
 # Enough for pictures of this size, and pairs are chosen as in large sets
@@ -208,6 +209,7 @@ def test_a_search_goes_on_from_what_is_there(scene, photographs, tmp_path, monke
 def as_of_0_2(work: Path) -> None:
     """Put the notes of version 0.2 in the place of ours."""
     settings = steps.recorded(work, "search")
+    settings["config"] |= poses_task.CONSTANTS_0_2
     (work / "request.json").write_text(json.dumps(settings))
     for name in ("matched", "models/done"):
         (work / name).touch()
@@ -436,16 +438,16 @@ def test_matches_of_right_places_fit_and_of_a_wrong_one_do_not(scene):
     """The database's matches against the model as it was found, and with one picture turned."""
     folders = Folders(scene[0] / "sfm")
     model = structure.models(folders)[0]
-    features, limit = database.positions(folders.database), SMALL.fitting_pixels
+    features = database.positions(folders.database)
 
     def shares(model):
-        found = evidence.partners(model, database.matches(folders.database), features, limit)
+        found = pose_validation.partners(model, database.matches(folders.database), features)
         return {
             n: sum(p.fitting for p in those) / sum(p.matches for p in those)
             for n, those in found.items()
         }
 
-    assert min(shares(model).values()) > SMALL.fitting_share
+    assert min(shares(model).values()) > pose_validation.FITTING_SHARE
     first = model.images[0]
     angle = np.radians(3.0)
     turn = np.array(
@@ -453,5 +455,5 @@ def test_matches_of_right_places_fit_and_of_a_wrong_one_do_not(scene):
     )
     wrong = replace(first, to_camera=turn @ first.to_camera)
     spoilt = shares(replace(model, images=[wrong, *model.images[1:]]))
-    assert spoilt[first.number] < SMALL.contradicted_share
+    assert spoilt[first.number] < pose_validation.CONTRADICTED_SHARE
     assert min(share for n, share in spoilt.items() if n != first.number) > 0.8

@@ -15,24 +15,23 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from univoxel import __version__, steps
 from univoxel.bars import bar
-from univoxel.capture import checks, database, evidence, structure, video
+from univoxel.capture import database, pose_validation, structure, video
 from univoxel.capture.config import DEFAULTS, CaptureConfig
-from univoxel.capture.grouping import in_words
 from univoxel.capture.model import Model, without
 from univoxel.capture.photographs import find_photographs, require_readers
-from univoxel.capture.prepare import Capture, Folders, gather, write_pictures
+from univoxel.capture.prepare import Capture, Folders, gather, in_words, write_pictures
 from univoxel.capture.scene import (
     PARTIAL,
     REPORT,
     WRITTEN,
     Report,
+    gauge_aligned,
     own_sizes,
     write_report,
     write_scene,
     written_name,
 )
 from univoxel.capture.sfm import require_pycolmap
-from univoxel.capture.world import moved, settle
 from univoxel.errors import DataError, ExistingFile, StillBackground
 from univoxel.files import read_json
 from univoxel.names import KEEP_SIZE
@@ -44,6 +43,19 @@ WORK = "sfm"  # folder in the scene that the steps keep their results in
 # Steps that are noted in it: those of the search, with its settings, and what stands by itself
 SEARCH, FRAMES, SCENE = "search", "frames", "scene"
 PARTS = FEATURES, PAIRS, MATCHES, MODELS = "features", "pairs", "matches", "models"
+# Share of pairs whose match is a shift alone, from where on the background stands still while the
+# object turns: on a turntable it was .6, elsewhere 0, with poor masks .04
+STILL_SHARE = 0.2
+PLACED_SHARE = 0.8  # of the photographs, below which the capture is no use
+GAP = 60.0  # degrees between neighbouring directions that are worth a word
+# What version 0.2 noted of the configuration that are constants now
+CONSTANTS_0_2 = {
+    **{"coarse_features": 512, "coarse_photographs": 150, "ratio": 0.8, "neighbours": 3},
+    **{"mask_margin": 0.006, "still_share": 0.2, "weak_share": 0.2, "weak_points": 50},
+    **{"weak_partners": 3, "fitting_share": 0.9, "fitting_pixels": 3.0, "weak_doubt": 0.3},
+    **{"contradicted_share": 0.5, "placed_share": 0.8, "gap": 60.0},
+    **{"base_seconds": 120.0, "photograph_seconds": 30.0},
+}
 NAMED = 5  # photographs that a message names at most
 
 
@@ -110,7 +122,7 @@ def poses(
         TimeRemainingColumn(),
     ) as progress:
         unreadable = _search(capture, folders, config, settings, progress)
-        found = _judge(capture, folders, config, unreadable)
+        found = _judge(capture, folders, unreadable)
         _say(capture, found, len(capture.photographs), keep_weak)
         left_out = set() if keep_weak else set(found.weak)
         model = without(found.model, left_out) if left_out else found.model
@@ -118,13 +130,12 @@ def poses(
         ordered = sorted(model.images, key=lambda i: index[i.name])
         wanted = [index[image.name] for image in ordered]
         model = own_sizes(Model(model.cameras, ordered, model.points), capture, keep_size)
-        similarity, known = settle(model.images)
-        model = moved(model, similarity)
+        model, known = gauge_aligned(model)
         if not known:
             log.warning("the cameras do not say what is up: the world may be askew")
         names = [image.name for image in model.images]
         centres = np.stack([image.centre for image in model.images])
-        for gap in gaps(centres, names, config.gap):
+        for gap in gaps(centres, names, GAP):
             log.info(gap)
         steps.forget(folders.work, SCENE)
         written = write_scene(out, capture, model, wanted, keep_size)
@@ -143,6 +154,8 @@ def folders_of(out: Path) -> Folders:
         noted[FRAMES] = read_json(frames)
     if begun.exists():
         settings = read_json(begun)
+        config = settings["config"].items()  # where another value was, these are other settings
+        settings["config"] = {k: v for k, v in config if CONSTANTS_0_2.get(k) != v}
         marks = {PAIRS: "pairs.txt", MATCHES: "matched", MODELS: "models/done"}
         done = [step for step, name in marks.items() if (folders.work / name).exists()]
         noted |= dict.fromkeys((SEARCH, *done), settings)
@@ -250,7 +263,7 @@ def _search(
     total = len(capture.photographs)
     unreadable = {}
     task = progress.add_task("reading", total=total)
-    for index, why in write_pictures(capture, folders, config.size, config.mask_margin):
+    for index, why in write_pictures(capture, folders, config.size):
         progress.advance(task)
         if why is not None:
             unreadable[index] = why
@@ -266,8 +279,8 @@ def _search(
     do(FEATURES, structure.extract, total)
     do(PAIRS, structure.select, total)
     do(MATCHES, structure.match, structure.pair_count(folders))
-    still, matching = checks.still(database.verified_pairs(folders.database))
-    if still > config.still_share * matching:
+    still, matching = pose_validation.still(database.verified_pairs(folders.database))
+    if still > STILL_SHARE * matching:
         stands = f"the background stands still in {still} of {matching} pairs"
         if capture.masks is None:
             raise StillBackground(stands)
@@ -284,9 +297,7 @@ def _follow(progress: Progress, name: str, steps: Iterable[int], total: int) -> 
     progress.update(task, completed=total)
 
 
-def _judge(
-    capture: Capture, folders: Folders, config: CaptureConfig, unreadable: dict[int, str]
-) -> Found:
+def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Found:
     """The largest model, and what is known of each photograph.
 
     Raises:
@@ -299,12 +310,12 @@ def _judge(
     placed = {i.number: i for i in models[0].images} if models else {}
     elsewhere = {i.number: len(m.images) - 1 for m in reversed(models[1:]) for i in m.images}
     errors = models[0].errors() if models else {}
-    weak = _weak(models[0], folders, errors, config) if models else {}
+    weak = _weak(models[0], folders, errors) if models else {}
     reports = []
     for index, name in enumerate(capture.pictures):
         photograph = capture.photographs[index].path.name
         number = numbers.get(name, (None, None))[0]
-        partners = sum(n >= checks.NEEDED for a, b, n, _ in pairs if number in (a, b))
+        partners = sum(n >= pose_validation.NEEDED for a, b, n, _ in pairs if number in (a, b))
         if number in placed:
             points = placed[number].points
             reason = weak.get(number, "")
@@ -312,9 +323,11 @@ def _judge(
                 Report(photograph, True, points, errors[number], partners, reason=reason)
             )
             continue
-        reason = unreadable.get(index) or checks.why_not(number, features, pairs, elsewhere)
+        reason = unreadable.get(index) or pose_validation.why_not(
+            number, features, pairs, elsewhere
+        )
         reports.append(Report(photograph, False, partners=partners, reason=reason))
-    if len(placed) < config.placed_share * len(reports):
+    if len(placed) < PLACED_SHARE * len(reports):
         missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
         raise DataError(
             f"only {len(placed)} of {len(reports)} photographs could be placed: take more of them, "
@@ -323,18 +336,15 @@ def _judge(
     return Found(models[0], weak, reports)
 
 
-def _weak(
-    model: Model, folders: Folders, errors: dict[int, float], config: CaptureConfig
-) -> dict[int, str]:
+def _weak(model: Model, folders: Folders, errors: dict[int, float]) -> dict[int, str]:
     """Placed pictures whose poses are not trusted, and why."""
-    partners = evidence.partners(
+    partners = pose_validation.partners(
         model,
         database.matches(folders.database),
         database.positions(folders.database),
-        config.fitting_pixels,
     )
-    doubts = {i.number: evidence.doubt(model, i, errors[i.number]) for i in model.images}
-    return checks.weak({i.number: i.points for i in model.images}, partners, doubts, config)
+    doubts = {i.number: pose_validation.doubt(model, i, errors[i.number]) for i in model.images}
+    return pose_validation.weak({i.number: i.points for i in model.images}, partners, doubts)
 
 
 def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
