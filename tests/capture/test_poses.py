@@ -252,7 +252,7 @@ def test_an_unfinished_search_with_other_settings_begins_anew(
     assert not (work / "database.db").exists()
     assert not (work / "models").exists()
     assert steps.recorded(work, "search")["config"]["features"] == 500
-    assert steps.recorded(work, "matches") is None
+    assert steps.recorded(work, "matching") is None
 
 
 def test_features_are_found_once_in_the_camera_that_was_begun(scene, photographs, tmp_path):

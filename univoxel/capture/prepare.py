@@ -29,36 +29,17 @@ MASK_MARGIN = 0.006  # that masks grow by before features are sought, of the lon
 ASPECT = 0.02  # relative difference of sides' ratios up to which a mask is of the same picture
 
 
-@dataclass(frozen=True)
 class Folders:
     """Where the work of one capture lies, all below one folder."""
 
-    work: Path
-
-    @property
-    def frames(self) -> Path:
-        """Of a video."""
-        return self.work / "frames"
-
-    @property
-    def pictures(self) -> Path:
-        return self.work / "pictures"
-
-    @property
-    def masks(self) -> Path:
-        return self.work / "masks"
-
-    @property
-    def database(self) -> Path:
-        return self.work / "database.db"
-
-    @property
-    def pairs(self) -> Path:
-        return self.work / "pairs.txt"
-
-    @property
-    def models(self) -> Path:
-        return self.work / "models"
+    def __init__(self, work: Path) -> None:
+        self.work = work
+        self.frames = work / "frames"  # of a video
+        self.pictures = work / "pictures"
+        self.masks = work / "masks"
+        self.database = work / "database.db"
+        self.pairs = work / "pairs.txt"
+        self.models = work / "models"
 
 
 @dataclass(frozen=True)

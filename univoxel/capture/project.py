@@ -35,42 +35,20 @@ class Given:
         return _words(self.files)
 
 
-@dataclass(frozen=True)
 class Project:
     """Where the parts of a capture lie, all below one folder."""
 
-    out: Path
-
-    @property
-    def scene(self) -> Path:
-        """Photographs and their cameras, as `univoxel poses` writes them."""
-        return self.out / "scene"
-
-    @property
-    def masks(self) -> Path:
-        """Of single photographs, of a turntable, made before there are cameras."""
-        return self.out / "masks"
-
-    @property
-    def cut(self) -> Path:
-        """Photographs with masks, as `univoxel cutout` writes them: what is trained on."""
-        return self.out / "cut"
-
-    @property
-    def run(self) -> Path:
-        return self.out / "run"
-
-    @property
-    def pictures(self) -> Path:
-        return self.out / "pictures"
-
-    @property
-    def mesh(self) -> Path:
-        return self.out / f"{self.out.absolute().name}.glb"
-
-    @property
-    def page(self) -> Path:
-        return self.out / "index.html"
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self.scene = out / "scene"  # photographs and cameras, as `univoxel poses` writes them
+        self.masks = (
+            out / "masks"
+        )  # of single photographs, of a turntable, before there are cameras
+        self.cut = out / "cut"  # photographs with masks, as `univoxel cutout` writes them
+        self.run = out / "run"
+        self.pictures = out / "pictures"
+        self.mesh = out / f"{out.absolute().name}.glb"
+        self.page = out / "index.html"
 
 
 def look_at(path: Path) -> Given:

@@ -6,7 +6,7 @@ import logging
 import platform
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -42,7 +42,7 @@ log: logging.Logger = logging.getLogger("univoxel")
 WORK = "sfm"  # folder in the scene that the steps keep their results in
 # Steps that are noted in it: those of the search, with its settings, and what stands by itself
 SEARCH, FRAMES, SCENE = "search", "frames", "scene"
-PARTS = FEATURES, PAIRS, MATCHES, MODELS = "features", "pairs", "matches", "models"
+PARTS = FEATURES, PAIRS, MATCHES, MODELS = "features", "choosing pairs", "matching", "placing"
 # Share of pairs whose match is a shift alone, from where on the background stands still while the
 # object turns: on a turntable it was .6, elsewhere 0, with poor masks .04
 STILL_SHARE = 0.2
@@ -140,7 +140,9 @@ def poses(
         steps.forget(folders.work, SCENE)
         written = write_scene(out, capture, model, wanted, keep_size)
         _follow(progress, "writing", written, len(wanted))
-    reports = [_written(r, wanted, i, capture) for i, r in enumerate(found.reports)]
+    reports = list(found.reports)
+    for i in wanted:
+        reports[i] = replace(reports[i], written=written_name(capture.photographs[i]))
     write_report(out, {**settings, **used, "versions": _versions()}, model, reports)
     steps.finish(folders.work, SCENE, used)
     return out
@@ -289,10 +291,10 @@ def _search(
     return unreadable
 
 
-def _follow(progress: Progress, name: str, steps: Iterable[int], total: int) -> None:
+def _follow(progress: Progress, name: str, parts: Iterable[int], total: int) -> None:
     """Show how far a step is while it runs."""
     task = progress.add_task(name, total=total)
-    for done in steps:
+    for done in parts:
         progress.update(task, completed=min(done, total))
     progress.update(task, completed=total)
 
@@ -373,11 +375,6 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
             "photograph that side again with more overlap",
             extra={"arguments": ("keep_weak",)},
         )
-
-
-def _written(report: Report, wanted: list[int], index: int, capture: Capture) -> Report:
-    name = written_name(capture.photographs[index]) if index in wanted else ""
-    return Report(**{**asdict(report), "written": name})
 
 
 def _aside(unread: list[str], doubles: int) -> str:
