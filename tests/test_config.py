@@ -24,6 +24,7 @@ from univoxel.lights.sg import SGConfig
 from univoxel.names import LIGHTS
 from univoxel.presets import PRESETS, budget, chosen, preset, with_field, with_metal, work_in
 from univoxel.scene import SceneConfig
+from univoxel.training.clock import expected_seconds
 
 STAGE = StageConfig(voxels=1.0, iterations=10, share=1.0)
 CONFIG = TrainConfig(Path("photos"), Path("run"), (STAGE,), minutes=1.0)

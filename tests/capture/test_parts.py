@@ -7,9 +7,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from univoxel.capture.checks import still, why_not
 from univoxel.capture.config import CaptureConfig
-from univoxel.capture.grouping import group, in_words
 from univoxel.capture.model import (
     NO_POINT,
     TRACK,
@@ -21,16 +19,13 @@ from univoxel.capture.model import (
     without,
     write_model,
 )
-from univoxel.capture.pairs import choose, features_each, similarities
 from univoxel.capture.photographs import Photograph
-from univoxel.capture.prepare import Capture
-from univoxel.capture.scene import own_sizes
-from univoxel.capture.turning import points_back, to_camera_back, to_landscape
-from univoxel.capture.world import moved, settle
+from univoxel.capture.pose_validation import still, why_not
+from univoxel.capture.prepare import Capture, group, in_words, to_landscape
+from univoxel.capture.scene import gauge_aligned, own_sizes, points_back, to_camera_back
+from univoxel.capture.structure import choose, features_each, similarities
 from univoxel.data.lens import Lens
 from univoxel.errors import ConfigError
-
-CONFIG = CaptureConfig()
 
 
 def photo(name="a.jpg", width=40, height=30, camera="", focal=(0.0, 0.0)) -> Photograph:
@@ -95,7 +90,7 @@ def test_similarities_count_mutual_clear_matches():
         b[row] = a[20] + step * _features(9)[row]
         b[row] /= np.linalg.norm(b[row])
     features = [a, b, np.zeros((0, 128), np.float32), _features(2, 25)]
-    found = np.stack(list(similarities(features, 0.8)))
+    found = np.stack(list(similarities(features)))
     expected = np.zeros_like(found)
     for i, own in enumerate(features):
         for j, other in enumerate(features):
@@ -113,10 +108,9 @@ def test_similarities_count_mutual_clear_matches():
 
 
 def test_pairs_are_the_best_partners_and_the_next_by_name():
-    config = CaptureConfig(partners=2, neighbours=1)
     similar = np.zeros((6, 6), int)
     similar[0, 3], similar[0, 5], similar[0, 2] = 30, 20, 10
-    pairs = choose(similar, config)
+    pairs = choose(similar, partners=2)
     assert {(0, 3), (0, 5)} <= set(pairs)
     assert {(i, i + 1) for i in range(5)} <= set(pairs)
     assert all(i < j for i, j in pairs)
@@ -124,8 +118,8 @@ def test_pairs_are_the_best_partners_and_the_next_by_name():
 
 
 def test_the_work_of_choosing_pairs_is_bounded():
-    assert features_each(60, CONFIG) == features_each(150, CONFIG) == 512
-    work = [n**2 * features_each(n, CONFIG) ** 2 for n in (150, 400, 1000)]
+    assert features_each(60) == features_each(150) == 512
+    work = [n**2 * features_each(n) ** 2 for n in (150, 400, 1000)]
     assert max(work) <= work[0]
 
 
@@ -210,8 +204,7 @@ def test_the_largest_model_comes_first(tmp_path):
 
 def test_settling_turns_up_centres_and_scales_without_moving_pictures():
     one = model(3)
-    similarity, known = settle(one.images)
-    two = moved(one, similarity)
+    two, known = gauge_aligned(one)
     assert known
     centres = np.stack([i.centre for i in two.images])
     assert np.median(np.linalg.norm(centres, axis=1)) == pytest.approx(4)
@@ -252,7 +245,7 @@ def test_left_out_images_leave_no_trace():
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"size": 10}, {"ratio": 1.0}, {"placed_share": 0.0}, {"partners": 0}, {"gap": 0.0}],
+    [{"size": 10}, {"first_octave": -2}, {"exhaustive": 1}, {"partners": 0}, {"seed": -1}],
 )
 def test_a_configuration_out_of_range_is_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image, ImageCms
 
 from univoxel.capture import photographs as module
+from univoxel.capture import prepare
 from univoxel.capture.photographs import describe, find_photographs, read_upright, require_readers
 from univoxel.capture.prepare import Folders, gather, read_mask, write_pictures
 from univoxel.errors import DataError, MissingExtra
@@ -250,13 +251,14 @@ def test_a_cut_off_photograph_is_told_when_it_is_read(tmp_path):
     (tmp_path / "b.jpg").write_bytes(data[: len(data) // 2])
     capture, unread = gather(sorted(tmp_path.glob("*.jpg")), None)
     assert unread == []
-    found = dict(write_pictures(capture, Folders(tmp_path / "work"), 32, 0.0))
+    found = dict(write_pictures(capture, Folders(tmp_path / "work"), 32))
     assert found[0] is None
     assert "b.jpg: expected a photograph" in str(found[1])
     assert [p.name for p in (tmp_path / "work/pictures/0").iterdir()] == ["00000.jpg"]
 
 
-def test_masks_are_grown_turned_and_of_the_pictures_size(tmp_path):
+def test_masks_are_grown_turned_and_of_the_pictures_size(tmp_path, monkeypatch):
+    monkeypatch.setattr(prepare, "MASK_MARGIN", 0.03)
     (tmp_path / "masks").mkdir()
     exif = Image.Exif()
     exif[ORIENTATION] = 6
@@ -269,7 +271,7 @@ def test_masks_are_grown_turned_and_of_the_pictures_size(tmp_path):
     capture, _ = gather(sorted(tmp_path.glob("*.jpg")), tmp_path / "masks")
     assert capture.groups == [[0, 1]]
     folders = Folders(tmp_path / "work")
-    assert not any(why for _, why in write_pictures(capture, folders, 100, 0.03))
+    assert not any(why for _, why in write_pictures(capture, folders, 100))
     with Image.open(folders.masks / "0/00000.jpg.png") as mask:
         a = np.asarray(mask) > 0
     assert a.shape == (60, 100)

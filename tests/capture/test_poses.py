@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import shutil
 import sqlite3
 import subprocess
@@ -16,12 +17,15 @@ import pytest
 import textured_room
 from PIL import Image
 
-from univoxel.capture import database, engine, evidence, structure
+import univoxel
+from univoxel import steps
+from univoxel.capture import database, pose_validation, sfm, structure
 from univoxel.capture.config import CaptureConfig
 from univoxel.capture.photographs import find_photographs
 from univoxel.capture.prepare import Folders, gather
 from univoxel.data.colmap import read_cameras, read_images
 from univoxel.errors import DataError, ExistingFile, MissingExtra, ProcessFailed
+from univoxel.tasks import poses as poses_task
 from univoxel.tasks.poses import poses
 
 # Enough for pictures of this size, and pairs are chosen as in large sets
@@ -191,13 +195,8 @@ def test_a_search_goes_on_from_what_is_there(scene, photographs, tmp_path, monke
     shutil.copytree(out / "sfm", again / "sfm")
     (again / "images").mkdir()
     (again / "images" / "half.jpg").touch()
-    ran = []
-    command_of = engine.command_of
-    monkeypatch.setattr(
-        engine, "command_of", lambda e, r, log: ran.append(r.step) or command_of(e, r, log)
-    )
+    monkeypatch.setattr(subprocess, "Popen", None)  # nothing may be run
     poses(photographs, again, keep_size=200, config=SMALL)
-    assert ran == []
     assert not (again / "images" / "half.jpg").exists()
     with Image.open(again / "images" / "IMG 00.jpg") as picture:
         assert picture.size == (200, 150)
@@ -205,6 +204,55 @@ def test_a_search_goes_on_from_what_is_there(scene, photographs, tmp_path, monke
     assert {max(lens.width, lens.height) for lens in lenses} == {200}
     centres, _ = aligned(again, {v: _view(v) for v in range(VIEWS)})
     assert centres.max() < 0.01 * 2.2
+
+
+def as_of_0_2(work: Path) -> None:
+    """Put the notes of version 0.2 in the place of ours."""
+    settings = steps.recorded(work, "search")
+    settings["config"] |= poses_task.CONSTANTS_0_2
+    (work / "request.json").write_text(json.dumps(settings))
+    for name in ("matched", "models/done"):
+        (work / name).touch()
+    (work / steps.FILE).unlink()
+
+
+def test_a_search_of_version_0_2_is_gone_on_with(scene, photographs, tmp_path, monkeypatch):
+    out, _ = scene
+    before, begun = tmp_path / "before", tmp_path / "begun"
+    shutil.copytree(out, before)
+    shutil.copytree(out / "sfm", begun / "sfm")
+    for folder in (before, begun):
+        as_of_0_2(folder / "sfm")
+    (begun / "sfm/models/done").unlink()
+    ran, run = [], structure.run
+    monkeypatch.setattr(structure, "run", lambda r, *rest: ran.append(r.step) or run(r, *rest))
+    images = (before / "sparse/0/images.bin").stat().st_mtime_ns
+    poses(photographs, before, config=SMALL)
+    assert ran == []
+    assert (before / "sparse/0/images.bin").stat().st_mtime_ns == images
+    with pytest.raises(ExistingFile, match="holds another scene"):
+        poses(photographs, before)
+    poses(photographs, begun, config=SMALL)
+    assert ran == ["map"]
+    centres, _ = aligned(begun, {v: _view(v) for v in range(VIEWS)})
+    assert centres.max() < 0.01 * 2.2
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_an_unfinished_search_with_other_settings_begins_anew(
+    scene, photographs, tmp_path, monkeypatch, older
+):
+    work = tmp_path / "sfm"
+    shutil.copytree(scene[0] / "sfm", work)
+    if older:
+        as_of_0_2(work)
+    monkeypatch.setattr(subprocess, "Popen", None)
+    with pytest.raises(TypeError):  # it is about to find features
+        poses(photographs, tmp_path, config=replace(SMALL, features=500))
+    assert not (work / "database.db").exists()
+    assert not (work / "models").exists()
+    assert steps.recorded(work, "search")["config"]["features"] == 500
+    assert steps.recorded(work, "matching") is None
 
 
 def test_features_are_found_once_in_the_camera_that_was_begun(scene, photographs, tmp_path):
@@ -217,12 +265,12 @@ def test_features_are_found_once_in_the_camera_that_was_begun(scene, photographs
     later = [folders.pictures / capture.pictures[i] for i in (2, 3, 20)]
     for path in later:
         path.rename(path.with_suffix(".later"))
-    list(structure.extract("pycolmap", capture, folders, SMALL))
+    list(structure.extract(capture, folders, SMALL))
     begun = database.images(folders.database)
     assert len(begun) == VIEWS + 1 - 3
     for path in later:
         path.with_suffix(".later").rename(path)
-    list(structure.extract("pycolmap", capture, folders, SMALL))
+    list(structure.extract(capture, folders, SMALL))
     found = database.images(folders.database)
     assert len(found) == VIEWS + 1
     assert begun.items() <= found.items()
@@ -298,97 +346,47 @@ def test_what_is_no_folder_of_photographs_is_one_line(tmp_path):
         poses(tmp_path, tmp_path / "out")
 
 
-def test_without_any_engine_nothing_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setenv("PATH", str(tmp_path))
+def test_without_pycolmap_nothing_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(sfm.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtra, match=r"pip install 'univoxel\[capture\]'"):
         poses(tmp_path / "not there", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-FAKE = """#!{python}
-import json, shutil, sys
-from pathlib import Path
-command, *rest = sys.argv[1:]
-if rest == ["--help"]:
-    print({helps!r}[command])
-    sys.exit(0)
-options = dict(zip(rest[::2], rest[1::2]))
-with open({log!r}, "a") as file:
-    file.write(json.dumps([command, options]) + "\\n")
-work = Path({work!r})
-if command == "feature_extractor":
-    shutil.copy(work / "database.db", options["--database_path"])
-if command == "mapper":
-    shutil.copytree(work / "models", options["--output_path"], dirs_exist_ok=True)
-"""
-HELPS = {
-    "feature_extractor": "--random_seed --SiftExtraction.use_gpu --SiftExtraction.first_octave "
-    "--SiftExtraction.max_num_features --ImageReader.single_camera --ImageReader.camera_model",
-    "matches_importer": "--random_seed --FeatureMatching.use_gpu --FeatureMatching.num_threads",
-    "mapper": "--Mapper.num_threads",
-}
-
-
-def test_colmap_on_the_path_serves(scene, photographs, tmp_path, monkeypatch):
-    """A stand-in that notes what it is asked and hands out what pycolmap found."""
-    out, _ = scene
-    told = tmp_path / "told"
-    fake = tmp_path / "bin" / "colmap"
-    fake.parent.mkdir()
-    fake.write_text(
-        FAKE.format(python=sys.executable, helps=HELPS, log=str(told), work=str(out / "sfm"))
-    )
-    fake.chmod(0o755)
-    monkeypatch.setenv("PATH", str(fake.parent))
-    find_spec = engine.importlib.util.find_spec
-    monkeypatch.setattr(
-        engine.importlib.util, "find_spec", lambda n: None if n == "pycolmap" else find_spec(n)
-    )
-    engine._options.cache_clear()
-    poses(photographs, tmp_path / "scene", config=SMALL)
-    calls = [json.loads(line) for line in told.read_text().splitlines()]
-    assert [command for command, _ in calls] == ["feature_extractor", "matches_importer", "mapper"]
-    extract, match, place = (options for _, options in calls)
-    assert extract["--SiftExtraction.use_gpu"] == "0"
-    assert extract["--SiftExtraction.max_num_features"] == "1000"
-    assert extract["--ImageReader.camera_model"] == "SIMPLE_RADIAL"
-    assert "--ImageReader.mask_path" not in extract  # this version does not list it
-    assert match["--match_type"] == "pairs"
-    assert match["--FeatureMatching.use_gpu"] == "0"
-    assert place["--Mapper.num_threads"]
-    assert (tmp_path / "scene/sparse/0/images.bin").read_bytes() == (
-        out / "sparse/0/images.bin"
-    ).read_bytes()
+def pycolmap_that(does: str, folder: Path) -> str:
+    """PYTHONPATH of a stand-in for the package, which does something when a step imports it."""
+    (folder / "pycolmap.py").write_text(does)
+    return os.pathsep.join([str(folder), str(Path(univoxel.__file__).parents[1])])
 
 
 def test_a_step_that_fails_or_hangs_is_stopped(tmp_path, monkeypatch):
-    request = engine.Request("match", str(tmp_path / "none.db"), "", "", seconds=0.1)
+    request = sfm.Request("match", str(tmp_path / "none.db"), "", "", seconds=0.1)
     log = tmp_path / "match.log"
     with pytest.raises(ProcessFailed, match=r"match: pycolmap ended with .*match.log"):
-        list(engine.run("pycolmap", engine.Request("match", "/", "/", "/"), log, lambda: 0))
-    monkeypatch.setattr(
-        engine, "command_of", lambda *_: [sys.executable, "-c", "import time; time.sleep(60)"]
-    )
+        list(sfm.run(sfm.Request("match", "/", "/", "/"), log, lambda: 0))
+    path = pycolmap_that("import time; time.sleep(60)", tmp_path)
+    monkeypatch.setenv("PYTHONPATH", path)
     with pytest.raises(ProcessFailed, match="was stopped after 0 seconds"):
-        list(engine.run("pycolmap", request, log, lambda: 0))
+        list(sfm.run(request, log, lambda: 0))
 
 
 ALONE = """
 import sys
 from pathlib import Path
-from univoxel.capture import engine
-step = "import os, time; print(os.getpid(), flush=True); time.sleep(60)"
-engine.command_of = lambda *_: [sys.executable, "-c", step]
-list(engine.run("pycolmap", engine.Request("match", "/", "/", "/"), Path(sys.argv[1])))
+from univoxel.capture import sfm
+list(sfm.run(sfm.Request("match", "/", "/", "/"), Path(sys.argv[1])))
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs prctl")
-def test_a_step_ends_with_who_began_it(tmp_path):
+def test_a_step_ends_with_who_began_it(tmp_path, monkeypatch):
     """Killed, it would otherwise go on alone, beside the step that is begun again."""
     log = tmp_path / "match.log"
     log.touch()
+    path = pycolmap_that(
+        "import os, time; print(os.getpid(), flush=True); time.sleep(60)", tmp_path
+    )
+    monkeypatch.setenv("PYTHONPATH", path)
     with subprocess.Popen([sys.executable, "-c", ALONE, log]) as parent:
         while not log.read_text().endswith("\n"):
             assert parent.poll() is None
@@ -440,16 +438,16 @@ def test_matches_of_right_places_fit_and_of_a_wrong_one_do_not(scene):
     """The database's matches against the model as it was found, and with one picture turned."""
     folders = Folders(scene[0] / "sfm")
     model = structure.models(folders)[0]
-    features, limit = database.positions(folders.database), SMALL.fitting_pixels
+    features = database.positions(folders.database)
 
     def shares(model):
-        found = evidence.partners(model, database.matches(folders.database), features, limit)
+        found = pose_validation.partners(model, database.matches(folders.database), features)
         return {
             n: sum(p.fitting for p in those) / sum(p.matches for p in those)
             for n, those in found.items()
         }
 
-    assert min(shares(model).values()) > SMALL.fitting_share
+    assert min(shares(model).values()) > pose_validation.FITTING_SHARE
     first = model.images[0]
     angle = np.radians(3.0)
     turn = np.array(
@@ -457,5 +455,5 @@ def test_matches_of_right_places_fit_and_of_a_wrong_one_do_not(scene):
     )
     wrong = replace(first, to_camera=turn @ first.to_camera)
     spoilt = shares(replace(model, images=[wrong, *model.images[1:]]))
-    assert spoilt[first.number] < SMALL.contradicted_share
+    assert spoilt[first.number] < pose_validation.CONTRADICTED_SHARE
     assert min(share for n, share in spoilt.items() if n != first.number) > 0.8

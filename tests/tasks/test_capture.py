@@ -193,7 +193,7 @@ def test_a_run_takes_the_place_of_three_steps(captured, tmp_path, caplog):
     assert made.run == captured.run
     assert made.mesh.read_bytes()[:4] == b"glTF"
     assert {p.name for p in made.page.parent.iterdir()} == {
-        *("again.glb", "capture.json", "index.html", "pictures")
+        *("again.glb", "steps.json", "index.html", "pictures")
     }
     assert f"step 3 of 6, training: there already, {captured.run}" in caplog.text
     with pytest.raises(UserError, match="is a trained run: masks, preset, minutes, light and set"):
@@ -329,6 +329,22 @@ def test_the_first_steps_alone(steps, pictures, tmp_path):
         task.find_data(out / "run", tmp_path / "other")
 
 
+def test_a_capture_of_version_0_2_is_gone_on_with(steps, pictures, tmp_path):
+    out = tmp_path / "mug"
+    task.find_data(pictures, out, masks="none")
+    noted = json.loads((out / "steps.json").read_text())
+    (out / "steps.json").unlink()
+    (out / "capture.json").write_text(json.dumps({"kind": "photographs", **noted}))
+    (pictures / "3.png").touch()
+    with pytest.raises(ExistingFile, match=r"holds a capture of 0.png .*3.png was not part of it"):
+        task.capture(pictures, out, masks="none")
+    (pictures / "3.png").unlink()
+    with pytest.raises(ExistingFile, match="holds photographs with masks=none"):
+        task.capture(pictures, out)
+    task.capture(pictures, out, masks="none")
+    assert [name for name, *_ in steps] == ["poses", "cutout", "train"]
+
+
 def still(photographs, out, masks=None, config=None):
     raise StillBackground("the background stands still in 9 of 10 pairs")
 
@@ -418,12 +434,12 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
         with pytest.raises(error, match=message):
             task.capture(photographs, out, **options)
         assert not out.exists()
-    monkeypatch.setattr(task, "find_engine", no_network)
+    monkeypatch.setattr(task, "require_pycolmap", no_network)
     with pytest.raises(MissingExtra):
         task.capture(pictures, out)
     assert not out.exists()
     out.touch()
-    monkeypatch.setattr(task, "find_engine", lambda: "pycolmap")
+    monkeypatch.setattr(task, "require_pycolmap", lambda: None)
     with pytest.raises(ExistingFile, match="is a file"):
         task.capture(pictures, out)
     with pytest.raises(ExistingFile, match=r"holds other files \(0.png\): choose another out"):
@@ -435,7 +451,7 @@ def test_what_a_killed_writer_left_is_removed(steps, pictures, tmp_path, monkeyp
     monkeypatch.setattr(task, "load_photos", without_masks)
     out = tmp_path / "mug"
     out.mkdir()
-    (out / ".capture.json.123.tmp").touch()
+    (out / ".steps.json.123.tmp").touch()
     task.capture(pictures, out)
     assert not list(out.rglob("*.tmp"))
 

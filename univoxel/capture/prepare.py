@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -13,7 +12,6 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import maximum_filter
 
-from univoxel.capture.grouping import group
 from univoxel.capture.photographs import (
     ORDER,
     SIDEWAYS,
@@ -23,54 +21,25 @@ from univoxel.capture.photographs import (
     fitted,
     read_upright,
 )
-from univoxel.capture.turning import to_landscape
 from univoxel.errors import DataError
 from univoxel.files import replacing
 
 SFM_QUALITY = 95  # of JPEG
+MASK_MARGIN = 0.006  # that masks grow by before features are sought, of the longer side
 ASPECT = 0.02  # relative difference of sides' ratios up to which a mask is of the same picture
 
 
-@dataclass(frozen=True)
 class Folders:
     """Where the work of one capture lies, all below one folder."""
 
-    work: Path
-
-    @property
-    def request(self) -> Path:
-        """What the work was begun with."""
-        return self.work / "request.json"
-
-    @property
-    def frames(self) -> Path:
-        """Of a video."""
-        return self.work / "frames"
-
-    @property
-    def pictures(self) -> Path:
-        return self.work / "pictures"
-
-    @property
-    def masks(self) -> Path:
-        return self.work / "masks"
-
-    @property
-    def database(self) -> Path:
-        return self.work / "database.db"
-
-    @property
-    def pairs(self) -> Path:
-        return self.work / "pairs.txt"
-
-    @property
-    def matched(self) -> Path:
-        """There when all pairs are matched."""
-        return self.work / "matched"
-
-    @property
-    def models(self) -> Path:
-        return self.work / "models"
+    def __init__(self, work: Path) -> None:
+        self.work = work
+        self.frames = work / "frames"  # of a video
+        self.pictures = work / "pictures"
+        self.masks = work / "masks"
+        self.database = work / "database.db"
+        self.pairs = work / "pairs.txt"
+        self.models = work / "models"
 
 
 @dataclass(frozen=True)
@@ -108,8 +77,54 @@ def gather(files: Sequence[Path], masks: Path | None) -> tuple[Capture, list[str
     return Capture(photographs, group(photographs), found), unread
 
 
+def group(photographs: Sequence[Photograph]) -> list[list[int]]:
+    """Indices of photographs with one camera, model, focal length and size; the largest first.
+
+    Portrait and landscape are one camera. Without anything in the file, the size decides.
+    """
+    groups: dict[tuple, list[int]] = {}
+    for i, p in enumerate(photographs):
+        key = (p.camera, p.focal, max(p.width, p.height), min(p.width, p.height))
+        groups.setdefault(key, []).append(i)
+    return sorted(groups.values(), key=lambda g: (-len(g), g[0]))
+
+
+def in_words(photographs: Sequence[Photograph], groups: Sequence[Sequence[int]]) -> str:
+    """What was photographed with what, for people."""
+    first = photographs[groups[0][0]]
+    portrait = sum(p.portrait for p in photographs)
+    long, short = max(first.width, first.height), min(first.width, first.height)
+    told = f"{len(photographs)} photographs"
+    if len(groups) == 1:
+        told += f" of {first.camera} ({long}x{short})" if first.camera else f" of {long}x{short}"
+    else:
+        zooms = {photographs[g[0]].focal for g in groups}
+        sizes = {tuple(sorted((p.width, p.height))) for p in photographs}
+        cameras = {p.camera for p in photographs}
+        of = [
+            f"{len(found)} {what}"
+            for found, what in ((cameras, "models"), (zooms, "zoom settings"), (sizes, "sizes"))
+            if len(found) > 1
+        ]
+        told += f" of {len(groups)} cameras ({', '.join(of)})"
+    if 0 < portrait < len(photographs):
+        told += f", {portrait} of them portrait"
+    return told
+
+
+def to_landscape(picture: Image.Image) -> Image.Image:
+    """A portrait picture turned counter-clockwise by 90 degrees; others as they are.
+
+    Held either way it is one camera, but structure from motion knows one size a camera.
+    `scene.own_sizes` turns its poses back.
+    """
+    if picture.height <= picture.width:
+        return picture
+    return picture.transpose(Image.Transpose.ROTATE_90)
+
+
 def write_pictures(
-    capture: Capture, folders: Folders, size: int, margin: float
+    capture: Capture, folders: Folders, size: int
 ) -> Iterator[tuple[int, str | None]]:
     """Write pictures and masks for structure from motion, those that are not there.
 
@@ -119,8 +134,7 @@ def write_pictures(
     jobs = list(enumerate(capture.pictures))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         running = {
-            pool.submit(_write_picture, capture, folders, i, name, size, margin): i
-            for i, name in jobs
+            pool.submit(_write_picture, capture, folders, i, name, size): i for i, name in jobs
         }
         try:
             for job in as_completed(running):
@@ -152,16 +166,8 @@ def read_mask(capture: Capture, index: int) -> Image.Image:
     return mask
 
 
-def start_over(folders: Folders) -> None:
-    """Remove all work but the frames of a video."""
-    for path in (folders.pictures, folders.masks, folders.models):
-        shutil.rmtree(path, ignore_errors=True)
-    for path in (*folders.work.glob("database.db*"), folders.pairs, folders.matched):
-        path.unlink(missing_ok=True)
-
-
 def _write_picture(
-    capture: Capture, folders: Folders, index: int, name: str, size: int, margin: float
+    capture: Capture, folders: Folders, index: int, name: str, size: int
 ) -> str | None:
     photograph = capture.photographs[index]
     target = folders.pictures / name
@@ -181,7 +187,7 @@ def _write_picture(
             # Of another size it would not be scaled, but laid into the picture's corner
             mask = mask.resize(fitted(photograph.width, photograph.height, size))
             object_ = np.asarray(mask) > 127
-            grown = maximum_filter(object_, 2 * round(margin * max(mask.size)) + 1)
+            grown = maximum_filter(object_, 2 * round(MASK_MARGIN * max(mask.size)) + 1)
             with replacing(target) as temporary:
                 to_landscape(Image.fromarray(255 * grown.astype(np.uint8))).save(
                     temporary, format="PNG"

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from univoxel import steps
 from univoxel.capture import video
 from univoxel.capture.photographs import find_photographs
 from univoxel.checkpoint import FILE
 from univoxel.data import has_cameras
 from univoxel.errors import DataError, ExistingFile
-from univoxel.files import read_json, replacing
+from univoxel.files import read_json
 
 Kind = Literal["photographs", "scene", "run"]
-RECORD = "capture.json"
+# Steps of a capture, beside its files, that leave a word for later ones: the choice of masks, and
+# that the object was turned before a still camera
+FACTS = MASKS, TURNED = "masks", "turned"
+RECORD_0_2 = "capture.json"  # what version 0.2 noted steps in
 
 
 @dataclass(frozen=True)
@@ -32,57 +35,20 @@ class Given:
         return _words(self.files)
 
 
-@dataclass(frozen=True)
 class Project:
     """Where the parts of a capture lie, all below one folder."""
 
-    out: Path
-
-    @property
-    def record(self) -> Path:
-        """What the capture is made of, and what was found out on the way."""
-        return self.out / RECORD
-
-    @property
-    def scene(self) -> Path:
-        """Photographs and their cameras, as `univoxel poses` writes them."""
-        return self.out / "scene"
-
-    @property
-    def masks(self) -> Path:
-        """Of single photographs, of a turntable, made before there are cameras."""
-        return self.out / "masks"
-
-    @property
-    def cut(self) -> Path:
-        """Photographs with masks, as `univoxel cutout` writes them: what is trained on."""
-        return self.out / "cut"
-
-    @property
-    def run(self) -> Path:
-        return self.out / "run"
-
-    @property
-    def pictures(self) -> Path:
-        return self.out / "pictures"
-
-    @property
-    def mesh(self) -> Path:
-        return self.out / f"{self.out.absolute().name}.glb"
-
-    @property
-    def page(self) -> Path:
-        return self.out / "index.html"
-
-    def recorded(self) -> dict[str, Any]:
-        """What the record says; nothing where there is none."""
-        return read_json(self.record) if self.record.exists() else {}
-
-    def remember(self, **facts: Any) -> None:
-        """Write facts into the record, whole or not at all."""
-        known = self.recorded() | facts
-        with replacing(self.record) as temporary:
-            temporary.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self.scene = out / "scene"  # photographs and cameras, as `univoxel poses` writes them
+        self.masks = (
+            out / "masks"
+        )  # of single photographs, of a turntable, before there are cameras
+        self.cut = out / "cut"  # photographs with masks, as `univoxel cutout` writes them
+        self.run = out / "run"
+        self.pictures = out / "pictures"
+        self.mesh = out / f"{out.absolute().name}.glb"
+        self.page = out / "index.html"
 
 
 def look_at(path: Path) -> Given:
@@ -112,25 +78,28 @@ def begin(project: Project, given: Given) -> None:
         ExistingFile: it holds the capture of something else, or other files.
     """
     out = project.out
-    if project.record.exists():
-        files = [tuple(file) for file in project.recorded().get("files", [])]
-        if files != given.files:
-            raise ExistingFile(
-                f"{out} holds a capture of {_words(files)}; {_difference(files, given.files)}: "
-                "choose another out",
-                "out",
-            )
-    elif out.exists():
-        if not out.is_dir():
-            raise ExistingFile(f"{out} is a file: choose another out", "out")
+    if out.exists() and not out.is_dir():
+        raise ExistingFile(f"{out} is a file: choose another out", "out")
+    if (out / RECORD_0_2).exists():
+        before = read_json(out / RECORD_0_2)
+        steps.adopt(out, {step: before[step] for step in ("files", *FACTS) if step in before})
+
+    def other(files: list) -> ExistingFile:
+        why = _difference(files, given.files)
+        return ExistingFile(
+            f"{out} holds a capture of {_words(files)}; {why}: choose another out", "out"
+        )
+
+    begun = steps.done(out, "files", given.files, other)
+    if out.exists() and not begun:
         foreign = sorted(p.name for p in out.iterdir() if p.suffix != ".tmp")
         if foreign:
             raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
     out.mkdir(parents=True, exist_ok=True)
     for path in out.rglob(".*.tmp"):  # of `files.replacing`, whose process was killed
         path.unlink()
-    if not project.record.exists():
-        project.remember(kind=given.kind, files=given.files)
+    if not begun:
+        steps.finish(out, "files", given.files)
 
 
 def discard_older(folder: Path, than: Path) -> None:

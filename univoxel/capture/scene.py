@@ -5,19 +5,22 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from univoxel.capture.model import Model, Placed, write_model
 from univoxel.capture.photographs import Photograph, fitted, read_upright
 from univoxel.capture.prepare import Capture, read_mask
-from univoxel.capture.turning import points_back, to_camera_back
 from univoxel.data.lens import Lens
+from univoxel.data.shots import turn_to_z, up_direction
 from univoxel.files import replacing
 
+DISTANCE = 4.0  # median distance of the cameras from the origin, in the written world
+FLIP = np.array([1.0, -1.0, -1.0])  # camera axes of COLMAP to those of `Cameras`
 QUALITY = 95  # of written JPEG
 KEEP_PNG = (".png",)
 REPORT = "poses.json"
@@ -67,6 +70,58 @@ def own_sizes(model: Model, capture: Capture, longest: int) -> Model:
         name = written_name(photograph)
         images.append(Placed(image.number, camera, name, to_camera, xy * scale, image.point))
     return Model(lenses, images, model.points)
+
+
+def points_back(points: np.ndarray, width: float) -> np.ndarray:
+    """Pixel coordinates [..., 2] in the portrait picture of so many pixels across."""
+    return np.stack([width - points[..., 1], points[..., 0]], -1)
+
+
+def to_camera_back(to_camera: np.ndarray) -> np.ndarray:
+    """World-to-camera [3, 3 or 4] of the portrait picture; axes x right, y down, z forward.
+
+    The landscape picture's x axis is the portrait's y axis, and its y axis the opposite of x.
+    """
+    return np.stack([-to_camera[1], to_camera[0], to_camera[2]])
+
+
+def gauge_aligned(model: Model) -> tuple[Model, bool]:
+    """The model with +Z up, the origin where its cameras look, and its first camera at -Y.
+
+    Of the similarity that structure from motion leaves open. Returns too whether the cameras say
+    what is up; if not, the mean of their up directions is taken. Errors stay, they are in pixels.
+    """
+    axes = np.stack([i.to_camera[:, :3].T * FLIP for i in model.images])
+    centres = np.stack([i.centre for i in model.images])
+    up = up_direction(axes[:, :, :2].swapaxes(1, 2))
+    known = up is not None
+    if up is None:
+        mean = axes[:, :, 1].mean(0)
+        up = mean / np.linalg.norm(mean) if np.linalg.norm(mean) > 1e-6 else np.array([0, 0, 1.0])
+    turn = turn_to_z(up)
+    middle = looked_at(centres, -axes[:, :, 2])
+    away = turn @ (centres - middle).T
+    if np.hypot(*away[:2, 0]) > 1e-9:
+        angle = -np.pi / 2 - np.arctan2(away[1, 0], away[0, 0])
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ turn
+    distance = float(np.median(np.linalg.norm(away, axis=0)))
+    scale = DISTANCE / distance if distance > 0 else 1.0
+    shift = -scale * turn @ middle
+    images = []
+    for image in model.images:
+        own = image.to_camera[:, :3] @ turn.T
+        away = scale * image.to_camera[:, 3] - own @ shift
+        images.append(replace(image, to_camera=np.concatenate([own, away[:, None]], 1)))
+    points = replace(model.points, position=scale * model.points.position @ turn.T + shift)
+    return Model(model.cameras, images, points), known
+
+
+def looked_at(centres: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """The point [3] nearest to all optical axes: positions [V, 3] and unit directions [V, 3]."""
+    across = np.eye(3) - directions[:, :, None] * directions[:, None]
+    system = across.mean(0) + 1e-9 * np.eye(3)
+    return np.linalg.solve(system, (across @ centres[:, :, None]).mean(0)[:, 0])
 
 
 def written_name(photograph: Photograph) -> str:

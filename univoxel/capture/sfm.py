@@ -1,4 +1,4 @@
-"""One step of structure from motion with pycolmap, in a process of its own.
+"""Steps of structure from motion with pycolmap, each in a process of its own.
 
     python -m univoxel.capture.sfm REQUEST.json
 
@@ -9,38 +9,125 @@ request is a record `Request`. Progress is in the database and in the log on std
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import os
+import re
+import subprocess
 import sys
+import time
 import zlib  # noqa: F401  before pycolmap
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+from univoxel.errors import MissingExtra, ProcessFailed
+
+MODEL = "SIMPLE_RADIAL"  # OPENCV begins with too much freedom: it placed 2 of 66 photographs
+POLL = 0.5  # seconds between looks at a running step
+GRACE = 60.0  # seconds beyond its limit that mapping has to write what it found
+REGISTERING = re.compile(rb"Registering (?:frame|image)|Initializing with")
+
+
+@dataclass(frozen=True)
+class Request:
+    """What one step is told. Paths are absolute."""
+
+    step: Literal["extract", "match", "map"]
+    database: str
+    pictures: str  # folder of the pictures of all groups
+    models: str  # folder that the models are written to, numbered
+    pairs: str = ""  # file of two names a line
+    masks: str = ""  # folder of NAME.png, or empty
+    names: tuple[str, ...] = ()  # pictures of one camera, for extraction
+    parameters: str = ""  # camera parameters to begin with, or empty
+    existing_camera: int | None = None  # of the database, where extraction goes on
+    features: int = 4096
+    first_octave: int = -1
+    seed: int = 0
+    threads: int = 2
+    seconds: float = 600.0  # limit
+
+
+def require_pycolmap() -> None:
+    """Say before anything is read whether cameras can be found.
+
+    Raises:
+        MissingExtra: they cannot.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise MissingExtra("finding cameras needs pycolmap: pip install 'univoxel[capture]'")
+
+
+def run(request: Request, log: Path, done: Callable[[], int] | None = None) -> Iterator[int]:
+    """Run one step and yield, while it runs, how much of it is done. It ends with this process.
+
+    Args:
+        log: file for what the process says; the request is written beside it.
+        done: counts what is done; by default pictures that the log says were placed.
+
+    Raises:
+        ProcessFailed: it did not end well, or not in time.
+    """
+    count = done or (lambda: len(REGISTERING.findall(log.read_bytes())))
+    asked = log.with_suffix(".json")
+    asked.write_text(json.dumps(asdict(request)), encoding="utf-8")
+    limit = request.seconds + (GRACE if request.step == "map" else 0.0)
+    begin = time.monotonic()
+    with log.open("wb") as file:
+        process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "univoxel.child", str(os.getpid()), "-"),
+                *(sys.executable, "-m", "univoxel.capture.sfm", str(asked)),
+            ],
+            **{"stdin": subprocess.DEVNULL, "stdout": file, "stderr": file},
+        )
+        try:
+            while process.poll() is None:
+                time.sleep(POLL)
+                yield count()
+                if time.monotonic() - begin > limit:
+                    raise ProcessFailed(
+                        f"{request.step}: pycolmap was stopped after {request.seconds:.0f} seconds"
+                    )
+        finally:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+    if process.returncode:
+        said = log.read_text("utf-8", "replace").strip().splitlines() or ["it said nothing"]
+        raise ProcessFailed(
+            f"{request.step}: pycolmap ended with {process.returncode}: {said[-1]} (see {log})"
+        )
+    yield count()
 
 
 def main(path: str) -> None:
     """Do what the request says."""
     import pycolmap  # pyright: ignore[reportMissingImports]  the extra `capture`
 
-    request = json.loads(Path(path).read_text(encoding="utf-8"))
-    pycolmap.set_random_seed(request["seed"])
-    {"extract": _extract, "match": _match, "map": _map}[request["step"]](pycolmap, request)
+    request = Request(**json.loads(Path(path).read_text(encoding="utf-8")))
+    pycolmap.set_random_seed(request.seed)
+    {"extract": _extract, "match": _match, "map": _map}[request.step](pycolmap, request)
 
 
-def _extract(pycolmap: Any, request: dict) -> None:
+def _extract(pycolmap: Any, request: Request) -> None:
     options = pycolmap.FeatureExtractionOptions()
-    options.num_threads, options.use_gpu = request["threads"], False
-    options.sift.max_num_features = request["features"]
-    options.sift.first_octave = request["first_octave"]
+    options.num_threads, options.use_gpu = request.threads, False
+    options.sift.max_num_features = request.features
+    options.sift.first_octave = request.first_octave
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = request["model"]
-    reader.camera_params = request["parameters"]
-    if request["existing_camera"] is not None:
-        reader.existing_camera_id = request["existing_camera"]
-    if request["masks"]:
-        reader.mask_path = request["masks"]
+    reader.camera_model = MODEL
+    reader.camera_params = request.parameters
+    if request.existing_camera is not None:
+        reader.existing_camera_id = request.existing_camera
+    if request.masks:
+        reader.mask_path = request.masks
     pycolmap.extract_features(
-        request["database"],
-        request["pictures"],
-        image_names=request["names"],
+        request.database,
+        request.pictures,
+        image_names=request.names,
         camera_mode=pycolmap.CameraMode.SINGLE,
         reader_options=reader,
         extraction_options=options,
@@ -48,15 +135,15 @@ def _extract(pycolmap: Any, request: dict) -> None:
     )
 
 
-def _match(pycolmap: Any, request: dict) -> None:
+def _match(pycolmap: Any, request: Request) -> None:
     matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads, matching.use_gpu = request["threads"], False
+    matching.num_threads, matching.use_gpu = request.threads, False
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = request["pairs"]
+    pairing.match_list_path = request.pairs
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = request["seed"]
+    verification.ransac.random_seed = request.seed
     pycolmap.match_image_pairs(
-        request["database"],
+        request.database,
         matching_options=matching,
         pairing_options=pairing,
         verification_options=verification,
@@ -64,13 +151,13 @@ def _match(pycolmap: Any, request: dict) -> None:
     )
 
 
-def _map(pycolmap: Any, request: dict) -> None:
+def _map(pycolmap: Any, request: Request) -> None:
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed = request["threads"], request["seed"]
-    options.max_runtime_seconds = int(request["seconds"])
-    options.mapper.random_seed = options.triangulation.random_seed = request["seed"]
+    options.num_threads, options.random_seed = request.threads, request.seed
+    options.max_runtime_seconds = int(request.seconds)
+    options.mapper.random_seed = options.triangulation.random_seed = request.seed
     pycolmap.incremental_mapping(
-        request["database"], request["pictures"], request["models"], options=options
+        request.database, request.pictures, request.models, options=options
     )
 
 

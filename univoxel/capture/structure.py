@@ -1,7 +1,8 @@
-"""Features, pairs, matches and models of a capture. Each step goes on where it stopped."""
+"""Features, pairs, matches and models of a capture. Features go on where they stopped."""
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,17 +12,22 @@ import torch
 
 from univoxel.capture import database
 from univoxel.capture.config import CaptureConfig
-from univoxel.capture.engine import Engine, Request, run
 from univoxel.capture.model import Model, read_models
-from univoxel.capture.pairs import all_pairs, choose, features_each, similarities
 from univoxel.capture.photographs import fitted
 from univoxel.capture.prepare import Capture, Folders
+from univoxel.capture.sfm import Request, run
 from univoxel.files import replacing
 
+COARSE_FEATURES = 512  # largest features that pairs are chosen by
+# Photographs up to which so many are compared: beyond, fewer of each, for the time of the
+# comparison grows with the square of photographs and of features
+COARSE_PHOTOGRAPHS = 150
+RATIO = 0.8  # of the distances to the best and second best feature, below which a match counts
+NEIGHBOURS = 3  # next photographs by name that are matched as well
+BASE_SECONDS, PHOTOGRAPH_SECONDS = 120.0, 30.0  # limit of one step, and for each photograph
 
-def extract(
-    engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig
-) -> Iterator[int]:
+
+def extract(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Find features, camera by camera; yields how many photographs have theirs."""
     pictures = capture.pictures
     for g, members in enumerate(capture.groups):
@@ -42,7 +48,6 @@ def extract(
             existing_camera=first,
         )
         yield from run(
-            engine,
             request,
             folders.work / f"extract{g}.log",
             lambda: database.count(folders.database, "descriptors"),
@@ -51,42 +56,89 @@ def extract(
 
 def select(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Write which pairs to match; yields how many photographs were compared with all others."""
-    if folders.pairs.exists():
-        return
     pictures = capture.pictures
     numbers = database.images(folders.database)
     there = [i for i, name in enumerate(pictures) if name in numbers]
     if len(there) <= config.exhaustive:
-        chosen = all_pairs(len(there))
+        chosen = list(itertools.combinations(range(len(there)), 2))
     else:
-        most = features_each(len(there), config)
+        most = features_each(len(there))
         features = [
             database.largest_features(folders.database, numbers[pictures[i]][0], most)
             for i in there
         ]
         rows = []
-        for row in similarities(features, config.ratio):
+        for row in similarities(features):
             rows.append(row)
             yield len(rows)
-        chosen = choose(np.stack(rows), config)
+        chosen = choose(np.stack(rows), config.partners)
     lines = [f"{pictures[there[i]]} {pictures[there[j]]}\n" for i, j in chosen]
     with replacing(folders.pairs) as temporary:
         temporary.write_text("".join(lines), encoding="utf-8")
 
 
-def match(
-    engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig
-) -> Iterator[int]:
+def features_each(photographs: int) -> int:
+    """Features of each photograph to compare, so that the time of all pairs is bounded."""
+    share = min(1.0, COARSE_PHOTOGRAPHS / photographs)
+    return max(16, int(COARSE_FEATURES * share))
+
+
+def similarities(features: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
+    """For each photograph its mutual matches [N] with all: best of each other, by a clear margin.
+
+    Args:
+        features: unit descriptors [F, D] of each photograph.
+    """
+    most = max((len(f) for f in features), default=0)
+    width = features[0].shape[1] if features else 0
+    others = np.zeros((len(features), max(most, 2), width), np.float32)
+    for row, f in zip(others, features, strict=True):
+        row[: len(f)] = f
+    flat = others.reshape(-1, width)
+    for i, own in enumerate(features):
+        found = np.zeros(len(features), int)
+        if len(own):
+            # Padding has cosine 0, which is no more than the least of real descriptors
+            cosine = (own @ flat.T).reshape(len(own), len(features), -1).swapaxes(0, 1)
+            for j, block in enumerate(cosine):
+                if j != i and len(features[j]) > 1:
+                    found[j] = _mutual(block[:, : len(features[j])])
+        yield found
+
+
+def _mutual(cosine: np.ndarray) -> int:
+    best, back = cosine.argmax(1), cosine.argmax(0)
+    rows = np.arange(len(cosine))
+    top = cosine[rows, best]
+    rest = cosine.copy()
+    rest[rows, best] = -1
+    second = rest.max(1)
+    # Squared distances of unit vectors
+    clear = (2 - 2 * top) < RATIO**2 * (2 - 2 * second)
+    return int(((back[best] == rows) & clear).sum())
+
+
+def choose(similar: np.ndarray, partners: int) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j: the best partners of each photograph and the next ones by name.
+
+    Args:
+        similar: matches [N, N] of the coarse look, of photographs in order of their names.
+    """
+    pairs = set()
+    for i, row in enumerate(similar):
+        best = [j for j in np.argsort(-row, kind="stable")[:partners] if j != i]
+        neighbours = range(i + 1, min(i + 1 + NEIGHBOURS, len(similar)))
+        pairs |= {(min(i, int(j)), max(i, int(j))) for j in (*best, *neighbours)}
+    return sorted(pairs)
+
+
+def match(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Match the chosen pairs and verify them; yields how many are done."""
-    if folders.matched.exists():
-        return
     yield from run(
-        engine,
         _request("match", capture, folders, config),
         folders.work / "match.log",
         lambda: database.count(folders.database, "two_view_geometries"),
     )
-    folders.matched.touch()
 
 
 def pair_count(folders: Folders) -> int:
@@ -94,17 +146,11 @@ def pair_count(folders: Folders) -> int:
     return len(folders.pairs.read_text(encoding="utf-8").splitlines())
 
 
-def place(
-    engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig
-) -> Iterator[int]:
+def place(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Find the cameras; yields how many photographs were placed, in all tries together."""
-    done = folders.models / "done"
-    if done.exists():
-        return
     shutil.rmtree(folders.models, ignore_errors=True)
     folders.models.mkdir(parents=True)
-    yield from run(engine, _request("map", capture, folders, config), folders.work / "map.log")
-    done.touch()
+    yield from run(_request("map", capture, folders, config), folders.work / "map.log")
 
 
 def models(folders: Folders) -> list[Model]:
@@ -127,7 +173,7 @@ def _request(step, capture: Capture, folders: Folders, config: CaptureConfig, **
         first_octave=config.first_octave,
         seed=config.seed,
         threads=torch.get_num_threads(),
-        seconds=config.base_seconds + config.photograph_seconds * len(capture.photographs),
+        seconds=BASE_SECONDS + PHOTOGRAPH_SECONDS * len(capture.photographs),
         **more,
     )
 

@@ -164,7 +164,7 @@ def traced_problem(
 ) -> JointProblem | None:
     """The problem on as many points as there is time for; None: no time, or no surface that is
     seen, which the progress is told of."""
-    if progress.clock.over:
+    if progress.clock.finished and progress.clock.over:
         return None
     # What does not fit is cut alike: points here, steps of Adam by `steps`, points of Newton there
     points = min(cfg.points, max(MIN_POINTS, round(progress.clock.pace * cfg.points)))

@@ -12,13 +12,21 @@ import numpy as np
 import torch
 from PIL import Image
 
+from univoxel import steps
 from univoxel.bars import track
 from univoxel.capture.config import DEFAULTS, CaptureConfig
-from univoxel.capture.engine import find_engine
 from univoxel.capture.photographs import read_upright, require_readers
-from univoxel.capture.prepare import Folders
-from univoxel.capture.project import Given, Project, begin, discard_older, look_at
+from univoxel.capture.project import (
+    MASKS,
+    TURNED,
+    Given,
+    Project,
+    begin,
+    discard_older,
+    look_at,
+)
 from univoxel.capture.scene import REPORT
+from univoxel.capture.sfm import require_pycolmap
 from univoxel.checkpoint import FILE
 from univoxel.config import TrainConfig, check_same
 from univoxel.data import keep_photos, load_photos
@@ -42,7 +50,7 @@ from univoxel.tasks.cutout import GROUND, REMBG, cutout
 from univoxel.tasks.demo import MAPS, SCENE
 from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.export import export
-from univoxel.tasks.poses import WORK, photographs_of, poses
+from univoxel.tasks.poses import folders_of, photographs_of, poses
 from univoxel.tasks.relight import relight_to_files
 from univoxel.tasks.train import train
 from univoxel.training.progress import TrainingProgress
@@ -196,7 +204,7 @@ def _check_machine(given: Given, masks: str | Path) -> None:
     if not native.reference_asked():
         native.require_embree("capture")
     if given.kind == "photographs":
-        find_engine()
+        require_pycolmap()
     if str(masks) == REMBG:
         network()
     elif str(masks) not in (AUTO, GROUND) and not Path(masks).is_dir():
@@ -215,13 +223,13 @@ def _find_cameras(project: Project, given: Given, masks: str | Path, config: Cap
     if given.kind == "scene" or (done / REPORT).exists():
         _skip("cameras", done)
         return done
-    if not project.recorded().get("turned"):
+    if not steps.recorded(project.out, TURNED):
         _say("cameras", f"of {given.path}")
         try:
             return poses(given.path, done, config=config)
         except StillBackground as error:
             log.info(f"{error.seen}: the object was turned before a still camera, so masks first")
-            project.remember(turned=True)
+            steps.finish(project.out, TURNED, True)
     first = _masks_before_cameras(project, given, masks)
     _say("cameras", f"of what masks show of {given.path}")
     return poses(given.path, done, masks=first, config=config)
@@ -246,7 +254,7 @@ def _masks_before_cameras(project: Project, given: Given, masks: str | Path) -> 
         )
     _say("masks", "of single photographs, from a network")
     masked = network()
-    files, _, _ = photographs_of(given.path, Folders(project.scene / WORK))
+    files, _, _ = photographs_of(given.path, folders_of(project.scene))
     require_readers(files)
     # Nothing half-made goes by its name
     partial = project.masks.with_name(f".{project.masks.name}.partial")
@@ -273,21 +281,24 @@ def _find_masks(project: Project, scene: Path, masks: str | Path) -> Path:
         ExistingFile: those that are there were made with another choice of masks.
         DataError, MissingExtra, UserError: as of `cutout`.
     """
-    facts, asked = project.recorded(), str(masks)
+    asked = str(masks)
+
+    def other(before: str) -> ExistingFile:
+        return ExistingFile(
+            f"{project.cut} holds photographs with masks={before}: to make them anew, remove it "
+            f"and {project.run}",
+            "masks",
+        )
+
     if project.cut.exists():
-        if facts.get("masks", asked) != asked:
-            raise ExistingFile(
-                f"{project.cut} holds photographs with masks={facts['masks']}: to make them anew, "
-                f"remove it and {project.run}",
-                "masks",
-            )
+        steps.done(project.out, MASKS, asked, other)
         _skip("masks", project.cut)
         return project.cut
-    turned = bool(facts.get("turned"))
+    turned = bool(steps.recorded(project.out, TURNED))
     if asked == AUTO and not turned and _have_masks(project, scene):
         _skip("masks", scene)
         return scene
-    project.remember(masks=asked)
+    steps.finish(project.out, MASKS, asked)  # before: the folder appears whole, at the end
     if turned:
         source = scene / "masks"  # those that the cameras were found with
     else:

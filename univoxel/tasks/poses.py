@@ -2,46 +2,60 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import platform
 import shutil
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from univoxel import __version__
+from univoxel import __version__, steps
 from univoxel.bars import bar
-from univoxel.capture import checks, database, evidence, structure, video
+from univoxel.capture import database, pose_validation, structure, video
 from univoxel.capture.config import DEFAULTS, CaptureConfig
-from univoxel.capture.engine import Engine, find_engine
-from univoxel.capture.grouping import in_words
 from univoxel.capture.model import Model, without
 from univoxel.capture.photographs import find_photographs, require_readers
-from univoxel.capture.prepare import Capture, Folders, gather, start_over, write_pictures
+from univoxel.capture.prepare import Capture, Folders, gather, in_words, write_pictures
 from univoxel.capture.scene import (
     PARTIAL,
     REPORT,
     WRITTEN,
     Report,
+    gauge_aligned,
     own_sizes,
     write_report,
     write_scene,
     written_name,
 )
-from univoxel.capture.world import moved, settle
+from univoxel.capture.sfm import require_pycolmap
 from univoxel.errors import DataError, ExistingFile, StillBackground
-from univoxel.files import replacing
+from univoxel.files import read_json
 from univoxel.names import KEEP_SIZE
 from univoxel.sphere import gaps
 
 log: logging.Logger = logging.getLogger("univoxel")
 
 WORK = "sfm"  # folder in the scene that the steps keep their results in
+# Steps that are noted in it: those of the search, with its settings, and what stands by itself
+SEARCH, FRAMES, SCENE = "search", "frames", "scene"
+PARTS = FEATURES, PAIRS, MATCHES, MODELS = "features", "choosing pairs", "matching", "placing"
+# Share of pairs whose match is a shift alone, from where on the background stands still while the
+# object turns: on a turntable it was .6, elsewhere 0, with poor masks .04
+STILL_SHARE = 0.2
+PLACED_SHARE = 0.8  # of the photographs, below which the capture is no use
+GAP = 60.0  # degrees between neighbouring directions that are worth a word
+# What version 0.2 noted of the configuration that are constants now
+CONSTANTS_0_2 = {
+    **{"coarse_features": 512, "coarse_photographs": 150, "ratio": 0.8, "neighbours": 3},
+    **{"mask_margin": 0.006, "still_share": 0.2, "weak_share": 0.2, "weak_points": 50},
+    **{"weak_partners": 3, "fitting_share": 0.9, "fitting_pixels": 3.0, "weak_doubt": 0.3},
+    **{"contradicted_share": 0.5, "placed_share": 0.8, "gap": 60.0},
+    **{"base_seconds": 120.0, "photograph_seconds": 30.0},
+}
 NAMED = 5  # photographs that a message names at most
 
 
@@ -78,7 +92,7 @@ def poses(
         config: how cameras are found.
 
     Raises:
-        MissingExtra: no pycolmap and no `colmap`, or no reader of a format.
+        MissingExtra: no pycolmap, or no reader of a format.
         DataError: photographs that cannot be used, or too few that can be placed; as
             StillBackground where an object was turned before a still camera, and there are no
             masks.
@@ -88,16 +102,17 @@ def poses(
     """
     source, out = Path(photographs), Path(out)
     masks = None if masks is None else Path(masks)
-    engine = find_engine()
-    folders = Folders(out / WORK)
+    require_pycolmap()
+    folders = folders_of(out)
     _check_free(out, folders)
     files, others, doubles = photographs_of(source, folders, every)
     require_readers(files)
     capture, unread = gather(files, masks)
     unread += others
     log.info(in_words(capture.photographs, capture.groups) + _aside(unread, doubles))
-    settings = _settings(engine, source, masks, every, config, capture)
-    if _begin(out, folders, settings, {"keep_size": keep_size, "keep_weak": keep_weak}):
+    settings = _settings(source, masks, every, config, capture)
+    used = {"keep_size": keep_size, "keep_weak": keep_weak}
+    if _begin(out, folders, settings, used):
         log.info(f"{out} is done")
         return out
     with bar(
@@ -106,8 +121,8 @@ def poses(
         TextColumn("{task.completed:.0f}/{task.total:.0f}"),
         TimeRemainingColumn(),
     ) as progress:
-        unreadable = _search(engine, capture, folders, config, progress)
-        found = _judge(capture, folders, config, unreadable)
+        unreadable = _search(capture, folders, config, settings, progress)
+        found = _judge(capture, folders, unreadable)
         _say(capture, found, len(capture.photographs), keep_weak)
         left_out = set() if keep_weak else set(found.weak)
         model = without(found.model, left_out) if left_out else found.model
@@ -115,20 +130,42 @@ def poses(
         ordered = sorted(model.images, key=lambda i: index[i.name])
         wanted = [index[image.name] for image in ordered]
         model = own_sizes(Model(model.cameras, ordered, model.points), capture, keep_size)
-        similarity, known = settle(model.images)
-        model = moved(model, similarity)
+        model, known = gauge_aligned(model)
         if not known:
             log.warning("the cameras do not say what is up: the world may be askew")
         names = [image.name for image in model.images]
         centres = np.stack([image.centre for image in model.images])
-        for gap in gaps(centres, names, config.gap):
+        for gap in gaps(centres, names, GAP):
             log.info(gap)
+        steps.forget(folders.work, SCENE)
         written = write_scene(out, capture, model, wanted, keep_size)
         _follow(progress, "writing", written, len(wanted))
-    used = {"keep_size": keep_size, "keep_weak": keep_weak}
-    reports = [_written(r, wanted, i, capture) for i, r in enumerate(found.reports)]
+    reports = list(found.reports)
+    for i in wanted:
+        reports[i] = replace(reports[i], written=written_name(capture.photographs[i]))
     write_report(out, {**settings, **used, "versions": _versions()}, model, reports)
+    steps.finish(folders.work, SCENE, used)
     return out
+
+
+def folders_of(out: Path) -> Folders:
+    """Where the work of a scene lies; what version 0.2 left files for is noted as steps."""
+    folders = Folders(out / WORK)
+    noted, begun = {}, folders.work / "request.json"
+    if (frames := folders.frames / "done").exists():
+        noted[FRAMES] = read_json(frames)
+    if begun.exists():
+        settings = read_json(begun)
+        config = settings["config"].items()  # where another value was, these are other settings
+        settings["config"] = {k: v for k, v in config if CONSTANTS_0_2.get(k) != v}
+        marks = {PAIRS: "pairs.txt", MATCHES: "matched", MODELS: "models/done"}
+        done = [step for step, name in marks.items() if (folders.work / name).exists()]
+        noted |= dict.fromkeys((SEARCH, *done), settings)
+    if begun.exists() and (out / REPORT).exists():
+        report = read_json(out / REPORT)
+        noted[SCENE] = {key: report.get(key) for key in ("keep_size", "keep_weak")}
+    steps.adopt(folders.work, noted)
+    return folders
 
 
 def _check_free(out: Path, folders: Folders) -> None:
@@ -140,7 +177,7 @@ def _check_free(out: Path, folders: Folders) -> None:
     if not out.exists() or (out / REPORT).exists():
         return
     # Written last, one after the other
-    begun = WRITTEN if folders.request.exists() else ()
+    begun = WRITTEN if steps.recorded(folders.work, SEARCH) else ()
     foreign = [p.name for p in out.iterdir() if p.name not in (WORK, PARTIAL, *begun)]
     if foreign:
         raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
@@ -152,13 +189,13 @@ def photographs_of(
     """Photographs of a folder or frames of a video; other files; how many came twice."""
     if video.is_video(source):
         video.require_ffmpeg()
-        stamp = json.dumps([source.name, source.stat().st_size, source.stat().st_mtime, every])
-        done = folders.frames / "done"
-        if not done.exists() or done.read_text(encoding="utf-8") != stamp:
+        stamp = [source.name, source.stat().st_size, source.stat().st_mtime, every]
+        if steps.recorded(folders.work, FRAMES) != stamp:
             log.info(f"{source}: choosing frames")
+            steps.forget(folders.work, FRAMES)
             shutil.rmtree(folders.frames, ignore_errors=True)
             video.write_frames(source, folders.frames, every)
-            done.write_text(stamp, encoding="utf-8")
+            steps.finish(folders.work, FRAMES, stamp)
         return sorted(folders.frames.glob("*.jpg")), [], 0
     if every is not None:
         raise DataError(f"{source}: every is for videos ({' '.join(video.SUFFIXES)})", "every")
@@ -168,7 +205,6 @@ def photographs_of(
 
 
 def _settings(
-    engine: Engine,
     source: Path,
     masks: Path | None,
     every: float | None,
@@ -178,7 +214,7 @@ def _settings(
     """What decides the cameras: the same settings go on with the same work."""
     files = [p.path for p in capture.photographs] + list(capture.masks or [])
     return {
-        "engine": engine,
+        "engine": "pycolmap",
         "source": str(source.absolute()),
         "masks": None if masks is None else str(masks.absolute()),
         "every": every,
@@ -188,28 +224,37 @@ def _settings(
 
 
 def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
-    """Make the folders; whether all is done already.
+    """Begin a search, or go on with it; whether all is done already.
 
     Raises:
         ExistingFile: out holds what is not of this search.
     """
-    asked, report = folders.request, out / REPORT
-    same = asked.exists() and json.loads(asked.read_text(encoding="utf-8")) == settings
-    if report.exists():
-        record = json.loads(report.read_text(encoding="utf-8"))
-        if not same:
-            raise ExistingFile(f"{out} holds another scene: choose another out", "out")
-        return all(record.get(key) == value for key, value in written.items())
-    if not same:
-        start_over(folders)
-        folders.work.mkdir(parents=True, exist_ok=True)
-        with replacing(asked) as temporary:
-            temporary.write_text(json.dumps(settings), encoding="utf-8")
+    if (out / REPORT).exists():
+        other = ExistingFile(f"{out} holds another scene: choose another out", "out")
+        if not steps.done(folders.work, SEARCH, settings, lambda _: other):
+            raise other
+        return steps.recorded(folders.work, SCENE) == written
+    if steps.recorded(folders.work, SEARCH) != steps.as_json(settings):  # and nothing came of it
+        _start_over(folders)
+        steps.finish(folders.work, SEARCH, settings)
     return False
 
 
+def _start_over(folders: Folders) -> None:
+    """Remove all work but the frames of a video."""
+    steps.forget(folders.work, SEARCH, *PARTS)
+    for path in (folders.pictures, folders.masks, folders.models):
+        shutil.rmtree(path, ignore_errors=True)
+    for path in (*folders.work.glob("database.db*"), folders.pairs):
+        path.unlink(missing_ok=True)
+
+
 def _search(
-    engine: Engine, capture: Capture, folders: Folders, config: CaptureConfig, progress: Progress
+    capture: Capture,
+    folders: Folders,
+    config: CaptureConfig,
+    settings: dict,
+    progress: Progress,
 ) -> dict[int, str]:
     """All steps up to the models; returns why photographs could not be read, by index.
 
@@ -220,39 +265,41 @@ def _search(
     total = len(capture.photographs)
     unreadable = {}
     task = progress.add_task("reading", total=total)
-    for index, why in write_pictures(capture, folders, config.size, config.mask_margin):
+    for index, why in write_pictures(capture, folders, config.size):
         progress.advance(task)
         if why is not None:
             unreadable[index] = why
     if unreadable:
         names = [capture.photographs[i].path.name for i in unreadable]
         log.warning(f"{len(names)} could not be read: {_some(names)}")
-    found = structure.extract(engine, capture, folders, config)
-    _follow(progress, "features", found, total)
-    _follow(progress, "choosing pairs", structure.select(capture, folders, config), total)
-    pairs = structure.pair_count(folders)
-    _follow(progress, "matching", structure.match(engine, capture, folders, config), pairs)
-    still, matching = checks.still(database.verified_pairs(folders.database))
-    if still > config.still_share * matching:
+
+    def do(step: str, part: Callable[..., Iterator[int]], total: int) -> None:
+        if not steps.done(folders.work, step, settings):
+            _follow(progress, step, part(capture, folders, config), total)
+            steps.finish(folders.work, step, settings)
+
+    do(FEATURES, structure.extract, total)
+    do(PAIRS, structure.select, total)
+    do(MATCHES, structure.match, structure.pair_count(folders))
+    still, matching = pose_validation.still(database.verified_pairs(folders.database))
+    if still > STILL_SHARE * matching:
         stands = f"the background stands still in {still} of {matching} pairs"
         if capture.masks is None:
             raise StillBackground(stands)
         raise DataError(f"{stands}: masks hold a part of it, make them tighter", "masks")
-    _follow(progress, "placing", structure.place(engine, capture, folders, config), total)
+    do(MODELS, structure.place, total)
     return unreadable
 
 
-def _follow(progress: Progress, name: str, steps: Iterable[int], total: int) -> None:
+def _follow(progress: Progress, name: str, parts: Iterable[int], total: int) -> None:
     """Show how far a step is while it runs."""
     task = progress.add_task(name, total=total)
-    for done in steps:
+    for done in parts:
         progress.update(task, completed=min(done, total))
     progress.update(task, completed=total)
 
 
-def _judge(
-    capture: Capture, folders: Folders, config: CaptureConfig, unreadable: dict[int, str]
-) -> Found:
+def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Found:
     """The largest model, and what is known of each photograph.
 
     Raises:
@@ -265,12 +312,12 @@ def _judge(
     placed = {i.number: i for i in models[0].images} if models else {}
     elsewhere = {i.number: len(m.images) - 1 for m in reversed(models[1:]) for i in m.images}
     errors = models[0].errors() if models else {}
-    weak = _weak(models[0], folders, errors, config) if models else {}
+    weak = _weak(models[0], folders, errors) if models else {}
     reports = []
     for index, name in enumerate(capture.pictures):
         photograph = capture.photographs[index].path.name
         number = numbers.get(name, (None, None))[0]
-        partners = sum(n >= checks.NEEDED for a, b, n, _ in pairs if number in (a, b))
+        partners = sum(n >= pose_validation.NEEDED for a, b, n, _ in pairs if number in (a, b))
         if number in placed:
             points = placed[number].points
             reason = weak.get(number, "")
@@ -278,9 +325,11 @@ def _judge(
                 Report(photograph, True, points, errors[number], partners, reason=reason)
             )
             continue
-        reason = unreadable.get(index) or checks.why_not(number, features, pairs, elsewhere)
+        reason = unreadable.get(index) or pose_validation.why_not(
+            number, features, pairs, elsewhere
+        )
         reports.append(Report(photograph, False, partners=partners, reason=reason))
-    if len(placed) < config.placed_share * len(reports):
+    if len(placed) < PLACED_SHARE * len(reports):
         missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
         raise DataError(
             f"only {len(placed)} of {len(reports)} photographs could be placed: take more of them, "
@@ -289,18 +338,15 @@ def _judge(
     return Found(models[0], weak, reports)
 
 
-def _weak(
-    model: Model, folders: Folders, errors: dict[int, float], config: CaptureConfig
-) -> dict[int, str]:
+def _weak(model: Model, folders: Folders, errors: dict[int, float]) -> dict[int, str]:
     """Placed pictures whose poses are not trusted, and why."""
-    partners = evidence.partners(
+    partners = pose_validation.partners(
         model,
         database.matches(folders.database),
         database.positions(folders.database),
-        config.fitting_pixels,
     )
-    doubts = {i.number: evidence.doubt(model, i, errors[i.number]) for i in model.images}
-    return checks.weak({i.number: i.points for i in model.images}, partners, doubts, config)
+    doubts = {i.number: pose_validation.doubt(model, i, errors[i.number]) for i in model.images}
+    return pose_validation.weak({i.number: i.points for i in model.images}, partners, doubts)
 
 
 def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
@@ -329,11 +375,6 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
             "photograph that side again with more overlap",
             extra={"arguments": ("keep_weak",)},
         )
-
-
-def _written(report: Report, wanted: list[int], index: int, capture: Capture) -> Report:
-    name = written_name(capture.photographs[index]) if index in wanted else ""
-    return Report(**{**asdict(report), "written": name})
 
 
 def _aside(unread: list[str], doubles: int) -> str:

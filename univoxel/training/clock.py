@@ -243,8 +243,8 @@ class Clock:
         allowed = self._allowed(max(self.limit - RESERVE_SECONDS - self._stage_begin, 0.0))
         shares = sum(s.share for s in self.cfg.stages)
         usual = (1 - PREPARATION) * self.limit * (1 - self.done) * stage.share / shares
-        if not self.finished:
-            allowed = max(allowed, LEAST * usual)
+        if not self.finished:  # what came between the stages may have taken long
+            allowed = max(allowed, self.seconds - self._stage_begin + LEAST * usual)
         self._stage_end = self._stage_begin + allowed
         self.reserved = off_pace * allowed if off_pace else 0.0
 

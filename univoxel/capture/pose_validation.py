@@ -1,4 +1,4 @@
-"""What matches say about where a photograph was placed, beyond the points that it hangs on.
+"""Whether the poses that structure from motion found can be right, and why others are missing.
 
 Structure from motion keeps the matches that fit and drops the others. Those dropped tell where it
 went wrong: of a photograph placed right, nearly all matches fit its place, however few there are.
@@ -6,7 +6,7 @@ went wrong: of a photograph placed right, nearly all matches fit its place, howe
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,17 @@ from univoxel.capture.model import NO_POINT, Model, Placed
 from univoxel.data.lens import Lens
 
 STEPS = 10  # of turning a bent lens back: far below a thousandth of a pixel
+NEEDED = 15  # matches of a pair that COLMAP begins to believe
+WEAK_SHARE = 0.2  # of the median number of points, below which a pose is not trusted
+# below which it is not trusted in any case; and matches below which nothing is said of it
+WEAK_POINTS = 50
+# It is trusted in spite of that with so many trusted partners at least, and so large a share of
+# matches that fit: on a head placed right it was .95 and more, on the same head before a still
+# background .05 to .4
+WEAK_PARTNERS, FITTING_SHARE = 3, 0.9
+FITTING_PIXELS = 3.0  # up to which a match fits
+WEAK_DOUBT = 0.3  # degrees of its direction that its points may leave open
+CONTRADICTED_SHARE = 0.5  # of matches that fit, below which no pose is trusted
 TO_SPREAD = np.sqrt(2 / np.pi)  # mean length of an error in a plane to its spread along one axis
 
 
@@ -29,14 +40,13 @@ class Partner:
 
 
 def partners(
-    model: Model, pairs: Iterable[Pair], features: Mapping[int, np.ndarray], pixels: float
+    model: Model, pairs: Iterable[Pair], features: Mapping[int, np.ndarray]
 ) -> dict[int, list[Partner]]:
     """Those of each placed picture among the placed.
 
     Args:
         pairs: verified ones, see `database.matches`.
         features: where they are in each picture [F, 2], pixels.
-        pixels: how far from where the other's line of sight is seen a match may be.
     """
     placed = {image.number: image for image in model.images}
     index = {number: i for i, number in enumerate(model.points.number.tolist())}
@@ -59,7 +69,7 @@ def partners(
             matches = pair.matches[:, columns]
             # A shift alone is what stands still in the pictures, whatever the cameras do
             off = _off(model, one, other, matches)
-            fitting = 0 if pair.kind == WATERMARK else int((off < pixels).sum())
+            fitting = 0 if pair.kind == WATERMARK else int((off < FITTING_PIXELS).sum())
             found[one.image.number].append(Partner(other.image.number, len(matches), fitting))
     return found
 
@@ -134,3 +144,82 @@ def doubt(model: Model, image: Placed, error: float) -> float:
     # Turns are about the camera's centre, which shifts alone move
     centre = np.trace(spread[3:, 3:])
     return float(np.degrees(np.sqrt(max(centre, 0)) / np.median(points[:, 2])))
+
+
+def still(pairs: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]:
+    """Pairs whose match is a shift alone, and pairs that match at all.
+
+    Args:
+        pairs: as `database.verified_pairs` has them.
+    """
+    matching = [kind for *_, inliers, kind in pairs if inliers > 0]
+    return sum(kind == WATERMARK for kind in matching), len(matching)
+
+
+def weak(
+    points: Mapping[int, int],
+    partners: Mapping[int, Sequence[Partner]],
+    doubts: Mapping[int, float],
+) -> dict[int, str]:
+    """Pictures whose poses are not to be trusted, and why.
+
+    Of those that hang on few points some are off by degrees, others stand right: they are trusted
+    if their matches with trusted ones, of which one after the other joins them, fit their places.
+
+    Args:
+        points: of the model that each picture sees.
+        partners: as `partners` has them.
+        doubts: degrees, as `doubt` has them.
+    """
+    if not points:
+        return {}
+    least = max(WEAK_POINTS, WEAK_SHARE * float(np.median(list(points.values()))))
+    few = {n: f"hangs on {count} points" for n, count in points.items() if count < least}
+    against = {}
+    for number, those in partners.items():
+        share, matches = _fitting(those)
+        if matches >= WEAK_POINTS and share < CONTRADICTED_SHARE:
+            against[number] = f"{1 - share:.0%} of its matches contradict its place"
+    open_ones = {n for n in few if doubts[n] <= WEAK_DOUBT} - against.keys()
+    while True:
+        doubtful = few.keys() | against.keys()
+        for number in sorted(open_ones, key=lambda n: -points[n]):
+            trusted = [p for p in partners[number] if p.number not in doubtful]
+            share, matches = _fitting(trusted)
+            enough = len(trusted) >= WEAK_PARTNERS and matches >= WEAK_POINTS
+            if enough and share >= FITTING_SHARE:
+                break
+        else:
+            return {**few, **against}
+        open_ones.remove(number)
+        del few[number]
+
+
+def _fitting(partners: Sequence[Partner]) -> tuple[float, int]:
+    """Share of the matches with partners that fit, and how many there are."""
+    matches = sum(p.matches for p in partners)
+    return sum(p.fitting for p in partners) / max(matches, 1), matches
+
+
+def why_not(
+    number: int | None,
+    features: Mapping[int, int],
+    pairs: Sequence[tuple[int, int, int, int]],
+    elsewhere: Mapping[int, int],
+) -> str:
+    """Why a picture has no place.
+
+    Args:
+        number: its id in the database, None if it is not there.
+        features: by id.
+        pairs: as `database.verified_pairs` has them.
+        elsewhere: of pictures that other models hold, the size of theirs.
+    """
+    if number is None or not features.get(number):
+        return "nothing in it to hold on to"
+    if number in elsewhere:
+        return f"with {elsewhere[number]} others that nothing connects to the rest"
+    best = max((n for a, b, n, _ in pairs if number in (a, b)), default=0)
+    if best < NEEDED:
+        return f"{best} matches with its best partner; {NEEDED} needed"
+    return f"{best} matches with its best partner, which do not fit the others"

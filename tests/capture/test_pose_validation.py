@@ -7,14 +7,11 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from univoxel.capture.checks import weak
-from univoxel.capture.config import CaptureConfig
 from univoxel.capture.database import WATERMARK, Pair
-from univoxel.capture.evidence import Partner, doubt, partners
 from univoxel.capture.model import NO_POINT, Model, Placed, Points
+from univoxel.capture.pose_validation import Partner, doubt, partners, weak
 from univoxel.data.lens import Lens
 
-CONFIG = CaptureConfig()
 LENS = Lens(400, 300, (420.0, 420.0), (200.0, 150.0), (-0.15,))
 VIEWS, POINTS = 6, 150
 RNG = np.random.default_rng(5)
@@ -60,7 +57,7 @@ def share(found: list[Partner]) -> float:
 
 def test_matches_fit_where_cameras_are_right_and_not_where_one_is_wrong():
     model, features, pairs = scene()
-    found = partners(model, pairs, features, CONFIG.fitting_pixels)
+    found = partners(model, pairs, features)
     assert all(len(those) == VIEWS - 1 for those in found.values())
     assert all(share(those) > 0.98 for those in found.values())
 
@@ -69,7 +66,7 @@ def test_matches_fit_where_cameras_are_right_and_not_where_one_is_wrong():
     wrong["lifted"][1, 3] += 0.2
     for to_camera in wrong.values():
         images = [replace(i, to_camera=to_camera) if i.number == 3 else i for i in model.images]
-        bad = partners(replace(model, images=images), pairs, features, CONFIG.fitting_pixels)
+        bad = partners(replace(model, images=images), pairs, features)
         assert share(bad[3]) < 0.5
         assert share(bad[1]) > share(bad[3])
 
@@ -77,11 +74,11 @@ def test_matches_fit_where_cameras_are_right_and_not_where_one_is_wrong():
 def test_shifts_alone_and_pictures_without_a_place_do_not_count():
     model, features, pairs = scene()
     watermarks = [replace(p, kind=WATERMARK) if 3 in (p.first, p.second) else p for p in pairs]
-    found = partners(model, watermarks, features, CONFIG.fitting_pixels)
+    found = partners(model, watermarks, features)
     assert share(found[3]) == 0
     assert sum(p.matches for p in found[3]) == POINTS * (VIEWS - 1)
     lost = replace(model, images=[i for i in model.images if i.number != 3])
-    found = partners(lost, pairs, features, CONFIG.fitting_pixels)
+    found = partners(lost, pairs, features)
     assert 3 not in found
     assert all(p.number != 3 for those in found.values() for p in those)
 
@@ -121,9 +118,9 @@ def test_points_close_to_one_another_leave_much_open():
     assert doubt(model, replace(image, point=point), 0.5) == np.inf
 
 
-def judged(points, partners, doubts=None, config=CONFIG) -> set[int]:
+def judged(points, partners, doubts=None) -> set[int]:
     doubts = doubts or dict.fromkeys(points, 0.05)
-    return set(weak(points, partners, doubts, config))
+    return set(weak(points, partners, doubts))
 
 
 def test_weak_are_those_below_a_fifth_of_the_median_or_fifty():
@@ -167,5 +164,5 @@ def test_few_points_that_leave_the_place_open_stay_weak():
 
 def test_many_points_do_not_help_where_matches_contradict_the_place():
     against = {**NEAR, 4: [Partner(n, 500, 200) for n in (1, 2, 3)]}
-    found = weak({1: 900, 2: 900, 3: 900, 4: 900}, against, dict.fromkeys(range(1, 5), 0.1), CONFIG)
+    found = weak({1: 900, 2: 900, 3: 900, 4: 900}, against, dict.fromkeys(range(1, 5), 0.1))
     assert found == {4: "60% of its matches contradict its place"}

@@ -1,0 +1,59 @@
+"""What is noted of steps, and what is refused."""
+
+import os
+
+import pytest
+
+from univoxel import steps
+from univoxel.errors import DataError, ExistingFile
+
+
+def test_a_step_is_done_with_what_it_was_made_of(tmp_path):
+    folder = tmp_path / "new"
+    made_of = {"files": [("a.jpg", 3)], "size": 1.5}
+    assert not steps.done(folder, "cut", made_of)
+    assert not folder.exists()
+    steps.finish(folder, "cut", made_of)
+    steps.finish(folder, "sewn", True)
+    assert steps.done(folder, "cut", made_of)
+    assert steps.recorded(folder, "cut") == {"files": [["a.jpg", 3]], "size": 1.5}
+    steps.forget(folder, "cut", "never done")
+    assert not steps.done(folder, "cut", made_of)
+    assert steps.done(folder, "sewn", True)
+
+
+def test_another_fingerprint_is_refused(tmp_path):
+    steps.finish(tmp_path, "cut", {"size": 1})
+    with pytest.raises(ExistingFile, match="cut has other options: choose another out"):
+        steps.done(tmp_path, "cut", {"size": 2})
+    with pytest.raises(ExistingFile, match="of size 1"):
+        steps.done(tmp_path, "cut", {}, lambda before: ExistingFile(f"of size {before['size']}"))
+
+
+def test_a_killed_writer_leaves_the_steps_before(tmp_path, monkeypatch):
+    steps.finish(tmp_path, "cut", 1)
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            steps.finish(tmp_path, "sewn", 2)
+    assert steps.done(tmp_path, "cut", 1)
+    assert steps.recorded(tmp_path, "sewn") is None
+
+
+def test_notes_of_another_version_count_where_there_are_no_others(tmp_path):
+    steps.adopt(tmp_path, {})
+    assert list(tmp_path.iterdir()) == []
+    steps.adopt(tmp_path, {"cut": 1})
+    steps.adopt(tmp_path, {"cut": 2})
+    assert steps.done(tmp_path, "cut", 1)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "3"])
+def test_a_broken_file_is_named(tmp_path, text):
+    (tmp_path / steps.FILE).write_text(text)
+    with pytest.raises(DataError, match=r"steps\.json: "):
+        steps.recorded(tmp_path, "cut")
