@@ -104,7 +104,7 @@ HELPERS = {
     "evaluation": {"measures", "truth"},
     "segmentation": {"config", "gaps", "vote"},
     "page": {"maps", "transfer"},
-    "jobs": {"job", "progress", "worker"},
+    "jobs": {"job"},
     "batch": {"results", "scenes"},
     "report": {"drawing", "light", "photographs", "sides", "training"},
     "viewer": {"subject", "denoise", "frames", "film", "hosting", "incident", "studio"},
