@@ -37,7 +37,7 @@ def work(folder: Path) -> None:
     figures expects. One that was finished is only evaluated; what came through in the meantime, in
     another process, stays.
     """
-    job = Job(folder.name, (), folder / JOB).record().identity["job"]
+    job = Job(folder.name, (), folder / JOB).record()["identity"]["job"]
     setting = Setting(**job["setting"] | {"changes": tuple(job["setting"]["changes"])})
     config = setting.config(Path(job["data"]), folder / RUN)
     samples = job["samples"]

@@ -7,34 +7,39 @@ import pytest
 from rich.console import Console
 
 from univoxel import bars
-from univoxel.jobs import progress
+from univoxel.jobs import scheduler
 from univoxel.jobs.job import Result
-from univoxel.jobs.progress import ProgressTable
+from univoxel.jobs.scheduler import ProgressTable
 
-TOLD = {"job": "mug", "process": "train", "share": 0.25, "held_out_psnr": 23.1}
+TOLD = ("mug", "train", 0.25, 23.1)
 
 
 @pytest.fixture
 def clock(monkeypatch):
     """Seconds that have passed."""
     time = {"now": 0.0}
-    monkeypatch.setattr(progress.time, "monotonic", lambda: time["now"])
+    monkeypatch.setattr(scheduler.time, "monotonic", lambda: time["now"])
     return time
 
 
 def test_lines_name_who_is_at_work(clock, monkeypatch, caplog):
     monkeypatch.setattr(bars, "LINE_SECONDS", 0.0)
+
+    def line(table: ProgressTable) -> str:
+        table.refresh()
+        return caplog.messages[-1]
+
     with caplog.at_level(logging.INFO, "univoxel"):
         table = ProgressTable(1, 3)
-        table.tell(TOLD)
-        assert caplog.messages[-1].startswith("1/3  mug train 25%")
-        table.tell({"job": "cup", "process": "eval"})
-        assert caplog.messages[-1].startswith("1/3  mug train 25%  cup eval")
+        table.tell(*TOLD)
+        assert line(table).startswith("1/3  mug train 25% 23.1 dB")
+        table.tell("cup", "eval", None, None)
+        assert "25% 23.1 dB  cup eval" in line(table)
         clock["now"] = 60.0
         table.ended(Result("mug", "failed", {"train": "x"}))
-        assert caplog.messages[-1].startswith("2/3  1 failed  cup eval  about 0:01:00 left")
+        assert line(table).startswith("2/3  1 failed  about 0:01:00 left  cup eval")
         table.ended(Result("cup", "killed"))  # it is tried again
-        assert caplog.messages[-1].startswith("2/3  1 failed  about 0:01:00 left")
+        assert "cup" not in line(table)
 
 
 def test_rows_on_a_terminal(monkeypatch, caplog):
@@ -44,10 +49,11 @@ def test_rows_on_a_terminal(monkeypatch, caplog):
     with caplog.at_level(logging.INFO, "univoxel"):
         table = ProgressTable(0, 2)
         with table.progress:
-            table.tell(TOLD)
+            table.tell(*TOLD)
+            table.tell("cup", "eval", None, None)
+            table.refresh()
             table.progress.refresh()
-            assert "mug train 25%" in drawn.getvalue()
-            assert "held-out 23.1 dB" in drawn.getvalue()
-            table.tell({"job": "cup", "process": "eval"})
-            table.ended(Result("mug", "done", seconds=50.0))
-            assert [task.description for task in table.progress.tasks] == ["1/2", "cup eval"]
+        (task,) = table.progress.tasks
+        assert (task.description, task.completed) == ("0/2", 0.25)
+        assert task.fields["facts"] == "mug train 25% 23.1 dB\ncup eval"
+        assert "cup eval" in drawn.getvalue()

@@ -22,7 +22,6 @@ from univoxel.checkpoint import FILE, load_checkpoint
 from univoxel.cli import main
 from univoxel.config import save_config
 from univoxel.errors import ExistingFile, MissingExtra, ProcessFailed, UserError
-from univoxel.jobs.job import Record
 from univoxel.machine import Memory
 from univoxel.tasks import batch as task
 from univoxel.training.memory import PER_PIXEL as FURTHER
@@ -356,7 +355,7 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
 def test_records_of_other_options_are_refused(scenes, tmp_path):
     job = job_of("ball", scenes[0], tmp_path, OPTIONS, 1)
     job.files.parent.mkdir()
-    job.save(Record({**job.identity, "data": "/elsewhere"}))
+    job.save({"identity": job.identity | {"data": "/elsewhere"}})
     with pytest.raises(ExistingFile, match=r"ball\.json is of another data: choose another out"):
         run_batch(scenes[:1], tmp_path)
 

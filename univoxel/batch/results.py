@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from univoxel.batch.scenes import measures_file
+from univoxel.batch.scenes import MEASURED
 from univoxel.capture.project import Project
 from univoxel.errors import UserError
 from univoxel.evaluation.measures import MEASURES
@@ -44,17 +44,17 @@ class SceneResult:
 def result_of(job: Job, data: Path, out: Path, ended: Result | None = None) -> SceneResult:
     """What the files of a scene in the folder of a batch say, and how this sitting of it ended."""
     project, record = Project(out / job.name), job.record()
-    errors = ended.errors if ended else record.errors
+    errors = ended.errors if ended else record["errors"]
     whole = all(step.done() or (step.makes is None and ended) for step in job.steps)
     state = "failed" if errors else "done" if whole else "left"
     verdict = load_verdict(project.run)
     try:
-        found = read_json(measures_file(project))
+        found = read_json(project.out / MEASURED)
     except (OSError, UserError):
         found = {}
     measures = {key: found[key] for key in MEASURES if key in found}
     doubts = {key: found["trust"][key] for key in DOUBTS if key in found.get("trust", {})}
-    told = (errors, record.seconds, verdict and verdict.word, measures, doubts)
+    told = (errors, record["seconds"], verdict and verdict.word, measures, doubts)
     return SceneResult(job.name, str(data), job.name, state, *told)
 
 

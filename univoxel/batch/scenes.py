@@ -19,12 +19,13 @@ from univoxel.errors import UserError
 from univoxel.files import read_json
 from univoxel.jobs.job import Job, Step
 from univoxel.machine import Memory
-from univoxel.names import BATCH_STEPS, SAMPLES, USUAL_STEPS, BatchStep, LightName, PresetOrAuto
+from univoxel.names import SAMPLES, USUAL_STEPS, BatchStep, LightName, PresetOrAuto
 from univoxel.overrides import changed
 from univoxel.presets import chosen
 from univoxel.training.memory import needed_for
 from univoxel.training.progress import LOG
 
+MEASURED = "measures.json"  # in the folder of a scene
 LOGS = "logs"  # the folder in a batch's of what processes said, records and locks
 PICTURES = {".png", ".jpg", ".jpeg", ".exr"}
 PER_PROCESS = 600_000_000  # bytes: Python, torch and what is loaded around them
@@ -101,49 +102,36 @@ def named(scenes: Sequence[Path]) -> dict[str, Path]:
 
 
 def job_of(name: str, data: Path, out: Path, options: BatchOptions, threads: int | None) -> Job:
-    """The steps of a scene that are asked for, in their order.
-
-    Args:
-        data: absolute.
-        out: the folder of the batch; the scene's is below it.
-    """
+    """The steps of a scene, data (absolute), that are asked for, below the folder of a batch."""
     out = out.absolute()
-    project, before = Project(out / name), [data]
-    if {"poses", "masks"} & set(options.steps):
-        before.insert(0, project.scene)
-    if "masks" in options.steps:  # photographs that bring masks are not written again
-        before.insert(0, project.cut)
-    run, trained, measures = str(project.run), project.run / "trust.txt", measures_file(project)
+    project = Project(out / name)
+    # Photographs that bring masks are not written again
+    before = [project.cut] if "masks" in options.steps else []
+    before += [project.scene] if {"poses", "masks"} & set(options.steps) else []
+    run, checkpoint, measures = str(project.run), project.run / FILE, project.out / MEASURED
+    trained, log = project.run / "trust.txt", project.run / LOG
     capture = ("capture", str(data), "--out", str(project.out), "--masks", options.masks, "--until")
-    words: dict[BatchStep, tuple[str | tuple[Path, ...], ...]] = {
-        "poses": (*capture, "cameras"),
-        "masks": (*capture, "masks"),
-        "train": ("train", (*before,), "--out", run, "--resume", "--no-page", *options.words()),
-        "eval": ("eval", run, "--json", str(measures), "--samples", str(options.samples)),
-        "export": ("export", run, "--mesh", str(project.mesh)),
-        "page": ("view", run, "--html", str(project.page), "--title", name),
-    }
-    makes = {"train": trained, "eval": measures, "export": project.mesh, "page": project.page}
-    unless = {"poses": (project.scene / REPORT, trained), "masks": (project.cut, trained)}
-    steps = [
-        Step(
-            step,
-            ("-m", "univoxel.cli", *words[step]),
-            makes.get(step),
-            after=project.run / FILE if step in makes else None,
-            unless=unless.get(step, ()),
-            log=project.run / LOG if step == "train" else None,
-            needed=step in ("poses", "masks", "train"),
-        )
-        for step in BATCH_STEPS
-        if step in options.steps
-    ]
-    return Job(name, tuple(steps), out / LOGS / name, options.identity(data), threads)
+    train = ("--out", run, "--resume", "--no-page", *options.words())
+    evaluate = ("eval", run, "--json", str(measures), "--samples", str(options.samples))
+    page = ("view", run, "--html", str(project.page), "--title", name)
+    export = ("export", run, "--mesh", str(project.mesh))
 
+    def step(name: BatchStep, *words: str | tuple[Path, ...], **fields: Any) -> Step:
+        return Step(name, ("-m", "univoxel.cli", *words), **fields)
 
-def measures_file(project: Project) -> Path:
-    """Where the measures of a scene lie."""
-    return project.out / "measures.json"
+    def aside(name: BatchStep, words: Sequence[str], makes: Path) -> Step:
+        return step(name, *words, makes=makes, after=checkpoint, needed=False)
+
+    every = (
+        step("poses", *capture, "cameras", unless=(project.scene / REPORT, trained)),
+        step("masks", *capture, "masks", unless=(project.cut, trained)),
+        step("train", "train", (*before, data), *train, makes=trained, after=checkpoint, log=log),
+        aside("eval", evaluate, measures),
+        aside("export", export, project.mesh),
+        aside("page", page, project.page),
+    )
+    steps = tuple(step for step in every if step.name in options.steps)
+    return Job(name, steps, out / LOGS / name, options.identity(data), threads)
 
 
 def share(

@@ -10,40 +10,38 @@ import uuid
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from datetime import timedelta
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+
 from univoxel import __version__
+from univoxel.bars import bar
 from univoxel.errors import MissingExtra, ProcessFailed, UserError
-from univoxel.jobs.job import Job, Result
-from univoxel.jobs.progress import ProgressTable
-from univoxel.jobs.worker import run_on_worker
+from univoxel.jobs.job import Job, Result, Step, last_line, run_job
+from univoxel.machine import cores
 
 if TYPE_CHECKING:
     from distributed import Client
 
 TICK_SECONDS = 0.25
 CONNECT_SECONDS = 15.0  # that a scheduler may take to answer
-# Clusters of one process start one by one: Dask changes its settings for all threads, and of what
-# two of them import at once one may get half
+# Dask changes its settings for all threads, and of what two of them import one may get half
 STARTING = Lock()
 
 
 @contextlib.contextmanager
 def connect(jobs: int, scheduler: str | None = None) -> Iterator[Client]:
-    """A client of this machine, of so many jobs at once, or of a scheduler.
+    """A client of this machine, of so many jobs at once (>= 1), or of a scheduler at an address.
 
     This machine's scheduler and worker are threads of this process: they open no port that others
     could reach, and need none, as each job has processes of its own.
 
-    Args:
-        jobs: at once, >= 1; of a scheduler its workers' threads decide.
-        scheduler: address of one that is there, such as tcp://10.0.0.1:8786.
-
     Raises:
         UserError: jobs out of range.
         MissingExtra: Dask is missing.
-        ProcessFailed: the scheduler does not answer, or its workers have no univoxel.
+        ProcessFailed: the scheduler does not answer, or its workers have another univoxel.
     """
     if jobs < 1:
         raise UserError(f"jobs must be at least 1, got {jobs}", "jobs")
@@ -64,20 +62,14 @@ def connect(jobs: int, scheduler: str | None = None) -> Iterator[Client]:
         try:
             client = stack.enter_context(Client(scheduler, timeout=CONNECT_SECONDS))
         except (OSError, ValueError, TypeError) as error:
-            said = " ".join(str(error).split()) or type(error).__name__
-            raise ProcessFailed(
-                f"scheduler={scheduler}: no scheduler of Dask answers there: {said:.200}",
-                "scheduler",
-            ) from None
+            said = f"no scheduler of Dask answers there: {' '.join(str(error).split()):.200}"
+            raise ProcessFailed(f"scheduler={scheduler}: {said}", "scheduler") from None
         versions: Any = client.run(lambda: __import__("univoxel").__version__, on_error="return")
         for address, found in versions.items():
             if found != __version__:
-                got = found if isinstance(found, str) else "none"
-                raise ProcessFailed(
-                    f"scheduler={scheduler}: expected workers with univoxel {__version__}, got "
-                    f"{got} on {address}",
-                    "scheduler",
-                )
+                got = f"{found if isinstance(found, str) else 'none'} on {address}"
+                said = f"expected workers with univoxel {__version__}, got {got}"
+                raise ProcessFailed(f"scheduler={scheduler}: {said}", "scheduler")
         yield client
 
 
@@ -86,23 +78,14 @@ def _cluster(jobs: int, stack: contextlib.ExitStack) -> Any:
     import dask.config
     from distributed import LocalCluster
 
+    options: dict[str, Any] = {"processes": False, "memory_limit": 0}  # this process does nothing
+    options |= {"dashboard_address": "127.0.0.1:0", "worker_dashboard_address": "127.0.0.1:0"}
+    options |= {"scheduler_kwargs": {"dashboard": False}, "silence_logs": logging.CRITICAL}
+    options |= {"local_directory": stack.enter_context(tempfile.TemporaryDirectory("univoxel"))}
     # Its pages would tell others on this machine what runs here
     routes = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
-    local: dict[str, Any] = {
-        "dashboard_address": "127.0.0.1:0",
-        "worker_dashboard_address": "127.0.0.1:0",
-    }
-    local |= {"local_directory": stack.enter_context(tempfile.TemporaryDirectory("univoxel"))}
     with STARTING, dask.config.set(routes):
-        cluster = LocalCluster(
-            n_workers=1,
-            threads_per_worker=jobs,
-            processes=False,
-            memory_limit=0,  # of this process, which does nothing
-            silence_logs=logging.CRITICAL,
-            scheduler_kwargs={"dashboard": False},
-            **local,
-        )
+        cluster = LocalCluster(n_workers=1, threads_per_worker=jobs, **options)
     return stack.enter_context(cluster)
 
 
@@ -118,7 +101,7 @@ def run_jobs(client: Client, jobs: Sequence[Job], total: int, tries: int = 3) ->
     """
     topic, deaths = f"univoxel-{uuid.uuid4().hex}", Counter[str]()
     table = ProgressTable(total - len(jobs), total)
-    client.subscribe_topic(topic, lambda event: table.tell(event[1]))
+    client.subscribe_topic(topic, lambda event: table.tell(**event[1]))
 
     def submit(job: Job) -> Any:
         return client.submit(run_on_worker, job, topic, pure=False)
@@ -127,6 +110,7 @@ def run_jobs(client: Client, jobs: Sequence[Job], total: int, tries: int = 3) ->
         running = {submit(job): job for job in jobs}
         while running:
             time.sleep(TICK_SECONDS)
+            table.refresh()
             for future in [f for f in running if f.done() or f.status == "lost"]:
                 job = running.pop(future)
                 result = _result(future, job)
@@ -141,6 +125,26 @@ def run_jobs(client: Client, jobs: Sequence[Job], total: int, tries: int = 3) ->
                     yield result
 
 
+def run_on_worker(job: Job, topic: str) -> Result:
+    """`run_job` as a task of Dask, which tells under a topic, and ends when nobody waits for it."""
+    from distributed import Reschedule, Status, get_worker
+
+    worker = get_worker()
+    key = worker.get_current_task()
+    over = (Status.closing, Status.closed, Status.stopping, Status.failed)
+
+    def watch(step: Step) -> None:
+        task = worker.state.tasks.get(key)
+        if worker.status in over or task is None or task.state == "cancelled":
+            raise Reschedule
+        line = last_line(step.log)
+        told = {name: line.get(name) for name in ("share", "held_out_psnr")}
+        worker.log_event(topic, {"job": job.name, "step": step.name, **told})
+
+    threads = job.threads or max(1, int(cores()) // worker.state.nthreads)
+    return run_job(replace(job, threads=threads), watch)
+
+
 def _result(future: Any, job: Job) -> Result:
     """What a task returned, or what its end says."""
     from distributed import KilledWorker
@@ -153,3 +157,48 @@ def _result(future: Any, job: Job) -> Result:
     if isinstance(error, KilledWorker):
         return Result(job.name, "failed", {"worker": "every worker that took it died"})
     raise ProcessFailed(f"a worker has another univoxel than this, or none: {error}") from error
+
+
+class ProgressTable:
+    """A bar of all jobs beside those at work; without a terminal a line now and then."""
+
+    def __init__(self, before: int, total: int) -> None:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[facts]}"),
+        )
+        self.progress = bar(*columns, TimeElapsedColumn())
+        self._all = self.progress.add_task(f"{before}/{total}", total=total, facts="")
+        self._begin, self._before, self._total = time.monotonic(), before, total
+        self._ended = Counter[str]()  # by state
+        self._told: dict[str, tuple[float, str]] = {}  # share of a job's step, and what to show
+
+    def tell(
+        self, job: str, step: str, share: float | None, held_out_psnr: float | None, **_: Any
+    ) -> None:
+        """Take in how far a job is. Dask calls it, in a thread of its own."""
+        facts = "" if share is None else f" {share:.0%}"
+        facts += "" if held_out_psnr is None else f" {held_out_psnr:.1f} dB"
+        self._told[job] = share or 0.0, f"{job} {step}{facts}"
+
+    def ended(self, result: Result) -> None:
+        """Take in how a sitting of a job ended."""
+        self._told.pop(result.name, None)
+        self._ended[result.state] += 1
+
+    def refresh(self) -> None:
+        """Show it."""
+        told, ended = list(self._told.values()), self._ended["done"] + self._ended["failed"]
+        made = ended + sum(share for share, _ in told)
+        facts = [f"{self._ended['failed']} failed"] if self._ended["failed"] else []
+        if ended:
+            spent, left = time.monotonic() - self._begin, self._total - self._before - made
+            facts.append(f"about {timedelta(seconds=round(spent * left / made))} left")
+        separator = "\n" if self.progress.console.is_terminal else "  "
+        row = {
+            "completed": self._before + made,
+            "description": f"{self._before + ended}/{self._total}",
+        }
+        shown = separator.join([*facts, *(text for _, text in told)])
+        self.progress.update(self._all, facts=shown, **row)

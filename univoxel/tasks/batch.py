@@ -38,21 +38,18 @@ def batch(
 
     Below `out` each scene has a folder with run/, measures.json, a mesh and a page; logs/ holds
     what processes said. index.html, batch.json and batch.csv tell of all of them, and are written
-    anew as each ends. What is done is not done again; what was killed goes on from where it was
-    saved. A scene that fails takes no other with it.
+    anew as each ends. What is done is not done again. A scene that fails takes no other with it.
 
     Args:
         scenes: folders of photographs, of different names; or videos.
-        jobs: scenes at once, on this machine; None: as cores and memory allow.
-        threads: of each; None: a share of the cores.
+        jobs, threads: scenes at once on this machine, and of each; None: as it allows.
         scheduler: address of a scheduler of Dask, whose workers do it; they see the same folders.
         tries: how often a scene whose process is killed is tried before it counts as failed.
         json: another file for what batch.json holds.
 
     Raises:
-        UserError: an argument cannot be used; nothing was begun.
-        MissingExtra: Dask is missing.
-        ExistingFile: out holds scenes that other options made.
+        UserError: an argument cannot be used, Dask is missing, or out holds scenes that other
+            options made; nothing was begun.
         ProcessFailed: the scheduler does not answer, or is gone.
         OSError: out cannot be written.
     """
@@ -76,12 +73,16 @@ def batch(
         job.check_same()
     ended: dict[str, Result] = {}
 
-    def results() -> list[SceneResult]:
-        return [result_of(job, known[job.name], out, ended.get(job.name)) for job in every]
+    def write(other: Path | None = None) -> list[SceneResult]:
+        results = [result_of(job, known[job.name], out, ended.get(job.name)) for job in every]
+        write_results(results, dataclasses.asdict(options), out, other)
+        write_sheet(results, out)
+        return results
 
-    missing = [job for job, r in zip(every, results(), strict=True) if r.state != "done"]
     with connect(jobs or 1, scheduler) as client:
         out.mkdir(parents=True, exist_ok=True)
+        before = {result.name for result in write() if result.state == "done"}
+        missing = [job for job in every if job.name not in before]
         for found in run_jobs(client, missing, len(every), tries):
             ended[found.name] = found
             if found.state == "done":
@@ -89,18 +90,10 @@ def batch(
             for step, said in found.errors.items():
                 log.warning("%s: failed in %s: %s", found.name, step, said)
             try:
-                _write(results(), options, out)
+                write()
             except OSError as error:  # the disk may have room again when the last one ends
                 log.warning("%s", error)
-    _write(results(), options, out, json)
-    return results()
-
-
-def _write(
-    results: Sequence[SceneResult], options: BatchOptions, out: Path, json: Path | None = None
-) -> None:
-    write_results(results, dataclasses.asdict(options), out, json)
-    write_sheet(results, out)
+    return write(json)
 
 
 def check(results: Sequence[SceneResult]) -> None:
@@ -119,19 +112,13 @@ def check(results: Sequence[SceneResult]) -> None:
 
 def table(results: Sequence[SceneResult]) -> Table:
     """What came out, as the command prints it."""
-    rows = Table("scene", "state", "verdict", "novel views, dB", "doubt of albedo", "seconds")
+    rows = Table("scene", "state", "verdict")
+    for head in ("novel views, dB", "doubt of albedo", "seconds"):
+        rows.add_column(head, justify="right")
     rows.add_column("error")
-    for result in results:
-        quality, doubt = result.measures.get("nvs_psnr"), result.doubts.get("doubt_albedo")
-        rows.add_row(
-            result.name,
-            result.state,
-            result.verdict or "-",
-            "-" if quality is None else f"{quality:.1f}",
-            "-" if doubt is None else f"{doubt:.2f}",
-            f"{sum(result.seconds.values()):.0f}",
-            result.error,
-        )
-    for column in rows.columns[3:6]:
-        column.justify = "right"
+    for r in results:
+        quality, doubt = r.measures.get("nvs_psnr"), r.doubts.get("doubt_albedo")
+        numbers = ("-" if quality is None else f"{quality:.1f}", f"{sum(r.seconds.values()):.0f}")
+        doubts = "-" if doubt is None else f"{doubt:.2f}"
+        rows.add_row(r.name, r.state, r.verdict or "-", numbers[0], doubts, numbers[1], r.error)
     return rows
