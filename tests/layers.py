@@ -4,7 +4,7 @@ them, and docs/figures/diagrams.py draws those of the package."""
 # From the bottom up. A folder or file imports only from layers below its own; inside a folder
 # anything goes that is no circle.
 LAYERS = [
-    {"bars", "errors", "guard", "installation", "machine", "names", "records", "retired", "shelf"}
+    {"bars", "errors", "guard", "installation", "machine", "names", "records", "retired", "memmap"}
     | {"threads", "files", "overrides", "validation", "jobs", "steps", "parsing"},
     {"brdf", "camera", "color", "grid", "losses", "metrics", "orbit", "sphere"},
     {"ops"},

@@ -26,7 +26,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.data.base import Photos, coverage_of
 from univoxel.files import replacing
 
@@ -61,8 +61,8 @@ def origin_of(files: Sequence[Path], *treatment: object) -> str:
 
 
 def kept_pixels(origin: str) -> tuple[Tensor, Tensor] | None:
-    """Colour and alpha of that origin, if they were kept where `looking_in` says; large ones on a
-    shelf, the file itself."""
+    """Colour and alpha of that origin, if they were kept where `looking_in` says; large ones are
+    the file itself."""
     path = _place.get()
     if path is None or _origin_in(path) != origin:
         return None
@@ -78,8 +78,8 @@ def kept_pixels(origin: str) -> tuple[Tensor, Tensor] | None:
 
 
 def to_be_kept(views: int, height: int, width: int) -> bool:
-    """Whether photographs of 8 bits are so large that they are read onto a shelf."""
-    return _place.get() is not None and shelf.is_large((views, height, width, 3), torch.uint8)
+    """Whether photographs of 8 bits are so large that they are read into a file."""
+    return _place.get() is not None and memmap.is_large((views, height, width, 3), torch.uint8)
 
 
 @dataclass
@@ -104,7 +104,7 @@ class Reading:
         try:
             color, alpha, facts = _opened(partial)
             state = json.loads(facts["reading"])
-            if not shelf.on_disk(color):
+            if not memmap.on_disk(color):
                 return None
             return Reading(color, alpha, partial, origin, **state)
         except UNFIT:
@@ -118,7 +118,7 @@ class Reading:
             OSError: there is no room on the disk for what is large.
         """
         path, shape = _place.get(), (*size, 3)
-        if not origin or path is None or not shelf.is_large(shape, color.dtype):
+        if not origin or path is None or not memmap.is_large(shape, color.dtype):
             return Reading(color.new_zeros(shape), alpha.new_zeros(size))
         path.parent.mkdir(parents=True, exist_ok=True)
         reading = Reading(torch.empty(0), torch.empty(0), _partial(path), origin)
@@ -130,11 +130,8 @@ class Reading:
     def done(self, view: int) -> None:
         """Note that a photograph is whole."""
         self.read = view + 1
-        for array in (self.color, self.alpha):
-            shelf.release(array[view])
         if self.partial is not None and self.read % FLUSHED == 0:
-            shelf.flush(self.color)
-            shelf.flush(self.alpha)
+            _flush(self.partial)
             _set_facts(self.partial, self._facts())
 
     def with_floating_alpha(self) -> Reading:
@@ -151,8 +148,7 @@ class Reading:
     def finished(self) -> tuple[Tensor, Tensor]:
         """Colour and alpha of all; the file has its name."""
         if self.partial is not None and (path := _place.get()) is not None:
-            shelf.flush(self.color)
-            shelf.flush(self.alpha)
+            _flush(self.partial)
             checksum = _checksum(self.color, self.alpha)
             _set_facts(self.partial, {"origin": self.origin, "checksum": checksum})
             os.replace(self.partial, path)
@@ -170,14 +166,21 @@ def _partial(path: Path) -> Path:
 def _write_empty(path: Path, arrays: dict[str, tuple[Sequence[int], torch.dtype]]) -> None:
     """A file of safetensors with zeros, in whose header there is room for facts."""
     header, end = {}, 0
-    for name, (shape, dtype) in arrays.items():
+    # The wider numbers first: so all are aligned
+    for name, (shape, dtype) in sorted(arrays.items(), key=lambda item: -item[1][1].itemsize):
         begin, end = end, end + math.prod(shape) * dtype.itemsize
         kind = "U8" if dtype == torch.uint8 else "F32"
         header[name] = {"dtype": kind, "shape": list(shape), "data_offsets": [begin, end]}
     with path.open("wb") as file:
         file.write(_encoded(header))
         file.flush()
-        shelf.reserve(file.fileno(), 8 + HEADER + end, path)
+        memmap.reserve(file.fileno(), 8 + HEADER + end, path)
+
+
+def _flush(path: Path) -> None:
+    """Write what arrays in a file hold to the disk: a crash of the machine does not lose it."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
 
 
 def _encoded(header: dict[str, Any]) -> bytes:
@@ -203,14 +206,13 @@ def _opened(path: Path) -> tuple[Tensor, Tensor, dict[str, str]]:
     header, length = _header(path)
     about = header["color"]
     dtype = torch.uint8 if about["dtype"] == "U8" else torch.float32
-    if shelf.is_large(about["shape"], dtype) and os.access(path, os.W_OK):
+    if memmap.is_large(about["shape"], dtype) and os.access(path, os.W_OK):
         arrays = []
-        with path.open("r+b") as file:
-            for name in ("color", "alpha"):
-                about = header[name]
-                dtype = torch.uint8 if about["dtype"] == "U8" else torch.float32
-                begin = 8 + length + about["data_offsets"][0]
-                arrays.append(shelf.mapped(file.fileno(), begin, about["shape"], dtype))
+        for name in ("color", "alpha"):
+            about = header[name]
+            dtype = torch.uint8 if about["dtype"] == "U8" else torch.float32
+            begin = 8 + length + about["data_offsets"][0]
+            arrays.append(memmap.mapped(path, begin, about["shape"], dtype))
         return arrays[0], arrays[1], header.get("__metadata__", {})
     with safe_open(path, "pt") as file:
         return file.get_tensor("color"), file.get_tensor("alpha"), file.metadata() or {}
@@ -246,5 +248,4 @@ def _checksum(*tensors: Tensor) -> str:
     for tensor in tensors:
         for picture in tensor:
             value = zlib.crc32(picture.flatten().view(torch.uint8).numpy().data, value)
-            shelf.release(picture)
     return f"{value:08x}"

@@ -11,7 +11,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.camera import Cameras
 from univoxel.data import Photos
 from univoxel.errors import UserError
@@ -155,7 +155,7 @@ def doubted_pixels(
     grid = fit_grid(*belief.box, BOX_NODES)
     silhouettes = distance if carving is None else carving
     hull = visual_hull(silhouettes, cameras, grid, belief.votes)
-    doubted = shelf.zeros(distance.shape, torch.bool)
+    doubted = memmap.zeros(distance.shape, torch.bool)
 
     def doubt_(view_and_depth: tuple[int, Tensor]) -> None:
         view, depth = view_and_depth
@@ -163,7 +163,6 @@ def doubted_pixels(
         differs = (shown != cameras.cut(view, depth.isfinite())).numpy()
         reach = max(ROUGH_PIXELS, ROUGH_SHARE * max(shown.shape))
         deep = np.asarray(ndimage.distance_transform_edt(np.pad(differs, 1)))[1:-1, 1:-1] > reach
-        shelf.release(distance[view])
         if not deep.any():
             return
         near = np.asarray(ndimage.distance_transform_edt(~deep)) <= reach + 1

@@ -8,7 +8,6 @@ import math
 import torch
 from torch import Tensor
 
-from univoxel import shelf
 from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.data import Photos
 from univoxel.grid import GridShape
@@ -92,8 +91,6 @@ def clipped_share(photos: Photos) -> float:
         object_ = alpha > 0.5 * (1 if alpha.is_floating_point() else 255)
         shown += int(object_.sum())
         clipped += int((color[object_] > 255 * CLIPPED).any(1).sum())
-        for array in (photos.color, photos.alpha):
-            shelf.release(array[view])
     return clipped / max(shown, 1)
 
 

@@ -7,7 +7,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.camera import Cameras, looked_at, project
 from univoxel.data.base import coverage_of
 from univoxel.errors import UserError
@@ -39,7 +39,7 @@ PIECE = (
 
 def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
     """Signed distance to the silhouette in pixels, negative inside, of coverage [V, H, W] that is
-    stored as in `Photos`: [V, H, W] float32, on a shelf where they are large.
+    stored as in `Photos`: [V, H, W] float32, in a file where they are large.
 
     Sub-pixel: a half-covered pixel lies on the silhouette. Infinite beyond a picture. Where the
     object leaves the picture there is no silhouette: the picture's edge is none.
@@ -47,7 +47,7 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
     Args:
         cameras: V, which know the sizes of the pictures, where these differ.
     """
-    distances = shelf.zeros(alpha.shape, torch.float32)
+    distances = memmap.zeros(alpha.shape, torch.float32)
     result = distances.numpy()
 
     def fill_(view: int) -> None:
@@ -55,8 +55,6 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
         a = (covered if cameras is None else cameras.cut(view, covered)).numpy()
         result[view] = np.inf
         result[view, : a.shape[0], : a.shape[1]] = _mask_distance(a)
-        for array in (alpha, distances):
-            shelf.release(array[view])
 
     side_by_side(fill_, range(len(alpha)))
     return distances
@@ -126,7 +124,6 @@ def _hull_sdf(
         bound = d.clamp_min(0.5) if uncut else torch.full_like(d, -torch.inf)
         bound = torch.where(seen, d, bound) * depth.abs() / cameras.focal[v].mean()
         voters += bound > -torch.inf
-        shelf.release(distance[v])
         for rank in range(votes):
             highest[rank], bound = (
                 torch.maximum(highest[rank], bound),

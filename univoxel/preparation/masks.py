@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.data.base import coverage_of
@@ -97,8 +97,6 @@ def _change(
         depth = (0.5 - d).floor().long()
         y, x = (~hidden & (depth >= 0) & (depth <= deepest)).nonzero(as_tuple=True)
         inward, _ = _slopes(encoded, d, y, x)
-        for array in view:
-            shelf.release(array)
         at = depth[y, x]
         return torch.bincount(at, inward, deepest + 1), torch.bincount(at, minlength=deepest + 1)
 
@@ -157,7 +155,6 @@ def fitted_masks(photos: Photos, wanted: MasksFrom) -> tuple[Photos, Tensor]:
         for pictures in (photos.color, photos.alpha, distance)
     )
     excess = mask_excess(colors, covered, away)
-    shelf.release()
     if not excess:
         return photos, distance
     much = f"masks are {excess} {'pixel' if excess == 1 else 'pixels'} too wide"
@@ -170,12 +167,10 @@ def fitted_masks(photos: Photos, wanted: MasksFrom) -> tuple[Photos, Tensor]:
 
 def with_masks(photos: Photos, coverage: Callable[[int], Tensor]) -> tuple[Photos, Tensor]:
     """The photographs with masks of such coverage [H, W] by view, and `mask_distances`."""
-    stored = shelf.zeros(photos.alpha.shape, photos.alpha.dtype)
-    exact = shelf.zeros(photos.alpha.shape, torch.float32)
+    stored = memmap.zeros(photos.alpha.shape, photos.alpha.dtype)
+    exact = memmap.zeros(photos.alpha.shape, torch.float32)
     for view in range(len(photos)):
         exact[view] = coverage(view)
         covered = exact[view]
         stored[view] = covered if stored.is_floating_point() else (255 * covered).round().byte()
-        for array in (stored, exact):
-            shelf.release(array[view])
     return replace(photos, alpha=stored), mask_distances(exact, photos.cameras)

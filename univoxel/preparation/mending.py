@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.camera import looked_at, pixel_width
 from univoxel.data import Photos
 from univoxel.data.base import coverage_of
@@ -135,10 +135,9 @@ def _filled(photos: Photos, distance: Tensor, doubted: Tensor) -> Tensor:
         return distance
     coverage = torch.stack([coverage_of(photos.alpha[v]).masked_fill(doubted[v], 1) for v in views])
     changed = mask_distances(coverage, photos.cameras.of(views))
-    result = shelf.zeros(distance.shape, distance.dtype)
+    result = memmap.zeros(distance.shape, distance.dtype)
     for view in range(len(distance)):
         result[view] = distance[view]
-        shelf.release(result[view])
     for view, one in zip(views.tolist(), changed, strict=True):
         result[view] = one
     return result

@@ -13,7 +13,7 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.data import Photos
 from univoxel.data.base import coverage_of
 from univoxel.preparation.masks import as_srgb, cut_away
@@ -60,7 +60,7 @@ def drawn_again(
         off: pixels, > 0, that edges may be off by; at most MOST are moved.
         doubted: [V, H, W] bool, where a mask is not believed at all: it stays, and tells nothing.
     """
-    coverage, cut = shelf.zeros(photos.alpha.shape, torch.float32), photos.cameras.cut
+    coverage, cut = memmap.zeros(photos.alpha.shape, torch.float32), photos.cameras.cut
 
     def draw_(view: int) -> None:
         coverage[view] = coverage_of(photos.alpha[view])
@@ -74,7 +74,6 @@ def drawn_again(
         covered.copy_(torch.from_numpy(outlined(picture, mask, far, believed, reach)))
 
     side_by_side(draw_, range(len(photos)))
-    shelf.release()
     return coverage
 
 

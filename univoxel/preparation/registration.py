@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.camera import Cameras, pixel_rays
 from univoxel.optim import RowAdam
 from univoxel.poses import PoseSteps
@@ -65,7 +64,7 @@ class Edges:
         self.ray_samples: int = RAY_SAMPLES
         self.distance = distance
         self.extended: Tensor = _extended(distance)
-        edges = [((d > low) & (d < high)).nonzero() for d in _one_by_one(distance)]
+        edges = [((d > low) & (d < high)).nonzero() for d in distance]
         view = torch.repeat_interleave(torch.tensor([len(e) for e in edges]))
         self.pixels: Tensor = torch.cat(
             [view[:, None], torch.cat(edges)], 1
@@ -98,7 +97,6 @@ class Edges:
         where = torch.cat([uv, slice_[:, None].to(uv)], 1)[None, None, None]
         volume = self.extended[None, None]
         missed = grid_sample(volume, where, align_corners=False, padding_mode="border")
-        shelf.release(self.extended)
         return missed[0, 0, 0, 0]
 
     def _nearest(self, cameras: Cameras, rays: Rays, others: Tensor) -> tuple[Tensor, Tensor]:
@@ -126,7 +124,6 @@ class Edges:
             seen = (depth > 0) & (uv.abs() <= 1).all(1)  # beyond its picture a view says nothing
             further = seen & (d > most)
             most[further], worst[further] = d[further], v
-            shelf.release(self.distance[v])
         return torch.where(most.isinf(), torch.inf, most), worst  # unseen places are outside
 
 
@@ -183,23 +180,16 @@ def align_(
 
 def _extended(distance: Tensor) -> Tensor:
     """Distances [V, H, W] with what stands at the border of a picture beyond it too."""
-    if all(bool(d.isfinite().all()) for d in _one_by_one(distance)):
+    if all(bool(d.isfinite().all()) for d in distance):
         return distance
-    extended = shelf.zeros(distance.shape, distance.dtype)
-    for picture, given in zip(_one_by_one(extended), _one_by_one(distance), strict=True):
+    extended = memmap.zeros(distance.shape, distance.dtype)
+    for picture, given in zip(extended, distance, strict=True):
         picture.copy_(given)
         there = given.isfinite()
         height, width = int(there[:, 0].sum()), int(there[0].sum())
         picture[:height, width:] = picture[:height, width - 1 : width]
         picture[height:] = picture[height - 1]
     return extended
-
-
-def _one_by_one(pictures: Tensor) -> Iterator[Tensor]:
-    """Pictures of [V, H, W], which hold no memory once the next one is asked for."""
-    for picture in pictures:
-        yield picture
-        shelf.release(picture)
 
 
 def _seen(cameras: Cameras, points: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:

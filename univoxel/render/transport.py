@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
-from univoxel import shelf
 from univoxel.camera import project
 from univoxel.color import srgb_to_linear
 from univoxel.data import Photos
@@ -98,8 +97,6 @@ def observe(
         if photos.color.dtype == torch.uint8:
             pixel_color = srgb_to_linear(pixel_color / 255)
         coverage = coverage_of(stored_alpha)
-        for array in (photos.color, photos.alpha):
-            shelf.release(array[v])
         alpha = grid_sample(coverage[None, None], uv, align_corners=False)[0, 0, 0]
         start = position[facing] + offset * (normal[facing] + towards[facing])
         reach = (eye - start).norm(dim=1).max().item() if len(facing) else 0.0

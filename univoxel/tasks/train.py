@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.build import build_scene
 from univoxel.checkpoint import FILE, load_checkpoint, save_scene
 from univoxel.compression import plan, storage
@@ -90,11 +90,11 @@ def train(
         native.require_embree("train")  # now, and not minutes later
     film = None if timelapse is None else Timelapse(timelapse, cfg)
     if view is None:
-        with shelf.shelved(cfg.out):
+        with memmap.large_arrays_in(cfg.out):
             return _train(cfg, resume, film, None, on_progress)
     from univoxel.viewer.training import watched
 
-    with watched(*view, cfg.out.resolve().name) as spectators, shelf.shelved(cfg.out):
+    with watched(*view, cfg.out.resolve().name) as spectators, memmap.large_arrays_in(cfg.out):
         log.info(f"to look at while it trains, in a browser: {spectators.address}")
         return _train(cfg, resume, film, spectators, on_progress)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from univoxel import losses, shelf
+from univoxel import losses, memmap
 from univoxel.camera import pixel_rays
 from univoxel.checkpoint import save_scene
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
@@ -79,7 +79,7 @@ def run_stage(
     guard = Guard(progress, restored=lambda: restore_surface_(scene))
     guard.follow(optimizer)
     brightness = None  # of photographs whose patches are compared
-    if cfg.loss.patches and stage.patches_from < 1 and not shelf.on_disk(pixels.photos.color):
+    if cfg.loss.patches and stage.patches_from < 1 and not memmap.on_disk(pixels.photos.color):
         brightness = patches.comparable(pixels.photos)
     shown: dict[str, Tensor] = {}  # losses; where patches are not compared, as they were last
     with scene.surface_held():

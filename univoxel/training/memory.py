@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import Photos
 from univoxel.errors import UserError
@@ -23,7 +23,7 @@ log: logging.Logger = logging.getLogger("univoxel")
 
 def needed(photos: Photos, cfg: TrainConfig) -> int:
     """Bytes, about, that training takes besides the photographs, which are there already."""
-    if shelf.on_disk(photos.color):
+    if memmap.on_disk(photos.color):
         return needed_for(0, cfg) + PER_DRAWN * MOST
     return needed_for(photos.alpha.numel(), cfg)
 
@@ -51,7 +51,7 @@ def check_memory(photos: Photos, cfg: TrainConfig, there: Memory | None = None) 
     if there is None:
         return
     further = needed(photos, cfg)
-    have = 0 if shelf.on_disk(photos.color) else photos.color.nbytes + photos.alpha.nbytes
+    have = 0 if memmap.on_disk(photos.color) else photos.color.nbytes + photos.alpha.nbytes
     left = there.total if there.free is None else there.free
     if further <= left:
         return

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.camera import Cameras, projection_matrices
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
@@ -47,7 +47,7 @@ def comparable(photos: Photos) -> Tensor:
 
     It spreads dark colours, as `univoxel.preparation.depth_sweep.log_colors` does.
     """
-    result = shelf.zeros(photos.alpha.shape, torch.float16)
+    result = memmap.zeros(photos.alpha.shape, torch.float16)
     result[:] = BACKGROUND
     for view in range(len(photos)):
         color, alpha = photos.stored(view)
@@ -59,8 +59,6 @@ def comparable(photos: Photos) -> Tensor:
         photos.cameras.cut(view, result[view])[:] = torch.where(
             coverage_of(alpha) > MIN_ALPHA, curve, BACKGROUND
         )
-        for array in (photos.color, photos.alpha, result):
-            shelf.release(array[view])
     return result
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.data import Photos
 from univoxel.data.base import decode
 
@@ -49,7 +49,7 @@ def split_pixels(photos: Photos, distance: Tensor, doubted: Tensor | None = None
     if sum(counts) > MOST:
         share = MOST / sum(counts)
         counts = [round(share * count) for count in counts]
-    with_colors = shelf.on_disk(photos.color)
+    with_colors = memmap.on_disk(photos.color)
     width = 3 + (packed_width(photos) if with_colors else 0)
     pixels = torch.empty(sum(counts), width, dtype=torch.int32)
     for view, part in enumerate(pixels.split(counts)):
@@ -60,8 +60,6 @@ def split_pixels(photos: Photos, distance: Tensor, doubted: Tensor | None = None
         part[:, 1:3] = found
         if with_colors:
             part[:, 3:] = packed(photos, view, found)
-            shelf.release(photos.color[view])
-            shelf.release(photos.alpha[view])
     order = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))
     held = min(HELD_OUT, len(pixels) // 10)
     if not held:  # so few that none can be spared
@@ -83,17 +81,14 @@ def _taken_out_(pixels: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
 def _near(distance: Tensor, doubted: Tensor | None, view: int) -> Tensor:
     """Which pixels [H, W] of a view are looked at."""
     near = distance[view] < MARGIN
-    shelf.release(distance[view])
     return near if doubted is None else near & ~doubted[view]
 
 
 def _without(alpha: Tensor, doubted: Tensor) -> Tensor:
     """Alpha [V, H, W] that is 0 where it is doubted."""
-    result = shelf.zeros(alpha.shape, alpha.dtype)
+    result = memmap.zeros(alpha.shape, alpha.dtype)
     for view in range(len(alpha)):
         result[view] = alpha[view].masked_fill(doubted[view], 0)
-        for array in (result, alpha, doubted):
-            shelf.release(array[view])
     return result
 
 

@@ -1,7 +1,8 @@
-"""Arrays on disk: the same numbers as in memory, and no memory of the process."""
+"""Arrays on disk: the same numbers as in memory."""
 
 import gc
 import logging
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 from analytic import write_scene
 from PIL import Image
 
-from univoxel import shelf
+from univoxel import memmap
 from univoxel.data import kept, load_photos, shots
 from univoxel.errors import DataError
 from univoxel.preparation.hull import mask_distances
@@ -19,47 +20,59 @@ from univoxel.training import pixels as training_pixels
 from univoxel.training.loop import batch_at
 from univoxel.training.pixels import packed, split_pixels, unpacked
 
-pytestmark = pytest.mark.skipif(shelf.DROP is None, reason="arrays on disk are of Linux")
+pytestmark = pytest.mark.skipif(not memmap.MAPS, reason="arrays on disk are of Linux")
 
 
-def resident_mb() -> float:
-    """Pages of files that this process holds."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    (line,) = [line for line in lines if line.startswith("RssFile")]
-    return int(line.split()[1]) / 1024
+def test_small_arrays_and_those_of_no_folder_are_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(memmap, "LARGE", 1000)
+    assert not memmap.on_disk(memmap.zeros((2000,), torch.uint8))
+    with memmap.large_arrays_in(tmp_path):
+        assert not memmap.on_disk(memmap.zeros((999,), torch.uint8))
+        assert memmap.on_disk(memmap.zeros((250,), torch.float32))
+    assert not memmap.on_disk(memmap.zeros((2000,), torch.uint8))
 
 
-def test_small_arrays_and_those_of_no_shelf_are_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(shelf, "LARGE", 1000)
-    assert not shelf.on_disk(shelf.zeros((2000,), torch.uint8))
-    with shelf.shelved(tmp_path):
-        assert not shelf.on_disk(shelf.zeros((999,), torch.uint8))
-        assert shelf.on_disk(shelf.zeros((250,), torch.float32))
-    assert not shelf.on_disk(shelf.zeros((2000,), torch.uint8))
-
-
-def test_what_is_released_takes_no_memory_and_stays(tmp_path, monkeypatch):
-    monkeypatch.setattr(shelf, "LARGE", 1000)
-    with shelf.shelved(tmp_path / "new"):
-        array = shelf.zeros((8, 1024, 1024), torch.float32)
-    assert list((tmp_path / "new").iterdir()) == []  # a file without a name
-    before = resident_mb()
+def test_a_large_array_is_a_file_without_a_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(memmap, "LARGE", 1000)
+    with memmap.large_arrays_in(tmp_path / "new"):
+        array = memmap.zeros((8, 1024, 1024), torch.float32)
+    assert list((tmp_path / "new").iterdir()) == []
+    assert open_files(tmp_path) == 0  # mapped, and closed
+    assert str(tmp_path) in Path("/proc/self/maps").read_text()
     array += torch.arange(8.0)[:, None, None]
-    assert resident_mb() > before + 30
-    shelf.release(array[3])
-    assert resident_mb() < before + 29
-    shelf.release()
-    assert resident_mb() < before + 2
+    assert memmap.on_disk(array[3].flatten())
     assert array[:, 5, 7].tolist() == list(range(8))
     del array
     gc.collect()
-    assert not shelf._maps
+    assert str(tmp_path) not in Path("/proc/self/maps").read_text()
+
+
+def open_files(folder: Path) -> int:
+    """Files below a folder that this process holds open."""
+    links = [f"/proc/self/fd/{name}" for name in os.listdir("/proc/self/fd")]
+    return sum(os.readlink(p).startswith(str(folder)) for p in links if os.path.lexists(p))
+
+
+def test_an_array_in_a_file_changes_the_file(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(bytes(8 + 12))
+    array = memmap.mapped(path, 8, (1, 3), torch.float32)
+    array[0, 1] = 2.5
+    assert np.frombuffer(path.read_bytes()[8:], np.float32).tolist() == [0, 2.5, 0]
+    with pytest.raises(ValueError, match="not aligned"):
+        memmap.mapped(path, 9, (1, 2), torch.float32)
+    with pytest.raises(ValueError, match="expected 24 bytes, got 20"):
+        memmap.mapped(path, 8, (1, 4), torch.float32)
+    assert path.stat().st_size == 20
 
 
 def test_a_full_disk_is_said_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(shelf, "LARGE", 1000)
-    with shelf.shelved(tmp_path), pytest.raises(OSError, match=r"no room for 1000000\.0 GB"):
-        shelf.zeros((10**15,), torch.uint8)
+    monkeypatch.setattr(memmap, "LARGE", 1000)
+    with (
+        memmap.large_arrays_in(tmp_path),
+        pytest.raises(OSError, match=r"no room for 1000000\.0 GB"),
+    ):
+        memmap.zeros((10**15,), torch.uint8)
 
 
 @pytest.fixture
@@ -67,24 +80,24 @@ def scene(tmp_path):
     return write_scene(tmp_path / "scene", views=20, size=32)
 
 
-def on_shelf(scene, run, monkeypatch, **more):
-    monkeypatch.setattr(shelf, "LARGE", 1000)
-    with shelf.shelved(run):
+def in_files(scene, run, monkeypatch, **more):
+    monkeypatch.setattr(memmap, "LARGE", 1000)
+    with memmap.large_arrays_in(run):
         return load_photos(scene, "train", kept=run / "kept.safetensors", **more)
 
 
-def test_photographs_on_a_shelf_are_those_in_memory(scene, tmp_path, monkeypatch):
+def test_photographs_in_a_file_are_those_in_memory(scene, tmp_path, monkeypatch):
     usual = load_photos(scene, "train")
-    read = on_shelf(scene, tmp_path / "run", monkeypatch)
-    again = on_shelf(scene, tmp_path / "run", monkeypatch)
+    read = in_files(scene, tmp_path / "run", monkeypatch)
+    again = in_files(scene, tmp_path / "run", monkeypatch)
     for photos in (read, again):
-        assert shelf.on_disk(photos.color)
-        assert shelf.on_disk(photos.alpha)
+        assert memmap.on_disk(photos.color)
+        assert memmap.on_disk(photos.alpha)
         assert torch.equal(photos.color, usual.color)
         assert torch.equal(photos.alpha, usual.alpha)
     assert [p.name for p in (tmp_path / "run").iterdir()] == ["kept.safetensors"]
     kept.keep_photos(read, tmp_path / "run/kept.safetensors")  # it is there already
-    monkeypatch.setattr(shelf, "LARGE", 1 << 28)
+    monkeypatch.setattr(memmap, "LARGE", 1 << 28)
     unmapped = load_photos(scene, "train", kept=tmp_path / "run/kept.safetensors")
     assert torch.equal(unmapped.color, usual.color)
 
@@ -107,10 +120,10 @@ def test_reading_that_was_ended_goes_on(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(shots, "READERS", 1)
     monkeypatch.setattr(shots, "read_photo", until(10))
     with pytest.raises(KeyboardInterrupt):
-        on_shelf(scene, run, monkeypatch)
+        in_files(scene, run, monkeypatch)
     names.clear()
     monkeypatch.setattr(shots, "read_photo", until(99))
-    photos = on_shelf(scene, run, monkeypatch)
+    photos = in_files(scene, run, monkeypatch)
     assert len(names) == 20 - 8  # two times four were safe
     assert torch.equal(photos.color, usual.color)
     assert torch.equal(photos.alpha, usual.alpha)
@@ -127,10 +140,10 @@ def test_reading_that_was_ended_goes_on(scene, tmp_path, monkeypatch):
 )
 def test_a_broken_file_is_read_again(scene, tmp_path, monkeypatch, damage):
     usual = load_photos(scene, "train")
-    on_shelf(scene, tmp_path / "run", monkeypatch)
+    in_files(scene, tmp_path / "run", monkeypatch)
     path = tmp_path / "run/kept.safetensors"
     path.write_bytes(damage(path.read_bytes()))
-    again = on_shelf(scene, tmp_path / "run", monkeypatch)
+    again = in_files(scene, tmp_path / "run", monkeypatch)
     assert torch.equal(again.color, usual.color)
     assert torch.equal(again.alpha, usual.alpha)
 
@@ -141,17 +154,17 @@ def test_what_cannot_be_used_leaves_no_photographs(tmp_path, monkeypatch):
     for path in scene.rglob("*.png"):
         Image.fromarray(np.zeros((32, 32, 4), np.uint8)).save(path)
     with pytest.raises(DataError, match="fully transparent"):
-        on_shelf(scene, tmp_path / "run", monkeypatch)
+        in_files(scene, tmp_path / "run", monkeypatch)
     assert list((tmp_path / "run").iterdir()) == []
 
 
 def test_distances_and_pixels_are_those_of_memory(scene, tmp_path, monkeypatch):
     usual = load_photos(scene, "train")
     wanted = split_pixels(usual, mask_distances(usual.alpha, usual.cameras))
-    photos = on_shelf(scene, tmp_path / "run", monkeypatch)
-    with shelf.shelved(tmp_path / "run"):
+    photos = in_files(scene, tmp_path / "run", monkeypatch)
+    with memmap.large_arrays_in(tmp_path / "run"):
         distance = mask_distances(photos.alpha, photos.cameras)
-        assert shelf.on_disk(distance)
+        assert memmap.on_disk(distance)
         got = split_pixels(photos, distance)
     assert torch.equal(got.held_out[:, :3], wanted.held_out)
     places = got.trained[:, :3]
