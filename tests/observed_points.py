@@ -88,7 +88,7 @@ def in_double(transport: LinearTransport) -> LinearTransport:
 class Steps:
     """A progress, and its clock, that let a stage run through."""
 
-    over, pace, reserved = False, 1.0, math.inf
+    finished, over, pace, reserved = False, False, 1.0, math.inf
     stage = step = 0
 
     def __init__(self, count: int, rooms: Sequence[int] = ()):

@@ -150,8 +150,9 @@ def test_bumps_that_shading_contradicts_are_smoothed():
     assert scene.occluder() is not occluder  # what is derived from the surface is made anew
 
 
-def test_no_time_is_no_tracing():
+def test_a_training_that_is_stopped_and_out_of_time_traces_nothing():
     steps = Steps(10)
+    steps.finished = True
     steps.over, steps.skip = True, lambda: steps.asked.append("skip")
     stage.solve(sphere_scene(8), photos_of(1, 8), JointConfig(), 0, steps)
     assert steps.asked == ["skip"]

@@ -89,6 +89,8 @@ def info(
     found["cameras"] = camera_check(scene, run)
     verdict = load_verdict(run)
     unknown = "Result: unfinished, training has not ended. What helps: train it with --resume"
+    if (run / "trust.txt").exists():
+        unknown = "Result: not judged, because a version before 0.3 trained it"
     found["said"] = unknown if verdict is None else verdict.sentence()
     found["result"] = None if verdict is None else as_json(verdict)
     for path in (json, picture):
