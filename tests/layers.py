@@ -55,6 +55,7 @@ HELPERS = {
         "composite_field",
         "dense_grid",
         "density",
+        "differentiable",
         "grid_sampling",
         "hash_grid",
         "native",
