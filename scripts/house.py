@@ -19,13 +19,13 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 37_700,
+    "lines of the package": 36_500,
     "lines of the laboratory": 3_100,
-    "lines of tests": 36_600,
-    "modules of the package": 270,
+    "lines of tests": 36_700,
+    "modules of the package": 261,
     "loose modules at the top": 36,
-    "configuration fields": 154,
-    "fields that nothing sets": 16,
+    "configuration fields": 131,
+    "fields that nothing sets": 0,
     "layers": 16,
     "imports that go up": 0,
     "circles": 0,

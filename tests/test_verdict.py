@@ -26,7 +26,7 @@ def test_a_good_run():
         ("psnr", 24.0, 15.0, "validation 24.0 dB", "sharp photographs"),
         ("outline", 0.05, 0.2, "5% of the outline", "better masks"),
         ("hidden", 0.4, 0.7, "40% of the surface is seen by fewer", "more photographs"),
-        ("residual", 0.3, 0.8, "30% of the surface differs", "--preset full"),
+        ("residual", 0.3, 0.9, "30% of the surface differs", "--preset full"),
     ],
 )
 def test_each_piece_of_evidence_counts(name, usable, retake, reason, remedy):
@@ -44,9 +44,9 @@ def test_what_is_no_number_is_not_good():
 
 
 def test_the_worst_comes_first_and_two_remedies_are_enough():
-    found = of(psnr=24.0, residual=0.8, outline=0.05, troubles=2)
+    found = of(psnr=24.0, residual=0.9, outline=0.05, troubles=2)
     assert found.word == "retake"
-    assert "80% of the surface" in found.reasons[0]
+    assert "90% of the surface" in found.reasons[0]
     assert len(found.reasons) == 4
     assert len(found.remedies) == 2
     assert of(troubles=1).reasons == ("training met trouble once and went on",)

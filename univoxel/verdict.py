@@ -22,7 +22,7 @@ GOOD_DB, POOR_DB = 26.0, 20.0
 GOOD_OUTLINE, POOR_OUTLINE = 0.03, 0.10
 # Shares of the surface: too few cameras see it; it differs visibly from its photographs
 GOOD_HIDDEN, POOR_HIDDEN = 0.25, 0.6
-GOOD_RESIDUAL, POOR_RESIDUAL = 0.15, 0.5
+GOOD_RESIDUAL, POOR_RESIDUAL = 0.15, 0.8
 
 
 @dataclass(frozen=True)

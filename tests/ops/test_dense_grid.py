@@ -5,7 +5,8 @@ import torch
 from check_op import check_op
 
 from univoxel.ops import sample_dense, sample_dense_reference, use_backend
-from univoxel.ops.dense_grid import _sample_dense, _sample_dense_backward
+from univoxel.ops.dense_grid import _sample_dense
+from univoxel.ops.grid_sampling import no_table
 
 ORIGIN = [0.125, -0.25, 0.375]
 H = 0.25
@@ -200,13 +201,14 @@ def test_far_origin_keeps_the_fraction_of_a_float32_point():
 
 
 def test_opcheck():
-    arguments = case((4, 4, 4))
-    torch.library.opcheck(_sample_dense.defined, (*arguments, False))
-    sdf, features, points = (a.detach() for a in arguments[:3])
-    *pulls, order = _sample_dense(sdf, features, points, ORIGIN, H, False)
+    sdf, features, points, *place = case((4, 4, 4))
+    place = (list(sdf.shape), *place, False)
+    torch.library.opcheck(_sample_dense.defined, (sdf, features, no_table(sdf), points, *place))
+    tensors = [t.detach() for t in (sdf, features, no_table(sdf), points)]
+    *pulls, order = _sample_dense(*tensors, *place)
     for needs in ([True, True, True], [True, False, False]):
         torch.library.opcheck(
-            _sample_dense_backward.defined, (sdf, features, points, order, *pulls, ORIGIN, H, needs)
+            _sample_dense.backward.defined, (*tensors, order, *pulls, *place, needs)
         )
 
 

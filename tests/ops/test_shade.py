@@ -14,7 +14,7 @@ from univoxel.ops import (
     shade_radiance_reference,
     use_backend,
 )
-from univoxel.ops.shade import _shade_map, _shade_radiance, _shade_radiance_backward
+from univoxel.ops.shade import _shade_map, _shade_radiance
 
 # Above check_op's common bound: sums of a few hundred directions, and D's denominator at low
 # roughness.
@@ -213,9 +213,8 @@ def test_fixed_light_gets_no_gradient():
         assert all(torch.equal(a, b) for a, b in zip(got, wanted, strict=True))
         torch.testing.assert_close(got, learned, rtol=1e-12, atol=0)
     *tensors, omega, f0 = detached(lit(3, 16))
-    grads = _shade_radiance_backward(
-        *tensors, torch.tensor(f0), torch.ones(3, 3), omega, False, False
-    )
+    needs = [False, False, True, True, False]
+    grads = _shade_radiance.backward(*tensors, torch.tensor(f0), torch.ones(3, 3), omega, needs)
     assert [g.numel() for g in grads] == [0, 0, 9, 3, 0]
 
 

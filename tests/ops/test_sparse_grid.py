@@ -8,7 +8,7 @@ from bricks import cut
 from check_op import check_op
 
 from univoxel.ops import sample_dense, sample_sparse, sample_sparse_reference, use_backend
-from univoxel.ops.sparse_grid import _sample_sparse, _sample_sparse_backward
+from univoxel.ops.sparse_grid import _sample_sparse
 from univoxel.records import Bricks
 
 ORIGIN = [0.125, -0.25, 0.375]
@@ -172,16 +172,13 @@ def test_gradient_of_one_argument(needed):
 
 def test_opcheck():
     pool, features, bricks, points, *place = case((5, 4, 4))
-    place = (list(bricks.size), *place)
-    torch.library.opcheck(
-        _sample_sparse.defined, (pool, features, bricks.table, points, *place, False)
-    )
-    pool, features, points = (a.detach() for a in (pool, features, points))
-    *pulls, order = _sample_sparse(pool, features, bricks.table, points, *place, False)
+    place = (list(bricks.size), *place, False)
+    torch.library.opcheck(_sample_sparse.defined, (pool, features, bricks.table, points, *place))
+    tensors = [t.detach() for t in (pool, features, bricks.table, points)]
+    *pulls, order = _sample_sparse(*tensors, *place)
     for needs in ([True, True, True], [True, False, False]):
         torch.library.opcheck(
-            _sample_sparse_backward.defined,
-            (pool, features, bricks.table, points, order, *pulls, *place, needs),
+            _sample_sparse.backward.defined, (*tensors, order, *pulls, *place, needs)
         )
 
 

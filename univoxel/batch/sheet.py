@@ -11,7 +11,7 @@ from PIL import Image
 from univoxel.batch.results import SceneResult
 from univoxel.batch.scenes import LOGS
 from univoxel.capture.project import Project
-from univoxel.pictures.html import DARK_STYLE, document, escape, image, paragraph, table, write_html
+from univoxel.page.html import DARK_STYLE, document, escape, image, paragraph, table, write_html
 
 TILE = 120  # pixels of the longer side
 COLUMNS = {  # measures that the page shows, by key, with their digits

@@ -98,7 +98,7 @@ def adam_rows_reference_(
     param[rows] -= lr / (1 - beta1**step) * m / (root + eps)
 
 
-@native.operator("adam_rows_", mutates_args=("param", "exp_avg", "exp_avg_sq"))
+@native.in_place("adam_rows_", ("param", "exp_avg", "exp_avg_sq"))
 def _adam_rows(
     param: Tensor,
     exp_avg: Tensor,
@@ -113,15 +113,5 @@ def _adam_rows(
 ) -> None:
     native.require().adam_rows(
         *native.arrays(param, exp_avg, exp_avg_sq, rows, grad),
-        lr,
-        beta1,
-        beta2,
-        eps,
-        step,
-        native.threads(),
+        *(lr, beta1, beta2, eps, step, native.threads()),
     )
-
-
-@_adam_rows.register_fake
-def _(param, exp_avg, exp_avg_sq, rows, grad, lr, beta1, beta2, eps, step):
-    return None

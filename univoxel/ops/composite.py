@@ -7,6 +7,7 @@ from torch import Tensor
 
 from univoxel.ops import native
 from univoxel.ops.checks import check
+from univoxel.ops.differentiable import differentiable
 
 
 def composite(
@@ -70,55 +71,8 @@ def composite_reference(
     return out, weight
 
 
-@native.operator("composite")
+@differentiable(to="alpha value")
 def _composite(
     alpha: Tensor, value: Tensor, offsets: Tensor, early_stop: float
 ) -> tuple[Tensor, Tensor]:
-    out, weight = value.new_empty(len(offsets) - 1, value.shape[1]), torch.empty_like(alpha)
-    native.require().composite_forward(
-        *native.arrays(alpha, value, offsets, out, weight), early_stop, native.threads()
-    )
-    return out, weight
-
-
-@native.operator("composite_backward")
-def _composite_backward(
-    alpha: Tensor,
-    value: Tensor,
-    offsets: Tensor,
-    grad_out: Tensor,
-    grad_weight: Tensor,
-    early_stop: float,
-) -> tuple[Tensor, Tensor]:
-    grad_alpha, grad_value = torch.empty_like(alpha), torch.empty_like(value)
-    native.require().composite_backward(
-        *native.arrays(alpha, value, offsets, grad_out, grad_weight, grad_alpha, grad_value),
-        early_stop,
-        native.threads(),
-    )
-    return grad_alpha, grad_value
-
-
-@_composite.register_fake
-def _(alpha, value, offsets, early_stop):
     return value.new_empty(len(offsets) - 1, value.shape[1]), torch.empty_like(alpha)
-
-
-@_composite_backward.register_fake
-def _(alpha, value, offsets, grad_out, grad_weight, early_stop):
-    return torch.empty_like(alpha), torch.empty_like(value)
-
-
-def _save(ctx, inputs, output):
-    *tensors, ctx.early_stop = inputs
-    ctx.save_for_backward(*tensors)
-
-
-def _backward(ctx, grad_out, grad_weight):
-    grads = _composite_backward(
-        *ctx.saved_tensors, grad_out.contiguous(), grad_weight.contiguous(), ctx.early_stop
-    )
-    return *grads, None, None
-
-
-_composite.register_autograd(_backward, setup_context=_save)

@@ -14,6 +14,7 @@ from univoxel.ops.checks import check, check_bricks
 from univoxel.ops.composite import composite_reference
 from univoxel.ops.dense_grid import sample_dense_reference
 from univoxel.ops.density import section_alpha
+from univoxel.ops.differentiable import differentiable
 from univoxel.ops.grid_sampling import SparseGrad, check_place
 from univoxel.ops.hash_grid import check_levels, encode_hash_reference, lattice_sizes
 from univoxel.ops.sparse_grid import sample_sparse_reference
@@ -124,7 +125,7 @@ def _total(
     sparse_grad: bool,
 ) -> Tensor:
     """As the reference, from the kernel."""
-    table = sdf.new_empty(0, 0, 0, dtype=torch.int32) if bricks is None else bricks.table
+    table = grid_sampling.no_table(sdf) if bricks is None else bricks.table
     corners = [[float(x) for x in part] for part in levels or ((), (), ())]
     total, _ = _composite_field(
         *(x.contiguous() for x in (sdf, features, table, origin, direction)),
@@ -214,12 +215,6 @@ def composite_field_reference(
     return torch.cat([opacity, summed((share * samples.t)[:, None]), scale * sums], 1)
 
 
-def _grid(table: Tensor, size: list[int], origin: list[float], voxel_size: float) -> Any:
-    if table.numel():
-        return native.require().SparseGrid(table.numpy(), size, origin, voxel_size)
-    return native.require().DenseGrid(size, origin, voxel_size)
-
-
 def _hash_place(
     lower: list[float], upper: list[float], voxel_sizes: list[float]
 ) -> hash_grid.Place:
@@ -229,7 +224,97 @@ def _hash_place(
     return lattice_sizes(lower, upper, voxel_sizes), lower, voxel_sizes
 
 
-@native.operator("composite_field")
+def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
+    sdf, features, table, *rays = tensors
+    *place, lower, upper, voxel_sizes, inv_s, min_share, _ = options
+    native.require().composite_field_forward(
+        grid_sampling.grid_of(table, *place),
+        *native.arrays(sdf, features),
+        *_hash_place(lower, upper, voxel_sizes),
+        *native.arrays(*rays),
+        inv_s,
+        min_share,
+        *native.arrays(*outputs),
+        native.threads(),
+    )
+
+
+class _Adjoints(NamedTuple):
+    """Derivatives of the loss to what was read of each sample, and where that was."""
+
+    points: Tensor  # [M, 3]
+    feature_points: Tensor  # [M, 3] the same, or NaN where no features were read
+    value: Tensor  # [M]
+    gradient: Tensor  # [M, 3]
+    feature: Tensor  # [M, C]
+
+
+def _adjoints(
+    saved: Sequence[Tensor],
+    grad_out: Tensor,
+    grid: Any,
+    levels: hash_grid.Place,
+    density: Sequence[float],
+) -> _Adjoints:
+    """Through compositing and opacity, back to samples."""
+    sdf, features, _, *rays, held = saved
+    t = rays[2]
+    adjoints = _Adjoints(
+        t.new_empty(len(t), 3),
+        t.new_empty(len(t), 3),
+        torch.empty_like(t),
+        t.new_empty(len(t), 3),
+        t.new_empty(len(t), held.shape[1] - SAMPLE_NUMBERS),
+    )
+    native.require().composite_field_pulls(
+        grid,
+        *native.arrays(sdf, features),
+        *levels,
+        *native.arrays(*rays),
+        *density,
+        *native.arrays(held, grad_out, *adjoints),
+        native.threads(),
+    )
+    return adjoints
+
+
+def _backward(
+    saved: Sequence[Tensor], grads: Sequence[Tensor], options: Sequence, needs: list[bool]
+) -> list[Tensor | None]:
+    """From samples to nodes, or to the hash table, and to rays."""
+    sdf, features, table, _, direction, t, _, offsets, _ = saved
+    *place, lower, upper, voxel_sizes, inv_s, min_share, sparse = options
+    grid = grid_sampling.grid_of(table, *place)
+    levels = _hash_place(lower, upper, voxel_sizes)
+    at = _adjoints(saved, grads[0], grid, levels, (inv_s, min_share))
+    hashed, moved = bool(voxel_sizes), needs[2] or needs[3]
+    of_nodes = sdf.new_empty(*sdf.shape, 0) if hashed else features
+    feature = at.feature[:, :0] if hashed else at.feature
+    order = torch.empty(len(t), dtype=torch.int32)
+    native.require().sort_by_tile(grid, *native.arrays(at.points, order), native.threads())
+    of_sdf, of_features, of_points = grid_sampling.gradients(
+        grid,
+        (sdf, of_nodes, at.points, order),
+        (at.value, at.gradient, feature.contiguous()),
+        [needs[0], needs[1] and not hashed, moved],
+        sparse,
+    )
+    of_hash = None
+    if hashed:
+        hash_needs, count = [needs[1], moved], len(voxel_sizes)
+        of_features, of_hash = hash_grid.gradients(
+            features, at.feature_points, at.feature, levels, count, hash_needs, sparse
+        )
+    of_origin = of_direction = None
+    if of_points is not None:
+        of_points = of_points if of_hash is None else of_points + of_hash
+        ray = torch.repeat_interleave(offsets.diff())
+        of_origin = torch.zeros_like(direction).index_add(0, ray, of_points)
+        of_direction = torch.zeros_like(direction).index_add(0, ray, t[:, None] * of_points)
+    return [of_sdf, of_features, of_origin, of_direction]
+
+
+@differentiable(to="sdf features origin direction", forward=_forward, backward=_backward, held=1)
 def _composite_field(
     sdf: Tensor,
     features: Tensor,
@@ -249,184 +334,9 @@ def _composite_field(
     min_share: float,
     sparse_grad: bool,
 ) -> tuple[Tensor, Tensor]:
-    out, held = _empty(features, t, offsets, voxel_sizes)
-    native.require().composite_field_forward(
-        _grid(table, size, grid_origin, voxel_size),
-        *native.arrays(sdf, features),
-        *_hash_place(lower, upper, voxel_sizes),
-        *native.arrays(origin, direction, t, connected, offsets),
-        inv_s,
-        min_share,
-        *native.arrays(out, held),
-        native.threads(),
-    )
-    return out, held
-
-
-def _empty(
-    features: Tensor, t: Tensor, offsets: Tensor, voxel_sizes: list[float]
-) -> tuple[Tensor, Tensor]:
     """What rays sum up to, and what is held of samples for the way back."""
     channels = features.shape[-1] * max(len(voxel_sizes), 1)
     return (
         t.new_empty(len(offsets) - 1, RAY_NUMBERS + channels),
         t.new_empty(len(t), SAMPLE_NUMBERS + channels),
     )
-
-
-@_composite_field.register_fake
-def _(sdf, features, table, origin, direction, t, connected, offsets, *numbers):
-    return _empty(features, t, offsets, numbers[5])
-
-
-class _Pulls(NamedTuple):
-    """How far the loss pulls at what was read of each sample."""
-
-    points: Tensor  # [M, 3]
-    feature_points: Tensor  # [M, 3] the same, or NaN where no features were read
-    value: Tensor  # [M]
-    gradient: Tensor  # [M, 3]
-    feature: Tensor  # [M, C]
-
-
-def _pulls(
-    tensors: Sequence[Tensor],
-    held: Tensor,
-    grad_out: Tensor,
-    grid: Any,
-    levels: hash_grid.Place,
-    inv_s: float,
-    min_share: float,
-) -> _Pulls:
-    sdf, features, _, *rays = tensors
-    t = rays[2]
-    pulls = _Pulls(
-        t.new_empty(len(t), 3),
-        t.new_empty(len(t), 3),
-        torch.empty_like(t),
-        t.new_empty(len(t), 3),
-        t.new_empty(len(t), held.shape[1] - SAMPLE_NUMBERS),
-    )
-    native.require().composite_field_pulls(
-        grid,
-        *native.arrays(sdf, features),
-        *levels,
-        *native.arrays(*rays),
-        inv_s,
-        min_share,
-        *native.arrays(held, grad_out, *pulls),
-        native.threads(),
-    )
-    return pulls
-
-
-def _gradients(
-    tensors: Sequence[Tensor],
-    held: Tensor,
-    grad_out: Tensor,
-    grid: Any,
-    levels: hash_grid.Place,
-    inv_s: float,
-    min_share: float,
-    needs: list[bool],
-    sparse: bool,
-) -> list[Tensor | None]:
-    """Of sdf, features, origin and direction; None where not needed."""
-    sdf, features, _, _, direction, t, _, offsets = tensors
-    pulls = _pulls(tensors, held, grad_out, grid, levels, inv_s, min_share)
-    hashed = bool(levels[0])
-    moved = needs[2] or needs[3]
-    of_nodes = sdf.new_empty(*sdf.shape, 0) if hashed else features
-    feature = pulls.feature[:, :0] if hashed else pulls.feature
-    order = torch.empty(len(t), dtype=torch.int32)
-    native.require().sort_by_tile(grid, *native.arrays(pulls.points, order), native.threads())
-    backward = grid_sampling.sample_backward_sparse if sparse else grid_sampling.sample_backward
-    of_sdf, of_features, of_points = backward(
-        grid,
-        (sdf, of_nodes, pulls.points, order),
-        (pulls.value, pulls.gradient, feature.contiguous()),
-        [needs[0], needs[1] and not hashed, moved],
-    )
-    of_hash = None
-    if hashed:
-        hash_needs, count = [needs[1], moved], len(levels[0])
-        of_features, of_hash = hash_grid.backward(
-            features, pulls.feature_points, pulls.feature, levels, count, hash_needs, sparse
-        )
-    of_origin = of_direction = None
-    if of_points is not None and moved:
-        pull = of_points if of_hash is None else of_points + of_hash
-        ray = torch.repeat_interleave(offsets.diff())
-        of_origin = torch.zeros_like(direction).index_add(0, ray, pull)
-        of_direction = torch.zeros_like(direction).index_add(0, ray, t[:, None] * pull)
-    grads = (of_sdf, of_features, of_origin, of_direction)
-    return [g if need else None for g, need in zip(grads, needs, strict=True)]
-
-
-@native.operator("composite_field_backward")
-def _composite_field_backward(
-    sdf: Tensor,
-    features: Tensor,
-    table: Tensor,
-    origin: Tensor,
-    direction: Tensor,
-    t: Tensor,
-    connected: Tensor,
-    offsets: Tensor,
-    held: Tensor,
-    grad_out: Tensor,
-    size: list[int],
-    grid_origin: list[float],
-    voxel_size: float,
-    lower: list[float],
-    upper: list[float],
-    voxel_sizes: list[float],
-    inv_s: float,
-    min_share: float,
-    needs: list[bool],
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    tensors = sdf, features, table, origin, direction, t, connected, offsets
-    grid = _grid(table, size, grid_origin, voxel_size)
-    levels = _hash_place(lower, upper, voxel_sizes)
-    grads = _gradients(tensors, held, grad_out, grid, levels, inv_s, min_share, needs, sparse=False)
-    # An op cannot return None
-    a, b, c, d = (t.new_empty(0) if g is None else g for g in grads)
-    return a, b, c, d
-
-
-@_composite_field_backward.register_fake
-def _(sdf, features, table, origin, direction, t, connected, offsets, held, grad_out, *numbers):
-    inputs = zip((sdf, features, origin, direction), numbers[-1], strict=True)
-    return tuple(torch.empty_like(x) if need else x.new_empty(0) for x, need in inputs)
-
-
-def _save(ctx, inputs, output):
-    tensors = inputs[:8]
-    ctx.place, (ctx.inv_s, ctx.min_share, ctx.sparse_grad) = inputs[8:14], inputs[14:]
-    ctx.save_for_backward(*tensors, output[1])
-    ctx.set_materialize_grads(False)
-
-
-def _backward(ctx, grad_out, _):
-    *tensors, held = ctx.saved_tensors
-    none = [None] * (len(ctx.place) + 3)
-    if grad_out is None:
-        return *[None] * len(tensors), *none
-    wanted = ctx.needs_input_grad
-    needs = [wanted[0], wanted[1], wanted[3], wanted[4]]
-    density = ctx.inv_s, ctx.min_share
-    if ctx.sparse_grad:
-        size, grid_origin, voxel_size, *levels = ctx.place
-        grid = _grid(tensors[2], size, grid_origin, voxel_size)
-        grads = _gradients(
-            tensors, held, grad_out.contiguous(), grid, _hash_place(*levels), *density, needs, True
-        )
-    else:
-        dense = _composite_field_backward(
-            *tensors, held, grad_out.contiguous(), *ctx.place, *density, needs
-        )
-        grads = [g if need else None for g, need in zip(dense, needs, strict=True)]
-    return grads[0], grads[1], None, grads[2], grads[3], None, None, None, *none
-
-
-_composite_field.register_autograd(_backward, setup_context=_save)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -73,7 +72,9 @@ def sample_dense(
         return _sample_dense(
             sdf.contiguous(),
             features.contiguous(),
+            grid_sampling.no_table(sdf),
             points.contiguous(),
+            list(sdf.shape),
             [float(x) for x in origin],
             float(voxel_size),
             sparse_grad,
@@ -112,80 +113,4 @@ def sample_dense_reference(
     return value, torch.where(lost, torch.nan, gradient), torch.where(lost, torch.nan, feature)
 
 
-def _grid(sdf: Tensor, origin: list[float], voxel_size: float) -> Any:
-    return native.require().DenseGrid(list(sdf.shape), origin, voxel_size)
-
-
-@native.operator("sample_dense")
-def _sample_dense(
-    sdf: Tensor,
-    features: Tensor,
-    points: Tensor,
-    origin: list[float],
-    voxel_size: float,
-    sparse_grad: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return grid_sampling.sample(_grid(sdf, origin, voxel_size), sdf, features, points)
-
-
-@native.operator("sample_dense_backward")
-def _sample_dense_backward(
-    sdf: Tensor,
-    features: Tensor,
-    points: Tensor,
-    order: Tensor,
-    grad_value: Tensor,
-    grad_gradient: Tensor,
-    grad_feature: Tensor,
-    origin: list[float],
-    voxel_size: float,
-    needs: list[bool],
-) -> tuple[Tensor, Tensor, Tensor]:
-    return grid_sampling.sample_backward(
-        _grid(sdf, origin, voxel_size),
-        (sdf, features, points, order),
-        (grad_value, grad_gradient, grad_feature),
-        needs,
-    )
-
-
-@_sample_dense.register_fake
-def _(sdf, features, points, origin, voxel_size, sparse_grad):
-    return grid_sampling.empty_outputs(features, points)
-
-
-@_sample_dense_backward.register_fake
-def _(
-    sdf,
-    features,
-    points,
-    order,
-    grad_value,
-    grad_gradient,
-    grad_feature,
-    origin,
-    voxel_size,
-    needs,
-):
-    return grid_sampling.empty_grads(sdf, features, points, needs)
-
-
-def _save(ctx, inputs, output):
-    sdf, features, points, ctx.origin, ctx.voxel_size, ctx.sparse_grad = inputs
-    ctx.save_for_backward(sdf, features, points, output[3])
-
-
-def _backward(ctx, grad_value, grad_gradient, grad_feature, _):
-    grad_outputs = (grad_value.contiguous(), grad_gradient.contiguous(), grad_feature.contiguous())
-    needs = list(ctx.needs_input_grad[:3])
-    inputs, place = ctx.saved_tensors, (ctx.origin, ctx.voxel_size)
-    if ctx.sparse_grad:
-        grid = _grid(inputs[0], *place)
-        grads = grid_sampling.sample_backward_sparse(grid, inputs, grad_outputs, needs)
-    else:
-        dense = _sample_dense_backward(*inputs, *grad_outputs, *place, needs)
-        grads = [g if need else None for g, need in zip(dense, needs, strict=True)]
-    return *grads, None, None, None
-
-
-_sample_dense.register_autograd(_backward, setup_context=_save)
+_sample_dense = grid_sampling.sampler("sample_dense")

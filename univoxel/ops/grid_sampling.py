@@ -14,9 +14,7 @@ import torch
 from torch import Tensor
 
 from univoxel.ops import native
-
-Outputs = tuple[Tensor, Tensor, Tensor, Tensor]
-Grads = tuple[Tensor | None, Tensor | None, Tensor | None]
+from univoxel.ops.differentiable import Differentiable, differentiable
 
 
 def check_place(op: str, points: int, origin: Sequence[float], voxel_size: float) -> None:
@@ -47,90 +45,49 @@ class SparseGrad(torch.autograd.Function):
         return grad.to_sparse(ctx.dims), None
 
 
-def empty_outputs(features: Tensor, points: Tensor) -> Outputs:
-    """Value, gradient, feature, and the points' order by tile, which backward uses again."""
-    m = len(points)
-    return (
-        points.new_empty(m),
-        points.new_empty(m, 3),
-        features.new_empty(m, features.shape[-1]),
-        points.new_empty(m, dtype=torch.int32),
-    )
+def grid_of(table: Tensor, size: list[int], origin: list[float], voxel_size: float) -> Any:
+    """The grid as the extension has it; dense where the table of bricks is empty."""
+    if table.numel():
+        return native.require().SparseGrid(*native.arrays(table), size, origin, voxel_size)
+    return native.require().DenseGrid(size, origin, voxel_size)
 
 
-def empty_grads(
-    sdf: Tensor, features: Tensor, points: Tensor, needs: list[bool]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients to fill; one that nobody needs is empty, because an op cannot return None."""
-    grads = [
-        torch.empty_like(t) if need else t.new_empty(0)
-        for t, need in zip((sdf, features, points), needs, strict=True)
-    ]
-    return grads[0], grads[1], grads[2]
+def no_table(like: Tensor) -> Tensor:
+    """The table of a dense grid."""
+    return like.new_empty(0, 0, 0, dtype=torch.int32)
 
 
-def sample(grid: Any, sdf: Tensor, features: Tensor, points: Tensor) -> Outputs:
-    """`empty_outputs`, filled."""
-    out = empty_outputs(features, points)
-    value, gradient, feature, order = out
-    native.require().sample_grid_forward(
-        grid,
-        *native.arrays(sdf, features, points, order, value, gradient, feature),
-        native.threads(),
-    )
-    return out
-
-
-def sample_backward(
+def gradients(
     grid: Any,
-    inputs: tuple[Tensor, Tensor, Tensor, Tensor],  # sdf, features, points, order
-    grad_outputs: tuple[Tensor, Tensor, Tensor],  # of value, gradient, feature
+    inputs: Sequence[Tensor],  # sdf, features, points, order
+    grad_outputs: Sequence[Tensor],  # of value, gradient, feature
     needs: list[bool],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """`empty_grads`, filled, in the shapes of sdf, features and points."""
-    grads = empty_grads(*inputs[:3], needs)
-    into = [g if need else None for g, need in zip(grads, needs, strict=True)]
-    _backward_into(grid, inputs, grad_outputs, into, (None, None))
-    return grads
+    sparse: bool,
+) -> list[Tensor | None]:
+    """Gradients to sdf, features and points; None where not needed.
 
-
-def sample_backward_sparse(
-    grid: Any,
-    inputs: tuple[Tensor, Tensor, Tensor, Tensor],
-    grad_outputs: tuple[Tensor, Tensor, Tensor],
-    needs: list[bool],
-) -> Grads:
-    """The same into touched rows; no op: how many there are depends on data."""
+    Args:
+        sparse: those to sdf and features hold touched rows alone.
+    """
     sdf, features, points, order = inputs
     core, threads = native.require(), native.threads()
-    rows = core.touched_rows(grid, *native.arrays(points, order), sdf.numel(), *needs[:2], threads)
-    values = [
-        None if r is None else t.new_empty(len(r), *t.shape[sdf.dim() :])
-        for r, t in zip(rows, (sdf, features), strict=True)
+    rows = None, None
+    if sparse:
+        touching = native.arrays(points, order)
+        rows = core.touched_rows(grid, *touching, sdf.numel(), *needs[:2], threads)
+    into = [
+        None
+        if not need
+        else torch.empty_like(t)
+        if r is None
+        else t.new_empty(len(r), *t.shape[sdf.dim() :])
+        for t, r, need in zip((sdf, features, points), (*rows, None), needs, strict=True)
     ]
-    grad_points = torch.empty_like(points) if needs[2] else None
-    _backward_into(grid, inputs, grad_outputs, [*values, grad_points], rows)
-    grads = [
-        None if v is None else _sparse_tensor(r, v, t.shape, sdf.dim())
-        for r, v, t in zip(rows, values, (sdf, features), strict=True)
+    core.sample_grid_backward(grid, *native.arrays(*inputs, *grad_outputs, *into), *rows, threads)
+    return [
+        g if g is None or r is None else _sparse_tensor(r, g, t.shape, sdf.dim())
+        for g, r, t in zip(into, (*rows, None), (sdf, features, points), strict=True)
     ]
-    return grads[0], grads[1], grad_points
-
-
-def _backward_into(
-    grid: Any,
-    inputs: tuple[Tensor, ...],
-    grad_outputs: tuple[Tensor, ...],
-    grads: list[Tensor | None],  # of sdf, features, points; None: not needed
-    rows: tuple[Any, Any],  # that the gradients of sdf and features hold; None: all
-) -> None:
-    native.require().sample_grid_backward(
-        grid,
-        *native.arrays(*inputs, *grad_outputs),
-        *[None if g is None else g.numpy() for g in grads],
-        *rows,
-        native.threads(),
-    )
 
 
 def _sparse_tensor(rows: Any, values: Tensor, shape: torch.Size, dims: int) -> Tensor:
@@ -141,3 +98,47 @@ def _sparse_tensor(rows: Any, values: Tensor, shape: torch.Size, dims: int) -> T
     return torch.sparse_coo_tensor(
         indices, values, shape, is_coalesced=True, check_invariants=False
     )
+
+
+def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
+    sdf, features, table, points = tensors
+    value, gradient, feature, order = outputs
+    native.require().sample_grid_forward(
+        grid_of(table, *options[:3]),
+        *native.arrays(sdf, features, points, order, value, gradient, feature),
+        native.threads(),
+    )
+
+
+def _backward(
+    saved: Sequence, grads: Sequence[Tensor], options: Sequence, needs: list[bool]
+) -> list[Tensor | None]:
+    sdf, features, table, points, order = saved
+    *place, sparse = options
+    return gradients(grid_of(table, *place), (sdf, features, points, order), grads, needs, sparse)
+
+
+def _sampled(
+    sdf: Tensor,
+    features: Tensor,
+    table: Tensor,
+    points: Tensor,
+    size: list[int],
+    origin: list[float],
+    voxel_size: float,
+    sparse_grad: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Value, gradient, feature, and the points' order by tile, which backward uses again."""
+    m = len(points)
+    return (
+        points.new_empty(m),
+        points.new_empty(m, 3),
+        features.new_empty(m, features.shape[-1]),
+        points.new_empty(m, dtype=torch.int32),
+    )
+
+
+def sampler(name: str) -> Differentiable:
+    """The op of that name. It is the same for both: a dense grid is one without a table."""
+    to = "sdf features points"
+    return differentiable(to, name=name, forward=_forward, backward=_backward, held=1)(_sampled)

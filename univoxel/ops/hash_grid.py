@@ -11,6 +11,7 @@ from torch import Tensor
 
 from univoxel.ops import native
 from univoxel.ops.checks import check
+from univoxel.ops.differentiable import differentiable
 from univoxel.ops.grid_sampling import SparseGrad
 
 PRIMES = (1, 2654435761, 805459861)
@@ -190,91 +191,9 @@ def rows_read(
     return torch.cat(found).unique()
 
 
-@native.operator("encode_hash")
-def _encode_hash(
-    table: Tensor,
-    points: Tensor,
-    lower: list[float],
-    upper: list[float],
-    voxel_sizes: list[float],
-    sparse_grad: bool,
-    felt: int,
-) -> Tensor:
-    out = points.new_empty(len(points), len(voxel_sizes) * table.shape[1])
-    native.require().encode_hash_forward(
-        *native.arrays(table, points, out), *_place(lower, upper, voxel_sizes), native.threads()
-    )
-    return out
-
-
 def _place(lower: list[float], upper: list[float], voxel_sizes: list[float]) -> Place:
     """Levels as the extension takes them."""
     return lattice_sizes(lower, upper, voxel_sizes), lower, voxel_sizes
-
-
-@native.operator("encode_hash_backward")
-def _encode_hash_backward(
-    table: Tensor,
-    points: Tensor,
-    grad_out: Tensor,
-    lower: list[float],
-    upper: list[float],
-    voxel_sizes: list[float],
-    felt: int,
-    needs: list[bool],
-) -> tuple[Tensor, Tensor]:
-    grads = _empty_grads(table, points, needs)
-    into = [g if need else None for g, need in zip(grads, needs, strict=True)]
-    place = _place(lower, upper, voxel_sizes)
-    _backward_into(table, points, grad_out, into[0], None, into[1], place, felt)
-    return grads
-
-
-def _empty_grads(table: Tensor, points: Tensor, needs: list[bool]) -> tuple[Tensor, Tensor]:
-    """Gradients to fill; one that nobody needs is empty, because an op cannot return None."""
-    return (
-        torch.empty_like(table) if needs[0] else table.new_empty(0),
-        torch.empty_like(points) if needs[1] else points.new_empty(0),
-    )
-
-
-def _backward_into(
-    table: Tensor,
-    points: Tensor,
-    grad_out: Tensor,
-    grad_table: Tensor | None,
-    touched,
-    grad_points: Tensor | None,
-    place: Place,
-    felt: int,
-) -> None:
-    native.require().encode_hash_backward(
-        *native.arrays(table, points, grad_out),
-        None if grad_table is None else grad_table.numpy(),
-        touched,
-        None if grad_points is None else grad_points.numpy(),
-        *place,
-        felt,
-        native.threads(),
-    )
-
-
-def _sparse_backward(
-    table: Tensor, points: Tensor, grad_out: Tensor, place: Place, felt: int, needs: list[bool]
-) -> tuple[Tensor | None, Tensor | None]:
-    """The backward into touched rows; no op: how many there are depends on data."""
-    grad_points = torch.empty_like(points) if needs[1] else None
-    if not needs[0]:
-        _backward_into(table, points, grad_out, None, None, grad_points, place, felt)
-        return None, grad_points
-    touched, rows = _touched(table, points, place)
-    values = table.new_empty(len(touched), table.shape[1])
-    _backward_into(table, points, grad_out, values, touched, grad_points, place, felt)
-    # The rows are distinct, in order and inside by construction: checking costs more than they do.
-    grad = torch.sparse_coo_tensor(
-        rows[None], values, table.shape, is_coalesced=True, check_invariants=False
-    )
-    return grad, grad_points
 
 
 def _touched(table: Tensor, points: Tensor, place: Place) -> tuple[Any, Tensor]:
@@ -285,7 +204,7 @@ def _touched(table: Tensor, points: Tensor, place: Place) -> tuple[Any, Tensor]:
     return touched, rows
 
 
-def backward(
+def gradients(
     table: Tensor,
     points: Tensor,
     grad_out: Tensor,
@@ -298,39 +217,53 @@ def backward(
 
     Args:
         place: as the extension takes it.
+        sparse: that to the table holds touched rows alone.
     """
-    if sparse:
-        return _sparse_backward(table, points, grad_out, place, felt, needs)
-    into = [torch.empty_like(t) if n else None for t, n in zip((table, points), needs, strict=True)]
-    _backward_into(table, points, grad_out, into[0], None, into[1], place, felt)
-    return into[0], into[1]
+    touched = rows = of_table = None
+    if needs[0] and sparse:
+        touched, rows = _touched(table, points, place)
+        of_table = table.new_empty(len(touched), table.shape[1])
+    elif needs[0]:
+        of_table = torch.empty_like(table)
+    of_points = torch.empty_like(points) if needs[1] else None
+    native.require().encode_hash_backward(
+        *native.arrays(table, points, grad_out, of_table),
+        touched,
+        *native.arrays(of_points),
+        *place,
+        felt,
+        native.threads(),
+    )
+    if rows is not None and of_table is not None:
+        # They are distinct, in order and inside by construction: checking costs more than they do
+        of_table = torch.sparse_coo_tensor(
+            rows[None], of_table, table.shape, is_coalesced=True, check_invariants=False
+        )
+    return of_table, of_points
 
 
-@_encode_hash.register_fake
-def _(table, points, lower, upper, voxel_sizes, sparse_grad, felt):
+def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
+    native.require().encode_hash_forward(
+        *native.arrays(*tensors, *outputs), *_place(*options[:3]), native.threads()
+    )
+
+
+def _backward(
+    saved: Sequence, grads: Sequence[Tensor], options: Sequence, needs: list[bool]
+) -> tuple[Tensor | None, Tensor | None]:
+    (table, points), (lower, upper, voxel_sizes, sparse, felt) = saved, options
+    place = _place(lower, upper, voxel_sizes)
+    return gradients(table, points, grads[0], place, felt, needs, sparse)
+
+
+@differentiable(to="table points", forward=_forward, backward=_backward)
+def _encode_hash(
+    table: Tensor,
+    points: Tensor,
+    lower: list[float],
+    upper: list[float],
+    voxel_sizes: list[float],
+    sparse_grad: bool,
+    felt: int,
+) -> Tensor:
     return points.new_empty(len(points), len(voxel_sizes) * table.shape[1])
-
-
-@_encode_hash_backward.register_fake
-def _(table, points, grad_out, lower, upper, voxel_sizes, felt, needs):
-    return _empty_grads(table, points, needs)
-
-
-def _save(ctx, inputs, output):
-    table, points, ctx.lower, ctx.upper, ctx.voxel_sizes, ctx.sparse_grad, ctx.felt = inputs
-    ctx.save_for_backward(table, points)
-
-
-def _backward(ctx, grad_out):
-    table, points = ctx.saved_tensors
-    needs, grad_out = list(ctx.needs_input_grad[:2]), grad_out.contiguous()
-    place = (ctx.lower, ctx.upper, ctx.voxel_sizes)
-    if ctx.sparse_grad:
-        grads = _sparse_backward(table, points, grad_out, _place(*place), ctx.felt, needs)
-    else:
-        dense = _encode_hash_backward(table, points, grad_out, *place, ctx.felt, needs)
-        grads = [g if need else None for g, need in zip(dense, needs, strict=True)]
-    return *grads, None, None, None, None, None
-
-
-_encode_hash.register_autograd(_backward, setup_context=_save)

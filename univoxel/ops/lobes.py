@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from univoxel.ops import native
 from univoxel.ops.checks import check
+from univoxel.ops.differentiable import differentiable
 
 SHORTEST = 1e-12  # squared length of a vector, below which its axis is shorter than 1
 
@@ -61,65 +63,23 @@ def decode_lobes_reference(
     return axis, sharpness, -torch.nn.functional.logsigmoid(-amplitude)
 
 
-@native.operator("decode_lobes")
+def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
+    parameters, *lobes = native.arrays(*tensors, *outputs)
+    native.require().decode_lobes_forward(parameters, *options, *lobes, native.threads())
+
+
+def _backward(
+    saved: Sequence, grads: Sequence[Tensor], options: Sequence, _: list[bool]
+) -> list[Tensor]:
+    grad = torch.empty_like(saved[0])
+    parameters, *others = native.arrays(*saved, *grads, grad)
+    native.require().decode_lobes_backward(parameters, *options, *others, native.threads())
+    return [grad]
+
+
+@differentiable(to="parameters", forward=_forward, backward=_backward)
 def _decode_lobes(
     parameters: Tensor, min_sharpness: float, max_sharpness: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    lobes = _empty(parameters)
-    native.require().decode_lobes_forward(
-        parameters.detach().numpy(),
-        min_sharpness,
-        max_sharpness,
-        *native.arrays(*lobes),
-        native.threads(),
-    )
-    return lobes
-
-
-def _empty(parameters: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     m = len(parameters)
     return parameters.new_empty(m, 3), parameters.new_empty(m), parameters.new_empty(m, 3)
-
-
-@native.operator("decode_lobes_backward")
-def _decode_lobes_backward(
-    parameters: Tensor,
-    grad_axis: Tensor,
-    grad_sharpness: Tensor,
-    grad_amplitude: Tensor,
-    min_sharpness: float,
-    max_sharpness: float,
-) -> Tensor:
-    grad = torch.empty_like(parameters)
-    native.require().decode_lobes_backward(
-        parameters.detach().numpy(),
-        min_sharpness,
-        max_sharpness,
-        *native.arrays(grad_axis, grad_sharpness, grad_amplitude, grad),
-        native.threads(),
-    )
-    return grad
-
-
-@_decode_lobes.register_fake
-def _(parameters, min_sharpness, max_sharpness):
-    return _empty(parameters)
-
-
-@_decode_lobes_backward.register_fake
-def _(parameters, *others):
-    return torch.empty_like(parameters)
-
-
-def _save(ctx, inputs, output):
-    parameters, *ctx.sharpness = inputs
-    ctx.save_for_backward(parameters)
-
-
-def _backward(ctx, *grads):
-    (parameters,) = ctx.saved_tensors
-    contiguous = (g.contiguous() for g in grads)
-    return _decode_lobes_backward(parameters, *contiguous, *ctx.sharpness), None, None
-
-
-_decode_lobes.register_autograd(_backward, setup_context=_save)

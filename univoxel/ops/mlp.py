@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from univoxel.ops import native
 from univoxel.ops.checks import check
+from univoxel.ops.differentiable import differentiable
 
 
 def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
@@ -60,103 +59,29 @@ def mlp_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]
     return torch.nn.functional.linear(x, weights[-1], biases[-1])
 
 
-@native.operator("mlp")
-def _mlp(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
-    out = x.new_empty(len(x), len(biases[-1]))
-    native.require().mlp_forward(
-        x.detach().numpy(),
-        native.arrays(*weights),
-        native.arrays(*biases),
-        out.numpy(),
-        native.threads(),
-    )
-    return out
+def _forward(tensors: Sequence, _: Sequence, outputs: Sequence[Tensor]) -> None:
+    x, weights, biases = tensors
+    n = len(weights)
+    x, *layers, out = native.arrays(x, *weights, *biases, *outputs)
+    native.require().mlp_forward(x, layers[:n], layers[n:], out, native.threads())
 
 
-@native.operator("mlp_backward")
-def _mlp_backward(
-    x: Tensor,
-    weights: list[Tensor],
-    biases: list[Tensor],
-    grad_out: Tensor,
-    need_x: bool,
-    need_layers: bool,
-) -> list[Tensor]:
-    grads = _empty_grads(x, weights, biases, need_x, need_layers)
-    grad_x, *of_layers = native.arrays(*grads)
+def _backward(
+    saved: Sequence, grads: Sequence[Tensor], _: Sequence, needs: list[bool]
+) -> list[Tensor | None]:
+    """Gradients to all layers or to none."""
+    x, weights, biases = saved
+    n, need_x, need_layers = len(weights), needs[0], any(needs[1:])
+    of_x = torch.empty_like(x) if need_x else None
+    of_layers = [torch.empty_like(t) for t in (*weights, *biases)] if need_layers else []
+    x, *layers, grad_out = native.arrays(x, *weights, *biases, *grads)
+    into_x, *into = native.arrays(of_x, *of_layers)
     native.require().mlp_backward(
-        x.detach().numpy(),
-        native.arrays(*weights),
-        native.arrays(*biases),
-        grad_out.numpy(),
-        grad_x if need_x else None,
-        of_layers[: len(weights)],
-        of_layers[len(weights) :],
-        native.threads(),
+        x, layers[:n], layers[n:], grad_out, into_x, into[:n], into[n:], native.threads()
     )
-    return grads
+    return [of_x, *(of_layers or [None] * (2 * n))]
 
 
-def _empty_grads(
-    x: Tensor, weights: list[Tensor], biases: list[Tensor], need_x: bool, need_layers: bool
-) -> list[Tensor]:
-    """Gradients to fill: x, then weights and biases if needed; an op cannot return None."""
-    grad_x = torch.empty_like(x) if need_x else x.new_empty(0)
-    return [grad_x, *(torch.empty_like(t) for t in (*weights, *biases) if need_layers)]
-
-
-@_mlp.register_fake
-def _(x, weights, biases):
+@differentiable(to="x weights biases", forward=_forward, backward=_backward)
+def _mlp(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
     return x.new_empty(len(x), len(biases[-1]))
-
-
-@_mlp_backward.register_fake
-def _(x, weights, biases, grad_out, need_x, need_layers):
-    return _empty_grads(x, weights, biases, need_x, need_layers)
-
-
-def _save(ctx, inputs, output):
-    x, weights, biases = inputs
-    ctx.layers = len(weights)
-    ctx.save_for_backward(x, *weights, *biases)
-
-
-def _backward(ctx, grad_out):
-    x, *layers = ctx.saved_tensors
-    weights, biases = layers[: ctx.layers], layers[ctx.layers :]
-    need_x, need_weights, need_biases = ctx.needs_input_grad
-    need_layers = any([*need_weights, *need_biases])
-    grads = _mlp_backward(x, weights, biases, grad_out.contiguous(), need_x, need_layers)
-    none = [None] * ctx.layers
-    return (
-        grads[0] if need_x else None,
-        grads[1 : 1 + ctx.layers] if need_layers else none,
-        grads[1 + ctx.layers :] if need_layers else none,
-    )
-
-
-class _Layers(torch.autograd.Function):
-    """The op with its layers one by one: weights, then biases."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, layers: int, *parameters: Tensor) -> Tensor:
-        ctx.layers = layers
-        ctx.save_for_backward(x, *parameters)
-        return _mlp.kernel(x, parameters[:layers], parameters[layers:])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
-        x, *parameters = ctx.saved_tensors
-        layers = parameters[: ctx.layers], parameters[ctx.layers :]
-        need_x, _, *need = ctx.needs_input_grad
-        grads = _mlp_backward(x, *layers, grad_out.contiguous(), need_x, any(need))
-        none = [None] * len(parameters)
-        return grads[0] if need_x else None, None, *(grads[1:] if any(need) else none)
-
-
-def _direct(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
-    return _Layers.apply(x, len(weights), *weights, *biases)
-
-
-_mlp.register_autograd(_backward, setup_context=_save, direct=_direct)

@@ -7,19 +7,18 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import inspect
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any, List, Literal, get_args, get_origin, get_type_hints  # noqa: UP035
 
-import numpy as np
 import torch  # first: the extension then shares torch's OpenMP runtime
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from univoxel.errors import MissingNative
 
@@ -27,7 +26,7 @@ log: logging.Logger = logging.getLogger("univoxel")
 
 Backend = Literal["auto", "native", "reference"]
 FOLDER = Path(__file__).parent.parent / "_core"
-PLAIN = (Tensor, torch.nn.Parameter)
+PLAIN = {Tensor, torch.nn.Parameter, float, int, bool, list}  # arguments that kernels take
 VARIANTS = ["default", "avx2", "avx512"]  # each runs what the ones before it run
 
 _backend: Backend = "auto"
@@ -181,9 +180,19 @@ def require_embree(what: str) -> ModuleType:
     return found
 
 
-def arrays(*tensors: Tensor) -> list[np.ndarray]:
-    """NumPy views of tensors, as the extension takes them."""
-    return [t.detach().numpy() for t in tensors]
+def arrays(*tensors: Tensor | None) -> list[Any]:
+    """NumPy views of tensors, as the extension takes them: halves as their bits, None as it is."""
+    # Every call of an op pays for each of these steps
+    return [
+        t
+        if t is None
+        else t.view(torch.uint16).numpy()
+        if t.dtype is torch.float16
+        else t.detach().numpy()
+        if t.requires_grad
+        else t.numpy()
+        for t in tensors
+    ]
 
 
 def threads() -> int:
@@ -210,69 +219,72 @@ class Operator:
     their arguments, which torch counts, go by the library always.
     """
 
-    def __init__(self, name: str, kernel: Callable, mutates_args: tuple[str, ...]) -> None:
-        # torch 2.4 reads neither text, which `from __future__` makes of them, nor list[float]
-        hints = get_type_hints(kernel).items()
-        kernel.__annotations__ = {name: _spelt_out(hint) for name, hint in hints}
+    def __init__(
+        self,
+        name: str,
+        kernel: Callable,
+        hints: dict[str, Any],
+        fake: Callable,
+        mutates_args: tuple[str, ...] = (),
+    ) -> None:
+        """
+        Args:
+            hints: types of the arguments and of what is returned, as of `hints_of`.
+            fake: called as the kernel is; returns what comes out, without values.
+        """
         qualified = f"univoxel::{name}"
+        self.name, self.kernel = name, kernel
         self.defined: Any = torch.library.custom_op(
-            qualified, kernel, mutates_args=mutates_args, device_types=()
+            qualified, _with_hints(kernel, hints), mutates_args=mutates_args, device_types=()
         )
         # Kernels that custom_op registers itself import the compiler when first called: a second,
         # and 70 MB, of every command
         torch.library.impl(qualified, "cpu", kernel)
-        self.kernel = kernel
+        self.defined.register_fake(fake)
         self._direct: Callable = self.defined if mutates_args else kernel
 
     def __call__(self, *arguments: Any) -> Any:
-        if torch.compiler.is_compiling() or _watched(arguments):
+        if goes_by_library(arguments):
             return self.defined(*arguments)
         return self._direct(*arguments)
 
-    def register_fake(self, fake: Callable[..., Any]) -> Callable[..., Any]:
-        """As of `torch.library.custom_op`: what comes out, without values."""
-        return self.defined.register_fake(fake)
 
-    def register_autograd(
-        self, backward: Callable, *, setup_context: Callable, direct: Callable | None = None
-    ) -> None:
-        """As of `torch.library.custom_op`.
-
-        Args:
-            direct: the short way, for an op that lists of tensors are differentiated in: autograd
-                functions see no lists.
-        """
-        self.defined.register_autograd(backward, setup_context=setup_context)
-        if direct is not None:
-            self._direct = direct
-            return
-        kernel = self.kernel
-
-        # With a setup_context of its own torch would look up the kernel's signature in every call
-        def forward(ctx: Any, *inputs: Any) -> Any:
-            output = kernel(*inputs)
-            setup_context(ctx, inputs, output)
-            return output
-
-        parts = {"forward": forward, "backward": once_differentiable(backward)}
-        methods = {name: staticmethod(part) for name, part in parts.items()}
-        self._direct = type(self.kernel.__name__, (torch.autograd.Function,), methods).apply
+def goes_by_library(arguments: Sequence) -> bool:
+    """Whether something else than plain arguments, computed at once, goes through an op."""
+    return (
+        torch.compiler.is_compiling()
+        or bool(torch._C._len_torch_dispatch_stack())
+        or torch._C._are_functorch_transforms_active()
+        or not PLAIN.issuperset(map(type, arguments))
+    )
 
 
-def _watched(arguments: tuple) -> bool:
-    """Whether something else than plain tensors, computed at once, goes through an op."""
-    if torch._C._len_torch_dispatch_stack() or torch._C._are_functorch_transforms_active():
-        return True
-    return any(isinstance(a, Tensor) and type(a) not in PLAIN for a in arguments)
+def in_place(name: str, mutates_args: tuple[str, ...]) -> Callable[[Callable], Operator]:
+    """Make an `Operator` of a kernel for the CPU that changes arguments and returns nothing."""
+    return lambda kernel: Operator(name, kernel, hints_of(kernel), lambda *_: None, mutates_args)
 
 
-def operator(name: str, mutates_args: tuple[str, ...] = ()) -> Callable[[Callable], Operator]:
-    """Make an `Operator` of a kernel for the CPU."""
-    return lambda kernel: Operator(name, kernel, mutates_args)
+def hints_of(function: Callable) -> dict[str, Any]:
+    """Types of arguments by name, and of "return", as every torch since 2.4 reads them: that reads
+    neither text, which `from __future__` makes of them, nor list[float]."""
+    return {name: _spelt_out(hint) for name, hint in get_type_hints(function).items()}
 
 
 def _spelt_out(hint: Any) -> Any:
-    """An annotation as every torch since 2.4 reads it."""
     if hint is type(None):
         return None
     return List[get_args(hint)] if get_origin(hint) is list else hint  # noqa: UP006
+
+
+def _with_hints(kernel: Callable, hints: dict[str, Any]) -> Callable:
+    """A kernel of any arguments with those that torch makes the schema of."""
+
+    def named(*arguments: Any) -> Any:
+        return kernel(*arguments)
+
+    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    named.__signature__ = inspect.Signature(  # pyright: ignore[reportFunctionMemberAccess]
+        [inspect.Parameter(n, kind, annotation=h) for n, h in hints.items() if n != "return"],
+        return_annotation=hints["return"],
+    )
+    return named

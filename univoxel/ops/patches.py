@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from univoxel.ops import native
 from univoxel.ops.checks import check
+from univoxel.ops.differentiable import differentiable
 
 NEAREST = 1e-6  # along the axis of a view: what lies before it is not seen
 
@@ -137,7 +139,22 @@ def _looked_up(brightness: Tensor, views: Tensor, x: Tensor, y: Tensor) -> tuple
     return a + u * (b - a) + v * (c - a) + u * v * (a - b - c + d), least
 
 
-@native.operator("patch_correlation")
+def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
+    correlation, seen, slopes = outputs
+    native.require().patch_correlation(
+        *native.arrays(*tensors, correlation, seen.view(torch.uint8), slopes),
+        *options,
+        native.threads(),
+    )
+
+
+def _backward(
+    saved: Sequence, grads: Sequence[Tensor], options: Sequence, needs: list[bool]
+) -> Sequence[Tensor]:
+    return (grads[0][..., None] * saved[0]).sum(1).split(3, 1)
+
+
+@differentiable(to="position normal", forward=_forward, backward=_backward, held=1, traced=True)
 def _patch_correlation(
     brightness: Tensor,
     projection: Tensor,
@@ -149,45 +166,7 @@ def _patch_correlation(
     normal: Tensor,
     noise: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    correlation, seen, pulls = _empty(position, views)
-    halves = brightness.dtype == torch.float16
-    inputs = (projection, origin, direction, own, views, position.detach(), normal.detach())
-    native.require().patch_correlation(
-        *native.arrays(
-            brightness.view(torch.uint16) if halves else brightness,
-            *inputs,
-            correlation,
-            seen.view(torch.uint8),
-            pulls,
-        ),
-        noise,
-        native.threads(),
-    )
-    return correlation, seen, pulls
-
-
-def _empty(position: Tensor, views: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Correlation, whether all is seen, and the gradient to position and normal."""
+    """Correlation, whether all is seen, and the derivative to position and normal."""
     n, k = views.shape
     seen = torch.empty(n, k, dtype=torch.bool, device=position.device)
     return position.new_empty(n, k), seen, position.new_empty(n, k, 6)
-
-
-@_patch_correlation.register_fake
-def _(brightness, projection, origin, direction, own, views, position, normal, noise):
-    return _empty(position, views)
-
-
-def _save(ctx, inputs, output):
-    _, seen, pulls = output
-    ctx.mark_non_differentiable(seen, pulls)
-    ctx.save_for_backward(pulls)
-
-
-def _backward(ctx, grad, *_):
-    (pulls,) = ctx.saved_tensors
-    to_position, to_normal = (grad[..., None] * pulls).sum(1).split(3, 1)
-    return *(6 * [None]), to_position, to_normal, None
-
-
-_patch_correlation.register_autograd(_backward, setup_context=_save)

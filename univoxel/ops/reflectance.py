@@ -24,8 +24,3 @@ def stored_f0(op: str, f0: Tensor | float, like: Tensor) -> Tensor:
     if not 0.0 <= f0 <= 1.0:
         raise ValueError(f"{op}: f0 must be in [0, 1], got {f0}")
     return like.new_full((), f0)
-
-
-def room_for_grad(f0: Tensor) -> Tensor:
-    """Room for the gradient of a stored F0; none where it is a number."""
-    return f0.new_empty(f0.shape if f0.dim() else 0)

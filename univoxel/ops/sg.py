@@ -10,7 +10,8 @@ from torch import Tensor
 from univoxel import brdf, sphere
 from univoxel.ops import native
 from univoxel.ops.checks import check
-from univoxel.ops.reflectance import room_for_grad, sizes_of_f0, stored_f0
+from univoxel.ops.differentiable import differentiable
+from univoxel.ops.reflectance import sizes_of_f0, stored_f0
 
 
 def shade_sg(
@@ -105,7 +106,7 @@ def shade_sg_reference(
     return (2 * math.pi / len(directions)) * (radiance * f * cosine).sum(1)
 
 
-@native.operator("shade_sg")
+@differentiable(to="axis sharpness amplitude normal wo albedo roughness f0")
 def _shade_sg(
     axis: Tensor,
     sharpness: Tensor,
@@ -118,54 +119,4 @@ def _shade_sg(
     rotation: Tensor,
     f0: Tensor,
 ) -> Tensor:
-    inputs = (axis, sharpness, amplitude, normal, wo, albedo, roughness, directions, rotation, f0)
-    rgb = torch.empty_like(normal)
-    native.require().shade_sg_forward(*native.arrays(*inputs, rgb), native.threads())
-    return rgb
-
-
-@native.operator("shade_sg_backward")
-def _shade_sg_backward(
-    axis: Tensor,
-    sharpness: Tensor,
-    amplitude: Tensor,
-    normal: Tensor,
-    wo: Tensor,
-    albedo: Tensor,
-    roughness: Tensor,
-    directions: Tensor,
-    rotation: Tensor,
-    f0: Tensor,
-    grad_rgb: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    inputs = (axis, sharpness, amplitude, normal, wo, albedo, roughness, directions, rotation, f0)
-    grads = _empty_grads(*inputs)
-    native.require().shade_sg_backward(*native.arrays(*inputs, grad_rgb, *grads), native.threads())
-    return grads  # pyright: ignore[reportReturnType]  there are eight
-
-
-def _empty_grads(*inputs: Tensor) -> tuple[Tensor, ...]:
-    """Room for the gradients: of all inputs but the directions and their rotation."""
-    return *(torch.empty_like(t) for t in inputs[:7]), room_for_grad(inputs[9])
-
-
-@_shade_sg.register_fake
-def _(axis, sharpness, amplitude, normal, *others):
     return torch.empty_like(normal)
-
-
-@_shade_sg_backward.register_fake
-def _(*inputs):
-    return _empty_grads(*inputs)
-
-
-def _save(ctx, inputs, output):
-    ctx.save_for_backward(*inputs)
-
-
-def _backward(ctx, grad_rgb):
-    *grads, grad_f0 = _shade_sg_backward(*ctx.saved_tensors, grad_rgb.contiguous())
-    return *grads, None, None, grad_f0 if ctx.needs_input_grad[9] else None
-
-
-_shade_sg.register_autograd(_backward, setup_context=_save)

@@ -10,7 +10,8 @@ from torch import Tensor
 from univoxel import brdf
 from univoxel.ops import native
 from univoxel.ops.checks import check
-from univoxel.ops.reflectance import room_for_grad, sizes_of_f0, stored_f0
+from univoxel.ops.differentiable import differentiable
+from univoxel.ops.reflectance import sizes_of_f0, stored_f0
 
 
 def shade_radiance(
@@ -191,7 +192,7 @@ def shade_map_reference(
     )
 
 
-@native.operator("shade_radiance")
+@differentiable(to="radiance normal albedo roughness f0", optional="radiance normal")
 def _shade_radiance(
     radiance: Tensor,
     normal: Tensor,
@@ -202,37 +203,10 @@ def _shade_radiance(
     f0: Tensor,
     solid_angle: float,
 ) -> Tensor:
-    inputs = (radiance, normal, wo, albedo, roughness, directions, f0)
-    rgb = torch.empty_like(normal)
-    native.require().shade_radiance_forward(
-        *native.arrays(*inputs, rgb), solid_angle, native.threads()
-    )
-    return rgb
+    return torch.empty_like(normal)
 
 
-@native.operator("shade_radiance_backward")
-def _shade_radiance_backward(
-    radiance: Tensor,
-    normal: Tensor,
-    wo: Tensor,
-    albedo: Tensor,
-    roughness: Tensor,
-    directions: Tensor,
-    f0: Tensor,
-    grad_rgb: Tensor,
-    solid_angle: float,
-    to_radiance: bool,
-    to_normal: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    inputs = (radiance, normal, wo, albedo, roughness, directions, f0)
-    grads = _empty_grads(radiance, normal, albedo, roughness, f0, to_radiance, to_normal)
-    native.require().shade_radiance_backward(
-        *native.arrays(*inputs, grad_rgb, *grads), solid_angle, native.threads()
-    )
-    return grads
-
-
-@native.operator("shade_map")
+@differentiable(to="map normal albedo roughness f0", optional="map normal")
 def _shade_map(
     map: Tensor,
     visibility: Tensor,
@@ -246,112 +220,4 @@ def _shade_map(
     f0: Tensor,
     solid_angle: float,
 ) -> Tensor:
-    surface = (normal, wo, albedo, roughness, directions, f0)
-    rgb = torch.empty_like(normal)
-    native.require().shade_map_forward(
-        *native.arrays(map, visibility, _bits(indirect), index, *surface, rgb),
-        solid_angle,
-        native.threads(),
-    )
-    return rgb
-
-
-@native.operator("shade_map_backward")
-def _shade_map_backward(
-    map: Tensor,
-    visibility: Tensor,
-    indirect: Tensor,
-    index: Tensor,
-    normal: Tensor,
-    wo: Tensor,
-    albedo: Tensor,
-    roughness: Tensor,
-    directions: Tensor,
-    f0: Tensor,
-    grad_rgb: Tensor,
-    solid_angle: float,
-    to_map: bool,
-    to_normal: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    surface = (normal, wo, albedo, roughness, directions, f0)
-    grads = _empty_grads(map, normal, albedo, roughness, f0, to_map, to_normal)
-    native.require().shade_map_backward(
-        *native.arrays(map, visibility, _bits(indirect), index, *surface, grad_rgb, *grads),
-        solid_angle,
-        native.threads(),
-    )
-    return grads
-
-
-def _bits(indirect: Tensor) -> Tensor:
-    """Halves as the integers that the extension takes."""
-    return indirect.view(torch.uint16) if indirect.dtype == torch.float16 else indirect
-
-
-def _empty_grads(
-    light: Tensor,
-    normal: Tensor,
-    albedo: Tensor,
-    roughness: Tensor,
-    f0: Tensor,
-    to_light: bool,
-    to_normal: bool,
-):
-    """Room for the gradients; for those of light and normal, which cost most, only where needed."""
-    grad_light = torch.empty_like(light) if to_light else light.new_empty(0)
-    grad_normal = torch.empty_like(normal) if to_normal else normal.new_empty(0)
-    materials = torch.empty_like(albedo), torch.empty_like(roughness), room_for_grad(f0)
-    return grad_light, grad_normal, *materials
-
-
-@_shade_radiance.register_fake
-def _(radiance, normal, *others):
     return torch.empty_like(normal)
-
-
-@_shade_radiance_backward.register_fake
-def _(radiance, normal, wo, albedo, roughness, directions, f0, grad_rgb, solid_angle, *needs):
-    return _empty_grads(radiance, normal, albedo, roughness, f0, *needs)
-
-
-@_shade_map.register_fake
-def _(map, visibility, indirect, index, normal, *others):
-    return torch.empty_like(normal)
-
-
-@_shade_map_backward.register_fake
-def _(map, visibility, indirect, index, normal, wo, albedo, roughness, directions, f0, *others):
-    return _empty_grads(map, normal, albedo, roughness, f0, *others[-2:])
-
-
-def _save(ctx, inputs, output):
-    *tensors, ctx.solid_angle = inputs
-    ctx.save_for_backward(*tensors)
-
-
-def _keep(needs: tuple[bool, ...], grads: tuple[Tensor, ...]) -> list[Tensor | None]:
-    return [grad if need else None for need, grad in zip(needs, grads, strict=True)]
-
-
-def _radiance_backward(ctx, grad_rgb):
-    radiance, normal, _, albedo, roughness, _, f0, _ = ctx.needs_input_grad
-    grads = _shade_radiance_backward(
-        *ctx.saved_tensors, grad_rgb.contiguous(), ctx.solid_angle, radiance, normal
-    )
-    needs = (radiance, normal, albedo, roughness, f0)
-    radiance, normal, albedo, roughness, f0 = _keep(needs, grads)
-    return radiance, normal, None, albedo, roughness, None, f0, None
-
-
-def _map_backward(ctx, grad_rgb):
-    map, _, _, _, normal, _, albedo, roughness, _, f0, _ = ctx.needs_input_grad
-    grads = _shade_map_backward(
-        *ctx.saved_tensors, grad_rgb.contiguous(), ctx.solid_angle, map, normal
-    )
-    needs = (map, normal, albedo, roughness, f0)
-    map, normal, albedo, roughness, f0 = _keep(needs, grads)
-    return map, None, None, None, normal, None, albedo, roughness, None, f0, None
-
-
-_shade_radiance.register_autograd(_radiance_backward, setup_context=_save)
-_shade_map.register_autograd(_map_backward, setup_context=_save)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -87,89 +86,4 @@ def sample_sparse_reference(
     return sample_dense_reference(whole, of_nodes, points, origin, voxel_size)
 
 
-def _grid(table: Tensor, size: list[int], origin: list[float], voxel_size: float) -> Any:
-    return native.require().SparseGrid(table.numpy(), size, origin, voxel_size)
-
-
-@native.operator("sample_sparse")
-def _sample_sparse(
-    sdf: Tensor,
-    features: Tensor,
-    table: Tensor,
-    points: Tensor,
-    size: list[int],
-    origin: list[float],
-    voxel_size: float,
-    sparse_grad: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    grid = _grid(table, size, origin, voxel_size)
-    return grid_sampling.sample(grid, sdf, features, points)
-
-
-@native.operator("sample_sparse_backward")
-def _sample_sparse_backward(
-    sdf: Tensor,
-    features: Tensor,
-    table: Tensor,
-    points: Tensor,
-    order: Tensor,
-    grad_value: Tensor,
-    grad_gradient: Tensor,
-    grad_feature: Tensor,
-    size: list[int],
-    origin: list[float],
-    voxel_size: float,
-    needs: list[bool],
-) -> tuple[Tensor, Tensor, Tensor]:
-    return grid_sampling.sample_backward(
-        _grid(table, size, origin, voxel_size),
-        (sdf, features, points, order),
-        (grad_value, grad_gradient, grad_feature),
-        needs,
-    )
-
-
-@_sample_sparse.register_fake
-def _(sdf, features, table, points, size, origin, voxel_size, sparse_grad):
-    return grid_sampling.empty_outputs(features, points)
-
-
-@_sample_sparse_backward.register_fake
-def _(
-    sdf,
-    features,
-    table,
-    points,
-    order,
-    grad_value,
-    grad_gradient,
-    grad_feature,
-    size,
-    origin,
-    voxel_size,
-    needs,
-):
-    return grid_sampling.empty_grads(sdf, features, points, needs)
-
-
-def _save(ctx, inputs, output):
-    sdf, features, table, points, ctx.size, ctx.origin, ctx.voxel_size, ctx.sparse_grad = inputs
-    ctx.save_for_backward(sdf, features, table, points, output[3])
-
-
-def _backward(ctx, grad_value, grad_gradient, grad_feature, _):
-    grad_outputs = (grad_value.contiguous(), grad_gradient.contiguous(), grad_feature.contiguous())
-    needs = [ctx.needs_input_grad[i] for i in (0, 1, 3)]
-    sdf, features, table, points, order = ctx.saved_tensors
-    place = (ctx.size, ctx.origin, ctx.voxel_size)
-    if ctx.sparse_grad:
-        inputs = (sdf, features, points, order)
-        grid = _grid(table, *place)
-        grads = grid_sampling.sample_backward_sparse(grid, inputs, grad_outputs, needs)
-    else:
-        filled = _sample_sparse_backward(*ctx.saved_tensors, *grad_outputs, *place, needs)
-        grads = [g if need else None for g, need in zip(filled, needs, strict=True)]
-    return grads[0], grads[1], None, grads[2], None, None, None, None
-
-
-_sample_sparse.register_autograd(_backward, setup_context=_save)
+_sample_sparse = grid_sampling.sampler("sample_sparse")

@@ -25,9 +25,7 @@ from univoxel.camera import looked_at
 from univoxel.checkpoint import load_checkpoint
 from univoxel.errors import UserError
 from univoxel.names import MAP_ROWS, TEXTURE_SIZE
-from univoxel.page.maps import PHOTOGRAPHED, Light, as_json, light_of_file, usual_lights
-from univoxel.page.transfer import Transfer, transfer
-from univoxel.pictures.html import (
+from univoxel.page.html import (
     VIEWPORT,
     base64_text,
     document,
@@ -36,6 +34,8 @@ from univoxel.pictures.html import (
     table,
     write_html,
 )
+from univoxel.page.maps import PHOTOGRAPHED, Light, as_json, light_of_file, usual_lights
+from univoxel.page.transfer import Transfer, transfer
 from univoxel.records import Mesh
 from univoxel.run import photos_of
 from univoxel.scene import Scene

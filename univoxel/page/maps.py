@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from univoxel.data.maps import read_map
+from univoxel.page.html import base64_text
 from univoxel.page.transfer import DEGREE
-from univoxel.pictures.html import base64_text
 from univoxel.records import HALF_MAX
 from univoxel.sphere import (
     latlong_direction,

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from univoxel.pictures.html import escape
+from univoxel.page.html import escape
 
 WIDTH, HEIGHT = 560.0, 190.0
 LEFT, BOTTOM, TOP = 56.0, 24.0, 12.0  # for numbers

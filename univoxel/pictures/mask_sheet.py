@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from univoxel.pictures.html import DARK_STYLE, document, escape, image, paragraph, write_html
+from univoxel.page.html import DARK_STYLE, document, escape, image, paragraph, write_html
 
 TILE = 240  # pixels of the longer side
 GAP, LABEL = 6, 34  # pixels

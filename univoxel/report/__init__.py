@@ -27,8 +27,8 @@ from univoxel.confidence.report import numbers, words
 from univoxel.confidence.survey import POINTS, Survey, survey
 from univoxel.errors import UserError
 from univoxel.page import START, facts_of
+from univoxel.page.html import document, escape, image, paragraph, table, write_html
 from univoxel.pictures.charts import chart
-from univoxel.pictures.html import document, escape, image, paragraph, table, write_html
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh
 from univoxel.report import drawing, light, photographs, sides, training

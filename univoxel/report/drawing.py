@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from univoxel.confidence.advice import Advice, azimuths, elevations
+from univoxel.page.html import escape
 from univoxel.pictures.contact_sheet import heat
-from univoxel.pictures.html import escape
 
 RADIUS = 200.0  # of the drawn sphere
 ROOM = 34.0  # around it, for words

@@ -1,0 +1,299 @@
+"""Ops with gradients: declared once, and registered with torch in full."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
+from typing import Any, List, TypeAlias, get_args  # noqa: UP035
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+from torch.autograd.function import once_differentiable
+
+from univoxel.ops import native
+
+LIST: Any = List[Tensor]  # noqa: UP006  torch 2.4 reads no other spelling
+Tensors: TypeAlias = Sequence[Any]  # or lists of tensors among them, as the op takes them
+Lengths: TypeAlias = "list[int | None]"  # of such lists; None stands for a single tensor
+# Called with tensors, options and outputs; fills the outputs
+Forward: TypeAlias = "Callable[[Tensors, Sequence, Sequence[Tensor]], None]"
+# Called with what was saved, gradients of the outputs that are not held, options, and whether each
+# gradient is needed; returns the gradients. In place of one not needed, anything may stand
+Backward: TypeAlias = (
+    "Callable[[Tensors, Sequence[Tensor], Sequence, list[bool]], Sequence[Tensor | None]]"
+)
+
+
+def differentiable(
+    to: str,
+    *,
+    name: str | None = None,
+    forward: Forward | None = None,
+    backward: Backward | None = None,
+    held: int = 0,
+    optional: str = "",
+    traced: bool = False,
+) -> Callable[[Callable], Differentiable]:
+    """Make an op with gradients of a function that allocates its outputs.
+
+        @differentiable(to="alpha value")
+        def _composite(
+            alpha: Tensor, value: Tensor, offsets: Tensor, early_stop: float
+        ) -> tuple[Tensor, Tensor]:
+            return value.new_empty(len(offsets) - 1, value.shape[1]), torch.empty_like(alpha)
+
+        out, weight = _composite(alpha, value, offsets, 0.0)
+
+    The op takes the arguments of the function: first contiguous tensors, then options, which are
+    numbers or lists of numbers. It calls these kernels of the extension:
+
+        composite_forward(alpha, value, offsets, out, weight, early_stop, threads)
+        composite_backward(alpha, value, offsets, grad_out, grad_weight,
+                           grad_alpha, grad_value, early_stop, threads)
+
+    torch knows them as `univoxel::composite` and `univoxel::composite_backward`: what they take and
+    return, the shapes of that without values, what is saved between them. Second order raises.
+
+    Args:
+        to: names of the tensors that have gradients, in the order of the backward kernel.
+        name: of the op; that of the function when left out.
+        forward: calls the kernel, where it takes its arguments in another order.
+        backward: likewise. If the op has an option `sparse_grad` and it is true, backward is called
+            without an op: sizes of gradients may then depend on values.
+        held: how many outputs, the last ones, serve the backward pass alone. They have no gradient
+            and are saved after the tensors.
+        optional: those of `to` whose gradient is an empty array where it is not needed. The kernel
+            computes the others always.
+        traced: backward is made of torch's operations and is no op. Only what is held is saved.
+    """
+    return lambda allocate: Differentiable(
+        name or allocate.__name__.removeprefix("_"),
+        allocate,
+        to.split(),
+        forward,
+        backward,
+        held,
+        optional.split(),
+        traced,
+    )
+
+
+class Differentiable(native.Operator):
+    """What `differentiable` makes; `backward` is its second op."""
+
+    def __init__(
+        self,
+        name: str,
+        allocate: Callable,
+        to: list[str],
+        forward: Forward | None,
+        backward: Backward | None,
+        held: int,
+        optional: list[str],
+        traced: bool,
+    ) -> None:
+        hints = native.hints_of(allocate)
+        arguments = {n: h for n, h in hints.items() if n != "return"}
+        tensors = {n: h for n, h in arguments.items() if h in (Tensor, LIST)}
+        options = {n: h for n, h in arguments.items() if n not in tensors}
+        outputs = get_args(hints["return"]) or (Tensor,)
+        lists = LIST in tensors.values()
+        assert [*arguments] == [*tensors, *options], "tensors come before options"
+        assert not lists or to == [*tensors], "beside lists all tensors have gradients"
+        self._to = [[*tensors].index(n) for n in to]
+        self._count, self._tensors = len(arguments), len(tensors)
+        self._held, self._shown = held, len(outputs) - held
+        self._sparse = [*options].index("sparse_grad") if "sparse_grad" in options else None
+        self._traced = traced
+        self._find = backward or _backward_by_name(name, self._to, [n in optional for n in to])
+        fill = forward or _forward_by_name(name)
+        n, several = len(tensors), len(outputs) > 1
+
+        def run(tensors: Tensors, options: Sequence) -> Any:
+            out = allocate(*tensors, *options)
+            fill(tensors, options, out if several else (out,))
+            return out
+
+        super().__init__(name, lambda *inputs: run(inputs[:n], inputs[n:]), hints, allocate)
+        self._run = run
+        self._function = self._register_lists() if lists else self._register()
+        if not traced:
+            more = [f"held_{i}" for i in range(held)] + [f"grad_{i}" for i in range(self._shown)]
+            needs = {"needs": List[bool]}  # noqa: UP006
+            self.backward = native.Operator(
+                f"{name}_backward",
+                self._backward_kernel,
+                tensors | dict.fromkeys(more, Tensor) | options | needs | {"return": LIST},
+                self._backward_fake,
+            )
+
+    def __call__(self, *arguments: Any) -> Any:
+        if native.goes_by_library(arguments):
+            return self.defined(*arguments)
+        if torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments):
+            return self._function(*arguments)
+        if forward_ad._current_level >= 0:  # the function tells that there is no such derivative
+            return self._function(*arguments)
+        return self.kernel(*arguments)
+
+    def _register(self) -> Callable:
+        """Tell torch of the gradients; returns the short way, an autograd function."""
+        run, n, count, to = self._run, self._tensors, self._count, self._to
+        gradients = self._gradients
+
+        def save(ctx: Any, inputs: Sequence, output: Any) -> None:
+            self._save(ctx, inputs[:n], inputs[n:], output)
+
+        # With a setup_context of its own torch would look up the kernel's signature in every call
+        def forward(ctx: Any, *inputs: Any) -> Any:
+            tensors, options = inputs[:n], inputs[n:]
+            output = run(tensors, options)
+            self._save(ctx, tensors, options, output)
+            return output
+
+        def backward(ctx: Any, *grads: Tensor | None) -> tuple:
+            result: list[Tensor | None] = [None] * count
+            if grads[0] is not None:
+                needs = ctx.needs_input_grad
+                wanted = [needs[i] for i in to]
+                found = gradients(ctx.saved_tensors, grads, ctx.options, wanted)
+                for i, need, gradient in zip(to, wanted, found, strict=True):
+                    if need:
+                        result[i] = gradient
+            return tuple(result)
+
+        self.defined.register_autograd(backward, setup_context=save)
+        return _autograd_function(self.name, forward, backward)
+
+    def _register_lists(self) -> Callable:
+        """The same where there are lists of tensors. Autograd functions see single ones only."""
+        run, n = self._run, self._tensors
+        none = [None] * (self._count - n)
+
+        def save(ctx: Any, inputs: Sequence, output: Any) -> None:
+            ctx.lengths = _lengths(inputs[:n])
+            self._save(ctx, _flat(inputs[:n]), inputs[n:], output)
+
+        def backward(ctx: Any, *grads: Tensor | None) -> tuple:
+            found = gradients(ctx, grads, _flat(ctx.needs_input_grad[:n]))
+            return *_grouped(found, ctx.lengths), *none
+
+        def gradients(ctx: Any, grads: Sequence[Tensor | None], needs: list[bool]) -> list:
+            saved = _grouped(ctx.saved_tensors, ctx.lengths)
+            found = self._gradients(saved, grads, ctx.options, needs)
+            return [g if need else None for g, need in zip(found, needs, strict=True)]
+
+        # What comes one by one is what autograd sees; the kernel reads the same, as the op takes it
+        def forward_of_single(ctx: Any, inputs: Sequence, *flat: Tensor) -> Any:
+            tensors, options = inputs[:n], inputs[n:]
+            output = run(tensors, options)
+            ctx.lengths = _lengths(tensors)
+            self._save(ctx, flat, options, output)
+            return output
+
+        def backward_of_single(ctx: Any, *grads: Tensor | None) -> tuple:
+            return None, *gradients(ctx, grads, ctx.needs_input_grad[1:])
+
+        self.defined.register_autograd(backward, setup_context=save)
+        apply = _autograd_function(self.name, forward_of_single, backward_of_single)
+        return lambda *inputs: apply(inputs, *_flat(inputs[:n]))
+
+    def _save(self, ctx: Any, tensors: Sequence, options: Sequence, output: Any) -> None:
+        ctx.options = options
+        if not self._held:
+            ctx.save_for_backward(*tensors)
+            return
+        held = output[self._shown :]
+        ctx.mark_non_differentiable(*held)
+        ctx.save_for_backward(*(() if self._traced else tensors), *held)
+        if self._shown == 1:  # no zeros for what is held, which may be large
+            ctx.set_materialize_grads(False)
+
+    def _gradients(
+        self, saved: Tensors, grads: Sequence[Any], options: Sequence, needs: list[bool]
+    ) -> Sequence[Tensor | None]:
+        """What backward finds, by the shortest way there is."""
+        if self._traced:
+            return self._find(saved, grads, options, needs)
+        grads = [g.contiguous() for g in grads[: self._shown]]
+        sparse = self._sparse is not None and options[self._sparse]
+        if sparse or not native.goes_by_library((*saved, *grads)):
+            return self._find(saved, grads, options, needs)
+        return self.backward(*saved, *grads, *options, needs)
+
+    def _backward_kernel(self, *arguments: Any) -> list[Tensor]:
+        start = self._tensors + self._held
+        stop = start + self._shown
+        saved, grads, needs = arguments[:start], arguments[start:stop], arguments[-1]
+        found = self._find(saved, grads, arguments[stop:-1], needs)
+        # An op cannot return None
+        return [
+            g if need and g is not None else grads[0].new_empty(0)
+            for g, need in zip(found, needs, strict=True)
+        ]
+
+    def _backward_fake(self, *arguments: Any) -> list[Tensor]:
+        tensors = _flat(arguments[i] for i in self._to)
+        return [
+            torch.empty_like(x) if need else x.new_empty(0)
+            for x, need in zip(tensors, arguments[-1], strict=True)
+        ]
+
+
+def _forward_by_name(name: str) -> Forward:
+    name = f"{name}_forward"
+
+    def forward(tensors: Tensors, options: Sequence, outputs: Sequence[Tensor]) -> None:
+        kernel = getattr(native.require(), name)
+        kernel(*native.arrays(*tensors, *outputs), *options, native.threads())
+
+    return forward
+
+
+def _backward_by_name(name: str, to: list[int], optional: list[bool]) -> Backward:
+    name = f"{name}_backward"
+
+    def backward(
+        saved: Tensors, grads: Sequence[Tensor], options: Sequence, needs: list[bool]
+    ) -> list[Tensor]:
+        found = [
+            torch.empty_like(saved[i]) if need or not spared else saved[i].new_empty(0)
+            for i, spared, need in zip(to, optional, needs, strict=True)
+        ]
+        kernel = getattr(native.require(), name)
+        kernel(*native.arrays(*saved, *grads, *found), *options, native.threads())
+        return found
+
+    return backward
+
+
+def _autograd_function(name: str, forward: Callable, backward: Callable) -> Callable:
+    parts = {"forward": forward, "backward": once_differentiable(backward)}
+    methods = {part: staticmethod(method) for part, method in parts.items()}
+    function = type(name, (torch.autograd.Function,), methods)
+    # Its own `apply` looks for functorch's transforms first, as `goes_by_library` has done
+    beyond: Any = super(torch.autograd.Function, function)
+    return beyond.apply
+
+
+def _lengths(tensors: Tensors) -> Lengths:
+    return [len(t) if isinstance(t, list) else None for t in tensors]
+
+
+def _flat(values: Iterable) -> list:
+    """Values, those of lists one by one."""
+    flat = []
+    for value in values:
+        if isinstance(value, (list, tuple)):
+            flat += value
+        else:
+            flat.append(value)
+    return flat
+
+
+def _grouped(flat: Iterable, lengths: Lengths) -> list:
+    """What `_flat` was made of, and what follows it."""
+    rest = iter(flat)
+    groups = [next(rest) if n is None else list(islice(rest, n)) for n in lengths]
+    return [*groups, *rest]
