@@ -14,8 +14,9 @@ import sys
 
 PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>; it stays through exec
 
-if __name__ == "__main__":
-    parent, command = int(sys.argv[1]), sys.argv[2:]
+
+def main(parent: int, command: list[str]) -> None:
+    """Replace this process by the command."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it was killed before it could be asked for
@@ -23,3 +24,7 @@ if __name__ == "__main__":
     if os.name == "nt":  # exec there begins another process, and ends this one at once
         sys.exit(subprocess.call(command))
     os.execvp(command[0], command)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), sys.argv[2:])

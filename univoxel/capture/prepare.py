@@ -33,13 +33,13 @@ class Folders:
     """Where the work of one capture lies, all below one folder."""
 
     def __init__(self, work: Path) -> None:
-        self.work = work
-        self.frames = work / "frames"  # of a video
-        self.pictures = work / "pictures"
-        self.masks = work / "masks"
-        self.database = work / "database.db"
-        self.pairs = work / "pairs.txt"
-        self.models = work / "models"
+        self.work: Path = work
+        self.frames: Path = work / "frames"  # of a video
+        self.pictures: Path = work / "pictures"
+        self.masks: Path = work / "masks"
+        self.database: Path = work / "database.db"
+        self.pairs: Path = work / "pairs.txt"
+        self.models: Path = work / "models"
 
 
 @dataclass(frozen=True)

@@ -39,16 +39,15 @@ class Project:
     """Where the parts of a capture lie, all below one folder."""
 
     def __init__(self, out: Path) -> None:
-        self.out = out
-        self.scene = out / "scene"  # photographs and cameras, as `univoxel poses` writes them
-        self.masks = (
-            out / "masks"
-        )  # of single photographs, of a turntable, before there are cameras
-        self.cut = out / "cut"  # photographs with masks, as `univoxel cutout` writes them
-        self.run = out / "run"
-        self.pictures = out / "pictures"
-        self.mesh = out / f"{out.absolute().name}.glb"
-        self.page = out / "index.html"
+        self.out: Path = out
+        self.scene: Path = out / "scene"  # photographs and cameras, as `univoxel poses` writes them
+        # Of single photographs, of a turntable, before there are cameras
+        self.masks: Path = out / "masks"
+        self.cut: Path = out / "cut"  # photographs with masks, as `univoxel cutout` writes them
+        self.run: Path = out / "run"
+        self.pictures: Path = out / "pictures"
+        self.mesh: Path = out / f"{out.absolute().name}.glb"
+        self.page: Path = out / "index.html"
 
 
 def look_at(path: Path) -> Given:

@@ -14,7 +14,7 @@ from datetime import timedelta
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from univoxel import __version__
 from univoxel.bars import bar
@@ -168,7 +168,7 @@ class ProgressTable:
             BarColumn(),
             TextColumn("{task.fields[facts]}"),
         )
-        self.progress = bar(*columns, TimeElapsedColumn())
+        self.progress: Progress = bar(*columns, TimeElapsedColumn())
         self._all = self.progress.add_task(f"{before}/{total}", total=total, facts="")
         self._begin, self._before, self._total = time.monotonic(), before, total
         self._ended = Counter[str]()  # by state

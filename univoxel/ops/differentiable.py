@@ -121,7 +121,7 @@ class Differentiable(native.Operator):
         if not traced:
             more = [f"held_{i}" for i in range(held)] + [f"grad_{i}" for i in range(self._shown)]
             needs = {"needs": List[bool]}  # noqa: UP006
-            self.backward = native.Operator(
+            self.backward: native.Operator = native.Operator(
                 f"{name}_backward",
                 self._backward_kernel,
                 tensors | dict.fromkeys(more, Tensor) | options | needs | {"return": LIST},

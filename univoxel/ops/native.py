@@ -26,7 +26,14 @@ log: logging.Logger = logging.getLogger("univoxel")
 
 Backend = Literal["auto", "native", "reference"]
 FOLDER = Path(__file__).parent.parent / "_core"
-PLAIN = {Tensor, torch.nn.Parameter, float, int, bool, list}  # arguments that kernels take
+PLAIN: set[type[Any]] = {
+    Tensor,
+    torch.nn.Parameter,
+    float,
+    int,
+    bool,
+    list,
+}  # arguments that kernels take
 VARIANTS = ["default", "avx2", "avx512"]  # each runs what the ones before it run
 
 _backend: Backend = "auto"
@@ -233,7 +240,8 @@ class Operator:
             fake: called as the kernel is; returns what comes out, without values.
         """
         qualified = f"univoxel::{name}"
-        self.name, self.kernel = name, kernel
+        self.name: str = name
+        self.kernel: Callable[..., Any] = kernel
         self.defined: Any = torch.library.custom_op(
             qualified, _with_hints(kernel, hints), mutates_args=mutates_args, device_types=()
         )
@@ -249,7 +257,7 @@ class Operator:
         return self._direct(*arguments)
 
 
-def goes_by_library(arguments: Sequence) -> bool:
+def goes_by_library(arguments: Sequence[Any]) -> bool:
     """Whether something else than plain arguments, computed at once, goes through an op."""
     return (
         torch.compiler.is_compiling()

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -49,7 +50,7 @@ STILL_SHARE = 0.2
 PLACED_SHARE = 0.8  # of the photographs, below which the capture is no use
 GAP = 60.0  # degrees between neighbouring directions that are worth a word
 # What version 0.2 noted of the configuration that are constants now
-CONSTANTS_0_2 = {
+CONSTANTS_0_2: dict[str, Any] = {
     **{"coarse_features": 512, "coarse_photographs": 150, "ratio": 0.8, "neighbours": 3},
     **{"mask_margin": 0.006, "still_share": 0.2, "weak_share": 0.2, "weak_points": 50},
     **{"weak_partners": 3, "fitting_share": 0.9, "fitting_pixels": 3.0, "weak_doubt": 0.3},
