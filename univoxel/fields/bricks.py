@@ -11,18 +11,9 @@ from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from univoxel.errors import NoSurface
-from univoxel.fields.distances import BAND, MIN_SHARE, AbstractDistances, no_values
+from univoxel.fields.distances import BAND, AbstractDistances
 from univoxel.grid import GridShape
-from univoxel.ops import (
-    brick_minimum,
-    composite_field,
-    diffuse_rows_,
-    march,
-    sample_sparse,
-    smooth_rows_,
-)
-from univoxel.ops.composite_field import FieldAlongRays, Lattices
-from univoxel.records import Bricks, FieldSample, Rays, Samples
+from univoxel.records import Bricks
 
 SLAB = 64  # planes of the grid whose surface is found at once; whole bricks
 SPARE = 0.05  # share of the bricks that may come without moving the others in memory
@@ -36,15 +27,13 @@ class BrickDistances(AbstractDistances):
     time grow with the surface. `refresh` adds bricks where the surface comes near.
     """
 
+    bricks: Bricks
+
     def __init__(self, grid: GridShape, bricks: Bricks) -> None:
         far = BAND * grid.voxel_size
         sdf = torch.full((Bricks.NODES * len(bricks.place),), far)
         sdf[Bricks.NODES : 2 * Bricks.NODES] = -far
-        super().__init__(grid, sdf)
-        self.bricks = bricks
-
-    def _brick_minimum(self) -> Tensor:
-        return brick_minimum(self.sdf.detach(), self.bricks)
+        super().__init__(grid, sdf, bricks)
 
     @property
     def far(self) -> float:
@@ -90,59 +79,6 @@ class BrickDistances(AbstractDistances):
             end = begin + len(part) * Bricks.NODES
             yield slice(begin, end), _nodes(self.grid, part, node_offsets)
             begin = end
-
-    def sample(self, points: Tensor, values: Tensor | None = None) -> FieldSample:
-        return self._sample(self.sdf, no_values(self.sdf) if values is None else values, points)
-
-    def interpolate(self, values: Tensor, points: Tensor) -> Tensor:
-        return self._sample(self.sdf.detach(), values, points).features
-
-    def _sample(self, sdf: Tensor, values: Tensor, points: Tensor) -> FieldSample:
-        place = points, self.grid.origin, self.voxel_size
-        return FieldSample(*sample_sparse(sdf, values, self.bricks, *place, sparse_grad=True))
-
-    def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
-        return march(
-            self.sdf.detach(),
-            self.brick_minimum(),
-            rays.origin,
-            rays.direction,
-            jitter,
-            self.grid.origin,
-            self.voxel_size,
-            step=self.voxel_size,
-            inv_s=inv_s,
-            bricks=self.bricks,
-        )
-
-    def composite(
-        self,
-        rays: Rays,
-        samples: Samples,
-        inv_s: float,
-        values: Tensor,
-        levels: Lattices | None = None,
-    ) -> FieldAlongRays:
-        return composite_field(
-            self.sdf,
-            values,
-            rays.origin,
-            rays.direction,
-            samples,
-            self.grid.origin,
-            self.voxel_size,
-            inv_s,
-            bricks=self.bricks,
-            levels=levels,
-            min_share=MIN_SHARE,
-            sparse_grad=True,
-        )
-
-    def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
-        smooth_rows_(values.view(len(values), -1), rows, amount, order, self.bricks)
-
-    def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
-        diffuse_rows_(values, rows, self.grid.size, amount, passes, self.bricks)
 
     def blocks(self, far: float) -> Tensor:
         stored = torch.nn.functional.pad(self.bricks.table >= Bricks.MISSING, (0, 1) * 3)
@@ -223,7 +159,7 @@ class BrickDistances(AbstractDistances):
         sign = 1 - 2 * table[new].float()  # before there was a brick
         number = torch.arange(count, count + len(new))
         table[new], place[number] = number.int(), new.int()
-        self.bricks: Bricks = Bricks(table.view(bricks.table.shape), place, bricks.size)
+        self.bricks = Bricks(table.view(bricks.table.shape), place, bricks.size)
         rows = (Bricks.NODES * number[:, None] + torch.arange(Bricks.NODES)).flatten()
         self.sdf[rows] = self.far * sign.repeat_interleave(Bricks.NODES)
         parts = zip(number.split(BRICKS_AT_ONCE), sign.split(BRICKS_AT_ONCE), strict=True)

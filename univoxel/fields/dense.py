@@ -7,18 +7,9 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from univoxel.errors import NoSurface
-from univoxel.fields.distances import MIN_SHARE, AbstractDistances, no_values
+from univoxel.fields.distances import AbstractDistances
 from univoxel.grid import GridShape, resample
-from univoxel.ops import (
-    brick_minimum,
-    composite_field,
-    diffuse_rows_,
-    march,
-    sample_dense,
-    smooth_rows_,
-)
-from univoxel.ops.composite_field import FieldAlongRays, Lattices
-from univoxel.records import FieldSample, Rays, Samples
+from univoxel.ops import brick_minimum
 
 
 class DenseDistances(AbstractDistances):
@@ -31,60 +22,6 @@ class DenseDistances(AbstractDistances):
         """
         start = torch.zeros(grid.size) if sdf is None else sdf
         super().__init__(grid, start.contiguous())
-
-    def _brick_minimum(self) -> Tensor:
-        return brick_minimum(self.sdf.detach())
-
-    def sample(self, points: Tensor, values: Tensor | None = None) -> FieldSample:
-        return self._sample(self.sdf, no_values(self.sdf) if values is None else values, points)
-
-    def interpolate(self, values: Tensor, points: Tensor) -> Tensor:
-        return self._sample(self.sdf.detach(), values, points).features
-
-    def _sample(self, sdf: Tensor, values: Tensor, points: Tensor) -> FieldSample:
-        place = self.grid.origin, self.voxel_size
-        return FieldSample(*sample_dense(sdf, values, points, *place, sparse_grad=True))
-
-    def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
-        return march(
-            self.sdf.detach(),
-            self.brick_minimum(),
-            rays.origin,
-            rays.direction,
-            jitter,
-            self.grid.origin,
-            self.voxel_size,
-            step=self.voxel_size,
-            inv_s=inv_s,
-        )
-
-    def composite(
-        self,
-        rays: Rays,
-        samples: Samples,
-        inv_s: float,
-        values: Tensor,
-        levels: Lattices | None = None,
-    ) -> FieldAlongRays:
-        return composite_field(
-            self.sdf,
-            values,
-            rays.origin,
-            rays.direction,
-            samples,
-            self.grid.origin,
-            self.voxel_size,
-            inv_s,
-            levels=levels,
-            min_share=MIN_SHARE,
-            sparse_grad=True,
-        )
-
-    def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
-        smooth_rows_(values.view(*self.grid.size, -1), rows, amount, order)
-
-    def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
-        diffuse_rows_(values, rows, self.grid.size, amount, passes)
 
     def on_grid(self, values: Tensor) -> Tensor:
         return values

@@ -9,8 +9,17 @@ import torch
 from torch import Tensor, nn
 
 from univoxel.grid import GridShape
+from univoxel.ops import (
+    brick_minimum,
+    composite_field,
+    diffuse_rows_,
+    march,
+    sample_dense,
+    sample_sparse,
+    smooth_rows_,
+)
 from univoxel.ops.composite_field import FieldAlongRays, Lattices
-from univoxel.records import FieldSample, Rays, Samples
+from univoxel.records import Bricks, FieldSample, Rays, Samples
 
 BAND = 4.0  # voxels from the surface beyond which density is nothing: 8 s at a sharpness of 0.5
 
@@ -53,12 +62,14 @@ class AbstractDistances(nn.Module, ABC):
     grid: GridShape
     voxel_size: float  # of the grid, world units
     sdf: nn.Parameter
+    bricks: Bricks | None  # that rows of the sdf belong to; None: the sdf is [X, Y, Z]
     pinned: Tensor | None  # as the sdf, bool: nodes that get no gradient; None: none
 
-    def __init__(self, grid: GridShape, sdf: Tensor) -> None:
+    def __init__(self, grid: GridShape, sdf: Tensor, bricks: Bricks | None = None) -> None:
         super().__init__()
         self.grid, self.voxel_size = grid, grid.voxel_size
         self.sdf = nn.Parameter(sdf)
+        self.bricks = bricks
         self.pinned = None
         self._minimum: tuple[Tensor, SurfaceVersion] | None = None
 
@@ -69,32 +80,44 @@ class AbstractDistances(nn.Module, ABC):
             minimum, version = self._minimum
             if self.training or version.holds(self.sdf):
                 return minimum
-        minimum = self._brick_minimum()
+        minimum = brick_minimum(self.sdf.detach(), self.bricks)
         self._minimum = minimum, SurfaceVersion.of(self.sdf)
         return minimum
 
-    @abstractmethod
-    def _brick_minimum(self) -> Tensor:
-        """`ops.brick_minimum` of the sdf."""
-
-    @abstractmethod
     def sample(self, points: Tensor, values: Tensor | None = None) -> FieldSample:
         """SDF, its spatial gradient and values of nodes, as features, at world points [M, 3].
 
         Args:
             values: as the sdf, and C; without them C is 0.
         """
+        return self._sample(self.sdf, no_values(self.sdf) if values is None else values, points)
 
-    @abstractmethod
     def interpolate(self, values: Tensor, points: Tensor) -> Tensor:
         """Values of nodes alone at world points [M, 3]: [M, C]; no gradient to the sdf, not even
         one of zeros."""
+        return self._sample(self.sdf.detach(), values, points).features
 
-    @abstractmethod
+    def _sample(self, sdf: Tensor, values: Tensor, points: Tensor) -> FieldSample:
+        place = points, self.grid.origin, self.voxel_size
+        if self.bricks is None:
+            return FieldSample(*sample_dense(sdf, values, *place, sparse_grad=True))
+        return FieldSample(*sample_sparse(sdf, values, self.bricks, *place, sparse_grad=True))
+
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         """The samples along rays that matter under density sharpness 1 / s; no gradients."""
+        return march(
+            self.sdf.detach(),
+            self.brick_minimum(),
+            rays.origin,
+            rays.direction,
+            jitter,
+            self.grid.origin,
+            self.voxel_size,
+            step=self.voxel_size,
+            inv_s=inv_s,
+            bricks=self.bricks,
+        )
 
-    @abstractmethod
     def composite(
         self,
         rays: Rays,
@@ -108,6 +131,20 @@ class AbstractDistances(nn.Module, ABC):
         Args:
             values: of nodes, as features; or a hash table with these levels.
         """
+        return composite_field(
+            self.sdf,
+            values,
+            rays.origin,
+            rays.direction,
+            samples,
+            self.grid.origin,
+            self.voxel_size,
+            inv_s,
+            bricks=self.bricks,
+            levels=levels,
+            min_share=MIN_SHARE,
+            sparse_grad=True,
+        )
 
     @torch.no_grad()
     def refresh(self) -> bool:
@@ -125,13 +162,14 @@ class AbstractDistances(nn.Module, ABC):
         """Add nodes where the surface came near; False: there are none to add."""
         return False
 
-    @abstractmethod
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
         """`ops.smooth_rows_` of values of nodes."""
+        nodes = self.grid.size if self.bricks is None else (len(values),)
+        smooth_rows_(values.view(*nodes, -1), rows, amount, order, self.bricks)
 
-    @abstractmethod
     def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
         """`ops.diffuse_rows_` of values [K] of nodes."""
+        diffuse_rows_(values, rows, self.grid.size, amount, passes, self.bricks)
 
     @abstractmethod
     def on_grid(self, values: Tensor) -> Tensor:
