@@ -1,13 +1,16 @@
 """What all tests run in."""
 
+import hashlib
 import os
 import tempfile
 from pathlib import Path
 
 import torch
 
-# Kernels that torch.compile has compiled for another instruction set are wrong here, not only slow:
-# its cache, in one folder for all processes of a user, does not tell them apart.
-_KIND = f"{torch.__version__}-{torch.backends.cpu.get_cpu_capability()}"
+# torch.compile has one cache for all processes of a user. It tells neither instruction sets apart,
+# whose kernels give wrong values on another, nor what the arguments of our backward ops are.
+_OPS = sorted((Path(__file__).parent.parent / "univoxel" / "ops").glob("*.py"))
+_SOURCES = hashlib.sha256(b"".join(path.read_bytes() for path in _OPS)).hexdigest()[:8]
+_KIND = f"{torch.__version__}-{torch.backends.cpu.get_cpu_capability()}-{_SOURCES}"
 _FOLDER = Path(tempfile.gettempdir()) / f"univoxel-tests-inductor-{os.getuid()}-{_KIND}"
 os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(_FOLDER))

@@ -12,7 +12,7 @@ def test_a_setting_is_a_preset_with_changes():
     config = setting.config(Path("photos"), Path("run"))
     assert (config.data, config.out, config.minutes) == (Path("photos"), Path("run"), 2.5)
     assert (config.stages[1].rays, config.seed, config.scene.light.kind) == (7, 3, "sg")
-    assert Setting("b", "draft").config(Path("a"), Path("b")).minutes == 2.0
+    assert Setting("b", "draft").config(Path("a"), Path("b")).minutes is None
     assert Setting("c", minutes=1.5).config(Path("a"), Path("b")).stages[1].voxels < 2.0
 
 

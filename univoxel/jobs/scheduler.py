@@ -64,7 +64,13 @@ def connect(jobs: int, scheduler: str | None = None) -> Iterator[Client]:
         except (OSError, ValueError, TypeError) as error:
             said = f"no scheduler of Dask answers there: {' '.join(str(error).split()):.200}"
             raise ProcessFailed(f"scheduler={scheduler}: {said}", "scheduler") from None
-        versions: Any = client.run(lambda: __import__("univoxel").__version__, on_error="return")
+
+        def version() -> str:  # in here, so that it goes there by value: its module may lack there
+            import univoxel
+
+            return univoxel.__version__
+
+        versions: Any = client.run(version, on_error="return")
         for address, found in versions.items():
             if found != __version__:
                 got = f"{found if isinstance(found, str) else 'none'} on {address}"
