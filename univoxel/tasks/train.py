@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 log: logging.Logger = logging.getLogger("univoxel")
 
 # Of preparation, a million pixels that are trained on, on two quiet cores of a Xeon
-PREPARATION_SECONDS = 0.4
+PREPARATION_SECONDS = 1.0
 
 
 def train(
