@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -458,3 +459,17 @@ def test_what_a_killed_writer_left_is_removed(steps, pictures, tmp_path, monkeyp
 
 def test_the_package_has_it():
     assert univoxel.capture_object is task.capture
+
+
+def test_how_long_training_takes_is_said_before_cameras_are_found(
+    tmp_path, photographs, monkeypatch, caplog
+):
+    caplog.set_level("INFO", "univoxel")
+
+    def stop(*_):
+        raise DataError("no cameras")
+
+    monkeypatch.setattr(task, "_find_cameras", stop)
+    with pytest.raises(DataError, match="no cameras"):
+        task.capture(photographs[0], tmp_path / "out", masks=photographs[1], preset="draft")
+    assert re.search(r"training takes about \d+ (s|min) on this machine; cameras", caplog.text)

@@ -52,7 +52,9 @@ from univoxel.tasks.evaluate import evaluate
 from univoxel.tasks.export import export
 from univoxel.tasks.poses import folders_of, photographs_of, poses
 from univoxel.tasks.relight import relight_to_files
-from univoxel.tasks.train import train
+from univoxel.tasks.train import duration, train
+from univoxel.training.clock import expected_seconds
+from univoxel.training.probe import slowdown
 from univoxel.training.progress import TrainingProgress
 
 log: logging.Logger = logging.getLogger("univoxel")
@@ -135,6 +137,10 @@ def capture(
         for step in STEPS[:3]:
             _skip(step, run)
     else:
+        if not (project.run / FILE).exists():
+            seconds = slowdown(training) * sum(map(expected_seconds, training.stages))
+            said = f"training takes about {duration(seconds)} on this machine"
+            log.info(f"{said}; cameras and masks come on top")
         scene = _find_cameras(project, given, masks, config)
         data = _find_masks(project, scene, masks)
         run = _train(replace(training, data=data.absolute(), out=project.run), on_progress)
