@@ -264,7 +264,7 @@ def test_in_a_browser(data, tmp_path, monkeypatch):
             assert time.monotonic() < end
             spectators.look(scene, clock)
             time.sleep(0.1)
-        now = TrainingProgress(1, 3, 0.1, 6.0, 60.0, {"a": 1.0}, 20.0, 1e4)
+        now = TrainingProgress(1, 3, "shape", 0.1, 6.0, 60.0, {"a": 1.0}, 20.0, 1e4)
         spectators.tell(now)
         find = (
             "[...document.querySelectorAll('button')].find(b => b.innerText.includes('end train'))"
