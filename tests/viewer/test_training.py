@@ -269,7 +269,7 @@ def test_in_a_browser(data, tmp_path, monkeypatch):
         find = (
             "[...document.querySelectorAll('button')].find(b => b.innerText.includes('end train'))"
         )
-        while not tab.run(f"Boolean({find})") or "Stage 1" not in tab.run(
+        while not tab.run(f"Boolean({find})") or "Shape, stage 1" not in tab.run(
             "document.body.innerText"
         ):
             assert time.monotonic() < end
