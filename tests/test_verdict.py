@@ -25,7 +25,7 @@ def test_a_good_run():
     [
         ("psnr", 24.0, 15.0, "validation 24.0 dB", "sharp photographs"),
         ("outline", 0.05, 0.2, "5% of the outline", "better masks"),
-        ("hidden", 0.4, 0.7, "40% of the surface is seen by fewer", "more photographs"),
+        ("hidden", 0.4, 0.7, "40% of the surface is seen by too few", "more photographs"),
         ("residual", 0.3, 0.9, "30% of the surface differs", "--preset full"),
     ],
 )

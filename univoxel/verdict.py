@@ -35,7 +35,7 @@ class Evidence:
     limit: float | None = None  # minutes; None: there was none
     psnr: float | None = None  # dB, of held-out pixels
     outline: float | None = None  # share of held-out pixels on the wrong side of the silhouette
-    hidden: float | None = None  # share of the surface that fewer than three cameras see
+    hidden: float | None = None  # share of the surface that too few cameras see
     residual: float | None = None  # share of the surface that differs from its photographs
     troubles: int = 0  # steps or stages that went wrong and were mended
 
@@ -68,40 +68,40 @@ def judge(evidence: Evidence) -> Verdict:
     """The verdict that evidence leads to."""
     faults: list[tuple[bool, str, str]] = []  # whether it is poor, the reason, the remedy
 
-    def fault(value: float | None, good: float, poor: float, reason: str, remedy: str) -> None:
-        """Note a share that is above what is good; of qualities, both are negative."""
-        if value is not None and not value <= good:
-            faults.append((not value <= poor, reason, remedy))
+    def check(value: float | None, good: float, poor: float, reason: str, remedy: str) -> None:
+        """Note a value that is not good; NaN is poor. Which way is better is told by the limits."""
+        if value is None:
+            return
+        sign = 1 if good > poor else -1
+        if not sign * value >= sign * good:
+            faults.append((not sign * value >= sign * poor, reason.format(value), remedy))
 
-    psnr, shares = evidence.psnr, {"outline": evidence.outline, "hidden": evidence.hidden}
-    shares |= {"residual": evidence.residual}
-    percent = {name: f"{0 if value is None else value:.0%}" for name, value in shares.items()}
-    fault(
-        None if psnr is None else -psnr,
-        -GOOD_DB,
-        -POOR_DB,
-        f"validation {psnr or math.nan:.1f} dB, where {GOOD_DB:g} and more are good",
+    check(
+        evidence.psnr,
+        GOOD_DB,
+        POOR_DB,
+        f"validation {{:.1f}} dB, where {GOOD_DB:g} and more are good",
         "sharp photographs of one exposure, with the object still and the light unchanged",
     )
-    fault(
+    check(
         evidence.outline,
         GOOD_OUTLINE,
         POOR_OUTLINE,
-        f"{percent['outline']} of the outline is not where the masks have it",
+        "{:.0%} of the outline is not where the masks have it",
         "better masks: look at them with `univoxel inspect`",
     )
-    fault(
+    check(
         evidence.hidden,
         GOOD_HIDDEN,
         POOR_HIDDEN,
-        f"{percent['hidden']} of the surface is seen by fewer than three cameras",
+        "{:.0%} of the surface is seen by too few cameras",
         "more photographs: `univoxel report` shows from where",
     )
-    fault(
+    check(
         evidence.residual,
         GOOD_RESIDUAL,
         POOR_RESIDUAL,
-        f"{percent['residual']} of the surface differs visibly from its photographs",
+        "{:.0%} of the surface differs visibly from its photographs",
         "`--preset full`, if the object did not move and its masks are right",
     )
     if evidence.troubles:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -29,13 +28,10 @@ from univoxel.preparation.registration import registered_poses
 from univoxel.preparation.strays import say_strays
 from univoxel.scene import Scene
 
-log: logging.Logger = logging.getLogger("univoxel")
-
 PINNED = "hull that stays"  # a step
-MINUTES = {"arguments": ("minutes",)}  # of a message
 
 
-def unhurried(step: str) -> bool:
+def unhurried(step: str, needed: bool = False) -> bool:
     """There is time for every step, and nobody to tell."""
     return True
 
@@ -68,13 +64,13 @@ class Prepared:
 
 
 def find_silhouettes(
-    photos: Photos, cfg: TrainConfig, begins: Callable[[str], bool] = unhurried
+    photos: Photos, cfg: TrainConfig, begins: Callable[..., bool] = unhurried
 ) -> Silhouettes:
     """The photographs with the masks that are used, and the box around the object.
 
     Args:
-        begins: told of each step, and says whether there is time for it: where there is not, masks
-            and cameras are taken as they are.
+        begins: told of each step, and whether it is needed; says whether it is to be made. Where it
+            is not, masks and cameras are taken as they are.
 
     Raises:
         DataError: the silhouettes share no volume.
@@ -89,13 +85,13 @@ def find_silhouettes(
             belief = weighed(photos, distance, cfg.cameras, cfg.masks)
         else:
             belief = unweighed(photos, distance, cfg.cameras)
-            log.info("there is no time to compare masks and cameras: see minutes", extra=MINUTES)
         found = None
         if belief.votes > 1 and begins("rough masks"):
             found = mended(photos, distance, belief)
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
-    doubted, edges_given = None, photos is given and found is None
+    # Rough masks that there was no time to mend are no measure of how sharp edges are
+    doubted, edges_given = None, photos is given and belief.votes == 1
     if found is not None:
         photos, doubted = found.photos, found.doubted
         distance, belief = found.distance, found.belief
@@ -104,7 +100,7 @@ def find_silhouettes(
 
 
 def prepare(
-    silhouettes: Silhouettes, cfg: TrainConfig, begins: Callable[[str], bool] = unhurried
+    silhouettes: Silhouettes, cfg: TrainConfig, begins: Callable[..., bool] = unhurried
 ) -> Prepared:
     """Cameras, carved hull and exposures that training begins with.
 
@@ -120,9 +116,9 @@ def prepare(
     if silhouettes.refined and begins("cameras"):
         poses = registered_poses(distance, photos.cameras, box)
         photos = replace(photos, cameras=poses.corrected(photos.cameras))
-    begins("hull")
+    begins("hull", needed=True)
     hull = visual_hull(distance, photos.cameras, grid, silhouettes.votes)
-    begins("exposures")
+    begins("exposures", needed=True)
     say_clipped(photos)
     varying, gains = varying_and_gains(photos, hull, grid, cfg.scene.varying, cfg.exposures)
     turntable = turntable_of(photos, hull, grid, cfg.light_frame)
@@ -141,7 +137,7 @@ def pinned_in(
     silhouettes: Silhouettes,
     scene: Scene,
     cfg: TrainConfig,
-    begins: Callable[[str], bool] = unhurried,
+    begins: Callable[..., bool] = unhurried,
 ) -> PinnedHull | None:
     """What `prepare` pinned, of a scene that goes on."""
     stage = cfg.stages[0]

@@ -113,11 +113,16 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def preparing(self, what: str) -> bool:
-        """Tell of a step of the preparation that begins; whether a limit leaves time for it."""
+    def preparing(self, what: str, needed: bool = False) -> bool:
+        """Tell of a step of the preparation; whether it is to be made.
+
+        Args:
+            needed: it is. Others are left out where a limit leaves no time for them.
+        """
         self._show(f"preparation: {what}", "")
-        if self.clock.hurried and not self._goes_on:
+        if not needed and self.clock.hurried and not self._goes_on:
             self.skipped.append(what)
+            log.info(f"minutes leave no time to look at {what}", extra={"arguments": ("minutes",)})
         return what not in self.skipped
 
     def prepared(self) -> None:
