@@ -203,7 +203,8 @@ def write_neilf(folder: Path, scene: Scene, original: int = 1) -> Path:
 
 def write_polycam(folder: Path, scene: Scene, place: str = "keyframes/corrected_") -> Path:
     """ARKit's world has +Y up."""
-    write_pictures(folder, scene, f"{place}images", "keyframes/masks")
+    masks = "keyframes/masks" if place.startswith("keyframes") else "masks"
+    write_pictures(folder, scene, f"{place}images", masks)
     (folder / f"{place}cameras").mkdir(parents=True)
     height, width = scene.pictures.shape[1:3]
     for pose, name in zip(scene.poses, scene.names, strict=True):

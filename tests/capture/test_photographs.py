@@ -291,13 +291,13 @@ def test_masks_that_do_not_fit_are_refused(tmp_path):
         quarters().save(tmp_path / f"{name}.jpg")
     files = sorted(tmp_path.glob("*.jpg"))
     Image.new("L", (64, 48)).save(tmp_path / "masks/a.png")
-    with pytest.raises(DataError, match=r"such as b.png; 1 of 2 have none"):
+    with pytest.raises(DataError, match=r"each of 2 photographs, got none for 1: b.jpg"):
         gather(files, tmp_path / "masks")
     Image.new("L", (64, 40)).save(tmp_path / "masks/b_mask.png")
     capture, _ = gather(files, tmp_path / "masks")
-    with pytest.raises(DataError, match=r"b_mask.png: expected the shape of b.jpg, 64x48"):
+    with pytest.raises(DataError, match=r"b_mask.png: expected 64x48 pixels, got 64x40"):
         read_mask(capture, 1)
-    with pytest.raises(DataError, match="masks: expected a folder"):
+    with pytest.raises(DataError, match="none: expected a folder of masks"):
         gather(files, tmp_path / "none")
 
 

@@ -168,10 +168,9 @@ def test_paths_out_of_the_folder(data, tmp_path, monkeypatch, key, absolute):
         load_photos(data)
     assert e.value.arguments == ("allow_outside",)
     assert len(load_photos(data, allow_outside=True)) == 8
-    edit(
-        data / "transforms.json",
-        lambda r: r["frames"][0].update({key: "masks/../images/p_009.png"}),
-    )
+    inside = "masks/../images/p_009.png" if key == "file_path" else "images/../mask.png"
+    write_png(data / "mask.png", np.full((8, 12), 255, np.uint8))
+    edit(data / "transforms.json", lambda r: r["frames"][0].update({key: inside}))
     assert len(load_photos(data)) == 8
 
 

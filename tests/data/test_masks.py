@@ -1,4 +1,4 @@
-"""Folders of masks: which is whose, and of what size."""
+"""Masks in files of their own: which is whose, what their numbers mean, how they lie on pixels."""
 
 import re
 
@@ -6,11 +6,29 @@ import numpy as np
 import pytest
 import torch
 from analytic import write_scene
-from PIL import Image
+from layouts import (
+    scene,
+    write_colmap,
+    write_idr,
+    write_llff,
+    write_metashape,
+    write_neilf,
+    write_nerfstudio,
+    write_polycam,
+    write_realitycapture,
+)
+from PIL import ExifTags, Image
 
 from univoxel.data import load_photos
-from univoxel.data.masks import masks_by_stem, read_mask
-from univoxel.errors import DataError
+from univoxel.data.images import (
+    orientation,
+    stored_from_upright,
+    upright_from_stored,
+    write_exr,
+    write_png,
+)
+from univoxel.data.masks import coverage_in, find_masks, masks_beside, masks_in, read_mask
+from univoxel.errors import DataError, WithoutMasks
 
 
 def save(path, mask):
@@ -26,20 +44,111 @@ def folder(tmp_path):
 
 @pytest.mark.parametrize(
     "name",
-    ["IMG_1.png", "IMG_1.JPG.png", "IMG_1_mask.png", "IMG_1.jpg_mask.jpg", "IMG_1_alpha.png"],
+    [
+        *("IMG_1.png", "img_1.PNG", "IMG_1.JPG.png", "IMG_1_mask.png", "IMG_1.jpg_mask.jpg"),
+        *("IMG_1_alpha.png", "IMG_1.mask.png", "IMG_1.JPG.mask.tif", "mask_IMG_1.png"),
+        *("IMG_1-Mask.JPG", "IMG_1_matte.png", "IMG_1-removebg-preview.png", "IMG_1.HEIC.png"),
+        "inner/IMG_1 mask.webp",
+    ],
 )
 def test_whose_a_mask_is(tmp_path, folder, name):
     path = save(folder / name, np.zeros((2, 2)))
     save(folder / "IMG_10.png", np.zeros((2, 2)))
-    assert masks_by_stem(folder, [("IMG_1", tmp_path / "IMG_1.JPG")]) == [path]
+    assert masks_in(folder, [("IMG_1", tmp_path / "IMG_1.JPG")]) == [path]
 
 
 def test_folders_tell_apart_what_names_do_not(tmp_path, folder):
     paths = [save(folder / side / "1.png", np.zeros((2, 2))) for side in ("left", "right")]
     asked = [(f"{side}/1", tmp_path / side / "1.jpg") for side in ("left", "right")]
-    assert masks_by_stem(folder, asked) == paths
+    assert masks_in(folder, asked) == paths
     with pytest.raises(DataError, match=r"1\.jpg: expected one mask, got .*1\.png and .*1\.png"):
-        masks_by_stem(folder, [("1", tmp_path / "1.jpg")])
+        masks_in(folder, [("1", tmp_path / "1.jpg")])
+
+
+def test_a_mask_is_of_the_photograph_that_it_names_most_exactly(tmp_path, folder):
+    names = {"a.jpg": "a.jpg.png", "a.png": "a.png.png", "mask_1.jpg": "mask_1.png"}
+    names |= {"1.jpg": "1_mask.png", "e\u0301.jpg": "\u00e9.png"}  # letters as Macs write them
+    paths = {image: save(folder / mask, np.zeros((2, 2))) for image, mask in names.items()}
+    asked = [(image.rpartition(".")[0], tmp_path / image) for image in names]
+    assert masks_in(folder, asked) == list(paths.values())
+    save(folder / "a.png", np.zeros((2, 2)))  # a copy: COLMAP's name is the exact one
+    assert masks_in(folder, asked) == list(paths.values())
+
+
+def test_a_mask_of_two_photographs(tmp_path, folder):
+    save(folder / "1.png", np.zeros((2, 2)))
+    asked = [(f"{side}/1", tmp_path / side / "1.jpg") for side in ("left", "right")]
+    with pytest.raises(DataError, match=r"masks/1\.png: expected a mask of one photograph, its na"):
+        masks_in(folder, asked)
+
+
+def test_masks_of_another_folder_are_of_no_photograph(tmp_path, folder):
+    """Of a split, where that of the photograph is missing."""
+    for name in ("train/1", "train/2", "test/3"):
+        save(folder / f"{name}.png", np.zeros((2, 2)))
+    asked = [(name, tmp_path / "train" / f"{name}.jpg") for name in "123"]
+    with pytest.raises(DataError, match=r"none for 1: 3\.jpg"):
+        masks_in(folder, asked)
+
+
+def test_where_folders_of_masks_are(tmp_path):
+    """The nearest first; nothing that is another program's, and nothing of other photographs."""
+    image = save(tmp_path / "a" / "images" / "1.jpg", np.zeros((2, 2)))
+    places = ["masks", "a/pmasks", "a/Mask", "a/masks", "a/images_mask", "a/images/masks"]
+    save(tmp_path / "a" / "test_mask" / "1.png", np.zeros((2, 2)))
+    for place in places:
+        save(tmp_path / place / "._1.png", np.zeros((2, 2)))
+        mask = save(tmp_path / place / "1.png", np.zeros((2, 2)))
+        assert find_masks(tmp_path, [("1", image)]) == [mask]
+    assert find_masks(tmp_path / "a" / "images", [("2", image)]) == [mask]
+    assert find_masks(tmp_path, [("2", image.with_name("2.jpg"))]) == [None]
+
+
+def test_beside_a_photograph_names_must_say_that_they_are_masks(tmp_path):
+    image = save(tmp_path / "1.jpg", np.zeros((2, 2)))
+    save(tmp_path / "1.png", np.zeros((2, 2)))
+    assert masks_beside([("1", image)]) == [None]
+    alpha = save(tmp_path / "1_alpha.png", np.zeros((2, 2)))
+    assert masks_beside([("1", image)]) == [alpha]
+    mask = save(tmp_path / "1.Mask.PNG", np.zeros((2, 2)))
+    assert masks_beside([("1", image)]) == [mask]
+    save(tmp_path / "1_mask.png", np.zeros((2, 2)))
+    with pytest.raises(DataError, match=r"1\.jpg: expected one mask, got .*1\.Mask\.PNG and "):
+        masks_beside([("1", image)])
+
+
+WRITERS = [write_colmap, write_idr, write_llff, write_metashape, write_neilf, write_polycam]
+WRITERS += [write_realitycapture]
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("name", ["{}_mask.PNG", "MASK-{}.png", "{}.mask.png"])
+def test_names_of_masks_in_every_layout(tmp_path, writer, name):
+    written = scene()
+    data = writer(tmp_path, written)
+    place = next(p for p in data.rglob("mask*") if p.is_dir())
+    images = sorted(p for p in data.rglob("*.png") if place not in p.parents)
+    for image, mask in zip(images, sorted(place.iterdir()), strict=True):
+        mask.rename(place / name.format(image.stem))
+    place.rename(place.with_name("Masks"))
+    for split in ("train", "test"):
+        found = load_photos(data, split).alpha
+        assert np.array_equal(found, written.pictures[written.split(split), ..., 3])
+    next((place.with_name("Masks")).glob("*003*")).unlink()
+    message = r"expected a mask for each of 8 photographs, got none for 1: \S*003\.png"
+    with pytest.raises(DataError, match=message) as caught:
+        load_photos(data)
+    assert not isinstance(caught.value, WithoutMasks)
+
+
+def test_masks_that_lie_beside_photographs_are_no_photographs(tmp_path):
+    written = scene()
+    data = write_llff(tmp_path, written)
+    for mask in (data / "masks").iterdir():
+        save(data / "images" / f"._{mask.name}", np.zeros((2, 2)))
+        mask.rename(data / "images" / f"{mask.stem}_mask.png")
+    found = load_photos(data).alpha
+    assert np.array_equal(found, written.pictures[written.split("train"), ..., 3])
 
 
 def test_photographs_without_a_mask(tmp_path, folder):
@@ -47,16 +156,16 @@ def test_photographs_without_a_mask(tmp_path, folder):
     asked = [(name, tmp_path / f"{name}.jpg") for name in "abcdefgh"]
     message = "expected a mask for each of 8 photographs, got none for 7: b.jpg, c.jpg, d.jpg, "
     with pytest.raises(DataError, match=re.escape(message)):
-        masks_by_stem(folder, asked)
+        masks_in(folder, asked)
 
 
 def test_folders_that_are_none(tmp_path, folder):
     asked = [("a", tmp_path / "a.jpg")]
     with pytest.raises(DataError, match="masks: expected a folder of masks, got nothing there"):
-        masks_by_stem(folder, asked)
+        masks_in(folder, asked)
     folder.mkdir()
     with pytest.raises(DataError, match=r"expected masks .*, got no picture"):
-        masks_by_stem(folder, asked)
+        masks_in(folder, asked)
 
 
 def test_masks_of_another_size(folder):
@@ -78,6 +187,174 @@ def test_alpha_is_the_mask_where_there_is_one(folder):
     rgba = np.zeros((2, 2, 4))
     rgba[0, :, 3], rgba[1, :, :3] = 255, 255
     assert read_mask(save(folder / "a.png", rgba), 2, 2).tolist() == [[255, 255], [0, 0]]
+
+
+HALF = np.array([[0, 0], [1, 1]])
+
+
+def palette(numbers, *colors):
+    picture = Image.fromarray(np.asarray(numbers, np.uint8), "P")
+    picture.putpalette([value for color in colors for value in color])
+    return picture
+
+
+def rgb(*scale):
+    return Image.fromarray((HALF[..., None] * np.array(scale)).astype(np.uint8))
+
+
+OBJECTS = {
+    "black and white": Image.fromarray((255 * HALF).astype(np.uint8)),
+    "one bit": Image.fromarray(HALF > 0),
+    "0 and 1": Image.fromarray(HALF.astype(np.uint8)),
+    "0 and 1, three channels": rgb(1, 1, 1),
+    "0 and 128": Image.fromarray((128 * HALF).astype(np.uint8)),
+    "green": rgb(0, 255, 0),
+    "dark red": rgb(128, 0, 0),
+    "opaque alpha": rgb(255, 255, 255).convert("RGBA"),
+    "grey with opaque alpha": rgb(255, 255, 255).convert("LA"),
+    "palette of colours": palette(HALF, (0, 0, 0), (128, 0, 0)),
+    "palette of grey": palette(1 - HALF, (255, 255, 255), (0, 0, 0)),
+    "palette of 0 and 1": palette(HALF, (0, 0, 0), (1, 1, 1)),
+    "16 bits": Image.fromarray((65535 * HALF).astype(np.uint16)),
+    "8 bits in 16": Image.fromarray((255 * HALF).astype(np.uint16)),
+    "0 and 1 in 16": Image.fromarray(HALF.astype(np.uint16)),
+}
+
+
+@pytest.mark.parametrize("what", OBJECTS)
+def test_what_is_the_object(tmp_path, what):
+    """As programs write masks, whose lower half is the object."""
+    OBJECTS[what].save(tmp_path / "a.png")
+    found = coverage_in(tmp_path / "a.png").float()
+    assert (found / found.max()).tolist() == HALF.tolist()
+    assert float(found.max()) == (1 if "16" in what else 255)
+
+
+@pytest.mark.parametrize(("high", "found"), [(255, [0, 0.4, 1]), (1, [0, 0.4, 1])])
+def test_masks_in_floating_point(tmp_path, high, found):
+    write_exr(tmp_path / "a.exr", {"Y": high * np.array([[-0.1, 0.4, 1]])}, half=False)
+    assert coverage_in(tmp_path / "a.exr")[0].tolist() == pytest.approx(found)
+
+
+def test_soft_masks_stay_as_they_are(tmp_path):
+    """Also where nothing of them is certain, and those of one value."""
+    for values in ([0, 100, 255], [0, 17, 180], [90, 90, 90], [0, 0, 0]):
+        save(tmp_path / "a.png", [values])
+        assert coverage_in(tmp_path / "a.png")[0].tolist() == values
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (Image.fromarray(np.array([[0, 1, 2]], np.uint8)), "largest value of 2 of 255"),
+        (palette([[0, 1, 2]], (0, 0, 0), (128, 0, 0), (0, 128, 0)), "a palette of 3 colours"),
+        (palette([[0, 1, 1]], (9, 9, 200), (128, 0, 0)), "a palette of 2 colours"),
+        (
+            Image.fromarray(np.random.default_rng(0).integers(0, 255, (9, 9, 3), np.uint8)),
+            "got a picture of several colours",
+        ),
+        (
+            Image.fromarray(np.array([[[255] * 3, [255, 0, 0]]], np.uint8)),
+            "got a picture of several colours",
+        ),
+    ],
+)
+def test_pictures_that_say_nothing_of_one_object(tmp_path, picture, message):
+    picture.save(tmp_path / "a.png")
+    with pytest.raises(DataError, match=rf"a\.png: expected a mask.*{message}.*: give masks that"):
+        coverage_in(tmp_path / "a.png")
+
+
+def test_a_cut_out_that_fills_its_picture_is_the_object(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (9, 9, 4), np.uint8)
+    noise[..., 3] = 255
+    write_png(tmp_path / "a.png", noise)
+    assert (coverage_in(tmp_path / "a.png") == 255).all()
+
+
+def test_inverted_masks_are_refused(tmp_path):
+    written = scene(10, 30, 20)
+    data = write_colmap(tmp_path, written)
+    for n, path in enumerate(sorted((data / "masks").iterdir())):
+        mask = np.zeros((20, 30))
+        mask[4:12, 3 + n : 15 + n] = 255
+        save(path, mask)
+    assert load_photos(data).alpha.any()
+    for path in (data / "masks").iterdir():
+        save(path, 255 - np.asarray(Image.open(path)))
+    with pytest.raises(DataError, match=r"8 of 8 masks are white along .* to be inverted"):
+        load_photos(data)
+
+
+# Photographs that EXIF says to turn
+
+
+def turned_photograph(path, upright, tag):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = tag
+    stored = stored_from_upright(torch.from_numpy(upright), tag).contiguous().numpy()
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(stored).save(path, exif=exif, quality=100, subsampling=0)
+
+
+@pytest.mark.parametrize("tag", range(1, 9))
+def test_turning_is_that_of_viewers(tmp_path, tag):
+    from PIL import ImageOps
+
+    upright = np.random.default_rng(0).integers(0, 255, (16, 24, 3), np.uint8)
+    turned_photograph(tmp_path / "a.jpg", upright, tag)
+    with Image.open(tmp_path / "a.jpg") as image:
+        stored = torch.from_numpy(np.array(image))
+        looked_at = np.array(ImageOps.exif_transpose(image))
+    assert orientation(tmp_path / "a.jpg") == tag
+    assert np.array_equal(upright_from_stored(stored, tag), looked_at)
+
+
+@pytest.mark.parametrize("tag", range(1, 9))
+def test_masks_follow_their_photographs(tmp_path, tag):
+    """Upright ones are turned to the stored pixels, by their size, or where they say so."""
+    upright = np.zeros((16, 24), np.uint8)
+    upright[2:7, 3:9] = 255
+    turned_photograph(tmp_path / "a.jpg", np.repeat(upright[..., None], 3, 2), tag)
+    stored = stored_from_upright(torch.from_numpy(upright), tag).contiguous()
+    height, width = stored.shape
+    plain, tagged, other = (tmp_path / name for name in ("a.png", "b.jpg", "c.jpg"))
+    save(plain, stored)
+    turned_photograph(tagged, upright, tag)
+    turned_photograph(other, upright, 3)
+    for mask in (plain, tagged, other):
+        found = read_mask(mask, width, height, tmp_path / "a.jpg")
+        assert torch.equal(found > 127, stored > 127)
+    save(plain, upright)
+    if tag >= 5:
+        assert torch.equal(read_mask(plain, width, height, tmp_path / "a.jpg"), stored)
+    assert torch.equal(read_mask(plain, width, height, tmp_path / "a.jpg", upright=True), stored)
+
+
+@pytest.mark.parametrize("square", [False, True])
+@pytest.mark.parametrize("upright", [False, True])
+def test_colours_tell_what_masks_were_made_of(tmp_path, caplog, square, upright):
+    """Where sizes do not: photographs that were held upside down, and square ones."""
+    size = 30 if square else 40
+    written = scene(10, size, 30)
+    data, tag = write_nerfstudio(tmp_path, written), 6 if square else 3
+    caplog.set_level("INFO", "univoxel")
+    for n, name in enumerate(written.names):
+        mask = np.zeros((30, size), np.uint8)
+        mask[3:14, 5 + n : 17 + n] = 255
+        picture = np.where(mask[..., None] > 0, (200, 120, 40), (20, 40, 90)).astype(np.uint8)
+        (data / "images" / f"{name}.png").unlink()
+        turned_photograph(data / "images" / f"{name}.jpg", picture, tag)
+        stored = stored_from_upright(torch.from_numpy(mask), tag)
+        save(data / "masks" / f"{name}.png", mask if upright else stored)
+    photos = load_photos(data)
+    red = photos.color[..., 0] > 120
+    assert torch.equal(photos.alpha > 127, red)
+    assert photos.alpha.any()
+    what = "the upright picture" if upright else "the pixels as they are stored"
+    assert f"8 photographs have an EXIF orientation: their masks are taken as made of {what}" in (
+        caplog.text
+    )
 
 
 def test_photographs_with_masks_of_a_folder(tmp_path, folder):

@@ -6,15 +6,15 @@ Formats: JPEG, PNG, TIFF, WebP, AVIF; HEIC with pillow-heif; RAW with rawpy.
 from __future__ import annotations
 
 import importlib.util
-import io
 import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageCms, ImageOps
+from PIL import Image, ImageOps
 
+from univoxel.data.images import srgb_of
 from univoxel.errors import DataError, MissingExtra
 
 PLAIN = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif")
@@ -159,7 +159,7 @@ def read_upright(path: Path, longest: int = 0) -> Image.Image:
             orientation = image.getexif().get(ORIENTATION, 1)
     except BROKEN as error:
         raise DataError(f"{path}: expected a photograph, could not read it: {error}") from None
-    picture = _in_srgb(picture, profile)
+    picture = srgb_of(picture, profile) if profile else picture
     picture.info.pop("icc_profile", None)
     picture.getexif()[ORIENTATION] = orientation
     return ImageOps.exif_transpose(picture)
@@ -197,25 +197,6 @@ def _eight_bits(image: Image.Image) -> Image.Image:
         top = 65535 if array.max() > 255 else 255
         return Image.fromarray((array * (255 / top)).clip(0, 255).astype(np.uint8)).convert("RGB")
     return image.convert("RGBA" if image.has_transparency_data else "RGB")
-
-
-def _in_srgb(picture: Image.Image, profile: bytes | None) -> Image.Image:
-    """Colours of a wider space, as phones store them, as sRGB."""
-    if not profile:
-        return picture
-    try:
-        own = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if "sRGB" in ImageCms.getProfileDescription(own):
-            return picture
-        srgb = ImageCms.createProfile("sRGB")
-        alpha = picture.getchannel("A") if picture.mode == "RGBA" else None
-        turned = ImageCms.profileToProfile(picture.convert("RGB"), own, srgb)
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):  # of CMYK, or broken
-        return picture
-    assert turned is not None  # as it is not converted in place
-    if alpha is not None:
-        turned.putalpha(alpha)
-    return turned
 
 
 def _describe_raw(path: Path) -> Photograph:

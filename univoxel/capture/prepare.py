@@ -13,20 +13,19 @@ from PIL import Image
 from scipy.ndimage import maximum_filter
 
 from univoxel.capture.photographs import (
-    ORDER,
     SIDEWAYS,
-    TURNS,
     Photograph,
     describe,
     fitted,
     read_upright,
 )
+from univoxel.data.images import upright_from_stored
+from univoxel.data.masks import laid_over, masks_in
 from univoxel.errors import DataError
 from univoxel.files import replacing
 
 SFM_QUALITY = 95  # of JPEG
 MASK_MARGIN = 0.006  # that masks grow by before features are sought, of the longer side
-ASPECT = 0.02  # relative difference of sides' ratios up to which a mask is of the same picture
 
 
 class Folders:
@@ -73,7 +72,8 @@ def gather(files: Sequence[Path], masks: Path | None) -> tuple[Capture, list[str
         raise DataError(
             f"{files[0].parent}: expected two photographs at least, could read {len(photographs)}"
         )
-    found = None if masks is None else _find_masks(photographs, masks)
+    named = [(photograph.name, photograph.path) for photograph in photographs]
+    found = None if masks is None else masks_in(masks, named)
     return Capture(photographs, group(photographs), found), unread
 
 
@@ -147,23 +147,17 @@ def read_mask(capture: Capture, index: int) -> Image.Image:
     """The mask of a photograph, upright, of its own size, grey.
 
     Raises:
-        DataError: it cannot be read, or is of another picture.
+        DataError: it cannot be read, is none, or is of another picture.
     """
     assert capture.masks is not None
     path, photograph = capture.masks[index], capture.photographs[index]
-    mask = read_upright(path)
-    # White on the object; or the alpha of a cut-out
-    mask = mask.getchannel("A") if mask.mode == "RGBA" else mask.convert("L")
-    if (mask.width > mask.height) != (photograph.width > photograph.height):
-        if photograph.turned in SIDEWAYS:  # drawn over the pixels as they are stored
-            mask = mask.transpose(TURNS[photograph.turned])
-    ratio = mask.width / mask.height * photograph.height / photograph.width
-    if abs(ratio - 1) > ASPECT:
-        raise DataError(
-            f"{path}: expected the shape of {photograph.path.name}, "
-            f"{photograph.width}x{photograph.height} pixels, got {mask.width}x{mask.height}"
-        )
-    return mask
+    width, height = photograph.width, photograph.height
+    if photograph.turned in SIDEWAYS:
+        width, height = height, width
+    mask = laid_over(path, width, height, photograph.path, upright=True)
+    if mask.is_floating_point():
+        mask = (255 * mask).round().byte()
+    return Image.fromarray(upright_from_stored(mask, photograph.turned).contiguous().numpy())
 
 
 def _write_picture(
@@ -193,19 +187,3 @@ def _write_picture(
                     temporary, format="PNG"
                 )
     return None
-
-
-def _find_masks(photographs: Sequence[Photograph], folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise DataError(f"masks: expected a folder, got {folder}", "masks")
-    masks = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in ORDER}
-    names = [(p.path.name, p.path.stem, f"{p.path.stem}_mask") for p in photographs]
-    found = [next((masks[n] for n in choice if n in masks), None) for choice in names]
-    missing = [p.path.name for p, mask in zip(photographs, found, strict=True) if mask is None]
-    if missing:
-        raise DataError(
-            f"{folder}: expected a mask for each photograph, such as "
-            f"{Path(missing[0]).stem}.png; {len(missing)} of {len(found)} have none",
-            "masks",
-        )
-    return [mask for mask in found if mask is not None]

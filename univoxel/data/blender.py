@@ -10,7 +10,6 @@ transforms_novel.json       views of other scenes, as of Stanford-ORB: split "no
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from univoxel.data.base import Photos
@@ -35,11 +34,4 @@ def load_blender(
     if not path.is_file():
         raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
     _, shots, remarks = read_frames(path)
-    shots = [replace(shot, mask=shot.mask or _mask(shot.image)) for shot in shots]
     return read_shots(folder, "NeRF layout", split, shots, downscale, remarks, masks)
-
-
-def _mask(image: Path) -> Path | None:
-    """What Stanford-ORB has in a folder of its own beside that of the photographs."""
-    path = image.parent.with_name(f"{image.parent.name}_mask") / f"{image.stem}.png"
-    return path if path.is_file() else None

@@ -22,7 +22,7 @@ from univoxel.data.images import image_size, turn_note
 from univoxel.data.inside import inside
 from univoxel.data.lens import FARTHEST, Lens, checked
 from univoxel.data.missing import left_out
-from univoxel.data.shots import Shot, find_mask, read_shots, upright
+from univoxel.data.shots import Shot, read_shots, upright
 from univoxel.errors import DataError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -99,10 +99,7 @@ def load_colmap(
                 f"{cameras_file.name}, got {width}x{height}{turn_note(path)}"
             )
         name = Path(image.name).with_suffix("").as_posix().replace("/", "_")
-        mask = find_mask(folder, image.name) or find_mask(
-            folder, str(Path(image.name).with_suffix(path.suffix))
-        )
-        shots.append(Shot(name, str(images_file), path, mask, image.pose, lens))
+        shots.append(Shot(name, str(images_file), path, None, image.pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(images_file), missing, len(images), note)
     shots, remarks = upright(shots)

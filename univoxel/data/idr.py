@@ -12,6 +12,7 @@ Source: Yariv et al. 2020 (IDR) and Wang et al. 2021 (NeuS), the conventions of 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from scipy.linalg import rq
 from univoxel.data.arrays import read_npz
 from univoxel.data.base import Photos
 from univoxel.data.foreign import TO_OPENGL, check_skew
-from univoxel.data.images import SUFFIXES, image_size, turn_note
+from univoxel.data.images import image_size, turn_note
+from univoxel.data.masks import find_masks, photographs_in
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, read_shots, upright
 from univoxel.data.transforms import lens_of, pose_of
@@ -48,12 +50,12 @@ def load_idr(
         DataError: one line that names the file, what was expected and what came.
     """
     path = _file(folder) or folder / FILES[0]
-    matrices, (pictures, silhouettes) = _matrices(path), _pictures(folder, path)
+    matrices, pictures = _matrices(path), _pictures(folder, path)
     numbers = _numbers(path, sorted(matrices), pictures)
     missing = [f"number {number}" for number in sorted(matrices) if number not in numbers]
     lost = left_out(str(path), missing, len(matrices), f" (looked in {pictures[0].parent})")
-    shots = []
-    for place, (number, picture) in enumerate(zip(numbers, pictures, strict=True)):
+    shots, silhouettes = [], _masks(folder, pictures)
+    for number, picture, mask in zip(numbers, pictures, silhouettes, strict=True):
         where = f"{path}: world_mat_{number}"
         intrinsics, pose = decomposed(matrices[number], where)
         size = image_size(picture)
@@ -61,7 +63,6 @@ def load_idr(
         values = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
         lens = lens_of(values, where, *size, turn_note(picture))
         check_skew(skew, lens, where)
-        mask = _mask(silhouettes, picture, place, len(pictures))
         shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
     shots, remarks = upright(shots)
     shots = every_eighth(folder, shots, split)
@@ -110,21 +111,12 @@ def _matrices(path: Path) -> dict[int, np.ndarray]:
     return {number: matrix[:3].astype(np.float64) for number, matrix in found.items()}
 
 
-def _pictures(folder: Path, path: Path) -> tuple[list[Path], list[Path]]:
-    """Photographs and masks, each in order of their names."""
-    images, masks = (
-        next((found for name in names if (found := _listed(folder / name))), [])
-        for names in (IMAGES, MASKS)
-    )
-    if not images:
-        raise DataError(f"{path}: no pictures in {folder / IMAGES[0]}")
-    return images, masks
-
-
-def _listed(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+def _pictures(folder: Path, path: Path) -> list[Path]:
+    """Photographs in order of their names."""
+    for name in IMAGES:
+        if found := photographs_in(folder / name):
+            return found
+    raise DataError(f"{path}: no pictures in {folder / IMAGES[0]}")
 
 
 def _numbers(path: Path, known: list[int], pictures: list[Path]) -> list[int]:
@@ -140,13 +132,9 @@ def _numbers(path: Path, known: list[int], pictures: list[Path]) -> list[int]:
     )
 
 
-def _mask(masks: list[Path], picture: Path, place: int, pictures: int) -> Path | None:
-    """The mask of a photograph: DTU has 000000.png with the mask 000.png."""
-    for path in masks:
-        if path.stem == picture.stem:
-            return path
-    number = picture.stem if picture.stem.isdecimal() else ""
-    for path in masks:
-        if number and path.stem.isdecimal() and int(path.stem) == int(number):
-            return path
-    return masks[place] if len(masks) == pictures else None
+def _masks(folder: Path, pictures: list[Path]) -> Sequence[Path | None]:
+    """The masks of photographs: by their places where no name tells."""
+    if any(find_masks(folder, [(path.stem, path) for path in pictures])):
+        return [None] * len(pictures)  # `read_shots` finds them again
+    listed = next((found for name in MASKS if (found := photographs_in(folder / name))), [])
+    return listed if len(listed) == len(pictures) else [None] * len(pictures)

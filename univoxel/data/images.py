@@ -1,4 +1,4 @@
-"""Pictures in files: PNG, JPEG, OpenEXR and Radiance in; PNG and OpenEXR out."""
+"""Pictures in files: PNG, JPEG, TIFF, WebP, OpenEXR and Radiance in; PNG and OpenEXR out."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from threading import Lock
 import numpy as np
 import OpenEXR
 import torch
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageCms
 from torch import Tensor
 
 from univoxel.data.radiance import read_radiance
@@ -24,16 +24,26 @@ from univoxel.records import HALF_MAX
 
 _OPENING = Lock()  # of an OpenEXR file: what it prints to is the process's, not the thread's
 EXR_TELLS = "Warning: "  # how its lines begin
-SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff", ".webp")
+# What Pillow may take a file for, whatever its name says
+FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
+KINDS = {".exr": "an OpenEXR file", ".tif": "a TIFF", ".tiff": "a TIFF", ".webp": "a WebP"}
 HEIF = (".heic", ".heif", ".avif")  # of telephones
+HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
+MOST_FRAMED = 1 << 29  # pixels of an EXR's display window, at most, where its data fill it in part
+# Endings of pictures that are not read: names may be those of files before they were converted
+FOREIGN = (*HEIF, ".hif", ".bmp", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 
 
-def read_image(path: str | Path) -> Tensor:
+def read_image(path: str | Path, in_srgb: bool = False) -> Tensor:
     """Read a picture, row 0 on top, channels in the order RGB(A) or grey.
 
+    Args:
+        in_srgb: turn colours of a profile that the file holds, as of telephones, into sRGB.
+
     Returns:
-        [H, W, C]: uint8 as stored for PNG and JPEG of 8 bits; float32 in [0, 1], still encoded as
-        stored, for grey PNG of 16 bits (colour PNG of 16 bits is cut to 8); float32 linear for EXR
+        [H, W, C]: uint8 as stored for files of 8 bits; float32 in [0, 1], still encoded as
+        stored, for grey of 16 bits (colour PNG of 16 bits is cut to 8); float32 linear for EXR
         (channels R, G, B and A if there, or Y) and Radiance .hdr.
 
     Raises:
@@ -58,43 +68,41 @@ def read_image(path: str | Path) -> Tensor:
             row, column, _ = np.argwhere(~np.isfinite(image))[0]
             raise DataError(f"{path}: NaN or infinity at row {row}, column {column}")
         return torch.from_numpy(image)
-    return torch.from_numpy(_read_pillow(path))
+    with opened(path) as image:
+        return torch.from_numpy(as_array(image, path, in_srgb))
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height of a PNG, JPEG or EXR, from its beginning alone.
+    """Width and height of a picture that Pillow or OpenEXR reads, from its beginning alone.
 
     Raises:
         DataError: the file is missing, empty, or not what its name says.
     """
     path = Path(path)
     _refuse_heif(path)
+    if path.suffix.lower() != ".exr":
+        with opened(path, whole=False) as image:
+            return image.size
     _require_file(path)
     try:
-        if path.suffix.lower() == ".exr":
-            with _exr(path, header_only=True) as file:
-                low, high = file.header()["dataWindow"]
-            return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path, formats=["PNG", "JPEG"]) as image:
-                return image.size
-    except (OSError, SyntaxError, ValueError, RuntimeError, Image.DecompressionBombError) as error:
-        kind = "an OpenEXR file" if path.suffix.lower() == ".exr" else "a PNG or JPEG"
-        raise DataError(f"{path}: expected {kind}, could not read it: {error}") from None
+        with _exr(path, header_only=True) as file:
+            low, high = file.header()["displayWindow"]
+        return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
+    except (OSError, ValueError, RuntimeError) as error:
+        raise DataError(f"{path}: expected an OpenEXR file, could not read it: {error}") from None
 
 
 def orientation(path: Path) -> int:
-    """How a JPEG says it is to be turned before it is looked at: EXIF's 1 to 8; 1 is not at all.
+    """How a picture says it is to be turned before it is looked at: EXIF's 1 to 8; 1 is not at all.
 
     Nothing here turns it: pixels are those of the file, which the cameras beside it are of.
     """
-    if path.suffix.lower() not in (".jpg", ".jpeg"):
+    if path.suffix.lower() not in (".jpg", ".jpeg", ".tif", ".tiff", ".webp"):
         return 1
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(path, formats=["JPEG"]) as image:
+            with Image.open(path, formats=["JPEG", "TIFF", "WEBP"]) as image:
                 found = image.getexif().get(ExifTags.Base.Orientation, 1)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return 1
@@ -112,26 +120,68 @@ def turn_note(path: Path) -> str:
     )
 
 
+def upright_from_stored(pixels: Tensor, turned: int) -> Tensor:
+    """Pixels [H, W, ..] as they are looked at, from those of a file of that EXIF orientation."""
+    match turned:
+        case 2:
+            return pixels.flip(1)
+        case 3:
+            return pixels.flip(0, 1)
+        case 4:
+            return pixels.flip(0)
+        case 5:
+            return pixels.transpose(0, 1)
+        case 6:
+            return pixels.transpose(0, 1).flip(1)
+        case 7:
+            return pixels.transpose(0, 1).flip(0, 1)
+        case 8:
+            return pixels.transpose(0, 1).flip(0)
+    return pixels
+
+
+def stored_from_upright(pixels: Tensor, turned: int) -> Tensor:
+    """What `upright_from_stored` makes such pixels of."""
+    return upright_from_stored(pixels, {6: 8, 8: 6}.get(turned, turned))
+
+
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     """All channels of the first part of an OpenEXR file, [H, W] float32 each.
 
+    The picture is the display window: 0 where a smaller data window ends, as renderers cut away
+    what is empty, and without what a larger one has around it.
+
     Raises:
-        DataError: the file is missing, empty, cut off, no EXR file, or has subsampled channels or a
-            data window unlike its display window.
+        DataError: the file is missing, empty, cut off, no EXR file, or has subsampled channels.
     """
     path = Path(path)
     _require_file(path)
     try:
         with _exr(path, separate_channels=True) as file:
-            crop = not np.array_equal(file.header()["dataWindow"], file.header()["displayWindow"])
+            data, shown = (file.header()[f"{what}Window"] for what in ("data", "display"))
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, TypeError) as error:
         raise DataError(f"{path}: expected an OpenEXR file, could not read it: {error}") from None
-    if crop:
-        raise DataError(f"{path}: expected a data window like the display window, got a crop")
     if len({pixels.shape for pixels in channels.values()}) != 1:
         raise DataError(f"{path}: expected channels of one size, got subsampled ones")
+    if not np.array_equal(data, shown):
+        channels = {name: _framed(p, data, shown, path) for name, p in channels.items()}
     return {name: np.asarray(pixels, np.float32) for name, pixels in channels.items()}
+
+
+def _framed(
+    pixels: np.ndarray, data: tuple[np.ndarray, ...], shown: tuple[np.ndarray, ...], path: Path
+) -> np.ndarray:
+    """Pixels of a data window in those of the display window."""
+    width, height = (int(high - low) + 1 for low, high in zip(*shown, strict=True))
+    if min(width, height) < 1 or width * height > MOST_FRAMED:
+        raise DataError(f"{path}: expected a display window of pixels, got {width}x{height}")
+    framed = np.zeros((height, width), pixels.dtype)
+    x, y = (int(d - s) for d, s in zip(data[0], shown[0], strict=True))
+    into = framed[max(y, 0) : max(y + pixels.shape[0], 0), max(x, 0) : max(x + pixels.shape[1], 0)]
+    inner = pixels[max(-y, 0) :, max(-x, 0) :]
+    into[:] = inner[: into.shape[0], : into.shape[1]]
+    return framed
 
 
 def write_png(path: str | Path, image: Tensor | np.ndarray) -> None:
@@ -248,22 +298,79 @@ def _require_file(path: Path) -> None:
         raise DataError(f"{path}: the file is empty")
 
 
-def _read_pillow(path: Path) -> np.ndarray:
-    """[H, W, C] uint8, or float32 for 16-bit grey."""
+@contextmanager
+def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
+    """A picture in Pillow's hands, its pixels read where `whole`.
+
+    Raises:
+        DataError: what is wrong with the file, where the block runs into it, too.
+    """
+    kind = KINDS.get(path.suffix.lower(), "a PNG or JPEG")
     _require_file(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path, formats=["PNG", "JPEG"]) as image:
-                image.load()
-                if image.mode.startswith("I;16"):
-                    return np.asarray(image, np.float32)[..., None] / 65535
-                grey = image.mode in ("1", "L")
-                transparent = image.has_transparency_data
-                mode = "L" if grey else "RGBA" if transparent else "RGB"
-                array = np.array(image if image.mode == mode else image.convert(mode))
+            with Image.open(path, formats=FORMATS) as image:
+                if whole:
+                    image.load()
+                yield image
+    except DataError:
+        raise
     except AssertionError:  # Pillow's own, of what it takes for granted
-        raise DataError(f"{path}: expected a PNG or JPEG, got one without its palette") from None
+        raise DataError(f"{path}: expected {kind}, got one without its palette") from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path}: expected a PNG or JPEG, could not read it: {error}") from None
+        raise DataError(f"{path}: expected {kind}, {_what_it_is(path, error)}") from None
+
+
+def as_array(image: Image.Image, path: Path, in_srgb: bool = False) -> np.ndarray:
+    """Pixels [H, W, C] of a picture, as `read_image` has them.
+
+    Raises:
+        DataError: numbers of 32 bits, of which nothing says how bright they are.
+    """
+    if image.mode.startswith("I;16"):
+        return np.asarray(image, np.float32)[..., None] / 65535
+    if image.mode in ("I", "F"):
+        raise DataError(f"{path}: expected a picture of 8 or 16 bits, got one of 32: write it as 8")
+    grey = image.mode in ("1", "L")
+    mode = "L" if grey else "RGBA" if image.has_transparency_data else "RGB"
+    profile = image.info.get("icc_profile") if in_srgb and not grey else None
+    if image.mode not in (mode, "CMYK"):  # whose profile is of its own numbers
+        image = image.convert(mode)
+    if profile:
+        image = srgb_of(image, profile)
+    array = np.array(image if image.mode == mode else image.convert(mode))
     return array[..., None] if grey else array
+
+
+def srgb_of(picture: Image.Image, profile: bytes) -> Image.Image:
+    """A picture RGB, RGBA or CMYK in the colours of a profile, as RGB or RGBA in sRGB.
+
+    Telephones store colours of a wider space. One in sRGB, or whose profile is broken or of
+    something else, stays as it is.
+    """
+    try:
+        own = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        if "sRGB" in ImageCms.getProfileDescription(own):
+            return picture
+        alpha = picture.getchannel("A") if picture.mode == "RGBA" else None
+        flat = picture.convert("RGB") if alpha else picture
+        srgb = ImageCms.createProfile("sRGB")
+        turned = ImageCms.profileToProfile(flat, own, srgb, outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return picture
+    assert turned is not None  # as it is not converted in place
+    if alpha is not None:
+        turned.putalpha(alpha)
+    return turned
+
+
+def _what_it_is(path: Path, error: Exception) -> str:
+    """Why a file could not be read: it may be of another kind than its name says."""
+    with path.open("rb") as file:
+        head = file.read(12)
+    if head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS:
+        return "got HEIC or AVIF under that name: convert it to JPEG, as `univoxel poses` does"
+    if head[:4] in (b"II*\0", b"MM\0*"):
+        return f"could not read this TIFF: {error}: convert it to PNG or JPEG of 8 bits"
+    return f"could not read it: {error}"

@@ -20,9 +20,9 @@ import numpy as np
 from univoxel.data.arrays import read_npy
 from univoxel.data.base import Photos
 from univoxel.data.foreign import fitted, listed_split
-from univoxel.data.images import SUFFIXES
 from univoxel.data.lens import Lens
-from univoxel.data.shots import Shot, find_mask, read_shots, upright
+from univoxel.data.masks import photographs_in
+from univoxel.data.shots import Shot, read_shots, upright
 from univoxel.data.transforms import pose_of
 from univoxel.errors import DataError
 
@@ -45,7 +45,7 @@ def load_llff(
         DataError: one line that names the file, what was expected and what came.
     """
     path = folder / FILE
-    rows, (pictures, ending) = _rows(path), _pictures(folder)
+    rows, pictures = _rows(path), _pictures(folder)
     if len(pictures) != len(rows):
         raise DataError(
             f"{path}: expected a row for each of {len(pictures)} photographs in "
@@ -58,9 +58,7 @@ def load_llff(
         down, right, back, position = camera[:, :4].T
         pose = pose_of(np.stack([right, -down, back, position], 1), where)
         lens = _lens(camera[:, 4], picture, where)
-        masked = (find_mask(folder, picture.name, place) for place in (f"masks{ending}", "masks"))
-        mask = next((found for found in masked if found), None)
-        shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
+        shots.append(Shot(picture.stem, where, picture, None, pose, lens))
     shots, remarks = upright(shots)
     shots = listed_split(folder, shots, split)
     return read_shots(folder, "LLFF layout", split, shots, downscale, remarks, masks)
@@ -75,16 +73,13 @@ def _rows(path: Path) -> np.ndarray:
     return rows.astype(np.float64)
 
 
-def _pictures(folder: Path) -> tuple[list[Path], str]:
-    """The photographs in order of their names, the largest that there are; and what stands behind
-    `images` in the name of their folder."""
+def _pictures(folder: Path) -> list[Path]:
+    """The photographs in order of their names, the largest that there are."""
     shrunk = [p for p in folder.glob("images_*") if p.name.removeprefix("images_").isdigit()]
     shrunk.sort(key=lambda p: int(p.name.removeprefix("images_")))
     for place in (folder / "images", *shrunk):
-        found = place.iterdir() if place.is_dir() else []
-        pictures = sorted(p for p in found if p.suffix.lower() in SUFFIXES)
-        if pictures:
-            return pictures, place.name.removeprefix("images")
+        if pictures := photographs_in(place):
+            return pictures
     raise DataError(f"{folder / FILE}: no pictures in {folder / 'images'} or images_2, images_4 ..")
 
 

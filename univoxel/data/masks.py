@@ -1,100 +1,499 @@
-"""Masks in files of their own: found by the names of the photographs, brought to their size."""
+"""Masks in files of their own: whose each is, what its numbers mean, how it lies on pixels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+import unicodedata
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from univoxel.data.images import SUFFIXES, read_image
+from univoxel.data.images import (
+    FOREIGN,
+    SUFFIXES,
+    as_array,
+    image_size,
+    opened,
+    orientation,
+    read_image,
+    stored_from_upright,
+    turn_note,
+    upright_from_stored,
+)
 from univoxel.errors import DataError
 
-ENDINGS = ("_mask", "_alpha")  # that a mask's name may have beyond the photograph's
+PLACES = ("masks", "mask", "pmasks")  # folders of masks; the first that has one counts
+# What stands before or behind a photograph's name in that of its mask. Beside a photograph the
+# first counts
+WORDS = ("mask", "masks", "alpha", "matte", "silhouette", "removebg-preview")
+_WORD = "|".join(map(re.escape, WORDS))
+_BEHIND = re.compile(rf"(.+?)[_\-. ]+({_WORD})")
+_BEFORE = re.compile(rf"({_WORD})[_\-. ]+(.+)")
+NAMED = 5  # files in a message, at most
 SKEW = 0.01  # by which width over height of a mask and its photograph may differ
-NAMED = 5  # photographs in a message, at most
+COLORED = 64  # of 255: difference of channels from which a pixel of a mask has a colour
+FEW = 0.001  # share of a mask's pixels that may have a colour, as JPEG makes some
+HUE = 0.2  # by which pixels of one colour may differ from it, channel over largest channel
+MOST = 0.95  # share of pixels that is taken for all: the others are on borders
+LABELS = 15  # of 255: largest value up to which several ones are numbers of things
+LOOKED_AT = 4  # photographs that say whether masks are upright
+WHITE = "give masks that are white on the object and black elsewhere"
+
+Named = Sequence[tuple[str, Path]]  # photographs: the name within the data set, and the file
+Claim = tuple[tuple[int, ...], Path]  # of a mask: how well it fits, lowest best, and the mask
 
 
-def masks_by_stem(folder: Path, photographs: Sequence[tuple[str, Path]]) -> list[Path]:
-    """The mask of each photograph in a folder of them.
+# Whose a mask is
 
-    That of IMG_1.jpg is IMG_1.png, IMG_1.jpg.png, IMG_1_mask.png or IMG_1_alpha.png, with any
-    ending of a picture. Where photographs lie in folders, the masks may lie in the same ones.
 
-    Args:
-        photographs: name within the data set, and file.
+def find_masks(folder: Path, photographs: Named) -> list[Path | None]:
+    """The mask of each photograph of a data set, where it has a folder of masks.
+
+    Such a folder is called masks, mask or pmasks, or like that of the photographs with _masks or
+    _mask behind, upper or lower case. It lies in the folder of the photographs, beside it, or
+    beside one around it. Of images_4 it may be masks_4.
+
+    Returns:
+        None for a photograph that has none there.
 
     Raises:
-        DataError: there is no such folder, a photograph has none in it, or has several.
+        DataError: two masks are of one photograph, or one is of two.
     """
-    if not folder.is_dir():
-        what = "a file" if folder.exists() else "nothing there"
-        raise DataError(f"{folder}: expected a folder of masks, got {what}")
-    files = [p for p in sorted(folder.rglob("*")) if p.suffix.lower() in SUFFIXES]
-    if not files:
-        raise DataError(f"{folder}: expected masks ({' '.join(SUFFIXES)}), got no picture")
-    known: dict[str, list[Path]] = {}
-    for path in files:
-        inside = path.relative_to(folder).with_suffix("")
-        for name in {inside.as_posix(), inside.name}:
-            known.setdefault(_stem(name), []).append(path)
-    found, without = [], []
-    for name, image in photographs:
-        candidates = known.get(_stem(name)) or known.get(_stem(image.stem)) or []
-        if len(candidates) > 1:
-            raise DataError(
-                f"{image}: expected one mask, got {' and '.join(map(str, candidates[:2]))}"
-            )
-        found += candidates
-        without += [] if candidates else [image.name]
-    if without:
-        more = ", ..." if len(without) > NAMED else ""
-        raise DataError(
-            f"{folder}: expected a mask for each of {len(photographs)} photographs, got none for "
-            f"{len(without)}: {', '.join(without[:NAMED])}{more} (looked for "
-            f"{Path(without[0]).stem}.png)"
-        )
+    found: list[Path | None] = [None] * len(photographs)
+    known = {p: _places(folder, p) for p in {image.parent for _, image in photographs}}
+    waiting = {i: list(known[image.parent]) for i, (_, image) in enumerate(photographs)}
+    while any(waiting.values()):
+        asked: dict[Path, list[int]] = {}
+        for i, places in waiting.items():
+            if places:
+                asked.setdefault(places.pop(0), []).append(i)
+        for place, those in asked.items():
+            masks = _paired(_pictures(place), place, [photographs[i] for i in those])
+            for i, mask in zip(those, masks, strict=True):
+                if mask:
+                    found[i] = mask
+                    del waiting[i]
     return found
 
 
-def read_mask(path: Path, width: int, height: int, note: str = "") -> Tensor:
-    """A mask [height, width], uint8 or float32 as stored: its alpha, or its first channel.
+def masks_in(folder: Path, photographs: Named) -> list[Path]:
+    """The mask of each photograph in a folder that the user names.
+
+    Raises:
+        DataError: there is no such folder, a photograph has none in it, two masks are of one
+            photograph, or one is of two.
+    """
+    if not folder.is_dir():
+        what = "a file" if folder.exists() else "nothing there"
+        raise DataError(f"{folder}: expected a folder of masks, got {what}", "masks")
+    files = _pictures(folder)
+    if not files:
+        raise DataError(f"{folder}: expected masks ({' '.join(SUFFIXES)}), got no picture")
+    found = _paired(files, folder, photographs)
+    require_all(folder, photographs, [mask is not None for mask in found])
+    return [mask for mask in found if mask]
+
+
+def require_all(where: Path, photographs: Named, masked: Sequence[bool]) -> None:
+    """Raise a DataError that names the photographs without a mask, if there are any."""
+    without = [image for (_, image), there in zip(photographs, masked, strict=True) if not there]
+    if without:
+        more = ", ..." if len(without) > NAMED else ""
+        first = without[0]
+        raise DataError(
+            f"{where}: expected a mask for each of {len(photographs)} photographs, got none for "
+            f"{len(without)}: {', '.join(p.name for p in without[:NAMED])}{more} (looked for "
+            f"{first.stem}.png, {first.name}.png, {first.stem}_mask.png and the like)"
+        )
+
+
+def masks_beside(photographs: Named) -> list[Path | None]:
+    """The mask of each photograph that lies beside it, such as IMG_1_mask.png.
+
+    Raises:
+        DataError: two masks are of one photograph.
+    """
+    found: list[Path | None] = [None] * len(photographs)
+    for parent in dict.fromkeys(image.parent for _, image in photographs):
+        here = [i for i, (_, image) in enumerate(photographs) if image.parent == parent]
+        masks = _paired(_beside(parent), None, [photographs[i] for i in here])
+        for i, mask in zip(here, masks, strict=True):
+            found[i] = mask
+    return found
+
+
+def without_masks(pictures: Sequence[Path]) -> list[Path]:
+    """Pictures of one folder, without those that are masks of others by their names."""
+    photographs = [(path.stem, path) for path in pictures]
+    claimed = {mask for claims in _claims(pictures, None, photographs) for _, mask in claims}
+    return [path for path in pictures if path not in claimed]
+
+
+def photographs_in(folder: Path) -> list[Path]:
+    """The photographs of a folder in order of their names; hidden files are of other programs."""
+    return without_masks(_beside(folder))
+
+
+def _places(folder: Path, start: Path) -> list[Path]:
+    """Folders of masks of the photographs in a folder of a data set, the nearest first."""
+    found: list[Path] = []
+    inner = ""  # name of the folder that leads to the photographs
+    for steps, around in enumerate([start, *start.parents]):
+        # Of what lies in another data set, only what is beside its folder
+        if steps > 1 and not around.is_relative_to(folder):
+            break
+        found += _named_masks(around, inner)
+        if around == folder:
+            break
+        inner = around.name
+    return found
+
+
+def _named_masks(around: Path, inner: str) -> list[Path]:
+    """Folders within another that are called as masks of what lies in its folder `inner`."""
+    names = [f"{inner}_masks", f"{inner}_mask"] if inner else []
+    if shrunk := re.fullmatch(r"images(_\d+)", inner):
+        names += [f"{name}{shrunk[1]}" for name in PLACES]
+    order = {_key(name): place for place, name in enumerate([*names, *PLACES])}
+    folders = [p for p in _entries(around) if _key(p.name) in order and p.is_dir()]
+    return sorted(folders, key=lambda p: (order[_key(p.name)], p.name))
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What is in a folder; nothing where it may not be listed."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
+
+
+def _beside(folder: Path) -> list[Path]:
+    return [path for path in _entries(folder) if _is_picture(path)]
+
+
+def _pictures(folder: Path) -> list[Path]:
+    """Pictures of a folder, and of folders in it."""
+    return sorted(p for p in folder.rglob("*") if _is_picture(p))
+
+
+def _is_picture(path: Path) -> bool:
+    """Whether a name is that of a picture. Macs leave ._IMG_1.png beside each on foreign disks."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+
+
+def _paired(masks: Sequence[Path], root: Path | None, photographs: Named) -> list[Path | None]:
+    """The mask of each photograph among files.
+
+    Args:
+        root: folder of the masks; None: that of the photographs, beside which names must say that
+            they are masks.
+    """
+    found: list[Path | None] = []
+    whose: dict[Path, Path] = {}
+    for (_, image), claims in zip(photographs, _claims(masks, root, photographs), strict=True):
+        best = [mask for rank, mask in claims if rank == min(claims)[0]]
+        if len(best) > 1:
+            raise DataError(
+                f"{image}: expected one mask, got {' and '.join(map(str, best[:2]))}: remove one"
+            )
+        mask = best[0] if best else None
+        if root is not None and mask and whose.setdefault(mask, image) != image:
+            raise DataError(
+                f"{mask}: expected a mask of one photograph, its name is that of {whose[mask]} and "
+                f"{image}: put masks into folders of the same names, or call them as "
+                f"{image.name}.png"
+            )
+        found.append(mask)
+    return found
+
+
+def _claims(masks: Sequence[Path], root: Path | None, photographs: Named) -> list[list[Claim]]:
+    """Of each photograph, the masks that name it.
+
+    A mask is of the photograph that it names most exactly: IMG_1.jpg.png is of IMG_1.jpg, and what
+    no photograph is called by its whole name is of one with that stem. Folders tell apart what
+    names do not.
+    """
+    whole: dict[str, list[int]] = {}
+    stems: dict[str, list[int]] = {}
+    numbers: dict[int, list[int]] = {}
+    for i, (name, image) in enumerate(photographs):
+        whole.setdefault(_key(image.name), []).append(i)
+        plain = re.sub("_rgba?$", "", image.stem)
+        for stem in {_key(s) for s in (image.stem, plain, name, Path(name).name)}:
+            stems.setdefault(stem, []).append(i)
+        if image.stem.isdecimal():
+            numbers.setdefault(int(image.stem), []).append(i)
+
+    def named(mask: Path) -> tuple[list[int], tuple[int, int]]:
+        """The photographs that a mask names, and how: with the word beside the name or none."""
+        for form, word in _forms(mask.name):
+            for exact, known in enumerate((whole, stems)):
+                those = [i for i in known.get(form, []) if photographs[i][1] != mask]
+                if those and (root or word is not None):
+                    return those, (exact, 0) if root else (WORDS.index(word or ""), exact)
+        return [], (0, 0)
+
+    found = {mask: named(mask) for mask in masks}
+    if root and not any(those for those, _ in found.values()):  # of 000000.png it is 000.png
+        found = {m: (numbers.get(int(m.stem), []), (0, 0)) for m in masks if m.stem.isdecimal()}
+    claims: list[list[Claim]] = [[] for _ in photographs]
+    strangers: list[tuple[int, Claim]] = []  # in folders that no photograph of theirs is in
+    for mask, (those, rank) in found.items():
+        inner = mask.relative_to(root).parts[:-1] if root else ()
+        common = {i: _common(inner, photographs[i][1].parts[:-1]) for i in those}
+        for i, count in common.items():
+            if count == max(common.values()):
+                claim = (-count, *rank), mask
+                if inner and not count:
+                    strangers.append((i, claim))
+                else:
+                    claims[i].append(claim)
+    if any(rank[0] for those in claims for rank, _ in those):
+        return claims
+    return [those or [claim for j, claim in strangers if j == i] for i, those in enumerate(claims)]
+
+
+def _common(inner: Sequence[str], parts: Sequence[str]) -> int:
+    """How many of the last names of two paths are the same."""
+    same = [_key(a) == _key(b) for a, b in zip(reversed(inner), reversed(parts), strict=False)]
+    return same.index(False) if False in same else len(same)
+
+
+def _forms(name: str) -> Iterator[tuple[str, str | None]]:
+    """What a mask's name may say, from most to least: each with a word of WORDS that is left out.
+
+    First without its own ending: IMG_1.jpg_mask.png yields img_1.jpg_mask, img_1.jpg, img_1.
+    """
+    text, word = _key(name), None
+    text = text[: -len(Path(text).suffix)]
+    while True:
+        yield text, word
+        if Path(text).suffix in (*SUFFIXES, *FOREIGN):
+            text = text[: -len(Path(text).suffix)]
+        elif found := _BEHIND.fullmatch(text):
+            text, word = found.groups()
+        elif found := _BEFORE.fullmatch(text):
+            word, text = found.groups()
+        else:
+            return
+
+
+def _key(name: str) -> str:
+    """A name as it is compared: Windows does not tell case apart, Macs take letters apart."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+# What its numbers mean
+
+
+def read_mask(
+    path: Path, width: int, height: int, photograph: Path | None = None, upright: bool = False
+) -> Tensor:
+    """A mask [height, width] of the stored pixels of a photograph, uint8 or float32 in [0, 1].
 
     One of another size but the same shape is resized; rows and columns that an original of N times
     the size has left over are cut off.
 
     Args:
-        note: on the size, added to the message that it is another one.
+        photograph: of this size, which EXIF may say to turn.
+        upright: as of `laid_over`.
 
     Raises:
-        DataError: it cannot be read, or its shape is another.
+        DataError: it cannot be read, is none, or has another shape.
     """
-    image = read_image(path)
-    channels = image.shape[-1]
-    mask = image[..., 3 if channels == 4 else 0]
+    mask = laid_over(path, width, height, photograph, upright)
     if mask.shape == (height, width):
         return mask
-    factor = max(mask.shape[0] // height, 1)
-    if (mask.shape[0] // factor, mask.shape[1] // factor) == (height, width):
-        mask = mask[: factor * height, : factor * width]  # what an original has left over
-    if abs(mask.shape[1] * height / (mask.shape[0] * width) - 1) > SKEW:
-        came = f"{mask.shape[1]}x{mask.shape[0]}"
-        raise DataError(f"{path}: expected {width}x{height} pixels, got {came}{note}")
     mode = "area" if mask.shape[1] > width else "bilinear"
     resized = interpolate(mask[None, None].float(), (height, width), mode=mode)[0, 0]
     return resized if mask.is_floating_point() else resized.round().to(torch.uint8)
 
 
-def _stem(name: str) -> str:
-    """The name without endings of pictures, and without those of masks."""
-    while (shorter := _shorter(name)) != name:
-        name = shorter
-    return name
+def laid_over(
+    path: Path, width: int, height: int, photograph: Path | None = None, upright: bool = False
+) -> Tensor:
+    """A mask as it lies over the stored pixels of a photograph, in its own size.
+
+    An orientation in the mask's EXIF counts. A mask without one may have been made of the stored
+    pixels or of the photograph as it is looked at: its size tells, where it is not square.
+
+    Args:
+        upright: what it was made of where its size does not tell.
+
+    Raises:
+        DataError: it cannot be read, is none, or has another shape.
+    """
+    mask, own = coverage_in(path), orientation(path)
+    turned = 1 if photograph is None else orientation(photograph)
+    if own not in (1, turned):
+        mask = upright_from_stored(mask, own)
+    if own != turned and (own != 1 or _seen_upright(mask.shape, width, height, turned, upright)):
+        mask = stored_from_upright(mask, turned)
+    factor = max(mask.shape[0] // height, 1)
+    if (mask.shape[0] // factor, mask.shape[1] // factor) == (height, width):
+        mask = mask[: factor * height, : factor * width]  # what an original has left over
+    if not _alike(mask.shape, width, height):
+        note = turn_note(photograph) if photograph else ""
+        came = f"{mask.shape[1]}x{mask.shape[0]}"
+        raise DataError(f"{path}: expected {width}x{height} pixels, got {came}{note}")
+    return mask.contiguous()
 
 
-def _shorter(name: str) -> str:
-    if Path(name).suffix.lower() in SUFFIXES:
-        return str(Path(name).with_suffix(""))
-    return next((name.removesuffix(e) for e in ENDINGS if name.endswith(e)), name)
+def _seen_upright(
+    shape: Sequence[int], width: int, height: int, turned: int, default: bool
+) -> bool:
+    """Whether a mask is of a photograph as it is looked at, and not of its stored pixels."""
+    stored = _alike(shape, width, height)
+    looked_at = _alike(shape, *((height, width) if turned >= 5 else (width, height)))
+    return default if stored and looked_at else looked_at
+
+
+def _alike(shape: Sequence[int], width: int, height: int) -> bool:
+    """Whether a mask [h, w] has the shape of a picture, but for the rounding of its sides."""
+    return abs(shape[1] * height / (shape[0] * width) - 1) <= SKEW + 0.5 / min(shape)
+
+
+def coverage_in(path: Path) -> Tensor:
+    """A mask as it is stored [H, W]: uint8, or float32 in [0, 1]; largest on the object.
+
+    That is its alpha, unless that is opaque everywhere; or its brightness. Where there are but two
+    values, or two colours of which one is black, the larger one is the object, whatever its number.
+
+    Raises:
+        DataError: it cannot be read, or it says nothing of one object.
+    """
+    if path.suffix.lower() in (".exr", ".hdr"):
+        return _levels(read_image(path), path)
+    with opened(path) as image:
+        if image.mode == "P" and not image.has_transparency_data:
+            return _of_palette(image, path)
+        return _levels(torch.from_numpy(as_array(image, path)), path)
+
+
+def _of_palette(image: Image.Image, path: Path) -> Tensor:
+    """Of a picture with a palette: brightness where that is grey; else what is not number 0."""
+    numbers = np.asarray(image)
+    palette = np.array(image.getpalette("RGB"), np.uint8).reshape(-1, 3)
+    used = np.unique(numbers).tolist()
+    colors = palette[[min(n, len(palette) - 1) for n in used]].astype(int)
+    if (np.ptp(colors, axis=1) == 0).all():
+        return _scaled(torch.from_numpy(np.array(image.convert("L"))), path)
+    things = [n for n in used if n]
+    if len(things) > 1 or palette[0].any():
+        named = ", ".join(
+            f"{n}: {palette[min(n, len(palette) - 1)].tolist()}" for n in used[:NAMED]
+        )
+        raise DataError(
+            f"{path}: expected a mask of one object, got a palette of {len(used)} colours "
+            f"({named}{', ...' if len(used) > NAMED else ''}): {WHITE}"
+        )
+    return torch.from_numpy(255 * (numbers > 0).astype(np.uint8))
+
+
+def _levels(image: Tensor, path: Path) -> Tensor:
+    """Coverage [H, W] in a picture [H, W, C]."""
+    opaque = 1 if image.is_floating_point() else 255
+    if image.shape[-1] == 4:
+        if bool((image[..., 3] < opaque).any()):
+            return _scaled(image[..., 3], path)
+        try:
+            return _scaled(_brightness(image[..., :3], path), path)
+        except DataError:  # a cut-out photograph whose object fills it
+            return image[..., 3].contiguous()
+    return _scaled(_brightness(image, path), path)
+
+
+def _brightness(image: Tensor, path: Path) -> Tensor:
+    """The first channel [H, W], or of one colour on black its strongest."""
+    if image.shape[-1] == 1:
+        return image[..., 0]
+    unit = 1 / 255 if image.is_floating_point() else 1
+    largest = image.amax(-1)
+    colored = largest - image.amin(-1) > COLORED * unit
+    count = int(colored.sum())
+    if count <= FEW * colored.numel():
+        return image[..., 0]
+    tones = image[colored].float() / largest[colored][:, None].float()
+    usual = tones.median(0).values
+    one = ((tones - usual).abs().amax(-1) < HUE).float().mean() >= MOST
+    if not one or count < MOST * int((largest > COLORED * unit).sum()):
+        raise DataError(f"{path}: expected a mask, got a picture of several colours: {WHITE}")
+    strongest = image[..., int(usual.argmax())]
+    if image.is_floating_point():
+        return strongest / strongest.max()
+    return (strongest.float() * (255 / int(strongest.max()))).round().to(torch.uint8)
+
+
+def _scaled(levels: Tensor, path: Path) -> Tensor:
+    """Coverage from brightness [H, W]: of two values the larger is the object."""
+    floating = levels.is_floating_point()
+    top = float(levels.max())
+    if top == (1 if floating else 255) or top <= 0:
+        return levels.clamp_min(0).contiguous() if floating else levels.contiguous()
+    if bool(((levels == 0) | (levels == top)).all()):
+        if bool(levels.all()) and top not in (1, 1 / 65535):
+            return levels.contiguous()  # of one value: nothing says how bright the object is
+        return (levels > 0).float() if floating else 255 * (levels > 0).to(torch.uint8)
+    if floating and 2 < top <= 255:
+        levels, top = levels / 255, top / 255
+    elif floating and top <= 255.5 / 65535:  # 8 bits in 16
+        levels, top = levels * (65535 / 255), top * 65535 / 255
+    code = round(255 * top) if floating else int(top)
+    if code <= LABELS:
+        raise DataError(
+            f"{path}: expected a mask, white on the object, got a largest value of {code} of 255, "
+            f"as of numbers of several things: {WHITE}"
+        )
+    return levels.clamp(0, 1) if floating else levels.contiguous()
+
+
+# How masks lie on photographs that EXIF says to turn
+
+
+def made_upright(pairs: Sequence[tuple[Path, Path]]) -> bool | None:
+    """Whether masks are of photographs as they are looked at, where EXIF says to turn these.
+
+    One whose size tells speaks for all. Without any, colours tell: along a mask's edge they change.
+
+    Args:
+        pairs: photographs and their masks.
+
+    Returns:
+        None where no photograph is turned without its mask.
+    """
+    asked = [(image, mask) for image, mask in pairs if orientation(image) != 1 == orientation(mask)]
+    if not asked:
+        return None
+    for image, mask in asked:
+        told = {
+            _seen_upright(image_size(mask)[::-1], *image_size(image), orientation(image), default)
+            for default in (False, True)
+        }
+        if len(told) == 1:
+            return told.pop()
+    changes = np.zeros(2)
+    for image, mask in asked[:: -(-len(asked) // LOOKED_AT)]:
+        picture, mask = read_image(image)[..., :3].float().mean(-1), coverage_in(mask).float()
+        for way, laid in enumerate((mask, stored_from_upright(mask, orientation(image)))):
+            changes[way] += _change(picture, laid / laid.max().clamp_min(1e-9))
+    return bool(changes[1] > changes[0])
+
+
+def _change(picture: Tensor, mask: Tensor) -> float:
+    """How much a picture changes along the edge of a mask, over how much it does on average."""
+    size = [min(n, 512) for n in picture.shape]
+    picture, mask = (interpolate(p[None, None], size, mode="area")[0, 0] for p in (picture, mask))
+    edge, change = (_steps(p) for p in (mask, picture))
+    return float((edge * change).sum() / (edge.sum() * change.mean()).clamp_min(1e-9))
+
+
+def _steps(values: Tensor) -> Tensor:
+    """Sums of the differences to the next pixels, to the right and below: [H - 1, W - 1]."""
+    here = values[:-1, :-1]
+    return (values[1:, :-1] - here).abs() + (values[:-1, 1:] - here).abs()

@@ -27,7 +27,7 @@ from univoxel.data.foreign import TO_OPENGL, check_skew, find_photo, fitted, nea
 from univoxel.data.inside import inside
 from univoxel.data.lens import Lens
 from univoxel.data.missing import left_out
-from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.data.shots import Shot, every_eighth, read_shots, upright
 from univoxel.data.transforms import lens_of, pose_of, short
 from univoxel.errors import DataError
 
@@ -74,9 +74,8 @@ def load_metashape(
         if sensor not in lenses:
             lenses[sensor] = _lens(sensors.get(sensor), f"{path}: sensor {sensor} of {label}")
         pose = _pose(camera, world, where)
-        mask = find_mask(folder, picture.name) or find_mask(folder, f"{picture.stem}_mask")
         lens = fitted(lenses[sensor], picture, where)
-        shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
+        shots.append(Shot(picture.stem, where, picture, None, pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(path), missing, len(chosen), note)
     if len(every) > len(chosen):

@@ -21,13 +21,12 @@ from univoxel.data.foreign import TO_OPENGL, fitted
 from univoxel.data.inside import inside
 from univoxel.data.lens import Lens
 from univoxel.data.missing import left_out
-from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.data.shots import Shot, every_eighth, read_shots, upright
 from univoxel.data.transforms import lens_of, listed_image, number, pose_of, short
 from univoxel.errors import DataError
 from univoxel.files import read_json
 
 FILE = "inputs/sfm_scene.json"
-MASKS = ("inputs/masks", "inputs/pmasks", "masks")
 PLACED = 2  # as flg of an image
 
 
@@ -59,8 +58,7 @@ def load_neilf(
             missing.append(name)
             continue
         lens, pose = _camera(image, where)
-        mask = next((m for place in MASKS if (m := find_mask(folder, picture.name, place))), None)
-        shots.append(Shot(picture.stem, where, picture, mask, pose, fitted(lens, picture, where)))
+        shots.append(Shot(picture.stem, where, picture, None, pose, fitted(lens, picture, where)))
     if unplaced == len(names):
         raise DataError(f"{path}: expected images with flg {PLACED}, which have cameras, got none")
     looked = f" (looked in {folder / 'inputs' / 'images'})"

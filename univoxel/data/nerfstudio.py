@@ -9,11 +9,10 @@ train_filenames and test_filenames in the file are its splits, as far as they ar
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from univoxel.data.base import Photos
-from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.data.shots import Shot, every_eighth, read_shots, upright
 from univoxel.data.transforms import read_frames, short, view_name
 from univoxel.errors import DataError
 
@@ -32,7 +31,6 @@ def load_nerfstudio(
     """
     path = folder / "transforms.json"
     root, shots, lost = read_frames(path)
-    shots = [replace(s, mask=s.mask or find_mask(folder, s.image.name)) for s in shots]
     shots, remarks = upright(shots)
     chosen = root.get(f"{split}_filenames")
     if chosen is None:

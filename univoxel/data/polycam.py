@@ -22,7 +22,7 @@ from univoxel.data.base import Photos
 from univoxel.data.foreign import fitted
 from univoxel.data.inside import inside
 from univoxel.data.missing import left_out
-from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots
+from univoxel.data.shots import Shot, every_eighth, read_shots
 from univoxel.data.transforms import lens_of, listed_image, number, pose_of, short
 from univoxel.errors import DataError
 from univoxel.files import read_json
@@ -60,9 +60,8 @@ def load_polycam(
         values = _read(path)
         width, height = (int(values[key]) for key in ("width", "height"))
         lens = fitted(lens_of(values, str(path), width, height), picture, str(path))
-        mask = find_mask(folder / "keyframes", picture.name) or find_mask(folder, picture.name)
         pose = UPRIGHT @ pose_of(values["pose"], str(path))
-        shots.append(Shot(path.stem, str(path), picture, mask, pose, lens))
+        shots.append(Shot(path.stem, str(path), picture, None, pose, lens))
     lost = left_out(str(cameras[0].parent), missing, len(cameras), f" (looked in {pictures})")
     shots = every_eighth(folder, shots, split)
     remarks = [*lost, "world turned from +Y to +Z up"]

@@ -28,7 +28,7 @@ from univoxel.data.images import image_size, turn_note
 from univoxel.data.inside import inside
 from univoxel.data.lens import Lens
 from univoxel.data.missing import left_out
-from univoxel.data.shots import Shot, every_eighth, find_mask, read_shots, upright
+from univoxel.data.shots import Shot, every_eighth, read_shots, upright
 from univoxel.data.transforms import lens_of, pose_of
 from univoxel.errors import DataError
 
@@ -65,8 +65,7 @@ def load_realitycapture(
             missing.append(name or where)
             continue
         lens, pose = _lens(row, picture, where), _pose(row, where)
-        mask = find_mask(folder, name) or find_mask(folder, picture.name)
-        shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
+        shots.append(Shot(picture.stem, where, picture, None, pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(path), missing, len(rows), note)
     shots, moved = near_origin(shots)

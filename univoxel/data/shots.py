@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Generator, Sequence
@@ -19,11 +20,18 @@ from torch import Tensor
 from univoxel.camera import Cameras, sizes_of
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.data.base import Photos, coverage_of, decode
-from univoxel.data.images import orientation, read_image, turn_note
+from univoxel.data.images import orientation, read_image
 from univoxel.data.inside import inside
 from univoxel.data.kept import Reading, kept_pixels, origin_of, to_be_kept
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
-from univoxel.data.masks import masks_by_stem, read_mask
+from univoxel.data.masks import (
+    find_masks,
+    made_upright,
+    masks_beside,
+    masks_in,
+    read_mask,
+    require_all,
+)
 from univoxel.errors import DataError, UserError, WithoutMasks
 
 # Pixels along the longer side that photographs are shrunk to, about. An object that fills half of
@@ -34,11 +42,15 @@ READERS = 4  # photographs that are read at once, at most: each may take 0.4 GB 
 BAND = 1 << 18  # pixels of a file, about, that are shrunk at once
 SIZES_TOLD = 3  # of the photographs, that are named one by one, at most
 TEST_EVERY = 8
+log: logging.Logger = logging.getLogger("univoxel")
 LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
 # How far +Z may be from the cameras' common up direction in a world that is taken as upright:
 # cameras are held askew and lean over, but worlds that are not upright are turned by much more.
 LEAN = math.radians(30)
-MASK_ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+# Masks of which the border is white and something within it black: where most are, they are of
+# what is not the object. Along a border of this share of the sides
+BORDER = 0.02
+AROUND, HOLE, INVERTED = 0.95, 0.005, 0.8  # share of border, of picture, of masks
 HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/guide/masks.md"
 
 
@@ -49,9 +61,10 @@ class Shot:
     name: str
     where: str  # for messages: what says that it is there
     image: Path
-    mask: Path | None  # a picture of its own, or None: alpha in the photograph, or beside it
+    mask: Path | None  # a picture of its own that the data name; None: `read_shots` looks for it
     pose: np.ndarray  # [3, 4] camera-to-world, axes as of `Cameras`
     lens: Lens
+    beside: Path | None = None  # a mask that counts where the photograph has no alpha
 
 
 def read_shots(
@@ -80,13 +93,16 @@ def read_shots(
     """
     if downscale < 0:
         raise ValueError(f"downscale must be at least 1, got {downscale}")
+    named = masks if isinstance(masks, Path) else None
+    if named is None and masks:
+        shots = _with_masks(folder, shots)
     for shot in shots:
         for path in _files(shot):
             inside(path, shot.where)
-    if isinstance(masks, Path):  # which the caller has named: they may lie anywhere
-        found = masks_by_stem(masks, [(shot.name, shot.image) for shot in shots])
+    if named is not None:  # by the caller: they may lie anywhere
+        found = masks_in(named, [(shot.name, shot.image) for shot in shots])
         shots = [replace(shot, mask=mask) for shot, mask in zip(shots, found, strict=True)]
-        masks = True
+    masks = bool(masks)
     _check(folder, shots, downscale)
     factor = downscale or fitting_downscale(shots)
     pinholes = _pinholes(shots)
@@ -140,10 +156,34 @@ def _pinholes(shots: Sequence[Shot]) -> list[Lens]:
     return [known[shot.lens] for shot in shots]
 
 
+def _with_masks(folder: Path, shots: Sequence[Shot]) -> list[Shot]:
+    """The shots with the masks that lie in folders of masks and beside photographs.
+
+    Raises:
+        DataError: some photographs have a mask in such a folder, and others none at all.
+    """
+    photographs = [(shot.name, shot.image) for shot in shots]
+    found, beside = find_masks(folder, photographs), masks_beside(photographs)
+    masked = [
+        replace(shot, mask=shot.mask or mask, beside=other)
+        for shot, mask, other in zip(shots, found, beside, strict=True)
+    ]
+    place = next((mask.parent for mask in found if mask), None)
+    if place and not all(shot.mask for shot in masked):
+        there = [bool(s.mask or s.beside) or _is_cut_out(s.image) for s in masked]
+        require_all(place, photographs, there)
+    return masked
+
+
+def _is_cut_out(path: Path) -> bool:
+    """Whether a photograph has an alpha that says something."""
+    image = read_image(path)
+    return image.shape[-1] == 4 and bool((image[..., 3] < image[..., 3].max()).any())
+
+
 def _files(shot: Shot) -> list[Path]:
     """The files that say what a photograph looks like."""
-    masks = _beside(shot.image) if shot.mask is None else [shot.mask]
-    return [shot.image, *(mask for mask in masks if mask.is_file())]
+    return [shot.image, *(mask for mask in (shot.mask or shot.beside,) if mask)]
 
 
 def _read_all(
@@ -156,11 +196,20 @@ def _read_all(
     origin: str,
 ) -> tuple[Tensor, Tensor]:
     """Colour [V, H, W, 3] and alpha [V, H, W] of all photographs as `Photos` has them."""
+    pairs = [(s.image, mask) for s in shots if masks and (mask := s.mask or s.beside)]
+    upright = made_upright(pairs)
+    if upright is not None:
+        turned = sum(orientation(image) != 1 for image, _ in pairs)
+        log.info(
+            "%d photographs have an EXIF orientation: their masks are taken as made of %s",
+            *(turned, "the upright picture" if upright else "the pixels as they are stored"),
+        )
     reading = Reading.resumed(origin)
     begin = reading.read if reading else 0
     # Closed here: a reader left to the garbage collector would be waited for in any thread, even in
     # one that holds what the reader's end waits for
-    with closing(_read_each(shots[begin:], pinholes[begin:], factor, masks)) as pictures:
+    arguments = factor, masks, bool(upright)
+    with closing(_read_each(shots[begin:], pinholes[begin:], *arguments)) as pictures:
         for view, (color, alpha) in enumerate(pictures, begin):
             if reading is None:
                 size = len(shots), cameras.height, cameras.width
@@ -184,17 +233,36 @@ def _read_all(
         raise DataError(f"{folder}: all {len(shots)} pictures are fully transparent")
     if masks and reading.opaque:
         raise WithoutMasks(f"{folder}: all {len(shots)} pictures are fully opaque: {HOW_TO_MASK}")
+    if masks and (inverted := _inverted(reading.alpha, cameras)) >= INVERTED * len(shots):
+        reading.drop()
+        raise DataError(
+            f"{folder}: {inverted} of {len(shots)} masks are white along the whole border of the "
+            "picture and black within: they seem to be inverted. Give masks that are white on the "
+            "object and black elsewhere, as `magick mogrify -negate masks/*.png` makes them"
+        )
     return reading.finished()
 
 
+def _inverted(alpha: Tensor, cameras: Cameras) -> int:
+    """How many of the masks [V, H, W] keep the border of the picture, and not what is within."""
+    count = 0
+    for view in range(len(alpha)):
+        mask = coverage_of(cameras.cut(view, alpha[view]))
+        rim = max(1, round(BORDER * min(mask.shape)))
+        whole, inner = mask.sum(), mask[rim:-rim, rim:-rim]
+        border = (whole - inner.sum()) / max(mask.numel() - inner.numel(), 1)
+        count += bool(border >= AROUND and inner.numel() and 1 - inner.mean() >= HOLE)
+    return count
+
+
 def _read_each(
-    shots: Sequence[Shot], pinholes: Sequence[Lens], factor: int, masks: bool
+    shots: Sequence[Shot], pinholes: Sequence[Lens], factor: int, masks: bool, upright: bool
 ) -> Generator[tuple[Tensor, Tensor], None, None]:
     """Colour and alpha of each photograph, in order; some are read at once."""
     grid_of = lru_cache(2)(sources)  # one lens often took all photographs, upright and across
 
     def read(shot: Shot, pinhole: Lens) -> tuple[Tensor, Tensor]:
-        color, alpha = read_photo(shot.image, shot.mask, masks)
+        color, alpha = read_photo(shot.image, shot.mask, masks, shot.beside, upright)
         grid = grid_of(shot.lens, pinhole) if shot.lens.bent else None
         return (
             (color, alpha)
@@ -234,44 +302,46 @@ def cameras_of(poses: Sequence[np.ndarray], lenses: Sequence[Lens]) -> Cameras:
     )
 
 
-def read_photo(path: Path, mask: Path | None = None, masks: bool = True) -> tuple[Tensor, Tensor]:
+def read_photo(
+    path: Path,
+    mask: Path | None = None,
+    masks: bool = True,
+    beside: Path | None = None,
+    upright: bool = False,
+) -> tuple[Tensor, Tensor]:
     """Colour [H, W, 3] and alpha [H, W] of one photograph, stored as in `Photos`.
 
-    Without a mask: its alpha channel, or <name>_mask.png or <name>_alpha.png beside it. The colour
-    of an EXR with alpha is premultiplied, as OpenEXR has it, and is divided; negative values, which
-    denoisers and filters leave, become 0.
+    Without a mask: its alpha channel, or the mask beside it where that is opaque everywhere or not
+    there. The colour of an EXR with alpha is premultiplied, as OpenEXR has it, and is divided;
+    negative values, which denoisers and filters leave, become 0.
 
     Args:
         masks: False to look for none: alpha is 1 everywhere.
+        upright: as of `masks.laid_over`.
     """
-    image = read_image(path)
+    image = read_image(path, in_srgb=True)
     channels = image.shape[-1]
     if channels not in (3, 4):
         raise DataError(f"{path}: expected a picture with 3 or 4 channels, got {channels}")
     color, linear = image[..., :3], image.is_floating_point()
     alpha = image[..., 3] if channels == 4 else None
+    opaque = 1 if linear else 255
     if linear and alpha is not None:
         alpha = alpha.clamp(0, 1)
         color = torch.where(alpha[..., None] > 0, color / alpha[..., None], 0.0)
     if not masks:
-        alpha, mask = torch.full_like(color[..., 0], 1 if linear else 255), None
-    beside = _beside(path)
-    if mask is None and alpha is None:
-        mask = next((file for file in beside if file.is_file()), None)
+        alpha, mask = torch.full_like(color[..., 0], opaque), None
+    elif mask is None and (alpha is None or bool((alpha == opaque).all())):
+        mask = beside
     if mask is not None:
-        alpha = read_mask(mask, color.shape[1], color.shape[0], turn_note(path))
+        alpha = read_mask(mask, color.shape[1], color.shape[0], path, upright)
     if alpha is None:
+        stem = path.stem.removesuffix("_rgb")
         raise WithoutMasks(
-            f"{path}: expected an alpha channel or a mask {beside[0].name}, got neither: "
+            f"{path}: expected an alpha channel or a mask {stem}_mask.png, got neither: "
             f"{HOW_TO_MASK}"
         )
     return (color.clamp_min(0) if linear else color).contiguous(), alpha.contiguous()
-
-
-def _beside(path: Path) -> list[Path]:
-    """Where the mask of a photograph may lie beside it."""
-    stem = path.stem.removesuffix("_rgb")
-    return [path.with_name(f"{stem}_{what}.png") for what in ("mask", "alpha")]
 
 
 def resampled(
@@ -358,17 +428,6 @@ def _stored(picture: Tensor, of_color: torch.dtype, of_alpha: torch.dtype) -> tu
     if of_alpha == torch.uint8:
         coverage = (255 * coverage).round().to(torch.uint8)
     return linear.contiguous(), coverage.contiguous()
-
-
-def find_mask(folder: Path, image: str, place: str = "masks") -> Path | None:
-    """The mask of a photograph: in COLMAP's naming, masks/<image>.png; or of the same stem.
-
-    Args:
-        image: path of the photograph within its folder.
-        place: folder of the masks within `folder`.
-    """
-    names = [f"{image}.png", *(str(Path(image).with_suffix(ending)) for ending in MASK_ENDINGS)]
-    return next((path for n in names if (path := folder / place / n).is_file()), None)
 
 
 def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:

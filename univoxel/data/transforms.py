@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from univoxel.camera import Cameras
-from univoxel.data.images import SUFFIXES, image_size, turn_note
+from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
 from univoxel.data.inside import inside
 from univoxel.data.lens import FARTHEST, Lens, checked
 from univoxel.data.missing import left_out
@@ -33,8 +33,6 @@ RIGID_TOLERANCE = 1e-3
 CAPITAL = (".JPG", ".JPEG", ".PNG")
 ENDINGS = ("", ".png", "_rgba.png", "_rgb.exr", ".exr", ".jpg", ".jpeg", *CAPITAL)
 LOOKED_FOR = f"looked for the endings {', '.join(ending or 'none' for ending in ENDINGS)}"
-# Endings of pictures that are not read: names may be those of files before they were converted
-FOREIGN = (".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp", ".dng", ".cr2", ".nef", ".arw")
 WIDEST = 1 << 16  # pixels along a side of pictures to be made: what formats of files hold
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
