@@ -265,7 +265,7 @@ BROKEN = {
     ),
     "a fisheye": (root(is_fisheye=True), "frame 0: expected one of the camera models .* a fisheye"),
     "another camera": (frame(camera_model="EQUIRECTANGULAR"), "models .* got 'EQUIRECTANGULAR'"),
-    "size unlike the file's": (root(w=60, h=40), r"pictures of 60x40 pixels \(w and h\), got 6x4"),
+    "size unlike the file's": (root(w=60, h=30), r"pictures of 60x30 pixels \(w and h\), got 6x4"),
     "transparent": (transparent, "all 2 pictures are fully transparent"),
     "opaque": (all_opaque, "all 2 pictures are fully opaque: cut the object out"),
     "no alpha": (opaque, r"r_1\.png: expected an alpha channel or a mask r_1_mask\.png"),

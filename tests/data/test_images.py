@@ -10,11 +10,12 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageCms
 
 from univoxel.data import images
 from univoxel.data.images import image_size, read_exr, read_image, write_exr, write_png
 from univoxel.data.radiance import write_radiance
+from univoxel.data.shots import read_photo
 from univoxel.errors import DataError
 from univoxel.files import replacing
 
@@ -54,6 +55,46 @@ def test_palette_with_transparency_becomes_rgba(tmp_path):
     image.putdata([0, 1])
     image.save(tmp_path / "a.png", transparency=1)
     assert read_image(tmp_path / "a.png").tolist() == [[[255, 0, 0, 255], [0, 0, 255, 0]]]
+
+
+def swapped_profile() -> bytes:
+    """That of sRGB, under another name and with red and green exchanged."""
+    data = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    data = data.replace("sRGB".encode("utf-16-be"), "else".encode("utf-16-be"))
+    return data.replace(b"rXYZ", b"----").replace(b"gXYZ", b"rXYZ").replace(b"----", b"gXYZ")
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "a.webp"])
+def test_colours_of_a_profile(tmp_path, name):
+    """They become sRGB where that is asked: masks and measures are no colours."""
+    picture = Image.new("RGBA" if name in ("a.png", "a.webp") else "RGB", (2, 2), (250, 10, 20))
+    options = {"quality": 100} | ({"lossless": True} if name == "a.webp" else {})
+    picture.save(tmp_path / name, icc_profile=swapped_profile(), **options)
+    stored, seen = (read_image(tmp_path / name, s)[0, 0, :3].tolist() for s in (False, True))
+    assert stored == pytest.approx([250, 10, 20], abs=3)
+    assert seen == pytest.approx([10, 250, 20], abs=6)
+    assert read_photo(tmp_path / name, masks=False)[0][0, 0].tolist() == seen
+    for profile in (b"none", ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()):
+        picture.save(tmp_path / name, icc_profile=profile, **options)
+        assert read_image(tmp_path / name, in_srgb=True)[0, 0, 0] == pytest.approx(250, abs=3)
+
+
+def test_other_kinds_under_the_name_of_jpeg(tmp_path):
+    path = tmp_path / "a.jpg"
+    for kind in ("WEBP", "TIFF", "PNG"):
+        Image.new("RGB", (5, 3), (9, 8, 7)).save(path, format=kind, lossless=True)
+        assert read_image(path)[0, 0].tolist() == [9, 8, 7]
+        assert image_size(path) == (5, 3)
+    path.write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
+    for read in (read_image, image_size):
+        with pytest.raises(DataError, match=r"a\.jpg: .*got HEIC or AVIF under that name: convert"):
+            read(path)
+    Image.fromarray(np.zeros((3, 5), np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(DataError, match="expected a picture of 8 or 16 bits, got one of 32"):
+        read_image(tmp_path / "a.tif")
+    (tmp_path / "a.tif").write_bytes(b"II*\0" + bytes(40))
+    with pytest.raises(DataError, match=r"could not read this TIFF: .*: convert it to"):
+        read_image(tmp_path / "a.tif")
 
 
 def test_jpeg(tmp_path):

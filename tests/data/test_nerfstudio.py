@@ -80,7 +80,7 @@ def other_mask(folder):
     ("change", "message"),
     [
         (root(camera_model="OPENCV_FISHEYE"), "frame 0: .*models .* got 'OPENCV_FISHEYE'"),
-        (root(w=24, h=16), r"frame 0: expected pictures of 24x16 pixels \(w and h\), got 12x8"),
+        (root(w=24, h=18), r"frame 0: expected pictures of 24x18 pixels \(w and h\), got 12x8"),
         (root(k1="x"), "frame 0: expected k1 between -inf and inf, got 'x'"),
         (frame(mask_path="masks/none.png"), r"frame 1: no mask .*masks/none\.png \(mask_path\)"),
         (frame(mask_path=7), "frame 1: no mask .*/7"),

@@ -12,7 +12,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from univoxel.data.base import Photos
 from univoxel.data.foreign import TO_OPENGL, find_photo, listed_split
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.inside import inside
-from univoxel.data.lens import FARTHEST, Lens, checked
+from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, read_shots, upright
 from univoxel.errors import DataError
@@ -32,6 +32,7 @@ MODELS = (
     *("FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
 SUPPORTED = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+SUPPORTED |= {"FULL_OPENCV": 12}  # without its denominator, k4 to k6
 # What reading a broken file may raise; OverflowError: of sizes of hundreds of digits
 BROKEN = (struct.error, IndexError, ValueError, OverflowError)
 
@@ -68,6 +69,8 @@ def load_colmap(
         inside(file, str(file))
     try:
         cameras = read_cameras(cameras_file)
+    except DataError:
+        raise
     except BROKEN as error:
         raise _broken(cameras_file, error) from None
     try:
@@ -83,7 +86,7 @@ def load_colmap(
                 f"{images_file}: expected names of photographs, each once, got {image.name!r}"
             )
         names.add(image.name)
-    shots, missing = [], []
+    shots, missing, scaled = [], [], 0
     for image in images:
         if image.camera not in cameras:
             raise DataError(f"{images_file}: {image.name} has camera {image.camera}, got no such")
@@ -93,15 +96,19 @@ def load_colmap(
             continue
         lens = cameras[image.camera]
         width, height = image_size(path)
-        if (width, height) != (lens.width, lens.height):
+        if is_shrunk(width, height, (lens.width, lens.height)):
+            lens, scaled = fitted(lens, path, cameras_file.name), scaled + 1
+        elif (width, height) != (lens.width, lens.height):
             raise DataError(
                 f"{path}: expected {lens.width}x{lens.height} pixels as its camera has in "
                 f"{cameras_file.name}, got {width}x{height}{turn_note(path)}"
             )
-        name = Path(image.name).with_suffix("").as_posix().replace("/", "_")
+        inner = PurePosixPath(image.name.replace("\\", "/"))
+        name = inner.with_suffix("").as_posix().replace("/", "_")
         shots.append(Shot(name, str(images_file), path, None, image.pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(images_file), missing, len(images), note)
+    lost += [f"cameras of {scaled} scaled to smaller pictures"] if scaled else []
     shots, remarks = upright(shots)
     shots = listed_split(folder, shots, split)
     if len(models) > 1:
@@ -129,7 +136,9 @@ def read_cameras(path: Path) -> dict[int, Lens]:
             case "RADIAL":
                 lens = Lens(width, height, (p[0], p[0]), (p[1], p[2]), (p[3], p[4], 0.0))
             case _:
-                radial, tangential = (p[4], p[5], 0.0), (p[6], p[7])
+                if any(p[9:]):
+                    raise _unsupported(path, number, f"{model} with k4, k5 or k6")
+                radial, tangential = (p[4], p[5], p[8] if p[8:] else 0.0), (p[6], p[7])
                 lens = Lens(width, height, (p[0], p[1]), (p[2], p[3]), radial, tangential)
         if min(width, height) <= 0 or not np.isfinite(p).all():
             raise ValueError(f"camera {number} has size {width}x{height} and parameters {p}")
@@ -197,15 +206,19 @@ def _broken(path: Path, error: Exception) -> DataError:
 
 def _parameters(path: Path, number: int, model: str) -> int:
     if model not in SUPPORTED:
-        raise DataError(
-            f"{path}: expected cameras of {', '.join(SUPPORTED)}, camera {number} is {model}: "
-            "run colmap image_undistorter, or `univoxel poses` on the photographs"
-        )
+        raise _unsupported(path, number, model)
     return SUPPORTED[model]
 
 
+def _unsupported(path: Path, number: int, model: str) -> DataError:
+    return DataError(
+        f"{path}: expected cameras of {', '.join(SUPPORTED)}, camera {number} is {model}: run "
+        "colmap image_undistorter, or `univoxel poses` on the photographs"
+    )
+
+
 def _cameras_text(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in path.read_text(encoding="utf-8-sig").splitlines():
         if not line.strip() or line.startswith("#"):
             continue
         number, model, width, height, *rest = line.split()
@@ -227,7 +240,7 @@ def _cameras_binary(path: Path) -> Iterator[tuple[int, str, int, int, list[float
 
 
 def _images_text(path: Path) -> Iterator[tuple[list[float], list[float], int, str]]:
-    lines = iter(path.read_text(encoding="utf-8").splitlines())
+    lines = iter(path.read_text(encoding="utf-8-sig").splitlines())
     for line in lines:
         if not line.strip() or line.startswith("#"):
             continue

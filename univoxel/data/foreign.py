@@ -1,28 +1,22 @@
-"""What the layouts of other programs share: axes, names, sizes, worlds far away."""
+"""What the layouts of other programs share: axes, names, numbers."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from univoxel.data.images import image_size, turn_note
 from univoxel.data.inside import inside
-from univoxel.data.lens import Lens, checked
+from univoxel.data.lens import Lens
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth
 from univoxel.data.transforms import listed_image, short
-from univoxel.errors import DataError, UserError
+from univoxel.errors import DataError
 
 TO_OPENGL = np.diag([1.0, -1.0, -1.0])  # of camera axes: x right, y down, z forward in OpenCV
-TALLER = 0.01  # share by which a shrunk picture may be taller or wider than its original
 SKEW = 0.5  # pixels by which lines may lean and are taken as upright: no mask is as sharp
-# Distance of cameras from the origin, in their distances from one another, beyond which float32
-# loses what they see: it has 7 digits, and pixels need 4
-FAR = 1000
 
 
 def find_photo(folder: Path, name: str, where: str) -> Path | None:
@@ -47,27 +41,6 @@ def listed_split(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
     return found
 
 
-def fitted(lens: Lens, picture: Path, where: str) -> Lens:
-    """The lens of a picture that may be smaller than those that the lens was found with.
-
-    Raises:
-        DataError: the picture has another shape.
-    """
-    w, h = image_size(picture)
-    across, down = w / lens.width, h / lens.height
-    if abs(across / down - 1) > TALLER + 1 / min(w, h):
-        raise DataError(
-            f"{picture}: expected a picture of the shape {lens.width:g}x{lens.height:g} as in "
-            f"{where}, got {w}x{h}{turn_note(picture)}"
-        )
-    (fx, fy), (cx, cy) = lens.focal, lens.centre
-    focal, centre = (fx * across, fy * down), (cx * across, cy * down)
-    try:
-        return checked(replace(lens, width=w, height=h, focal=focal, centre=centre))
-    except UserError as error:
-        raise DataError(f"{where}: {error}") from None
-
-
 def check_skew(skew: float, lens: Lens, where: str) -> None:
     """Raise where x and y axes of a camera's pixels are not square to one another.
 
@@ -80,23 +53,6 @@ def check_skew(skew: float, lens: Lens, where: str) -> None:
             f"{where}: expected pixels with axes square to one another, got some that lean by "
             f"{lean:.3g} pixels (skew {skew:.4g})"
         )
-
-
-def near_origin(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
-    """The shots in a world that float32 can hold, and what was done.
-
-    Surveyed worlds have coordinates of the Earth, with cameras millions of metres from the origin.
-    Such a world is moved by whole units, so that the cameras' mean is near its origin.
-    """
-    places = np.stack([shot.pose[:, 3] for shot in shots])
-    middle = places.mean(0)
-    if np.linalg.norm(middle) <= FAR * np.linalg.norm(places - middle, axis=1).mean():
-        return list(shots), []
-    offset = np.round(middle)
-    moved = [
-        replace(s, pose=np.column_stack([s.pose[:, :3], s.pose[:, 3] - offset])) for s in shots
-    ]
-    return moved, ["world moved by " + " ".join(f"{-x:.0f}" for x in offset)]
 
 
 def parsed(text: str | None, what: str, where: str) -> float:

@@ -112,11 +112,18 @@ def _matrices(path: Path) -> dict[int, np.ndarray]:
 
 
 def _pictures(folder: Path, path: Path) -> list[Path]:
-    """Photographs in order of their names."""
+    """Photographs in order of their names, or of their numbers."""
     for name in IMAGES:
         if found := photographs_in(folder / name):
-            return found
+            return _ordered(found)
     raise DataError(f"{path}: no pictures in {folder / IMAGES[0]}")
+
+
+def _ordered(pictures: list[Path]) -> list[Path]:
+    """9.png before 10.png, where all names are numbers."""
+    if all(path.stem.isdecimal() for path in pictures):
+        return sorted(pictures, key=lambda path: int(path.stem))
+    return pictures
 
 
 def _numbers(path: Path, known: list[int], pictures: list[Path]) -> list[int]:
@@ -137,4 +144,5 @@ def _masks(folder: Path, pictures: list[Path]) -> Sequence[Path | None]:
     if any(find_masks(folder, [(path.stem, path) for path in pictures])):
         return [None] * len(pictures)  # `read_shots` finds them again
     listed = next((found for name in MASKS if (found := photographs_in(folder / name))), [])
+    listed = _ordered(listed)
     return listed if len(listed) == len(pictures) else [None] * len(pictures)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import reduce
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from univoxel.errors import UserError
+from univoxel.data.images import image_size, turn_note
+from univoxel.errors import DataError, UserError
 
 ZOOM = (0.5, 2.0)  # of the pinhole against the lens, at most
 HALVINGS = 30  # of the interval above: far below a thousandth of a pixel
@@ -18,6 +20,8 @@ EDGE_POINTS = 65  # along each border of a picture, where it is asked what a len
 # directions of neighbouring pixels are one in float32, or the picture's border is at infinity
 FOCALS = (5e-4, 1e5)
 STRONGEST = 1e6  # coefficient of distortion; the squares of larger ones leave float32
+TALLER = 0.01  # share by which a shrunk picture may be taller or wider than its original
+SHRUNK = 1.25  # times as wide as a picture that its camera must be for it to be a shrunk copy
 FARTHEST = 1e9  # of a camera from the origin, world units: volumes of boxes stay within float32
 
 
@@ -168,3 +172,30 @@ def _folds(lens: Lens, pinhole: Lens) -> bool:
     xx, xy = np.gradient(x, axis=1), np.gradient(x, axis=0)
     yx, yy = np.gradient(y, axis=1), np.gradient(y, axis=0)
     return bool((xx * yy - xy * yx <= 0).any())
+
+
+def is_shrunk(width: int, height: int, of: tuple[int, int]) -> bool:
+    """Whether a picture of this size is one of that size that was made smaller, and not cut."""
+    factor = of[0] / max(width, 1)
+    return factor >= SHRUNK and abs(of[1] / factor - height) < 1
+
+
+def fitted(lens: Lens, picture: Path, where: str) -> Lens:
+    """The lens of a picture that may be smaller than those that the lens was found with.
+
+    Raises:
+        DataError: the picture has another shape.
+    """
+    w, h = image_size(picture)
+    across, down = w / lens.width, h / lens.height
+    if abs(across / down - 1) > TALLER + 1 / min(w, h):
+        raise DataError(
+            f"{picture}: expected a picture of the shape {lens.width:g}x{lens.height:g} as in "
+            f"{where}, got {w}x{h}{turn_note(picture)}"
+        )
+    (fx, fy), (cx, cy) = lens.focal, lens.centre
+    focal, centre = (fx * across, fy * down), (cx * across, cy * down)
+    try:
+        return checked(replace(lens, width=w, height=h, focal=focal, centre=centre))
+    except UserError as error:
+        raise DataError(f"{where}: {error}") from None

@@ -2,6 +2,7 @@
 
 poses_bounds.npy            [V, 17]: a row for each photograph, in the order of their names
 images/<name>               photographs, or images_<n>/: shrunk by n
+view_imgs.txt               names of those that have a row, where some have none
 masks/<name>.png            masks, where there are any; for images_<n>/ also masks_<n>/
 
 A row is camera-to-world [3, 4] with the camera axes down, right and backwards, beside it a column
@@ -19,8 +20,9 @@ import numpy as np
 
 from univoxel.data.arrays import read_npy
 from univoxel.data.base import Photos
-from univoxel.data.foreign import fitted, listed_split
-from univoxel.data.lens import Lens
+from univoxel.data.foreign import listed_split
+from univoxel.data.inside import inside
+from univoxel.data.lens import Lens, fitted
 from univoxel.data.masks import photographs_in
 from univoxel.data.shots import Shot, read_shots, upright
 from univoxel.data.transforms import pose_of
@@ -47,6 +49,8 @@ def load_llff(
     path = folder / FILE
     rows, pictures = _rows(path), _pictures(folder)
     if len(pictures) != len(rows):
+        pictures = _placed(folder, pictures)
+    if len(pictures) != len(rows):
         raise DataError(
             f"{path}: expected a row for each of {len(pictures)} photographs in "
             f"{pictures[0].parent}, got {len(rows)}"
@@ -62,6 +66,16 @@ def load_llff(
     shots, remarks = upright(shots)
     shots = listed_split(folder, shots, split)
     return read_shots(folder, "LLFF layout", split, shots, downscale, remarks, masks)
+
+
+def _placed(folder: Path, pictures: list[Path]) -> list[Path]:
+    """The photographs that LLFF's script wrote rows for, where it left some out."""
+    listed = folder / "view_imgs.txt"
+    if not listed.is_file():
+        return pictures
+    text = inside(listed, str(listed)).read_text(encoding="utf-8", errors="replace")
+    names = {Path(line.strip()).stem for line in text.splitlines()}
+    return [path for path in pictures if path.stem in names]
 
 
 def _rows(path: Path) -> np.ndarray:

@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.data.base import Photos
-from univoxel.data.foreign import TO_OPENGL, check_skew, find_photo, fitted, near_origin, parsed
+from univoxel.data.foreign import TO_OPENGL, check_skew, find_photo, parsed
 from univoxel.data.inside import inside
-from univoxel.data.lens import Lens
+from univoxel.data.lens import Lens, fitted
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, read_shots, upright
 from univoxel.data.transforms import lens_of, pose_of, short
@@ -62,29 +62,35 @@ def load_metashape(
     chosen = [c for c in placed if c.get("component_id") == component]
     world = _world(chunk, component, path)
 
+    groups = {c: g.get("label") for g in chunk.iterfind("cameras/group") for c in g.iter("camera")}
+    twice = Counter(c.get("label") for c in chosen)
     lenses: dict[str | None, Lens] = {}
     shots, missing = [], []
     for camera in chosen:
         label, sensor = camera.get("label") or "", camera.get("sensor_id")
         where = f"{path}: camera {label}"
-        picture = find_photo(folder, label, where) if label else None
+        group = groups.get(camera) if twice[label] > 1 else None
+        listed = f"{group}/{label}" if group else label
+        picture = find_photo(folder, listed, where) if label else None
         if picture is None:
-            missing.append(label)
+            missing.append(listed)
             continue
         if sensor not in lenses:
             lenses[sensor] = _lens(sensors.get(sensor), f"{path}: sensor {sensor} of {label}")
         pose = _pose(camera, world, where)
         lens = fitted(lenses[sensor], picture, where)
-        shots.append(Shot(picture.stem, where, picture, None, pose, lens))
+        name = f"{group}_{picture.stem}" if group else picture.stem
+        shots.append(Shot(name, where, picture, None, pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(path), missing, len(chosen), note)
     if len(every) > len(chosen):
         told = "not placed, not enabled or in another component"
+        if rig := sum(c.get("master_id") is not None for c in every if c not in placed):
+            told += f"; {rig} of a rig, whose place is that of a master camera"
         lost += [f"{len(every) - len(chosen)} of {len(every)} cameras left out: {told}"]
-    shots, moved = near_origin(shots)
     shots, remarks = upright(shots)
     shots = every_eighth(folder, shots, split)
-    remarks = [*lost, *moved, *remarks]
+    remarks = [*lost, *remarks]
     return read_shots(folder, "Metashape cameras", split, shots, downscale, remarks, masks)
 
 

@@ -17,9 +17,9 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 
 from univoxel.data.base import Photos
-from univoxel.data.foreign import TO_OPENGL, fitted
+from univoxel.data.foreign import TO_OPENGL
 from univoxel.data.inside import inside
-from univoxel.data.lens import Lens
+from univoxel.data.lens import Lens, fitted
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, read_shots, upright
 from univoxel.data.transforms import lens_of, listed_image, number, pose_of, short

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from univoxel.data.base import Photos
 from univoxel.data.shots import Shot, every_eighth, read_shots, upright
-from univoxel.data.transforms import read_frames, short, view_name
+from univoxel.data.transforms import read_frames, short, view_name, view_names
 from univoxel.errors import DataError
 
 
@@ -36,22 +36,24 @@ def load_nerfstudio(
     if chosen is None:
         shots = every_eighth(folder, shots, split)
     else:
-        listed = {view_name(frame["file_path"]) for frame in root["frames"]}
+        listed = [frame["file_path"] for frame in root["frames"]]
         shots = _named(path, shots, listed, f"{split}_filenames", chosen)
     return read_shots(
         folder, "nerfstudio layout", split, shots, downscale, [*lost, *remarks], masks
     )
 
 
-def _named(path: Path, shots: list[Shot], listed: set[str], key: str, chosen: object) -> list[Shot]:
+def _named(
+    path: Path, shots: list[Shot], listed: list[str], key: str, chosen: object
+) -> list[Shot]:
     """The shots of a split. What is listed and has no picture is left out of it, too."""
     if not isinstance(chosen, list) or not all(isinstance(name, str) for name in chosen):
         raise DataError(f"{path}: expected {key} as a list of file_paths, got {short(chosen)}")
-    by_name = {shot.name: shot for shot in shots}
-    names = [view_name(name) for name in chosen]
-    unknown = [name for name in names if name not in listed]
-    if unknown or not names:
-        came = ", ".join(unknown[:1]) or "an empty list"
+    by_name, every = {shot.name: shot for shot in shots}, view_names(listed)
+    known = {name: name for name in every} | dict(zip(listed, every, strict=True))
+    names = [known.get(name) or known.get(view_name(name)) for name in chosen]
+    if None in names or not names:
+        came = view_name(chosen[names.index(None)]) if names else "an empty list"
         raise DataError(f"{path}: expected frames of the file in {key}, got {came}")
     found = [by_name[name] for name in names if name in by_name]
     if not found:

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from univoxel.data.base import Photos
-from univoxel.data.foreign import fitted
 from univoxel.data.inside import inside
+from univoxel.data.lens import fitted
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, every_eighth, read_shots
 from univoxel.data.transforms import lens_of, listed_image, number, pose_of, short
@@ -62,7 +62,11 @@ def load_polycam(
         lens = fitted(lens_of(values, str(path), width, height), picture, str(path))
         pose = UPRIGHT @ pose_of(values["pose"], str(path))
         shots.append(Shot(path.stem, str(path), picture, None, pose, lens))
-    lost = left_out(str(cameras[0].parent), missing, len(cameras), f" (looked in {pictures})")
+    note = f" (looked in {pictures}"
+    others = folder / f"{place.removesuffix('corrected_')}images"
+    if others != pictures and others.is_dir():
+        note += f"; those in {others} are of the cameras in {others.with_name('cameras')}"
+    lost = left_out(str(cameras[0].parent), missing, len(cameras), f"{note})")
     shots = every_eighth(folder, shots, split)
     remarks = [*lost, "world turned from +Y to +Z up"]
     return read_shots(folder, "Polycam raw data", split, shots, downscale, remarks, masks)

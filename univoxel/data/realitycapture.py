@@ -15,6 +15,7 @@ Source: the vendor's "Registration export and camera orientations" and "XMP Came
 
 from __future__ import annotations
 
+import codecs
 import csv
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
@@ -23,7 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from univoxel.data.base import Photos
-from univoxel.data.foreign import find_photo, near_origin, parsed
+from univoxel.data.foreign import find_photo, parsed
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.inside import inside
 from univoxel.data.lens import Lens
@@ -33,6 +34,7 @@ from univoxel.data.transforms import lens_of, pose_of
 from univoxel.errors import DataError
 
 HEAD = 4096  # bytes of a file in which the names of columns stand
+DELIMITERS = (",", ";", "\t")
 FILM = 36  # millimetres along the longer side that focal lengths are for
 REQUIRED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 # Of RealityScan 2.2 and on
@@ -68,10 +70,9 @@ def load_realitycapture(
         shots.append(Shot(picture.stem, where, picture, None, pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(path), missing, len(rows), note)
-    shots, moved = near_origin(shots)
     shots, remarks = upright(shots)
     shots = every_eighth(folder, shots, split)
-    remarks = [*lost, *moved, *remarks]
+    remarks = [*lost, *remarks]
     return read_shots(folder, "RealityCapture cameras", split, shots, downscale, remarks, masks)
 
 
@@ -79,34 +80,48 @@ def _file(folder: Path) -> Path | None:
     for path in sorted(folder.glob("*.csv")):
         if path.is_file():
             with path.open("rb") as stream:
-                head = stream.read(HEAD).decode("utf-8-sig", "replace")
-            if any(set(REQUIRED) <= set(_columns(line)) for line in head.splitlines()[:2]):
+                head = _text(stream.read(HEAD), "replace")
+            if any(_delimiter(line) for line in head.splitlines()[:2]):
                 return path
     return None
 
 
-def _columns(line: str) -> list[str]:
-    names = [name.strip().lstrip("#").strip().lower() for name in line.split(",")]
+def _text(data: bytes, errors: str = "strict") -> str:
+    """Text in UTF-8, or in UTF-16, as spreadsheets write it."""
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if wide else "utf-8-sig", errors)
+
+
+def _delimiter(line: str) -> str | None:
+    """What stands between the names of the columns; None where it is no line of them."""
+    return next((d for d in DELIMITERS if set(REQUIRED) <= set(_columns(line, d))), None)
+
+
+def _columns(line: str, delimiter: str) -> list[str]:
+    names = [name.strip().lstrip("#").strip().lower() for name in line.split(delimiter)]
     return [OTHER_NAMES.get(name, name) for name in names]
 
 
 def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
     """Rows by the names of their columns, each with the number of its line."""
     try:
-        lines = inside(path, str(path)).read_text(encoding="utf-8-sig").splitlines()
+        lines = _text(inside(path, str(path)).read_bytes()).splitlines()
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: expected text in UTF-8, got {error.reason}") from None
-    start = next(i for i, line in enumerate(lines) if set(REQUIRED) <= set(_columns(line)))
-    columns, rows = _columns(lines[start]), []
+    start, delimiter = next((i, d) for i, line in enumerate(lines) if (d := _delimiter(line)))
+    columns, rows = _columns(lines[start], delimiter), []
     for number, line in enumerate(lines[start + 1 :], start + 2):
         if not line.strip() or line.startswith("#"):
             continue
-        values = next(csv.reader([line]))
+        values = next(csv.reader([line], delimiter=delimiter))
         if len(values) != len(columns):
             raise DataError(
                 f"{path}: line {number}: expected {len(columns)} values, got {len(values)}"
             )
-        rows.append((number, dict(zip(columns, values, strict=True))))
+        row = dict(zip(columns, values, strict=True))
+        if delimiter != ",":  # where the comma is that of numbers
+            row |= {key: v.replace(",", ".") for key, v in row.items() if key != "name"}
+        rows.append((number, row))
     if not rows:
         raise DataError(f"{path}: expected a line for each camera, got none")
     return rows

@@ -47,6 +47,9 @@ LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
 # How far +Z may be from the cameras' common up direction in a world that is taken as upright:
 # cameras are held askew and lean over, but worlds that are not upright are turned by much more.
 LEAN = math.radians(30)
+# Distance of cameras from the origin, in their distances from one another, beyond which float32
+# loses what they see: it has 7 digits, and pixels need 4
+FAR = 1000
 # Masks of which the border is white and something within it black: where most are, they are of
 # what is not the object. Along a border of this share of the sides
 BORDER = 0.02
@@ -104,6 +107,8 @@ def read_shots(
         shots = [replace(shot, mask=mask) for shot, mask in zip(shots, found, strict=True)]
     masks = bool(masks)
     _check(folder, shots, downscale)
+    if split == "train" and len(shots) == 1:
+        log.warning("%s: one photograph shows no shape: at least 3 views are needed", folder)
     factor = downscale or fitting_downscale(shots)
     pinholes = _pinholes(shots)
     cameras = cameras_of([s.pose for s in shots], [shrunk(lens, factor) for lens in pinholes])
@@ -441,22 +446,41 @@ def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
     return chosen
 
 
+def _near_origin(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
+    """The shots in a world that float32 can hold, and what was done.
+
+    Surveyed worlds have coordinates of the Earth, with cameras millions of metres from the origin.
+    Such a world is moved by whole units, so that the cameras' mean is near its origin.
+    """
+    places = np.stack([shot.pose[:, 3] for shot in shots])
+    middle = places.mean(0)
+    if np.linalg.norm(middle) <= FAR * np.linalg.norm(places - middle, axis=1).mean():
+        return list(shots), []
+    offset = np.round(middle)
+    moved = [
+        replace(s, pose=np.column_stack([s.pose[:, :3], s.pose[:, 3] - offset])) for s in shots
+    ]
+    return moved, ["world moved by " + " ".join(f"{-x:.0f}" for x in offset)]
+
+
 def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
-    """The shots in a world whose +Z is up, and what was done.
+    """The shots in a world whose +Z is up and whose origin is not far away, and what was done.
 
     The world of structure from motion has any direction. Cameras are held level, mostly, or a
     quarter turn from that, as EXIF then says: what is to the right in their photographs lies in the
     horizontal plane, and up is what is across to all of that. A world
     that is upright already, to within LEAN, stays as it is; and one whose cameras do not agree.
     """
+    shots, moved = _near_origin(shots)
     held = np.stack([_right_and_up(shot) for shot in shots])
     up = up_direction(held)
     if up is None:
-        return list(shots), ["world as in the files: its cameras do not say what is up"]
+        return shots, [*moved, "world as in the files: its cameras do not say what is up"]
     if up[2] >= math.cos(LEAN):
-        return list(shots), []
+        return shots, moved
     turn = turn_to_z(up)
-    return [replace(shot, pose=turn @ shot.pose) for shot in shots], ["world turned to +Z up"]
+    turned = [replace(shot, pose=turn @ shot.pose) for shot in shots]
+    return turned, [*moved, "world turned to +Z up"]
 
 
 def size_of(image: Tensor) -> str:

@@ -13,7 +13,8 @@ import json
 import math
 import reprlib
 from collections.abc import Sequence
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ import numpy as np
 from univoxel.camera import Cameras
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
 from univoxel.data.inside import inside
-from univoxel.data.lens import FARTHEST, Lens, checked
+from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
 from univoxel.data.missing import left_out
 from univoxel.data.shots import Shot, cameras_of, check_name
 from univoxel.errors import DataError, UserError
@@ -58,7 +59,7 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
     if not path.is_file():
         raise DataError(f"{path}: expected a file of cameras, got nothing there")
     root, frames = read_transforms(path)
-    names = [view_name(str(f.get("file_path", f"{i:04d}"))) for i, f in enumerate(frames)]
+    names = view_names([str(f.get("file_path", f"{i:04d}")) for i, f in enumerate(frames)])
     for index, name in enumerate(names):
         check_name(name, f"{path}: frame {index}")
     if len(set(names)) != len(names):
@@ -87,7 +88,13 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise DataError(f"{path}: frame {index}: expected an object, got {short(frame)}")
-    return root, frames
+    frames = [_without_nothing(frame) for frame in frames]
+    return _without_nothing(root), frames
+
+
+def _without_nothing(values: dict[str, Any]) -> dict[str, Any]:
+    """Without keys whose value is null: some write all that they know of."""
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def read_frames(path: Path) -> tuple[dict[str, Any], list[Shot], list[str]]:
@@ -96,15 +103,21 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[Shot], list[str]]:
     Frames without a picture are left out, as `left_out` says.
     """
     root, frames = read_transforms(path)
-    names: set[str] = set()
     for index, frame in enumerate(frames):  # all of them, before a picture is opened
         where, file_path = f"{path}: frame {index}", frame.get("file_path")
         if not isinstance(file_path, str) or "\0" in file_path:
             raise DataError(f"{where}: expected an object with a file_path, got {short(file_path)}")
-        if (name := _name(frame)) in names:
-            raise DataError(f"{where}: the name {name} of {file_path} came before")
-        names.add(name)
-    shots, missing = [], []
+    names = [_name(frame, view_name(frame["file_path"])) for frame in frames]
+    if len(set(names)) < len(names):
+        longer = view_names([frame["file_path"] for frame in frames])
+        names = [_name(frame, name) for frame, name in zip(frames, longer, strict=True)]
+    if len(set(names)) < len(names):
+        index = next(i for i, name in enumerate(names) if name in names[:i])
+        raise DataError(
+            f"{path}: frame {index}: the name {names[index]} of {frames[index]['file_path']} came "
+            "before"
+        )
+    shots, missing, scaled = [], [], 0
     for index, frame in enumerate(frames):
         where, file_path = f"{path}: frame {index}", frame["file_path"]
         folder = _folder(path, frame, where)
@@ -112,22 +125,39 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[Shot], list[str]]:
         if image is None:
             missing.append(folder / file_path)
             continue
-        shots.append(
-            Shot(
-                name=_name(frame),
-                where=where,
-                image=image,
-                mask=_mask(path.parent, frame, where),
-                pose=pose_of(frame.get("transform_matrix"), where),
-                lens=lens_of(root | frame, where, *image_size(image), turn_note(image)),
-            )
-        )
-    return root, shots, left_out(str(path), missing, len(frames), f" ({LOOKED_FOR})")
+        lens = _lens(root | frame, where, image)
+        scaled += lens.width < (root | frame).get("w", 0)
+        pose, mask = pose_of(frame.get("transform_matrix"), where), _mask(path.parent, frame, where)
+        shots.append(Shot(names[index], where, image, mask, pose, lens))
+    lost = left_out(str(path), missing, len(frames), f" ({LOOKED_FOR}{_smaller(missing)})")
+    lost += [f"cameras of {scaled} scaled to smaller pictures"] if scaled else []
+    return root, shots, lost
 
 
-def _name(frame: dict[str, Any]) -> str:
+def _lens(values: dict[str, Any], where: str, image: Path) -> Lens:
+    """The lens of a picture, which may be smaller than those that the lens was found with."""
+    width, height = image_size(image)
+    given = values.get("w", width), values.get("h", height)
+    if all(isinstance(n, int) and n > 0 for n in given) and is_shrunk(width, height, given):
+        return fitted(lens_of(values, where, *given), image, where)
+    return lens_of(values, where, width, height, turn_note(image))
+
+
+def _smaller(missing: Sequence[Path]) -> str:
+    """A word on folders of shrunk copies of pictures that are missing, such as images_2."""
+    if not missing:
+        return ""
+    place = missing[0].parent
+    others = sorted(p.name for p in place.parent.glob(f"{place.name}_*") if p.is_dir())
+    if not others:
+        return ""
+    return (
+        f"; {others[0]} is there: rename it to {place.name}, and cameras are scaled to its pictures"
+    )
+
+
+def _name(frame: dict[str, Any], name: str) -> str:
     """Unique within a file: Stanford-ORB's novel views are of several scenes."""
-    name = view_name(frame["file_path"])
     return f"{scene}_{name}" if isinstance(scene := frame.get("scene_name"), str) else name
 
 
@@ -159,7 +189,40 @@ def listed_image(folder: Path, file_path: str, where: str) -> Path | None:
     if (named := Path(file_path)).suffix.lower() in (*SUFFIXES, *FOREIGN):
         names += [str(named.with_suffix(ending)) for ending in (*SUFFIXES, *CAPITAL)]
     found = next((path for name in names if _is_file(path := folder / name)), None)
+    found = found or _found_as_written_elsewhere(folder, names)
     return None if found is None else inside(found, where)
+
+
+def _found_as_written_elsewhere(folder: Path, names: Sequence[str]) -> Path | None:
+    """A file that a list names as another machine has it: with backslashes, in capitals or not, or
+    by an absolute path, of which the end says which it is in the folder."""
+    paths = [PureWindowsPath(name) if "\\" in name else PurePosixPath(name) for name in names]
+    if any(".." in path.parts for path in paths):
+        return None
+    absolute = bool(paths[0].anchor)
+    for begin in range(len(paths[0].parts) if absolute else 1):
+        for path in paths:
+            parts = path.parts[begin + absolute :]
+            if parts and (found := _in_any_case(folder, parts)):
+                return found
+    return None
+
+
+def _in_any_case(folder: Path, parts: Sequence[str]) -> Path | None:
+    """The one file of a folder whose path is this, but for capitals."""
+    found = [folder]
+    for part in parts:
+        found = [p for f in found for p in _entries(f).get(part.casefold(), [])]
+    return found[0] if len(found) == 1 and found[0].is_file() else None
+
+
+def _entries(folder: Path) -> dict[str, list[Path]]:
+    """What is in a folder, by its name without regard to capitals."""
+    entries: dict[str, list[Path]] = {}
+    with suppress(OSError):
+        for path in sorted(folder.iterdir()):
+            entries.setdefault(path.name.casefold(), []).append(path)
+    return entries
 
 
 def _is_file(path: Path) -> bool:
@@ -170,9 +233,20 @@ def _is_file(path: Path) -> bool:
         return False
 
 
+def view_names(file_paths: Sequence[str]) -> list[str]:
+    """Names of views, with the folders in front where names alone come twice."""
+    names = [view_name(file_path) for file_path in file_paths]
+    if len(set(names)) == len(names):
+        return names
+    folders = [PurePosixPath(p.replace("\\", "/")).parts[:-1] for p in file_paths]
+    differ = [len(set(level)) > 1 for level in zip(*folders, strict=False)]
+    shared = [*differ, True].index(True)
+    return ["_".join([*parts[shared:], name]) for parts, name in zip(folders, names, strict=True)]
+
+
 def view_name(file_path: str) -> str:
     """./train/r_000 and ./train/r_000.png are r_000; r_0.5 stays."""
-    path = Path(file_path)
+    path = PurePosixPath(file_path.replace("\\", "/"))
     name = path.stem if path.suffix.lower() in (*SUFFIXES, *FOREIGN) else path.name
     return name.removesuffix("_rgba").removesuffix("_rgb")
 
@@ -218,8 +292,8 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
             f"{where}: expected one of the camera models {', '.join(MODELS)}, got "
             + ("a fisheye" if values.get("is_fisheye") else short(model))
         )
-    if values.get("k4"):
-        raise DataError(f"{where}: expected distortion by k1 k2 k3 p1 p2, got k4 too")
+    if more := [key for key in ("k4", "k5", "k6") if values.get(key)]:
+        raise DataError(f"{where}: expected distortion by k1 k2 k3 p1 p2, got {more[0]} too")
     if "fl_x" in values:
         x = number(values, "fl_x", where, 0.0, math.inf)
         y = number(values, "fl_y", where, 0.0, math.inf) if "fl_y" in values else x
@@ -288,6 +362,9 @@ def _mask(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
     named = frame.get("mask_path")
     if named is None:
         return None
-    if not isinstance(named, str) or "\0" in named or not (folder / named).is_file():
+    found = None
+    if isinstance(named, str) and "\0" not in named:
+        found = listed_image(folder, named, where)
+    if found is None:
         raise DataError(f"{where}: no mask {folder / str(named)[:200]} (mask_path)")
-    return inside(folder / named, where)
+    return found

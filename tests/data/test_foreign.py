@@ -1,0 +1,253 @@
+"""Lists of photographs as other machines and programs write them: the same as without."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from layouts import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    scene,
+    write_colmap,
+    write_idr,
+    write_llff,
+    write_metashape,
+    write_nerfstudio,
+    write_polycam,
+    write_realitycapture,
+)
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from univoxel.data import load_cameras, load_photos
+from univoxel.data.transforms import view_names
+from univoxel.errors import DataError
+
+
+def text(file, *changes, encoding="utf-8"):
+    """A change of a file: each pattern by what stands in its place."""
+
+    def apply(folder):
+        before = (folder / file).read_text()
+        after = before
+        for pattern, new in changes:
+            after = re.sub(pattern, new, after)
+        assert after != before or not changes
+        (folder / file).write_bytes(after.encode(encoding))
+
+    return apply
+
+
+def smaller(folder):
+    """Pictures shrunk after the cameras were found: of blocks of one colour."""
+    for path in [*(folder / "images").iterdir(), *(folder / "masks").iterdir()]:
+        picture = Image.open(path)
+        picture.resize((2 * picture.width, 2 * picture.height), Image.Resampling.NEAREST).save(path)
+    file = folder / "transforms.json"
+    if file.exists():
+        root = json.loads(file.read_text())
+        root |= {key: 2 * root[key] for key in ("w", "h", "cx", "cy", "fl_x", "fl_y")}
+        file.write_text(json.dumps(root))
+    else:
+        lens = f"{2 * WIDTH} {2 * HEIGHT} {2 * FOCAL} {WIDTH} {HEIGHT}"
+        text("sparse/0/cameras.txt", ("12 8 .*", lens))(folder)
+    for path in [*(folder / "images").iterdir(), *(folder / "masks").iterdir()]:
+        picture = Image.open(path)
+        picture.resize((picture.width // 2, picture.height // 2), Image.Resampling.BOX).save(path)
+
+
+def in_capitals(folder):
+    for path in (folder / "images").iterdir():
+        path.rename(path.with_name(path.name.upper()))
+
+
+def groups(folder):
+    """Two groups of cameras with the same labels, pictures in folders of the groups' names."""
+    for part in ("images", "masks"):
+        for v in range(10):
+            old = next((folder / part).glob(f"p_00{v}*"))
+            new = old.parent / "ab"[v // 5] / old.name.replace(f"p_00{v}", f"p_00{v % 5}")
+            new.parent.mkdir(exist_ok=True)
+            old.rename(new)
+    cameras = re.findall("<camera id.*?</camera>", (folder / "cameras.xml").read_text())
+    named = [re.sub("p_00.", f"p_00{v % 5}", camera) for v, camera in enumerate(cameras)]
+    inner = "".join(
+        f'<group label="{name}">{"".join(named[i : i + 5])}</group>'
+        for name, i in (("a", 0), ("b", 5))
+    )
+    text("cameras.xml", ("(?s)<cameras>.*</cameras>", f"<cameras>{inner}</cameras>"))(folder)
+
+
+def unpadded(folder):
+    for place in ("image", "mask"):
+        for path in sorted((folder / place).iterdir(), reverse=True):
+            path.rename(path.with_name(f"{int(path.stem[-3:]) + 5}.png"))
+
+
+def more_pictures(folder):
+    rows = np.load(folder / "poses_bounds.npy")
+    names = sorted(path.name for path in (folder / "images").iterdir())
+    (folder / "view_imgs.txt").write_text("\n".join(names) + "\n")
+    Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "images" / "o_000.png")
+    assert len(rows) == len(names)
+
+
+OF_NERFSTUDIO = {
+    "backslashes": text("transforms.json", ("images/", r"images\\\\\\\\")),
+    "backslashes and a dot": text("transforms.json", ("(images|masks)/", r".\\\\\\\\\1\\\\\\\\")),
+    "of another machine": text("transforms.json", ('"images/', '"/home/a/b/images/')),
+    "of Windows": text("transforms.json", ('"images/', r'"C:\\\\\\\\a\\\\\\\\images\\\\\\\\')),
+    "capitals": in_capitals,
+    "null": text("transforms.json", ('"k1": 0.0', '"k1": null, "is_fisheye": null')),
+    "smaller": smaller,
+}
+OF_COLMAP = {
+    "backslashes": text("sparse/0/images.txt", (" p_", r" .\\p_")),
+    "capitals": in_capitals,
+    "a mark and CR LF": text("sparse/0/cameras.txt", ("^", "\ufeff"), ("\n", "\r\n")),
+    "FULL_OPENCV": text(
+        "sparse/0/cameras.txt",
+        ("SIMPLE_PINHOLE 12 8 11.0", "FULL_OPENCV 12 8 11 11"),
+        (r"(FULL_OPENCV .*)\n", r"\1 0 0 0 0 0 0 0 0\n"),
+    ),
+    "smaller": smaller,
+}
+SPLITS = ("train", "test")
+
+
+def views(photos):
+    """Alpha and camera of each view, by its colours: a list may number them otherwise."""
+    cameras = photos.cameras
+    for view in range(len(photos)):
+        color, alpha = photos.stored(view)
+        camera = (getattr(cameras, k)[view] for k in ("camera_to_world", "focal", "centre"))
+        yield color.numpy().tobytes(), [alpha, *camera]
+
+
+CASES = [
+    *((write_nerfstudio, name, change) for name, change in OF_NERFSTUDIO.items()),
+    *((lambda *a: write_colmap(*a, text=True), name, change) for name, change in OF_COLMAP.items()),
+    (
+        write_realitycapture,
+        "semicolons",
+        text("cameras.csv", (r"\.", "!"), (",", ";"), ("!", ","), (",png", ".png")),
+    ),
+    (write_realitycapture, "tabs in UTF-16", text("cameras.csv", (",", "\t"), encoding="utf-16")),
+    (write_metashape, "groups", groups),
+    (write_idr, "unpadded", unpadded),
+    (write_llff, "more pictures than rows", more_pictures),
+]
+
+
+@pytest.mark.parametrize(("writer", "name", "change"), CASES, ids=[c[1] for c in CASES])
+def test_lists_are_read_as_they_were_meant(tmp_path, writer, name, change):
+    written = scene(10)
+    plain, data = writer(tmp_path / "plain", written), writer(tmp_path / "data", written)
+    change(data)
+    found, wanted = (
+        {color: view for split in SPLITS for color, view in views(load_photos(folder, split))}
+        for folder in (data, plain)
+    )
+    assert len(found) == len(wanted) == 10
+    for color, (alpha, *camera) in found.items():
+        assert torch.equal(alpha, wanted[color][0])
+        torch.testing.assert_close(camera, wanted[color][1:], atol=1e-5, rtol=1e-5)
+    about = load_photos(data).about
+    assert ("cameras of 10 scaled to smaller pictures" in about) == (name == "smaller")
+
+
+def test_pictures_of_one_name_in_two_folders(tmp_path):
+    data = write_nerfstudio(tmp_path, scene(10))
+    for v in range(10):
+        for part in ("images", "masks"):
+            old = data / part / f"p_00{v}.png"
+            new = data / part / f"cam{v % 2}" / f"{v // 2}.png"
+            new.parent.mkdir(exist_ok=True)
+            old.rename(new)
+    moved = [(f"p_00{v}", f"cam{v % 2}/{v // 2}") for v in range(10)]
+    chosen = [("^{", '{"test_filenames": ["images/cam1/2.png"],'), (', "mask_path": "[^"]*"', "")]
+    text("transforms.json", *moved, *chosen)(data)
+    photos = load_photos(data, "test")
+    assert photos.names == ["cam1_2"]
+    assert np.array_equal(photos.alpha[0], scene(10).pictures[5, ..., 3])
+    assert load_cameras(data / "transforms.json", 8)[0] == [
+        f"cam{v % 2}_{v // 2}" for v in reversed(range(10))
+    ]
+    assert view_names(["a/0.png", "b/1.png"]) == ["0", "1"]
+
+
+@pytest.mark.parametrize("writer", [write_nerfstudio, write_llff, write_colmap])
+def test_coordinates_of_the_earth(tmp_path, writer):
+    """Distances between cameras stay as exact as float32 has them, in every layout."""
+    written = scene()
+    far = scene()
+    far.poses[:, :3, :3] = Rotation.from_matrix(far.poses[:, :3, :3]).as_matrix()
+    far.poses[:, :3, 3] += (391234.5, 5.82e6, 34.0)
+    photos = load_photos(writer(tmp_path, far))
+    assert re.search(r"world moved by -39123\d -5820000 -3\d", photos.about)
+    place = photos.cameras.camera_to_world[:, :, 3]
+    wanted = torch.from_numpy(written.poses[written.split("train"), :3, 3]).float()
+    torch.testing.assert_close(torch.cdist(place, place), torch.cdist(wanted, wanted))
+
+
+def no_images(place, other):
+    return lambda folder: (folder / place).rename(folder / other)
+
+
+def two_fit(folder):
+    for path in list((folder / "images").iterdir()):
+        path.rename(path.with_name(path.name.replace("p_", "P_")))
+        (path.with_name(path.name.replace(".png", ".pNg"))).write_bytes(b"")
+
+
+@pytest.mark.parametrize(
+    ("writer", "change", "message"),
+    [
+        (write_nerfstudio, two_fit, "10 of 10 are missing"),
+        (
+            write_nerfstudio,
+            text("transforms.json", ("images/p", "/a/../images/p")),
+            "10 of 10 are missing",
+        ),
+        (
+            write_nerfstudio,
+            no_images("images", "images_2"),
+            "images_2 is there: rename it to images, and cameras are scaled",
+        ),
+        (
+            write_polycam,
+            lambda f: (f / "keyframes/corrected_images").rename(f / "keyframes/images"),
+            "corrected_images; those in .*keyframes/images are of the cameras in .*/cameras",
+        ),
+        (
+            write_nerfstudio,
+            text("transforms.json", ('"k1": 0.0', '"k5": 0.1')),
+            "expected distortion by k1 k2 k3 p1 p2, got k5 too",
+        ),
+        (
+            lambda f, s: write_colmap(
+                f, s, "sparse/0", True, "FULL_OPENCV", (*[9] * 4, *[0.1] * 8)
+            ),
+            lambda f: None,
+            "camera 3 is FULL_OPENCV with k4, k5 or k6: run",
+        ),
+    ],
+)
+def test_what_helps_is_said(tmp_path, writer, change, message):
+    change(writer(tmp_path, scene()))
+    with pytest.raises(DataError, match=message):
+        load_photos(tmp_path)
+
+
+def test_cameras_of_a_rig_are_named(tmp_path):
+    write_metashape(tmp_path, scene())
+    text("cameras.xml", ('label="not_placed"', 'label="right" master_id="0"'))(tmp_path)
+    assert "; 1 of a rig, whose place is that of a master camera" in load_photos(tmp_path).about
+
+
+def test_one_photograph_is_told(tmp_path, caplog):
+    load_photos(write_nerfstudio(tmp_path, scene(2), test_filenames=["images/p_000.png"]))
+    assert "one photograph shows no shape: at least 3 views are needed" in caplog.text
