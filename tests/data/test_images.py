@@ -14,7 +14,8 @@ from PIL import Image, ImageCms
 
 from univoxel.data import images
 from univoxel.data.images import image_size, read_exr, read_image, write_exr, write_png
-from univoxel.data.radiance import write_radiance
+from univoxel.data.maps import read_map
+from univoxel.data.radiance import OF_RADIANCE, REC_709, write_radiance
 from univoxel.data.shots import read_photo
 from univoxel.errors import DataError
 from univoxel.files import replacing
@@ -166,6 +167,81 @@ def test_cropped_exr(tmp_path, corner):
     whole[10 + y : 14 + y, 10 + x : 15 + x] = data
     assert np.array_equal(read_exr(tmp_path / "a.exr")["Y"], whole[11:19, 11:21])
     assert image_size(tmp_path / "a.exr") == (10, 8)
+
+
+def test_an_exr_of_several_parts(tmp_path):
+    """The one with colours is meant, and of two nobody knows which."""
+    header = {"type": OpenEXR.scanlineimage}
+    parts = [
+        OpenEXR.Part({**header, "name": name}, {c: noise(4, 5) for c in channels})
+        for name, channels in (("depth", "Z"), ("beauty", "RGB"), ("diffuse", "RGB"))
+    ]
+    OpenEXR.File(parts[:2]).write(str(tmp_path / "a.exr"))
+    assert sorted(read_exr(tmp_path / "a.exr")) == ["B", "G", "R"]
+    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
+    with pytest.raises(DataError, match="got parts with colours: depth, beauty, diffuse: write th"):
+        read_image(tmp_path / "a.exr")
+
+
+DISPLAY_P3 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329)
+ACES_CG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+
+
+@pytest.mark.parametrize(
+    ("stated", "red"),
+    [
+        # Colours as published with the spaces, white adapted as of Bradford
+        (DISPLAY_P3, [1.22494, -0.04206, -0.01964]),
+        (ACES_CG, [1.70505, -0.13026, -0.02400]),
+        (REC_709, [1, 0, 0]),
+        (OF_RADIANCE, [1, 0, 0]),
+        ((0,) * 8, [1, 0, 0]),
+    ],
+)
+def test_colours_of_stated_primaries(tmp_path, stated, red):
+    """White stays white, and what only the wider space has is cut off."""
+    rgb = np.array([[[0.5, 0.5, 0.5], [0.5, 0, 0]]], np.float32)
+    channels = {c: np.ascontiguousarray(rgb[..., i]) for i, c in enumerate("RGB")}
+    header = {"type": OpenEXR.scanlineimage, "chromaticities": stated}
+    if any(stated):
+        OpenEXR.File(header, channels).write(str(tmp_path / "a.exr"))
+    body = bytes([128, 128, 128, 128, 128, 0, 0, 128])
+    head = radiance(body, "-Y  1   +X 2 ")
+    lines = f"PRIMARIES= {' '.join(map(str, stated))}\n".encode()
+    (tmp_path / "a.hdr").write_bytes(head.replace(b"FORMAT", lines + b"FORMAT"))
+    for path in tmp_path.iterdir():
+        white, found = read_image(path)[0].tolist()
+        assert white == pytest.approx([0.5] * 3, abs=1e-3)
+        assert found == pytest.approx([max(x / 2, 0) for x in red], abs=1e-3)
+
+
+def test_maps_that_are_nearly_right(tmp_path):
+    """Filters leave texels slightly below 0; a JPEG says nothing of the sun."""
+    value = np.full((4, 8), 2.0)
+    value[1, 2] = -0.01
+    write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", value))
+    assert float(read_map(tmp_path / "a.exr").radiance.min()) == 0
+    write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", 4 * value - 7.9))
+    with pytest.raises(DataError, match="expected finite radiance of at least 0"):
+        read_map(tmp_path / "a.exr")
+    Image.new("RGB", (8, 4)).save(tmp_path / "a.jpg")
+    with pytest.raises(
+        DataError, match=r"a\.jpg: expected a map of light, \.hdr or \.exr, got a pi"
+    ):
+        read_map(tmp_path / "a.jpg")
+
+
+def test_the_largest_photographs(tmp_path, monkeypatch):
+    """Pillow's own limit is below what telephones make; a bomb is refused all the same."""
+    monkeypatch.setattr(images, "LARGEST", 40)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
+    Image.new("RGB", (8, 5)).save(tmp_path / "a.png")
+    assert read_image(tmp_path / "a.png").shape == (5, 8, 3)
+    assert image_size(tmp_path / "a.png") == (8, 5)
+    assert Image.MAX_IMAGE_PIXELS == 10
+    Image.new("RGB", (9, 5)).save(tmp_path / "a.png")
+    with pytest.raises(DataError, match="exceeds limit of 40 pixels"):
+        read_image(tmp_path / "a.png")
 
 
 # Radiance

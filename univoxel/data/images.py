@@ -6,7 +6,7 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from threading import Lock
@@ -17,11 +17,12 @@ import torch
 from PIL import ExifTags, Image, ImageCms
 from torch import Tensor
 
-from univoxel.data.radiance import read_radiance
+from univoxel.data.radiance import in_rec709, read_radiance
 from univoxel.errors import DataError
 from univoxel.files import replacing
 from univoxel.records import HALF_MAX
 
+_LIMIT = Lock()  # of Pillow, which is the process's
 _OPENING = Lock()  # of an OpenEXR file: what it prints to is the process's, not the thread's
 EXR_TELLS = "Warning: "  # how its lines begin
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff", ".webp")
@@ -30,6 +31,7 @@ FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 KINDS = {".exr": "an OpenEXR file", ".tif": "a TIFF", ".tiff": "a TIFF", ".webp": "a WebP"}
 HEIF = (".heic", ".heif", ".avif")  # of telephones
 HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
+LARGEST = 1 << 29  # pixels of a file: panoramas and the largest telephones have 200 million
 MOST_FRAMED = 1 << 29  # pixels of an EXR's display window, at most, where its data fill it in part
 # Endings of pictures that are not read: names may be those of files before they were converted
 FOREIGN = (*HEIF, ".hif", ".bmp", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
@@ -44,7 +46,8 @@ def read_image(path: str | Path, in_srgb: bool = False) -> Tensor:
     Returns:
         [H, W, C]: uint8 as stored for files of 8 bits; float32 in [0, 1], still encoded as
         stored, for grey of 16 bits (colour PNG of 16 bits is cut to 8); float32 linear for EXR
-        (channels R, G, B and A if there, or Y) and Radiance .hdr.
+        (channels R, G, B and A if there, or Y) and Radiance .hdr, whose colours of stated
+        primaries become those of Rec. 709.
 
     Raises:
         DataError: the file is missing, empty, cut off, not what its name says, of an unsupported
@@ -59,7 +62,7 @@ def read_image(path: str | Path, in_srgb: bool = False) -> Tensor:
         _require_file(path)
         return torch.from_numpy(read_radiance(path))
     if suffix == ".exr":
-        channels = read_exr(path)
+        channels, stated = _read_exr(path)
         names = [c for c in "RGBA" if c in channels] if "R" in channels else ["Y"]
         if names not in (["R", "G", "B"], ["R", "G", "B", "A"], ["Y"]) or names[0] not in channels:
             raise DataError(f"{path}: expected channels R, G, B or Y, got {', '.join(channels)}")
@@ -67,6 +70,8 @@ def read_image(path: str | Path, in_srgb: bool = False) -> Tensor:
         if not np.isfinite(image).all():
             row, column, _ = np.argwhere(~np.isfinite(image))[0]
             raise DataError(f"{path}: NaN or infinity at row {row}, column {column}")
+        if stated and image.shape[2] > 1:
+            image[..., :3] = in_rec709(image[..., :3], stated)
         return torch.from_numpy(image)
     with opened(path) as image:
         return torch.from_numpy(as_array(image, path, in_srgb))
@@ -100,10 +105,8 @@ def orientation(path: Path) -> int:
     if path.suffix.lower() not in (".jpg", ".jpeg", ".tif", ".tiff", ".webp"):
         return 1
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(path, formats=["JPEG", "TIFF", "WEBP"]) as image:
-                found = image.getexif().get(ExifTags.Base.Orientation, 1)
+        with open_picture(path, FORMATS) as image:
+            found = image.getexif().get(ExifTags.Base.Orientation, 1)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
         return 1
     return found if found in range(1, 9) else 1
@@ -146,27 +149,42 @@ def stored_from_upright(pixels: Tensor, turned: int) -> Tensor:
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """All channels of the first part of an OpenEXR file, [H, W] float32 each.
+    """All channels of an OpenEXR file, [H, W] float32 each; of several parts, those of the only one
+    with colours, or of the first.
 
     The picture is the display window: 0 where a smaller data window ends, as renderers cut away
     what is empty, and without what a larger one has around it.
 
     Raises:
-        DataError: the file is missing, empty, cut off, no EXR file, or has subsampled channels.
+        DataError: the file is missing, empty, cut off, no EXR file, has subsampled channels or
+            several parts with colours.
     """
-    path = Path(path)
+    return _read_exr(Path(path))[0]
+
+
+def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], Sequence[float]]:
+    """Channels as of `read_exr`, and the primaries that the file states, if any."""
     _require_file(path)
     try:
         with _exr(path, separate_channels=True) as file:
-            data, shown = (file.header()[f"{what}Window"] for what in ("data", "display"))
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
+            colored = [i for i, part in enumerate(file.parts) if "R" in part.channels]
+            names = ", ".join(part.name() for part in file.parts)
+            header = file.header(part := colored[0] if colored else 0)
+            data, shown = (header[f"{what}Window"] for what in ("data", "display"))
+            stated = header.get("chromaticities", ())
+            channels = {name: channel.pixels for name, channel in file.channels(part).items()}
     except (RuntimeError, ValueError, TypeError) as error:
         raise DataError(f"{path}: expected an OpenEXR file, could not read it: {error}") from None
+    if len(colored) > 1:
+        raise DataError(
+            f"{path}: expected one picture, got parts with colours: {names}: write the one that is "
+            "meant into a file of its own"
+        )
     if len({pixels.shape for pixels in channels.values()}) != 1:
         raise DataError(f"{path}: expected channels of one size, got subsampled ones")
     if not np.array_equal(data, shown):
         channels = {name: _framed(p, data, shown, path) for name, p in channels.items()}
-    return {name: np.asarray(pixels, np.float32) for name, pixels in channels.items()}
+    return {name: np.asarray(pixels, np.float32) for name, pixels in channels.items()}, stated
 
 
 def _framed(
@@ -298,6 +316,22 @@ def _require_file(path: Path) -> None:
         raise DataError(f"{path}: the file is empty")
 
 
+def open_picture(path: Path, formats: Sequence[str]) -> Image.Image:
+    """A file in Pillow's hands, whose own limit of size is too low for photographs.
+
+    Raises:
+        OSError, Image.DecompressionBombError, ValueError, SyntaxError: it is no such picture.
+    """
+    with _LIMIT, warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        usual = Image.MAX_IMAGE_PIXELS
+        try:
+            Image.MAX_IMAGE_PIXELS = usual and max(usual, LARGEST // 2)  # it refuses twice as many
+            return Image.open(path, formats=list(formats))
+        finally:
+            Image.MAX_IMAGE_PIXELS = usual
+
+
 @contextmanager
 def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
     """A picture in Pillow's hands, its pixels read where `whole`.
@@ -308,12 +342,10 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
     kind = KINDS.get(path.suffix.lower(), "a PNG or JPEG")
     _require_file(path)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path, formats=FORMATS) as image:
-                if whole:
-                    image.load()
-                yield image
+        with open_picture(path, FORMATS) as image:
+            if whole:
+                image.load()
+            yield image
     except DataError:
         raise
     except AssertionError:  # Pillow's own, of what it takes for granted
@@ -365,12 +397,19 @@ def srgb_of(picture: Image.Image, profile: bytes) -> Image.Image:
     return turned
 
 
-def _what_it_is(path: Path, error: Exception) -> str:
-    """Why a file could not be read: it may be of another kind than its name says."""
+def is_heif(path: Path) -> bool:
+    """Whether a file is HEIC or AVIF by its first bytes, whatever its name says."""
     with path.open("rb") as file:
         head = file.read(12)
-    if head[4:8] == b"ftyp" and head[8:12] in HEIF_BRANDS:
+    return head[4:8] == b"ftyp" and head[8:] in HEIF_BRANDS
+
+
+def _what_it_is(path: Path, error: Exception) -> str:
+    """Why a file could not be read: it may be of another kind than its name says."""
+    if is_heif(path):
         return "got HEIC or AVIF under that name: convert it to JPEG, as `univoxel poses` does"
-    if head[:4] in (b"II*\0", b"MM\0*"):
+    with path.open("rb") as file:
+        head = file.read(4)
+    if head in (b"II*\0", b"MM\0*"):
         return f"could not read this TIFF: {error}: convert it to PNG or JPEG of 8 bits"
     return f"could not read it: {error}"

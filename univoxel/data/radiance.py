@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,22 @@ from univoxel.errors import DataError
 from univoxel.files import replacing
 
 SMALLEST = 2.0**-128  # what is darker has no exponent: black
+# x and y of red, green, blue and white: of Rec. 709, which colours here are of, and of Radiance,
+# whose writers state it whatever colours they have
+REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+OF_RADIANCE = (0.64, 0.33, 0.29, 0.60, 0.15, 0.06, 0.3333, 0.3333)
+NEAR = 2e-3  # by which primaries may differ and are the same
+BRADFORD = np.array(
+    [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
+)
 LARGEST = 255 * 2.0**119  # the largest number of the format
 
 
 def read_radiance(path: Path) -> np.ndarray:
     """Linear RGB [H, W, 3] float32: mantissa * 2^(exponent - 136), exactly; 0 where exponent is 0.
 
-    EXPOSURE lines are not applied, as in other readers.
+    EXPOSURE lines are not applied, as in other readers. Colours of stated PRIMARIES become those of
+    Rec. 709.
 
     Raises:
         DataError: not a Radiance RGBE picture, cut off, or of an orientation or encoding other than
@@ -36,7 +46,7 @@ def read_radiance(path: Path) -> np.ndarray:
     if form := re.search(rb"^FORMAT=(.*)$", head, re.MULTILINE):
         if form[1].strip() != b"32-bit_rle_rgbe":
             raise DataError(f"{path}: expected FORMAT=32-bit_rle_rgbe, got {form[1].strip()!r}")
-    size = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", line)
+    size = re.fullmatch(rb"\s*-Y\s+(\d{1,9})\s+\+X\s+(\d{1,9})\s*", line)
     if not size or not (int(size[1]) and int(size[2])):
         raise DataError(f"{path}: expected the size as '-Y height +X width', got {line[:40]!r}")
     height, width = int(size[1]), int(size[2])
@@ -54,7 +64,35 @@ def read_radiance(path: Path) -> np.ndarray:
         )
     exponent = rgbe[..., 3:].astype(np.int32)
     value = np.ldexp(rgbe[..., :3].astype(np.float32), exponent - 136)
-    return np.where(exponent > 0, value, np.float32(0))
+    value = np.where(exponent > 0, value, np.float32(0))
+    stated = re.search(rb"^PRIMARIES=\s*((?:[\d.]+\s+){7}[\d.]+)\s*$", head, re.MULTILINE)
+    return in_rec709(value, [float(x) for x in stated[1].split()]) if stated else value
+
+
+def in_rec709(rgb: np.ndarray, stated: Sequence[float]) -> np.ndarray:
+    """Linear colours [.., 3] float32 of stated primaries as those of Rec. 709, white as white; what
+    only the wider space has becomes 0.
+
+    Args:
+        stated: x and y of red, green, blue and white. Numbers that are none change nothing.
+    """
+    usual = any(np.allclose(stated, known, atol=NEAR) for known in (REC_709, OF_RADIANCE))
+    if len(stated) != 8 or usual or min(stated[1::2]) <= 0:
+        return rgb
+    (theirs, white), (ours, d65) = _to_xyz(stated), _to_xyz(REC_709)
+    scale = np.diag((BRADFORD @ d65) / (BRADFORD @ white))
+    matrix = np.linalg.inv(ours) @ np.linalg.inv(BRADFORD) @ scale @ BRADFORD @ theirs
+    return np.maximum(rgb @ matrix.T, 0).astype(np.float32)
+
+
+def _to_xyz(primaries: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """From linear RGB of primaries to XYZ [3, 3], and the XYZ of their white [3]."""
+    *colors, white = (
+        np.array([x / y, 1, (1 - x - y) / y])
+        for x, y in zip(primaries[::2], primaries[1::2], strict=True)
+    )
+    matrix = np.stack(colors, 1)
+    return matrix * np.linalg.solve(matrix, white), white
 
 
 def write_radiance(path: Path, radiance: np.ndarray) -> None:
