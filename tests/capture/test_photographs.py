@@ -224,6 +224,29 @@ def test_the_photographs_of_a_folder(tmp_path):
     assert len(find_photographs(tmp_path / "outer")[0]) == 1
 
 
+def test_where_photographs_lie(tmp_path):
+    """A preview beside a folder of them is none, nor are masks; of a card the folders are told."""
+    for name in ("preview", "images/a", "images/b", "images/c", "images/a_mask"):
+        (tmp_path / "x" / name).parent.mkdir(parents=True, exist_ok=True)
+        quarters().save(tmp_path / "x" / f"{name}.jpg")
+    files, others, _ = find_photographs(tmp_path / "x")
+    assert [path.name for path in files] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert others == ["a_mask.jpg"]
+    (tmp_path / "x/images").rename(tmp_path / "x/DCIM")
+    assert len(find_photographs(tmp_path / "x")[0]) == 1
+    (tmp_path / "x/preview.jpg").unlink()
+    with pytest.raises(DataError, match="got none but in DCIM: give that folder, or put all into"):
+        find_photographs(tmp_path / "x")
+
+
+def test_heic_under_another_name(tmp_path):
+    pillow_heif.register_heif_opener()
+    quarters().save(tmp_path / "a.heic", quality=100)
+    (tmp_path / "a.heic").rename(tmp_path / "a.jpg")
+    assert describe(tmp_path / "a.jpg").width == 64
+    assert corners(read_upright(tmp_path / "a.jpg")) == list("rgbw")
+
+
 def test_a_missing_reader_is_named_before_reading(tmp_path, monkeypatch):
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
     require_readers([tmp_path / "a.jpg"])

@@ -70,6 +70,53 @@ def test_a_turned_video_comes_upright(film, tmp_path):
         assert picture.size == (120, 160)
 
 
+COLORS = [(200, 40, 40), (40, 160, 60), (50, 70, 200), (190, 170, 60)]
+
+
+@pytest.mark.parametrize(
+    ("matrix", "full", "tagged", "height"),
+    [
+        ("bt709", False, True, 64),
+        ("bt709", True, True, 64),
+        ("bt601", False, True, 64),
+        ("bt601", False, False, 64),
+        ("bt709", False, False, 720),  # as players take it
+    ],
+)
+def test_colours_are_those_of_the_video(tmp_path, matrix, full, tagged, height):
+    picture = np.repeat(np.array(COLORS, np.uint8), height // 4, 0)[None].repeat(height, 0)
+    Image.fromarray(picture).save(tmp_path / "a.png")
+    scale = f"scale=out_color_matrix={matrix}:out_range={'pc' if full else 'tv'}"
+    tag = ["-colorspace", "smpte170m" if matrix == "bt601" else matrix] if tagged else []
+    drop = [] if tagged else ["-bsf:v", "h264_metadata=matrix_coefficients=2"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-loop", "1", "-framerate", "5"]
+    command += ["-i", str(tmp_path / "a.png"), "-t", "1", "-vf", scale, *tag, *drop]
+    command += ["-color_range", "pc" if full else "tv", "-crf", "4"]
+    command += ["-pix_fmt", "yuvj420p" if full else "yuv420p", str(tmp_path / "a.mp4")]
+    subprocess.run(command, check=True)
+    assert write_frames(tmp_path / "a.mp4", tmp_path / "100% wool") == 1  # it stands still
+    found = np.asarray(Image.open(tmp_path / "100% wool/frame_00000.jpg"))
+    middles = found[height // 2, height // 8 :: height // 4].tolist()
+    np.testing.assert_allclose(middles, COLORS, atol=6)
+
+
+def test_hdr_is_told(film, tmp_path, caplog):
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(film), "-c", "copy"]
+    curve = "h264_metadata=transfer_characteristics=18:matrix_coefficients=9:colour_primaries=9"
+    subprocess.run([*command, "-bsf:v", curve, str(tmp_path / "a.mp4")], check=True)
+    write_frames(tmp_path / "a.mp4", tmp_path / "frames", every=1.0)
+    assert "a.mp4: colours of HLG (HDR) come out flat: record without HDR" in caplog.text
+
+
+def test_a_recording_that_does_not_know_its_length(film, tmp_path):
+    """As browsers write them, while they come."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(film), "-c", "copy"]
+    piped = [*command, "-f", "matroska", "-live", "1", "-"]
+    done = subprocess.run(piped, check=True, capture_output=True)
+    (tmp_path / "a.mkv").write_bytes(done.stdout)
+    assert seconds(tmp_path / "a.mkv") == pytest.approx(3.9, abs=0.15)  # begin of the last
+
+
 def test_what_is_no_video_is_one_line(tmp_path):
     path = tmp_path / "a.mp4"
     path.write_bytes(b"no video" * 50)

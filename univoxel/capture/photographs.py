@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageOps
 
-from univoxel.data.images import srgb_of
+from univoxel.data.images import is_heif, open_picture, srgb_of
+from univoxel.data.masks import without_masks
 from univoxel.errors import DataError, MissingExtra
 
 PLAIN = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif")
@@ -27,6 +27,8 @@ RAW = (
 )
 # Of one photograph in several formats the first is taken
 ORDER = (".jpg", ".jpeg", *HEIF, ".png", ".tif", ".tiff", ".webp", ".avif", *RAW)
+FEWEST = 3  # pictures that are a capture; fewer beside a folder of them are previews
+NAMED = 5  # folders in a message, at most
 DIAGONAL_35MM = math.hypot(36, 24)  # millimetres
 T = Image.Transpose
 TURNS = {5: T.TRANSPOSE, 6: T.ROTATE_270, 7: T.TRANSVERSE, 8: T.ROTATE_90}  # to upright, by EXIF
@@ -71,28 +73,37 @@ class Photograph:
 def find_photographs(folder: Path) -> tuple[list[Path], list[str], int]:
     """The photographs of a folder by name, names of files that are none, and how many came twice.
 
-    Where the folder has none but a folder `images`, those of that. Of a photograph in two formats,
-    as many cameras write it, one is taken.
+    Where the folder has none or a few beside a folder `images`, those of that. Of a photograph in
+    two formats, as many cameras write it, one is taken. Masks beside photographs are none.
 
     Raises:
         DataError: no photographs.
     """
-    places = [folder, folder / "images"]
-    for place in places:
-        if not place.is_dir():
+    for place in (folder, folder / "images"):
+        pictures, others = _pictures(place)
+        if len(pictures) < FEWEST and place == folder and _pictures(folder / "images")[0]:
             continue
-        files = sorted(p for p in place.iterdir() if p.is_file() and not p.name.startswith("."))
-        pictures = [p for p in files if p.suffix.lower() in ORDER]
         if not pictures:
             continue
-        others = [p.name for p in files if p.suffix.lower() not in ORDER]
         best: dict[str, Path] = {}
         for path in sorted(pictures, key=lambda p: ORDER.index(p.suffix.lower())):
             best.setdefault(path.stem, path)
         return sorted(best.values()), others, len(pictures) - len(best)
+    inner = [p for p in sorted(folder.rglob("*")) if p.is_dir() and len(_pictures(p)[0]) >= FEWEST]
+    where = ", ".join(str(p.relative_to(folder)) for p in inner[:NAMED])
     raise DataError(
         f"{folder}: expected photographs ({' '.join((*PLAIN, *HEIF))} or RAW), got none"
+        + (f" but in {where}: give that folder, or put all into one" if inner else "")
     )
+
+
+def _pictures(folder: Path) -> tuple[list[Path], list[str]]:
+    """The photographs of one folder, and names of files that are none."""
+    if not folder.is_dir():
+        return [], []
+    files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    pictures = without_masks([p for p in files if p.suffix.lower() in ORDER])
+    return pictures, [p.name for p in files if p not in set(pictures)]
 
 
 def require_readers(paths: list[Path]) -> None:
@@ -180,15 +191,17 @@ def shrunk_to(picture: Image.Image, longest: int) -> Image.Image:
     return picture.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
 
 
+def _can_read_heif() -> bool:
+    return importlib.util.find_spec("pillow_heif") is not None
+
+
 def _open(path: Path) -> Image.Image:
-    if path.suffix.lower() in HEIF:
+    if path.suffix.lower() in HEIF or (_can_read_heif() and is_heif(path)):
         import pillow_heif  # pyright: ignore[reportMissingImports]  the extra `capture`
 
         pillow_heif.register_heif_opener()
     Image.init()  # builds of Pillow differ in formats, and it knows none before
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        return Image.open(path, formats=[name for name in FORMATS if name in Image.OPEN])
+    return open_picture(path, [name for name in FORMATS if name in Image.OPEN])
 
 
 def _eight_bits(image: Image.Image) -> Image.Image:

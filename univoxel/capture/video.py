@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 import re
 import subprocess
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,10 @@ KEPT = 80  # frames of a video, unless it is told otherwise
 FASTEST = 6.0  # frames a second to keep at most, by default
 LOOKED_AT = (640, 360)  # pixels, in which sharpness is compared
 JPEG_QUALITY = 2  # of ffmpeg: 1 to 31, lower is better
+HD = 720  # pixels of the shorter side from which colours are BT.709, where a video does not say
+HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}  # curves of colours that no JPEG has
+
+log: logging.Logger = logging.getLogger("univoxel")
 
 
 def is_video(path: Path) -> bool:
@@ -38,8 +44,8 @@ def require_ffmpeg() -> None:
 def write_frames(video: Path, folder: Path, every: float | None = None) -> int:
     """Write frames as FOLDER/frame_00000.jpg ..., turned as the video says; return how many.
 
-    The sharpest of each `every` seconds is taken, of LOOKS that are looked at. By default so many
-    seconds that KEPT are.
+    The sharpest of each `every` seconds is taken, of LOOKS that are looked at, and none twice where
+    the picture stands still. By default so many seconds that KEPT are.
 
     Raises:
         DataError: the video cannot be read.
@@ -53,18 +59,33 @@ def write_frames(video: Path, folder: Path, every: float | None = None) -> int:
     )
     pictures = np.frombuffer(looked, np.uint8).reshape(-1, height, width)
     chosen = sharpest([sharpness(picture) for picture in pictures], LOOKS)
+    again = [np.array_equal(pictures[a], pictures[b]) for a, b in pairwise(chosen)]
+    chosen = chosen[:1] + [n for n, same in zip(chosen[1:], again, strict=True) if not same]
     if not chosen:
         raise DataError(f"{video}: expected a video, got none of its frames")
     folder.mkdir(parents=True, exist_ok=True)
     which = "+".join(f"eq(n\\,{n})" for n in chosen)
-    target = folder / "frame_%05d.jpg"
+    target = str(folder / "frame").replace("%", "%%") + "_%05d.jpg"
     _ffmpeg(
         video,
-        f"{rate},select='{which}'",
+        f"{rate},select='{which}',{_to_jpeg(video)}",
         *("-fps_mode", "passthrough", "-q:v", str(JPEG_QUALITY), "-start_number", "0"),
-        str(target),
+        target,
     )
     return len(chosen)
+
+
+def _to_jpeg(video: Path) -> str:
+    """The filter that turns a video's colours into those that readers of JPEG expect: BT.601 in
+    full range. Without it ffmpeg writes the numbers of HD colours as they are."""
+    found = re.search(r"Video: .*?, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)", _about(video))
+    tags = re.split("[,/ ]+", found[1] or "") if found else []
+    if curve := next((HDR[tag] for tag in tags if tag in HDR), None):
+        log.warning("%s: colours of %s (HDR) come out flat: record without HDR", video.name, curve)
+    stated = any(tag.startswith(("bt", "smpte", "fcc", "gbr")) for tag in tags)
+    large = found is not None and min(int(found[2]), int(found[3])) >= HD
+    origin = "bt709" if large and not stated else "auto"
+    return f"scale=in_color_matrix={origin}:out_color_matrix=bt601:out_range=pc,format=yuvj420p"
 
 
 def sharpest(scores: list[float], looks: int) -> list[int]:
@@ -90,14 +111,22 @@ def seconds(video: Path) -> float:
     Raises:
         DataError: it does not say.
     """
-    told = subprocess.run(
-        [_program(), "-hide_banner", *_opened(video)], capture_output=True, check=False
-    ).stderr.decode("utf-8", "replace")
-    found = re.search(r"Duration: (\d+):(\d+):(\d+\.?\d*)", told)
+    clock = r"(\d+):(\d+):(\d+\.?\d*)"
+    found = re.findall(f"Duration: {clock}", _about(video))
+    if not found:  # of recordings that were written as they came: the time of the last frame
+        found = re.findall(f"time={clock}", _about(video, "-c", "copy", "-f", "null", "-"))
     if not found:
         raise DataError(f"{video}: expected a video, could not read it")
-    hours, minutes, rest = found.groups()
+    hours, minutes, rest = found[-1]
     return 3600 * int(hours) + 60 * int(minutes) + float(rest)
+
+
+def _about(video: Path, *output: str) -> str:
+    """What ffmpeg says of a video."""
+    command = [_program(), "-hide_banner", "-nostdin", *_opened(video), *output]
+    return subprocess.run(command, capture_output=True, check=False).stderr.decode(
+        "utf-8", "replace"
+    )
 
 
 def _ffmpeg(video: Path, filters: str, *output: str) -> bytes:
