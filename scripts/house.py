@@ -20,7 +20,7 @@ from layers import LAYERS, violations  # noqa: E402
 LIMITS = {
     "lines of the package": 37_300,
     "lines of the laboratory": 3_100,
-    "lines of tests": 37_400,
+    "lines of tests": 37_500,
     "modules of the package": 261,
     "loose modules at the top": 36,
     "configuration fields": 131,

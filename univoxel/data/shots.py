@@ -29,8 +29,10 @@ from univoxel.data.masks import (
     made_upright,
     masks_beside,
     masks_in,
+    premultiplied,
     read_mask,
     require_all,
+    require_fit,
 )
 from univoxel.errors import DataError, UserError, WithoutMasks
 
@@ -50,10 +52,7 @@ LEAN = math.radians(30)
 # Distance of cameras from the origin, in their distances from one another, beyond which float32
 # loses what they see: it has 7 digits, and pixels need 4
 FAR = 1000
-# Masks of which the border is white and something within it black: where most are, they are of
-# what is not the object. Along a border of this share of the sides
-BORDER = 0.02
-AROUND, HOLE, INVERTED = 0.95, 0.005, 0.8  # share of border, of picture, of masks
+LOOKED_AT = 12  # photographs, at most, on which it is tried whether masks can be right
 HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/guide/masks.md"
 
 
@@ -238,26 +237,21 @@ def _read_all(
         raise DataError(f"{folder}: all {len(shots)} pictures are fully transparent")
     if masks and reading.opaque:
         raise WithoutMasks(f"{folder}: all {len(shots)} pictures are fully opaque: {HOW_TO_MASK}")
-    if masks and (inverted := _inverted(reading.alpha, cameras)) >= INVERTED * len(shots):
-        reading.drop()
-        raise DataError(
-            f"{folder}: {inverted} of {len(shots)} masks are white along the whole border of the "
-            "picture and black within: they seem to be inverted. Give masks that are white on the "
-            "object and black elsewhere, as `magick mogrify -negate masks/*.png` makes them"
-        )
+    if masks:
+        looked = range(0, len(shots), -(-len(shots) // LOOKED_AT))
+        some = [[cameras.cut(v, r[v]) for r in (reading.color, reading.alpha)] for v in looked]
+        try:
+            require_fit(folder, [(color, coverage_of(alpha)) for color, alpha in some])
+        except DataError:
+            reading.drop()
+            raise
+        if premultiplied(some):
+            log.warning(
+                "%s: colours seem to be multiplied by alpha: they come out dark along the object's "
+                "edge. Write photographs with straight alpha",
+                folder,
+            )
     return reading.finished()
-
-
-def _inverted(alpha: Tensor, cameras: Cameras) -> int:
-    """How many of the masks [V, H, W] keep the border of the picture, and not what is within."""
-    count = 0
-    for view in range(len(alpha)):
-        mask = coverage_of(cameras.cut(view, alpha[view]))
-        rim = max(1, round(BORDER * min(mask.shape)))
-        whole, inner = mask.sum(), mask[rim:-rim, rim:-rim]
-        border = (whole - inner.sum()) / max(mask.numel() - inner.numel(), 1)
-        count += bool(border >= AROUND and inner.numel() and 1 - inner.mean() >= HOLE)
-    return count
 
 
 def _read_each(
