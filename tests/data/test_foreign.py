@@ -100,6 +100,7 @@ OF_NERFSTUDIO = {
     "backslashes and a dot": text("transforms.json", ("(images|masks)/", r".\\\\\\\\\1\\\\\\\\")),
     "of another machine": text("transforms.json", ('"images/', '"/home/a/b/images/')),
     "of Windows": text("transforms.json", ('"images/', r'"C:\\\\\\\\a\\\\\\\\images\\\\\\\\')),
+    "of Windows, with slashes": text("transforms.json", ('"images/', '"D:/a/images/')),
     "capitals": in_capitals,
     "null": text("transforms.json", ('"k1": 0.0', '"k1": null, "is_fisheye": null')),
     "smaller": smaller,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import reprlib
 from collections.abc import Sequence
 from contextlib import suppress
@@ -196,23 +197,31 @@ def listed_image(folder: Path, file_path: str, where: str) -> Path | None:
 def _found_as_written_elsewhere(folder: Path, names: Sequence[str]) -> Path | None:
     """A file that a list names as another machine has it: with backslashes, in capitals or not, or
     by an absolute path, of which the end says which it is in the folder."""
-    paths = [PureWindowsPath(name) if "\\" in name else PurePosixPath(name) for name in names]
+    of_windows = "\\" in names[0] or re.match("[A-Za-z]:/", names[0])
+    paths = [PureWindowsPath(name) if of_windows else PurePosixPath(name) for name in names]
     if any(".." in path.parts for path in paths):
         return None
-    absolute = bool(paths[0].anchor)
+    absolute, known = bool(paths[0].anchor), {}
     for begin in range(len(paths[0].parts) if absolute else 1):
         for path in paths:
             parts = path.parts[begin + absolute :]
-            if parts and (found := _in_any_case(folder, parts)):
+            if parts and (found := _in_any_case(folder, parts, known)):
                 return found
     return None
 
 
-def _in_any_case(folder: Path, parts: Sequence[str]) -> Path | None:
-    """The one file of a folder whose path is this, but for capitals."""
+def _in_any_case(
+    folder: Path, parts: Sequence[str], known: dict[Path, dict[str, list[Path]]]
+) -> Path | None:
+    """The one file of a folder whose path is this, but for capitals.
+
+    Args:
+        known: what is in folders, which is added to.
+    """
     found = [folder]
     for part in parts:
-        found = [p for f in found for p in _entries(f).get(part.casefold(), [])]
+        known |= {f: _entries(f) for f in found if f not in known}
+        found = [p for f in found for p in known[f].get(part.casefold(), [])]
     return found[0] if len(found) == 1 and found[0].is_file() else None
 
 
