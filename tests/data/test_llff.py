@@ -27,12 +27,12 @@ def test_masks_of_the_originals(tmp_path, odd):
     """images_4 beside masks of four times the size, rows and columns left over cut off."""
     write_llff(tmp_path, scene(), original=4, place="images_4")
     (tmp_path / "masks").mkdir()
-    block = np.tile(np.repeat(np.uint8([0, 40, 80, 120]), 1), (4, 1))  # mean 60
+    block = np.tile(np.repeat(np.uint8([0, 140, 180, 240]), 1), (4, 1))  # mean 140
     for path in (tmp_path / "masks_4").iterdir():
         path.unlink()
         whole = np.pad(np.tile(block, (8, 12)), ((0, odd), (0, odd)))
         write_png(tmp_path / "masks" / path.name, whole)
-    assert (load_photos(tmp_path).alpha == 60).all()
+    assert (load_photos(tmp_path).alpha == 140).all()
 
 
 def change(folder, rows):

@@ -342,6 +342,16 @@ def test_colours_that_are_multiplied_by_alpha_are_told(lit, caplog, straight):
     assert ("colours seem to be multiplied by alpha" in caplog.text) != straight
 
 
+def test_faint_masks_are_refused(lit):
+    for path in (lit / "masks").iterdir():
+        mask = np.asarray(Image.open(path)) // 4
+        save(path, mask + np.arange(40) % 20)
+    with pytest.raises(
+        DataError, match=r"expected masks .*, got a largest value of 82 of 255 in 8"
+    ):
+        load_photos(lit)
+
+
 # Photographs that EXIF says to turn
 
 

@@ -119,17 +119,17 @@ def test_a_mask_beside_the_photograph(tmp_path):
     write_nerf(tmp_path, written)
     for what in ("alpha", "mask"):  # the second is looked for first
         write_png(tmp_path / "test" / "p_000.png", written.pictures[0, ..., :3])
-        write_png(tmp_path / "test" / f"p_000_{what}.png", np.full((HEIGHT, WIDTH), 9, np.uint8))
-        assert load_photos(tmp_path, "test").alpha.unique().tolist() == [9]
-        write_png(tmp_path / "test" / "p_000_alpha.png", np.full((HEIGHT, WIDTH), 7, np.uint8))
+        write_png(tmp_path / "test" / f"p_000_{what}.png", np.full((HEIGHT, WIDTH), 209, np.uint8))
+        assert load_photos(tmp_path, "test").alpha.unique().tolist() == [209]
+        write_png(tmp_path / "test" / "p_000_alpha.png", np.full((HEIGHT, WIDTH), 207, np.uint8))
 
 
 def test_masks_in_a_folder_beside_that_of_the_photographs(tmp_path):
     written = scene(2)
     write_nerf(tmp_path, written)
     (tmp_path / "test_mask").mkdir()
-    write_png(tmp_path / "test_mask" / "p_000.png", np.full((HEIGHT, WIDTH), 9, np.uint8))
-    assert load_photos(tmp_path, "test").alpha.unique().tolist() == [9]
+    write_png(tmp_path / "test_mask" / "p_000.png", np.full((HEIGHT, WIDTH), 209, np.uint8))
+    assert load_photos(tmp_path, "test").alpha.unique().tolist() == [209]
     assert np.array_equal(load_photos(tmp_path).alpha[0], written.pictures[1, ..., 3])
 
 

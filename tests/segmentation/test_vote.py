@@ -80,6 +80,8 @@ def test_masks_that_show_nothing():
     cameras = cameras_around(12, 32)
     with pytest.raises(UserError, match="nothing in common"):
         vote.elect([torch.zeros(32, 32)] * 12, cameras, SMALL)
+    with pytest.raises(UserError, match="too faint or too few"):
+        vote.elect([torch.full((32, 32), 0.1)] * 12, cameras, SMALL)
 
 
 def test_votes_are_means_of_those_that_see_a_node():

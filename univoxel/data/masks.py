@@ -498,7 +498,7 @@ def made_upright(pairs: Sequence[tuple[Path, Path]]) -> bool | None:
 
 
 def require_fit(where: Path, views: Sequence[tuple[Tensor, Tensor]]) -> None:
-    """Raise where most masks are of what is not the object, or are mirrored or turned.
+    """Raise where masks are faint, or most are of what is not the object, mirrored or turned.
 
     Args:
         views: colours [H, W, 3] and coverage [H, W] of some photographs.
@@ -506,6 +506,12 @@ def require_fit(where: Path, views: Sequence[tuple[Tensor, Tensor]]) -> None:
     Raises:
         DataError: they are.
     """
+    largest = max(float(mask.max()) for _, mask in views)
+    if largest < 0.5 and len(views) >= FEWEST:
+        raise DataError(
+            f"{where}: expected masks that are white on the object, got a largest value of "
+            f"{255 * largest:.0f} of 255 in {len(views)} that were looked at: {WHITE}"
+        )
     inverted, ways = 0, []
     for color, mask in views:
         picture, mask = _small(color.float().mean(-1)), _small(mask)

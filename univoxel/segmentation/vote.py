@@ -89,6 +89,10 @@ def elect(
     smaller = [shrunk(mask, cfg.pixels // 2) for mask in small]
     vote = votes(smaller, cameras, second)
     threshold, _, _ = _compared(second, vote, smaller, cameras)
+    if float(vote.max()) < threshold:
+        raise UserError(
+            "the masks of the photographs are too faint or too few for any common shape"
+        )
     grid = _around(second, vote >= threshold, cfg.voxels**3)
     vote = votes(small, cameras, grid)
     threshold, usual, largest = _compared(grid, vote, small, cameras)
