@@ -7,9 +7,10 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from univoxel.commands.arguments import (
+from univoxel.cli.parsing import (
     AtOnce,
     Changes,
+    Command,
     Minutes,
     Run,
     Scenes,
@@ -17,7 +18,6 @@ from univoxel.commands.arguments import (
     check_minutes,
 )
 from univoxel.names import BOUNCES, LIGHTS, SAMPLES, LightName, PresetName, PresetOrAuto
-from univoxel.parsing import Command
 
 
 def submit(

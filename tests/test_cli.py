@@ -1,4 +1,4 @@
-"""The command line over stand-ins for the tasks: what is passed on, what a mistake prints."""
+"""The command line over stand-ins for the work: what is passed on, what a mistake prints."""
 
 import errno
 import importlib
@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 import univoxel
-from univoxel import commands, errors
-from univoxel.cli import SPINS, main
-from univoxel.commands import COMMANDS, LABORATORY, laboratory
+from univoxel import cli, errors
+from univoxel.cli import COMMANDS, LABORATORY, SPINS, laboratory, main
+from univoxel.cli.parsing import takes
 from univoxel.errors import (
     ExistingFile,
     MissingExtra,
@@ -27,6 +27,10 @@ from univoxel.errors import (
     UserError,
 )
 
+# What a command calls, by the module that holds it; and commands that do all themselves
+WORK = {"train": "univoxel.trainer", "poses": "univoxel.capture.poses"}
+WORK |= {"cutout": "univoxel.segmentation.cutout"}
+ALONE = ("demo", "export", "inspect", "view")
 KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, UserError)]
 
 
@@ -64,7 +68,7 @@ class Config:
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Replace config and tasks; every task call is noted as (name, args, kwargs)."""
+    """Replace config and work; every call is noted as (name, args, kwargs)."""
     noted = []
 
     def stand_in(module, **functions):
@@ -84,8 +88,19 @@ def calls(monkeypatch):
 
         return call
 
-    def replace(name, result, **others):
-        stand_in(f"univoxel.tasks.{name}", **{name: task(name, result)}, **others)
+    def replace(name, result=None, **others):
+        """In place of what a command calls, or of what it does itself."""
+        if name in WORK:
+            stand_in(WORK[name], **{name: task(name, result)})
+        elif name in ALONE:
+            command = takes(COMMANDS[name].record)(task(name, result))
+            monkeypatch.setitem(COMMANDS, name, command)
+        else:
+            give(name, **{name: task(name, result)}, **others)
+
+    def give(module, **functions):
+        for name, function in functions.items():
+            monkeypatch.setattr(f"univoxel.cli.{module}.{name}", function)
 
     def chosen(preset, minutes, data, out, light, varying):
         return Config(data, out, preset, light, varying, minutes or 4.0)
@@ -102,6 +117,7 @@ def calls(monkeypatch):
         return f"table of {found}"
 
     replace("train", Path("run"))
+    monkeypatch.setattr("univoxel.cli.train.with_page", lambda run: run)
     replace("poses", Path("scene"))
     made = types.SimpleNamespace(
         page=Path("mug/index.html"), mesh=Path("mug/mug.glb"), run=Path("mug/run")
@@ -109,14 +125,16 @@ def calls(monkeypatch):
     replace("capture", made)
     replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)
-    stand_in("univoxel.tasks.relight", relight_to_files=task("relight", None))
+    monkeypatch.setattr("univoxel.cli.relight.relight_to_files", task("relight"))
     replace("export", [Path("out.ply"), Path("out_lod1.ply")])
     replace("envmap", None)
     found = {"chosen": [{"said": "lobes 24 -> 12"}]}
     replace("info", found, tables=lambda found: ["parts", "sizes"])
     replace("demo", Path("demo/index.html"))
-    replace("view", Path("mug.html"), with_page=lambda run: run)
-    return types.SimpleNamespace(noted=noted, replace=replace, stand_in=stand_in, task=task)
+    replace("view", Path("mug.html"))
+    replace("inspect", Path("light.png"))
+    functions = {"replace": replace, "give": give, "stand_in": stand_in, "task": task}
+    return types.SimpleNamespace(noted=noted, **functions)
 
 
 def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
@@ -154,9 +172,9 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     ]
 
 
-def test_capture_until_a_step(calls, capsys):
+def test_capture_until_a_step(calls, monkeypatch, capsys):
     find = calls.task("find", Path("mug/cut"))
-    calls.stand_in("univoxel.tasks.capture", find_data=find)
+    monkeypatch.setattr("univoxel.cli.capture.find_data", find)
     assert main(["capture", "photos", "--out", "mug", "--until", "masks"]) == 0
     assert capsys.readouterr().out == "mug/cut\n"
     assert calls.noted[0][2] == {"masks": "auto", "until": "masks"}
@@ -218,9 +236,11 @@ def test_poses(calls, capsys):
     assert main(["poses", "film.mp4", "--out", "scene", *options, *more]) == 0
     fast = replace_fields(FAST, size=800, seed=3)
     out = Path("scene")
+    usual = {"keep_size": 2000, "keep_weak": False, "config": DEFAULTS}
+    asked = {"keep_size": 900, "keep_weak": True, "config": fast}
     assert calls.noted == [
-        ("poses", (Path("photos"), out, None, None, 2000, False, DEFAULTS), {}),
-        ("poses", (Path("film.mp4"), out, Path("m"), 0.5, 900, True, fast), {}),
+        ("poses", (Path("photos"), out, None, None), usual),
+        ("poses", (Path("film.mp4"), out, Path("m"), 0.5), asked),
     ]
     assert capsys.readouterr().out == "scene\nscene\n"
 
@@ -238,15 +258,13 @@ def test_sizes_of_poses_out_of_range(calls, capsys, option):
 
 def test_cutout(calls, capsys):
     assert main(["cutout", "photos", "--out", "cut", "--downscale", "2"]) == 0
-    given = {"downscale": 2, "allow_outside": False}
-    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "rembg"), given)]
+    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "rembg", 2, False), {})]
     assert capsys.readouterr().out == "cut\n"
 
 
 def test_cutout_from_masks(calls, capsys):
     assert main(["cutout", "photos", "--out", "cut", "--from", "masks"]) == 0
-    given = {"downscale": 0, "allow_outside": False}
-    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "masks"), given)]
+    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "masks", 0, False), {})]
 
 
 @pytest.mark.parametrize("command", ["train", "cutout"])
@@ -307,23 +325,20 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
 
 
 def test_eval(calls, capsys):
-    options = ["--samples", "8", "--bounces", "0", "--light-of", "r_7"]
-    options += ["--test-every", "16", "--background", "white", "--fit-light"]
+    options = ["--samples", "8", "--bounces", "0", "--test-every", "16"]
+    options += ["--background", "white", "--fit-light"]
     paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
     named = [str(part) for name, path in paths.items() for part in (f"--{name}", path)]
     assert main(["eval", "run", *named, *options]) == 0
     assert main(["eval", "run"]) == 0
     default = {"data": None, "save": None, "json": None, "samples": 64, "bounces": 2}
+    run = {"run": Path("run")}
     protocol = {"test_every": 16, "background": "white", "fit_light": True}
     default |= {"light_of": None, "test_every": None, "background": "black", "fit_light": False}
     assert "table of {'psnr': 31.25, 'views': 5}" in capsys.readouterr().out
     assert calls.noted == [
-        (
-            "evaluate",
-            (Path("run"),),
-            {**paths, "samples": 8, "bounces": 0, "light_of": "r_7", **protocol},
-        ),
-        ("evaluate", (Path("run"),), default),
+        ("evaluate", (), run | paths | {"samples": 8, "bounces": 0, "light_of": None} | protocol),
+        ("evaluate", (), run | default),
     ]
 
 
@@ -339,14 +354,15 @@ def test_relight_export_view_and_demo(calls, capsys):
     options |= {"quality": 90, "size": None, "origin": "world", "lods": 0}
     chosen_options = {"texture_format": "jpeg", "quality": 80}
     chosen_options |= {"size": 0.3, "origin": "bottom", "lods": 1}
-    served = {"host": "127.0.0.1", "port": 8080}
+    served = {"title": None, "host": "127.0.0.1", "port": 8080}
     (name, given, chosen), *others = calls.noted
     assert (name, given, chosen["cameras"], chosen["rotate"]) == ("relight", paths, "test", 90.0)
-    assert others == [
-        ("export", (Path("run"), Path("out.ply")), options),
-        ("export", (Path("run"), Path("out.ply")), options | chosen_options),
-        ("view", (Path("run"), Path("mug.html")), {"envmap": (paths[1],), "title": None} | served),
-        ("demo", (Path("demo"),), {}),
+    run, mesh = {"run": Path("run")}, {"mesh": Path("out.ply")}
+    assert [(name, vars(asked)) for name, (asked,), _ in others] == [
+        ("export", run | mesh | options),
+        ("export", run | mesh | options | chosen_options),
+        ("view", run | {"html": Path("mug.html"), "envmap": (paths[1],)} | served),
+        ("demo", {"out": Path("demo")}),
     ]
     printed = capsys.readouterr().out.split()
     levels = ["out.ply", "out_lod1.ply"]
@@ -355,14 +371,13 @@ def test_relight_export_view_and_demo(calls, capsys):
 
 def test_envmap(calls, capsys):
     assert main(["envmap", "run", "--out", "map.exr"]) == 0
-    assert calls.noted == [
-        ("envmap", (Path("run"), Path("map.exr")), {"height": 128, "light_of": None})
-    ]
+    options = {"height": 128, "light_of": None}
+    assert calls.noted == [("envmap", (), {"run": Path("run"), "out": Path("map.exr")} | options)]
     assert capsys.readouterr().out == "map.exr\n"
     found = types.SimpleNamespace(ball_psnr=31.24, brightest_degrees=4.0, mirror_psnr=18.06)
     calls.replace("envmap", found)
     assert main(["envmap", "run", "--out", "map.exr", "--height", "32", "--light-of", "2"]) == 0
-    assert calls.noted[-1][2] == {"height": 32, "light_of": "2"}
+    assert calls.noted[-1][2] | {"height": 32, "light_of": "2"} == calls.noted[-1][2]
     _, ball, mirror, brightest = capsys.readouterr().out.splitlines()
     assert "31.2 dB" in ball
     assert "18.1 dB" in mirror
@@ -371,9 +386,10 @@ def test_envmap(calls, capsys):
 
 def test_inspect(calls, tmp_path, capsys):
     out = tmp_path / "light.png"
-    calls.replace("inspect", out, parse_pixel=lambda text: text.split(","))
+    calls.replace("inspect", out)
     assert main(["inspect", "run", "--view", "r_1", "--pixel", "3,4", "--out", str(out)]) == 0
-    assert calls.noted == [("inspect", (Path("run"), "r_1", ["3", "4"], out), {"light_of": None})]
+    ((_, (asked,), _),) = calls.noted
+    assert (asked.run, asked.view, asked.pixel, asked.out) == (Path("run"), "r_1", "3,4", out)
     assert capsys.readouterr().out == f"{out}\n"
 
 
@@ -477,7 +493,7 @@ def test_the_package_speaks_through_its_logger(calls, capsys):
         logger.debug("nothing")
         return {"chosen": []}
 
-    calls.stand_in("univoxel.tasks.info", info=info, tables=lambda found: [])
+    calls.give("info", info=info, tables=lambda found: [])
     assert main(["info", "run"]) == 0
     assert capsys.readouterr().out == "3 pixels: see --masks auto\n"
     assert before == (logger.level, logger.handlers)
@@ -567,7 +583,7 @@ def test_the_laboratory_has_a_screen_of_its_own(capsys):
 
 @pytest.mark.parametrize("arguments", [["lab"], ["lab", "chart", "--help"], ["chart", "cup"]])
 def test_without_a_clone_there_is_no_laboratory(calls, monkeypatch, tmp_path, capsys, arguments):
-    monkeypatch.setattr(commands, "CLONE", tmp_path)
+    monkeypatch.setattr(cli, "CLONE", tmp_path)
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert err.startswith("univoxel: compare, chart, stress, submit measure the method and are not")
@@ -595,7 +611,7 @@ def said(capsys, calls, *options):
         logger.info("half", extra={"progress": True})
         return {"chosen": []}
 
-    calls.stand_in("univoxel.tasks.info", info=info, tables=lambda found: ["the table"])
+    calls.give("info", info=info, tables=lambda found: ["the table"])
     assert main(["info", "run", *options]) == 0
     return [stream.split("\n")[:-1] for stream in capsys.readouterr()]
 
@@ -651,8 +667,8 @@ def test_json_alone_on_stdout(capsys, calls, command):
         return {"chosen": []}
 
     task = {"info": "info", "eval": "evaluate"}[command]
-    table = {"tables": lambda found: ["t"], "table": lambda found: "t"}
-    calls.stand_in(f"univoxel.tasks.{task}", **{task: write}, **table)
+    table = {"tables": lambda found: ["t"]} if task == "info" else {"table": lambda found: "t"}
+    calls.give(task, **{task: write}, **table)
     assert main([command, "run", "--json", "-"]) == 0
     assert capsys.readouterr() == ('{"psnr": 30}\n', "a remark\n")
 

@@ -8,11 +8,11 @@ import pytest
 from analytic import write_scene
 
 import univoxel
+from univoxel.cli.info import info
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.lights import SGConfig
 from univoxel.ops import PointLight
 from univoxel.scene import SceneConfig
-from univoxel.tasks.info import info
 
 PRINTING = {"cli.py", "commands"}  # the command line
 

@@ -14,10 +14,12 @@ import typing
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from tyro.conf import Positional
+
 
 def command_line() -> str:
     """A section for each command: what it does, and a table of its options."""
-    from univoxel.commands import COMMANDS, laboratory
+    from univoxel.cli import COMMANDS, laboratory
 
     named = COMMANDS | {f"lab {name}": function for name, function in laboratory().items()}
     return "\n\n".join(_command(name, function) for name, function in named.items())
@@ -60,10 +62,14 @@ GENERATORS: dict[str, Callable[[], str]] = {
 
 # Command line
 
+(POSITIONAL,) = Positional[int].__metadata__
+
 
 def _command(name: str, function: Callable) -> str:
+    from univoxel.cli.parsing import documentation
+
     hints = typing.get_type_hints(function, include_extras=True)
-    summary, description, meanings = _parts(inspect.getdoc(function) or "")
+    summary, description, meanings = _parts(documentation(function))
     rows = []
     for parameter in inspect.signature(function).parameters.values():
         option, values = _option(parameter, hints[parameter.name])
@@ -78,9 +84,10 @@ def _option(parameter: inspect.Parameter, hint: Any) -> tuple[str, str]:
     metavar = next((m.metavar for m in _metadata(hint) if getattr(m, "metavar", None)), None)
     kinds = list(_leaves(hint))
     choices = [str(c) for kind in kinds for c in typing.get_args(kind) if _is_literal(kind)]
-    if parameter.kind is parameter.POSITIONAL_ONLY:
+    if parameter.kind is parameter.POSITIONAL_ONLY or POSITIONAL in _metadata(hint):
         return f"`{metavar or parameter.name.upper()}`", ""
-    flag = "--" + parameter.name.replace("_", "-")
+    named = next((m.name for m in _metadata(hint) if getattr(m, "name", None)), parameter.name)
+    flag = "--" + named.replace("_", "-")
     if kinds == [bool]:
         return f"`{flag}`", "a flag"
     if choices and metavar is None:
