@@ -18,14 +18,14 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 36_500,
+    "lines of the package": 36_300,
     "lines of the laboratory": 3_100,
     "lines of tests": 36_700,
     "modules of the package": 261,
-    "loose modules at the top": 36,
+    "loose modules at the top": 35,
     "configuration fields": 131,
     "fields that nothing sets": 0,
-    "layers": 16,
+    "layers": 15,
     "imports that go up": 0,
     "circles": 0,
 }

@@ -16,7 +16,7 @@ from univoxel.data import load_photos
 from univoxel.data.shots import read_photo
 from univoxel.errors import DataError, MissingExtra
 from univoxel.segmentation import cutout as task
-from univoxel.segmentation.config import VoteConfig
+from univoxel.segmentation.vote import VoteConfig
 
 VIEWS, SIZE = 16, 40
 SMALL = VoteConfig(voxels=40, first_voxels=20)

@@ -128,10 +128,9 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     surveyed = views.survey_of(scene, run, data)
     mesh = extract_mesh(scene) if truth.maps or truth.points is not None else None
     scales = albedo_scales(scene, photos)
-    light = asked.samples, asked.bounces
-    relighting = views.relighting_of(scene, mesh, truth, scales, *light)
-    protocol = views.Protocol(asked.background, asked.fit_light)
-    found = views.measure_views(scene, photos, truth, scales, relighting, surveyed, protocol, save)
+    relighting = views.relighting_of(scene, mesh, truth, scales, asked.samples, asked.bounces)
+    how = {"background": asked.background, "fit_light": asked.fit_light, "save": save}
+    found = views.measure_views(scene, photos, truth, scales, relighting, surveyed, **how)
     result = {key: fmean(values) if values else None for key, values in found.measures.items()}
     result |= {
         "chamfer": mesh_chamfer(mesh, truth.points),

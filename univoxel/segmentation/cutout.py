@@ -24,11 +24,10 @@ from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.errors import DataError, ExistingFile
 from univoxel.names import GROUND, REMBG
-from univoxel.segmentation.config import VoteConfig
 from univoxel.segmentation.ground import find_ground, ground_mask
 from univoxel.segmentation.mask_sheet import MaskTile, darkened, mask_sheet, worst_first, write_page
 from univoxel.segmentation.network import network
-from univoxel.segmentation.vote import BESIDE, MISSING, VOTE, Verdict, elect, judge
+from univoxel.segmentation.vote import BESIDE, MISSING, VOTE, Verdict, VoteConfig, elect, judge
 
 # Photographs at least, for a vote; fewer do not outvote one another
 PHOTOGRAPHS = 12
