@@ -18,8 +18,8 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 36_300,
-    "lines of the laboratory": 3_100,
+    "lines of the package": 36_330,
+    "lines of the laboratory": 3_000,
     "lines of tests": 36_700,
     "modules of the package": 261,
     "loose modules at the top": 35,

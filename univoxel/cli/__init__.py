@@ -18,8 +18,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional
-
 from univoxel import __version__
 from univoxel.cli import (
     batch,
@@ -57,7 +55,9 @@ OPTIONS = {"changes": "--set", "source": "--from"}
 SPINS = "3000"
 
 
-def completion(shell: Annotated[Positional[Shell], parsing.written("bash|zsh|fish")], /) -> None:
+def completion(
+    shell: Annotated[Shell, parsing.written("bash|zsh|fish", positional=True)], /
+) -> None:
     """Print what makes a shell complete commands, options and choices.
 
     For bash, in ~/.bashrc: eval "$(univoxel completion bash)"

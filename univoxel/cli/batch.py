@@ -9,9 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import rich
-from rich.table import Table
-
 from univoxel import machine
 from univoxel.cli.parsing import (
     STDOUT,
@@ -31,6 +28,8 @@ from univoxel.files import read_json
 from univoxel.names import BATCH_STEPS, SAMPLES, USUAL_STEPS, BatchStep, LightName, PresetOrAuto
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from univoxel.batch.results import SceneResult
     from univoxel.config import TrainConfig
     from univoxel.jobs.job import Job, Result, Step
@@ -122,6 +121,8 @@ def command(asked: BatchOptions) -> None:
     NIGHT/SCENE has what was made, NIGHT/logs what was said. Ends with exit code 2 where a scene
     failed.
     """
+    import rich
+
     check_minutes(asked.minutes)
     with json_file(asked.json) as file:
         results = batch(replace(asked, json=file), machine.threads_asked())
@@ -252,6 +253,8 @@ def check(results: Sequence[SceneResult]) -> None:
 
 def table(results: Sequence[SceneResult]) -> Table:
     """What came out, as the command prints it."""
+    from rich.table import Table
+
     rows = Table("scene", "state", "verdict")
     for head in ("novel views, dB", "doubt of albedo", "seconds"):
         rows.add_column(head, justify="right")

@@ -8,10 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional
-
 from univoxel import steps
-from univoxel.bars import track
 from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.cli.demo import MAPS, SCENE
 from univoxel.cli.evaluate import evaluate
@@ -42,7 +39,7 @@ STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
 
 @dataclass(frozen=True)
 class CaptureOptions:
-    photographs: Annotated[Positional[Path], written("PHOTOS")]
+    photographs: Annotated[Path, written("PHOTOS", positional=True)]
     """what to begin with: a folder of photographs or a video; photographs with cameras, as train
     reads them; or the folder of a trained run"""
     out: Annotated[Path, written("DIR")]
@@ -276,6 +273,7 @@ def _masks_before_cameras(project: Project, given: Given, masks: str | Path) -> 
     import torch
     from PIL import Image
 
+    from univoxel.bars import track
     from univoxel.capture.photographs import read_upright, require_readers
     from univoxel.capture.poses import folders_of, photographs_of
     from univoxel.segmentation.network import network

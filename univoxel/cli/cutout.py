@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional
-
 from univoxel.cli.parsing import DownscaleBy, check_downscale, takes, written
 
 
 @dataclass(frozen=True)
 class CutoutOptions:
-    data: Annotated[Positional[Path], written("DATA")]
+    data: Annotated[Path, written("DATA", positional=True)]
     """folder of the photographs and their cameras; masks in it are not looked at"""
     out: Annotated[Path, written("DIR")]
     """folder to write"""

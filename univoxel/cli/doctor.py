@@ -10,16 +10,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-import rich
-from rich.table import Table
-from rich.text import Text
-
 from univoxel import __version__, machine
 from univoxel.cli.parsing import STDOUT, JsonFile, json_file, takes
 from univoxel.errors import MissingNative
 from univoxel.files import replacing
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from univoxel.ops import NativeStatus
 
 State: TypeAlias = Literal["good", "look", "bad"]  # bad: training is refused
@@ -54,6 +52,8 @@ def command(asked: DoctorOptions) -> None:
     Processor and the kernels built for it, Embree, torch, OpenMP, threads, memory, extras. Ends
     with exit code 2 where training would be refused.
     """
+    import rich
+
     findings = look()
     with json_file(asked.json) as file:
         if file is not None:
@@ -157,6 +157,9 @@ def extra_findings() -> list[Finding]:
 
 def table(findings: Sequence[Finding]) -> Table:
     """The findings as the command prints them, what to do under each."""
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")

@@ -5,11 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from json import dumps
 from pathlib import Path
-from statistics import fmean
 from typing import TYPE_CHECKING, Annotated, Any
-
-import rich
-from rich.table import Table
 
 from univoxel.cli.parsing import (
     STDOUT,
@@ -27,6 +23,8 @@ from univoxel.files import replacing
 from univoxel.names import BOUNCES, SAMPLES, Behind
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from univoxel.scene import Scene
 
 
@@ -77,6 +75,8 @@ class EvaluateOptions:
 @takes(EvaluateOptions)
 def command(asked: EvaluateOptions) -> None:
     """Measure a run on the test views and print the table."""
+    import rich
+
     with json_file(asked.json) as file:
         measures = evaluate(**vars(replace(asked, json=file)))
     if asked.json != STDOUT:
@@ -105,6 +105,8 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
         UserError: an argument out of range; light_of is no training view, or light does not vary.
         OSError: a result cannot be written.
     """
+    from statistics import fmean
+
     from univoxel.checkpoint import load_checkpoint
     from univoxel.evaluation import views
     from univoxel.evaluation.measures import albedo_scales, doubt_correlation, mesh_chamfer
@@ -148,6 +150,8 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
 
 def table(result: dict[str, float | int | None]) -> Table:
     """The measures as the command prints them."""
+    from rich.table import Table
+
     from univoxel.evaluation.measures import MEASURES
 
     rows = Table("measure", "meaning", "value", title="Test views")

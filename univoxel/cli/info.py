@@ -9,16 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import rich
-from rich.table import Table
-from rich.text import Text
-
 from univoxel.cli.parsing import STDOUT, File, JsonFile, Run, json_file, takes, written
 from univoxel.errors import UserError
 from univoxel.files import replacing
 
 if TYPE_CHECKING:
     import numpy as np
+    from rich.table import Table
 
     from univoxel.scene import Scene
 
@@ -69,6 +66,9 @@ def command(asked: InfoOptions) -> None:
     Parameters and bytes by part, and sizes. Also whether points that are matched between the
     photographs lie where the cameras put them.
     """
+    import rich
+    from rich.text import Text
+
     with json_file(asked.json) as file:
         found = info(asked.run, json=file, picture=asked.picture)
     if asked.json == STDOUT:
@@ -198,6 +198,8 @@ def facts(scene: Scene, parts: dict[str, Part], state: dict[str, Any]) -> dict[s
 
 def tables(found: dict[str, Any]) -> Iterable[Table | str]:
     """The facts as the command prints them."""
+    from rich.table import Table
+
     yield found["said"]
     table = Table("part", "parameters", "bytes", "share", title="Model")
     for column in table.columns[1:]:

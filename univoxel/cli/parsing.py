@@ -13,23 +13,22 @@ import inspect
 import io
 import itertools
 import re
+import sys
 import tempfile
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, ParamSpec, TypeAlias, TypeVar, Union, get_type_hints
-
-import tyro
-from tyro.conf import (
-    ConsolidateSubcommandArgs,
-    FlagCreatePairsOff,
-    OmitArgPrefixes,
-    OmitSubcommandPrefixes,
-    Positional,
-    UseAppendAction,
-    arg,
-    subcommand,
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    ParamSpec,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_type_hints,
 )
 
 from univoxel.errors import UserError
@@ -44,25 +43,33 @@ LAB = "lab"  # the word before commands of the laboratory
 WIDTH = 79  # of the overview
 
 
-def written(metavar: str | None = None, default: str | None = None, name: str | None = None) -> Any:
-    """How help shows an option: what it takes, its default in words, and its name if not the
-    field's."""
-    hint = None if default is None else f"(default: {default})"
-    return arg(name=name, metavar=metavar, help_behavior_hint=hint)
+@dataclass(frozen=True)
+class Written:
+    """How an option is written, and shown in help."""
+
+    metavar: str | None = None  # what it takes
+    hint: str | None = None  # what help says of its default
+    name: str | None = None  # without dashes, if it is not the field's
+    positional: bool = False
+    repeatable: bool = False
+
+
+def written(metavar: str | None = None, default: str | None = None, **other: Any) -> Written:
+    """The same with a default in words."""
+    hint = {} if default is None else {"hint": f"(default: {default})"}
+    return Written(metavar, **hint, **other)
 
 
 # Options of several commands
 File: TypeAlias = Path | str  # text in the library alone: the command line makes paths
-Run: TypeAlias = Annotated[Positional[File], written("RUN")]
+Run: TypeAlias = Annotated[File, written("RUN", positional=True)]
 AtOnce: TypeAlias = Annotated[int, written("N")]
 Scheduler: TypeAlias = Annotated[str | None, written("ADDRESS", "this machine")]
 Scenes: TypeAlias = Annotated[
-    Positional[tuple[Path, ...]],
-    arg(metavar="SCENE [SCENE ...]", help_behavior_hint="(required)"),
+    tuple[Path, ...], Written("SCENE [SCENE ...]", "(required)", positional=True)
 ]
 Changes: TypeAlias = Annotated[
-    UseAppendAction[tuple[str, ...]],
-    arg(name="set", metavar="FIELD=VALUE", help_behavior_hint="(repeatable)"),
+    tuple[str, ...], Written("FIELD=VALUE", "(repeatable)", "set", repeatable=True)
 ]
 Minutes: TypeAlias = Annotated[float | None, written("MINUTES", "none")]
 ConfigFile: TypeAlias = Annotated[Path | None, written("FILE", "what --preset says")]
@@ -120,11 +127,16 @@ def parse(
         near = difflib.get_close_matches(name, commands, n=1)
         perhaps = f"; perhaps you meant {near[0]}" if near else ""
         raise Usage(f"no command {name!r}{perhaps}; see univoxel {prefix}--help")
+    import tyro
+
     program, said = f"univoxel {prefix}{name}", io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             run, common = tyro.cli(
-                deferred(commands[name]), prog=program, args=rest, config=(FlagCreatePairsOff,)
+                deferred(commands[name]),
+                prog=program,
+                args=rest,
+                config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as end:
         if not end.code:
@@ -160,11 +172,15 @@ def takes(
                 return function(asked)
 
         call.__signature__ = inspect.signature(record)  # pyright: ignore[reportAttributeAccessIssue]
-        call.__annotations__ = get_type_hints(record, include_extras=True)
         call.record = record  # pyright: ignore[reportAttributeAccessIssue]
         return call
 
     return made
+
+
+def hints_of(command: Command) -> dict[str, Any]:
+    """Types of a command's arguments, with what is said of them; only now, as it takes a while."""
+    return get_type_hints(getattr(command, "record", command), include_extras=True)
 
 
 def documentation(command: Command) -> str:
@@ -177,12 +193,19 @@ def documentation(command: Command) -> str:
 
 
 def meanings(record: type) -> dict[str, str]:
-    """What stands under each field of a record, in one line."""
+    """What stands under each field of a record, in one line; nothing where there is no source.
+
+    Args:
+        record: a class that stands in one file with its bases.
+    """
+    try:
+        tree = ast.parse(inspect.getsource(sys.modules[record.__module__]))
+    except OSError:
+        return {}
+    bodies = {node.name: node.body for node in tree.body if isinstance(node, ast.ClassDef)}
     found = {}
     for kind in record.__mro__[-2::-1]:  # bases first, as their fields are
-        tree = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
-        assert isinstance(tree, ast.ClassDef)
-        for pair in itertools.pairwise(tree.body):
+        for pair in itertools.pairwise(bodies[kind.__name__]):
             match pair:
                 case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
                     found[name] = " ".join(text.split())
@@ -192,22 +215,38 @@ def meanings(record: type) -> dict[str, str]:
 def deferred(command: Command) -> Callable[..., tuple[functools.partial[Result], Any]]:
     """A function of the same signature, and the common options, that returns the call."""
 
-    def prepare(*args, common: Any, **kwargs):
-        return functools.partial(command, *args, **kwargs), common
+    def prepare(*args, quiet: bool, verbose: bool, threads: int | None, **kwargs):
+        return functools.partial(command, *args, **kwargs), Common(quiet, verbose, threads)
 
-    hints = get_type_hints(command, include_extras=True)
-    options = inspect.Parameter(
-        "common",
-        inspect.Parameter.KEYWORD_ONLY,
-        default=Common(),
-        annotation=Annotated[Common, OmitArgPrefixes],
-    )
+    common = [
+        p.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for p in inspect.signature(Common).parameters.values()
+    ]
+    hints = hints_of(command) | get_type_hints(Common, include_extras=True)
+    hints = {name: _for_tyro(hint) for name, hint in hints.items()}
     signature = inspect.signature(command)
-    own = [p.replace(annotation=hints[p.name]) for p in signature.parameters.values()]
-    prepare.__signature__ = signature.replace(parameters=[*own, options])
-    prepare.__annotations__ = hints | {"common": options.annotation}
-    prepare.__doc__, prepare.__name__ = documentation(command), command.__name__
+    every = [*signature.parameters.values(), *common]
+    every = [p.replace(annotation=hints[p.name]) for p in every]
+    prepare.__signature__ = signature.replace(parameters=every)
+    prepare.__annotations__ = hints
+    said = (f"    {name}: {text}" for name, text in meanings(Common).items())
+    prepare.__doc__, prepare.__name__ = "\n".join([documentation(command), *said]), "command"
     return prepare
+
+
+def _for_tyro(hint: Any) -> Any:
+    """A type with how it is written, as tyro is told it."""
+    from tyro.conf import Positional, UseAppendAction, arg
+
+    found = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, Written)]
+    if not found:
+        return hint
+    kind, (mark,) = get_args(hint)[0], found
+    if mark.positional:
+        kind = Positional[kind]
+    if mark.repeatable:
+        kind = UseAppendAction[kind]
+    return Annotated[kind, arg(name=mark.name, metavar=mark.metavar, help_behavior_hint=mark.hint)]
 
 
 def gist(box: str) -> str:
@@ -244,6 +283,9 @@ def completion(shell: Shell, commands: Mapping[str, Command], lab: Mapping[str, 
         lab: commands of the laboratory; none where it is not there.
     """
 
+    import tyro
+    from tyro.conf import ConsolidateSubcommandArgs, FlagCreatePairsOff, OmitSubcommandPrefixes
+
     def laboratory(command):
         """Commands of the laboratory."""
 
@@ -264,6 +306,8 @@ def completion(shell: Shell, commands: Mapping[str, Command], lab: Mapping[str, 
 
 def _union(commands: Mapping[str, Command]) -> Any:
     """A type whose values are commands, for tyro."""
+    from tyro.conf import subcommand
+
     kinds = [
         Annotated[Any, subcommand(name, constructor=command if name == LAB else deferred(command))]
         for name, command in commands.items()

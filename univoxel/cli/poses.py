@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional
-
 from univoxel.cli.parsing import takes, written
 from univoxel.errors import UserError
 from univoxel.names import FEATURE_SIZE, KEEP_SIZE
@@ -15,7 +13,7 @@ from univoxel.names import FEATURE_SIZE, KEEP_SIZE
 
 @dataclass(frozen=True)
 class PosesOptions:
-    photographs: Annotated[Positional[Path], written("PHOTOS")]
+    photographs: Annotated[Path, written("PHOTOS", positional=True)]
     """folder of JPEG, PNG, TIFF, WebP, HEIC or RAW, held either way; or a video"""
     out: Annotated[Path, written("SCENE")]
     """folder to write; its folder sfm/ keeps the steps and is of no use afterwards"""

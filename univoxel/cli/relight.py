@@ -8,8 +8,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import UseAppendAction
-
 from univoxel.cli.parsing import Run, takes, written
 from univoxel.errors import UserError
 from univoxel.names import BOUNCES, ELEVATION, SAMPLES, Animation, Background, Ground
@@ -49,14 +47,14 @@ class RelightOptions:
 
     # In the library the first four may be objects too: `Sun`, `PointLight`, `Cameras`, a number
     suns: Annotated[
-        UseAppendAction[tuple[tuple[float, ...], ...]],
-        written("AZIMUTH ELEVATION IRRADIANCE [ANGLE]", name="sun"),
+        tuple[tuple[float, ...], ...],
+        written("AZIMUTH ELEVATION IRRADIANCE [ANGLE]", name="sun", repeatable=True),
     ] = ()
     """a far light: degrees from +X counter-clockwise and above the horizon, irradiance, degrees
     across (0.53 if not given; 0: hard shadows); repeatable"""
     point_lights: Annotated[
-        UseAppendAction[tuple[tuple[float, float, float, float], ...]],
-        written("X Y Z INTENSITY", name="point"),
+        tuple[tuple[float, float, float, float], ...],
+        written("X Y Z INTENSITY", name="point", repeatable=True),
     ] = ()
     """a near light: where it stands, irradiance at distance 1; repeatable"""
     cameras: Annotated[str, written("test|orbit|FILE")] = "test"

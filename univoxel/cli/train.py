@@ -6,8 +6,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional
-
 from univoxel.cli.parsing import (
     Changes,
     ConfigFile,
@@ -45,7 +43,7 @@ OWN = ("data", "out", "config", "minutes", "downscale", "allow_outside", "seed",
 class TrainOptions:
     """What is trained, and how; `univoxel.train` takes them too."""
 
-    data: Annotated[Positional[File], written("DATA")]
+    data: Annotated[File, written("DATA", positional=True)]
     """folder of the photographs and their cameras"""
     out: Annotated[File, written("RUN")]
     """folder that the run is written to"""
