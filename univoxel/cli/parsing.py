@@ -171,8 +171,9 @@ def takes(
             with torch.no_grad():
                 return function(asked)
 
-        call.__signature__ = inspect.signature(record)  # pyright: ignore[reportAttributeAccessIssue]
-        call.record = record  # pyright: ignore[reportAttributeAccessIssue]
+        result = function.__annotations__.get("return")
+        signature = inspect.signature(record).replace(return_annotation=result)
+        vars(call).update(__signature__=signature, record=record)
         return call
 
     return made
