@@ -23,12 +23,12 @@ from made import made
 from lab import plots
 from lab.record import result_text
 from univoxel.checkpoint import FILE
+from univoxel.cli.evaluate import evaluate
+from univoxel.cli.info import info
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.files import replacing
 from univoxel.presets import preset, with_field
-from univoxel.tasks.evaluate import evaluate
-from univoxel.tasks.info import info
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 
 SETTINGS = ["dense", "sparse", "hash", "adaptive"]
 PANELS = [plots.NVS, plots.ALBEDO, plots.RELIT]

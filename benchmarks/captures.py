@@ -19,11 +19,11 @@ from typing import Any
 from made import made
 
 from lab.record import result_text
+from univoxel.capture.poses import poses
 from univoxel.checkpoint import FILE
+from univoxel.cli.evaluate import evaluate
 from univoxel.presets import preset
-from univoxel.tasks.evaluate import evaluate
-from univoxel.tasks.poses import poses
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 
 FIELD = {"test_every": 16, "background": "white"}  # its protocol
 COLUMNS = [

@@ -34,7 +34,7 @@ from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
-from univoxel.tasks.cutout import GROUND, REMBG, cutout
+from univoxel.segmentation.cutout import GROUND, REMBG, cutout
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "tests"))

@@ -36,10 +36,10 @@ from PIL import Image
 
 import univoxel
 from lab.record import result_text
+from univoxel.capture.poses import poses
 from univoxel.data.colmap import read_images
 from univoxel.data.shots import TEST_EVERY
 from univoxel.data.transforms import write_cameras
-from univoxel.tasks.poses import poses
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "tests"))

@@ -26,13 +26,13 @@ from varying import exposed
 
 from lab.record import result_text
 from univoxel.checkpoint import FILE
+from univoxel.cli.evaluate import evaluate
 from univoxel.config import LossConfig, TrainConfig, save_config
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.files import replacing
 from univoxel.presets import preset
-from univoxel.tasks.evaluate import evaluate
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 
 matplotlib.use("agg")
 import matplotlib.pyplot as plt

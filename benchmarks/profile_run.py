@@ -2,7 +2,7 @@
 
     python benchmarks/profile_run.py SCENE [--preset fast] [--part 6] [--cpu]
 
-`univoxel.tasks.train` itself runs; what it calls is timed where it is called. Of every 16th
+`univoxel.trainer` itself runs; what it calls is timed where it is called. Of every 16th
 backward pass the profiler says which part of the forward pass its nodes belong to; the time of all
 of them is divided in these proportions.
 """
@@ -23,13 +23,13 @@ from made import made
 from train_step import OTHER, STAGES, Clock
 
 from lab.record import result_text
+from univoxel import trainer
 from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.fields.field import Field
 from univoxel.joint import observations, stage
 from univoxel.ops import VisibilityScene
 from univoxel.preparation import prepare
 from univoxel.presets import chosen
-from univoxel.tasks import train
 from univoxel.training import loop, patches
 
 HERE = Path(__file__).parent
@@ -42,9 +42,9 @@ ONCE = {
     "joint: Newton": [(stage, "newton_round_")],
     "joint: metal decision": [(stage, "find_metal")],
     "held-out rays": [(loop, "held_out_psnr")],
-    "previews": [(train, "preview")],
-    "checkpoints": [(train, "save_scene"), (loop, "save_scene")],
-    "trust": [(train, "save_trust")],
+    "previews": [(trainer, "preview")],
+    "checkpoints": [(trainer, "save_scene"), (loop, "save_scene")],
+    "trust": [(trainer, "save_trust")],
 }  # seconds of a stage whatever the number of its steps
 EVERY = 16  # backward passes of which one is divided
 START = "before"  # loading, hull; also what lies between the stages
@@ -55,7 +55,7 @@ PARTS = {
     "hull": [(prepare, name) for name in ("fitted_masks", "weighed", "visual_hull")],
     "carving": [(prepare, "carve_within_time")],
     "cameras": [(prepare, "registered_poses")],
-    "loading": [(train, "load_photos")],
+    "loading": [(trainer, "load_photos")],
     "mesh for rays": [(VisibilityScene, "__init__")],
     "patches": [(patches, "comparable"), (patches, "disagreement")],
     **ONCE,
@@ -155,11 +155,11 @@ def profile(cfg: TrainConfig, now: Callable[[], float] = time.perf_counter) -> d
         for owner, attribute in places:
             patch(owner, attribute, lambda f, name=name: clock.timed(name, f))
     patch(torch.Tensor, "backward", clock.backward_pass)
-    patch(train, "run_stage", clock.stage)
+    patch(trainer, "run_stage", clock.stage)
     patch(stage, "solve", clock.stage)
     begin = now()
     try:
-        train.train(cfg)
+        trainer.train(cfg)
         clock.enter(START)
     finally:
         for owner, attribute, original in originals:

@@ -30,6 +30,7 @@ from univoxel import lights
 from univoxel.assets.bake import with_materials
 from univoxel.camera import image_rays
 from univoxel.checkpoint import load_scene, save_scene
+from univoxel.cli.evaluate import evaluate
 from univoxel.color import linear_to_srgb
 from univoxel.config import JointConfig, StageConfig, TrainConfig, save_config
 from univoxel.data import load_photos, load_relit, load_truth, relight_maps
@@ -49,8 +50,7 @@ from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, relight_surface, traced_mesh
 from univoxel.scene import Scene
 from univoxel.sphere import latlong_directions, texel_solid_angles
-from univoxel.tasks.evaluate import evaluate
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 
 TERMS = ("none", "geometry", "light", "both")
 NEIGHBOURS = 4  # samples of the surface whose triangles a node is measured to

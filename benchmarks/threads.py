@@ -29,13 +29,13 @@ def measure(scene: Path, preset: str, folder: Path, threads: int) -> list[list]:
     """Name, seconds on the clock and seconds of the processor of each stage of a training here."""
     import torch
 
+    from univoxel import trainer
     from univoxel.config import JointConfig
     from univoxel.presets import chosen
-    from univoxel.tasks import train
 
     torch.set_num_threads(threads)
     cfg = chosen(preset, LIMIT, scene, folder)
-    run_stage, spent = train.make_stage_, []
+    run_stage, spent = trainer.make_stage_, []
 
     def now() -> tuple[float, float]:
         return time.perf_counter(), time.process_time()
@@ -50,9 +50,9 @@ def measure(scene: Path, preset: str, folder: Path, threads: int) -> list[list]:
             name = f"{'refit' if stage.refit else 'grid'}, {stage.voxels:g} M"
         spent.append([f"{index + 1}: {name}", *(b - a for a, b in zip(begin, now(), strict=True))])
 
-    train.make_stage_ = timed
+    trainer.make_stage_ = timed
     begin = now()
-    train.train(cfg)
+    trainer.train(cfg)
     whole = [b - a for a, b in zip(begin, now(), strict=True)]
     rest = [w - sum(s[1 + i] for s in spent) for i, w in enumerate(whole)]
     return [*spent, [REST, *rest], ["whole", *whole]]

@@ -2,7 +2,7 @@
 
     python benchmarks/train_step.py [--rays 4096] [--out benchmarks/results/train_step.json]
 
-The bundled scene is trained natively for some steps, then the loop of univoxel.tasks.train itself
+The bundled scene is trained natively for some steps, then the loop of univoxel.trainer itself
 runs on, once on each backend: its stages are timed where they are called. With the kernels the
 backward pass is divided too: a node belongs to the stage in which its forward was called. The
 references' is not: under the profiler that this takes their memory grew past 20 GB.

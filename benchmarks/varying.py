@@ -31,6 +31,7 @@ from torch.nn.functional import normalize
 from lab.record import result_text
 from univoxel.camera import image_rays
 from univoxel.checkpoint import FILE, load_scene
+from univoxel.cli.evaluate import evaluate
 from univoxel.color import linear_to_srgb, luminance
 from univoxel.data import Photos, load_photos, load_truth
 from univoxel.data.images import write_png
@@ -41,8 +42,7 @@ from univoxel.files import replacing
 from univoxel.presets import preset
 from univoxel.records import Mesh, Surface
 from univoxel.render.relight import Lighting, relight_surface, rotated, traced_mesh
-from univoxel.tasks.evaluate import evaluate
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 
 # kind: what it is compared with, and the models that are trained on it
 KINDS = {

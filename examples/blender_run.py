@@ -49,9 +49,9 @@ def prepare(run, folder):
     from PIL import Image
 
     import univoxel
+    from univoxel.cli.envmap import envmap
     from univoxel.color import linear_to_srgb
     from univoxel.run import photos_of
-    from univoxel.tasks.envmap import envmap
 
     found = univoxel.open_run(run)
     (folder / "photographs").mkdir(parents=True, exist_ok=True)

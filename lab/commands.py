@@ -5,27 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import arg
-
-from univoxel.commands.arguments import (
+from univoxel.cli.parsing import (
     AtOnce,
     Changes,
+    Command,
     Minutes,
     Run,
     Scenes,
     Scheduler,
     check_minutes,
+    written,
 )
 from univoxel.names import BOUNCES, LIGHTS, SAMPLES, LightName, PresetName, PresetOrAuto
-from univoxel.parsing import Command
 
 
 def submit(
     run: Run,
     /,
-    out: Annotated[Path, arg(metavar="DIR")],
-    samples: Annotated[int, arg(metavar="N")] = SAMPLES,
-    bounces: Annotated[int, arg(metavar="N")] = BOUNCES,
+    out: Annotated[Path, written("DIR")],
+    samples: Annotated[int, written("N")] = SAMPLES,
+    bounces: Annotated[int, written("N")] = BOUNCES,
 ) -> None:
     """Write what the benchmark of Stanford-ORB measures, of a run.
 
@@ -46,9 +45,9 @@ def submit(
 def compare(
     scenes: Scenes,
     /,
-    out: Annotated[Path, arg(metavar="DIR")],
+    out: Annotated[Path, written("DIR")],
     preset: PresetOrAuto = "auto",
-    light: Annotated[tuple[str, ...], arg(metavar="LIGHT [LIGHT ...]")] = LIGHTS,
+    light: Annotated[tuple[str, ...], written("LIGHT [LIGHT ...]")] = LIGHTS,
     minutes: Minutes = None,
     samples: int = SAMPLES,
     set: Changes = (),
@@ -84,13 +83,11 @@ def compare(
 def chart(
     scenes: Scenes,
     /,
-    out: Annotated[Path, arg(metavar="DIR")],
+    out: Annotated[Path, written("DIR")],
     preset: PresetName = "fast",
     light: LightName = "hybrid",
     quick: bool = False,
-    only: Annotated[
-        tuple[str, ...], arg(metavar="SETTING [SETTING ...]", help_behavior_hint="(default: all)")
-    ] = (),
+    only: Annotated[tuple[str, ...], written("SETTING [SETTING ...]", "all")] = (),
     samples: int = SAMPLES,
     set: Changes = (),
     jobs: AtOnce = 1,
@@ -124,21 +121,14 @@ def chart(
 
 
 def stress(
-    out: Annotated[Path, arg(metavar="DIR")],
+    out: Annotated[Path, written("DIR")],
     quick: bool = False,
-    only: Annotated[
-        tuple[str, ...], arg(metavar="AXIS [AXIS ...]", help_behavior_hint="(default: all)")
-    ] = (),
+    only: Annotated[tuple[str, ...], written("AXIS [AXIS ...]", "all")] = (),
     light: Annotated[
         tuple[str, ...],
-        arg(
-            metavar="LIGHT [LIGHT ...]",
-            help_behavior_hint="(default: sg sh envmap hybrid; with --quick: hybrid)",
-        ),
+        written("LIGHT [LIGHT ...]", "sg sh envmap hybrid; with --quick: hybrid"),
     ] = (),
-    seeds: Annotated[
-        int | None, arg(metavar="N", help_behavior_hint="(default: 3; with --quick: 1)")
-    ] = None,
+    seeds: Annotated[int | None, written("N", "3; with --quick: 1")] = None,
     set: Changes = (),
     jobs: AtOnce = 1,
     scheduler: Scheduler = None,

@@ -49,7 +49,7 @@ class Outcome:
     setting: str
     identity: dict[str, Any]  # what a later call must agree with to take this for its own; JSON
     # By the keys of evaluation.measures.MEASURES, steps_made (share of the planned ones), and
-    # map_*, the fields of tasks.envmap.Comparison
+    # map_*, the fields of evaluation.recovered_map.Comparison
     measures: Mapping[str, float | int | None] = dataclasses.field(default_factory=dict)
     log: list[dict[str, Any]] = dataclasses.field(
         default_factory=list

@@ -29,6 +29,7 @@ from torch import Tensor
 from univoxel.bars import track
 from univoxel.camera import Cameras, resize
 from univoxel.checkpoint import load_scene
+from univoxel.cli.export import export
 from univoxel.data import Photos
 from univoxel.data.images import write_exr
 from univoxel.data.maps import read_map
@@ -45,7 +46,6 @@ from univoxel.render.relight import Lighting, traced_mesh
 from univoxel.run import photos_of
 from univoxel.scene import Scene
 from univoxel.sphere import latlong_directions
-from univoxel.tasks.export import export
 
 SIZE = 512  # pixels along a side of the benchmark's pictures
 FILE = "submission.json"

@@ -17,13 +17,14 @@ from typing import Any
 
 from lab.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.checkpoint import load_checkpoint
+from univoxel.cli.envmap import envmap
+from univoxel.cli.evaluate import evaluate
 from univoxel.config import TrainConfig, check_same
 from univoxel.errors import UserError
+from univoxel.evaluation.recovered_map import Comparison
 from univoxel.jobs.job import Job
 from univoxel.machine import load
-from univoxel.tasks.envmap import Comparison, envmap
-from univoxel.tasks.evaluate import evaluate
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 
 JOB = "job"  # beginning of the names of its record, its lock and what it said
 RUN = "run"  # the training's own folder

@@ -22,10 +22,10 @@ LIMITS = {
     "lines of the laboratory": 3_100,
     "lines of tests": 37_500,
     "modules of the package": 261,
-    "loose modules at the top": 36,
+    "loose modules at the top": 35,
     "configuration fields": 131,
     "fields that nothing sets": 0,
-    "layers": 16,
+    "layers": 15,
     "imports that go up": 0,
     "circles": 0,
 }

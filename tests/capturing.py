@@ -13,10 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from univoxel import trainer
 from univoxel.capture import structure
 from univoxel.capture.config import CaptureConfig
-from univoxel.tasks import capture as task
-from univoxel.tasks import cutout, relight, train
+from univoxel.cli import capture as task
+from univoxel.data import images
+from univoxel.segmentation import cutout
 
 # Enough for pictures of this size
 CONFIG = CaptureConfig(features=1000, first_octave=0, exhaustive=10, partners=8)
@@ -43,11 +45,11 @@ def kill_in(step: str) -> None:
         case "masks":
             _kill_at(cutout, "write_photo", 5)
         case "training":  # the first stage is saved
-            _kill_at(train, "make_stage_", 1)
+            _kill_at(trainer, "make_stage_", 1)
         case "mesh":
             _kill_writing(".glb")
         case "pictures":
-            _kill_at(relight, "write_png", 1)
+            _kill_at(images, "write_png", 1)
         case "page":
             _kill_writing(".html")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 # anything goes that is no circle.
 LAYERS = [
     {"bars", "errors", "guard", "installation", "machine", "names", "records", "retired", "memmap"}
-    | {"threads", "files", "overrides", "validation", "jobs", "steps", "parsing"},
+    | {"threads", "files", "overrides", "validation", "jobs", "steps"},
     {"brdf", "camera", "color", "grid", "losses", "metrics", "orbit", "sphere"},
     {"ops"},
     {"envmap", "networks", "optim", "poses"},
@@ -20,14 +20,13 @@ LAYERS = [
     {"checkpoint", "run", "scene", "verdict"},
     {"assets", "config", "presets", "render"},
     {"capture", "preparation", "training"},
-    {"compression", "joint", "page", "segmentation"},
-    {"build", "confidence"},
+    {"compression", "joint", "page"},
+    {"build", "confidence", "segmentation"},
     {"pictures"},
     {"evaluation", "report", "viewer"},
-    {"batch"},
-    {"tasks"},
-    {"api", "commands"},
+    {"batch", "trainer"},
     {"cli"},
+    {"api"},
 ]
 
 # Of lab/, which imports from the package what it likes, and which the package does not import

@@ -95,6 +95,21 @@ def test_the_configuration_alone_is_enough_as_before(data, tmp_path, monkeypatch
     assert univoxel.train(dataclasses.replace(cfg), True) == tmp_path / "run"
 
 
+def test_options_of_the_command_are_arguments(monkeypatch):
+    asked = []
+    monkeypatch.setattr(api, "train_config", lambda cfg, **_: asked.append(cfg) or cfg.out)
+    monkeypatch.setattr(api, "Run", lambda path: path)
+    options = {"preset": "draft", "field": "sparse", "masks": "given", "seed": 3, "downscale": 2}
+    assert str(univoxel.train("photos", "run", **options, changes=("loss.radiance=2",))) == "run"
+    cfg = asked[0]
+    assert (cfg.masks, cfg.seed, cfg.downscale, cfg.loss.radiance) == ("given", 3, 2, 2.0)
+    assert cfg.stages[1].field == "sparse"
+    with pytest.raises(TypeError, match="colour"):
+        univoxel.train("photos", "run", colour="red")
+    with pytest.raises(TypeError, match="expected a configuration or preset, got both"):
+        univoxel.train(cfg, preset="draft")
+
+
 def test_what_is_wrong_is_one_line(data, tmp_path):
     with pytest.raises(TypeError, match="out must be the folder of the run"):
         univoxel.train(data)

@@ -1,7 +1,6 @@
-"""The command line over stand-ins for the tasks: what is passed on, what a mistake prints."""
+"""The command line over stand-ins for the work: what is passed on, what a mistake prints."""
 
 import errno
-import importlib
 import json
 import logging
 import os
@@ -9,16 +8,17 @@ import re
 import subprocess
 import sys
 import types
-from dataclasses import dataclass
+from dataclasses import fields
 from dataclasses import replace as replace_fields
 from pathlib import Path
 
 import pytest
 
 import univoxel
-from univoxel import commands, errors
-from univoxel.cli import SPINS, main
-from univoxel.commands import COMMANDS, LABORATORY, laboratory
+from univoxel import cli, errors
+from univoxel.cli import COMMANDS, LABORATORY, SPINS, laboratory, main
+from univoxel.cli.parsing import meanings, takes
+from univoxel.config import JointConfig
 from univoxel.errors import (
     ExistingFile,
     MissingExtra,
@@ -26,54 +26,19 @@ from univoxel.errors import (
     ProcessFailed,
     UserError,
 )
+from univoxel.presets import chosen
 
+# What a command calls, by the module that holds it; and commands that do all themselves
+WORK = {"train": "univoxel.trainer", "poses": "univoxel.capture.poses"}
+WORK |= {"cutout": "univoxel.segmentation.cutout"}
+ALONE = ("demo", "export", "inspect", "view")
 KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, UserError)]
-
-
-@dataclass(frozen=True)
-class LossConfig:
-    radiance: float = 1.0
-
-
-@dataclass(frozen=True)
-class StageConfig:
-    voxels: float = 1.0
-    rates: tuple[float, float] = (0.1, 0.01)
-    field: str = "dense"
-
-
-@dataclass(frozen=True)
-class Config:
-    data: Path
-    out: Path
-    preset: str
-    light: str
-    varying: str
-    minutes: float = 4.0
-    masks: str = "auto"
-    cameras: str = "auto"
-    downscale: int = 0
-    seed: int = 0
-    capacity: str = "as preset"
-    budget_mb: float | None = None
-    allow_outside: bool = False
-    metal: str = "auto"
-    loss: LossConfig = LossConfig()
-    stages: tuple[StageConfig, ...] = (StageConfig(), StageConfig())
 
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Replace config and tasks; every task call is noted as (name, args, kwargs)."""
+    """Replace the work; every call is noted as (name, args, kwargs)."""
     noted = []
-
-    def stand_in(module, **functions):
-        fake = types.ModuleType(module)
-        for name, function in functions.items():
-            setattr(fake, name, function)
-        monkeypatch.setitem(sys.modules, module, fake)
-        parent, _, leaf = module.rpartition(".")
-        monkeypatch.setattr(importlib.import_module(parent), leaf, fake, raising=False)
 
     def task(name, result=None):
         def call(*args, **kwargs):
@@ -84,24 +49,24 @@ def calls(monkeypatch):
 
         return call
 
-    def replace(name, result, **others):
-        stand_in(f"univoxel.tasks.{name}", **{name: task(name, result)}, **others)
+    def replace(name, result=None, **others):
+        """In place of what a command calls, or of what it does itself."""
+        if name in ALONE:
+            command = takes(COMMANDS[name].record)(task(name, result))
+            monkeypatch.setitem(COMMANDS, name, command)
+        else:
+            module = WORK.get(name, f"univoxel.cli.{name}")
+            give(module, **{name: task(name, result)}, **others)
 
-    def chosen(preset, minutes, data, out, light, varying):
-        return Config(data, out, preset, light, varying, minutes or 4.0)
-
-    def with_field(config, kind):
-        return replace_fields(config, stages=(config.stages[0], StageConfig(field=kind)))
-
-    def with_metal(config, metal):
-        return replace_fields(config, metal=metal)
-
-    stand_in("univoxel.presets", chosen=chosen, with_field=with_field, with_metal=with_metal)
+    def give(module, **functions):
+        for name, function in functions.items():
+            monkeypatch.setattr(f"{module}.{name}", function)
 
     def as_table(found):
         return f"table of {found}"
 
     replace("train", Path("run"))
+    give("univoxel.cli.train", with_page=lambda run: run)
     replace("poses", Path("scene"))
     made = types.SimpleNamespace(
         page=Path("mug/index.html"), mesh=Path("mug/mug.glb"), run=Path("mug/run")
@@ -109,19 +74,20 @@ def calls(monkeypatch):
     replace("capture", made)
     replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)
-    stand_in("univoxel.tasks.relight", relight_to_files=task("relight", None))
+    give("univoxel.cli.relight", relight_to_files=task("relight"))
     replace("export", [Path("out.ply"), Path("out_lod1.ply")])
     replace("envmap", None)
     found = {"chosen": [{"said": "lobes 24 -> 12"}]}
     replace("info", found, tables=lambda found: ["parts", "sizes"])
     replace("demo", Path("demo/index.html"))
-    replace("view", Path("mug.html"), with_page=lambda run: run)
-    return types.SimpleNamespace(noted=noted, replace=replace, stand_in=stand_in, task=task)
+    replace("view", Path("mug.html"))
+    replace("inspect", Path("light.png"))
+    return types.SimpleNamespace(noted=noted, replace=replace, give=give, task=task)
 
 
 def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     out = tmp_path / "run"
-    changes = ["loss.radiance=2", "seed=7", "stages.1.voxels=3", "stages.0.rates=(0.5, 0.1)"]
+    changes = ["loss.radiance=2", "seed=7", "stages.1.voxels=3", "stages.0.lr_sdf=(0.5, 0.1)"]
     options = [
         "--preset",
         "draft",
@@ -141,12 +107,18 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
         *(f"--set={change}" for change in changes),
     ]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
-    stages = StageConfig(rates=(0.5, 0.1)), StageConfig(3.0, field="hash")
-    expected = Config(
-        *(Path("photos"), out, "draft", "sg", "exposure", 2.0, "given", "refined", 4, 7),
-        allow_outside=True,
-        loss=LossConfig(2.0),
-        stages=stages,
+    expected = chosen("draft", 2.0, Path("photos"), out, "sg", "exposure")
+    first, second, *others = expected.stages
+    expected = replace_fields(
+        expected,
+        **{"masks": "given", "cameras": "refined", "downscale": 4, "allow_outside": True},
+        seed=7,
+        loss=replace_fields(expected.loss, radiance=2.0),
+        stages=(
+            replace_fields(first, lr_sdf=(0.5, 0.1)),
+            replace_fields(second, voxels=3.0),
+            *others,
+        ),
     )
     assert capsys.readouterr().out == "run\n"
     assert calls.noted == [
@@ -156,7 +128,7 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
 
 def test_capture_until_a_step(calls, capsys):
     find = calls.task("find", Path("mug/cut"))
-    calls.stand_in("univoxel.tasks.capture", find_data=find)
+    calls.give("univoxel.cli.capture", find_data=find)
     assert main(["capture", "photos", "--out", "mug", "--until", "masks"]) == 0
     assert capsys.readouterr().out == "mug/cut\n"
     assert calls.noted[0][2] == {"masks": "auto", "until": "masks"}
@@ -218,9 +190,11 @@ def test_poses(calls, capsys):
     assert main(["poses", "film.mp4", "--out", "scene", *options, *more]) == 0
     fast = replace_fields(FAST, size=800, seed=3)
     out = Path("scene")
+    usual = {"keep_size": 2000, "keep_weak": False, "config": DEFAULTS}
+    asked = {"keep_size": 900, "keep_weak": True, "config": fast}
     assert calls.noted == [
-        ("poses", (Path("photos"), out, None, None, 2000, False, DEFAULTS), {}),
-        ("poses", (Path("film.mp4"), out, Path("m"), 0.5, 900, True, fast), {}),
+        ("poses", (Path("photos"), out, None, None), usual),
+        ("poses", (Path("film.mp4"), out, Path("m"), 0.5), asked),
     ]
     assert capsys.readouterr().out == "scene\nscene\n"
 
@@ -238,15 +212,13 @@ def test_sizes_of_poses_out_of_range(calls, capsys, option):
 
 def test_cutout(calls, capsys):
     assert main(["cutout", "photos", "--out", "cut", "--downscale", "2"]) == 0
-    given = {"downscale": 2, "allow_outside": False}
-    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "rembg"), given)]
+    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "rembg", 2, False), {})]
     assert capsys.readouterr().out == "cut\n"
 
 
 def test_cutout_from_masks(calls, capsys):
     assert main(["cutout", "photos", "--out", "cut", "--from", "masks"]) == 0
-    given = {"downscale": 0, "allow_outside": False}
-    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "masks"), given)]
+    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "masks", 0, False), {})]
 
 
 @pytest.mark.parametrize("command", ["train", "cutout"])
@@ -259,18 +231,19 @@ def test_downscale_out_of_range(calls, tmp_path, capsys, command, factor):
 
 def test_train_keeps_the_minutes_of_the_preset(calls, tmp_path):
     assert main(["train", "photos", "--out", str(tmp_path / "run")]) == 0
-    assert calls.noted[0][1][0].minutes == 4.0
+    assert calls.noted[0][1] == (chosen("fast", None, Path("photos"), tmp_path / "run"),)
 
 
 def test_train_is_told_what_is_metal(calls, tmp_path):
     assert main(["train", "photos", "--out", str(tmp_path / "run"), "--metal", "all"]) == 0
-    assert calls.noted[0][1][0].metal == "all"
+    (joint,) = (s for s in calls.noted[0][1][0].stages if isinstance(s, JointConfig))
+    assert joint.only_metal is True
 
 
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ([], ("as preset", None)),
+        ([], ("adaptive", None)),
         (["--capacity", "adaptive"], ("adaptive", None)),
         (["--capacity", "fixed"], ("fixed", None)),
         (["--budget-mb", "2.5"], ("adaptive", 2.5)),
@@ -292,7 +265,9 @@ def test_info(calls, capsys):
 def test_train_takes_a_sparse_field_before_changes(calls, tmp_path):
     options = ["--field", "sparse", "--set", "stages.1.voxels=30"]
     assert main(["train", "photos", "--out", str(tmp_path / "run"), *options]) == 0
-    assert calls.noted[0][1][0].stages == (StageConfig(), StageConfig(30.0, field="sparse"))
+    config = calls.noted[0][1][0]
+    assert (config.stages[1].field, config.stages[1].voxels) == ("sparse", 30.0)
+    assert config.capacity == "fixed"
 
 
 def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
@@ -307,23 +282,20 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
 
 
 def test_eval(calls, capsys):
-    options = ["--samples", "8", "--bounces", "0", "--light-of", "r_7"]
-    options += ["--test-every", "16", "--background", "white", "--fit-light"]
+    options = ["--samples", "8", "--bounces", "0", "--test-every", "16"]
+    options += ["--background", "white", "--fit-light"]
     paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
     named = [str(part) for name, path in paths.items() for part in (f"--{name}", path)]
     assert main(["eval", "run", *named, *options]) == 0
     assert main(["eval", "run"]) == 0
     default = {"data": None, "save": None, "json": None, "samples": 64, "bounces": 2}
+    run = {"run": Path("run")}
     protocol = {"test_every": 16, "background": "white", "fit_light": True}
     default |= {"light_of": None, "test_every": None, "background": "black", "fit_light": False}
     assert "table of {'psnr': 31.25, 'views': 5}" in capsys.readouterr().out
     assert calls.noted == [
-        (
-            "evaluate",
-            (Path("run"),),
-            {**paths, "samples": 8, "bounces": 0, "light_of": "r_7", **protocol},
-        ),
-        ("evaluate", (Path("run"),), default),
+        ("evaluate", (), run | paths | {"samples": 8, "bounces": 0, "light_of": None} | protocol),
+        ("evaluate", (), run | default),
     ]
 
 
@@ -339,14 +311,15 @@ def test_relight_export_view_and_demo(calls, capsys):
     options |= {"quality": 90, "size": None, "origin": "world", "lods": 0}
     chosen_options = {"texture_format": "jpeg", "quality": 80}
     chosen_options |= {"size": 0.3, "origin": "bottom", "lods": 1}
-    served = {"host": "127.0.0.1", "port": 8080}
-    (name, given, chosen), *others = calls.noted
-    assert (name, given, chosen["cameras"], chosen["rotate"]) == ("relight", paths, "test", 90.0)
-    assert others == [
-        ("export", (Path("run"), Path("out.ply")), options),
-        ("export", (Path("run"), Path("out.ply")), options | chosen_options),
-        ("view", (Path("run"), Path("mug.html")), {"envmap": (paths[1],), "title": None} | served),
-        ("demo", (Path("demo"),), {}),
+    served = {"title": None, "host": "127.0.0.1", "port": 8080}
+    (name, given, relit), *others = calls.noted
+    assert (name, given, relit["cameras"], relit["rotate"]) == ("relight", paths, "test", 90.0)
+    run, mesh = {"run": Path("run")}, {"mesh": Path("out.ply")}
+    assert [(name, vars(asked)) for name, (asked,), _ in others] == [
+        ("export", run | mesh | options),
+        ("export", run | mesh | options | chosen_options),
+        ("view", run | {"html": Path("mug.html"), "envmap": (paths[1],)} | served),
+        ("demo", {"out": Path("demo")}),
     ]
     printed = capsys.readouterr().out.split()
     levels = ["out.ply", "out_lod1.ply"]
@@ -355,14 +328,13 @@ def test_relight_export_view_and_demo(calls, capsys):
 
 def test_envmap(calls, capsys):
     assert main(["envmap", "run", "--out", "map.exr"]) == 0
-    assert calls.noted == [
-        ("envmap", (Path("run"), Path("map.exr")), {"height": 128, "light_of": None})
-    ]
+    options = {"height": 128, "light_of": None}
+    assert calls.noted == [("envmap", (), {"run": Path("run"), "out": Path("map.exr")} | options)]
     assert capsys.readouterr().out == "map.exr\n"
     found = types.SimpleNamespace(ball_psnr=31.24, brightest_degrees=4.0, mirror_psnr=18.06)
     calls.replace("envmap", found)
     assert main(["envmap", "run", "--out", "map.exr", "--height", "32", "--light-of", "2"]) == 0
-    assert calls.noted[-1][2] == {"height": 32, "light_of": "2"}
+    assert calls.noted[-1][2] | {"height": 32, "light_of": "2"} == calls.noted[-1][2]
     _, ball, mirror, brightest = capsys.readouterr().out.splitlines()
     assert "31.2 dB" in ball
     assert "18.1 dB" in mirror
@@ -371,15 +343,16 @@ def test_envmap(calls, capsys):
 
 def test_inspect(calls, tmp_path, capsys):
     out = tmp_path / "light.png"
-    calls.replace("inspect", out, parse_pixel=lambda text: text.split(","))
+    calls.replace("inspect", out)
     assert main(["inspect", "run", "--view", "r_1", "--pixel", "3,4", "--out", str(out)]) == 0
-    assert calls.noted == [("inspect", (Path("run"), "r_1", ["3", "4"], out), {"light_of": None})]
+    ((_, (asked,), _),) = calls.noted
+    assert (asked.run, asked.view, asked.pixel, asked.out) == (Path("run"), "r_1", "3,4", out)
     assert capsys.readouterr().out == f"{out}\n"
 
 
 def test_experiments(calls, tmp_path, capsys):
-    calls.stand_in("lab.compare", compare=calls.task("compare", "table"))
-    calls.stand_in("lab.chart", chart=calls.task("chart", "picture"))
+    calls.give("lab.compare", compare=calls.task("compare", "table"))
+    calls.give("lab.chart", chart=calls.task("chart", "picture"))
     options = ["--preset", "draft", "--samples", "4", "--set", "seed=1"]
     more = ["--light", "sg", "sg:lobes=12", "--minutes", "2"]
     assert main(["compare", "cup", "shoe", "--out", "out", *options, *more]) == 0
@@ -393,7 +366,7 @@ def test_experiments(calls, tmp_path, capsys):
         ((Path("cup"),), Path("out"), "fast", "hybrid", False, ("draft", "fast"), (), 64),
     ]
     assert capsys.readouterr().out.split() == ["table", "picture", "picture"]
-    calls.stand_in("lab.stress.suite", stress=calls.task("stress", "breaks"))
+    calls.give("lab.stress.suite", stress=calls.task("stress", "breaks"))
     options = ["--quick", "--only", "sun", "dark", "--light", "sg", "sh", "--seeds", "2"]
     assert main(["stress", "--out", "out", *options, "--set", "loss.radiance=2"]) == 0
     assert calls.noted[-1][1] == (
@@ -404,7 +377,7 @@ def test_experiments(calls, tmp_path, capsys):
     capsys.readouterr()
     assert main(["compare", "cup", "--out", "out", "--minutes", "-1"]) == 2
     assert "--minutes must be above 0, got -1" in capsys.readouterr().err
-    calls.stand_in("lab.chart", chart=calls.task("chart", KeyboardInterrupt()))
+    calls.give("lab.chart", chart=calls.task("chart", KeyboardInterrupt()))
     assert main(["chart", "cup", "--out", "out"]) == 130
     assert "out keeps the trainings that are done" in capsys.readouterr().err
 
@@ -477,7 +450,7 @@ def test_the_package_speaks_through_its_logger(calls, capsys):
         logger.debug("nothing")
         return {"chosen": []}
 
-    calls.stand_in("univoxel.tasks.info", info=info, tables=lambda found: [])
+    calls.give("univoxel.cli.info", info=info, tables=lambda found: [])
     assert main(["info", "run"]) == 0
     assert capsys.readouterr().out == "3 pixels: see --masks auto\n"
     assert before == (logger.level, logger.handlers)
@@ -500,10 +473,10 @@ def test_output_that_nobody_reads_to_its_end(arguments):
         (["--minutes", "0"], "--minutes must be above 0, got 0"),
         (["--minutes", "nan"], "--minutes must be above 0, got nan"),
         (["--set", "seed"], "--set seed: expected FIELD=VALUE"),
-        (["--set", "sede=1"], "--set sede=1: no field 'sede', there are: data, out, preset"),
+        (["--set", "sede=1"], "--set sede=1: no field 'sede', there are: data, out, stages"),
         (["--set", "seed.x=1"], "--set seed.x=1: no field 'x', there are: none"),
         (["--set", "seed=fast"], "--set seed=fast: expected a int such as 0, got 'fast'"),
-        (["--set", "stages.2.voxels=1"], "--set stages.2.voxels=1: no field '2', there are: 0, 1"),
+        (["--set", "stages.4.voxels=1"], "--set stages.4.voxels=1: no field '4', there are: 0, 1"),
     ],
 )
 def test_bad_options(calls, tmp_path, capsys, options, message):
@@ -567,7 +540,7 @@ def test_the_laboratory_has_a_screen_of_its_own(capsys):
 
 @pytest.mark.parametrize("arguments", [["lab"], ["lab", "chart", "--help"], ["chart", "cup"]])
 def test_without_a_clone_there_is_no_laboratory(calls, monkeypatch, tmp_path, capsys, arguments):
-    monkeypatch.setattr(commands, "CLONE", tmp_path)
+    monkeypatch.setattr(cli, "CLONE", tmp_path)
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert err.startswith("univoxel: compare, chart, stress, submit measure the method and are not")
@@ -579,7 +552,7 @@ def test_without_a_clone_there_is_no_laboratory(calls, monkeypatch, tmp_path, ca
 
 @pytest.mark.parametrize("word", [["lab"], []])
 def test_commands_of_the_laboratory_have_their_old_names_too(calls, word):
-    calls.stand_in("lab.stress.suite", stress=calls.task("stress", "breaks"))
+    calls.give("lab.stress.suite", stress=calls.task("stress", "breaks"))
     assert main([*word, "stress", "--out", "out"]) == 0
     here = {"jobs": 1, "scheduler": None}
     assert calls.noted == [("stress", (Path("out"), (), (), None, False, ()), here)]
@@ -595,7 +568,7 @@ def said(capsys, calls, *options):
         logger.info("half", extra={"progress": True})
         return {"chosen": []}
 
-    calls.stand_in("univoxel.tasks.info", info=info, tables=lambda found: ["the table"])
+    calls.give("univoxel.cli.info", info=info, tables=lambda found: ["the table"])
     assert main(["info", "run", *options]) == 0
     return [stream.split("\n")[:-1] for stream in capsys.readouterr()]
 
@@ -651,8 +624,8 @@ def test_json_alone_on_stdout(capsys, calls, command):
         return {"chosen": []}
 
     task = {"info": "info", "eval": "evaluate"}[command]
-    table = {"tables": lambda found: ["t"], "table": lambda found: "t"}
-    calls.stand_in(f"univoxel.tasks.{task}", **{task: write}, **table)
+    table = {"tables": lambda found: ["t"]} if task == "info" else {"table": lambda found: "t"}
+    calls.give(f"univoxel.cli.{task}", **{task: write}, **table)
     assert main([command, "run", "--json", "-"]) == 0
     assert capsys.readouterr() == ('{"psnr": 30}\n', "a remark\n")
 
@@ -746,3 +719,10 @@ def test_version(capsys):
 def test_help_names_every_default(command, capsys):
     main([command, "--help"])
     assert "(default: )" not in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name != "completion"])
+def test_every_option_has_its_help_under_it(command):
+    record = COMMANDS[command].record
+    assert list(meanings(record)) == [field.name for field in fields(record)]
+    assert all(meanings(record).values())

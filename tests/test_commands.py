@@ -6,7 +6,7 @@ import sys
 import pytest
 
 import univoxel
-from univoxel.commands.using import parse_ground, point_light, sun_light
+from univoxel.cli.relight import parse_ground, point_light, sun_light
 
 
 def test_suns_and_points():
@@ -30,11 +30,11 @@ def test_ground():
         parse_ground("floor")
 
 
-def test_the_package_has_the_tasks_and_stays_cheap():
+def test_the_package_has_the_work_and_stays_cheap():
     code = "import sys, univoxel; dir(univoxel); assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
     from univoxel import api
-    from univoxel.tasks import evaluate, export, relight
+    from univoxel.cli import evaluate, export, relight
 
     assert univoxel.train is api.train
     assert univoxel.evaluate is evaluate.evaluate

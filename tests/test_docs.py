@@ -12,9 +12,8 @@ import doc_reference
 import doc_tables
 import pytest
 
-from univoxel.cli import help_screen, understood
-from univoxel.commands import COMMANDS, LABORATORY, laboratory
-from univoxel.parsing import LAB, Usage
+from univoxel.cli import COMMANDS, LABORATORY, help_screen, laboratory, understood
+from univoxel.cli.parsing import LAB, Usage
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted(doc_blocks.pages(ROOT))

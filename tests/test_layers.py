@@ -8,7 +8,7 @@ import house
 import pytest
 from layers import LAB_LAYERS, LAYERS, violations
 
-from univoxel.commands import COMMANDS
+from univoxel.cli import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 
@@ -80,8 +80,9 @@ def test_the_diagram_shows_the_layers():
     assert [row for row in rows if row in shown] == shown
 
 
-def test_tasks_are_commands():
-    names = {path.stem for path in (ROOT / "univoxel" / "tasks").glob("*.py")} - {"__init__"}
+def test_a_command_is_one_file():
+    names = {path.stem for path in (ROOT / "univoxel" / "cli").glob("*.py")}
+    names -= {"__init__", "__main__", "parsing"}
     commands = {"poses", "cutout", "train", "eval", "relight", "export", "envmap", "inspect"}
     commands |= {"batch", "capture", "info", "demo", "doctor", "view", "report"}
     assert names - {"evaluate"} | {"eval"} == commands == set(COMMANDS) - {"completion"}

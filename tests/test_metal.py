@@ -13,6 +13,7 @@ from PIL import Image
 
 from univoxel import brdf
 from univoxel.camera import Cameras
+from univoxel.cli import export as task
 from univoxel.envmap import EnvMap, lookup, tables
 from univoxel.ops import VisibilityScene
 from univoxel.records import Mesh, Surface
@@ -20,7 +21,6 @@ from univoxel.render.frame import Quality, channels, render_picture
 from univoxel.render.pipeline import at_rays, extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, TracedMesh, relight_surface
 from univoxel.sphere import fibonacci_sphere
-from univoxel.tasks import export as task
 
 BASE = torch.tensor([0.95, 0.6, 0.3])  # copper, about
 
@@ -157,7 +157,7 @@ def test_views_and_pictures_carry_it(scene):
 def test_files_hold_it(scene, tmp_path, monkeypatch):
     pygltflib = pytest.importorskip("pygltflib")
     trimesh = pytest.importorskip("trimesh")
-    monkeypatch.setattr(task, "load_scene", lambda run: scene)
+    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: scene)
     for name in ("a.glb", "a.obj", "a.ply"):
         task.export("run", tmp_path / name, faces=500, texture_size=64)
     file = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))

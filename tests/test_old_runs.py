@@ -8,8 +8,8 @@ import pytest
 
 import univoxel
 from univoxel.checkpoint import load_checkpoint
+from univoxel.cli.info import info, tables
 from univoxel.config import check_same, load_config
-from univoxel.tasks.info import info, tables
 
 RUNS = sorted((Path(__file__).parent / "runs").iterdir())
 

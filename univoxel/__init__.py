@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from univoxel.api import TrainingProgress as TrainingProgress
     from univoxel.api import open_run as open_run
     from univoxel.api import train as train
+    from univoxel.capture.poses import poses as find_poses
+    from univoxel.cli.capture import capture as capture_object
+    from univoxel.cli.evaluate import evaluate as evaluate
+    from univoxel.cli.export import export as export
+    from univoxel.cli.relight import relight_images as relight
     from univoxel.errors import Cancelled as Cancelled
     from univoxel.errors import UserError as UserError
-    from univoxel.tasks.capture import capture as capture_object
-    from univoxel.tasks.cutout import cutout as cutout
-    from univoxel.tasks.evaluate import evaluate as evaluate
-    from univoxel.tasks.export import export as export
-    from univoxel.tasks.poses import poses as find_poses
-    from univoxel.tasks.relight import relight_images as relight
+    from univoxel.segmentation.cutout import cutout as cutout
 
 __version__ = "0.2.0"
 __all__ = [
@@ -48,13 +48,13 @@ _PLACES = {
     "Run": ("univoxel.api", "Run"),
     "TrainingProgress": ("univoxel.api", "TrainingProgress"),
     "UserError": ("univoxel.errors", "UserError"),
-    "capture_object": ("univoxel.tasks.capture", "capture"),
-    "find_poses": ("univoxel.tasks.poses", "poses"),
-    "cutout": ("univoxel.tasks.cutout", "cutout"),
-    "evaluate": ("univoxel.tasks.evaluate", "evaluate"),
-    "export": ("univoxel.tasks.export", "export"),
+    "capture_object": ("univoxel.cli.capture", "capture"),
+    "find_poses": ("univoxel.capture.poses", "poses"),
+    "cutout": ("univoxel.segmentation.cutout", "cutout"),
+    "evaluate": ("univoxel.cli.evaluate", "evaluate"),
+    "export": ("univoxel.cli.export", "export"),
     "open_run": ("univoxel.api", "open_run"),
-    "relight": ("univoxel.tasks.relight", "relight_images"),
+    "relight": ("univoxel.cli.relight", "relight_images"),
     "train": ("univoxel.api", "train"),
 }
 

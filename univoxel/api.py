@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, overload
 
@@ -13,23 +13,22 @@ from torch import Tensor
 
 from univoxel.camera import Cameras, stacked
 from univoxel.checkpoint import load_scene
+from univoxel.cli.evaluate import evaluate
+from univoxel.cli.export import export
+from univoxel.cli.relight import relight_images
+from univoxel.cli.report import report
+from univoxel.cli.train import TrainOptions
 from univoxel.config import TrainConfig
 from univoxel.envmap import EnvMap
 from univoxel.errors import UserError
-from univoxel.names import ELEVATION, MAP_ROWS, Differing, LightName, PresetOrAuto
-from univoxel.overrides import changed
+from univoxel.evaluation.recovered_map import recovered_map
+from univoxel.names import ELEVATION, MAP_ROWS
 from univoxel.page import SMALL, page_text, write_page
 from univoxel.pictures.viewpoints import views_of
-from univoxel.presets import chosen
 from univoxel.records import Mesh
 from univoxel.render.pipeline import extract_mesh, shade_hits, surface_of_view
 from univoxel.scene import Scene
-from univoxel.tasks.envmap import recovered_map
-from univoxel.tasks.evaluate import evaluate
-from univoxel.tasks.export import export
-from univoxel.tasks.relight import relight_images
-from univoxel.tasks.report import report
-from univoxel.tasks.train import train as train_config
+from univoxel.trainer import train as train_config
 from univoxel.training.progress import LOG, TrainingProgress
 from univoxel.verdict import Verdict, load_verdict
 
@@ -102,7 +101,7 @@ class Run:
 
         Args:
             envmap: a file, a map, or None for suns and point lights alone.
-            cameras, options: fields of `univoxel.tasks.relight.RelightOptions`.
+            cameras, options: fields of `univoxel.cli.relight.RelightOptions`.
 
         Raises:
             UserError: a map or the cameras cannot be used, or a number is out of range.
@@ -113,7 +112,7 @@ class Run:
         """Write the surface with its materials as .glb, .usdz, .obj or .ply; return the file.
 
         Args:
-            options: fields of `univoxel.tasks.export.ExportOptions`.
+            options: fields of `univoxel.cli.export.ExportOptions`, but run and mesh.
 
         Raises:
             UserError: an argument is out of range, or there is no surface.
@@ -186,7 +185,8 @@ class Run:
         return [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
 
     def evaluate(self, **options: Any) -> dict[str, float | int | None]:
-        """Measures on the test views; options as of `univoxel.tasks.evaluate.evaluate`."""
+        """Measures on the test views; options: fields of `univoxel.cli.evaluate.EvaluateOptions`,
+        but run."""
         return evaluate(self.path, **options)
 
 
@@ -218,15 +218,11 @@ def train(
     /,
     out: str | Path,
     *,
-    preset: PresetOrAuto = "auto",
-    light: LightName = "hybrid",
-    varying: Differing = "auto",
-    minutes: float | None = None,
-    changes: Sequence[str] = (),
-    on_progress: Callable[[TrainingProgress], None] | None = None,
     resume: bool = False,
     timelapse: str | Path | None = None,
+    on_progress: Callable[[TrainingProgress], None] | None = None,
     view: tuple[str, int] | None = None,
+    **options: Any,
 ) -> Run: ...
 
 
@@ -235,15 +231,11 @@ def train(
     /,
     out: str | Path | bool | None = None,
     *,
-    preset: PresetOrAuto = "auto",
-    light: LightName = "hybrid",
-    varying: Differing = "auto",
-    minutes: float | None = None,
-    changes: Sequence[str] = (),
-    on_progress: Callable[[TrainingProgress], None] | None = None,
     resume: bool = False,
     timelapse: str | Path | None = None,
+    on_progress: Callable[[TrainingProgress], None] | None = None,
     view: tuple[str, int] | None = None,
+    **options: Any,
 ) -> Run | Path:
     """Recover geometry, materials and light from posed photographs.
 
@@ -251,17 +243,14 @@ def train(
         data: folder of the photographs and their cameras; or the whole configuration, which says
             all but resume, timelapse, on_progress and view: then the folder of the run is returned.
         out: folder that the run is written to.
-        preset: how much work goes in: draft, fast, full or best; auto is what fits into minutes, or
-            fast.
-        light, varying: as of `univoxel.presets.budget`.
-        minutes: wall-clock limit, above 0, from the first photograph read to the end; None: all
-            steps are made.
-        changes: FIELD=VALUE of the configuration, as of --set.
-        on_progress: called every few seconds of training. Raise `univoxel.Cancelled` in it to end
-            the training: it is saved, and goes on with resume.
         resume: go on with the run in out from its last checkpoint.
         timelapse: .gif, .mp4 or folder for pictures of a view over training time.
-        view: host and port that browsers may look at the training at, such as ("127.0.0.1", 8080).
+        on_progress: called every few seconds of training. Raise `univoxel.Cancelled` in it to end
+            the training: it is saved, and goes on with resume.
+        view: host and port that browsers may look at the training at, such as ("127.0.0.1", 8080);
+            port 0: any free one. A button there ends it early, with a result.
+        options: fields of `univoxel.cli.train.TrainOptions`, such as preset, light, varying,
+            minutes and changes: what `univoxel train` has options for, with changes for --set.
 
     Raises:
         UserError: an argument or the data cannot be used.
@@ -271,8 +260,10 @@ def train(
     """
     watched = {"timelapse": timelapse, "on_progress": on_progress, "view": view}
     if isinstance(data, TrainConfig):
+        if options:
+            raise TypeError(f"train: expected a configuration or {', '.join(options)}, got both")
         return train_config(data, resume=resume or out is True, **watched)
     if out is None or isinstance(out, bool):
         raise TypeError("train: out must be the folder of the run, got none")
-    config = chosen(preset, minutes, Path(data), Path(out), light, varying)
-    return Run(train_config(changed(config, changes), resume=resume, **watched))
+    config = TrainOptions(data=data, out=out, **options).configuration()
+    return Run(train_config(config, resume=resume, **watched))

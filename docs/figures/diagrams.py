@@ -33,7 +33,7 @@ BANDS = (
     ("configuration", "config", SOFT),
     ("training", "preparation", ORANGE),
     ("after training", "confidence", RED),
-    ("what a person runs", "tasks", SOFT),
+    ("what a person runs", "cli", SOFT),
 )
 STYLE = {
     "font.family": "sans-serif",

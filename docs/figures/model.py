@@ -23,10 +23,10 @@ from PIL import Image
 from torch import Tensor
 
 import univoxel
+from univoxel.cli.relight import relight_images
 from univoxel.color import linear_to_srgb
 from univoxel.pictures.layers import Layers, render_layers
 from univoxel.run import photos_of
-from univoxel.tasks.relight import relight_images
 
 VIEW = 0  # of the test views
 LAYERS = "albedo", "roughness", "normal"

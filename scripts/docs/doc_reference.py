@@ -17,7 +17,7 @@ from typing import Any
 
 def command_line() -> str:
     """A section for each command: what it does, and a table of its options."""
-    from univoxel.commands import COMMANDS, laboratory
+    from univoxel.cli import COMMANDS, laboratory
 
     named = COMMANDS | {f"lab {name}": function for name, function in laboratory().items()}
     return "\n\n".join(_command(name, function) for name, function in named.items())
@@ -62,8 +62,10 @@ GENERATORS: dict[str, Callable[[], str]] = {
 
 
 def _command(name: str, function: Callable) -> str:
-    hints = typing.get_type_hints(function, include_extras=True)
-    summary, description, meanings = _parts(inspect.getdoc(function) or "")
+    from univoxel.cli.parsing import documentation, hints_of
+
+    hints = hints_of(function)
+    summary, description, meanings = _parts(documentation(function))
     rows = []
     for parameter in inspect.signature(function).parameters.values():
         option, values = _option(parameter, hints[parameter.name])
@@ -75,12 +77,13 @@ def _command(name: str, function: Callable) -> str:
 
 def _option(parameter: inspect.Parameter, hint: Any) -> tuple[str, str]:
     """How an argument is written, and the values that it takes."""
-    metavar = next((m.metavar for m in _metadata(hint) if getattr(m, "metavar", None)), None)
+    metavar = next((m.metavar for m in _metadata(hint) if m.metavar), None)
     kinds = list(_leaves(hint))
     choices = [str(c) for kind in kinds for c in typing.get_args(kind) if _is_literal(kind)]
-    if parameter.kind is parameter.POSITIONAL_ONLY:
+    if any(m.positional for m in _metadata(hint)):
         return f"`{metavar or parameter.name.upper()}`", ""
-    flag = "--" + parameter.name.replace("_", "-")
+    named = next((m.name for m in _metadata(hint) if m.name), parameter.name)
+    flag = "--" + named.replace("_", "-")
     if kinds == [bool]:
         return f"`{flag}`", "a flag"
     if choices and metavar is None:
@@ -91,9 +94,8 @@ def _option(parameter: inspect.Parameter, hint: Any) -> tuple[str, str]:
 
 
 def _default(parameter: inspect.Parameter, hint: Any) -> str:
-    given = [getattr(m, "help_behavior_hint", None) for m in _metadata(hint)]
-    for text in given:
-        if isinstance(text, str) and text:
+    for text in (m.hint for m in _metadata(hint)):
+        if text:
             return re.sub(r"^(?:default: )?(.*)$", r"\1", text.strip("()"))
     if parameter.default is inspect.Parameter.empty:
         return "required"

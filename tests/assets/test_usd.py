@@ -13,9 +13,9 @@ from PIL import Image
 from univoxel.assets.bake import bake
 from univoxel.assets.topology import clean, simplify
 from univoxel.assets.usd import write_usdz
+from univoxel.cli import export as task
 from univoxel.errors import MissingExtra
 from univoxel.records import Mesh
-from univoxel.tasks import export as task
 
 pytest.importorskip("pxr")
 from pxr import Usd, UsdGeom, UsdShade
@@ -132,7 +132,7 @@ def test_textures_come_back(file, mesh):
 
 
 def test_it_is_exported(tmp_path, monkeypatch):
-    monkeypatch.setattr(task, "load_scene", lambda run: lopsided())
+    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: lopsided())
     (path,) = task.export(
         "run", tmp_path / "a.usdz", faces=300, texture_size=64, size=0.3, origin="bottom"
     )

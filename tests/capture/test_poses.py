@@ -20,13 +20,13 @@ from PIL import Image
 import univoxel
 from univoxel import steps
 from univoxel.capture import database, pose_validation, sfm, structure
+from univoxel.capture import poses as poses_task
 from univoxel.capture.config import CaptureConfig
 from univoxel.capture.photographs import find_photographs
+from univoxel.capture.poses import poses
 from univoxel.capture.prepare import Folders, gather
 from univoxel.data.colmap import read_cameras, read_images
 from univoxel.errors import DataError, ExistingFile, MissingExtra, ProcessFailed
-from univoxel.tasks import poses as poses_task
-from univoxel.tasks.poses import poses
 
 # Enough for pictures of this size, and pairs are chosen as in large sets
 SMALL = CaptureConfig(features=1000, first_octave=0, exhaustive=10, partners=8)
@@ -407,7 +407,7 @@ def test_a_step_ends_with_who_began_it(tmp_path, monkeypatch):
 
 def test_pycolmap_stays_out_of_this_process():
     code = (
-        "import sys, univoxel, univoxel.cli, univoxel.tasks.poses, univoxel.capture.sfm\n"
+        "import sys, univoxel, univoxel.cli, univoxel.capture.poses, univoxel.capture.sfm\n"
         "assert 'pycolmap' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

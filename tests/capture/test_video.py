@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-import univoxel.tasks.poses as tasks_poses
+import univoxel.capture.poses as tasks_poses
 from univoxel.capture import video
 from univoxel.capture.prepare import Folders
 from univoxel.capture.video import is_video, seconds, sharpest, sharpness, write_frames

@@ -8,15 +8,15 @@ import torch
 from analytic import photos_of, write_scene
 from spare_scene import LIGHT
 
+from univoxel import trainer as task
 from univoxel.checkpoint import FILE, load_checkpoint, load_scene
+from univoxel.cli.info import info
 from univoxel.compression import plan
 from univoxel.compression.storage import FEWEST_VOXELS
 from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.lights import EnvmapConfig
 from univoxel.scene import SceneConfig
-from univoxel.tasks import train as task
-from univoxel.tasks.info import info
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 from univoxel.training import loop
 
 

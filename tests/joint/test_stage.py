@@ -18,6 +18,7 @@ from observed_points import (
 from torch.nn.functional import normalize
 
 from univoxel import brdf
+from univoxel import trainer as train_task
 from univoxel.checkpoint import load_checkpoint
 from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.joint import stage
@@ -31,7 +32,6 @@ from univoxel.lights.sg import SGConfig
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig
-from univoxel.tasks import train as train_task
 from univoxel.training import progress
 
 CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)

@@ -13,12 +13,13 @@ from asymmetric_scene import lopsided
 from browser import browser, installed, pixels
 
 from univoxel.camera import Cameras
+from univoxel.cli.relight import relight_images
 from univoxel.color import linear_to_srgb
 from univoxel.data.images import write_exr
 from univoxel.page import PageOptions, page_text
+from univoxel.pictures import relighting
 from univoxel.render.pipeline import surface_of_view
 from univoxel.sphere import latlong_directions
-from univoxel.tasks import relight as relighting
 
 pytestmark = pytest.mark.skipif(
     installed() is None, reason="needs a browser, such as Debian's package chromium"
@@ -120,7 +121,7 @@ def test_it_looks_as_relit(fresh, scene, folder, monkeypatch, azimuth, elevation
     camera = looking(azimuth, elevation)
     monkeypatch.setattr(relighting, "load_scene", lambda run: scene)
     options = {"rotate": turn, "exposure": 2**stops, "samples": 64}
-    expected = relighting.relight_images(folder, folder / "lamp.exr", camera, **options)[0]
+    expected = relight_images(folder, folder / "lamp.exr", camera, **options)[0]
     fresh.run(f"univoxel.set({{turn: {turn}, exposure: {stops}}})")
     shown, alpha = taken(fresh, camera)
     expected_rgb = linear_to_srgb(expected[..., :3]).numpy()

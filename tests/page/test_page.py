@@ -20,6 +20,8 @@ from scipy.spatial import ConvexHull
 import univoxel.page as page
 from univoxel.api import Run
 from univoxel.assets.base import TexturedMesh
+from univoxel.cli.view import command as view
+from univoxel.cli.view import with_page
 from univoxel.data.images import write_exr
 from univoxel.envmap import EnvMap, tables
 from univoxel.errors import DataError, MissingFile, NoSurface, UserError
@@ -28,7 +30,6 @@ from univoxel.page import maps
 from univoxel.page.transfer import transfer, vertex_albedo
 from univoxel.records import Mesh
 from univoxel.sphere import fibonacci_sphere, latlong_directions, real_harmonics
-from univoxel.tasks.view import view, with_page
 
 VENDOR = Path(page.__file__).parent / "vendor"
 SMALL = page.PageOptions(title='"Balls" </script> & more', faces=500, texture_size=128)
@@ -304,14 +305,14 @@ def test_training_ends_well_without_a_page(tmp_path, monkeypatch, caplog):
     def fail(run, path):
         raise NoSurface("there is no surface")
 
-    monkeypatch.setattr("univoxel.tasks.view.write_page", fail)
+    monkeypatch.setattr("univoxel.page.write_page", fail)
     with caplog.at_level(logging.INFO, "univoxel"):
         assert with_page(tmp_path) == tmp_path
     assert caplog.messages == ["no page was written: there is no surface"]
 
 
 def test_training_names_its_page(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("univoxel.tasks.view.write_page", lambda run, path: path)
+    monkeypatch.setattr("univoxel.page.write_page", lambda run, path: path)
     with caplog.at_level(logging.INFO, "univoxel"):
         with_page(tmp_path)
     assert caplog.messages == [f"to look at, in a browser: {tmp_path / 'index.html'}"]

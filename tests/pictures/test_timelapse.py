@@ -8,6 +8,7 @@ import torch
 from analytic import write_scene
 from PIL import Image
 
+from univoxel import trainer as task
 from univoxel.checkpoint import load_checkpoint, load_scene
 from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.data.images import read_image
@@ -16,8 +17,7 @@ from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.pictures import timelapse as module
 from univoxel.pictures.timelapse import LABEL, Timelapse
 from univoxel.scene import SceneConfig
-from univoxel.tasks import train as task
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 from univoxel.training import clock as clock_module
 
 

@@ -35,7 +35,7 @@ from univoxel.report import (
     what_is_known,
 )
 from univoxel.sphere import latlong_directions
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 
 SIZE, VIEWS, SECTOR = 24, 24, 90.0  # pixels, photographs, azimuth that none is taken from
 STAGES = tuple(

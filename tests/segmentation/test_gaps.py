@@ -9,7 +9,7 @@ from spoilt_masks import MISSING, iou, lost_part
 
 from univoxel.camera import Cameras, image_rays
 from univoxel.segmentation import gaps, vote
-from univoxel.segmentation.config import VoteConfig
+from univoxel.segmentation.vote import VoteConfig
 
 SIZE = 96
 ABOVE, BESIDE = 24, 3  # cameras that look down on a gate, and that see through it

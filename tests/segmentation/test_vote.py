@@ -9,7 +9,7 @@ from univoxel.camera import image_rays
 from univoxel.errors import UserError
 from univoxel.grid import GridShape
 from univoxel.segmentation import vote
-from univoxel.segmentation.config import VoteConfig
+from univoxel.segmentation.vote import VoteConfig
 
 VIEWS, SIZE = 40, 64
 SMALL = VoteConfig(voxels=48, first_voxels=24)

@@ -8,13 +8,13 @@ import torch
 from analytic import photos_of, sphere_scene, write_scene
 from observed_points import Steps, no_metal, problem_on_a_sphere
 
+from univoxel import trainer as task
 from univoxel.checkpoint import load_scene
 from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.joint import equations, newton, stage
 from univoxel.lights import SGConfig
 from univoxel.optim import RowAdam
 from univoxel.scene import SceneConfig
-from univoxel.tasks import train as task
 from univoxel.training import divergence, loop
 from univoxel.training import progress as progress_module
 from univoxel.training.divergence import LIMIT, PROOF, Guard

@@ -22,7 +22,7 @@ from univoxel.lights.base import Regularisation
 from univoxel.preparation.hull import mask_distances, visual_hull
 from univoxel.render.pipeline import surface_at
 from univoxel.scene import Scene, SceneConfig
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 from univoxel.training import loop, progress
 from univoxel.training.loop import add_gradient_, batch_at, light_priors, losses_of
 from univoxel.training.pixels import TrainingPixels, split_pixels

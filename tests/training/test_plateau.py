@@ -9,7 +9,7 @@ from univoxel.checkpoint import load_checkpoint
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.lights import SGConfig
 from univoxel.scene import SceneConfig
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 from univoxel.training.plateau import CHECK, WINDOW, Plateau
 
 

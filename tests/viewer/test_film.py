@@ -12,9 +12,9 @@ from PIL import Image
 from univoxel.camera import project
 from univoxel.envmap import EnvMap
 from univoxel.errors import MissingExtra
+from univoxel.pictures.relighting import lighting
 from univoxel.pictures.viewpoints import orbit
 from univoxel.render.relight import traced_mesh
-from univoxel.tasks.relight import lighting
 from univoxel.viewer import film as module
 from univoxel.viewer.film import film, kind, turned_about
 from univoxel.viewer.frames import Look

@@ -12,15 +12,16 @@ import torch
 from asymmetric_scene import lopsided
 
 from univoxel.camera import Cameras
+from univoxel.cli.relight import RelightOptions, relight_images
 from univoxel.color import linear_to_srgb
 from univoxel.envmap import EnvMap
 from univoxel.errors import UserError
 from univoxel.metrics import psnr
 from univoxel.ops import Sun
+from univoxel.pictures import relighting
 from univoxel.render.pipeline import surface_of_view
 from univoxel.render.relight import traced_mesh
 from univoxel.sphere import latlong_directions
-from univoxel.tasks import relight as relighting
 from univoxel.viewer import denoise
 from univoxel.viewer.frames import LAYERS, Look, quick_picture, refined_pictures
 from univoxel.viewer.subject import Subject, mesh_of
@@ -81,7 +82,7 @@ def on_black(picture):
 
 def relit(monkeypatch, scene, lamp, camera, **options):
     monkeypatch.setattr(relighting, "load_scene", lambda run: scene)
-    return straight(relighting.relight_images("run", lamp, camera, samples=1024, **options)[0])
+    return straight(relight_images("run", lamp, camera, samples=1024, **options)[0])
 
 
 def shown(pictures):
@@ -97,7 +98,7 @@ def test_at_rest_it_becomes_the_relit_picture(monkeypatch, scene, subject, lamp,
     expected = relit(
         monkeypatch, scene, lamp, camera, ground=ground, background=background, **options
     )
-    lighting = relighting.lighting(lamp, relighting.RelightOptions(**options | {"exposure": 1.0}))
+    lighting = RelightOptions(**options | {"exposure": 1.0}).lighting(lamp)
     look = Look(lighting, exposure=-1.0, ground=not backdrop, backdrop=backdrop)
     found = shown(refined_pictures(subject, camera, look, samples=64))
     quality = [float(psnr(on_black(p), on_black(expected))) for p in found]

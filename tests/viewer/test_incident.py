@@ -9,10 +9,10 @@ from asymmetric_scene import BALLS, lopsided
 from univoxel.camera import Cameras, pixel_rays
 from univoxel.envmap import EnvMap, lookup
 from univoxel.ops import Sun
+from univoxel.pictures.relighting import lighting
 from univoxel.records import Rays
 from univoxel.render.relight import relight_surface, traced_mesh
 from univoxel.sphere import latlong_directions, texel_solid_angles
-from univoxel.tasks.relight import RelightOptions, lighting
 from univoxel.viewer.incident import incident_light, incident_picture, point_on_mesh
 from univoxel.viewer.subject import Subject, mesh_of, mesh_surface
 
@@ -67,7 +67,7 @@ def test_a_free_point_sees_the_map(subject):
 
 def test_what_hides_the_sky_is_seen_as_a_camera_there_sees_it(subject, crease):
     """Pixels of a camera at the point, rendered as the viewer renders, on every blocked texel."""
-    light_of = lighting(uneven(), RelightOptions(suns=[Sun((1, -1, 1), (2.0, 1.0, 0.5))]))
+    light_of = lighting(uneven(), suns=[Sun((1, -1, 1), (2.0, 1.0, 0.5))])
     found = incident_light(subject, crease, light_of, ROWS, samples=512)
     eye = crease.position + subject.traced.offset * crease.normal
     back = torch.tensor([0.0, -1.0, 0.0])  # it looks at the upper ball
@@ -94,16 +94,16 @@ def test_a_sun_adds_its_irradiance_or_hides(subject, crease):
     dark = EnvMap(torch.zeros(2, 4, 3))
     towards = crease.normal.tolist()
     sun = Sun(tuple(towards), (3.0, 2.0, 1.0))
-    light = incident_light(subject, crease, lighting(dark, RelightOptions(suns=[sun])), ROWS)
+    light = incident_light(subject, crease, lighting(dark, suns=[sun]), ROWS)
     angle = texel_solid_angles(ROWS, 2 * ROWS)[..., None]
     free = latlong_directions(ROWS) @ crease.normal > math.cos(math.radians(5))
     summed = (light * angle)[free].sum(0)
     torch.testing.assert_close(summed, torch.tensor([3.0, 2.0, 1.0]), rtol=0.02, atol=0)
     below = Sun((-towards[0], -towards[1], -towards[2]), (3.0, 2.0, 1.0))
-    light = incident_light(subject, crease, lighting(dark, RelightOptions(suns=[below])), ROWS)
+    light = incident_light(subject, crease, lighting(dark, suns=[below]), ROWS)
     assert light.max() < 0.1  # what the object's lit side sends
     behind = Sun((0.0, 1.0, 0.1), (3.0, 2.0, 1.0))  # the upper ball
-    light = incident_light(subject, crease, lighting(dark, RelightOptions(suns=[behind])), ROWS)
+    light = incident_light(subject, crease, lighting(dark, suns=[behind]), ROWS)
     assert light.max() < 1
 
 

@@ -17,9 +17,9 @@ from univoxel.data import Photos
 from univoxel.data.images import write_exr
 from univoxel.envmap import EnvMap
 from univoxel.errors import MissingExtra, UserError
+from univoxel.pictures.relighting import lighting
 from univoxel.pictures.viewpoints import orbit
 from univoxel.render.relight import traced_mesh
-from univoxel.tasks.relight import lighting
 from univoxel.viewer import server as serving_module
 from univoxel.viewer.frames import Look
 from univoxel.viewer.hosting import same_site
@@ -239,14 +239,14 @@ SCRIPT = """
 import logging, sys
 from asymmetric_scene import lopsided
 from univoxel.render.relight import traced_mesh
-from univoxel.tasks.view import view
+from univoxel.cli.view import command
 from univoxel.viewer import subject
 
 logging.basicConfig(level=logging.INFO, stream=sys.stderr)
 scene = lopsided(24**3)
 traced = traced_mesh(subject.mesh_of(scene), scene.field.voxel_size)
 subject.subject_of = lambda run: subject.Subject(scene, traced)
-view("run", port=0)
+command("run", port=0)
 """
 
 

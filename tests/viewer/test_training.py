@@ -20,7 +20,7 @@ from univoxel.errors import MissingExtra, UserError
 from univoxel.lights import SGConfig
 from univoxel.pictures.timelapse import LABEL
 from univoxel.scene import SceneConfig
-from univoxel.tasks.train import train
+from univoxel.trainer import train
 from univoxel.training import progress as progress_module
 from univoxel.training.clock import Clock
 from univoxel.training.progress import TrainingProgress
@@ -194,9 +194,9 @@ def test_the_port_is_taken_which_is_said_before_anything(tmp_path, capfd):
 def test_by_the_command_line(data, tmp_path, capfd, monkeypatch):
     asked = {}
     monkeypatch.setattr(
-        "univoxel.tasks.train.train", lambda cfg, **options: asked.update(options) or cfg.out
+        "univoxel.trainer.train", lambda cfg, **options: asked.update(options) or cfg.out
     )
-    monkeypatch.setattr("univoxel.tasks.view.with_page", lambda run: run)
+    monkeypatch.setattr("univoxel.cli.train.with_page", lambda run: run)
     arguments = ["train", str(data), "--out", str(tmp_path / "run")]
     for more, view in (
         ([], None),

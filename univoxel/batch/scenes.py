@@ -1,82 +1,23 @@
-"""Scenes of a batch as jobs: their steps as command lines, and how many run at once."""
+"""Scenes of a batch by name, and how many run at once."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from univoxel.capture.project import Project
-from univoxel.capture.scene import REPORT
-from univoxel.checkpoint import FILE
-from univoxel.config import TrainConfig, load_config
+from univoxel.config import TrainConfig
 from univoxel.data.images import image_size
 from univoxel.data.shots import LARGE
 from univoxel.errors import UserError
-from univoxel.files import read_json
-from univoxel.jobs.job import Job, Step
 from univoxel.machine import Memory
-from univoxel.names import SAMPLES, USUAL_STEPS, BatchStep, LightName, PresetOrAuto
-from univoxel.overrides import changed
-from univoxel.presets import chosen
 from univoxel.training.memory import needed_for
-from univoxel.training.progress import LOG
 
 MEASURED = "measures.json"  # in the folder of a scene
 LOGS = "logs"  # the folder in a batch's of what processes said, records and locks
 PICTURES = {".png", ".jpg", ".jpeg", ".exr"}
 PER_PROCESS = 600_000_000  # bytes: Python, torch and what is loaded around them
 PER_PIXEL = 7  # bytes of a photograph and its alpha
-
-
-@dataclass(frozen=True)
-class BatchOptions:
-    """What is to be done with each scene."""
-
-    steps: tuple[BatchStep, ...] = USUAL_STEPS
-    masks: str = "auto"  # where they come from, as of capture
-    preset: PresetOrAuto = "auto"
-    light: LightName = "hybrid"
-    minutes: float | None = None  # of each training; None: it makes all steps of the preset
-    config: Path | None = None  # a file that says all of a training, in place of a preset
-    changes: tuple[str, ...] = ()  # FIELD=VALUE of the configuration
-    samples: int = SAMPLES  # of the light, per pixel of relit pictures that are measured
-
-    def training(self) -> TrainConfig:
-        """The configuration of a training.
-
-        Raises:
-            UserError: there is none of that kind.
-        """
-        if self.config is None:
-            config = chosen(self.preset, self.minutes, Path(), Path(), self.light)
-            return changed(config, self.changes)
-        if (self.preset, self.light) != ("auto", "hybrid"):
-            raise UserError(
-                f"expected config or preset and light, got both: {self.config} says them", "config"
-            )
-        config = load_config(self.config)
-        minutes = config.minutes if self.minutes is None else self.minutes
-        return changed(replace(config, minutes=minutes), self.changes)
-
-    def identity(self, data: Path) -> dict[str, Any]:
-        """What a later sitting must agree with to go on; JSON. Steps may be added."""
-        fields = asdict(self) | {"data": str(data)}
-        del fields["steps"]
-        if self.config is not None:
-            fields["config"] = read_json(self.config)
-        return json.loads(json.dumps(fields, default=str))
-
-    def words(self) -> list[str]:
-        """The options of train."""
-        words = ["--preset", self.preset, "--light", self.light]
-        if self.config is not None:
-            words = ["--config", str(self.config.absolute())]
-        words += [] if self.minutes is None else ["--minutes", f"{self.minutes:g}"]
-        return [*words, *(f"--set={change}" for change in self.changes)]
 
 
 def named(scenes: Sequence[Path]) -> dict[str, Path]:
@@ -99,39 +40,6 @@ def named(scenes: Sequence[Path]) -> dict[str, Path]:
     if not found:
         raise UserError("expected a scene, a folder of photographs, or more; got none")
     return found
-
-
-def job_of(name: str, data: Path, out: Path, options: BatchOptions, threads: int | None) -> Job:
-    """The steps of a scene, data (absolute), that are asked for, below the folder of a batch."""
-    out = out.absolute()
-    project = Project(out / name)
-    # Photographs that bring masks are not written again
-    before = [project.cut] if "masks" in options.steps else []
-    before += [project.scene] if {"poses", "masks"} & set(options.steps) else []
-    run, checkpoint, measures = str(project.run), project.run / FILE, project.out / MEASURED
-    trained, log = project.run / "trust.txt", project.run / LOG
-    capture = ("capture", str(data), "--out", str(project.out), "--masks", options.masks, "--until")
-    train = ("--out", run, "--resume", "--no-page", *options.words())
-    evaluate = ("eval", run, "--json", str(measures), "--samples", str(options.samples))
-    page = ("view", run, "--html", str(project.page), "--title", name)
-    export = ("export", run, "--mesh", str(project.mesh))
-
-    def step(name: BatchStep, *words: str | tuple[Path, ...], **fields: Any) -> Step:
-        return Step(name, ("-m", "univoxel.cli", *words), **fields)
-
-    def aside(name: BatchStep, words: Sequence[str], makes: Path) -> Step:
-        return step(name, *words, makes=makes, after=checkpoint, needed=False)
-
-    every = (
-        step("poses", *capture, "cameras", unless=(project.scene / REPORT, trained)),
-        step("masks", *capture, "masks", unless=(project.cut, trained)),
-        step("train", "train", (*before, data), *train, makes=trained, after=checkpoint, log=log),
-        aside("eval", evaluate, measures),
-        aside("export", export, project.mesh),
-        aside("page", page, project.page),
-    )
-    steps = tuple(step for step in every if step.name in options.steps)
-    return Job(name, steps, out / LOGS / name, options.identity(data), threads)
 
 
 def share(

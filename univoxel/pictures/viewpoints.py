@@ -77,7 +77,7 @@ def views_of(
     elevation: float,
     mesh: Mesh,
 ) -> tuple[list[str], Cameras]:
-    """Names of the views, and their cameras; arguments as of `tasks.relight.RelightOptions`.
+    """Names of the views, and their cameras; arguments as of `cli.relight.RelightOptions`.
 
     Raises:
         UserError: the cameras cannot be used.

@@ -19,8 +19,8 @@ from univoxel.camera import Cameras, looked_at, pixel_rays, project
 from univoxel.errors import UserError
 from univoxel.grid import GridShape, fit_grid
 from univoxel.preparation.hull import mask_distances
-from univoxel.segmentation.config import VoteConfig
 from univoxel.segmentation.gaps import carve_gaps_
+from univoxel.validation import check_fields
 
 # Sides of the first grid, in those of what half of the pictures show whole
 ROOM = 1.6
@@ -40,6 +40,23 @@ BELOW = 0.08
 LEAST = 0.75
 # Voxels beside the silhouette within which a mended mask is kept
 BAND = 1.5
+
+
+@dataclass(frozen=True)
+class VoteConfig:
+    """How masks vote for a hull, and which of them it mends.
+
+    Raises:
+        ConfigError: a field is out of range.
+    """
+
+    pixels: int = 192  # of the longer side of the pictures that are compared, >= 16
+    voxels: int = 96  # along a side of the grid, >= 8; finer ones cost more and mend no better
+    first_voxels: int = 40  # of the grid that only looks where the object is, >= 8
+
+    def __post_init__(self) -> None:
+        check_fields(self, "at least 16", lambda x: x >= 16, "pixels")
+        check_fields(self, "at least 8", lambda x: x >= 8, "voxels", "first_voxels")
 
 
 VOTE = VoteConfig()

@@ -1,0 +1,390 @@
+"""Many scenes, with real trainings of a moment: done once, killed, broken, shared by two."""
+
+import csv
+import dataclasses
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from analytic import write_scene
+from clusters import scheduler, wait_for, worker
+
+from univoxel.batch.results import SceneResult, write_results
+from univoxel.batch.scenes import PER_PIXEL, bytes_of, named, share
+from univoxel.batch.sheet import write_sheet
+from univoxel.checkpoint import FILE, load_checkpoint
+from univoxel.cli import batch as task
+from univoxel.cli import main
+from univoxel.cli.batch import BatchOptions, job_of
+from univoxel.config import save_config
+from univoxel.errors import ExistingFile, MissingExtra, ProcessFailed, UserError
+from univoxel.machine import Memory
+from univoxel.training.memory import PER_PIXEL as FURTHER
+
+TINY = (
+    *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),
+    *("stages.0.iterations=2", "stages.1.iterations=8", "stages.1.physical_from=0.0"),
+    *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
+    *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
+)
+# Its steps take a moment; draft's minute would cut them on a busy machine
+USUAL = BatchOptions(scenes=(), out=Path("night"))
+DRAFT = {"steps": ("train",), "preset": "draft", "light": "sg", "minutes": 30.0}
+OPTIONS = dataclasses.replace(USUAL, **DRAFT, changes=TINY, samples=1, jobs=2)
+# The first stage is saved at once; the second takes long enough to be killed in
+SLOW = dataclasses.replace(OPTIONS, changes=(*TINY, "stages.1.iterations=1500"))
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    root = tmp_path_factory.mktemp("scenes")
+    return [write_scene(root / name, views=6, size=16) for name in ("ball", "cup")]
+
+
+def run_batch(scenes, out, options=OPTIONS, **how):
+    threads = how.pop("threads", 1)
+    return task.batch(dataclasses.replace(options, scenes=scenes, out=out, **how), threads)
+
+
+def said(out: Path, name: str) -> str:
+    path = out / "logs" / f"{name}.txt"
+    return path.read_text() if path.exists() else ""
+
+
+def trainings(out: Path, name: str) -> int:
+    """Processes that trained a scene."""
+    return said(out, name).count("univoxel.cli train")
+
+
+def training_process(out: Path, name: str) -> int:
+    """The process that trains a scene; 0: there is none."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = path.read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if b"train" in words and str(out / name / "run").encode() in words:
+            return int(path.parent.name)
+    return 0
+
+
+def parent(process: int) -> int:
+    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def in_mid_training(out: Path, name: str) -> bool:
+    """Whether its first stage is saved, and not all of it is done."""
+    folder = out / name / "run"
+    return (folder / FILE).exists() and not (folder / "trust.txt").exists()
+
+
+def went_on(out: Path, name: str) -> bool:
+    """Whether a later process began with what an earlier one had saved."""
+    return said(out, name).count("nothing was saved") == 1 < trainings(out, name)
+
+
+def whole(out: Path, name: str) -> bool:
+    return load_checkpoint(out / name / "run")[1]["made"] == [1.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def night(scenes, tmp_path_factory):
+    """Two scenes through all of the usual steps, by the command line."""
+    out = tmp_path_factory.mktemp("out") / "night"
+    sets = [f"--set={change}" for change in TINY]
+    options = ["--preset", "draft", "--light", "sg", "--minutes", "30", "--samples", "1", *sets]
+    assert main(["batch", *map(str, scenes), "--out", str(out), "--jobs", "2", *options]) == 0
+    return out, options
+
+
+def test_each_scene_has_all_of_its_results(night):
+    out, _ = night
+    for name in ("ball", "cup"):
+        assert whole(out, name)
+        assert (out / name / f"{name}.glb").read_bytes()[:4] == b"glTF"
+        assert json.loads((out / name / "measures.json").read_text())["nvs_psnr"] > 5
+        page = (out / name / "index.html").read_text()
+        assert f"<title>{name}" in page
+        assert not (out / name / "run" / "index.html").exists()  # not twice
+    record = json.loads((out / "batch.json").read_text())
+    assert record["options"]["preset"] == "draft"
+    ball, cup = record["scenes"]
+    assert (ball["name"], ball["state"], ball["errors"]) == ("ball", "done", {})
+    words = {"good", "usable", "retake", "unfinished"}
+    assert {ball["verdict"], cup["verdict"]} <= words
+    assert set(ball["seconds"]) == {"train", "eval", "export", "page"}
+    assert 0 <= ball["doubts"]["doubt_albedo"] <= 1
+    rows = list(csv.DictReader((out / "batch.csv").read_text().splitlines()))
+    assert [row["name"] for row in rows] == ["ball", "cup"]
+    assert [row["verdict"] for row in rows] == [ball["verdict"], cup["verdict"]]
+    assert float(rows[1]["nvs_psnr"]) == pytest.approx(cup["measures"]["nvs_psnr"], rel=1e-5)
+
+
+def test_the_page_shows_them_and_needs_no_other_file(night):
+    out, _ = night
+    page = (out / "index.html").read_text()
+    assert page.count('<img alt="" src="data:image/jpeg;base64,') == 2
+    assert page.rstrip().endswith("</html>")
+    assert "<p>2 done</p>" in page
+    links = re.findall(r'href="([^"]+)"', page)
+    assert sorted(links) == ["ball/index.html", "cup/index.html", "logs/ball.txt", "logs/cup.txt"]
+    assert all((out / link).exists() for link in links)
+    assert not re.search(r'(src|href)="https?:', page)
+
+
+def test_what_is_done_is_not_done_again(night, scenes, monkeypatch, capsys):
+    out, options = night
+    before = {path: path.stat().st_mtime_ns for path in (out / "ball").rglob("*")}
+    arguments = ["batch", *map(str, scenes), "--out", str(out), *options]
+    assert main([*arguments, "--json", "-"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == json.loads((out / "batch.json").read_text())
+    assert {path: path.stat().st_mtime_ns for path in (out / "ball").rglob("*")} == before
+    assert trainings(out, "ball") == 1
+
+
+def test_another_training_is_refused(night, scenes, capsys):
+    out, options = night
+    assert main(["batch", str(scenes[0]), "--out", str(out), *options, "--set=seed=4"]) == 2
+    assert re.search(
+        r"ball\.json is of another changes: choose another --out", capsys.readouterr().err
+    )
+
+
+def test_a_scene_that_fails_takes_no_other_with_it(scenes, tmp_path, monkeypatch, capsys):
+    """One cannot be read, and the disk is full for one; later it has room."""
+    broken, full = tmp_path / "broken", tmp_path / "full"
+    broken.mkdir()
+    shutil.copytree(scenes[0], full)
+    out = tmp_path / "night"
+    patch = tmp_path / "patch"
+    patch.mkdir()
+    (patch / "sitecustomize.py").write_text(
+        "import errno, os\n"
+        "replace = os.replace\n"
+        "def fails(source, target):\n"
+        f"    if str(target).startswith({str(out / 'full')!r}):\n"
+        "        raise OSError(errno.ENOSPC, 'No space left on device')\n"
+        "    replace(source, target)\n"
+        "os.replace = fails\n"
+    )
+    path = os.environ.get("PYTHONPATH", "")
+    monkeypatch.setenv("PYTHONPATH", f"{patch}:{path}")
+    options = ["--steps", "train", "--preset", "draft", "--light", "sg", "--minutes", "30"]
+    options += ["--samples", "1", *(f"--set={change}" for change in TINY)]
+    given = [*map(str, (broken, full, scenes[1])), "--out", str(out), "--jobs", "2"]
+    assert main(["batch", *given, *options]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.splitlines()[-1] == (
+        "univoxel batch: 2 of 3 scenes failed (broken, full): the same command tries them again"
+    )
+    lines = captured.out.splitlines()
+    assert [line for line in lines if line.startswith("broken: failed in train: univoxel train: ")]
+    (line,) = (line for line in lines if line.startswith("full: failed in train: "))
+    assert "No space left" in line
+    assert whole(out, "cup")
+    assert not (out / "full" / "run" / FILE).exists()  # whole or absent
+    page = (out / "index.html").read_text()
+    assert "<p>2 failed, 1 done</p>" in page
+    assert page.index("broken") < page.index("cup")
+
+    monkeypatch.setenv("PYTHONPATH", path)
+    assert main(["batch", *given, *options]) == 2
+    assert "1 of 3 scenes failed (broken)" in capsys.readouterr().err
+    assert whole(out, "full")
+    assert trainings(out, "cup") == 1
+    shutil.copytree(scenes[0], broken, dirs_exist_ok=True)
+    assert main(["batch", *given, *options]) == 0
+
+
+def test_a_training_that_is_killed_goes_on(scenes, tmp_path):
+    def kill() -> None:
+        wait_for(lambda: in_mid_training(tmp_path, "ball"), 240)
+        os.kill(training_process(tmp_path, "ball"), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    (result,) = run_batch(scenes[:1], tmp_path, SLOW)
+    killer.join()
+    assert result.state == "done"
+    assert went_on(tmp_path, "ball")
+    assert whole(tmp_path, "ball")
+    assert trainings(tmp_path, "ball") == 2
+
+
+def test_workers_and_schedulers_that_are_killed(scenes, tmp_path):
+    """Another worker goes on; with another scheduler the same command does."""
+    out = tmp_path / "night"
+
+    options = {"jobs": None}
+    with scheduler(tmp_path) as (running, address), worker(address), worker(address):
+
+        def both() -> None:
+            wait_for(lambda: in_mid_training(out, "ball"), 240)
+            os.kill(parent(training_process(out, "ball")), signal.SIGKILL)  # either worker has it
+            wait_for(lambda: trainings(out, "ball") == 2, 240)
+            running.kill()
+
+        changing = threading.Thread(target=both)
+        changing.start()
+        with pytest.raises(ProcessFailed, match="scheduler is gone: the same command goes on"):
+            run_batch(scenes[:1], out, SLOW, scheduler=address, **options)
+        changing.join()
+        wait_for(lambda: not training_process(out, "ball"))
+    with scheduler(tmp_path) as (_, address), worker(address):
+        (result,) = run_batch(scenes[:1], out, SLOW, scheduler=address, **options)
+    assert result.state == "done"
+    assert went_on(out, "ball")
+    assert whole(out, "ball")
+
+
+def test_two_batches_on_one_folder_train_each_scene_once(scenes, tmp_path):
+    results = []
+    second = threading.Thread(target=lambda: results.extend(run_batch(scenes, tmp_path)))
+    second.start()
+    results += run_batch(scenes, tmp_path)
+    second.join()
+    assert [result.state for result in results] == ["done"] * 4
+    assert [trainings(tmp_path, name) for name in ("ball", "cup")] == [1, 1]
+
+
+def test_masks_that_photographs_bring_are_taken(scenes, tmp_path):
+    """Then nothing is cut out; what made no file is looked at again only until it was trained."""
+    options = dataclasses.replace(OPTIONS, steps=("masks", "train"))
+    assert run_batch(scenes[:1], tmp_path, options)[0].state == "done"
+    assert not (tmp_path / "ball" / "cut").exists()
+    assert whole(tmp_path, "ball")
+    words = said(tmp_path, "ball")
+    assert run_batch(scenes[:1], tmp_path, options)[0].state == "done"
+    assert said(tmp_path, "ball") == words
+
+
+def test_steps_of_raw_photographs(tmp_path):
+    options = dataclasses.replace(OPTIONS, steps=("page", "train", "poses", "masks"), masks="none")
+    options = dataclasses.replace(options, out=tmp_path / "night")
+    job = job_of("mug", tmp_path / "mug", options, 1)
+    assert [step.name for step in job.steps] == ["poses", "masks", "train", "page"]
+    poses, masks, train, page = job.steps
+    folder = tmp_path / "night" / "mug"
+    assert poses.words()[2:] == [
+        *("capture", str(tmp_path / "mug"), "--out", str(folder), "--masks", "none"),
+        *("--until", "cameras"),
+    ]
+    assert masks.words()[-2:] == ["--until", "masks"]
+    assert train.words()[3] == str(tmp_path / "mug")
+    for name in ("scene", "cut"):  # each takes the place of those before
+        (folder / name).mkdir(parents=True)
+        assert train.words()[3] == str(folder / name)
+    assert masks.done()
+    assert not poses.done()
+    (folder / "scene" / "poses.json").touch()
+    assert poses.done()
+    assert (train.needed, page.needed) == (True, False)
+
+
+def test_what_a_training_of_a_batch_is_asked_for(tmp_path):
+    def options(threads, **changes) -> str:
+        asked = dataclasses.replace(USUAL, out=tmp_path, **changes)
+        train = job_of("mug", tmp_path, asked, threads).steps[0]
+        return " ".join(train.words()[5:])
+
+    # A preset makes all its steps, on any number of threads
+    assert options(1).endswith("--preset auto --light hybrid")
+    assert options(2, preset="draft").endswith("--preset draft --light hybrid")
+    assert options(1, minutes=3.0).endswith("--preset auto --light hybrid --minutes 3")
+    config = dataclasses.replace(USUAL.training(), out=tmp_path)
+    save_config(config)
+    alike = options(1, config=tmp_path / "config.json", changes=("seed=2",))
+    assert f"--config {tmp_path / 'config.json'} --set=seed=2" in alike
+    asked = dataclasses.replace(USUAL, config=tmp_path / "config.json", minutes=2.0)
+    assert asked.training() == dataclasses.replace(config, minutes=2.0)
+
+
+def test_a_machine_is_shared(scenes, tmp_path):
+    known = scenes * 4
+    config = USUAL.training()
+    plenty = Memory(10**13, 10**13)
+    assert share(known, config, 16.0, plenty) == (8, 2)
+    assert share(known, config, 4.0, plenty) == (4, 1)
+    assert share(known, config, 4.0, None, threads=2) == (2, 2)
+    assert share(known, config, 4.0, plenty, jobs=3) == (3, 1)
+    assert share(known, config, 0.5, plenty) == (1, 1)
+    most = bytes_of(scenes[0], config)
+    assert share(known, config, 16.0, Memory(10**13, int(3.5 * most))) == (3, 5)
+    assert share(known, config, 16.0, Memory(most // 2, None)) == (1, 16)
+
+
+def test_more_pictures_need_more_memory(scenes, tmp_path):
+    config = USUAL.training()
+    many = write_scene(tmp_path / "many", views=12, size=64)
+    each = PER_PIXEL + FURTHER  # the photograph, and what training makes of it
+    assert bytes_of(many, config) - bytes_of(scenes[0], config) == each * (14 * 64**2 - 8 * 16**2)
+    (many / "train" / "r_0.png").write_bytes(b"")
+    assert bytes_of(many, config) - bytes_of(scenes[0], config) == each * (13 * 64**2 - 8 * 16**2)
+
+
+def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypatch):
+    def refused(error, match, given=tuple(scenes), **options):
+        with pytest.raises(error, match=match):
+            run_batch(given, tmp_path / "out", **options)
+        assert not (tmp_path / "out").exists()
+
+    refused(UserError, "expected a scene, a folder of photographs, or more; got none", [])
+    refused(UserError, "nothing: expected a scene, got nothing there", [tmp_path / "nothing"])
+    other = tmp_path / "b" / "ball"
+    other.mkdir(parents=True)
+    refused(UserError, "folders of different names, got .*ball and .*ball", [scenes[0], other])
+    (tmp_path / "logs").mkdir()
+    refused(UserError, "logs: expected another name than 'logs'", [tmp_path / "logs"])
+    for name in ("jobs", "threads", "tries"):
+        refused(UserError, f"{name} must be at least 1, got 0", **{name: 0})
+    for field, value, match in (
+        ("samples", 0, "samples must be at least 1, got 0"),
+        ("steps", (), "steps must be of poses, masks, .*, got none"),
+        ("steps", ("fly",), "steps must be of .*, got fly"),
+        ("changes", ("seed=x",), "changes=seed=x: expected a int"),
+        ("config", tmp_path / "none.json", "got both: .*none.json says them"),
+    ):
+        refused(UserError, match, options=dataclasses.replace(OPTIONS, **{field: value}))
+    refused(UserError, "expected jobs or scheduler, got both", scheduler="tcp://x:1")
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    refused(MissingExtra, r"univoxel\[cluster\]")
+
+
+def test_records_of_other_options_are_refused(scenes, tmp_path):
+    job = job_of("ball", scenes[0], dataclasses.replace(OPTIONS, out=tmp_path), 1)
+    job.files.parent.mkdir()
+    job.save({"identity": job.identity | {"data": "/elsewhere"}})
+    with pytest.raises(ExistingFile, match=r"ball\.json is of another data: choose another out"):
+        run_batch(scenes[:1], tmp_path)
+
+
+def test_a_video_is_a_scene(tmp_path):
+    (tmp_path / "mug.mp4").touch()
+    assert named([tmp_path / "mug.mp4"]) == {"mug": tmp_path / "mug.mp4"}
+
+
+def test_what_is_not_known_is_a_dash_or_empty(tmp_path):
+    results = [
+        SceneResult("a<b", "/a", "a<b", "failed", {"train": "x < y"}, {}),
+        SceneResult("c", "/c", "c", "done", {}, {"train": 61.5}, "good", {"nvs_psnr": 30.04}),
+    ]
+    page = write_sheet(results, tmp_path).read_text()
+    assert "a&lt;b" in page
+    assert "train: x &lt; y" in page
+    assert "<td>30.0" in page
+    assert "<td>62 s" in page
+    assert "albedo, dB" not in page
+    write_results(results, {}, tmp_path)
+    rows = list(csv.DictReader((tmp_path / "batch.csv").read_text().splitlines()))
+    assert [row["verdict"] for row in rows] == ["", "good"]
+    assert (rows[0]["nvs_psnr"], rows[0]["train_s"], rows[0]["error"]) == ("", "", "train: x < y")
+    with pytest.raises(ProcessFailed, match=r"1 of 2 scenes failed \(a<b\)"):
+        task.check(results)
+    assert task.check(results[1:]) is None

@@ -1,0 +1,480 @@
+"""From photographs to a page in one go: what is made, kept, taken from the user, refused."""
+
+import json
+import logging
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import capturing
+import numpy as np
+import pytest
+import textured_room
+from PIL import Image
+
+import univoxel
+from univoxel.capture import poses as structure_from_motion
+from univoxel.cli import capture as task
+from univoxel.errors import DataError, ExistingFile, MissingExtra, StillBackground, UserError
+
+VIEWS = 11  # of 36 around the object: too few for a vote, so masks are taken as they are
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory) -> tuple[Path, Path]:
+    """Photographs, and their masks in another folder."""
+    root = tmp_path_factory.mktemp("given")
+    for name in ("photos", "masks"):
+        (root / name).mkdir()
+    for v, view in enumerate(textured_room.orbit(36, 400, 300)[:VIEWS]):
+        picture, mask = textured_room.photograph(view)
+        picture.save(root / "photos" / f"IMG_{v:02d}.jpg", quality=92)
+        mask.save(root / "masks" / f"IMG_{v:02d}.png")
+    return root / "photos", root / "masks"
+
+
+@pytest.fixture(scope="module")
+def captured(photographs, tmp_path_factory) -> task.Captured:
+    return capturing.make(photographs, tmp_path_factory.mktemp("out") / "mug")
+
+
+def files_of(out: Path) -> dict[str, int]:
+    """Files below a folder, but for those of the search for cameras, which need not stay."""
+    return {
+        path.relative_to(out).as_posix(): path.stat().st_mtime_ns
+        for path in sorted(out.rglob("*"))
+        if path.is_file() and "sfm" not in path.parts
+    }
+
+
+def test_photographs_become_a_mesh_and_a_page(captured):
+    out = captured.page.parent
+    assert captured == task.Captured(out / "index.html", out / "mug.glb", out / "run")
+    assert captured.mesh.read_bytes()[:4] == b"glTF"
+    files = files_of(out)
+    for name in ("scene/sparse/0/images.bin", "scene/images/IMG_00.jpg", "cut/masks.html"):
+        assert name in files
+    for name in ("city", "sunset"):
+        for frame in range(capturing.PICTURES.frames):
+            with Image.open(out / "pictures" / name / f"orbit_{frame:04d}.png") as picture:
+                assert picture.size == (48, 48)
+    page = captured.page.read_text("utf-8")
+    assert "(mug.glb)" in page
+    assert "(cut/masks.html)" in page
+    assert "Made of " in page
+    assert "novel views, PSNR" in page
+    assert univoxel.open_run(captured.run).path == captured.run
+
+
+def test_the_same_again_only_says_what_is_there(captured, photographs, caplog):
+    out = captured.page.parent
+    before = files_of(out)
+    with caplog.at_level(logging.INFO, "univoxel"):
+        capturing.make(photographs, out)
+    said = [r.getMessage() for r in caplog.records]
+    there = ("cameras", "masks", "training", "mesh", "pictures")
+    for n, step in enumerate(there, 1):
+        assert said[n - 1].startswith(f"step {n} of 6, {step}: there already, {out}")
+    assert said[5:] == [f"step 6 of 6, page: {out}/index.html"]
+    after = files_of(out)
+    assert after.pop("index.html") >= before.pop("index.html")
+    assert after == before
+
+
+def test_killed_in_each_step_the_same_call_goes_on(captured, photographs, tmp_path):
+    out = tmp_path / "mug"
+    command = [sys.executable, capturing.__file__, *photographs, out]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    told = [json.loads(line) for line in ended.stdout.splitlines()]
+    assert [step for step, _, _ in told] == list(task.STEPS)
+    made = ("scene/poses.json", "cut/masks.html", "run/trust.txt", "mug.glb")
+    made += ("pictures/measures.json", "index.html")
+    for n, (step, ended_by, files) in enumerate(told):
+        assert ended_by == signal.SIGKILL, (step, ended.stderr)
+        assert {*made[:n]} <= {*files}
+        assert not {*made[n:]} & {*files}  # not whole, so not there
+        if step == "training":  # it goes on from there
+            assert "run/scene.safetensors" in files
+    finished = capturing.make(photographs, out)
+    reference = captured.page.parent
+    assert finished.mesh == out / "mug.glb"
+    # Nothing half-written among them; the log is there where training took seconds
+    assert files_of(out).keys() | {"run/log.jsonl"} == files_of(reference).keys() | {
+        "run/log.jsonl"
+    }
+    # What does not hang on how long training took is the same to the bit
+    for name in files_of(out):
+        if name.startswith(("scene/images/", "scene/sparse/", "cut/")):
+            assert (out / name).read_bytes() == (reference / name).read_bytes(), name
+
+
+def test_other_photographs_are_refused(captured, photographs, tmp_path):
+    out, (photos, masks) = captured.page.parent, photographs
+    before = files_of(out)
+    more, fewer, other = (tmp_path / name for name in ("more", "fewer", "other"))
+    for folder in (more, fewer, other):
+        shutil.copytree(photos, folder)
+    shutil.copy(photos / "IMG_00.jpg", more / "IMG_99.jpg")
+    (fewer / "IMG_03.jpg").unlink()
+    with (other / "IMG_04.jpg").open("ab") as file:
+        file.write(b"\0")
+    for folder, why in (
+        (more, "IMG_99.jpg was not part of it"),
+        (fewer, "IMG_03.jpg is not there now"),
+        (other, "IMG_04.jpg is another file now"),
+    ):
+        with pytest.raises(ExistingFile, match=f"holds a capture of IMG_00.jpg and 10 .*{why}"):
+            capturing.make((folder, masks), out)
+    moved = tmp_path / "moved"
+    shutil.copytree(photos, moved)  # the same photographs elsewhere
+    capturing.make((moved, masks), out)
+    before.pop("index.html")
+    assert before.items() <= files_of(out).items()
+
+
+def test_what_other_options_made_is_refused(captured, photographs):
+    out, (photos, masks) = captured.page.parent, photographs
+    options: dict[str, Any] = {"config": capturing.CONFIG, "pictures": capturing.PICTURES}
+    with pytest.raises(ExistingFile, match=r"cut holds photographs with masks=.*remove it and"):
+        task.capture(photos, out, **options)
+    options |= {"masks": masks, "changes": capturing.CHANGES}
+    choices: list[dict[str, Any]] = [
+        {"preset": "full", "light": "baked"},
+        {"preset": "draft", "light": "sg"},
+        {"preset": "draft", "light": "baked", "minutes": 3.0},
+    ]
+    for choice in choices:
+        with pytest.raises(ExistingFile, match=r"run was trained with another preset, minutes"):
+            task.capture(photos, out, **options, **choice)
+
+
+def test_a_mask_that_was_mended_is_told(captured, photographs, caplog):
+    out = captured.page.parent
+    edited = next((out / "cut" / "train").glob("*.png"))
+    times = edited.stat().st_atime_ns, edited.stat().st_mtime_ns
+    try:
+        os.utime(edited)
+        with caplog.at_level(logging.WARNING, "univoxel"):
+            capturing.make(photographs, out)
+    finally:
+        os.utime(edited, ns=times)
+    assert f"photographs in {(out / 'cut').absolute()} have changed since" in caplog.text
+
+
+def test_a_newer_run_makes_mesh_and_pictures_anew(captured, photographs, tmp_path, monkeypatch):
+    """As where it was trained on: what is older than it is of another state."""
+    out = tmp_path / "mug"
+    shutil.copytree(captured.page.parent, out)
+    os.utime(out / "run" / "scene.safetensors")
+    os.utime(out / "run" / "trust.txt")
+    called = []
+    monkeypatch.setattr(task, "_check_trained", lambda *_: None)
+    monkeypatch.setattr(task, "export", lambda run, mesh: called.append("export"))
+    monkeypatch.setattr(task, "relight_to_files", lambda *_, **__: called.append("relight"))
+
+    def measures(run, save, json):
+        called.append("evaluate")
+        raise DataError("photographs are elsewhere")
+
+    monkeypatch.setattr(task, "evaluate", measures)
+    assert not list((out / "pictures").rglob("*.xyz"))
+    capturing.make(photographs, out)
+    assert called == ["export", "relight", "evaluate"]
+    assert not any(p.is_file() for p in (out / "pictures").rglob("*"))
+    assert "novel views, PSNR" not in (out / "index.html").read_text("utf-8")
+
+
+def test_a_run_takes_the_place_of_three_steps(captured, tmp_path, caplog):
+    with caplog.at_level(logging.INFO, "univoxel"):
+        made = task.capture(captured.run, tmp_path / "again", pictures=capturing.PICTURES)
+    assert made.run == captured.run
+    assert made.mesh.read_bytes()[:4] == b"glTF"
+    assert {p.name for p in made.page.parent.iterdir()} == {
+        *("again.glb", "steps.json", "index.html", "pictures")
+    }
+    assert f"step 3 of 6, training: there already, {captured.run}" in caplog.text
+    with pytest.raises(UserError, match="is a trained run: masks, preset, minutes, light and set"):
+        task.capture(captured.run, tmp_path / "other", minutes=2.0)
+    with pytest.raises(UserError, match="is a trained run: masks"):
+        task.capture(captured.run, tmp_path / "other", masks="none")
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.fixture
+def steps(monkeypatch, tmp_path) -> list[tuple]:
+    """Stand-ins for all steps: they write what the next looks at, and note what they are told."""
+    noted = []
+
+    def poses(photographs, out, masks=None, config=None):
+        noted.append(("poses", photographs, masks))
+        (out / "sparse/0").mkdir(parents=True)
+        for name in ("cameras.bin", "images.bin"):
+            (out / "sparse/0" / name).write_bytes(bytes(8))
+        (out / "poses.json").write_text("{}")
+        if masks:
+            shutil.copytree(masks, out / "masks")
+        return out
+
+    def cutout(data, out, source):
+        noted.append(("cutout", data, source))
+        out.mkdir()
+        return out
+
+    def train(config, resume, on_progress):
+        noted.append(("train", config.data, resume))
+        config.out.mkdir(exist_ok=True)
+        text = json.dumps({"data": str(config.data), "downscale": 1, "allow_outside": False})
+        (config.out / "config.json").write_text(text)
+        for name in ("scene.safetensors", "trust.txt"):
+            (config.out / name).write_text("all is sure")
+        return config.out
+
+    def evaluate(run, save, json):
+        save.mkdir(parents=True)
+        Image.new("RGB", (8, 8)).save(save / "contact_sheet.png")
+        json.write_text('{"nvs_psnr": 31.25}')
+
+    def write_page(run, path, title, notes, measures):
+        path.write_text(f"{title}: {notes} {measures}")
+
+    monkeypatch.setattr("univoxel.capture.poses.poses", poses)
+    monkeypatch.setattr("univoxel.segmentation.cutout.cutout", cutout)
+    monkeypatch.setattr("univoxel.trainer.train", train)
+    monkeypatch.setattr(task, "evaluate", evaluate)
+    monkeypatch.setattr(task, "_check_trained", lambda wanted, done: None)
+    monkeypatch.setattr(task, "export", lambda run, mesh: mesh.write_bytes(b"glTF"))
+    monkeypatch.setattr(task, "relight_to_files", lambda *_, **__: None)
+    monkeypatch.setattr("univoxel.segmentation.network.network", no_network)
+    monkeypatch.setattr("univoxel.page.write_page", write_page)
+    return noted
+
+
+def no_network():
+    raise MissingExtra("masks from a network need rembg: pip install 'univoxel[masks]'")
+
+
+def red_is_the_object():
+    return lambda photograph: (photograph[..., 0] > 128).float()
+
+
+@pytest.fixture
+def pictures(tmp_path) -> Path:
+    folder = tmp_path / "pictures of mine"
+    folder.mkdir()
+    for v in range(3):
+        picture = np.zeros((12, 16, 3), np.uint8)
+        picture[3:9, v : v + 4, 0] = 255
+        Image.fromarray(picture).save(folder / f"{v}.png")
+    return folder
+
+
+def test_without_a_network_or_masks_there_is_one_line(steps, pictures, tmp_path, monkeypatch):
+    """Cameras are kept: the same call with masks goes on."""
+    out = tmp_path / "mug"
+    monkeypatch.setattr("univoxel.data.load_photos", without_masks)
+    monkeypatch.setattr(
+        "univoxel.segmentation.cutout.cutout", lambda data, out, source: no_network()
+    )
+    with pytest.raises(MissingExtra, match=r"pip install 'univoxel\[masks\]'"):
+        task.capture(pictures, out)
+    assert steps == [("poses", pictures, None)]
+
+
+def test_masks_of_ones_own_go_on(steps, pictures, tmp_path):
+    out = tmp_path / "mug"
+    task.capture(pictures, out, masks=pictures)
+    assert steps == [
+        ("poses", pictures, None),
+        ("cutout", out / "scene", pictures),
+        ("train", (out / "cut").absolute(), False),
+    ]
+    page = (out / "index.html").read_text("utf-8")
+    assert "Made of 0.png and 2 others" in page
+    assert "31.25" in page
+
+
+def without_masks(*_, **__):
+    from univoxel.errors import WithoutMasks
+
+    raise WithoutMasks("none")
+
+
+def test_with_a_network_masks_come_from_it(steps, pictures, tmp_path, monkeypatch):
+    monkeypatch.setattr("univoxel.data.load_photos", without_masks)
+    monkeypatch.setattr("univoxel.segmentation.network.network", red_is_the_object)
+    task.capture(pictures, tmp_path / "mug")
+    assert steps[1] == ("cutout", tmp_path / "mug/scene", "rembg")
+
+
+def test_photographs_with_cameras_and_masks_are_trained_on_as_they_lie(
+    steps, tmp_path, monkeypatch
+):
+    scene = task.SCENE
+    for _ in range(2):  # and are not read again to find out
+        task.capture(scene, tmp_path / "mug")
+        monkeypatch.setattr("univoxel.data.load_photos", None)
+    assert steps == [("train", scene.absolute(), False)]
+    kept = [p.name for p in (tmp_path / "mug").iterdir()]
+    assert "scene" not in kept
+    assert "cut" not in kept
+
+
+def test_the_first_steps_alone(steps, pictures, tmp_path):
+    out = tmp_path / "mug"
+    assert task.find_data(pictures, out, until="cameras") == out / "scene"
+    assert task.find_data(pictures, out, masks="none") == out / "cut"
+    assert [name for name, *_ in steps] == ["poses", "cutout"]
+    assert task.capture(pictures, out, masks="none").page.exists()  # goes on with them
+    assert [name for name, *_ in steps] == ["poses", "cutout", "train"]
+    with pytest.raises(UserError, match="is a trained run: there are cameras and masks"):
+        task.find_data(out / "run", tmp_path / "other")
+
+
+def test_a_capture_of_version_0_2_is_gone_on_with(steps, pictures, tmp_path):
+    out = tmp_path / "mug"
+    task.find_data(pictures, out, masks="none")
+    noted = json.loads((out / "steps.json").read_text())
+    (out / "steps.json").unlink()
+    (out / "capture.json").write_text(json.dumps({"kind": "photographs", **noted}))
+    (pictures / "3.png").touch()
+    with pytest.raises(ExistingFile, match=r"holds a capture of 0.png .*3.png was not part of it"):
+        task.capture(pictures, out, masks="none")
+    (pictures / "3.png").unlink()
+    with pytest.raises(ExistingFile, match="holds photographs with masks=none"):
+        task.capture(pictures, out)
+    task.capture(pictures, out, masks="none")
+    assert [name for name, *_ in steps] == ["poses", "cutout", "train"]
+
+
+def still(photographs, out, masks=None, config=None):
+    raise StillBackground("the background stands still in 9 of 10 pairs")
+
+
+def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, caplog):
+    out, found = tmp_path / "mug", structure_from_motion.poses
+
+    def poses(photographs, scene, masks=None, config=None):
+        return (found if masks else still)(photographs, scene, masks)
+
+    monkeypatch.setattr("univoxel.capture.poses.poses", poses)
+    monkeypatch.setattr("univoxel.segmentation.network.network", red_is_the_object)
+    with caplog.at_level(logging.INFO, "univoxel"):
+        task.capture(pictures, out)
+    assert "9 of 10 pairs: the object was turned before a still camera, so masks first" in (
+        caplog.text
+    )
+    assert steps == [
+        ("poses", pictures, out / "masks"),
+        ("cutout", out / "scene", out / "scene" / "masks"),
+        ("train", (out / "cut").absolute(), False),
+    ]
+    for v in range(3):
+        mask = np.asarray(Image.open(out / "masks" / f"{v}.png"))
+        assert (mask == np.asarray(Image.open(pictures / f"{v}.png"))[..., 0]).all()
+
+
+def test_a_turntable_goes_on_with_the_masks_that_are_there(steps, pictures, tmp_path, monkeypatch):
+    """Killed among the masks: the background is not looked at again."""
+    out, made = tmp_path / "mug", []
+    monkeypatch.setattr("univoxel.capture.poses.poses", still)
+
+    def killed():
+        def mask(photograph):
+            made.append(photograph)
+            if len(made) == 3:
+                raise KeyboardInterrupt
+            return red_is_the_object()(photograph)
+
+        return mask
+
+    monkeypatch.setattr("univoxel.segmentation.network.network", killed)
+    with pytest.raises(KeyboardInterrupt):
+        task.capture(pictures, out)
+    assert not (out / "masks").exists()
+    told = []
+    monkeypatch.setattr(
+        "univoxel.capture.poses.poses",
+        lambda p, scene, masks=None, config=None: told.append(masks) or scene,
+    )
+    task.capture(pictures, out)
+    assert told == [out / "masks"]
+    assert len(made) == 4  # two of three are kept
+
+
+def test_masks_of_a_turntable_can_be_ones_own(steps, pictures, tmp_path, monkeypatch):
+    found = structure_from_motion.poses
+    monkeypatch.setattr(
+        "univoxel.capture.poses.poses",
+        lambda p, out, masks=None, config=None: (found if masks else still)(p, out, masks),
+    )
+    task.capture(pictures, tmp_path / "mug", masks=pictures)
+    assert steps[0] == ("poses", pictures, pictures)
+    assert steps[1] == ("cutout", tmp_path / "mug/scene", tmp_path / "mug/scene/masks")
+
+
+def test_a_turntable_without_anything_for_masks_is_one_line(steps, pictures, tmp_path, monkeypatch):
+    monkeypatch.setattr("univoxel.capture.poses.poses", still)
+    with pytest.raises(MissingExtra, match="need rembg"):
+        task.capture(pictures, tmp_path / "mug")
+    with pytest.raises(UserError, match=r"and its ground with it: expected masks=rembg"):
+        task.capture(pictures, tmp_path / "mug", masks="none")
+
+
+def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypatch):
+    out = tmp_path / "mug"
+    cases: list[tuple[Path, dict[str, Any], type[Exception], str]] = [
+        (tmp_path / "none", {}, DataError, "expected a folder of photographs or a video, got not"),
+        (pictures / "0.png", {}, DataError, "got a file of another kind"),
+        (pictures, {"masks": "nothing here"}, DataError, "masks: expected rembg, none or a folder"),
+        (pictures, {"masks": "rembg"}, MissingExtra, "need rembg"),
+        (pictures, {"preset": "quick"}, UserError, "preset must be one of draft, fast, full, best"),
+        (pictures, {"minutes": -1.0}, UserError, "minutes must be above 0"),
+        (pictures, {"changes": ["colour=red"]}, UserError, "no field 'colour'"),
+    ]
+    for photographs, options, error, message in cases:
+        with pytest.raises(error, match=message):
+            task.capture(photographs, out, **options)
+        assert not out.exists()
+    monkeypatch.setattr("univoxel.capture.sfm.require_pycolmap", no_network)
+    with pytest.raises(MissingExtra):
+        task.capture(pictures, out)
+    assert not out.exists()
+    out.touch()
+    monkeypatch.setattr("univoxel.capture.sfm.require_pycolmap", lambda: None)
+    with pytest.raises(ExistingFile, match="is a file"):
+        task.capture(pictures, out)
+    with pytest.raises(ExistingFile, match=r"holds other files \(0.png\): choose another out"):
+        task.capture(pictures, pictures)
+
+
+def test_what_a_killed_writer_left_is_removed(steps, pictures, tmp_path, monkeypatch):
+    """Killed while it wrote its first file, and others: nothing half-written stays."""
+    monkeypatch.setattr("univoxel.data.load_photos", without_masks)
+    out = tmp_path / "mug"
+    out.mkdir()
+    (out / ".steps.json.123.tmp").touch()
+    task.capture(pictures, out)
+    assert not list(out.rglob("*.tmp"))
+
+
+def test_the_package_has_it():
+    assert univoxel.capture_object is task.capture
+
+
+def test_how_long_training_takes_is_said_before_cameras_are_found(
+    tmp_path, photographs, monkeypatch, caplog
+):
+    caplog.set_level("INFO", "univoxel")
+
+    def stop(*_):
+        raise DataError("no cameras")
+
+    monkeypatch.setattr(task, "_find_cameras", stop)
+    with pytest.raises(DataError, match="no cameras"):
+        task.capture(photographs[0], tmp_path / "out", masks=photographs[1], preset="draft")
+    assert re.search(r"training takes about \d+ (s|min) on this machine; cameras", caplog.text)

@@ -1,0 +1,200 @@
+"""Photographs written with the masks that were found."""
+
+import logging
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from analytic import photograph, write_scene
+from PIL import Image
+from spoilt_masks import iou
+
+from univoxel.cli import main
+from univoxel.data import load_photos
+from univoxel.data.shots import read_photo
+from univoxel.errors import DataError, MissingExtra
+from univoxel.segmentation import cutout as task
+from univoxel.segmentation.vote import VoteConfig
+
+VIEWS, SIZE = 16, 40
+SMALL = VoteConfig(voxels=40, first_voxels=20)
+
+
+def write_masks(folder, masks, stems):
+    folder.mkdir(exist_ok=True)
+    for stem, mask in zip(stems, masks, strict=True):
+        picture = np.asarray(255 * mask.float()).astype(np.uint8)
+        Image.fromarray(picture).save(folder / f"{stem}.png")
+    return folder
+
+
+@pytest.fixture
+def by_brightness(monkeypatch):
+    """A network for which what is not black is the object."""
+    monkeypatch.setattr(task, "network", lambda: lambda photo: (photo.sum(-1) > 0).float())
+
+
+def test_what_cannot_be_written_leaves_nothing_behind_that_looks_whole(
+    tmp_path, monkeypatch, by_brightness
+):
+    def full(*_):
+        raise OSError("no space left")
+
+    data, out = write_scene(tmp_path / "data", 3, 8), tmp_path / "cut"
+    with monkeypatch.context() as patch:
+        patch.setattr(task, "write_cameras", full)
+        with pytest.raises(OSError, match="no space left"):
+            task.cutout(data, out)
+    assert not out.exists()
+    assert task.cutout(data, out).is_dir()  # what was begun is not in the way
+
+
+def test_what_is_written_can_be_trained_on(tmp_path, caplog, by_brightness):
+    data = write_scene(tmp_path / "data", VIEWS, SIZE)
+    for path in data.glob("*/r_*.png"):  # no alpha at all
+        picture = np.asarray(Image.open(path))
+        Image.fromarray(picture[..., :3] * (picture[..., 3:] > 0)).save(path)
+    with pytest.raises(DataError, match="univoxel cutout"):
+        load_photos(data)
+    out = tmp_path / "cut"
+    caplog.set_level("INFO", "univoxel")
+    assert task.cutout(str(data), str(out), vote=SMALL) == out
+    assert "photographs of 40x40 pixels" in caplog.text
+    for split, count in (("train", VIEWS), ("test", 2)):
+        cut, source = load_photos(out, split), load_photos(data, split, masks=False)
+        assert len(cut) == count
+        assert torch.equal(cut.color, source.color)
+        torch.testing.assert_close(cut.cameras.focal, source.cameras.focal)
+        torch.testing.assert_close(cut.cameras.camera_to_world, source.cameras.camera_to_world)
+        for view in range(count):  # each mask with its photograph
+            assert iou(cut.picture(view)[1], photograph(source.cameras, view)[1]) > 0.9
+    with pytest.raises(FileExistsError, match="cut is there already: choose another out"):
+        task.cutout(data, out)
+
+
+def test_linear_photographs_stay_linear(tmp_path):
+    photos = load_photos(write_scene(tmp_path / "data", VIEWS, SIZE))
+    linear = replace(photos, color=torch.rand(VIEWS, SIZE, SIZE, 3), alpha=photos.alpha / 255)
+    alpha = torch.full((SIZE, SIZE), 0.5)
+    task.write_photo(tmp_path / "r_3", linear, 3, alpha)
+    color, found = read_photo(tmp_path / "r_3.exr")
+    torch.testing.assert_close(color, linear.color[3], atol=1e-3, rtol=1e-3)  # half floats
+    assert torch.equal(found, alpha)
+
+
+def test_a_data_set_without_test_views(tmp_path, by_brightness):
+    data = write_scene(tmp_path / "data", VIEWS, SIZE)
+    (data / "transforms_test.json").unlink()
+    out = task.cutout(data, tmp_path / "cut", vote=SMALL)
+    assert sorted(path.name for path in out.iterdir()) == [
+        "masks.html",
+        "masks.png",
+        "train",
+        "transforms_train.json",
+    ]
+
+
+@pytest.fixture
+def with_masks(tmp_path):
+    """A scene of a sphere, and the true masks of its photographs by stem; test ones by theirs."""
+    data = write_scene(tmp_path / "data", VIEWS, SIZE)
+    (data / "transforms_test.json").unlink()
+    photos = load_photos(data)
+    return data, photos, [photos.picture(view)[1] for view in range(VIEWS)]
+
+
+def test_masks_of_a_folder_are_mended(tmp_path, with_masks, caplog):
+    data, photos, true = with_masks
+    masks = [mask.clone() for mask in true]
+    masks[2][:] = 0
+    masks[5][SIZE // 2 :] = 1  # what stands below
+    folder, out = write_masks(tmp_path / "masks", masks, photos.names), tmp_path / "cut"
+    caplog.set_level("INFO", "univoxel")
+    assert task.cutout(data, out, folder, vote=SMALL) == out
+    told = f"{VIEWS - 2} of {VIEWS} agree with the hull"
+    assert told in caplog.text
+    assert "1 keep something beside the object (r_5), 1 miss a part (r_2): mended" in caplog.text
+    cut = load_photos(out)
+    for view, mask in enumerate(true):
+        found = cut.picture(view)[1]
+        assert iou(found, mask) > 0.88 if view in (2, 5) else torch.equal(found, masks[view])
+    page = (out / "masks.html").read_text()
+    assert told in page
+    assert page.index("train/r_2") < page.index("train/r_5") < page.index("train/r_0")
+    assert (out / "masks.png").is_file()
+    assert torch.equal(cut.color, photos.color)
+
+
+def test_masks_that_are_mostly_wrong_stay(tmp_path, with_masks, caplog):
+    """Each shows another place: there is no telling what is right."""
+    data, photos, true = with_masks
+    masks = [mask.roll((11 * (v % 3 - 1), 11 * (v % 4 - 1)), (0, 1)) for v, mask in enumerate(true)]
+    folder, out = write_masks(tmp_path / "masks", masks, photos.names), tmp_path / "cut"
+    task.cutout(data, out, folder, vote=SMALL)
+    said = [r for r in caplog.records if r.levelno == logging.WARNING]
+    assert len(said) == 1
+    assert "none is mended" in said[0].getMessage()
+    assert "look at masks.html" in said[0].getMessage()
+    cut = load_photos(out)
+    for view, mask in enumerate(masks):
+        assert torch.equal(cut.picture(view)[1], mask)
+
+
+def test_few_masks_stay_as_they_are(tmp_path, caplog):
+    data = write_scene(tmp_path / "data", 4, 16)
+    (data / "transforms_test.json").unlink()
+    photos = load_photos(data)
+    masks = [photos.picture(view)[1] for view in range(4)]
+    folder = write_masks(tmp_path / "masks", masks, photos.names)
+    task.cutout(data, tmp_path / "cut", folder)
+    assert "a vote needs 12 photographs, there are 4" in caplog.text
+    masks[1][:] = 0
+    write_masks(folder, masks, photos.names)
+    with pytest.raises(DataError, match="the mask of r_1 shows nothing"):
+        task.cutout(data, tmp_path / "other", folder)
+    (folder / "r_2.png").unlink()
+    with pytest.raises(DataError, match=r"got none for 1: r_2\.png"):
+        task.cutout(data, tmp_path / "other", folder)
+    assert not (tmp_path / "other").exists()
+
+
+def test_masks_of_a_network(tmp_path, with_masks, by_brightness):
+    data, _, true = with_masks
+    out = task.cutout(data, tmp_path / "cut", vote=SMALL)
+    cut = load_photos(out)
+    assert all(iou(cut.picture(view)[1], true[view]) > 0.95 for view in range(VIEWS))
+
+
+def test_without_a_network_there_is_one_line(tmp_path, with_masks, monkeypatch, capsys):
+    """And nothing was read or written."""
+    monkeypatch.setitem(sys.modules, "rembg", None)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    out = tmp_path / "cut"
+    with pytest.raises(MissingExtra, match=r"pip install 'univoxel\[masks\]'.*--from FOLDER"):
+        task.cutout(with_masks[0], out)
+    assert main(["cutout", str(with_masks[0]), "--out", str(out)]) == 2
+    assert capsys.readouterr().err.startswith("univoxel cutout: masks from a network need rembg: ")
+    assert not out.exists()
+
+
+def test_what_stands_on_a_pattern(tmp_path, with_masks, monkeypatch, caplog):
+    data, _, true = with_masks
+    caplog.set_level("INFO", "univoxel")
+    monkeypatch.setattr(task, "find_ground", lambda photographs, cameras: len(photographs))
+    monkeypatch.setattr(task, "ground_mask", lambda ground, photo, cameras, view: true[view])
+    cut = load_photos(task.cutout(data, tmp_path / "cut", "none", vote=SMALL))
+    assert "patterned ground" in caplog.text
+    assert f"{VIEWS} of {VIEWS} agree with the hull" in caplog.text
+    assert all(iou(cut.picture(view)[1], true[view]) > 0.95 for view in range(VIEWS))
+
+
+@pytest.mark.parametrize("least", [2, VIEWS + 1])
+def test_where_no_pattern_is_the_way_out_is_told(tmp_path, with_masks, monkeypatch, least):
+    """Or too few photographs to find one."""
+    monkeypatch.setattr(task, "find_ground", lambda *_: least > VIEWS or None)
+    monkeypatch.setattr(task, "PHOTOGRAPHS", least)
+    with pytest.raises(DataError, match="expected source=rembg or a folder of masks, got none"):
+        task.cutout(with_masks[0], tmp_path / "cut", "none", vote=SMALL)
+    assert not (tmp_path / "cut").exists()

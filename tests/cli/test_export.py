@@ -1,0 +1,262 @@
+"""A scene as files that other programs read: same shape, same place, same look."""
+
+import io
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+from asymmetric_scene import BALLS, Identity, albedo, lopsided, roughness, sdf
+from PIL import Image
+
+from univoxel.cli import export as task
+
+trimesh = pytest.importorskip("trimesh")
+
+SIZE = 256
+FACES = 2000
+# Colours are stored in 8 bits of sRGB, whose slope in linear is 2.3 at most: 0.5 / 255 * 2.3, and
+# as much again for what a texel's width changes and for the way to the surface.
+COLOR = 0.01
+
+
+def decoded(srgb):
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def looked_up(picture, x, y):
+    """Bilinear value at texture coordinates, x to the right, y downwards, as renderers do."""
+    picture = np.atleast_3d(np.asarray(picture, float))
+    height, width = picture.shape[:2]
+    x, y = x * width - 0.5, y * height - 0.5
+    i, j = np.floor(x).astype(int), np.floor(y).astype(int)
+    fx, fy = (x - i)[:, None], (y - j)[:, None]
+    (i0, i1), (j0, j1) = (
+        (k.clip(0, n - 1), (k + 1).clip(0, n - 1)) for k, n in ((i, width), (j, height))
+    )
+    top = (1 - fx) * picture[j0, i0] + fx * picture[j0, i1]
+    bottom = (1 - fx) * picture[j1, i0] + fx * picture[j1, i1]
+    return (1 - fy) * top + fy * bottom
+
+
+def surface_of_balls(points):
+    """The nearest point of the nearest ball, and its distance to the next ball."""
+    offsets = points[:, None] - BALLS[:, :3]
+    distances = offsets.norm(dim=2) - BALLS[:, 3]
+    ball = distances.argmin(1)
+    normal = torch.nn.functional.normalize(offsets[torch.arange(len(points)), ball], dim=1)
+    near, next_one = distances.sort(1).values[:, :2].unbind(1)
+    return BALLS[ball, :3] + BALLS[ball, 3:] * normal, normal, next_one - near
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return lopsided()
+
+
+@pytest.fixture(scope="module")
+def written(scene, tmp_path_factory):
+    """The scene in each format: name -> path."""
+    folder = tmp_path_factory.mktemp("out")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("univoxel.checkpoint.load_scene", lambda run: {"run": scene}[str(run)])
+        for name in ("a.glb", "a.obj", "a.ply"):
+            task.export("run", folder / "deep" / name, faces=FACES, texture_size=SIZE)
+    return folder / "deep"
+
+
+def check_materials(position, color, rough, tolerance=COLOR):
+    on, _, gap = surface_of_balls(torch.tensor(position).float())
+    clear = (gap > 0.06).numpy()  # the crease between two balls is rounded by the grid
+    assert clear.mean() > 0.7
+    np.testing.assert_allclose(color[clear], albedo(on).numpy()[clear], rtol=0, atol=tolerance)
+    np.testing.assert_allclose(rough[clear], roughness(on).numpy()[clear], rtol=0, atol=tolerance)
+
+
+def test_only_the_files_that_are_asked_for(written):
+    pictures = [f"a_{kind}.png" for kind in ("albedo", "normal", "roughness")]
+    assert sorted(p.name for p in written.iterdir()) == sorted(
+        ["a.glb", "a.obj", "a.mtl", "a.ply", *pictures]
+    )
+
+
+def test_glb(written):
+    pygltflib = pytest.importorskip("pygltflib")
+    file = pygltflib.GLTF2().load(str(written / "a.glb"))
+    blob = file.binary_blob()
+
+    def view(index):
+        part = file.bufferViews[index]
+        assert part.byteOffset % 4 == 0
+        return blob[part.byteOffset :][: part.byteLength]
+
+    def values(index):
+        accessor = file.accessors[index]
+        kind = {pygltflib.FLOAT: "<f4", pygltflib.UNSIGNED_INT: "<u4"}[accessor.componentType]
+        return np.frombuffer(view(accessor.bufferView), kind).reshape(accessor.count, -1)
+
+    (primitive,) = file.meshes[0].primitives
+    faces = values(primitive.indices).reshape(-1, 3)
+    names = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0")
+    corners = [values(getattr(primitive.attributes, name))[faces] for name in names]
+    assert ((corners[3] >= 0) & (corners[3] <= 1)).all()
+    np.testing.assert_allclose(np.linalg.norm(corners[1], axis=2), 1, atol=1e-5)
+    # The middle of each face as a renderer shades it
+    position, normal, tangent, uv = (c.mean(1) for c in corners)
+    pictures = []
+    for image in file.images:
+        assert image.mimeType == "image/png"
+        pictures.append(np.asarray(Image.open(io.BytesIO(view(image.bufferView)))))
+        assert pictures[-1].shape == (SIZE, SIZE, 3)
+        assert pictures[-1].dtype == np.uint8
+    material = file.materials[0]
+    assert material.pbrMetallicRoughness.metallicFactor == 0
+    texel = [
+        looked_up(pictures[slot.index] / 255, *uv.T)
+        for slot in (
+            material.pbrMetallicRoughness.baseColorTexture,
+            material.pbrMetallicRoughness.metallicRoughnessTexture,
+            material.normalTexture,
+        )
+    ]
+    assert (texel[1][:, 2] == 0).all()
+
+    def to_world(v):  # glTF has +Y up: what is up is our +Z, what comes nearer our -Y
+        return np.stack([v[:, 0], -v[:, 2], v[:, 1]], 1)
+
+    check_materials(to_world(position), decoded(texel[0]), texel[1][:, 1])
+    local = 2 * texel[2] - 1
+    b = tangent[:, 3:] * np.cross(normal, tangent[:, :3])
+    shaded = local[:, :1] * tangent[:, :3] + local[:, 1:2] * b + local[:, 2:] * normal
+    shaded = torch.tensor(to_world(shaded)).float()
+    _, true, gap = surface_of_balls(torch.tensor(to_world(position)).float())
+    error = torch.rad2deg(torch.nn.functional.cosine_similarity(shaded, true).clamp(-1, 1).acos())
+    error = error[gap > 0.06]
+    # 8 bits are worth 0.4 degrees, the field's gradient as much again; slivers without a
+    # texel of their own see their neighbours' frame.
+    assert error.median() < 0.5
+    assert error.quantile(0.99) < 1.6
+
+
+def test_other_readers_see_the_object_where_it_is(written):
+    inside = trimesh.load(written / "a.glb", force="mesh")
+    upright = inside.vertices @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    for name, vertices in (("a.glb", upright), ("a.obj", None), ("a.ply", None)):
+        mesh = trimesh.load(written / name, force="mesh")
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        assert mesh.is_watertight, name
+        assert mesh.volume > 0, name
+        assert len(mesh.faces) <= FACES
+        assert mesh.area_faces.min() > 0
+        vertices = mesh.vertices if vertices is None else vertices
+        # On the surface of an object without symmetry; decimated triangles sag by less than a voxel
+        distance = sdf(torch.tensor(vertices).float())
+        assert distance.abs().max() < 0.024, name
+
+
+def test_obj(written):
+    mesh = trimesh.load(written / "a.obj", force="mesh", process=False)
+    position = mesh.triangles_center
+    x, y = mesh.visual.uv[mesh.faces].mean(1).T
+    picture = {
+        kind: np.asarray(Image.open(written / f"a_{kind}.png")) / 255
+        for kind in ("albedo", "normal", "roughness")
+    }
+    color = decoded(looked_up(picture["albedo"], x, 1 - y))  # OBJ counts v upwards
+    check_materials(position, color, looked_up(picture["roughness"], x, 1 - y)[:, 0])
+    assert np.array_equal(
+        np.asarray(mesh.visual.material.image), np.uint8(255 * picture["albedo"] + 0.5)
+    )
+    assert looked_up(picture["normal"], x, 1 - y)[:, 2].min() > 0.5
+    text = (written / "a.mtl").read_text()
+    for kind in picture:
+        assert f"a_{kind}.png" in text
+
+
+def test_ply(written):
+    mesh = trimesh.load(written / "a.ply", process=False)
+    rough = mesh.metadata["_ply_raw"]["vertex"]["data"]["roughness"].ravel()
+    color = decoded(mesh.visual.vertex_colors[:, :3] / 255)
+    check_materials(mesh.vertices, color, rough)
+
+
+def test_the_validator_of_khronos_has_nothing_to_say(written):
+    """Needs node and its module gltf-validator (npm install gltf-validator; NODE_PATH)."""
+    program = """
+        const read = require('fs').readFileSync;
+        require('gltf-validator').validateBytes(new Uint8Array(read(process.argv[1])))
+            .then(report => console.log(JSON.stringify(report.issues)));
+    """
+    node = shutil.which("node")
+    if (
+        not node
+        or subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True).returncode
+    ):
+        pytest.skip("no gltf-validator")
+    run = subprocess.run(
+        [node, "-e", program, str(written / "a.glb")], capture_output=True, text=True, check=True
+    )
+    assert json.loads(run.stdout)["messages"] == []
+
+
+def test_defaults(tmp_path, scene, monkeypatch):
+    """All faces without textures, fewer with; the same shape."""
+    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: scene)
+    monkeypatch.setattr(task, "TEXTURED_FACES", 500)
+    task.export("run", tmp_path / "a.PLY")
+    task.export("run", tmp_path / "a.glb", texture_size=64)
+    full = trimesh.load(tmp_path / "a.PLY", process=False)
+    assert len(full.faces) > 5000
+    assert 400 < len(trimesh.load(tmp_path / "a.glb", force="mesh").faces) <= 500
+
+
+def test_watertight(tmp_path, monkeypatch):
+    cut = lopsided(24**3, change=lambda nodes, sdf: nodes.norm(dim=-1) - 0.55)
+    cut.material = Identity()
+    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: cut)
+    task.export("run", tmp_path / "open.ply", faces=400)
+    task.export("run", tmp_path / "closed.ply", faces=400, watertight=True)
+    assert not trimesh.load(tmp_path / "open.ply").is_watertight
+    assert trimesh.load(tmp_path / "closed.ply").is_watertight
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("a.stl", {}, r"ends in \.glb, \.obj, \.ply, \.usdz, got .*a\.stl"),
+        ("a", {}, "ends in"),
+        ("a.ply", {"faces": 3}, "faces must be at least 4, got 3"),
+        ("a.glb", {"texture_size": 1000}, "power of 2 from 16 to 4096, got 1000"),
+        ("a.glb", {"texture_size": 8}, "power of 2 from 16 to 4096, got 8"),
+        ("a.glb", {"texture_size": 8192}, "got 8192"),
+        ("a.glb", {"texture_size": 0}, "got 0"),
+        ("a.glb", {"texture_size": -64}, "got -64"),
+        ("a.glb", {"texture_format": "webp"}, "texture_format must be png or jpeg, got webp"),
+        ("a.glb", {"quality": 96}, "quality must be 1 to 95, got 96"),
+        ("a.glb", {"quality": 0}, "quality must be 1 to 95, got 0"),
+        ("a.glb", {"size": 0.0}, "size must be above 0, got 0"),
+        ("a.glb", {"size": float("inf")}, "size must be above 0, got inf"),
+        ("a.glb", {"size": float("nan")}, "size must be above 0, got nan"),
+        ("a.glb", {"origin": "top"}, "origin must be world or bottom or centre, got top"),
+        ("a.glb", {"lods": -1}, "lods must be 0 to 8, got -1"),
+        ("a.glb", {"lods": 9}, "lods must be 0 to 8, got 9"),
+        ("a.glb", {"lods": 3, "faces": 2000}, "lods=3 of 2000 faces leave 31 in the coarsest"),
+    ],
+)
+def test_bad_arguments(tmp_path, name, options, message):
+    with pytest.raises(ValueError, match=message):
+        task.export(tmp_path, tmp_path / name, **options)
+
+
+def test_errors_leave_nothing_behind(tmp_path, scene, monkeypatch):
+    with pytest.raises(FileNotFoundError, match="no checkpoint"):
+        task.export(tmp_path, tmp_path / "mesh.ply")
+    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: scene)
+    with pytest.raises(ValueError, match="without spaces"):
+        task.export("run", tmp_path / "a b.obj", faces=100, texture_size=64)
+    (tmp_path / "a.glb").mkdir()
+    with pytest.raises(OSError, match=r"a\.glb"):
+        task.export("run", tmp_path / "a.glb", faces=100, texture_size=64)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.glb"]

@@ -1,0 +1,147 @@
+"""Training with cameras that are off by some: they are put right, and kept with the scene."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from analytic import LIGHTS, RADIUS, cameras_around, write_scene
+
+from lab.stress.damage import turned
+from univoxel import trainer as task
+from univoxel.camera import project
+from univoxel.checkpoint import load_scene
+from univoxel.confidence.survey import survey
+from univoxel.config import StageConfig, TrainConfig
+from univoxel.data import load_photos
+from univoxel.data.transforms import write_cameras
+from univoxel.lights import SGConfig
+from univoxel.preparation.prepare import find_silhouettes
+from univoxel.render.pipeline import extract_mesh
+from univoxel.scene import SceneConfig
+from univoxel.trainer import train
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """The sphere in 12 photographs of 32 x 32 pixels, each camera turned by some 1.4 pixels."""
+    folder = write_scene(tmp_path_factory.mktemp("turned") / "data")
+    photos = load_photos(folder, "train")
+    write_cameras(
+        folder, "train", turned(photos.cameras, 1.6, np.random.default_rng(0)), photos.names
+    )
+    return folder
+
+
+def config(data, out, cameras="auto") -> TrainConfig:
+    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
+    stages = (
+        StageConfig(voxels=0.01, iterations=80, share=0.5, rays=256),
+        StageConfig(voxels=0.02, iterations=80, share=0.5, rays=256, physical_from=0.5),
+    )
+    scene = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
+    return TrainConfig(
+        data, out, stages, minutes=2.0, cameras=cameras, scene=scene, voxel_pixels=0.0
+    )
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory):
+    return train(config(data, tmp_path_factory.mktemp("turned") / "run"))
+
+
+def off(cameras):
+    """Pixels that the sphere's centre is off, in each view, but for what all share in space."""
+    truth = cameras_around(12)
+    pairs = [[project(c, v, torch.zeros(1, 3))[0] for c in (cameras, truth)] for v in range(12)]
+    return torch.cat([a - b for a, b in pairs]).norm(dim=1)
+
+
+def test_turned_cameras_are_put_right(data, run):
+    photos = load_photos(data, "train")
+    before, after = off(photos.cameras), off(load_scene(run).registered(photos).cameras)
+    assert before.mean() > 1.0
+    assert after.mean() < 0.3 * before.mean()
+
+
+def test_geometry_is_the_sphere_again(data, run, tmp_path):
+    away = [
+        (extract_mesh(load_scene(r)).vertices.norm(dim=1) - RADIUS).abs().mean()
+        for r in (run, train(config(data, tmp_path / "run", cameras="given")))
+    ]
+    assert away[0] < 0.03  # as from the true cameras, see test_train.py
+    assert away[1] > away[0]
+
+
+def test_the_run_keeps_its_cameras(data, run):
+    kept = load_scene(run)
+    assert kept.cfg.refined
+    assert kept.poses.steps.abs().max() > 1e-3
+    assert json.loads((run / "config.json").read_text())["cameras"] == "auto"
+
+
+def test_cameras_that_agree_stay_as_they_are(tmp_path, caplog):
+    data = write_scene(tmp_path / "data")
+    cfg = replace(config(data, tmp_path / "run"), stages=config(data, tmp_path).stages[:1])
+    caplog.set_level("INFO", "univoxel")
+    assert load_scene(train(cfg)).poses is None
+    assert "contradict" not in caplog.text
+
+
+def test_given_cameras_are_only_complained_about(data, tmp_path, caplog):
+    cfg = config(data, tmp_path / "run", cameras="given")
+    caplog.set_level("INFO", "univoxel")
+    assert load_scene(train(replace(cfg, stages=cfg.stages[:1]))).poses is None
+    assert "pixels: see cameras=refined" in caplog.text
+
+
+def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):
+    """From a checkpoint after the first stage: the box and the cameras are as they were."""
+    cfg = config(data, tmp_path / "run")
+    original, stages = task.run_stage, []
+
+    def killed(scene, cfg, stage, *rest):
+        if stages:
+            raise KeyboardInterrupt
+        stages.append(scene.field.grid)
+        original(scene, cfg, stage, *rest)
+
+    monkeypatch.setattr(task, "run_stage", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(cfg)
+    before = load_scene(cfg.out).poses.steps
+    seen = []
+    monkeypatch.setattr(task, "run_stage", lambda scene, *_: seen.append(scene.field.grid))
+    train(cfg, resume=True)
+    torch.testing.assert_close(load_scene(cfg.out).poses.steps, before)
+    box = find_silhouettes(load_photos(data, "train"), cfg).box
+    assert seen == [task.fit_grid(*box, 20000)]
+
+
+@pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.kind)
+def test_cameras_are_refined_under_every_light(data, tmp_path, light):
+    """The directions to them have gradients, then, and what is drawn under the light takes some."""
+    cfg = config(data, tmp_path / "run")
+    stage = replace(cfg.stages[1], iterations=5, physical_from=0.0)
+    cfg = replace(cfg, stages=(stage,), scene=replace(cfg.scene, light=light, sky_nodes=0))
+    scene = load_scene(train(cfg))
+    assert scene.poses.steps.isfinite().all()
+    assert scene.cfg.refined
+
+
+def test_trust_looks_from_where_the_cameras_are(data, run):
+    """As it would if they had been put there from the start, and not from where they were."""
+    scene, photos = load_scene(run), load_photos(data, "train")
+    refined, moved = survey(scene, photos, 200), scene.registered(photos)
+    scene.poses.steps.data.zero_()
+    there, before = survey(scene, moved, 200), survey(scene, photos, 200)
+    torch.testing.assert_close(refined.disagreement, there.disagreement)
+    assert (before.disagreement - there.disagreement).abs().mean() > 1e-3
+
+
+def test_other_photographs_are_refused(data, run):
+    photos = load_photos(data, "train")
+    fewer = replace(photos.cameras, camera_to_world=photos.cameras.camera_to_world[:5])
+    with pytest.raises(ValueError, match="trained on 12 photographs with refined cameras, got 5"):
+        load_scene(run).registered(replace(photos, cameras=fewer))

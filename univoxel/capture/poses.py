@@ -1,0 +1,381 @@
+"""Find the cameras of photographs: from a folder of them, or a video, to a scene to train on."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from univoxel import __version__, steps
+from univoxel.bars import bar
+from univoxel.capture import database, pose_validation, structure, video
+from univoxel.capture.config import DEFAULTS, CaptureConfig
+from univoxel.capture.model import Model, without
+from univoxel.capture.photographs import find_photographs, require_readers
+from univoxel.capture.prepare import Capture, Folders, gather, in_words, write_pictures
+from univoxel.capture.scene import (
+    PARTIAL,
+    REPORT,
+    WRITTEN,
+    Report,
+    gauge_aligned,
+    own_sizes,
+    write_report,
+    write_scene,
+    written_name,
+)
+from univoxel.capture.sfm import require_pycolmap
+from univoxel.errors import DataError, ExistingFile, StillBackground
+from univoxel.files import read_json
+from univoxel.names import KEEP_SIZE
+from univoxel.sphere import gaps
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+WORK = "sfm"  # folder in the scene that the steps keep their results in
+# Steps that are noted in it: those of the search, with its settings, and what stands by itself
+SEARCH, FRAMES, SCENE = "search", "frames", "scene"
+PARTS = FEATURES, PAIRS, MATCHES, MODELS = "features", "choosing pairs", "matching", "placing"
+# Share of pairs whose match is a shift alone, from where on the background stands still while the
+# object turns: on a turntable it was .6, elsewhere 0, with poor masks .04
+STILL_SHARE = 0.2
+PLACED_SHARE = 0.8  # of the photographs, below which the capture is no use
+GAP = 60.0  # degrees between neighbouring directions that are worth a word
+# What version 0.2 noted of the configuration that are constants now
+CONSTANTS_0_2: dict[str, Any] = {
+    **{"coarse_features": 512, "coarse_photographs": 150, "ratio": 0.8, "neighbours": 3},
+    **{"mask_margin": 0.006, "still_share": 0.2, "weak_share": 0.2, "weak_points": 50},
+    **{"weak_partners": 3, "fitting_share": 0.9, "fitting_pixels": 3.0, "weak_doubt": 0.3},
+    **{"contradicted_share": 0.5, "placed_share": 0.8, "gap": 60.0},
+    **{"base_seconds": 120.0, "photograph_seconds": 30.0},
+}
+NAMED = 5  # photographs that a message names at most
+
+
+@dataclass(frozen=True)
+class Found:
+    """What structure from motion says, and what is believed of it."""
+
+    model: Model  # the largest, as it is
+    weak: dict[int, str]  # ids of pictures whose poses are not trusted, and why
+    reports: list[Report]  # of all photographs
+
+
+def poses(
+    photographs: str | Path,
+    out: str | Path,
+    masks: str | Path | None = None,
+    every: float | None = None,
+    keep_size: int = KEEP_SIZE,
+    keep_weak: bool = False,
+    config: CaptureConfig = DEFAULTS,
+) -> Path:
+    """Write photographs upright, with the cameras they were taken with, as a scene; return out.
+
+    The world has +Z up, its origin where the cameras look, and the median distance of cameras from
+    it is 4. An interrupted search goes on with the same call.
+
+    Args:
+        photographs: a folder of photographs of any common format, or a video.
+        out: folder to write: images/, masks/, sparse/0 and poses.json, and sfm/ for the steps.
+        masks: folder of a mask for each photograph; features are sought within them alone.
+        every: seconds of a video, of each of which the sharpest frame is taken.
+        keep_size: pixels of written photographs along the longer side, at most; 0 for any.
+        keep_weak: write photographs too whose cameras are not trusted.
+        config: how cameras are found.
+
+    Raises:
+        MissingExtra: no pycolmap, or no reader of a format.
+        DataError: photographs that cannot be used, or too few that can be placed; as
+            StillBackground where an object was turned before a still camera, and there are no
+            masks.
+        ExistingFile: out holds something else.
+        ProcessFailed: a step did not end well.
+        OSError: a file cannot be written.
+    """
+    source, out = Path(photographs), Path(out)
+    masks = None if masks is None else Path(masks)
+    require_pycolmap()
+    folders = folders_of(out)
+    _check_free(out, folders)
+    files, others, doubles = photographs_of(source, folders, every)
+    require_readers(files)
+    capture, unread = gather(files, masks)
+    unread += others
+    log.info(in_words(capture.photographs, capture.groups) + _aside(unread, doubles))
+    settings = _settings(source, masks, every, config, capture)
+    used = {"keep_size": keep_size, "keep_weak": keep_weak}
+    if _begin(out, folders, settings, used):
+        log.info(f"{out} is done")
+        return out
+    with bar(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeRemainingColumn(),
+    ) as progress:
+        unreadable = _search(capture, folders, config, settings, progress)
+        found = _judge(capture, folders, unreadable)
+        _say(capture, found, len(capture.photographs), keep_weak)
+        left_out = set() if keep_weak else set(found.weak)
+        model = without(found.model, left_out) if left_out else found.model
+        index = {name: i for i, name in enumerate(capture.pictures)}
+        ordered = sorted(model.images, key=lambda i: index[i.name])
+        wanted = [index[image.name] for image in ordered]
+        model = own_sizes(Model(model.cameras, ordered, model.points), capture, keep_size)
+        model, known = gauge_aligned(model)
+        if not known:
+            log.warning("the cameras do not say what is up: the world may be askew")
+        names = [image.name for image in model.images]
+        centres = np.stack([image.centre for image in model.images])
+        for gap in gaps(centres, names, GAP):
+            log.info(gap)
+        steps.forget(folders.work, SCENE)
+        written = write_scene(out, capture, model, wanted, keep_size)
+        _follow(progress, "writing", written, len(wanted))
+    reports = list(found.reports)
+    for i in wanted:
+        reports[i] = replace(reports[i], written=written_name(capture.photographs[i]))
+    write_report(out, {**settings, **used, "versions": _versions()}, model, reports)
+    steps.finish(folders.work, SCENE, used)
+    return out
+
+
+def folders_of(out: Path) -> Folders:
+    """Where the work of a scene lies; what version 0.2 left files for is noted as steps."""
+    folders = Folders(out / WORK)
+    noted, begun = {}, folders.work / "request.json"
+    if (frames := folders.frames / "done").exists():
+        noted[FRAMES] = read_json(frames)
+    if begun.exists():
+        settings = read_json(begun)
+        config = settings["config"].items()  # where another value was, these are other settings
+        settings["config"] = {k: v for k, v in config if CONSTANTS_0_2.get(k) != v}
+        marks = {PAIRS: "pairs.txt", MATCHES: "matched", MODELS: "models/done"}
+        done = [step for step, name in marks.items() if (folders.work / name).exists()]
+        noted |= dict.fromkeys((SEARCH, *done), settings)
+    if begun.exists() and (out / REPORT).exists():
+        report = read_json(out / REPORT)
+        noted[SCENE] = {key: report.get(key) for key in ("keep_size", "keep_weak")}
+    steps.adopt(folders.work, noted)
+    return folders
+
+
+def _check_free(out: Path, folders: Folders) -> None:
+    """Refuse a folder that holds what is not of a search for cameras."""
+    if not out.exists() or (out / REPORT).exists():
+        return
+    # Written last, one after the other
+    begun = WRITTEN if steps.recorded(folders.work, SEARCH) else ()
+    foreign = [p.name for p in out.iterdir() if p.name not in (WORK, PARTIAL, *begun)]
+    if foreign:
+        raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
+
+
+def photographs_of(
+    source: Path, folders: Folders, every: float | None = None
+) -> tuple[list[Path], list[str], int]:
+    """Photographs of a folder or frames of a video; other files; how many came twice."""
+    if video.is_video(source):
+        video.require_ffmpeg()
+        stamp = [source.name, source.stat().st_size, source.stat().st_mtime, every]
+        if steps.recorded(folders.work, FRAMES) != stamp:
+            log.info(f"{source}: choosing frames")
+            steps.forget(folders.work, FRAMES)
+            shutil.rmtree(folders.frames, ignore_errors=True)
+            video.write_frames(source, folders.frames, every)
+            steps.finish(folders.work, FRAMES, stamp)
+        return sorted(folders.frames.glob("*.jpg")), [], 0
+    if every is not None:
+        raise DataError(f"{source}: every is for videos ({' '.join(video.SUFFIXES)})", "every")
+    if not source.is_dir():
+        raise DataError(f"{source}: expected a folder of photographs or a video")
+    return find_photographs(source)
+
+
+def _settings(
+    source: Path,
+    masks: Path | None,
+    every: float | None,
+    config: CaptureConfig,
+    capture: Capture,
+) -> dict:
+    """What decides the cameras: the same settings go on with the same work."""
+    files = [p.path for p in capture.photographs] + list(capture.masks or [])
+    return {
+        "engine": "pycolmap",
+        "source": str(source.absolute()),
+        "masks": None if masks is None else str(masks.absolute()),
+        "every": every,
+        "config": asdict(config),
+        "files": [[p.name, p.stat().st_size, p.stat().st_mtime] for p in files],
+    }
+
+
+def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
+    """Begin a search, or go on with it; whether all is done already."""
+    if (out / REPORT).exists():
+        other = ExistingFile(f"{out} holds another scene: choose another out", "out")
+        if not steps.done(folders.work, SEARCH, settings, lambda _: other):
+            raise other
+        return steps.recorded(folders.work, SCENE) == written
+    if steps.recorded(folders.work, SEARCH) != steps.as_json(settings):  # and nothing came of it
+        _start_over(folders)
+        steps.finish(folders.work, SEARCH, settings)
+    return False
+
+
+def _start_over(folders: Folders) -> None:
+    """Remove all work but the frames of a video."""
+    steps.forget(folders.work, SEARCH, *PARTS)
+    for path in (folders.pictures, folders.masks, folders.models):
+        shutil.rmtree(path, ignore_errors=True)
+    for path in (*folders.work.glob("database.db*"), folders.pairs):
+        path.unlink(missing_ok=True)
+
+
+def _search(
+    capture: Capture,
+    folders: Folders,
+    config: CaptureConfig,
+    settings: dict,
+    progress: Progress,
+) -> dict[int, str]:
+    """All steps up to the models; returns why photographs could not be read, by index."""
+    total = len(capture.photographs)
+    unreadable = {}
+    task = progress.add_task("reading", total=total)
+    for index, why in write_pictures(capture, folders, config.size):
+        progress.advance(task)
+        if why is not None:
+            unreadable[index] = why
+    if unreadable:
+        names = [capture.photographs[i].path.name for i in unreadable]
+        log.warning(f"{len(names)} could not be read: {_some(names)}")
+
+    def do(step: str, part: Callable[..., Iterator[int]], total: int) -> None:
+        if not steps.done(folders.work, step, settings):
+            _follow(progress, step, part(capture, folders, config), total)
+            steps.finish(folders.work, step, settings)
+
+    do(FEATURES, structure.extract, total)
+    do(PAIRS, structure.select, total)
+    do(MATCHES, structure.match, structure.pair_count(folders))
+    still, matching = pose_validation.still(database.verified_pairs(folders.database))
+    if still > STILL_SHARE * matching:
+        stands = f"the background stands still in {still} of {matching} pairs"
+        if capture.masks is None:
+            raise StillBackground(stands)
+        raise DataError(f"{stands}: masks hold a part of it, make them tighter", "masks")
+    do(MODELS, structure.place, total)
+    return unreadable
+
+
+def _follow(progress: Progress, name: str, parts: Iterable[int], total: int) -> None:
+    """Show how far a step is while it runs."""
+    task = progress.add_task(name, total=total)
+    for done in parts:
+        progress.update(task, completed=min(done, total))
+    progress.update(task, completed=total)
+
+
+def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Found:
+    """The largest model, and what is known of each photograph."""
+    models = structure.models(folders)
+    pairs = database.verified_pairs(folders.database)
+    features = database.feature_counts(folders.database)
+    numbers = database.images(folders.database)
+    placed = {i.number: i for i in models[0].images} if models else {}
+    elsewhere = {i.number: len(m.images) - 1 for m in reversed(models[1:]) for i in m.images}
+    errors = models[0].errors() if models else {}
+    weak = _weak(models[0], folders, errors) if models else {}
+    reports = []
+    for index, name in enumerate(capture.pictures):
+        photograph = capture.photographs[index].path.name
+        number = numbers.get(name, (None, None))[0]
+        partners = sum(n >= pose_validation.NEEDED for a, b, n, _ in pairs if number in (a, b))
+        if number in placed:
+            points = placed[number].points
+            reason = weak.get(number, "")
+            reports.append(
+                Report(photograph, True, points, errors[number], partners, reason=reason)
+            )
+            continue
+        reason = unreadable.get(index) or pose_validation.why_not(
+            number, features, pairs, elsewhere
+        )
+        reports.append(Report(photograph, False, partners=partners, reason=reason))
+    if len(placed) < PLACED_SHARE * len(reports):
+        missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
+        raise DataError(
+            f"only {len(placed)} of {len(reports)} photographs could be placed: take more of them, "
+            f"closer to one another, all of the same still object; not placed: {_some(missing)}"
+        )
+    return Found(models[0], weak, reports)
+
+
+def _weak(model: Model, folders: Folders, errors: dict[int, float]) -> dict[int, str]:
+    """Placed pictures whose poses are not trusted, and why."""
+    partners = pose_validation.partners(
+        model,
+        database.matches(folders.database),
+        database.positions(folders.database),
+    )
+    doubts = {i.number: pose_validation.doubt(model, i, errors[i.number]) for i in model.images}
+    return pose_validation.weak({i.number: i.points for i in model.images}, partners, doubts)
+
+
+def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
+    """How many were placed, how well, and which not."""
+    model, reports = found.model, found.reports
+    lenses = [model.cameras[c] for c in sorted({i.camera for i in model.images})]
+    shares = [f"{lens.focal[0] / lens.width:.2f}" for lens in lenses[:NAMED]]
+    cameras = "one camera" if len(lenses) == 1 else f"{len(lenses)} cameras"
+    log.info(
+        f"cameras: {len(model.images)} of {total} placed, {model.error:.2f} pixels, focal length "
+        f"{', '.join(shares)} of the longer side ({cameras})"
+    )
+    missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
+    if missing:
+        log.warning(f"not placed: {_some(missing)}")
+    index = {name: i for i, name in enumerate(capture.pictures)}
+    weak = [
+        f"{capture.photographs[index[i.name]].path.name} ({found.weak[i.number]})"
+        for i in model.images
+        if i.number in found.weak
+    ]
+    if weak:
+        fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
+        log.warning(
+            f"{len(weak)} may be off by degrees, {fate}: {_some(weak)}; "
+            "photograph that side again with more overlap",
+            extra={"arguments": ("keep_weak",)},
+        )
+
+
+def _aside(unread: list[str], doubles: int) -> str:
+    told = f"; {doubles} came in two formats, one is taken" if doubles else ""
+    return told + (f"; {len(unread)} could not be read: {_some(unread)}" if unread else "")
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(sorted(names)[:NAMED]) + more
+
+
+def _versions() -> dict[str, str]:
+    found = {"univoxel": __version__, "python": platform.python_version()}
+    for package in ("pycolmap", "pillow", "pillow-heif", "rawpy", "imageio-ffmpeg"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found

@@ -1,0 +1,267 @@
+"""Many scenes, each through the same steps, on one machine or on a cluster; what came out."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from univoxel import machine
+from univoxel.cli.parsing import (
+    STDOUT,
+    Changes,
+    ConfigFile,
+    JsonFile,
+    Minutes,
+    Scenes,
+    Scheduler,
+    check_minutes,
+    json_file,
+    takes,
+    written,
+)
+from univoxel.errors import ProcessFailed, UserError
+from univoxel.files import read_json
+from univoxel.names import BATCH_STEPS, SAMPLES, USUAL_STEPS, BatchStep, LightName, PresetOrAuto
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from univoxel.batch.results import SceneResult
+    from univoxel.config import TrainConfig
+    from univoxel.jobs.job import Job, Result, Step
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+
+# Options of what is done with each scene: those of a later sitting agree but for the steps
+EACH = ("steps", "masks", "preset", "light", "minutes", "config", "changes", "samples")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchOptions:
+    scenes: Scenes
+    """folders of photographs, of different names"""
+    out: Annotated[Path, written("NIGHT")]
+    """folder to write"""
+    steps: Annotated[tuple[BatchStep, ...], written("STEP [STEP ...]")] = USUAL_STEPS
+    """of each scene: train eval export page; before them poses masks, for photographs without
+    cameras or masks, as capture makes them"""
+    masks: Annotated[str, written("auto|rembg|FOLDER|none")] = "auto"
+    """as of capture, for the step masks"""
+    preset: PresetOrAuto = "auto"
+    """as of train"""
+    light: LightName = "hybrid"
+    """as of train"""
+    minutes: Minutes = None
+    """wall-clock limit of each training, above 0"""
+    config: ConfigFile = None
+    """as of train"""
+    changes: Changes = ()
+    """as of train"""
+    samples: int = SAMPLES
+    """of the light, per pixel of relit pictures that are measured"""
+    jobs: Annotated[int | None, written("N", "as cores and memory allow")] = None
+    """scenes at once; each runs on --threads, or its share of the cores"""
+    scheduler: Scheduler = None
+    """of a Dask cluster whose workers take the scenes, such as tcp://10.0.0.1:8786; they see the
+    same folders. Whoever reaches a scheduler can run programs on its workers"""
+    tries: Annotated[int, written("N")] = 3
+    """how often a scene whose process is killed is tried before it counts as failed"""
+    json: JsonFile = None
+    """another file for what batch.json holds; - prints it in place of the table"""
+
+    def training(self) -> TrainConfig:
+        """The configuration of a training.
+
+        Raises:
+            UserError: there is none of that kind.
+        """
+        from univoxel.config import load_config
+        from univoxel.overrides import changed
+        from univoxel.presets import chosen
+
+        if self.config is None:
+            config = chosen(self.preset, self.minutes, Path(), Path(), self.light)
+            return changed(config, self.changes)
+        if (self.preset, self.light) != ("auto", "hybrid"):
+            raise UserError(
+                f"expected config or preset and light, got both: {self.config} says them", "config"
+            )
+        config = load_config(self.config)
+        minutes = config.minutes if self.minutes is None else self.minutes
+        return changed(replace(config, minutes=minutes), self.changes)
+
+    def identity(self, data: Path) -> dict[str, Any]:
+        """What a later sitting must agree with to go on; JSON. Steps may be added."""
+        said = {name: getattr(self, name) for name in EACH[1:]} | {"data": str(data)}
+        if self.config is not None:
+            said["config"] = read_json(self.config)
+        return json.loads(json.dumps(said, default=str))
+
+    def words(self) -> list[str]:
+        """The options of train."""
+        words = ["--preset", self.preset, "--light", self.light]
+        if self.config is not None:
+            words = ["--config", str(self.config.absolute())]
+        words += [] if self.minutes is None else ["--minutes", f"{self.minutes:g}"]
+        return [*words, *(f"--set={change}" for change in self.changes)]
+
+
+@takes(BatchOptions)
+def command(asked: BatchOptions) -> None:
+    """Take many scenes through training, measures, mesh and page, on one machine or a cluster.
+
+    Each scene has processes of its own: one that crashes, or that the system ends, takes no other
+    with it. What is done is kept: the same command goes on after an interruption, and tries again
+    what failed. NIGHT/index.html shows all scenes, batch.json and batch.csv hold their measures,
+    NIGHT/SCENE has what was made, NIGHT/logs what was said. Ends with exit code 2 where a scene
+    failed.
+    """
+    import rich
+
+    check_minutes(asked.minutes)
+    with json_file(asked.json) as file:
+        results = batch(replace(asked, json=file), machine.threads_asked())
+    if asked.json != STDOUT:
+        rich.print(table(results))
+        print(asked.out / "index.html")
+    check(results)
+
+
+def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
+    """Take scenes through steps, each in processes of its own; return what came out, in order.
+
+    index.html, batch.json and batch.csv tell of all of them, and are written anew as each ends.
+
+    Args:
+        threads: of each scene; None: as the machine allows.
+
+    Raises:
+        UserError: an argument cannot be used, Dask is missing, or out holds scenes that other
+            options made; nothing was begun.
+        ProcessFailed: the scheduler does not answer, or is gone.
+        OSError: out cannot be written.
+    """
+    from univoxel.batch.results import result_of, write_results
+    from univoxel.batch.scenes import named, share
+    from univoxel.batch.sheet import write_sheet
+    from univoxel.jobs.scheduler import connect, run_jobs
+
+    unknown = [step for step in asked.steps if step not in BATCH_STEPS]
+    if unknown or not asked.steps:
+        got = ", ".join(unknown) or "none"
+        raise UserError(f"steps must be of {', '.join(BATCH_STEPS)}, got {got}", "steps")
+    numbers = {"jobs": asked.jobs, "threads": threads}
+    numbers |= {"tries": asked.tries, "samples": asked.samples}
+    for name, number in numbers.items():
+        if number is not None and number < 1:
+            raise UserError(f"{name} must be at least 1, got {number}", name)
+    known, config = named(asked.scenes), asked.training()
+    jobs, out = asked.jobs, asked.out
+    if asked.scheduler is None:
+        here = (machine.cores(), machine.memory())
+        jobs, threads = share(known.values(), config, *here, jobs, threads)
+        log.info("scenes at once: %d, threads of each: %d", jobs, threads)
+    elif jobs is not None:
+        raise UserError("expected jobs or scheduler, got both", "jobs", "scheduler")
+    every = [job_of(name, data, asked, threads) for name, data in known.items()]
+    for job in every:
+        job.check_same()
+    ended: dict[str, Result] = {}
+
+    def write(other: Path | None = None) -> list[SceneResult]:
+        results = [result_of(job, known[job.name], out, ended.get(job.name)) for job in every]
+        options = {name: getattr(asked, name) for name in EACH}
+        write_results(results, options, out, other)
+        write_sheet(results, out)
+        return results
+
+    with connect(jobs or 1, asked.scheduler) as client:
+        out.mkdir(parents=True, exist_ok=True)
+        before = {result.name for result in write() if result.state == "done"}
+        missing = [job for job in every if job.name not in before]
+        for found in run_jobs(client, missing, len(every), asked.tries):
+            ended[found.name] = found
+            if found.state == "done":
+                log.info("%s: done in %.0f s", found.name, found.seconds)
+            for step, said in found.errors.items():
+                log.warning("%s: failed in %s: %s", found.name, step, said)
+            try:
+                write()
+            except OSError as error:  # the disk may have room again when the last one ends
+                log.warning("%s", error)
+    return write(None if asked.json is None else Path(asked.json))
+
+
+def job_of(name: str, data: Path, asked: BatchOptions, threads: int | None) -> Job:
+    """The steps of a scene, data (absolute), that are asked for, below the folder of a batch."""
+    from univoxel.batch.scenes import LOGS, MEASURED
+    from univoxel.capture.project import Project
+    from univoxel.capture.scene import REPORT
+    from univoxel.checkpoint import FILE
+    from univoxel.jobs.job import Job, Step
+    from univoxel.training.progress import LOG
+
+    out = asked.out.absolute()
+    project = Project(out / name)
+    # Photographs that bring masks are not written again
+    before = [project.cut] if "masks" in asked.steps else []
+    before += [project.scene] if {"poses", "masks"} & set(asked.steps) else []
+    run, checkpoint, measures = str(project.run), project.run / FILE, project.out / MEASURED
+    trained, log = project.run / "trust.txt", project.run / LOG
+    capture = ("capture", str(data), "--out", str(project.out), "--masks", asked.masks, "--until")
+    train = ("--out", run, "--resume", "--no-page", *asked.words())
+    evaluate = ("eval", run, "--json", str(measures), "--samples", str(asked.samples))
+    page = ("view", run, "--html", str(project.page), "--title", name)
+    export = ("export", run, "--mesh", str(project.mesh))
+
+    def step(name: BatchStep, *words: str | tuple[Path, ...], **fields: Any) -> Step:
+        return Step(name, ("-m", "univoxel.cli", *words), **fields)
+
+    def aside(name: BatchStep, words: Sequence[str], makes: Path) -> Step:
+        return step(name, *words, makes=makes, after=checkpoint, needed=False)
+
+    every = (
+        step("poses", *capture, "cameras", unless=(project.scene / REPORT, trained)),
+        step("masks", *capture, "masks", unless=(project.cut, trained)),
+        step("train", "train", (*before, data), *train, makes=trained, after=checkpoint, log=log),
+        aside("eval", evaluate, measures),
+        aside("export", export, project.mesh),
+        aside("page", page, project.page),
+    )
+    steps = tuple(step for step in every if step.name in asked.steps)
+    return Job(name, steps, out / LOGS / name, asked.identity(data), threads)
+
+
+def check(results: Sequence[SceneResult]) -> None:
+    """Refuse a batch in which scenes failed.
+
+    Raises:
+        ProcessFailed: some did.
+    """
+    failed = [result.name for result in results if result.state != "done"]
+    if failed:
+        raise ProcessFailed(
+            f"{len(failed)} of {len(results)} scenes failed ({', '.join(failed)}): "
+            "the same command tries them again"
+        )
+
+
+def table(results: Sequence[SceneResult]) -> Table:
+    """What came out, as the command prints it."""
+    from rich.table import Table
+
+    rows = Table("scene", "state", "verdict")
+    for head in ("novel views, dB", "doubt of albedo", "seconds"):
+        rows.add_column(head, justify="right")
+    rows.add_column("error")
+    for r in results:
+        quality, doubt = r.measures.get("nvs_psnr"), r.doubts.get("doubt_albedo")
+        numbers = ("-" if quality is None else f"{quality:.1f}", f"{sum(r.seconds.values()):.0f}")
+        doubts = "-" if doubt is None else f"{doubt:.2f}"
+        rows.add_row(r.name, r.state, r.verdict or "-", numbers[0], doubts, numbers[1], r.error)
+    return rows

@@ -1,0 +1,466 @@
+"""From photographs to an object that can be lit anew, in one go: cameras, masks, training, mesh."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from univoxel import steps
+from univoxel.capture.config import DEFAULTS, CaptureConfig
+from univoxel.cli.demo import MAPS, SCENE
+from univoxel.cli.evaluate import evaluate
+from univoxel.cli.export import export
+from univoxel.cli.parsing import Changes, Minutes, check_minutes, takes, written
+from univoxel.cli.relight import relight_to_files
+from univoxel.cli.train import code_of
+from univoxel.errors import (
+    DataError,
+    ExistingFile,
+    StillBackground,
+    UserError,
+    WithoutMasks,
+)
+from univoxel.files import read_json, replacing
+from univoxel.names import GROUND, KEEP_SIZE, REMBG, SAMPLES, LightName, PresetOrAuto, Until
+
+if TYPE_CHECKING:
+    from univoxel.capture.project import Given, Project
+    from univoxel.config import TrainConfig
+    from univoxel.training.progress import TrainingProgress
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+AUTO = "auto"  # masks that the photographs have, or else of a network
+STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
+
+
+@dataclass(frozen=True)
+class CaptureOptions:
+    photographs: Annotated[Path, written("PHOTOS", positional=True)]
+    """what to begin with: a folder of photographs or a video; photographs with cameras, as train
+    reads them; or the folder of a trained run"""
+    out: Annotated[Path, written("DIR")]
+    """folder to write: scene/, cut/, run/, pictures/, the mesh and the page"""
+    masks: Annotated[str, written("auto|rembg|FOLDER|none")] = AUTO
+    """where masks come from: rembg, a network; a folder of masks; none, the pattern of the ground,
+    as of cutout; auto takes those that the photographs bring, else the network"""
+    preset: PresetOrAuto = "auto"
+    """as of train"""
+    light: LightName = "hybrid"
+    """as of train"""
+    minutes: Minutes = None
+    """of training, above 0; as of train"""
+    changes: Changes = ()
+    """as of train"""
+    until: Until = "page"
+    """the last step: page is all of them; cameras or masks end before training, and the folder to
+    train on is printed"""
+
+
+@takes(CaptureOptions)
+def command(asked: CaptureOptions) -> int:
+    """From photographs to a mesh with materials and a page, in one command.
+
+    Finds cameras, makes masks, trains, exports DIR/DIR.glb, lights the object anew and writes
+    DIR/index.html: poses, cutout, train, export, relight and eval, one after another. What is there
+    is not made again: the same command goes on after an interruption.
+    """
+    check_minutes(asked.minutes)
+    where, until = (asked.photographs, asked.out), asked.until
+    training = {"preset": asked.preset, "light": asked.light, "minutes": asked.minutes}
+    if until == "page":
+        made = capture(*where, masks=asked.masks, **training, changes=asked.changes)
+        print(made.page)
+        print(made.mesh)
+        return code_of(made.run)
+    if (*training.values(), asked.changes) != ("auto", "hybrid", None, ()):
+        raise UserError(f"--until {until}: --preset, --light, --minutes, --set come after it")
+    print(find_data(*where, masks=asked.masks, until=until))
+    return 0
+
+
+@dataclass(frozen=True)
+class PicturesConfig:
+    """The pictures of a capture."""
+
+    frames: int = 8  # of an orbit around the object, under each map
+    resolution: int = 512  # pixels of their sides
+    samples: int = SAMPLES  # of the light, per pixel
+
+
+PICTURES = PicturesConfig()
+
+
+@dataclass(frozen=True)
+class Captured:
+    """What a capture leaves: the pages and files to open."""
+
+    page: Path
+    mesh: Path  # .glb
+    run: Path  # for `univoxel.open_run`
+
+
+def capture(
+    photographs: str | Path,
+    out: str | Path,
+    *,
+    masks: str | Path = AUTO,
+    preset: PresetOrAuto = "auto",
+    minutes: float | None = None,
+    light: LightName = "hybrid",
+    changes: Sequence[str] = (),
+    on_progress: Callable[[TrainingProgress], None] | None = None,
+    config: CaptureConfig = DEFAULTS,
+    pictures: PicturesConfig = PICTURES,
+) -> Captured:
+    """Make an object that can be lit anew from photographs, in steps that are each kept.
+
+    Below `out`: scene/ holds photographs and cameras, cut/ those with masks, run/ the training,
+    pictures/ the object under other light and measures, then the mesh and index.html. What is
+    there is not made again, so the same call goes on after an interruption. What is of one's own
+    takes the place of a step: photographs with cameras, masks, a run.
+
+    Args:
+        photographs: a folder of photographs or a video; or photographs with cameras, of any layout
+            that `train` reads; or a trained run.
+        out: folder to write.
+        masks: a folder of masks; rembg, a network; none, the pattern of the ground, as of `cutout`;
+            auto: what the photographs bring, else a network.
+        preset, minutes, light, changes, on_progress: as of `univoxel.train`.
+        config: how cameras are found.
+        pictures: how many are made, and how large.
+
+    Raises:
+        ExistingFile: out holds another capture, or what other options made.
+        MissingExtra: a package that finds cameras, reads a format or makes masks is missing.
+        MissingNative: the compiled extension is missing or was built without Embree.
+        DataError: photographs, cameras or masks that cannot be used.
+        UserError: an argument cannot be used, or there is no surface.
+        ProcessFailed: finding cameras did not end well.
+        Cancelled: on_progress raised it.
+        OSError: a file cannot be written.
+    """
+    from univoxel.capture.project import Project, begin, look_at
+    from univoxel.checkpoint import FILE
+    from univoxel.overrides import changed
+    from univoxel.presets import chosen
+    from univoxel.trainer import duration
+    from univoxel.training.clock import expected_seconds
+    from univoxel.training.probe import slowdown
+
+    given = look_at(Path(photographs))
+    project = Project(Path(out))
+    training = chosen(preset, minutes, project.cut, project.run, light)
+    training = changed(training, changes)
+    if given.kind == "run":
+        _check_unused(given, masks, training)
+    _check_machine(given, masks)
+    begin(project, given)
+    if given.kind == "run":
+        run = given.path
+        for step in STEPS[:3]:
+            _skip(step, run)
+    else:
+        if not (project.run / FILE).exists():
+            seconds = slowdown(training) * sum(map(expected_seconds, training.stages))
+            said = f"training takes about {duration(seconds)} on this machine"
+            log.info(f"{said}; cameras and masks come on top")
+        scene = _find_cameras(project, given, masks, config)
+        data = _find_masks(project, scene, masks)
+        run = _train(replace(training, data=data.absolute(), out=project.run), on_progress)
+    _export(project, run)
+    _picture(project, run, pictures)
+    _say("page", str(project.page))
+    _write_page(project, given, run)
+    return Captured(project.page, project.mesh, run)
+
+
+def find_data(
+    photographs: str | Path,
+    out: str | Path,
+    *,
+    masks: str | Path = AUTO,
+    until: Literal["cameras", "masks"] = "masks",
+    config: CaptureConfig = DEFAULTS,
+) -> Path:
+    """The first steps of a capture alone; return the folder to train on. `capture` goes on with it.
+
+    Args:
+        until: the step that is the last.
+
+    Raises:
+        UserError: photographs are a trained run; else as of `capture`.
+        OSError: a file cannot be written.
+    """
+    from univoxel.capture.project import Project, begin, look_at
+
+    given = look_at(Path(photographs))
+    if given.kind == "run":
+        raise UserError(f"{given.path} is a trained run: there are cameras and masks", "until")
+    project = Project(Path(out))
+    _check_machine(given, masks)
+    begin(project, given)
+    scene = _find_cameras(project, given, masks, config)
+    return scene if until == "cameras" else _find_masks(project, scene, masks)
+
+
+def _say(step: str, what: str) -> None:
+    log.info(f"step {STEPS.index(step) + 1} of {len(STEPS)}, {step}: {what}")
+
+
+def _skip(step: str, what: Path) -> None:
+    _say(step, f"there already, {what}")
+
+
+def _check_unused(given: Given, masks: str | Path, training: TrainConfig) -> None:
+    """Refuse options of steps that a run has behind it."""
+    from univoxel.presets import chosen
+
+    usual = chosen("auto", None, training.data, training.out)
+    if str(masks) != AUTO or training != usual:
+        raise UserError(
+            f"{given.path} is a trained run: masks, preset, minutes, light and set come too late",
+            *("masks", "preset", "minutes", "light", "set"),
+        )
+
+
+def _check_machine(given: Given, masks: str | Path) -> None:
+    """Refuse now what would fail after minutes."""
+    from univoxel.capture.sfm import require_pycolmap
+    from univoxel.ops import native
+    from univoxel.segmentation.network import network
+
+    if not native.reference_asked():
+        native.require_embree("capture")
+    if given.kind == "photographs":
+        require_pycolmap()
+    if str(masks) == REMBG:
+        network()
+    elif str(masks) not in (AUTO, GROUND) and not Path(masks).is_dir():
+        raise DataError(
+            f"masks: expected {REMBG}, {GROUND} or a folder of masks, got {masks}", "masks"
+        )
+
+
+def _find_cameras(project: Project, given: Given, masks: str | Path, config: CaptureConfig) -> Path:
+    """The folder of photographs with cameras."""
+    from univoxel.capture.poses import poses
+    from univoxel.capture.project import TURNED
+    from univoxel.capture.scene import REPORT
+
+    done = given.path if given.kind == "scene" else project.scene
+    if given.kind == "scene" or (done / REPORT).exists():
+        _skip("cameras", done)
+        return done
+    if not steps.recorded(project.out, TURNED):
+        _say("cameras", f"of {given.path}")
+        try:
+            return poses(given.path, done, config=config)
+        except StillBackground as error:
+            log.info(f"{error.seen}: the object was turned before a still camera, so masks first")
+            steps.finish(project.out, TURNED, True)
+    first = _masks_before_cameras(project, given, masks)
+    _say("cameras", f"of what masks show of {given.path}")
+    return poses(given.path, done, masks=first, config=config)
+
+
+def _masks_before_cameras(project: Project, given: Given, masks: str | Path) -> Path:
+    """A folder of masks of single photographs."""
+    import numpy as np
+    import torch
+    from PIL import Image
+
+    from univoxel.bars import track
+    from univoxel.capture.photographs import read_upright, require_readers
+    from univoxel.capture.poses import folders_of, photographs_of
+    from univoxel.segmentation.network import network
+
+    if str(masks) not in (AUTO, REMBG, GROUND):
+        return Path(masks)
+    if project.masks.exists():
+        _skip("masks", project.masks)
+        return project.masks
+    if str(masks) == GROUND:
+        raise UserError(
+            f"{given.path}: the object was turned before a still camera, and its ground with it: "
+            f"expected masks={REMBG} or a folder, got {masks}",
+            "masks",
+        )
+    _say("masks", "of single photographs, from a network")
+    masked = network()
+    files, _, _ = photographs_of(given.path, folders_of(project.scene))
+    require_readers(files)
+    # Nothing half-made goes by its name
+    partial = project.masks.with_name(f".{project.masks.name}.partial")
+    partial.mkdir(exist_ok=True)
+    for file in track(files, "masks"):
+        path = partial / f"{file.stem}.png"
+        if path.exists():
+            continue
+        try:
+            picture = read_upright(file, KEEP_SIZE).convert("RGB")
+        except DataError:  # which `poses` counts and names
+            continue
+        mask = (255 * masked(torch.from_numpy(np.array(picture)))).round().byte()
+        with replacing(path) as temporary:
+            Image.fromarray(mask.numpy()).save(temporary, format="PNG")
+    partial.rename(project.masks)
+    return project.masks
+
+
+def _find_masks(project: Project, scene: Path, masks: str | Path) -> Path:
+    """The folder of photographs with masks and cameras."""
+    from univoxel.capture.project import MASKS, TURNED
+    from univoxel.segmentation.cutout import cutout
+
+    asked = str(masks)
+
+    def other(before: str) -> ExistingFile:
+        return ExistingFile(
+            f"{project.cut} holds photographs with masks={before}: to make them anew, remove it "
+            f"and {project.run}",
+            "masks",
+        )
+
+    if project.cut.exists():
+        steps.done(project.out, MASKS, asked, other)
+        _skip("masks", project.cut)
+        return project.cut
+    turned = bool(steps.recorded(project.out, TURNED))
+    if asked == AUTO and not turned and _have_masks(project, scene):
+        _skip("masks", scene)
+        return scene
+    steps.finish(project.out, MASKS, asked)  # before: the folder appears whole, at the end
+    if turned:
+        source = scene / "masks"  # those that the cameras were found with
+    else:
+        source = REMBG if asked == AUTO else masks
+    words = {REMBG: "from a network", GROUND: "from the pattern of the ground"}
+    _say("masks", words.get(str(source), f"from {source}"))
+    return cutout(scene, project.cut, source)
+
+
+def _have_masks(project: Project, scene: Path) -> bool:
+    """Whether photographs bring masks."""
+    from univoxel.data import keep_photos, load_photos
+    from univoxel.run import kept_photos, trained_on
+
+    if (project.run / "config.json").is_file():  # without reading them
+        return trained_on(project.run) == scene.absolute()
+    kept = kept_photos(project.run, "train")
+    try:
+        photos = load_photos(scene, "train", kept=kept)
+    except WithoutMasks:
+        return False
+    kept.parent.mkdir(exist_ok=True)
+    keep_photos(photos, kept)  # training need not read them again
+    return True
+
+
+def _train(wanted: TrainConfig, on_progress: Callable[[TrainingProgress], None] | None) -> Path:
+    """The folder of the run, trained to its end."""
+    from univoxel.checkpoint import FILE
+    from univoxel.trainer import train
+
+    run, data = wanted.out, wanted.data
+    done, begun = (run / "trust.txt").exists(), (run / FILE).exists()
+    if done or begun:
+        _check_trained(wanted, done)
+    if not done:
+        _say("training", "goes on" if begun else f"on {data}")
+        return train(wanted, resume=begun, on_progress=on_progress)
+    _skip("training", run)
+    newest = max((p.stat().st_mtime_ns for p in data.rglob("*.png")), default=0)
+    if newest > (run / FILE).stat().st_mtime_ns:
+        log.warning(f"photographs in {data} have changed since: to train anew, remove {run}")
+    return run
+
+
+def _check_trained(wanted: TrainConfig, done: bool) -> None:
+    """Refuse a run that other options began."""
+    from univoxel.config import check_same
+
+    try:
+        before = read_json(wanted.out / "config.json")
+        check_same(replace(wanted, downscale=before["downscale"]))
+        same = not done or before["minutes"] == wanted.minutes
+    except (UserError, OSError, KeyError, TypeError):
+        same = False
+    if not same:
+        raise ExistingFile(
+            f"{wanted.out} was trained with another preset, minutes, light or set: to train anew, "
+            "remove it, or choose another out",
+            *("preset", "minutes", "light", "set", "out"),
+        )
+
+
+def _export(project: Project, run: Path) -> None:
+    if _up_to_date(project.mesh, run):
+        return _skip("mesh", project.mesh)
+    _say("mesh", str(project.mesh))
+    export(run, project.mesh)
+    return None
+
+
+def _up_to_date(file: Path, run: Path) -> bool:
+    """Whether a file was made since the run was trained."""
+    from univoxel.checkpoint import FILE
+
+    return file.exists() and file.stat().st_mtime_ns >= (run / FILE).stat().st_mtime_ns
+
+
+def _picture(project: Project, run: Path, config: PicturesConfig) -> None:
+    """Write the object under other light, and measures; what is there of this run stays."""
+    from univoxel.capture.project import discard_older
+    from univoxel.checkpoint import FILE
+
+    folder = project.pictures
+    measures = folder / "measures.json"
+    if _up_to_date(measures, run):
+        return _skip("pictures", folder)
+    _say("pictures", str(folder))
+    discard_older(folder, than=run / FILE)
+    relight_to_files(
+        run,
+        [SCENE / "envmaps" / f"{name}.hdr" for name in MAPS],
+        folder,
+        resume=True,
+        cameras=f"orbit {config.frames}",
+        resolution=config.resolution,
+        samples=config.samples,
+    )
+    try:
+        evaluate(run, save=folder / "test", json=measures)
+    except DataError as error:  # such as a run whose photographs are elsewhere now
+        log.warning(f"no measures: {error}")
+    return None
+
+
+def _write_page(project: Project, given: Given, run: Path) -> None:
+    """Write the page of the object, which also says what lies beside it."""
+    from univoxel.evaluation.measures import in_words
+    from univoxel.page import write_page
+
+    beside = [
+        ("the mesh with its materials", project.mesh),
+        ("pictures with their layers", project.pictures),
+        ("the masks, worst first", project.cut / "masks.html"),
+    ]
+    named = [
+        f"{what} ({path.relative_to(project.out).as_posix()})"
+        for what, path in beside
+        if path.exists()
+    ]
+    measures = project.pictures / "measures.json"
+    values = read_json(measures) if measures.exists() else {}
+    known = {key: value for key, value in values.items() if value is not None}
+    write_page(
+        run,
+        project.page,
+        title=project.out.absolute().name,
+        notes=f"Made of {given.words}. Beside this page lie {', '.join(named)}.",
+        measures=in_words(known),
+    )

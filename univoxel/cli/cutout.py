@@ -1,0 +1,38 @@
+"""Cut the object out of photographs without masks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from univoxel.cli.parsing import DownscaleBy, check_downscale, takes, written
+
+
+@dataclass(frozen=True)
+class CutoutOptions:
+    data: Annotated[Path, written("DATA", positional=True)]
+    """folder of the photographs and their cameras; masks in it are not looked at"""
+    out: Annotated[Path, written("DIR")]
+    """folder to write"""
+    source: Annotated[str, written("rembg|FOLDER|none", "rembg", name="from")] = "rembg"
+    """where masks come from: rembg, a network on single photographs; a folder of masks with the
+    stems of the photographs; or none, the pattern of the ground that the object stands on, which it
+    hides. Masks vote for a hull, and those that it contradicts are mended"""
+    downscale: DownscaleBy = "auto"
+    """write photographs of 1/N of their width and height; auto as of train"""
+    allow_outside: bool = False
+    """as of train"""
+
+
+@takes(CutoutOptions)
+def command(asked: CutoutOptions) -> Path:
+    """Cut the object out of photographs without masks.
+
+    Writes them with their alpha, and their cameras, as a new folder to train on: look at its
+    masks.html, worst first, and mend what is wrong in any image editor.
+    """
+    from univoxel.segmentation.cutout import cutout
+
+    downscale = check_downscale(asked.downscale)
+    return cutout(asked.data, asked.out, asked.source, downscale, asked.allow_outside)

@@ -1,0 +1,180 @@
+"""Whether this installation can train, on what, and what to do about what it lacks."""
+
+from __future__ import annotations
+
+import json as jsonlib
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from univoxel import __version__, machine
+from univoxel.cli.parsing import STDOUT, JsonFile, json_file, takes
+from univoxel.errors import MissingNative
+from univoxel.files import replacing
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from univoxel.ops import NativeStatus
+
+State: TypeAlias = Literal["good", "look", "bad"]  # bad: training is refused
+COLORS: dict[State, str] = {"good": "green", "look": "yellow", "bad": "red"}
+REINSTALL = "pip install --force-reinstall --no-deps --only-binary univoxel univoxel"
+REBUILD = (
+    f"install a wheel that has it ({REINSTALL}), or build anew with a compiler, GLM and Embree"
+)
+ENOUGH = 4 << 30  # bytes: presets on 100 photographs of about 1000 pixels stay below
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    found: str
+    state: State = "good"
+    remedy: str = ""  # what to do, where there is something to do
+
+
+@dataclass(frozen=True)
+class DoctorOptions:
+    json: JsonFile = None
+    """file for the findings; - prints them in place of the table"""
+
+
+@takes(DoctorOptions)
+def command(asked: DoctorOptions) -> None:
+    """Look at this installation and machine, and say what they lack.
+
+    Processor and the kernels built for it, Embree, torch, OpenMP, threads, memory, extras. Ends
+    with exit code 2 where training would be refused.
+    """
+    import rich
+
+    findings = look()
+    with json_file(asked.json) as file:
+        if file is not None:
+            with replacing(Path(file)) as temporary:
+                text = jsonlib.dumps([asdict(f) for f in findings], indent=2)
+                temporary.write_text(text + "\n", encoding="utf-8")
+    if asked.json != STDOUT:
+        rich.print(table(findings))
+    check(findings)
+
+
+def look() -> list[Finding]:
+    """What was found of the installation and the machine."""
+    import torch
+
+    from univoxel.installation import openmp_runtimes, torch_build
+    from univoxel.ops import native_status
+
+    status = native_status()
+    return [
+        Finding("univoxel", f"{__version__}, {Path(__file__).parent.parent}"),
+        Finding("Python", f"{platform.python_version()}, {platform.platform()}"),
+        Finding("processor", f"{machine.processor()}, runs {status.usable[-1]}"),
+        kernels(status),
+        embree(status),
+        Finding("torch", torch_build()),
+        openmp(openmp_runtimes()),
+        threads(torch.get_num_threads(), machine.cores()),
+        memory(machine.memory()),
+        *extra_findings(),
+    ]
+
+
+def kernels(status: NativeStatus) -> Finding:
+    """Whether the compiled extension is loaded, and the best build of it."""
+    if status.variant is None:
+        return Finding("kernels", f"not loaded: {status.reason}", "bad", REBUILD)
+    found = f"{status.variant}, of {' '.join(status.built)}"
+    if status.variant == status.usable[-1]:
+        return Finding("kernels", found)
+    faster = f"this processor runs {status.usable[-1]}, which is not there: {REBUILD}"
+    return Finding("kernels", found, "look", faster)
+
+
+def embree(status: NativeStatus) -> Finding:
+    """Whether rays can be traced."""
+    if status.embree is not None:
+        return Finding("Embree", f"{status.embree}")
+    return Finding("Embree", "none: no rays, so no training and no relighting", "bad", REBUILD)
+
+
+def openmp(runtimes: Sequence[str]) -> Finding:
+    """Whether torch and the kernels share one OpenMP runtime; two would fight over the cores."""
+    found = ", ".join(runtimes) or "none"
+    if len(runtimes) <= 1:
+        return Finding("OpenMP", found)
+    remedy = "two slow each other down: import univoxel before what brings the second"
+    return Finding("OpenMP", found, "look", remedy)
+
+
+def threads(count: int, cores: float) -> Finding:
+    """Whether kernels run on as many threads as there are cores to be had."""
+    asked = os.environ.get("OMP_NUM_THREADS")
+    found = f"{count} on {cores:g} cores" + (f", OMP_NUM_THREADS={asked}" if asked else "")
+    if count > max(cores, 1):
+        remedy = (
+            f"more threads than cores wait for one another: OMP_NUM_THREADS={max(int(cores), 1)}"
+        )
+        return Finding("threads", found, "look", remedy)
+    return Finding("threads", found)
+
+
+def memory(found: machine.Memory | None) -> Finding:
+    """Whether there is memory enough for a training."""
+    if found is None:
+        return Finding("memory", "unknown")
+    total = f"{found.total / 2**30:.1f} GiB"
+    if found.free is None:
+        return Finding("memory", total)
+    said = f"{found.free / 2**30:.1f} GiB free of {total}"
+    if found.free < ENOUGH:
+        return Finding("memory", said, "look", "train with --downscale, or close other programs")
+    return Finding("memory", said)
+
+
+def extra_findings() -> list[Finding]:
+    """A finding for each extra."""
+    from univoxel.installation import extras
+
+    known = extras()
+    if known is None:
+        return [Finding("extras", "unknown: the package is not installed, only on the path")]
+    return [
+        Finding(f"extra {extra.name}", f"without {', '.join(extra.missing)}", "look", remedy)
+        if extra.missing
+        else Finding(f"extra {extra.name}", "installed")
+        for extra in known
+        for remedy in [f'where a command asks for it: pip install "univoxel[{extra.name}]"']
+    ]
+
+
+def table(findings: Sequence[Finding]) -> Table:
+    """The findings as the command prints them, what to do under each."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for f in findings:
+        said = Text(f.found, COLORS[f.state])
+        table.add_row(f.what, said.append(f"\n-> {f.remedy}", "default") if f.remedy else said)
+    return table
+
+
+def check(findings: Sequence[Finding]) -> None:
+    """Refuse an installation that cannot train.
+
+    Raises:
+        MissingNative: a part of the extension is missing; the message names it.
+    """
+    bad = [f"{f.what}: {f.found}" for f in findings if f.state == "bad"]
+    if bad:
+        raise MissingNative(f"this installation cannot train: {'; '.join(bad)}")

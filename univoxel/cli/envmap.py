@@ -1,0 +1,92 @@
+"""The recovered environment map as a file, and how far it is from the true one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from univoxel.cli.parsing import File, LightOf, Run, takes, written
+from univoxel.errors import UserError
+from univoxel.names import MAP_ROWS
+
+if TYPE_CHECKING:
+    from univoxel.evaluation.recovered_map import Comparison
+
+
+@dataclass(frozen=True)
+class EnvmapOptions:
+    run: Run
+    """folder of a trained run"""
+    out: Annotated[File, written("FILE.exr|hdr")]
+    """the map, linear radiance, in 32 bits a channel as .exr, a pixel as .hdr; a picture of it goes
+    beside, with the true map if the data set has it"""
+    height: Annotated[int, written("ROWS")] = MAP_ROWS
+    """rows of the map; it is twice as wide"""
+    light_of: LightOf = None
+    """training view, by name or number, whose map it is, where the run was trained with
+    --varying"""
+
+
+@takes(EnvmapOptions)
+def command(asked: EnvmapOptions) -> None:
+    """Write the light of the photographs as an environment map."""
+    found = envmap(**vars(asked))
+    print(asked.out)
+    if found:
+        print(f"grey ball under it: PSNR {found.ball_psnr:.1f} dB, a scale per channel")
+        print(f"mirror ball under it: PSNR {found.mirror_psnr:.1f} dB")
+        print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
+
+
+@takes(EnvmapOptions)
+def envmap(asked: EnvmapOptions) -> Comparison | None:
+    """Write the recovered map of a run, and a picture of it beside; compare it with the true one.
+
+    Light and albedo share a factor per channel that photographs hardly fix; the comparison takes it
+    out, the file holds the map as it is. The true map is envmaps/train.hdr or .exr in the data set.
+    The picture goes to the same name with .png: a row for the recovered map and one for the true
+    map, each with a grey and a mirror ball seen from +X, +Z up.
+
+    Returns:
+        None where the data set has no true map.
+
+    Raises:
+        DataError: run or true map cannot be read.
+        UserError: the run has no map; an argument out of range; light_of is no training view, or
+            light does not vary.
+        OSError: a file cannot be written.
+    """
+    import torch
+
+    from univoxel.checkpoint import load_scene
+    from univoxel.color import linear_to_srgb
+    from univoxel.data.images import write_exr, write_png
+    from univoxel.data.maps import true_map
+    from univoxel.data.radiance import write_radiance
+    from univoxel.evaluation.recovered_map import compare, exposure_of, recovered_map, scale_to
+    from univoxel.pictures.balls import map_and_balls
+    from univoxel.run import trained_on
+
+    run, out = Path(asked.run), Path(asked.out)
+    height = asked.height
+    if height < 1:
+        raise UserError(f"height must be at least 1, got {height}", "height")
+    if out.suffix.lower() not in (".exr", ".hdr"):
+        raise UserError(f"out: expected a name that ends in .exr or .hdr, got {out}", "out")
+    scene = load_scene(run)
+    scene.show_light_of(asked.light_of)
+    recovered, true = recovered_map(scene, run, height), true_map(trained_on(run))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix.lower() == ".hdr":
+        write_radiance(out, recovered.numpy())
+    else:
+        write_exr(out, dict(zip("RGB", recovered.unbind(2), strict=True)), half=False)
+    rows, result = [recovered], None
+    if true is not None:
+        recovered = recovered * scale_to(recovered, true)
+        rows, result = [recovered, true], compare(recovered, true)
+    exposure = exposure_of(rows[-1])
+    picture = [torch.cat(map_and_balls(row * exposure, height), 1) for row in rows]
+    write_png(out.with_suffix(".png"), linear_to_srgb(torch.cat(picture)))
+    return result

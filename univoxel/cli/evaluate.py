@@ -1,0 +1,186 @@
+"""A trained scene against the truth of its test views: the measures, and pictures of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from univoxel.cli.parsing import (
+    STDOUT,
+    DataOf,
+    File,
+    JsonFile,
+    LightOf,
+    Run,
+    json_file,
+    takes,
+    written,
+)
+from univoxel.errors import UserError
+from univoxel.files import replacing
+from univoxel.names import BOUNCES, SAMPLES, Behind
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from univoxel.scene import Scene
+
+
+@dataclass(frozen=True)
+class EvaluateOptions:
+    """How a run is measured.
+
+    Raises:
+        UserError: samples or bounces out of range; both light_of and fit_light.
+    """
+
+    run: Run
+    """folder of a trained run"""
+    data: DataOf = None
+    """folder of the photographs"""
+    save: Annotated[File | None, written("DIR", "none are written")] = None
+    """folder for the rendered pictures"""
+    json: JsonFile = None
+    """file for the measures; - prints them in place of the table"""
+    samples: int = SAMPLES
+    """of the light, per pixel of relit pictures"""
+    bounces: int = BOUNCES
+    """reflections between parts of the object in relit pictures, 0 for none"""
+    light_of: LightOf = None
+    """training view, by name or number, in whose light novel views are rendered, where the run was
+    trained with --varying"""
+    test_every: Annotated[int | None, written("N", "the test split")] = None
+    """measure the first of every so many photographs, in order of all names; none of them may have
+    been trained on"""
+    background: Behind = "black"
+    """what novel views are composited on"""
+    fit_light: bool = False
+    """render each novel view in the light in which it looks most like its photograph, as the field
+    does where light differs from photograph to photograph"""
+
+    def __post_init__(self) -> None:
+        if self.samples < 1 or self.bounces < 0:
+            raise UserError(
+                "evaluate: expected samples >= 1 and bounces >= 0, got "
+                f"{self.samples} and {self.bounces}",
+                "samples",
+                "bounces",
+            )
+        if self.fit_light and self.light_of is not None:
+            raise UserError("light_of and fit_light exclude one another", "light_of", "fit_light")
+
+
+@takes(EvaluateOptions)
+def command(asked: EvaluateOptions) -> None:
+    """Measure a run on the test views and print the table."""
+    import rich
+
+    with json_file(asked.json) as file:
+        measures = evaluate(**vars(replace(asked, json=file)))
+    if asked.json != STDOUT:
+        rich.print(table(measures))
+
+
+@takes(EvaluateOptions, gradients=False)
+def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
+    """Measures of a trained scene on its test views, by the keys of `MEASURES`.
+
+    Arguments are the fields of `EvaluateOptions`. Pictures are compared as sRGB in [0, 1], whole
+    image, composited on black, novel views on `background`. Numbers are means over the views (and
+    maps) of numbers per view; `univoxel.evaluation.measures` and `univoxel.metrics` define each. A
+    measure that the data has no truth for is None. What is weakly determined is said in words
+    through the log.
+
+    Into the folder `save` go <name>.exr of each view, contact_sheet.png, and trust.txt, what is
+    weakly determined. The channels are half floats: rgb.*, albedo.* and relit_<map>.* linear,
+    composited on black, with the albedo as it is; roughness, normal.* (world), doubt.albedo and
+    doubt.roughness in [0, 1], 0 where nothing is; alpha; depth along -Z, 0 where nothing is. The
+    file `json` holds the measures; `complete` and `verdict`, how training came out, None where that
+    is not known; and the figures of trust.txt under the key trust.
+
+    Raises:
+        DataError: the run or the data cannot be read.
+        UserError: an argument out of range; light_of is no training view, or light does not vary.
+        OSError: a result cannot be written.
+    """
+    from statistics import fmean
+
+    from univoxel.checkpoint import load_checkpoint
+    from univoxel.evaluation import views
+    from univoxel.evaluation.measures import albedo_scales, doubt_correlation, mesh_chamfer
+    from univoxel.evaluation.truth import every_nth, load_scene_truth
+    from univoxel.render.pipeline import extract_mesh
+    from univoxel.run import photos_of
+
+    run = Path(asked.run)
+    paths = asked.data, asked.save, asked.json
+    data, save, json = (None if path is None else Path(path) for path in paths)
+    photos = photos_of(run, data)
+    if asked.test_every is not None:
+        photos = every_nth(photos, photos_of(run, data, "train").names, asked.test_every)
+    truth = load_scene_truth(photos)
+    scene, report = load_checkpoint(run)
+    scene.show_light_of(asked.light_of)
+    for folder in (save, json and json.parent):
+        if folder:
+            folder.mkdir(parents=True, exist_ok=True)
+
+    surveyed = views.survey_of(scene, run, data)
+    mesh = extract_mesh(scene) if truth.maps or truth.points is not None else None
+    scales = albedo_scales(scene, photos)
+    relighting = views.relighting_of(scene, mesh, truth, scales, asked.samples, asked.bounces)
+    how = {"background": asked.background, "fit_light": asked.fit_light, "save": save}
+    found = views.measure_views(scene, photos, truth, scales, relighting, surveyed, **how)
+    result = {key: fmean(values) if values else None for key, values in found.measures.items()}
+    result |= {
+        "chamfer": mesh_chamfer(mesh, truth.points),
+        "trust_spearman": doubt_correlation(found.albedo_doubts),
+        "trust_spearman_roughness": doubt_correlation(found.roughness_doubts),
+        **_costs(run, scene, report),
+    }
+    figures = views.say_trust(surveyed, report.get("troubles", []), save)
+    if json:
+        with replacing(json) as temporary:
+            text = dumps(result | _verdict(run) | figures, indent=2)
+            temporary.write_text(text + "\n", encoding="utf-8")
+    return result
+
+
+def table(result: dict[str, float | int | None]) -> Table:
+    """The measures as the command prints them."""
+    from rich.table import Table
+
+    from univoxel.evaluation.measures import MEASURES
+
+    rows = Table("measure", "meaning", "value", title="Test views")
+    rows.columns[2].justify = "right"
+    for key, meaning in MEASURES.items():
+        value = result[key]
+        text = "-" if value is None else f"{value:.4g}" if isinstance(value, float) else f"{value}"
+        rows.add_row(key, meaning, text)
+    return rows
+
+
+def _costs(run: Path, scene: Scene, report: dict) -> dict[str, float | int | None]:
+    """What training took, and the size of the model."""
+    from univoxel.checkpoint import FILE
+
+    return {
+        "train_seconds": report.get("seconds"),
+        "threads": report.get("threads"),
+        "peak_rss_mb": report.get("peak_rss_mb"),
+        "parameters": sum(p.numel() for p in scene.parameters()),
+        "model_bytes": (run / FILE).stat().st_size,
+    }
+
+
+def _verdict(run: Path) -> dict[str, Any]:
+    """How training came out, for JSON."""
+    from univoxel.verdict import load_verdict
+
+    verdict = load_verdict(run)
+    if verdict is None:
+        return {"complete": None, "verdict": None}
+    return {"complete": verdict.complete, "verdict": verdict.word}

@@ -1,0 +1,184 @@
+"""The surface of a trained scene as a mesh file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from univoxel.cli.parsing import File, Run, takes, written
+from univoxel.errors import UserError
+from univoxel.names import (
+    ORIGINS,
+    TEXTURE_FORMATS,
+    TEXTURE_QUALITY,
+    TEXTURE_SIZE,
+    Origin,
+    TextureFormat,
+)
+
+if TYPE_CHECKING:
+    from univoxel.assets.placement import Placement
+    from univoxel.records import Mesh
+    from univoxel.scene import Scene
+
+SUFFIXES = (".glb", ".obj", ".ply", ".usdz")
+TEXTURED_FACES = 20_000  # of textured meshes: the texture holds what they are too coarse for
+TEXTURE_SIZES = (16, 4096)
+QUALITIES = (1, 95)  # of JPEG textures; above, files grow and lose as much
+LODS = (0, 8)
+FEWER = 4  # times fewer triangles from level to level: their edges become twice as long
+LEAST_FACES = 32  # of the coarsest level: with fewer no shape is left
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """How a surface becomes a file.
+
+    Raises:
+        UserError: an argument is out of range.
+    """
+
+    run: Run
+    """folder of a trained run"""
+    mesh: Annotated[File, written("FILE.glb|usdz|obj|ply")]
+    """the file to write: .glb, .usdz and .obj hold textures, .ply materials at the vertices"""
+    faces: Annotated[int | None, written("N", "20000 with textures, all without")] = None
+    """most triangles, at least 4"""
+    texture_size: Annotated[int, written("TEXELS")] = TEXTURE_SIZE
+    """width of the square textures, a power of 2 up to 4096"""
+    watertight: bool = False
+    """close holes, or fail"""
+    texture_format: TextureFormat = "png"
+    """png loses nothing, jpeg is smaller"""
+    quality: Annotated[int, written("1-95")] = TEXTURE_QUALITY
+    """of textures as jpeg"""
+    size: Annotated[float | None, written("METRES", "as photographed")] = None
+    """what the longest side of the object becomes"""
+    origin: Origin = "world"
+    """what lies at 0: the origin of the data set, the middle of the object's floor, or its
+    centre"""
+    lods: Annotated[int, written("N")] = 0
+    """coarser levels of detail to write beside, FILE_lod1 and so on: each has a quarter of the
+    triangles, and textures of half the width"""
+
+    def __post_init__(self) -> None:
+        if self.faces is not None and self.faces < 4:
+            raise UserError(f"export: faces must be at least 4, got {self.faces}", "faces")
+        low, high = TEXTURE_SIZES
+        size = self.texture_size
+        if not low <= size <= high or size & (size - 1):
+            raise UserError(
+                f"export: texture_size must be a power of 2 from {low} to {high}, got {size}",
+                "texture_size",
+            )
+        for name, known in (("texture_format", TEXTURE_FORMATS), ("origin", ORIGINS)):
+            if (value := getattr(self, name)) not in known:
+                raise UserError(f"export: {name} must be {' or '.join(known)}, got {value}", name)
+        for name, (low, high) in (("quality", QUALITIES), ("lods", LODS)):
+            if not low <= (value := getattr(self, name)) <= high:
+                raise UserError(f"export: {name} must be {low} to {high}, got {value}", name)
+        if self.size is not None and not 0 < self.size < math.inf:
+            raise UserError(f"export: size must be above 0, got {self.size:g}", "size")
+        if self.faces is not None and self.lods:
+            require_levels(self.faces, self.lods)
+
+    @property
+    def jpeg(self) -> int | None:
+        """Quality of JPEG textures; None: PNG."""
+        return self.quality if self.texture_format == "jpeg" else None
+
+
+def require_levels(faces: int, lods: int) -> None:
+    """Refuse levels of detail that would have next to no triangles.
+
+    Raises:
+        UserError: the coarsest would.
+    """
+    coarsest = faces // FEWER**lods
+    if coarsest < LEAST_FACES:
+        raise UserError(
+            f"export: lods={lods} of {faces} faces leave {coarsest} in the coarsest level, expected"
+            f" at least {LEAST_FACES}",
+            "lods",
+        )
+
+
+def level_path(mesh: Path, level: int) -> Path:
+    """The file of a level of detail: NAME.glb is the finest, NAME_lod1.glb the next."""
+    return mesh.with_name(f"{mesh.stem}_lod{level}{mesh.suffix}") if level else mesh
+
+
+@takes(ExportOptions)
+def export(asked: ExportOptions) -> list[Path]:
+    """Write the surface as a mesh with its materials, for any renderer.
+
+    Returns:
+        The files of the levels of detail, the finest first, each written whole or not at all.
+
+    Raises:
+        UserError: the run cannot be used, an argument is out of range, there is
+            no surface, or none that can be closed.
+        MissingExtra: .usdz without usd-core.
+        OSError: a file cannot be written.
+    """
+    from univoxel.assets.placement import placement_of
+    from univoxel.assets.topology import clean, close, simplify
+    from univoxel.assets.usd import require_usd
+    from univoxel.checkpoint import load_scene
+    from univoxel.records import Mesh
+
+    mesh = Path(asked.mesh)
+    suffix = mesh.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise UserError(
+            f"export: mesh: expected a file that ends in {', '.join(SUFFIXES)}, got {mesh}", "mesh"
+        )
+    if suffix == ".usdz":
+        require_usd()
+    scene = load_scene(Path(asked.run))
+    surface = clean(Mesh(*scene.field.isosurface()))
+    if asked.watertight:
+        surface = close(surface)
+    most = TEXTURED_FACES if asked.faces is None and suffix != ".ply" else asked.faces
+    most = len(surface.faces) if most is None else min(most, len(surface.faces))
+    if asked.lods:
+        require_levels(most, asked.lods)
+    mesh.parent.mkdir(parents=True, exist_ok=True)
+    placement, written = None, []
+    for level in range(asked.lods + 1):
+        reduced = simplify(surface, most // FEWER**level)
+        if asked.watertight:
+            reduced = close(reduced)  # what decimation has torn
+        if placement is None:  # all levels where the finest lies
+            placement = placement_of(reduced.vertices, asked.size, asked.origin)
+        written.append(level_path(mesh, level))
+        size = max(asked.texture_size >> level, TEXTURE_SIZES[0])
+        _write(written[-1], scene, reduced, placement, size, asked.jpeg)
+    return written
+
+
+def _write(
+    path: Path, scene: Scene, surface: Mesh, placement: Placement, size: int, jpeg: int | None
+) -> None:
+    """Write a surface, given in the scene's world, as its file's name says."""
+    from univoxel.assets.bake import bake, with_materials
+    from univoxel.assets.gltf import write_glb
+    from univoxel.assets.obj import write_obj
+    from univoxel.assets.placement import placed
+    from univoxel.assets.ply import write_ply
+    from univoxel.assets.usd import write_usdz
+
+    match path.suffix.lower():
+        case ".glb":
+            write_glb(path, placed(bake(scene, surface, size), placement), jpeg)
+        case ".usdz":
+            write_usdz(path, placed(bake(scene, surface, size), placement), jpeg)
+        case ".obj":
+            write_obj(path, placed(bake(scene, surface, size), placement), jpeg)
+        case ".ply":
+            write_ply(path, placed(with_materials(scene, surface), placement))
+
+
+command = export

@@ -1,0 +1,351 @@
+"""Arguments of the command line: which command is meant, how options are written, completion.
+
+The options of a command are a record: what stands under a field is its help.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import difflib
+import functools
+import inspect
+import io
+import itertools
+import re
+import sys
+import tempfile
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    ParamSpec,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_type_hints,
+)
+
+from univoxel.errors import UserError
+from univoxel.names import Downscale
+
+# What a command returns is printed, if it is a file or several; a number is the exit code
+Result: TypeAlias = int | Path | Sequence[Path] | None
+Command: TypeAlias = Callable[..., Result]
+Shell: TypeAlias = Literal["bash", "zsh", "fish"]
+
+LAB = "lab"  # the word before commands of the laboratory
+WIDTH = 79  # of the overview
+
+
+@dataclass(frozen=True)
+class Written:
+    """How an option is written, and shown in help."""
+
+    metavar: str | None = None  # what it takes
+    hint: str | None = None  # what help says of its default
+    name: str | None = None  # without dashes, if it is not the field's
+    positional: bool = False
+    repeatable: bool = False
+
+
+def written(metavar: str | None = None, default: str | None = None, **other: Any) -> Written:
+    """The same with a default in words."""
+    hint = {} if default is None else {"hint": f"(default: {default})"}
+    return Written(metavar, **hint, **other)
+
+
+# Options of several commands
+File: TypeAlias = Path | str  # text in the library alone: the command line makes paths
+Run: TypeAlias = Annotated[File, written("RUN", positional=True)]
+AtOnce: TypeAlias = Annotated[int, written("N")]
+Scheduler: TypeAlias = Annotated[str | None, written("ADDRESS", "this machine")]
+Scenes: TypeAlias = Annotated[
+    tuple[Path, ...], Written("SCENE [SCENE ...]", "(required)", positional=True)
+]
+Changes: TypeAlias = Annotated[
+    tuple[str, ...], Written("FIELD=VALUE", "(repeatable)", "set", repeatable=True)
+]
+Minutes: TypeAlias = Annotated[float | None, written("MINUTES", "none")]
+ConfigFile: TypeAlias = Annotated[Path | None, written("FILE", "what --preset says")]
+JsonFile: TypeAlias = Annotated[File | None, written("FILE|-", "none")]
+LightOf: TypeAlias = Annotated[str | None, written("VIEW", "the mean of all")]
+
+DataOf: TypeAlias = Annotated[File | None, written("DATA", "the data trained on")]
+Title: TypeAlias = Annotated[str | None, written("TEXT", "the folder's name")]
+DownscaleBy: TypeAlias = Annotated[Downscale, written("auto|N")]
+
+STDOUT = Path("-")  # as a file for JSON: print it, and it alone
+
+P = ParamSpec("P")
+R = TypeVar("R")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Common:
+    quiet: bool = False
+    """say nothing but results, warnings and errors"""
+    verbose: bool = False
+    """say more, with the seconds since the beginning, and where an error came from"""
+    threads: Annotated[int | None, written("N", "one for each core")] = None
+    """on which kernels and torch run"""
+
+
+@dataclass(frozen=True)
+class Call:
+    """A command with its arguments."""
+
+    name: str  # as it is written: "train", "lab chart"
+    run: functools.partial[Result]
+    common: Common
+
+
+class Usage(Exception):
+    """Arguments that make no command; the message says what is wrong and where to look."""
+
+
+def parse(
+    arguments: Sequence[str], commands: Mapping[str, Command], prefix: str = ""
+) -> Call | None:
+    """The call that arguments ask for; None: help was asked for and printed.
+
+    Args:
+        commands: by name.
+        prefix: what stands before their names.
+
+    Raises:
+        Usage: they make no command.
+    """
+    name, *rest = arguments
+    if name not in commands:
+        near = difflib.get_close_matches(name, commands, n=1)
+        perhaps = f"; perhaps you meant {near[0]}" if near else ""
+        raise Usage(f"no command {name!r}{perhaps}; see univoxel {prefix}--help")
+    import tyro
+
+    program, said = f"univoxel {prefix}{name}", io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            run, common = tyro.cli(
+                deferred(commands[name]),
+                prog=program,
+                args=rest,
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as end:
+        if not end.code:
+            return None
+        raise Usage(f"{gist(said.getvalue())}; see {program} --help") from None
+    if common.quiet and common.verbose:
+        raise Usage(f"expected --quiet or --verbose, got both; see {program} --help")
+    if common.threads is not None and common.threads < 1:
+        raise Usage(f"--threads must be at least 1, got {common.threads}; see {program} --help")
+    return Call(prefix + name, run, common)
+
+
+def takes(
+    record: Callable[P, R], gradients: bool = True
+) -> Callable[[Callable[[R], T]], Callable[P, T]]:
+    """Make a function of a record one of the record's fields, so that options stand once.
+
+    Commands and functions of the library are such functions.
+
+    Args:
+        gradients: whether torch keeps track of what they would need.
+    """
+
+    def made(function: Callable[[R], T]) -> Callable[P, T]:
+        @functools.wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> T:
+            asked = record(*args, **kwargs)
+            if gradients:
+                return function(asked)
+            import torch
+
+            with torch.no_grad():
+                return function(asked)
+
+        result = function.__annotations__.get("return")
+        signature = inspect.signature(record).replace(return_annotation=result)
+        vars(call).update(__signature__=signature, record=record)
+        return call
+
+    return made
+
+
+def hints_of(command: Command) -> dict[str, Any]:
+    """Types of a command's arguments, with what is said of them; only now, as it takes a while."""
+    return get_type_hints(getattr(command, "record", command), include_extras=True)
+
+
+def documentation(command: Command) -> str:
+    """What a command does, and under Args what its arguments mean: what its record says of them."""
+    text = inspect.getdoc(command) or ""
+    if (record := getattr(command, "record", None)) is None:
+        return text
+    what = re.split(r"\n\n(?:Returns|Raises):\n", text)[0]
+    return "\n".join([what, "", "Args:", *(f"    {n}: {m}" for n, m in meanings(record).items())])
+
+
+def meanings(record: type) -> dict[str, str]:
+    """What stands under each field of a record, in one line; nothing where there is no source.
+
+    Args:
+        record: a class that stands in one file with its bases.
+    """
+    try:
+        tree = ast.parse(inspect.getsource(sys.modules[record.__module__]))
+    except OSError:
+        return {}
+    bodies = {node.name: node.body for node in tree.body if isinstance(node, ast.ClassDef)}
+    found = {}
+    for kind in record.__mro__[-2::-1]:  # bases first, as their fields are
+        for pair in itertools.pairwise(bodies[kind.__name__]):
+            match pair:
+                case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                    found[name] = " ".join(text.split())
+    return found
+
+
+def deferred(command: Command) -> Callable[..., tuple[functools.partial[Result], Any]]:
+    """A function of the same signature, and the common options, that returns the call."""
+
+    def prepare(*args, quiet: bool, verbose: bool, threads: int | None, **kwargs):
+        return functools.partial(command, *args, **kwargs), Common(quiet, verbose, threads)
+
+    common = [
+        p.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for p in inspect.signature(Common).parameters.values()
+    ]
+    hints = hints_of(command) | get_type_hints(Common, include_extras=True)
+    hints = {name: _for_tyro(hint) for name, hint in hints.items()}
+    signature = inspect.signature(command)
+    every = [*signature.parameters.values(), *common]
+    every = [p.replace(annotation=hints[p.name]) for p in every]
+    prepare.__signature__ = signature.replace(parameters=every)
+    prepare.__annotations__ = hints
+    said = (f"    {name}: {text}" for name, text in meanings(Common).items())
+    prepare.__doc__, prepare.__name__ = "\n".join([documentation(command), *said]), "command"
+    return prepare
+
+
+def _for_tyro(hint: Any) -> Any:
+    """A type with how it is written, as tyro is told it."""
+    from tyro.conf import Positional, UseAppendAction, arg
+
+    found = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, Written)]
+    if not found:
+        return hint
+    kind, (mark,) = get_args(hint)[0], found
+    if mark.positional:
+        kind = Positional[kind]
+    if mark.repeatable:
+        kind = UseAppendAction[kind]
+    return Annotated[kind, arg(name=mark.name, metavar=mark.metavar, help_behavior_hint=mark.hint)]
+
+
+def gist(box: str) -> str:
+    """The message on one line, with what tyro thinks was meant, of the box that it draws.
+
+    The box has a title, the message and hints, with rules between them.
+    """
+    lines = [line.strip("│╰╯ ") for line in box.splitlines()][1:]
+    ruled = [bool(line) and not line.strip("─-") for line in lines]
+    begin = ruled[:1] == [True]  # without UTF-8 there is a rule under the title
+    message = lines[begin : ruled.index(True, begin)] if True in ruled[begin:] else lines
+    meant = re.search(r"Perhaps you meant:\s+(--[\w-]+)", "\n".join(lines))
+    perhaps = f"; perhaps you meant {meant[1]}" if meant else ""
+    return " ".join(" ".join(message).split()).rstrip(".") + perhaps
+
+
+def overview(title: str, groups: Mapping[str, Mapping[str, Command]], end: str) -> str:
+    """One screen: groups of commands, each with the first line of what it does."""
+    width = max(len(name) for group in groups.values() for name in group)
+    lines = [title]
+    for group, commands in groups.items():
+        lines.append(f"{group}:")
+        for name, command in commands.items():
+            what = (inspect.getdoc(command) or "").partition("\n")[0].rstrip(".")
+            what = textwrap.shorten(what, WIDTH - width - 4, placeholder=" ...")
+            lines.append(f"  {name:<{width}}  {what}")
+    return "\n".join([*lines, end])
+
+
+def completion(shell: Shell, commands: Mapping[str, Command], lab: Mapping[str, Command]) -> str:
+    """The script that makes a shell complete commands, options and their choices.
+
+    Args:
+        lab: commands of the laboratory; none where it is not there.
+    """
+
+    import tyro
+    from tyro.conf import ConsolidateSubcommandArgs, FlagCreatePairsOff, OmitSubcommandPrefixes
+
+    def laboratory(command):
+        """Commands of the laboratory."""
+
+    if lab:
+        laboratory.__annotations__["command"] = Annotated[_union(lab), OmitSubcommandPrefixes]
+        commands = {**commands, LAB: laboratory}
+    said = io.StringIO()
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(said):
+        tyro.cli(
+            _union(commands),
+            prog="univoxel",
+            args=["--tyro-write-completion", shell, "-"],
+            config=(FlagCreatePairsOff, ConsolidateSubcommandArgs),
+        )
+    # Names of files where nothing else fits, as zsh and fish do
+    return said.getvalue().replace("complete -F ", "complete -o default -F ")
+
+
+def _union(commands: Mapping[str, Command]) -> Any:
+    """A type whose values are commands, for tyro."""
+    from tyro.conf import subcommand
+
+    kinds = [
+        Annotated[Any, subcommand(name, constructor=command if name == LAB else deferred(command))]
+        for name, command in commands.items()
+    ]
+    return Union[tuple(kinds)]  # noqa: UP007
+
+
+@contextlib.contextmanager
+def json_file(asked: File | None) -> Iterator[File | None]:
+    """The file for a task to write; what was asked to be printed is, at the end."""
+    if asked != STDOUT:
+        yield asked
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "printed.json"
+        yield file
+        print(file.read_text(encoding="utf-8"), end="")
+
+
+def check_minutes(minutes: float | None) -> None:
+    """Refuse a limit that is not above 0.
+
+    Raises:
+        UserError: it is not.
+    """
+    if minutes is not None and not minutes > 0:
+        raise UserError(f"minutes must be above 0, got {minutes:g}", "minutes")
+
+
+def check_downscale(downscale: Downscale) -> int:
+    """The side of the squares of pixels that become one, 0 for auto.
+
+    Raises:
+        UserError: it is below 1.
+    """
+    if downscale == "auto":
+        return 0
+    if downscale < 1:
+        raise UserError(f"downscale must be at least 1, got {downscale}", "downscale")
+    return downscale

@@ -1,0 +1,318 @@
+"""A trained scene under new light, from the test views, an orbit or given cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from univoxel.cli.parsing import Run, takes, written
+from univoxel.errors import UserError
+from univoxel.names import BOUNCES, ELEVATION, SAMPLES, Animation, Background, Ground
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from univoxel.camera import Cameras
+    from univoxel.envmap import EnvMap
+    from univoxel.ops import PointLight, Sun
+    from univoxel.pictures.relighting import Studio
+    from univoxel.render.frame import Quality
+    from univoxel.render.relight import Lighting
+
+NO_MAP = "lights"  # name of light without a map
+
+
+@dataclass(frozen=True, kw_only=True)
+class Where:
+    """What is relit, and where the pictures go."""
+
+    run: Run
+    """folder of a trained run"""
+    envmap: Annotated[tuple[Path, ...], written("MAP [MAP ...]", "none")] = ()
+    """equirectangular maps, twice as wide as high, .exr or .hdr, linear radiance"""
+    out: Annotated[Path | None, written("DIR", "in RUN/relight")] = None
+    """folder for the pictures, with a folder for each map where there are several"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelightOptions:
+    """How relit pictures are made.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+
+    # In the library the first four may be objects too: `Sun`, `PointLight`, `Cameras`, a number
+    suns: Annotated[
+        tuple[tuple[float, ...], ...],
+        written("AZIMUTH ELEVATION IRRADIANCE [ANGLE]", name="sun", repeatable=True),
+    ] = ()
+    """a far light: degrees from +X counter-clockwise and above the horizon, irradiance, degrees
+    across (0.53 if not given; 0: hard shadows); repeatable"""
+    point_lights: Annotated[
+        tuple[tuple[float, float, float, float], ...],
+        written("X Y Z INTENSITY", name="point", repeatable=True),
+    ] = ()
+    """a near light: where it stands, irradiance at distance 1; repeatable"""
+    cameras: Annotated[str, written("test|orbit|FILE")] = "test"
+    """the test views, an orbit around the object, or a path in a transforms.json"""
+    ground: Annotated[str | None, written("lowest|HEIGHT")] = None
+    """z of a floor that catches the object's shadow, or lowest for its lowest point"""
+    elevation: Annotated[float, written("DEGREES")] = ELEVATION
+    """of an orbit above the horizon, degrees"""
+    turn: Annotated[int | None, written("FRAMES")] = None
+    """frames of a turn of the light under the first camera"""
+    resolution: Annotated[int | None, written("PIXELS", "the data's; orbits: 512")] = None
+    """width of the pictures"""
+    rotate: Annotated[float, written("DEGREES")] = 0.0
+    """turn maps and suns counter-clockwise about +Z, degrees"""
+    exposure: Annotated[float, written("FACTOR")] = 1.0
+    """factor on all light"""
+    samples: int = SAMPLES
+    """of the light, per pixel"""
+    noise: Annotated[float | None, written("SHARE")] = None
+    """instead of --samples: as many as bring the relative noise below this, such as 0.02"""
+    bounces: int = BOUNCES
+    """reflections between parts of the object"""
+    background: Background = "transparent"
+    """what stands behind the object"""
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.rotate):
+            raise UserError(f"relight: rotate must be finite, got {self.rotate}", "rotate")
+        if not 0 <= self.exposure < math.inf:
+            raise UserError(
+                f"relight: exposure must be finite and at least 0, got {self.exposure}", "exposure"
+            )
+
+    def quality(self) -> Quality:
+        """How a frame is rendered; a ground at the lowest point is left to the mesh.
+
+        Raises:
+            UserError: a number is out of range.
+        """
+        from univoxel.render.frame import Quality
+
+        ground = parse_ground(self.ground)
+        ground = None if ground == "lowest" else ground
+        return Quality(self.samples, self.noise, self.bounces, self.background, ground)
+
+    def lighting(self, envmap: str | Path | EnvMap | None) -> Lighting:
+        """All light, that of a map too, if there is one.
+
+        Raises:
+            DataError: the map cannot be used; the message names its file.
+            UserError: there is no light, or a number is out of range.
+        """
+        from univoxel.pictures.relighting import lighting
+
+        suns = [sun_light(values) for values in self.suns]
+        point_lights = [point_light(values) for values in self.point_lights]
+        return lighting(envmap, suns, point_lights, self.rotate, self.exposure)
+
+    def studio(self, run: Path) -> tuple[Studio, Quality]:
+        """The scene of a run, ready for frames, and how they are rendered."""
+        from univoxel.pictures.relighting import open_studio
+
+        quality = self.quality()
+        studio = open_studio(run, self.cameras, self.resolution, self.elevation)
+        if self.ground == "lowest":
+            quality = replace(quality, ground=float(studio.traced.mesh.vertices[:, 2].min()))
+        return studio, quality
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relight(RelightOptions, Where):  # whose fields come first
+    orbit: Annotated[int | None, written("FRAMES")] = None
+    """frames of an orbit; --cameras "orbit FRAMES" is the same"""
+    animation: Annotated[tuple[Animation, ...], written(default="none")] = ()
+    """the frames as a moving picture too"""
+    resume: bool = False
+    """keep the frames that are there"""
+
+
+@takes(Relight)
+def command(asked: Relight) -> Path:
+    """Render a run under other light: environment maps, suns, points."""
+    run, envmap, out = Path(asked.run), asked.envmap, asked.out
+    options = {field.name: getattr(asked, field.name) for field in fields(RelightOptions)}
+    if asked.orbit is not None:
+        if asked.cameras != "test":
+            raise UserError(f"expected --orbit or --cameras, got {asked.orbit} and {asked.cameras}")
+        options["cameras"] = f"orbit {asked.orbit}"
+    if out is None:
+        out = run / "relight" / envmap[0].stem if len(envmap) == 1 else run / "relight"
+    maps = envmap[0] if len(envmap) == 1 else envmap
+    relight_to_files(run, maps, out, animation=asked.animation, resume=asked.resume, **options)
+    return out
+
+
+def sun_light(values: tuple[float, ...] | Sun) -> Sun:
+    """A white sun from azimuth and elevation in degrees, irradiance and, perhaps, its angle.
+
+    Raises:
+        UserError: not 3 or 4 numbers, or one out of range.
+    """
+    from univoxel.ops import Sun
+
+    if isinstance(values, Sun):
+        return values
+    if len(values) not in (3, 4):
+        raise UserError(f"--sun: expected AZIMUTH ELEVATION IRRADIANCE [ANGLE], got {values}")
+    azimuth, elevation = (math.radians(x) for x in values[:2])
+    across = math.cos(elevation)
+    direction = (across * math.cos(azimuth), across * math.sin(azimuth), math.sin(elevation))
+    try:
+        return Sun(direction, (values[2], values[2], values[2]), *values[3:])
+    except ValueError as error:
+        raise UserError(f"--{error}") from None
+
+
+def point_light(values: tuple[float, float, float, float] | PointLight) -> PointLight:
+    """A white point light from x, y, z and its intensity.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+    from univoxel.ops import PointLight
+
+    if isinstance(values, PointLight):
+        return values
+    x, y, z, intensity = values
+    try:
+        return PointLight((x, y, z), (intensity, intensity, intensity))
+    except ValueError as error:
+        raise UserError(f"--point: {error}") from None
+
+
+def parse_ground(text: str | float | None) -> Ground:
+    """A height, the word lowest, or nothing.
+
+    Raises:
+        UserError: another text.
+    """
+    if text is None or text == "lowest":
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise UserError(f"--ground: expected lowest or a height, got {text!r}") from None
+
+
+def relight_to_files(
+    run: str | Path,
+    envmap: str | Path | Sequence[str | Path],
+    out: str | Path,
+    *,
+    animation: Sequence[str] = (),
+    resume: bool = False,
+    progress: bool = True,
+    **options: Any,
+) -> None:
+    """Render a trained scene under new light, a PNG and an EXR file per frame.
+
+    The PNG is sRGB, clipped at 1; over a transparent background its alpha is straight and holds
+    the ground's shadow. The EXR holds half floats: rgb.* linear, composited on the background
+    (premultiplied where that is transparent); albedo.* linear and composited on black; normal.*
+    (world) and depth along -Z, 0 where nothing is; alpha of the object; with a ground, shadow.
+    Over a plate: rgb + (1 - alpha) (1 - shadow) plate. Files appear whole or not at all.
+
+    Args:
+        run: folder of the trained scene.
+        envmap: an equirectangular map, or several: each then gets a folder of its name in `out`.
+            An empty sequence leaves the suns and point lights.
+        out: folder for the pictures.
+        animation: "gif" or "mp4" or both: the frames as animation.gif and so on beside them.
+        resume: keep frames whose two files are there already.
+        progress: show a bar.
+        options: fields of `RelightOptions`.
+
+    Raises:
+        UserError: the run, a map or the cameras cannot be used, or a number is out of range.
+        MissingExtra: an MP4 without imageio-ffmpeg.
+        OSError: a file cannot be read or written.
+    """
+    from univoxel.bars import bar
+    from univoxel.data.images import write_exr, write_png
+    from univoxel.pictures.animation import require, write_animation
+    from univoxel.pictures.relighting import pictures_of
+    from univoxel.pictures.viewpoints import frames_of
+    from univoxel.render.frame import channels, srgb
+
+    run, out, chosen = Path(run), Path(out), RelightOptions(**options)
+    chosen.quality()  # now, and not after maps are read
+    several = not isinstance(envmap, str | Path)
+    paths = [Path(path) for path in envmap] if several else [Path(envmap)]
+    if len({path.stem for path in paths}) != len(paths):
+        raise UserError(
+            "relight: expected environment maps of different names, got "
+            f"{[str(path) for path in paths]}"
+        )
+    for kind in animation:
+        require(kind)
+    lights = {path.stem: chosen.lighting(path) for path in paths}
+    if not paths:
+        lights = {NO_MAP: chosen.lighting(None)}
+    studio, quality = chosen.studio(run)
+    frames = frames_of(studio.names, lights, chosen.turn)
+    folders = {name: out / name if several and paths else out for name in lights}
+    files = {frame: folders[frame.light] / frame.stem for frame in frames}
+    missing = [f for f in frames if not (resume and all(p.is_file() for p in _pair(files[f])))]
+    with bar(shown=progress) as shown:
+        done = len(frames) - len(missing)
+        task = shown.add_task("relighting", total=len(frames), completed=done)
+
+        def report(share: float) -> None:
+            shown.update(task, completed=done + share)
+
+        for frame, picture in pictures_of(studio, missing, lights, quality, report):
+            png, exr = _pair(files[frame])
+            png.parent.mkdir(parents=True, exist_ok=True)
+            write_exr(exr, channels(picture))
+            write_png(png, srgb(picture))
+    for name, folder in folders.items():
+        pngs = [_pair(files[frame])[0] for frame in frames if frame.light == name]
+        for kind in animation:
+            write_animation(folder / f"animation.{kind}", pngs)
+
+
+def relight_images(
+    run: str | Path,
+    envmap: str | Path | EnvMap | None = None,
+    cameras: str | Path | Cameras = "test",
+    **options: Any,
+) -> Tensor:
+    """Render a trained scene under new light: [F, H, W, 4] linear RGBA, premultiplied.
+
+    Of cameras with pictures of differing sizes, the smaller ones have nothing but 0 below and to
+    the right of them.
+
+    Args:
+        run: folder of the trained scene.
+        envmap: a file, a map, or None for the suns and point lights alone.
+        cameras, options: fields of `RelightOptions`.
+
+    Raises:
+        UserError: as of `relight_to_files`.
+    """
+    from univoxel.camera import stacked
+    from univoxel.pictures.relighting import pictures_of
+    from univoxel.pictures.viewpoints import frames_of
+    from univoxel.render.frame import rgba
+
+    options["cameras"] = cameras
+    chosen = RelightOptions(**options)
+    chosen.quality()  # now, and not after maps are read
+    light = chosen.lighting(envmap)
+    studio, quality = chosen.studio(Path(run))
+    frames = frames_of(studio.names, [NO_MAP], chosen.turn)
+    pictures = pictures_of(studio, frames, {NO_MAP: light}, quality)
+    return stacked([rgba(picture) for _, picture in pictures])
+
+
+def _pair(stem: Path) -> tuple[Path, Path]:
+    """The PNG and the EXR file of a frame; names may hold dots."""
+    return stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}.exr")

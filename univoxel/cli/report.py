@@ -1,0 +1,46 @@
+"""A trained run as a report: how good it is, where it is in doubt, what to photograph next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from univoxel.cli.parsing import DataOf, File, Run, Title, takes, written
+
+REPORT = "report.html"  # in the folder of a run, unless another file is named
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    run: Run
+    """folder of a trained run"""
+    html: Annotated[Path | None, written("FILE.html", "RUN/report.html")] = None
+    """the page to write, which needs no network"""
+    data: DataOf = None
+    """folder of the photographs, where they were moved"""
+    views: Annotated[int, written("N")] = 4
+    """photographs beside their render, the worst first"""
+    title: Title = None
+    """what stands above it"""
+
+
+@takes(ReportOptions)
+def command(asked: ReportOptions) -> Path:
+    """Say how good a run is, and what to photograph next, on one web page.
+
+    Photographs beside their render, doubt painted on the object, materials, light, the course of
+    training, and directions from which more photographs would help. It needs no truth.
+    """
+    return report(**vars(asked))
+
+
+def report(run: File, html: File | None = None, **options: Any) -> Path:
+    """Write the report of a run; arguments and errors as of `univoxel.report.write_report`.
+
+    Args:
+        html: the page; in the run's folder when left out.
+    """
+    from univoxel.report import write_report
+
+    return write_report(run, Path(run) / REPORT if html is None else html, **options)

@@ -1,0 +1,77 @@
+"""A trained scene to look at and to light: in a browser, live, or as one web page."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from univoxel.cli.parsing import File, Run, Title, takes, written
+from univoxel.errors import UserError
+
+PAGE = "index.html"  # in the folder of a run, written at the end of `univoxel train`
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    run: Run
+    """folder of a trained run"""
+    html: Annotated[File | None, written("FILE.html", "a server")] = None
+    """write this page, which needs no network, instead of serving"""
+    envmap: Annotated[tuple[File, ...], written("MAP [MAP ...]", "the usual ones alone")] = ()
+    """equirectangular maps to offer, before the usual ones"""
+    title: Title = None
+    """what stands above the object"""
+    host: Annotated[str, written("ADDRESS")] = "127.0.0.1"
+    """address to listen on; the default is reached from this machine alone"""
+    port: Annotated[int, written("N")] = 8080
+    """port to listen on; 0 is any free one"""
+
+
+@takes(ViewOptions)
+def command(asked: ViewOptions) -> Path | None:
+    """Look at a run in a browser and turn its light; or write it as one web page to send.
+
+    Returns:
+        The page, written whole or not at all; None of a server, after it has ended.
+
+    Raises:
+        UserError: the run or a map cannot be used, there is no surface, or the port is taken.
+        MissingExtra: viser is missing, which the server needs.
+        OSError: a file cannot be read or written.
+    """
+    from univoxel.page import PageOptions, write_page
+
+    if asked.html is not None:
+        return write_page(asked.run, asked.html, envmaps=asked.envmap, title=asked.title)
+    from univoxel.viewer.server import serving
+    from univoxel.viewer.subject import subject_of
+
+    options = PageOptions(title=asked.title, envmaps=asked.envmap)
+    with serving(subject_of(Path(asked.run)), options, asked.host, asked.port) as address:
+        log.info(f"to look at, in a browser: {address} (Ctrl-C ends it)")
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            log.info("ended")
+    return None
+
+
+def with_page(run: Path) -> Path:
+    """Write the page of a run into its folder and name it; say so where it cannot be done.
+
+    Returns:
+        The run.
+    """
+    from univoxel.page import write_page
+
+    try:
+        page = write_page(run, run / PAGE)
+        log.info(f"to look at, in a browser: {page}")
+    except (UserError, OSError) as error:  # the training is done and saved
+        log.warning(f"no page was written: {error}")
+    return run

@@ -1,0 +1,181 @@
+"""Test views as a scene renders them against their truth: measures, pictures, and what is weak."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from univoxel.bars import track
+from univoxel.color import linear_to_srgb
+from univoxel.confidence.doubts import Doubts
+from univoxel.confidence.report import numbers, words
+from univoxel.confidence.survey import POINTS, Survey, survey
+from univoxel.data import Photos
+from univoxel.data.images import write_exr, write_png
+from univoxel.envmap import tables
+from univoxel.errors import UserError
+from univoxel.evaluation.fitted_light import fit_light_
+from univoxel.evaluation.measures import MEASURES, Pairs, Scales, doubts_and_errors, score
+from univoxel.evaluation.truth import Expected, SceneTruth, expected_view
+from univoxel.files import replacing
+from univoxel.names import Behind
+from univoxel.pictures.contact_sheet import Panel, contact_sheet, heat, shrink
+from univoxel.pictures.layers import Layers, Relighting, exr_channels, render_layers
+from univoxel.records import Mesh
+from univoxel.render.relight import Lighting, traced_mesh
+from univoxel.run import photos_of
+from univoxel.scene import Scene
+
+SHEET_ROWS = 12  # views on the contact sheet, at most
+COLOR_LIMIT, ROUGHNESS_LIMIT, NORMAL_LIMIT = 0.2, 0.5, 45.0  # brightest errors on it
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+
+@dataclass(frozen=True)
+class ViewMeasures:
+    """What the test views say, view by view."""
+
+    measures: dict[str, list[float]]  # by key
+    albedo_doubts: list[Pairs]
+    roughness_doubts: list[Pairs]
+
+
+def relighting_of(
+    scene: Scene,
+    mesh: Mesh | None,
+    truth: SceneTruth,
+    scales: Scales,
+    samples: int,
+    bounces: int,
+) -> Relighting | None:
+    """What test views are relit with, where there are maps to relight them under."""
+    if not truth.maps or mesh is None:
+        return None
+    lights = {name: Lighting(tables(envmap)) for name, envmap in truth.maps.items()}
+    traced = traced_mesh(mesh, scene.field.voxel_size)
+    return Relighting(lights, traced, scales.three, samples, bounces)
+
+
+def measure_views(
+    scene: Scene,
+    photos: Photos,
+    truth: SceneTruth,
+    scales: Scales,
+    relighting: Relighting | None,
+    surveyed: Survey | None,
+    background: Behind,
+    fit_light: bool,
+    save: Path | None,
+) -> ViewMeasures:
+    """Render and measure all test views; write their layers and the contact sheet into `save`.
+
+    Args:
+        background: what novel views are compared with photographs on.
+        fit_light: each is rendered in the light that fits its photograph.
+    """
+    doubts = Doubts(surveyed) if surveyed else None
+    found = ViewMeasures({key: [] for key in MEASURES}, [], [])
+    every = -(-len(photos) // SHEET_ROWS)
+    rows = []
+    for view in track(range(len(photos)), "rendering test views"):
+        if fit_light:
+            fit_light_(scene, photos, view)
+        layers = render_layers(scene, photos.cameras, view, relighting, doubts)
+        expected = expected_view(photos, truth.relit, view, background)
+        for key, value in score(layers, expected, scales):
+            found.measures[key].append(value)
+        albedo, roughness = doubts_and_errors(layers, expected, scales)
+        found.albedo_doubts.append(albedo)
+        found.roughness_doubts.append(roughness)
+        if save:
+            write_exr(save / f"{photos.names[view]}.exr", exr_channels(layers))
+            if view % every == 0:
+                rows.append((photos.names[view], panels_of_view(layers, expected, scales)))
+    if save:
+        write_png(save / "contact_sheet.png", contact_sheet(rows))
+    return found
+
+
+def panels_of_view(layers: Layers, expected: Expected, scales: Scales) -> list[Panel]:
+    """What the contact sheet shows of a view. Errors of materials and normals: in the mask."""
+    truth, mask = expected.truth, expected.truth.mask
+
+    def colors(title: str, linear: Tensor, photo: Tensor | None) -> Panel:
+        picture = linear_to_srgb(linear)
+        error = None if photo is None else (picture - photo).abs().mean(-1)
+        return Panel(title, picture, photo, error, COLOR_LIMIT)
+
+    def gray(roughness: Tensor) -> Tensor:
+        return roughness[..., None].expand(-1, -1, 3)
+
+    def mapped(normal: Tensor) -> Tensor:
+        return 0.5 * normal + 0.5 * (normal != 0).any(-1, keepdim=True)
+
+    rough, bent = None, None
+    if truth.roughness is not None and mask is not None:
+        rough = (layers.roughness - truth.roughness).abs() * mask
+    if truth.normal is not None and mask is not None:
+        cosine = (layers.normal * truth.normal).sum(-1).clamp(-1, 1)
+        bent = cosine.acos().rad2deg() * mask
+    panels = [
+        colors(
+            "novel view",
+            layers.rgb + expected.behind * (1 - layers.alpha[..., None]),
+            expected.photo,
+        ),
+        colors("albedo, scaled", layers.albedo * scales.three, expected.albedo),
+        Panel(
+            "roughness",
+            gray(layers.roughness),
+            None if truth.roughness is None else gray(truth.roughness),
+            rough,
+            ROUGHNESS_LIMIT,
+        ),
+        Panel(
+            "normal",
+            mapped(layers.normal),
+            None if truth.normal is None else mapped(truth.normal),
+            bent,
+            NORMAL_LIMIT,
+            " degrees",
+        ),
+    ]
+    if layers.doubt is not None:  # beside what it should foretell
+        albedo, rough = (torch.from_numpy(heat(x, 1.0)) for x in layers.doubt.unbind(-1))
+        heads = ("roughness doubt", "albedo error")
+        error = panels[1].error
+        panels.append(Panel("albedo doubt", albedo, rough, error, COLOR_LIMIT, heads=heads))
+    panels += [
+        colors(f"under {name}", layers.relit_scaled[name], photo)
+        for name, photo in expected.relit.items()
+    ]
+    return [shrink(panel) for panel in panels]
+
+
+def survey_of(scene: Scene, run: Path, data: Path | None) -> Survey | None:
+    """What the photographs that were trained on fix; None, with a line, where they are missing."""
+    try:
+        return survey(scene, photos_of(run, data, "train"), POINTS)
+    except UserError as error:  # no photographs to train on, or no surface
+        log.info("no trust report: %s", error, extra={"arguments": error.arguments})
+        return None
+
+
+def say_trust(
+    surveyed: Survey | None, troubles: list[str], save: Path | None
+) -> dict[str, dict[str, float]]:
+    """Say what is weakly determined, and write it to `save`; its figures under the key trust."""
+    if surveyed is None:
+        return {}
+    figures = numbers(surveyed)
+    paragraph = words(figures, troubles)
+    log.info(paragraph)
+    if save:
+        with replacing(save / "trust.txt") as temporary:
+            temporary.write_text(paragraph + "\n", encoding="utf-8")
+    return {"trust": figures}

@@ -1,0 +1,251 @@
+"""Cut an object out of photographs without masks.
+
+Masks come from a network, from a folder, or, of what stands on a patterned ground, from the colours
+of all photographs: it hides the pattern. They vote for a hull, and those that it contradicts are
+mended.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from univoxel.bars import track
+from univoxel.color import linear_to_srgb
+from univoxel.data import Photos, load_photos, splits_of
+from univoxel.data.images import write_exr, write_png
+from univoxel.data.transforms import write_cameras
+from univoxel.errors import DataError, ExistingFile
+from univoxel.names import GROUND, REMBG
+from univoxel.segmentation.ground import find_ground, ground_mask
+from univoxel.segmentation.mask_sheet import MaskTile, darkened, mask_sheet, worst_first, write_page
+from univoxel.segmentation.network import network
+from univoxel.segmentation.vote import BESIDE, MISSING, VOTE, Verdict, VoteConfig, elect, judge
+
+# Photographs at least, for a vote; fewer do not outvote one another
+PHOTOGRAPHS = 12
+
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+NAMED = 5  # photographs in a message, at most
+Masks = dict[str, list[Tensor]]  # [H, W] uint8 of each photograph of each split
+
+
+def cutout(
+    data: str | Path,
+    out: str | Path,
+    source: str | Path = REMBG,
+    downscale: int = 0,
+    allow_outside: bool = False,
+    vote: VoteConfig = VOTE,
+) -> Path:
+    """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
+
+    All splits are written, in the layout of NeRF-synthetic scenes, without lens distortion, beside
+    masks.png and masks.html, which show the masks, worst first. Hull and ground are found from
+    the training photographs alone.
+
+    Args:
+        out: folder to write.
+        source: where masks come from: rembg, from a network; none, from the pattern of the ground
+            that the object stands on; else a folder of masks with the stems of the photographs.
+        downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
+        allow_outside: as of `load_photos`.
+        vote: how masks are judged and mended.
+
+    Raises:
+        DataError: photographs or masks that cannot be used, or no patterned ground in them.
+        ExistingFile: out is there already.
+        MissingExtra: there is no network.
+        UserError: the masks have nothing in common.
+        OSError: a file cannot be written.
+    """
+    data, out, origin = Path(data), Path(out), str(source)
+    if out.exists():
+        raise ExistingFile(f"{out} is there already: choose another out", "out")
+    masked = network() if origin == REMBG else None
+    load = functools.partial(load_photos, data, allow_outside=allow_outside)
+    photos = load("train", downscale, masks=False)
+    splits = {
+        name: photos if name == "train" else load(name, photos.downscale, masks=False)
+        for name in splits_of(data)
+    }
+    log.info(photos.about)
+    if masked:
+        masks = _from_network(splits, masked)
+    elif origin == GROUND:
+        masks = _from_ground(splits)
+    else:  # of shrunk photographs those with masks are black outside of them
+        masks = _as_read({n: load(n, photos.downscale, masks=Path(origin)) for n in splits})
+    verdicts, told = _judged(splits, masks, vote)
+    _write(out, splits, masks, verdicts, told)
+    return out
+
+
+def _from_ground(splits: dict[str, Photos]) -> Masks:
+    """Masks of what stands on a patterned ground."""
+    train = splits["train"]
+    photographs = [_encoded(train, view) for view in range(len(train))]
+    enough = len(train) >= PHOTOGRAPHS
+    ground = find_ground(photographs, train.cameras) if enough else None
+    if ground is None:
+        raise DataError(
+            f"{train.folder}: no object on a patterned ground was found, and colours tell no other "
+            f"from its room: expected source={REMBG} or a folder of masks, got {GROUND}",
+            "source",
+        )
+    log.info("patterned ground: the object is what stands on it")
+    return _of_all(
+        splits,
+        lambda split, view: ground_mask(ground, _encoded(split, view), split.cameras, view),
+    )
+
+
+def _from_network(splits: dict[str, Photos], masked: Callable[[Tensor], Tensor]) -> Masks:
+    return _of_all(splits, lambda split, view: masked(_encoded(split, view)))
+
+
+def _of_all(splits: dict[str, Photos], masked: Callable[[Photos, int], Tensor]) -> Masks:
+    """Masks of all photographs, of each by its split and number."""
+    return {
+        name: [_bytes(masked(split, view)) for view in track(range(len(split)), "masks")]
+        for name, split in splits.items()
+    }
+
+
+def _as_read(splits: dict[str, Photos]) -> Masks:
+    return {
+        name: [_bytes(split.picture(view)[1]) for view in range(len(split))]
+        for name, split in splits.items()
+    }
+
+
+def _judged(
+    splits: dict[str, Photos], masks: Masks, cfg: VoteConfig
+) -> tuple[dict[str, list[Verdict]], str]:
+    """What the vote says about each mask, mended if it may be, and what to tell people."""
+    train, count = splits["train"], len(splits["train"])
+    if count < PHOTOGRAPHS:
+        for name, split in splits.items():
+            for stem, one in zip(split.names, masks[name], strict=True):
+                if not bool((one >= 128).any()):
+                    raise DataError(f"{split.folder}: the mask of {stem} shows nothing")
+        log.warning(
+            "masks are taken as they are: a vote needs %d photographs, there are %d",
+            *(PHOTOGRAPHS, count),
+        )
+        verdicts = {name: [Verdict(None, "", m) for m in those] for name, those in masks.items()}
+        return verdicts, "too few photographs for a vote: masks as they came"
+    hull, largest = elect((m.float() / 255 for m in masks["train"]), train.cameras, cfg)
+    verdicts = {}
+    for name, split in splits.items():
+        verdicts[name] = []
+        for view, one in enumerate(track(masks[name], "mending masks")):
+            known = largest[view] if name == "train" else None
+            found = judge(hull, one.float() / 255, split.cameras, view, known, cfg)
+            verdicts[name].append(replace(found, mask=_bytes(found.mask)))
+    wrong = sum(bool(v.fault) for v in verdicts["train"])
+    told = _told(splits, verdicts, hull.usual)
+    if 2 * wrong > count:
+        told += ": none is mended, as it may be the hull that is wrong"
+        log.warning(
+            f"{told}. The masks keep or miss the same everywhere, or the cameras are wrong; "
+            "look at masks.html",
+        )
+        for name, those in verdicts.items():
+            kept = zip(those, masks[name], strict=True)
+            verdicts[name] = [replace(verdict, mask=one) for verdict, one in kept]
+        return verdicts, told
+    if any(v.fault for those in verdicts.values() for v in those):
+        told += ": mended from the other photographs; look at masks.html"
+    log.info(told)
+    return verdicts, told
+
+
+def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: float) -> str:
+    """How many masks agree with the hull, and what is wrong with the others."""
+    faults: dict[str, list[str]] = {BESIDE: [], MISSING: []}
+    count = 0
+    for name, split in splits.items():
+        count += len(split)
+        for stem, verdict in zip(split.names, verdicts[name], strict=True):
+            if verdict.fault:
+                faults[verdict.fault].append(stem)
+    wrong = sum(map(len, faults.values()))
+    told = f"masks: {count - wrong} of {count} agree with the hull ({usual:.2f})"
+    if not wrong:
+        return told
+    parts = []
+    for stems, words in (
+        (faults[BESIDE], "keep something beside the object"),
+        (faults[MISSING], "miss a part"),
+    ):
+        if stems:
+            more = ", ..." if len(stems) > NAMED else ""
+            parts.append(f"{len(stems)} {words} ({', '.join(stems[:NAMED])}{more})")
+    return f"{told}; {wrong} do not: {', '.join(parts)}"
+
+
+def _write(
+    out: Path,
+    splits: dict[str, Photos],
+    masks: Masks,
+    verdicts: dict[str, list[Verdict]],
+    told: str,
+) -> None:
+    """The folder, whole or not at all: photographs, cameras, and the sheet of masks."""
+    # Nothing half-written goes by the name of out
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    tiles = []
+    for name, split in splits.items():
+        (partial / name).mkdir(parents=True)
+        for view in track(range(len(split)), f"writing {name}"):
+            before, verdict, stem = masks[name][view], verdicts[name][view], split.names[view]
+            write_photo(partial / name / stem, split, view, verdict.mask.float() / 255)
+            photograph = _encoded(split, view)
+            mended = not torch.equal(before, verdict.mask)
+            tiles.append(
+                MaskTile(
+                    name=f"{name}/{stem}",
+                    agreement=verdict.agreement,
+                    fault=verdict.fault,
+                    before=darkened(photograph, before.float() / 255),
+                    after=darkened(photograph, verdict.mask.float() / 255) if mended else None,
+                )
+            )
+        write_cameras(partial, name, split.cameras, split.names)
+    tiles = worst_first(tiles)
+    write_png(partial / "masks.png", mask_sheet(tiles))
+    write_page(partial / "masks.html", tiles, told)
+    partial.rename(out)
+
+
+def _encoded(photos: Photos, view: int) -> Tensor:
+    """A photograph [H, W, 3] uint8, sRGB."""
+    color, _ = photos.stored(view)
+    return color if color.dtype == torch.uint8 else _bytes(linear_to_srgb(color).clamp(0, 1))
+
+
+def _bytes(values: Tensor) -> Tensor:
+    """Values in [0, 1] as uint8."""
+    return (255 * values).round().to(torch.uint8)
+
+
+def write_photo(stem: Path, photos: Photos, view: int, alpha: Tensor) -> None:
+    """Write a photograph as STEM.png, or STEM.exr where it is linear, with that alpha."""
+    color, _ = photos.stored(view)
+    if color.dtype == torch.uint8:
+        rgba = torch.cat([color, torch.round(255 * alpha)[..., None].byte()], -1)
+        write_png(stem.with_name(f"{stem.name}.png"), rgba)
+    else:
+        planes = {c: color[..., i] * alpha for i, c in enumerate("RGB")}
+        write_exr(stem.with_name(f"{stem.name}.exr"), {**planes, "A": alpha})

@@ -1,1 +1,0 @@
-"""One module per command: a function that does the whole of it."""
