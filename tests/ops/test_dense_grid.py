@@ -1,12 +1,10 @@
-"""Sampling of a dense grid: native against reference, definitions, sparse gradients, bad input."""
+"""Sampling of a dense grid: native against reference, definitions, sparse gradients."""
 
 import pytest
 import torch
 from check_op import check_op
 
 from univoxel.ops import sample_dense, sample_dense_reference, use_backend
-from univoxel.ops.dense_grid import _sample_dense
-from univoxel.ops.grid_sampling import no_table
 
 ORIGIN = [0.125, -0.25, 0.375]
 H = 0.25
@@ -198,89 +196,3 @@ def test_far_origin_keeps_the_fraction_of_a_float32_point():
     value = sample_dense(sdf.float(), features.float(), far.float(), [100.0] * 3, H)[0]
     expected = sample_dense_reference(sdf, features, far, [100.0] * 3, H)[0]
     torch.testing.assert_close(value.double(), expected, rtol=1e-5, atol=1e-6)
-
-
-def test_opcheck():
-    sdf, features, points, *place = case((4, 4, 4))
-    place = (list(sdf.shape), *place, False)
-    torch.library.opcheck(_sample_dense.defined, (sdf, features, no_table(sdf), points, *place))
-    tensors = [t.detach() for t in (sdf, features, no_table(sdf), points)]
-    *pulls, order = _sample_dense(*tensors, *place)
-    for needs in ([True, True, True], [True, False, False]):
-        torch.library.opcheck(
-            _sample_dense.backward.defined, (*tensors, order, *pulls, *place, needs)
-        )
-
-
-def test_whole_graph_compiles():
-    arguments = case((4, 4, 4), needs=(True, True, False))
-
-    @torch.compile(fullgraph=True)
-    def loss(sdf, features):
-        return sum(o.square().sum() for o in sample_dense(sdf, features, *arguments[2:]))
-
-    loss(*arguments[:2]).backward()
-    expected = sum(o.square().sum() for o in sample_dense_reference(*arguments))
-    wanted = torch.autograd.grad(expected, arguments[:2])
-    torch.testing.assert_close([a.grad for a in arguments[:2]], list(wanted))
-
-
-def test_strided_inputs():
-    sdf, features, points, *place = case()
-    strided = [t.detach().mT.contiguous().mT for t in (sdf, features, points)]
-    assert not any(t.is_contiguous() for t in strided)
-    torch.testing.assert_close(
-        sample_dense(*strided, *place), sample_dense(sdf, features, points, *place)
-    )
-
-
-def test_second_order_raises():
-    sdf, features, points, *place = case()
-    value, gradient, _ = sample_dense(sdf, features, points, *place)
-    (first,) = torch.autograd.grad(value.sum() + gradient.square().sum(), points, create_graph=True)
-    with pytest.raises(RuntimeError, match=r"differentiate twice"):
-        first.sum().backward()
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"sdf": [0.5]}, TypeError, "sdf must be a tensor, got list"),
-        ({"sdf": torch.rand(4, 5)}, ValueError, r"sdf must be \[X, Y, Z\]"),
-        ({"features": torch.rand(4, 5, 5, 2)}, ValueError, r"features must be .* Z=6"),
-        ({"points": torch.rand(7, 2)}, ValueError, r"points must be \[M, 3\]"),
-        ({"points": torch.rand(7, 3).double()}, ValueError, "points must be .* float32"),
-        ({"points": torch.rand(7, 3, device="meta")}, ValueError, "points must be .* on cpu"),
-        (
-            {"sdf": torch.rand(4, 0, 6), "features": torch.rand(4, 0, 6, 2)},
-            ValueError,
-            r"sdf must have nodes, got \[4, 0, 6\]",
-        ),
-        ({"origin": (0.0, 1.0)}, ValueError, "origin must be 3 finite numbers, got"),
-        ({"origin": (0.0, 1.0, float("nan"))}, ValueError, "origin must be 3 finite numbers"),
-        ({"voxel_size": 0.0}, ValueError, "voxel_size must be above 0, got 0.0"),
-        ({"voxel_size": float("inf")}, ValueError, "voxel_size must be above 0, got inf"),
-    ],
-)
-def test_bad_arguments(change, error, message):
-    arguments = {
-        "sdf": torch.rand(4, 5, 6),
-        "features": torch.rand(4, 5, 6, 2),
-        "points": torch.rand(7, 3),
-        "origin": (0.0, 0.0, 0.0),
-        "voxel_size": 0.5,
-    }
-    sample_dense(**arguments)
-    with pytest.raises(error, match=message):
-        sample_dense(**(arguments | change))
-
-
-def test_too_many_points():
-    with pytest.raises(ValueError, match=r"points must be fewer than 2\^31"):
-        sample_dense(
-            torch.rand(2, 2, 2),
-            torch.rand(2, 2, 2, 1),
-            torch.rand(1, 3).expand(2**31, 3),
-            (0, 0, 0),
-            1,
-        )

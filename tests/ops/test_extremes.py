@@ -8,7 +8,7 @@ import math
 
 import pytest
 import torch
-from extremes import WILD, channels, check_finite, few, pick, run, same, seeds, shading
+from extremes import WILD, channels, check_finite, few, pick, run, same, seeds
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -325,33 +325,3 @@ def test_rays_at_the_edge_meet_what_they_should(seed, n):
 
 
 # --- strides
-
-
-@few
-@given(seeds, st.integers(0, 6))
-def test_strided_arguments_give_the_same_bits(seed, n):
-    def strided(t):
-        wide = torch.empty(*[2 * s for s in t.shape], dtype=t.dtype)
-        view = wide[tuple(slice(None, None, 2) for _ in t.shape)]
-        return view.copy_(t.detach())
-
-    dense = shading(seed, n, 2)
-    assert same(ops.shade_sg(*dense), ops.shade_sg(*map(strided, dense)))
-    alpha, value, offsets = packed_rays(seed, [n, 0, 2], 3)
-    for a, b in zip(
-        ops.composite(alpha, value, offsets),
-        ops.composite(*map(strided, (alpha, value, offsets))),
-        strict=True,
-    ):
-        assert same(a, b)
-    grid = lattice(seed, (3, 4, 5), 2, n)
-    place = ((0.0, 0.0, 0.0), 1.0)
-    for a, b in zip(
-        ops.sample_dense(*grid, *place), ops.sample_dense(*map(strided, grid), *place), strict=True
-    ):
-        assert same(a, b)
-    net = network(seed, n, 3, 5, 2)
-    assert same(flat(ops.mlp)(*net), flat(ops.mlp)(*map(strided, net)))
-    rays = rays_and_ball(seed, n)
-    rays[2][:] = torch.tensor([0.6, 0.0, 0.8])
-    assert torch.equal(march(*rays).t, march(*map(strided, rays)).t)

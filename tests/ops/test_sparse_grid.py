@@ -1,4 +1,4 @@
-"""Sampling of a sparse grid: against the dense one it stands for, sparse gradients, bad input."""
+"""Sampling of a sparse grid: against the dense one it stands for, sparse gradients."""
 
 from dataclasses import replace
 
@@ -8,7 +8,6 @@ from bricks import cut
 from check_op import check_op
 
 from univoxel.ops import sample_dense, sample_sparse, sample_sparse_reference, use_backend
-from univoxel.ops.sparse_grid import _sample_sparse
 from univoxel.records import Bricks
 
 ORIGIN = [0.125, -0.25, 0.375]
@@ -168,51 +167,6 @@ def test_gradient_of_one_argument(needed):
     for sparse in (False, True):
         (got,) = grads_of(sample_sparse, arguments, sparse_grad=sparse)
         torch.testing.assert_close(got.to_dense(), wanted)
-
-
-def test_opcheck():
-    pool, features, bricks, points, *place = case((5, 4, 4))
-    place = (list(bricks.size), *place, False)
-    torch.library.opcheck(_sample_sparse.defined, (pool, features, bricks.table, points, *place))
-    tensors = [t.detach() for t in (pool, features, bricks.table, points)]
-    *pulls, order = _sample_sparse(*tensors, *place)
-    for needs in ([True, True, True], [True, False, False]):
-        torch.library.opcheck(
-            _sample_sparse.backward.defined, (*tensors, order, *pulls, *place, needs)
-        )
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"sdf": [0.5]}, TypeError, "sdf must be a tensor, got list"),
-        ({"sdf": torch.rand(64)}, ValueError, r"sdf must be \[256\]"),
-        ({"features": torch.rand(256)}, ValueError, r"features must be \[256, C\]"),
-        ({"bricks": None}, TypeError, "bricks must be Bricks, got NoneType"),
-        ({"points": torch.rand(7, 2)}, ValueError, r"points must be \[M, 3\]"),
-        ({"points": torch.rand(7, 3).double()}, ValueError, "points must be .* float32"),
-        ({"points": torch.rand(1, 3).expand(2**31, 3)}, ValueError, r"fewer than 2\^31"),
-        ({"origin": (0.0, 1.0)}, ValueError, "origin must be 3 finite numbers, got"),
-        ({"voxel_size": 0.0}, ValueError, "voxel_size must be above 0, got 0.0"),
-        (
-            {"bricks": Bricks(torch.zeros(0, 1, 1).int(), torch.full((4,), -1).int(), (0, 4, 4))},
-            ValueError,
-            r"bricks must have nodes, got size \[0, 4, 4\]",
-        ),
-    ],
-)
-def test_bad_arguments(change, error, message):
-    arguments = {
-        "sdf": torch.rand(256),
-        "features": torch.rand(256, 2),
-        "bricks": BRICKS,
-        "points": torch.rand(7, 3),
-        "origin": (0.0, 0.0, 0.0),
-        "voxel_size": 0.5,
-    }
-    sample_sparse(**arguments)
-    with pytest.raises(error, match=message):
-        sample_sparse(**(arguments | change))
 
 
 BRICKS = Bricks(
