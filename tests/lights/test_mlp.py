@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 from balls import ball, fit, shaken, views
 
@@ -71,20 +70,3 @@ def test_regularisation_sees_change_and_colour():
     with torch.no_grad():
         light.base[0, 0] += 5.0
     assert light.regularisation(here, near).white_light > before.white_light
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"rank": 0}, "rank must be at least 1, got 0"),
-        ({"hidden": 0}, "hidden must be at least 1"),
-        ({"layers": -1}, "layers must be at least 0"),
-        ({"frequencies": -1}, "frequencies must be at least 0"),
-        ({"directions": 0}, "directions must be at least 1"),
-        ({"directions_eval": 0}, "directions_eval must be at least 1"),
-        ({"scale": -1.0}, "scale must be above 0"),
-    ],
-)
-def test_bad_config(change, message):
-    with pytest.raises(ValueError, match=f"MLPLightConfig: {message}"):
-        MLPLightConfig(**change)

@@ -106,19 +106,3 @@ def test_regularisation_sees_change_and_colour():
     with torch.no_grad():
         light.base[0, 0] += 5.0
     assert light.regularisation(here, near).white_light > before.white_light
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"order": -1}, "order must be at least 0, got -1"),
-        ({"hidden": 0}, "hidden must be at least 1"),
-        ({"layers": -1}, "layers must be at least 0"),
-        ({"directions": 0}, "directions must be at least 1"),
-        ({"directions_eval": 0}, "directions_eval must be at least 1"),
-        ({"scale": 0.0}, "scale must be above 0, got 0.0"),
-    ],
-)
-def test_bad_config(change, message):
-    with pytest.raises(ValueError, match=f"SHConfig: {message}"):
-        SHConfig(**change)
