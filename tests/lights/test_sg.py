@@ -35,16 +35,6 @@ def test_an_occlusion_hides_the_light():
     assert float(dark.detach().abs().max()) == 0
 
 
-def test_regularisation_sees_change_and_colour():
-    light, here, near = shaken(LocalSG(4)), ball(), ball(seed=1)
-    same, other = light.regularisation(here, here), light.regularisation(here, near)
-    assert same.light_smoothness == 0
-    assert other.light_smoothness > 0
-    with torch.no_grad():
-        light.base[:, 4] += 2.0
-    assert light.regularisation(here, near).white_light > other.white_light
-
-
 @pytest.mark.parametrize("lobes", [1, 12, 16, 128])
 def test_start_is_white_and_mid_grey(lobes):
     surface, light = ball(), LocalSG(4, SGConfig(lobes=lobes))
