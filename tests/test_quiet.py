@@ -1,8 +1,6 @@
 """The package's functions return, write files and log; only the command line prints."""
 
-import ast
 import shutil
-from pathlib import Path
 
 import pytest
 from analytic import write_scene
@@ -13,8 +11,6 @@ from univoxel.lights import SGConfig
 from univoxel.ops import PointLight
 from univoxel.scene import SceneConfig
 from univoxel.tasks.info import info
-
-PRINTING = {"cli.py", "commands"}  # the command line
 
 
 @pytest.fixture(scope="module")
@@ -42,17 +38,3 @@ def test_nothing_is_printed(run, tmp_path, capsys):
     assert univoxel.cutout(str(data), str(cut), str(masks)) == cut
     assert info(here)["bytes"] > 0
     assert capsys.readouterr() == ("", "")
-
-
-def test_only_the_command_line_has_print():
-    package = Path(univoxel.__file__).parent
-    calls = set()
-    for path in package.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            match node:
-                case (
-                    ast.Call(func=ast.Name(id="print"))
-                    | ast.Call(func=ast.Attribute(value=ast.Name(id="rich"), attr="print"))
-                ):
-                    calls.add(path.relative_to(package).parts[0])
-    assert calls <= PRINTING
