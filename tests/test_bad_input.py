@@ -20,16 +20,19 @@ from univoxel.data.images import read_exr, read_image, write_exr
 from univoxel.training import progress
 
 SMALL = [
-    f"--set={change}"
-    for change in (
-        *(f"stages.{i}.{name}" for i in (0, 1, 3) for name in ("voxels=0.004", "rays=64")),
-        *(f"stages.{i}.iterations=2" for i in (0, 2, 3)),
-        *("stages.1.iterations=20", "stages.1.physical_from=0.0"),
-        *("stages.2.rays=64", "stages.2.points=64", "stages.2.newton_points=8"),
-        *("scene.sky_nodes=32", "stages.2.newton_steps=1"),
-        *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
-        *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
-    )
+    "--no-page",
+    *(
+        f"--set={change}"
+        for change in (
+            *(f"stages.{i}.{name}" for i in (0, 1, 3) for name in ("voxels=0.004", "rays=64")),
+            *(f"stages.{i}.iterations=2" for i in (0, 2, 3)),
+            *("stages.1.iterations=20", "stages.1.physical_from=0.0"),
+            *("stages.2.rays=64", "stages.2.points=64", "stages.2.newton_points=8"),
+            *("scene.sky_nodes=32", "stages.2.newton_steps=1"),
+            *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
+            *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
+        )
+    ),
 ]
 
 
