@@ -1,4 +1,4 @@
-"""A field composited along rays: against the ops it stands for, sparse gradients."""
+"""A field composited along rays: against the ops it stands for."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from bricks import cut
 from check_op import check_op
 
 from univoxel import ops
-from univoxel.ops import composite_field, composite_field_reference, use_backend
+from univoxel.ops import composite_field, composite_field_reference
 from univoxel.records import Samples
 
 SHAPE, ORIGIN, H = (7, 8, 9), [0.125, -0.25, 0.375], 0.25
@@ -129,30 +129,6 @@ def test_it_is_the_chain_of_the_ops(hashed):
     )
 
 
-@pytest.mark.parametrize("kind", ["dense", "bricks"])
-@pytest.mark.parametrize("hashed", [False, True])
-def test_sparse_gradients_and_threads(kind, hashed):
-    """The same numbers; the same bits on any number of threads, in more than one chunk."""
-    leaves, samples, options = case(kind, hashed, rays=700)
-    found = []
-    threads = torch.get_num_threads()
-    for sparse, count in ((False, 1), (True, 1), (True, 2), (True, 3)):
-        torch.set_num_threads(count)
-        got = composite_field(
-            *leaves, samples, ORIGIN, H, INV_S, min_share=0.1, sparse_grad=sparse, **options
-        )
-        pull = torch.Generator().manual_seed(1)
-        loss = sum((x * torch.randn(x.shape, generator=pull)).sum() for x in got)
-        grads = torch.autograd.grad(loss, leaves)
-        assert [g.is_sparse for g in grads] == [sparse, sparse, False, False]
-        found.append([x.detach() for x in got] + [g.to_dense() for g in grads])
-    torch.set_num_threads(threads)
-    for a, b, c, d in zip(*found, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)  # sums in another order
-        assert torch.equal(b, c)
-        assert torch.equal(b, d)
-
-
 def test_light_samples_lend_only_their_distance():
     """Features of a sample below the share do not matter; those of the heaviest do."""
     leaves, samples, options = case("dense", hashed=True)
@@ -187,14 +163,6 @@ def test_rays_that_are_nowhere():
     assert all(x[good].isfinite().all() for x in got)
     grad, _ = torch.autograd.grad(got.features[good].sum(), leaves[:2])
     assert grad.isfinite().all()
-
-
-def test_reference_backend_gives_sparse_gradients_too():
-    leaves, samples, options = case("dense", hashed=True)
-    with use_backend("reference"):
-        got = composite_field(*leaves, samples, ORIGIN, H, INV_S, sparse_grad=True, **options)
-        grads = torch.autograd.grad(got.features.sum(), leaves[:2])
-    assert all(g.is_sparse for g in grads)
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,10 @@
-"""Sampling of a dense grid: native against reference, definitions, sparse gradients."""
+"""Sampling of a dense grid: native against reference, definitions."""
 
 import pytest
 import torch
 from check_op import check_op
 
-from univoxel.ops import sample_dense, sample_dense_reference, use_backend
+from univoxel.ops import sample_dense, sample_dense_reference
 
 ORIGIN = [0.125, -0.25, 0.375]
 H = 0.25
@@ -117,44 +117,6 @@ def test_derivative_to_a_clamped_axis_is_zero():
     assert grad[0, 2] == 0
 
 
-@pytest.mark.parametrize("backend", ["native", "reference"])
-@pytest.mark.parametrize("sparse", [False, True])
-def test_nan_and_infinite_points(backend, sparse):
-    sdf, features, points, *place = case((9, 20, 4), m=50)
-    with torch.no_grad():
-        points[3, 1], points[7] = torch.nan, torch.nan
-        points[9, 0], points[11] = torch.inf, -torch.inf
-    with use_backend(backend):
-        outputs = sample_dense(sdf, features, points, *place)
-        grads = grads_of(sample_dense, (sdf, features, points, *place), sparse_grad=sparse)
-    lost = torch.zeros(50, dtype=torch.bool)
-    lost[[3, 7]] = True
-    for o in outputs:
-        assert torch.equal(o.reshape(50, -1).isnan().any(1), lost)
-        assert torch.equal(o.reshape(50, -1).isnan().all(1), lost)
-    assert torch.equal(outputs[0][11], sdf[0, 0, 0])
-    assert all(g.to_dense().isfinite().all() for g in grads)
-    assert not grads[2][[3, 7, 11]].any()
-
-
-@pytest.mark.parametrize("backend", ["native", "reference"])
-def test_sparse_gradient_is_the_dense_one(backend):
-    arguments = case((20, 11, 70), channels=4, m=30)
-    with use_backend(backend):
-        dense = grads_of(sample_dense, arguments)
-        sparse = grads_of(sample_dense, arguments, sparse_grad=True)
-    for g, d, dims in zip(sparse[:2], dense[:2], (0, 1), strict=True):
-        assert g.is_sparse
-        assert g.is_coalesced()
-        assert (g.sparse_dim(), g.dense_dim()) == (3, dims)
-        checked = torch.sparse_coo_tensor(g.indices(), g.values(), g.shape, check_invariants=True)
-        assert torch.equal(checked.coalesce().indices(), g.indices()), "rows double or unsorted"
-        assert torch.equal(g.to_dense(), d)
-        assert g._nnz() < d[..., 0].numel() / 2 if dims else d.numel() / 2
-    assert torch.equal(sparse[2], dense[2])
-    assert sparse[0]._nnz() > sparse[1]._nnz()
-
-
 def test_sparse_rows_are_the_touched_ones():
     """One point in the middle: 8 rows of features, 32 of the sdf, none of the far grid."""
     sdf, features = case((30, 30, 30))[:2]
@@ -167,27 +129,6 @@ def test_sparse_rows_are_the_touched_ones():
     assert g_features.indices().T.tolist() == [
         [x, y, z] for x in (12, 13) for y in (7, 8) for z in (15, 16)
     ]
-
-
-@pytest.mark.parametrize("needed", range(3))
-def test_gradient_of_one_argument(needed):
-    arguments = case(needs=[i == needed for i in range(3)])
-    (wanted,) = grads_of(sample_dense_reference, arguments)
-    for sparse in (False, True):
-        (got,) = grads_of(sample_dense, arguments, sparse_grad=sparse)
-        assert got.is_sparse is (sparse and needed < 2)
-        torch.testing.assert_close(got.to_dense(), wanted)
-
-
-def test_sparse_gradients_accumulate():
-    sdf, features, points, *place = case()
-    for _ in range(2):
-        sum(o.sum() for o in sample_dense(sdf, features, points, *place, True)).backward()
-    once = torch.autograd.grad(
-        sum(o.sum() for o in sample_dense(sdf, features, points, *place)), [sdf, features]
-    )
-    torch.testing.assert_close(sdf.grad.to_dense(), 2 * once[0])
-    torch.testing.assert_close(features.grad.to_dense(), 2 * once[1])
 
 
 def test_far_origin_keeps_the_fraction_of_a_float32_point():

@@ -1,4 +1,4 @@
-"""Sampling of a sparse grid: against the dense one it stands for, sparse gradients."""
+"""Sampling of a sparse grid: against the dense one it stands for."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import torch
 from bricks import cut
 from check_op import check_op
 
-from univoxel.ops import sample_dense, sample_sparse, sample_sparse_reference, use_backend
+from univoxel.ops import sample_dense, sample_sparse, sample_sparse_reference
 from univoxel.records import Bricks
 
 ORIGIN = [0.125, -0.25, 0.375]
@@ -103,23 +103,6 @@ def test_the_same_as_the_dense_grid_it_stands_for(shape):
             assert torch.equal(a, c)
 
 
-@pytest.mark.parametrize("backend", ["native", "reference"])
-def test_sparse_gradient_is_the_dense_one(backend):
-    arguments = case((20, 11, 40), channels=4, m=30)
-    with use_backend(backend):
-        dense = grads_of(sample_sparse, arguments)
-        sparse = grads_of(sample_sparse, arguments, sparse_grad=True)
-    for g, d, dims in zip(sparse[:2], dense[:2], (0, 1), strict=True):
-        assert g.is_sparse
-        assert g.is_coalesced()
-        assert (g.sparse_dim(), g.dense_dim()) == (1, dims)
-        checked = torch.sparse_coo_tensor(g.indices(), g.values(), g.shape, check_invariants=True)
-        assert torch.equal(checked.coalesce().indices(), g.indices()), "rows double or unsorted"
-        torch.testing.assert_close(g.to_dense(), d)
-        assert (g.indices() >= 128).all()
-    assert torch.equal(sparse[2], dense[2])
-
-
 def test_sparse_rows_are_the_touched_ones():
     """One point in the middle: 8 rows of features, 32 of the sdf."""
     _, pool, bricks = cut(torch.linspace(-0.5, 0.5, 30)[:, None, None].expand(30, 30, 30), 1.0)
@@ -144,29 +127,6 @@ def test_a_missing_node_is_far_and_without_features():
     assert value.tolist() == [1.0, -1.0, 1.0]
     assert not gradient[:2].any()
     assert feature[:, 0].tolist() == [0.0, 0.0, 0.75]
-
-
-@pytest.mark.parametrize("backend", ["native", "reference"])
-def test_nan_and_infinite_points(backend):
-    pool, features, bricks, points, *place = case(m=50)
-    with torch.no_grad():
-        points[3, 1], points[7] = torch.nan, torch.nan
-        points[9, 0], points[11] = torch.inf, -torch.inf
-    with use_backend(backend):
-        outputs = sample_sparse(pool, features, bricks, points, *place)
-        grads = grads_of(sample_sparse, (pool, features, bricks, points, *place))
-    for o in outputs:
-        assert o.reshape(50, -1).isnan().all(1).nonzero()[:, 0].tolist() == [3, 7]
-    assert all(g.isfinite().all() for g in grads)
-
-
-@pytest.mark.parametrize("needed", range(3))
-def test_gradient_of_one_argument(needed):
-    arguments = case(needs=[i == needed for i in range(3)])
-    (wanted,) = grads_of(sample_sparse_reference, arguments)
-    for sparse in (False, True):
-        (got,) = grads_of(sample_sparse, arguments, sparse_grad=sparse)
-        torch.testing.assert_close(got.to_dense(), wanted)
 
 
 BRICKS = Bricks(
