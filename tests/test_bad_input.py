@@ -10,52 +10,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic import write_scene
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from tiny import OPTIONS
 
 from univoxel.checkpoint import FILE
 from univoxel.cli import main
 from univoxel.data.images import read_exr, read_image, write_exr
 from univoxel.training import progress
 
-SMALL = [
-    "--no-page",
-    *(
-        f"--set={change}"
-        for change in (
-            *(f"stages.{i}.{name}" for i in (0, 1, 3) for name in ("voxels=0.004", "rays=64")),
-            *(f"stages.{i}.iterations=2" for i in (0, 2, 3)),
-            *("stages.1.iterations=20", "stages.1.physical_from=0.0"),
-            *("stages.2.rays=64", "stages.2.points=64", "stages.2.newton_points=8"),
-            *("scene.sky_nodes=32", "stages.2.newton_steps=1"),
-            *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
-            *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
-        )
-    ),
-]
 
-
-@pytest.fixture(scope="module")
-def template(tmp_path_factory):
-    """A small data set, and a run trained on it for a moment."""
-    folder = tmp_path_factory.mktemp("bad_input")
-    data = write_scene(folder / "data", views=6, size=16)
-    assert main(["train", str(data), "--out", str(folder / "run"), *SMALL]) == 0
-    return folder
+@pytest.fixture
+def data(tiny_copy):
+    return tiny_copy / "data"
 
 
 @pytest.fixture
-def data(template, tmp_path):
-    return Path(shutil.copytree(template / "data", tmp_path / "data"))
-
-
-@pytest.fixture
-def run(template, data, tmp_path):
-    run = Path(shutil.copytree(template / "run", tmp_path / "run"))
-    config = json.loads((run / "config.json").read_text())
-    (run / "config.json").write_text(json.dumps(config | {"data": str(data)}))
-    return run
+def run(tiny_copy):
+    return tiny_copy / "run"
 
 
 @pytest.fixture
@@ -154,7 +126,7 @@ def test_a_run_that_was_killed_before_its_first_checkpoint(run, data, capsys):
     """It left a configuration and a log of work that is gone: with --resume it begins."""
     (run / FILE).unlink()
     (run / "log.jsonl").write_text("gone\n")
-    assert main(["train", str(data), "--out", str(run), "--resume", *SMALL]) == 0
+    assert main(["train", str(data), "--out", str(run), "--resume", *OPTIONS]) == 0
     assert f"nothing was saved in {run} yet: training begins\n" in capsys.readouterr().out
     assert (run / FILE).is_file()
     assert "gone" not in ((run / "log.jsonl").read_text() if (run / "log.jsonl").exists() else "")
@@ -277,14 +249,14 @@ def full_disk(room: int):
     ],
 )
 def test_training_on_a_full_disk(
-    template, data, tmp_path, refused, monkeypatch, room, report, message, left
+    tiny, data, tmp_path, refused, monkeypatch, room, report, message, left
 ):
     """Without a number there is room for the configuration, and a little more."""
-    room = room or (template / "run" / "config.json").stat().st_size + 500
+    room = room or (tiny / "run" / "config.json").stat().st_size + 500
     monkeypatch.setattr(progress, "REPORT_SECONDS", report)
     out = tmp_path / "out"
     with full_disk(room):
-        refused(message, "train", data, "--out", out, *SMALL, "--set=stages.0.iterations=40")
+        refused(message, "train", data, "--out", out, *OPTIONS, "--set=stages.0.iterations=40")
     assert {p.name for p in out.iterdir()} == left
     for path in out.iterdir():
         for line in path.read_text().splitlines() if path.suffix == ".jsonl" else []:
