@@ -86,7 +86,7 @@ def test_metal_is_learned_where_it_is():
         [{"params": [scene.field.features], "lr": 0.03}, {"params": scene.material.parameters()}],
         lr=3e-3,
     )
-    for _ in range(400):
+    for _ in range(300):
         optimizer.zero_grad(set_to_none=True)
         terms = stage.objective(scene, problem, Decisions(copper), CFG)
         torch.stack(list(terms.values())).sum().backward()
@@ -106,7 +106,7 @@ def test_solve_recovers_albedo_and_map():
     scene = sphere_scene(nodes)
     before = {k: v.clone() for k, v in scene.state_dict().items()}
     cfg = JointConfig(points=1500, newton_points=1000, rays=1024, tracing=1, rounds=3, lr_sdf=0.0)
-    stage.solve(scene, photos, cfg, 0, Steps(700))
+    stage.solve(scene, photos, cfg, 0, Steps(450))
     after = scene.state_dict()
     changed = {k.split(".")[0] for k in after if not torch.equal(after[k], before[k])}
     assert changed == {"field", "material", "sky"}
