@@ -282,6 +282,18 @@ def flat(values: Any) -> list[Tensor]:
     return [t for v in values for t in flat(v)] if isinstance(values, list | tuple) else []
 
 
+def doubled(values: Any) -> Any:
+    """Arguments in double precision."""
+    if isinstance(values, Tensor):
+        return values.double() if values.is_floating_point() else values
+    if isinstance(values, dict):
+        return {k: doubled(v) for k, v in values.items()}
+    if isinstance(values, list):
+        return [doubled(v) for v in values]
+    is_samples = dataclasses.is_dataclass(values) and hasattr(values, "connected")
+    return dataclasses.replace(values, t=values.t.double()) if is_samples else values
+
+
 def fresh(case: str, arguments: dict, **options) -> tuple[dict, list[Tensor]]:
     """Arguments of their own memory, and those that ask for a gradient."""
     name, leaves = case.split()[0], []

@@ -1,10 +1,8 @@
 """What all samplers of fields share: sparse gradients, gradients alone, points that are nowhere."""
 
-import dataclasses
-
 import pytest
 import torch
-from op_cases import CASES, LEAVES, flat, fresh, function, projection
+from op_cases import CASES, LEAVES, doubled, flat, fresh, function, projection
 from torch import Tensor
 
 from univoxel.ops import native, use_backend
@@ -12,16 +10,6 @@ from univoxel.ops import native, use_backend
 POINTS = ["sample_dense", "sample_sparse", "encode_hash"]
 SAMPLERS = [*POINTS, "composite_field", "composite_field of bricks"]
 BACKENDS = pytest.mark.parametrize("backend", ["native", "reference"])
-
-
-def doubled(values):
-    """Arguments in double precision."""
-    if isinstance(values, Tensor):
-        return values.double() if values.is_floating_point() else values
-    if isinstance(values, dict):
-        return {k: doubled(v) for k, v in values.items()}
-    is_samples = dataclasses.is_dataclass(values) and hasattr(values, "connected")
-    return dataclasses.replace(values, t=values.t.double()) if is_samples else values
 
 
 def leaves_of(case: str) -> list[str]:
