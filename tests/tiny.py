@@ -2,11 +2,15 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from analytic import write_scene
 
 from univoxel.cli import main
+from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.lights import SGConfig
+from univoxel.scene import SceneConfig
 
 CHANGES = (
     *(f"stages.{i}.{name}" for i in (0, 1, 3) for name in ("voxels=0.004", "rays=64")),
@@ -18,6 +22,17 @@ CHANGES = (
     *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
 )
 OPTIONS = ["--no-page", *(f"--set={change}" for change in CHANGES)]
+
+
+def three_stages(data, out, iterations=12, light=None, **sizes) -> TrainConfig:
+    """Training of a moment: 12 steps, 6 of the joint stage, 4 that refit."""
+    light = light or SGConfig(lobes=2, hidden=8, directions=16, directions_eval=16)
+    stage = StageConfig(voxels=0.008, iterations=iterations, share=0.4, rays=128, physical_from=0.5)
+    joint = JointConfig(iterations=6, rounds=2, points=100, newton_points=50, rays=64, tracing=1)
+    refit = replace(stage, iterations=4, refit=True, physical_from=0.0)
+    options = {"channels": 4, "material_channels": 2, "hidden": 8, "sky_nodes": 16} | sizes
+    scene = SceneConfig(light=light, **options)
+    return TrainConfig(data, out, (stage, joint, refit), minutes=60.0, scene=scene)
 
 
 @pytest.fixture(scope="session")
