@@ -260,6 +260,7 @@ def test_a_configuration_is_read_back_as_it_was_written(tmp_path, light):
         ('{"data": "a"}', "TrainConfig: out is missing"),
         ('{"data": "a", "out": "b", "minutes": 1, "stages": [{"voxels": "many"}]}', "voxels must"),
         ('{"data": "a", "out": "b", "minutes": 1, "stages": [], "sead": 1}', "no field 'sead'"),
+        ('{"data": "a", "out": "b", "minutes": true, "stages": []}', "minutes must be"),
         ('{"scene": {"light": {"kind": "lamp"}}}', "light must be one of"),
         ("{", "config.json"),
     ],
