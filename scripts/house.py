@@ -20,7 +20,7 @@ from layers import LAYERS, violations  # noqa: E402
 LIMITS = {
     "lines of the package": 36_500,
     "lines of the laboratory": 3_100,
-    "lines of tests": 36_700,
+    "lines of tests": 35_650,
     "modules of the package": 261,
     "loose modules at the top": 36,
     "configuration fields": 131,
