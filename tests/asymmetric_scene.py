@@ -1,11 +1,15 @@
 """A scene without any symmetry, whose materials are known functions of position."""
 
+import math
+
 import torch
 
+from univoxel.envmap import EnvMap
 from univoxel.fields.field import dense_field
 from univoxel.grid import fit_grid
 from univoxel.lights import SGConfig
 from univoxel.scene import Scene, SceneConfig
+from univoxel.sphere import latlong_directions
 
 # Balls of these centres and radii, united.
 BALLS = torch.tensor([[0.0, 0, 0, 0.4], [0.35, 0.1, 0, 0.2], [0, 0.1, 0.4, 0.15]])
@@ -30,6 +34,21 @@ class Identity(torch.nn.Module):
 
     def forward(self, features):
         return features[:, :3], features[:, 3], torch.zeros(len(features))
+
+
+class Metals(torch.nn.Module):
+    """The features are the materials; metal where the albedo is reddest."""
+
+    def forward(self, features):
+        metal = torch.sigmoid(40 * (features[:, 0] - 0.65))
+        return features[:, :3], features[:, 3], metal
+
+
+def lamp() -> EnvMap:
+    """A wide warm light at +X, dim blue all round."""
+    towards = torch.tensor([math.cos(0.5), 0.0, math.sin(0.5)])
+    power = 6 * ((latlong_directions(32) @ towards - 1) / 0.15).exp()
+    return EnvMap(power[..., None] * torch.tensor([1.0, 0.9, 0.7]) + torch.tensor([0.1, 0.12, 0.2]))
 
 
 def lopsided(voxels: int = 48**3, change=None, light=None) -> Scene:

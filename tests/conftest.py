@@ -6,6 +6,7 @@ import tempfile
 from pathlib import Path
 
 import torch
+from tiny import tiny, tiny_copy  # noqa: F401
 
 # torch.compile has one cache for all processes of a user. It tells neither instruction sets apart,
 # whose kernels give wrong values on another, nor what the arguments of our backward ops are.

@@ -4,8 +4,6 @@ import torch
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from univoxel import sphere
-
 few = settings(max_examples=40, deadline=None, derandomize=True)
 
 REACH = 1e36  # of a float32 result: sums of some tens of these stay below 3.4e38
@@ -38,41 +36,8 @@ def run(op, arguments, dtype=torch.float32):
     return [*(o.detach() for o in out), *(g.to_dense() if g.is_sparse else g for g in grads)]
 
 
-def check_finite(op, reference, arguments):
-    for got, want in zip(
-        run(op, arguments),
-        run(reference, arguments, torch.float64),
-        strict=True,
-    ):
-        assert got.shape == want.shape
-        lost = want.isfinite() & (want.abs() < REACH) & ~got.isfinite()
-        assert not lost.any(), f"{got[lost][:4]}, in float64 {want[lost][:4]}"
-
-
 def same(a, b):
     """Equal numbers, NaN equal to NaN."""
     return torch.equal(torch.nan_to_num(a, 12345.0), torch.nan_to_num(b, 12345.0)) and torch.equal(
         a.isnan(), b.isnan()
     )
-
-
-def shading(seed, n, k):
-    g = torch.Generator().manual_seed(seed)
-
-    def unit(*size):
-        v = torch.nn.functional.normalize(torch.randn(*size, 3, generator=g), dim=-1)
-        poles = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, -0.0, -0.0], [1, 0, 0], [1e-20, 0, 1]])
-        chosen = poles[torch.randint(len(poles), size, generator=g)]
-        return torch.where(torch.rand(*size, 1, generator=g) < 0.4, chosen, v)
-
-    normal = unit(n)
-    towards = torch.tensor([1.0, -1.0])[torch.randint(2, (n, 1), generator=g)]
-    wo = torch.where(torch.rand(n, 1, generator=g) < 0.3, normal * towards, unit(n))
-    sharpness = pick(g, (0.0, 1e-45, 1e-3, 30.0, 1e6, 1e30), n, k).abs()
-    amplitude = pick(g, (0.0, 1e-45, 1.0, 1e6), n, k, 3).abs()
-    albedo = pick(g, (0.0, 1.0, 1e-45), n, 3).clamp(0, 1)
-    roughness = pick(g, (0.0, 1.0, 1e-45, 0.03), n).clamp(0, 1)
-    parameters = (unit(n, k), sharpness, amplitude, normal, wo, albedo, roughness)
-    directions = sphere.fibonacci_hemisphere(32)
-    rotation = pick(g, (0.0, 6.2831853, -1e4), n)
-    return [p.requires_grad_() for p in parameters] + [directions, rotation]

@@ -3,15 +3,19 @@
 import json
 import math
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from analytic import look_at
 from scipy.spatial.transform import Rotation
 
+from univoxel.data import load_photos
 from univoxel.data.images import write_png
+from univoxel.errors import DataError
 
 WIDTH, HEIGHT, FOCAL = 12, 8, 11.0
 MODELS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4}
@@ -297,3 +301,13 @@ def write_tensoir(folder: Path, scene: Scene) -> Path:
             }
             (view / "metadata.json").write_text(json.dumps(meta))
     return folder
+
+
+def refused(folder: Path, damage: Callable[[Path], object], message: str, split="train") -> None:
+    """A data set that is sound can be read; damaged, one line says where, and what."""
+    load_photos(folder, split)
+    damage(folder)
+    with pytest.raises(DataError, match=message) as caught:
+        load_photos(folder, split)
+    assert "\n" not in str(caught.value)
+    assert str(folder) in str(caught.value)

@@ -11,15 +11,13 @@ import univoxel
 from univoxel.config import (
     PREPARATION,
     JointConfig,
-    LossConfig,
-    MirrorConfig,
     StageConfig,
     TrainConfig,
     check_same,
     load_config,
     save_config,
 )
-from univoxel.errors import ConfigError, MissingFile, UserError
+from univoxel.errors import MissingFile, UserError
 from univoxel.lights.sg import SGConfig
 from univoxel.names import LIGHTS
 from univoxel.presets import PRESETS, budget, chosen, preset, with_field, with_metal, work_in
@@ -39,12 +37,6 @@ def test_presets(name):
     voxels = [stage.voxels for stage in grids]
     assert voxels == sorted(voxels)
     assert grids[-1].physical_from < 1  # or materials would never be learned
-
-
-@pytest.mark.parametrize("field", ["data", "out"])
-def test_names_of_folders_that_files_cannot_hold(field):
-    with pytest.raises(ConfigError, match=rf"{field} must be a path in UTF-8, got .*run.udcff"):
-        replace(CONFIG, **{field: Path("run\udcff")})
 
 
 def test_fine_stages_may_be_sparse():
@@ -208,68 +200,6 @@ def test_the_file_holds_every_field(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["config.json"]
 
 
-@pytest.mark.parametrize(
-    ("config", "change", "message"),
-    [
-        (STAGE, {"voxels": 0.0}, "voxels must be above 0, got 0.0"),
-        (STAGE, {"voxels": float("nan")}, "voxels must be above 0, got nan"),
-        (STAGE, {"iterations": 0}, "iterations must be at least 1, got 0"),
-        (STAGE, {"rays": -1}, "rays must be at least 1, got -1"),
-        (STAGE, {"share": 0.0}, r"share must be in \(0, 1\], got 0.0"),
-        (STAGE, {"sharpness": (0.5, 0.0)}, "sharpness must be two numbers above 0"),
-        (STAGE, {"lr_sdf": (0.1,)}, r"lr_sdf must be two numbers above 0, got \(0.1,\)"),
-        (STAGE, {"lr_features": 0.1}, "lr_features must be two numbers above 0, got 0.1"),
-        (STAGE, {"lr_networks": (-1.0, 1.0)}, "lr_networks must be two numbers above 0"),
-        (STAGE, {"plate": 0.2}, r"plate must be in \[0, 0.125\], got 0.2"),
-        (STAGE, {"spread": -1}, "spread must be at least 0, got -1"),
-        (STAGE, {"diffusion": -0.1}, r"diffusion must be in \[0, 0.25\], got -0.1"),
-        (STAGE, {"diffusion": 0.3}, r"diffusion must be in \[0, 0.25\], got 0.3"),
-        (STAGE, {"field": "octree"}, "field must be dense, sparse or hash, got 'octree'"),
-        (STAGE, {"physical_from": 2.0}, r"physical_from must be in \[0, 1\], got 2.0"),
-        (LossConfig(), {"silhouette": -1.0}, "silhouette must be at least 0, got -1.0"),
-        (LossConfig(), {"map_smoothness": -1.0}, "map_smoothness must be at least 0, got -1.0"),
-        (CONFIG, {"data": 42}, "data must be a path, got 42"),
-        (CONFIG, {"out": None}, "out must be a path, got None"),
-        (CONFIG, {"stages": ()}, r"stages must be a StageConfig first, .*got \(\)"),
-        (CONFIG, {"stages": (JointConfig(),)}, "stages must be a StageConfig first"),
-        (
-            CONFIG,
-            {"stages": (STAGE, JointConfig()), "scene": SceneConfig(sky_nodes=0)},
-            "sky_nodes",
-        ),
-        (JointConfig(), {"rounds": 0}, "rounds must be at least 1, got 0"),
-        (JointConfig(), {"rays": 3}, "rays must be at least views, got 3"),
-        (JointConfig(), {"lr_map": 0.0}, "lr_map must be above 0, got 0.0"),
-        (JointConfig(), {"newton_steps": -1}, "newton_steps must be at least 0, got -1"),
-        (JointConfig(), {"lr_sdf": -0.1}, "lr_sdf must be at least 0, got -0.1"),
-        (JointConfig(), {"newton_roughness": -1}, "newton_roughness must be at least 0, got -1"),
-        (JointConfig(), {"newton_views": 1}, "newton_views must be at least 2, got 1"),
-        (CONFIG, {"patience": -0.1}, "patience must be at least 0, got -0.1"),
-        (CONFIG, {"downscale": -1}, "downscale must be at least 0, got -1"),
-        (CONFIG, {"voxel_pixels": -1}, "voxel_pixels must be at least 0, got -1"),
-        (CONFIG, {"carving_seconds": -0.1}, "carving_seconds must be at least 0, got -0.1"),
-        (CONFIG, {"minutes": 0.0}, "minutes must be above 0 or None, got 0.0"),
-        (CONFIG, {"masks": "wide"}, "masks must be auto or given, got 'wide'"),
-        (CONFIG, {"cameras": "wrong"}, "cameras must be auto, given or refined, got 'wrong'"),
-        (SceneConfig(), {"channels": 0}, "channels must be at least 1, got 0"),
-        (SceneConfig(), {"hidden": 0}, "hidden must be at least 1, got 0"),
-        (SceneConfig(), {"material_channels": 99}, r"at most channels \(16\), got 99"),
-        (SceneConfig(), {"mirror_levels": -1}, r"mirror_levels must be in \[0, 8\], got -1"),
-        (SceneConfig(), {"mirror_levels": 9}, r"mirror_levels must be in \[0, 8\], got 9"),
-        (SceneConfig(), {"sky_rows": -1}, r"sky_rows must be in \[0, 8192\], got -1"),
-        (MirrorConfig(), {"rows": 100}, r"rows must be a multiple of 32 in \[0, 1024\], got 100"),
-    ],
-)
-def test_values_out_of_range(config, change, message):
-    with pytest.raises(ValueError, match=f"^{type(config).__name__}: .*{message}"):
-        replace(config, **change)
-
-
-def test_a_light_is_checked_as_soon_as_it_is_described():
-    with pytest.raises(ValueError, match="SGConfig: lobes must be at least 1, got 0"):
-        SGConfig(lobes=0)
-
-
 def saved(tmp_path, cut) -> TrainConfig:
     """The configuration of a run, whose config.json `cut` changes."""
     cfg = preset("draft", tmp_path / "photos", tmp_path)
@@ -280,31 +210,30 @@ def saved(tmp_path, cut) -> TrainConfig:
     return cfg
 
 
-def test_a_run_goes_on_whose_file_lacks_fields_that_came_since(tmp_path):
-    def cut(content):
-        for stage in content["stages"]:
-            stage.pop("spread", None)
-            stage.pop("tracing", None)
-        del content["scene"]["light"]["lobes"]
-
-    check_same(saved(tmp_path, cut))
+def without_newer_fields(content):
+    for stage in content["stages"]:
+        stage.pop("spread", None)
+        stage.pop("tracing", None)
+    del content["scene"]["light"]["lobes"]
 
 
-def test_a_run_does_not_go_on_under_other_stages(tmp_path):
-    cfg = saved(tmp_path, lambda content: content["stages"][2].update(tracing=7))
-    with pytest.raises(ValueError, match="the run began with other stages"):
-        check_same(cfg)
-
-
-def test_a_run_does_not_go_on_with_more_stages(tmp_path):
-    cfg = saved(tmp_path, lambda content: content.update(stages=content["stages"][:3]))
-    with pytest.raises(ValueError, match="the run began with other stages"):
-        check_same(cfg)
-
-
-def test_a_file_that_holds_no_configuration(tmp_path):
-    with pytest.raises(ValueError, match=r"config\.json: expected an object"):
-        check_same(saved(tmp_path, lambda content: [content]))
+@pytest.mark.parametrize(
+    ("cut", "refusal"),
+    [
+        (without_newer_fields, ""),
+        (lambda c: c["stages"][2].update(tracing=7), "the run began with other stages"),
+        (lambda c: c.update(stages=c["stages"][:3]), "the run began with other stages"),
+        (lambda c: [c], "config.json: expected an object"),
+    ],
+)
+def test_a_run_goes_on_under_its_own_stages_alone(tmp_path, cut, refusal):
+    said = ""
+    try:
+        check_same(saved(tmp_path, cut))
+    except UserError as error:
+        said = str(error)
+    assert refusal in said
+    assert bool(said) == bool(refusal)
 
 
 def test_retired_fields_of_a_file_are_passed_over(tmp_path):
@@ -331,6 +260,7 @@ def test_a_configuration_is_read_back_as_it_was_written(tmp_path, light):
         ('{"data": "a"}', "TrainConfig: out is missing"),
         ('{"data": "a", "out": "b", "minutes": 1, "stages": [{"voxels": "many"}]}', "voxels must"),
         ('{"data": "a", "out": "b", "minutes": 1, "stages": [], "sead": 1}', "no field 'sead'"),
+        ('{"data": "a", "out": "b", "minutes": true, "stages": []}', "minutes must be"),
         ('{"scene": {"light": {"kind": "lamp"}}}', "light must be one of"),
         ("{", "config.json"),
     ],

@@ -1,35 +1,25 @@
 """Pages against results, code and rules: the checks of scripts/docs, and that they can fail."""
 
-import inspect
 import re
-import shlex
 import shutil
+from functools import partial
 from pathlib import Path
 
 import doc_blocks
+import doc_names
 import doc_prose
 import doc_reference
 import doc_tables
 import pytest
 
-from univoxel.cli import COMMANDS, LABORATORY, help_screen, laboratory, understood
-from univoxel.cli.parsing import LAB, Usage
-
 ROOT = Path(__file__).parent.parent
-PAGES = sorted(doc_blocks.pages(ROOT))
-COMMAND = re.compile(r"^    univoxel +(.+)$|^univoxel +([a-z]+ (?:\S*/|-).*)$", re.MULTILINE)
 
 
 def test_pages_agree_with_results_and_code():
     assert doc_blocks.update(ROOT, write=False) == []
-
-
-def test_every_result_is_shown():
     assert doc_blocks.unused(ROOT) == []
-
-
-def test_pages_keep_the_rules_of_prose():
     assert doc_prose.faults(ROOT) == []
+    assert doc_names.faults(ROOT) == []
 
 
 def test_every_field_of_the_configuration_has_a_meaning():
@@ -152,95 +142,38 @@ def test_a_link_to_markdown_outside_of_docs_is_found():
     assert not doc_prose.leaves_docs(page, "../../LICENSE", ROOT)
 
 
-def commands() -> list[tuple[str, str]]:
-    """Every command line of the pages: page and arguments."""
-    found = []
-    for page in PAGES:
-        name = page.relative_to(ROOT).as_posix()
-        text = re.sub(r" *\\\n *", " ", page.read_text(encoding="utf-8"))
-        found += [(name, m[1] or m[2]) for m in COMMAND.finditer(text)]
-    return [(name, line) for name, line in found if "[--" not in line and "COMMAND" not in line]
+@pytest.mark.parametrize(
+    ("check", "page", "count"),
+    [
+        (doc_names.commands, "    univoxel trian x --out y\n", 1),
+        (doc_names.commands, "    univoxel train x --out y --presett fast\n", 1),
+        (doc_names.commands, "    univoxel train x --out y\n    univoxel --version\n", 0),
+        (doc_names.spans, "Look at `univoxel trian`, at `univoxel train --presett`.", 2),
+        (doc_names.spans, "Look at `univoxel train --preset fast`.", 0),
+        (doc_names.imports, "```python\nfrom univoxel import nothing\n```\n", 1),
+        (doc_names.imports, "```python\nx = = 1\n```\n", 1),
+        (doc_names.imports, "```python\nfrom univoxel import train\n```\n", 0),
+        (partial(doc_names.targets, ROOT), "    make nothing\n\nRun `python tests/none.py`.", 2),
+        (partial(doc_names.targets, ROOT), "    make test\n", 0),
+        *(
+            (partial(doc_names.unknown, ROOT), f"A page with `{code}`.", 1)
+            for code in ("StageConfig.none", "NoneConfig.rays", "NO_SUCH_ONE", "joint/none.py")
+        ),
+        (
+            partial(doc_names.unknown, ROOT),
+            "`StageConfig.rays`, `pictures/timelapse.py`, `DATA`",
+            0,
+        ),
+    ],
+)
+def test_names_that_are_not_there_are_found(check, page, count):
+    assert len(check(page)) == count
 
 
-def check(line: str) -> None:
-    """Refuse arguments that the command line would refuse.
-
-    Raises:
-        Usage: they make no command.
-    """
-    arguments = [a for a in shlex.split(line, comments=True) if a != "--traceback"]
-    if sorted(arguments) in (["--version"], ["--verbose", "--version"]):
-        return
-    if help_screen(arguments) is None:
-        understood(arguments)
-
-
-@pytest.mark.parametrize(("page", "line"), commands())
-def test_commands_of_the_pages_are_understood(page, line):
-    check(line)
-
-
-@pytest.mark.parametrize("line", ["trian x --out y", "train x --out y --presett fast", "eval"])
-def test_a_command_that_is_not_understood_is_found(line):
-    with pytest.raises(Usage):
-        check(line)
-
-
-def spans() -> list[tuple[str, str]]:
-    """Every code span of the pages that names a command."""
-    found = []
-    for page in PAGES:
-        text = " ".join(page.read_text(encoding="utf-8").split())
-        for span in re.findall(r"`univoxel ([^`]+)`", text):
-            if not span.startswith("was built"):  # a message
-                found.append((page.relative_to(ROOT).as_posix(), span))
-    return found
-
-
-@pytest.mark.parametrize(("page", "span"), spans())
-def test_commands_and_options_in_sentences_are_there(page, span):
-    words = span.split()
-    known = laboratory() if words[0] == LAB or words[0] in LABORATORY else COMMANDS
-    name = words[1] if words[0] == LAB and len(words) > 1 else words[0]
-    if name in (LAB, "COMMAND") or name.startswith("--"):
-        return
-    assert name in known, f"{page}: univoxel {span}"
-    options = set(re.findall(r"--[a-z-]+", span)) - {"--help", "--quiet", "--verbose", "--threads"}
-    parameters = inspect.signature(known[name]).parameters
-    names = {"--" + p.replace("_", "-") for p in parameters} | {"--from"}
-    assert options <= names, f"{page}: univoxel {span}"
-
-
-@pytest.mark.parametrize("page", [p for p in PAGES if "```python" in p.read_text("utf-8")], ids=str)
-def test_names_that_python_code_of_the_pages_imports_are_there(page):
-    for block in re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
-        if not re.match(r"\s*(?:@|def |class )", block):  # signatures of the reference
-            compile(block, str(page), "exec")
-        for line in re.findall(r"^(?:from|import) .*", block, re.MULTILINE):
-            exec(line, {})
-
-
-def test_folders_and_files_of_the_tree_are_there():
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    tree = text.partition("## The tree")[2].partition("## Rules")[0]
-    rows = re.findall(r"^\| (`.*?) \|", tree, re.MULTILINE)
-    for name in re.findall(r"`([^`]+)`", " ".join(rows)):
-        assert (ROOT / name).exists() or (ROOT / "univoxel" / name).exists(), name
-    named = set(re.findall(r"`(?:univoxel/)?([a-z]+(?:\.py|/))`", tree))
-    package = {p.name + "/" * p.is_dir() for p in (ROOT / "univoxel").iterdir()}
-    unnamed = {n for n in package - named if not n.startswith(("_", "example_data", "py.typed"))}
-    assert not unnamed, "add to the tree of CONTRIBUTING.md"
-
-
-def targets(text: str) -> set[str]:
-    return set(re.findall(r"^    make ([a-z-]+)", text, re.MULTILINE))
-
-
-def test_targets_and_scripts_of_the_pages_are_there():
-    there = re.search(r"\.PHONY: (.*)", (ROOT / "Makefile").read_text())
-    assert there
-    for page in PAGES:
-        text = page.read_text(encoding="utf-8")
-        assert targets(text) <= set(there.group(1).split()), page
-        for script in re.findall(r"python ((?:benchmarks|scripts|examples|tests)/\S+)", text):
-            assert (ROOT / script).exists(), f"{page}: {script}"
+def test_a_tree_that_is_not_the_folders_is_found(tmp_path):
+    (tmp_path / "univoxel" / "joint").mkdir(parents=True)
+    page = tmp_path / "CONTRIBUTING.md"
+    page.write_text("## The tree\n\n| `univoxel/none/` | nothing |\n\n## Rules\n")
+    gone, lacks = doc_names.tree(tmp_path)
+    assert "no such file or folder: univoxel/none/" in gone
+    assert "the tree lacks joint/" in lacks

@@ -8,7 +8,7 @@ from univoxel.data.images import read_image
 
 # dB at least. Rounding decides what little steps leave open, such as what is metal: with kernels
 # and torch for AVX-512, for AVX2 and for any processor the same case ends up to 8 dB apart. The
-# worst of the three had 24.4, 23.8 and 20.2; a grey silhouette, without material or light, 18.0.
+# worst of the three had 25.5, 23.3 and 20.2; a grey silhouette, without material or light, 18.0.
 LEAST = {"hybrid": 22.0, "varying": 21.5, "sparse": 18.5}
 
 

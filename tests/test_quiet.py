@@ -1,36 +1,16 @@
 """The package's functions return, write files and log; only the command line prints."""
 
-import ast
 import shutil
-from pathlib import Path
-
-import pytest
-from analytic import write_scene
 
 import univoxel
 from univoxel.cli.info import info
-from univoxel.config import StageConfig, TrainConfig
-from univoxel.lights import SGConfig
 from univoxel.ops import PointLight
-from univoxel.scene import SceneConfig
-
-PRINTING = {"cli/__init__.py", "cli/parsing.py"}
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("quiet")
-    data = write_scene(folder / "data", views=6, size=16)
-    light = SGConfig(lobes=1, hidden=4, directions=8, directions_eval=8)
-    scene = SceneConfig(channels=2, material_channels=1, hidden=4, light=light, sky_nodes=0)
-    stage = StageConfig(0.004, 10, 1.0, 64, physical_from=0.5)
-    return univoxel.train(TrainConfig(data, folder / "run", (stage,), minutes=1.0, scene=scene))
-
-
-def test_nothing_is_printed(run, tmp_path, capsys):
+def test_nothing_is_printed(tiny_copy, tmp_path, capsys):
     """Paths may be text, too."""
     capsys.readouterr()
-    data, cut, here = run.parent / "data", tmp_path / "cut", str(run)
+    data, cut, here = tiny_copy / "data", tmp_path / "cut", str(tiny_copy / "run")
     masks = tmp_path / "masks"
     masks.mkdir()
     for photograph in data.glob("*/*.png"):  # whose alpha counts
@@ -42,22 +22,3 @@ def test_nothing_is_printed(run, tmp_path, capsys):
     assert univoxel.cutout(str(data), str(cut), str(masks)) == cut
     assert info(here)["bytes"] > 0
     assert capsys.readouterr() == ("", "")
-
-
-def test_only_the_command_line_has_print():
-    """Of a command's file only the command itself: the library has the rest."""
-    package = Path(univoxel.__file__).parent
-    calls = set()
-    for path in package.rglob("*.py"):
-        for part in ast.parse(path.read_text(encoding="utf-8")).body:
-            for node in ast.walk(part):
-                match node:
-                    case (
-                        ast.Call(func=ast.Name(id="print"))
-                        | ast.Call(func=ast.Attribute(value=ast.Name(id="rich"), attr="print"))
-                    ):
-                        place = path.relative_to(package).as_posix()
-                        calls.add((place, getattr(part, "name", "")))
-    commands = {call for call in calls if call[0].startswith("cli/") and call[1] == "command"}
-    assert {name for name, _ in calls - commands} <= PRINTING
-    assert len(commands) > 5

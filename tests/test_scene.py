@@ -361,49 +361,6 @@ def test_a_failed_write_keeps_the_checkpoint_before(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == [FILE]
 
 
-def test_no_checkpoint(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"looked for scene.safetensors.*univoxel train"):
-        load_scene(tmp_path)
-
-
-def test_cut_short(tmp_path):
-    path = save_scene(small_scene(), tmp_path, {})
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ValueError, match="damaged or cut short"):
-        load_scene(tmp_path)
-
-
-def test_another_version(tmp_path):
-    save_file({"a": torch.zeros(1)}, tmp_path / FILE, {"univoxel": '{"format": 99}'})
-    with pytest.raises(ValueError, match="expected checkpoint format 1, got 99"):
-        load_scene(tmp_path)
-
-
-def test_not_a_checkpoint_of_ours(tmp_path):
-    save_file({"a": torch.zeros(1)}, tmp_path / FILE)
-    with pytest.raises(ValueError, match="expected checkpoint format 1, got None"):
-        load_scene(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"sky": 7},
-        {"channels": 0},
-        {"light": {"kind": "candle"}},
-        {"light": {"kind": "sh", "rank": 1}},
-    ],
-)
-def test_a_description_that_says_nothing_to_us(tmp_path, change):
-    path = save_scene(small_scene(), tmp_path, {})
-    with safe_open(path, "pt") as file:
-        meta = json.loads(file.metadata()["univoxel"])
-    meta["scene"] |= change
-    save_file(load_file(path), path, {"univoxel": json.dumps(meta)})
-    with pytest.raises(ValueError, match=r"scene.safetensors: does not fit its own description"):
-        load_scene(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("scene", "name", "tensor"),
     [

@@ -70,12 +70,6 @@ def test_fronts_by_scene_and_measure():
     assert found["shoe"] == {m.key: [] for m in module.SHOWN} | {"nvs_psnr": ["draft"]}
 
 
-def test_the_picture_is_drawn(tmp_path):
-    png, svg = module.plot(ROWS, tmp_path / "chart")
-    assert png.read_bytes().startswith(b"\x89PNG")
-    assert "<svg" in svg.read_text()
-
-
 @pytest.fixture
 def passed(monkeypatch):
     """What reaches the runner, in place of the trainings."""

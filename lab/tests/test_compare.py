@@ -2,9 +2,10 @@
 
 import builtins
 import json
+import shutil
 
 import pytest
-from analytic import write_scene
+from tiny import OPTIONS
 
 from lab import compare as module
 from lab.record import Outcome
@@ -40,13 +41,6 @@ def test_the_best_of_a_column_is_bold():
 
 def test_one_scene_has_no_mean():
     assert module.markdown(ROWS[:2]).count("## ") == 1
-
-
-def test_the_picture_is_drawn(tmp_path):
-    png, svg = module.plot(ROWS, tmp_path / "a.b")
-    assert (png.name, svg.name) == ("a.b.png", "a.b.svg")
-    assert png.read_bytes().startswith(b"\x89PNG")
-    assert "<svg" in svg.read_text()
 
 
 @pytest.fixture
@@ -113,21 +107,11 @@ def test_without_matplotlib_nothing_is_trained(passed, tmp_path, monkeypatch, ca
     assert not passed
 
 
-def test_the_command_on_a_small_scene(tmp_path, capsys):
-    data = write_scene(tmp_path / "ball", views=6, size=16)
-    fields = (
-        *(f"stages.{i}.{name}" for i in (0, 1, 3) for name in ("voxels=0.004", "rays=64")),
-        *(f"stages.{i}.iterations=2" for i in (0, 2, 3)),
-        *("stages.1.iterations=20", "stages.1.physical_from=0.0"),
-        *("stages.2.rays=64", "stages.2.points=64", "stages.2.newton_points=8"),
-        *("scene.sky_nodes=32", "stages.2.newton_steps=1"),
-        *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
-        *("scene.light.hidden=4", "scene.light.directions=8"),
-    )
+def test_the_command_on_a_small_scene(tiny, tmp_path, capsys):
+    data = shutil.copytree(tiny / "data", tmp_path / "ball")
     out = tmp_path / "out"
     arguments = ["--preset", "draft", "--light", "hybrid:lobes=1", "--samples", "1"]
-    changes = [f"--set={field}" for field in fields]
-    assert main(["compare", str(data), "--out", str(out), *arguments, *changes]) == 0
+    assert main(["compare", str(data), "--out", str(out), *arguments, *OPTIONS[1:]]) == 0
     assert capsys.readouterr().out.strip().endswith("compare.md")
     (row,) = json.loads((out / "compare.json").read_text())["rows"]
     assert row["measures"]["nvs_psnr"] > 0

@@ -13,11 +13,12 @@ import argparse
 import sys
 from pathlib import Path
 
-import doc_blocks
-import doc_prose
-
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))  # the package of this tree, wherever the command is called
+
+import doc_blocks  # noqa: E402
+import doc_names  # noqa: E402
+import doc_prose  # noqa: E402
 
 
 def main() -> int:
@@ -26,7 +27,7 @@ def main() -> int:
     parser.add_argument("--release", action="store_true", help="figures must be of one version")
     options = parser.parse_args()
     faults = doc_blocks.update(ROOT, write=options.write)
-    faults += doc_blocks.unused(ROOT) + doc_prose.faults(ROOT)
+    faults += doc_blocks.unused(ROOT) + doc_prose.faults(ROOT) + doc_names.faults(ROOT)
     if options.release:
         faults += doc_blocks.several_versions(ROOT)
     for fault in faults:

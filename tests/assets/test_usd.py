@@ -6,8 +6,7 @@ import zipfile
 
 import numpy as np
 import pytest
-import torch
-from asymmetric_scene import lopsided
+from asymmetric_scene import Metals, lopsided
 from PIL import Image
 
 from univoxel.assets.bake import bake
@@ -21,13 +20,6 @@ pytest.importorskip("pxr")
 from pxr import Usd, UsdGeom, UsdShade
 
 UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # rows of USD times this: our world
-
-
-class Metals(torch.nn.Module):
-    """The features are the materials; metal on one side."""
-
-    def forward(self, features):
-        return features[:, :3], features[:, 3], (features[:, 0] > 0.5).float()
 
 
 @pytest.fixture(scope="module", params=["plain", "metal"])

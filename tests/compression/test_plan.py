@@ -144,19 +144,6 @@ def test_a_light_without_networks_is_adapted_too(data, tmp_path):
     assert [c["what"] for c in load_checkpoint(out)[1]["chosen"]] == ["mirror levels", "reach"]
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"capacity": "elastic"}, "capacity must be fixed or adaptive, got 'elastic'"),
-        ({"budget_mb": -1.0}, "budget_mb must be above 0 or None, got -1"),
-        ({"budget_mb": 1.0, "capacity": "fixed"}, "budget_mb 1 needs adaptive capacity"),
-    ],
-)
-def test_bad_configurations(data, tmp_path, changes, message):
-    with pytest.raises(ValueError, match=message):
-        config(data, tmp_path / "run", **changes)
-
-
 def test_a_picture_of_another_kind_is_refused(run, tmp_path):
     with pytest.raises(ValueError, match=r"picture: expected a .png file, got .*a.jpg"):
         info(run, picture=tmp_path / "a.jpg")

@@ -11,7 +11,6 @@ from torch.nn.functional import normalize
 from univoxel.confidence import advice as task
 from univoxel.confidence.advice import (
     ADVICE,
-    AdviceConfig,
     advise,
     azimuths,
     elevations,
@@ -20,7 +19,6 @@ from univoxel.confidence.advice import (
     place,
 )
 from univoxel.confidence.survey import survey
-from univoxel.errors import ConfigError
 from univoxel.ops import VisibilityScene
 
 NODES, VIEWS = 64, 40
@@ -142,16 +140,3 @@ def test_the_front_is_where_the_first_photograph_was_taken(scene, photos):
     advice = advice_of(scene, photos.of(torch.tensor([0, 25, 30])))
     assert elevations(taken_from(photos))[0] > 60
     assert advice.front_name in (photos.names[0], photos.names[25])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"most": 0}, "most must be at least 1, got 0"),
-        ({"share": -0.5}, r"share must be in \[0, 1\], got -0.5"),
-        ({"least": 2.0}, r"least must be in \[0, 1\], got 2.0"),
-    ],
-)
-def test_ranges(change, message):
-    with pytest.raises(ConfigError, match=f"^AdviceConfig: {message}"):
-        AdviceConfig(**change)

@@ -4,7 +4,7 @@ import struct
 
 import numpy as np
 import pytest
-from layouts import HEIGHT, WIDTH, scene, write_colmap
+from layouts import HEIGHT, WIDTH, refused, scene, write_colmap
 
 from univoxel.data import load_photos
 from univoxel.data.images import write_png
@@ -52,8 +52,9 @@ def cut(name, keep):
     return apply
 
 
-def other_size(folder):
-    write_png(folder / "images" / "p_004.png", np.ones((HEIGHT, WIDTH + 1, 3), np.uint8))
+def other_size(wider, higher):
+    picture = np.ones((HEIGHT + higher, WIDTH + wider, 3), np.uint8)
+    return lambda folder: write_png(folder / "images" / "p_004.png", picture)
 
 
 TEXT = {
@@ -94,7 +95,8 @@ TEXT = {
         lambda f: (f / "images").rename(f / "photos"),
         r"images\.txt: no picture p_009\.png, .* 10 of 10 are missing.*looked in .*images and ",
     ),
-    "size": (other_size, r"p_004\.png: expected 12x8 pixels as its camera .*, got 13x8"),
+    "size": (other_size(1, 0), r"p_004\.png: expected 12x8 pixels as its camera .*, got 13x8"),
+    "height": (other_size(0, 1), r"p_004\.png: expected 12x8 pixels as its camera .*, got 12x9"),
 }
 BINARY = {
     "cut cameras": (cut("cameras.bin", 30), r"cameras\.bin: expected a file of a COLMAP model"),
@@ -107,11 +109,7 @@ BINARY = {
 @pytest.mark.parametrize("case", [*TEXT, *BINARY])
 def test_broken_models(tmp_path, case):
     change, message = (TEXT | BINARY)[case]
-    write_colmap(tmp_path, scene(), text=case in TEXT)
-    change(tmp_path)
-    with pytest.raises(DataError, match=message) as caught:
-        load_photos(tmp_path)
-    assert "\n" not in str(caught.value)
+    refused(write_colmap(tmp_path, scene(), text=case in TEXT), change, message)
 
 
 @pytest.mark.parametrize(("number", "name"), [(7, "FOV"), (99, "model 99")])

@@ -5,12 +5,11 @@ Axes are checked by test_layouts.
 
 import numpy as np
 import pytest
-from layouts import FOCAL, scene, write_idr
+from layouts import FOCAL, refused, scene, write_idr
 
 from univoxel.data import load_photos
 from univoxel.data.idr import decomposed
 from univoxel.data.images import write_png
-from univoxel.errors import DataError
 
 
 def load_arrays(folder):
@@ -142,8 +141,4 @@ def leaning(arrays):
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, damage, message):
-    write_idr(tmp_path, scene())
-    damage(tmp_path)
-    with pytest.raises(DataError, match=message) as caught:
-        load_photos(tmp_path)
-    assert "\n" not in str(caught.value)
+    refused(write_idr(tmp_path, scene()), damage, message)

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from layouts import FOCAL, HEIGHT, WIDTH, scene, write_metashape
+from layouts import FOCAL, HEIGHT, WIDTH, refused, scene, write_metashape
 
 from univoxel.data import load_photos, metashape
-from univoxel.errors import DataError
 
 TERMS = {"k1": 0.03, "k2": -0.02, "k3": 0.01, "k4": 0.05, "p1": 0.004, "p2": -0.007}
 OFFSETS = {"cx": 0.75, "cy": -0.5, "b1": 0.4}
@@ -171,8 +170,4 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, damage, message):
-    write_metashape(tmp_path, scene())
-    damage(tmp_path)
-    with pytest.raises(DataError, match=message) as caught:
-        load_photos(tmp_path)
-    assert "\n" not in str(caught.value)
+    refused(write_metashape(tmp_path, scene()), damage, message)

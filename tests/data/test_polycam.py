@@ -4,10 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from layouts import FOCAL, scene, write_polycam
+from layouts import FOCAL, refused, scene, write_polycam
 
 from univoxel.data import load_photos
-from univoxel.errors import DataError
 
 
 def edited(**values):
@@ -76,8 +75,4 @@ def test_pictures_that_are_not_there(tmp_path):
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, damage, message):
-    write_polycam(tmp_path, scene())
-    damage(tmp_path)
-    with pytest.raises(DataError, match=message) as caught:
-        load_photos(tmp_path)
-    assert "\n" not in str(caught.value)
+    refused(write_polycam(tmp_path, scene()), damage, message)

@@ -93,8 +93,8 @@ def test_rows_near_are_all_that_points_near_the_surface_read(finest):
     field = Field(field.distances, HashFeatures(levels))
     near = field.rows_near(1.5 * field.voxel_size)
     g = torch.Generator().manual_seed(0)
-    direction = torch.nn.functional.normalize(torch.randn(2_000_000, 3, generator=g))
-    away = 7 * torch.rand(2_000_000, generator=g) - 3.5  # voxels
+    direction = torch.nn.functional.normalize(torch.randn(1_000_000, 3, generator=g))
+    away = 7 * torch.rand(1_000_000, generator=g) - 3.5  # voxels
     points = direction * (0.5 + field.voxel_size * away[:, None])
     # The node next to a point is up to 0.87 voxels away; and a cube around a near node reaches as
     # far beyond it
@@ -137,11 +137,12 @@ def test_smoothing_leaves_the_table():
 FINE = GridShape((-0.7,) * 3, 1.4 / 199, (200, 200, 200))
 
 
-@pytest.fixture
-def bricks(monkeypatch):
+@pytest.fixture(scope="module")
+def bricks():
     """The ball on a grid so fine that only bricks around its surface are stored."""
-    monkeypatch.setattr(fields, "DENSE_MOST", 1_000_000)
-    return ball().resized(FINE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fields, "DENSE_MOST", 1_000_000)
+        return ball().resized(FINE)
 
 
 def test_distances_of_a_fine_grid_lie_in_bricks(bricks):
@@ -161,6 +162,7 @@ def test_distances_of_a_fine_grid_lie_in_bricks(bricks):
 
 def test_bricks_learn_and_grow(bricks):
     """Gradients reach distances and table; where the surface moves, bricks follow."""
+    bricks = copy.deepcopy(bricks)
     rays = Rays(torch.tensor([[0.0, 0.1, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]]))
     samples = bricks.march(rays, torch.zeros(1), 2 / FINE.voxel_size)
     assert len(samples.t) > 2

@@ -16,7 +16,13 @@ from observed_points import (
 from univoxel import brdf
 from univoxel.config import JointConfig
 from univoxel.joint import newton
-from univoxel.joint.newton import NewtonRound, newton_round_
+from univoxel.joint.newton import (
+    MAX_ALBEDO_CHANGE,
+    MAX_ROUGHNESS_CHANGE,
+    NewtonPoints,
+    NewtonRound,
+    newton_round_,
+)
 from univoxel.joint.observations import (
     Decisions,
     prefiltered_roughness,
@@ -150,3 +156,17 @@ def test_newton_starts_from_the_albedo_that_it_is_given():
         newton.choose_points(scene, problem, nothing, cfg).log_albedo,
         torch.full((20, 3), 0.5).log(),
     )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_step_changes_a_point_by_no_more_than_so_much(sign):
+    class Far:
+        def back_substituted(self, _):
+            return torch.full((5, 3), 9.0 * sign), torch.full((5,), 9.0 * sign)
+
+    nothing, of_all = torch.zeros(5, dtype=torch.int64), [torch.arange(5)]
+    numbers = torch.full((5, 3), -2.0), torch.full((5,), 0.5), torch.full((5,), 0.5)
+    points = NewtonPoints(None, nothing.bool(), nothing, nothing[:, None], of_all, *numbers, 1.0)
+    points.step_([Far()], torch.zeros(3, 1))
+    assert torch.equal(points.log_albedo, numbers[0] + sign * MAX_ALBEDO_CHANGE)
+    assert torch.equal(points.roughness, numbers[1] + sign * MAX_ROUGHNESS_CHANGE)

@@ -86,7 +86,7 @@ def test_metal_is_learned_where_it_is():
         [{"params": [scene.field.features], "lr": 0.03}, {"params": scene.material.parameters()}],
         lr=3e-3,
     )
-    for _ in range(400):
+    for _ in range(300):
         optimizer.zero_grad(set_to_none=True)
         terms = stage.objective(scene, problem, Decisions(copper), CFG)
         torch.stack(list(terms.values())).sum().backward()
@@ -106,7 +106,7 @@ def test_solve_recovers_albedo_and_map():
     scene = sphere_scene(nodes)
     before = {k: v.clone() for k, v in scene.state_dict().items()}
     cfg = JointConfig(points=1500, newton_points=1000, rays=1024, tracing=1, rounds=3, lr_sdf=0.0)
-    stage.solve(scene, photos, cfg, 0, Steps(700))
+    stage.solve(scene, photos, cfg, 0, Steps(450))
     after = scene.state_dict()
     changed = {k.split(".")[0] for k in after if not torch.equal(after[k], before[k])}
     assert changed == {"field", "material", "sky"}
@@ -198,129 +198,119 @@ def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, 
         assert rate[-1] == pytest.approx(0.1 * cfg.lr_features, rel=0.03)  # of 100 steps, the last
 
 
-@pytest.mark.parametrize("changed", [True, False])
-def test_paint_is_asked_before_and_after_newton(monkeypatch, changed):
-    """Newton starts from the albedos under a map that the materials do not follow yet."""
-    calls, begun = [], []
-    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+@pytest.fixture
+def events(monkeypatch):
+    """What two rounds on a small problem do, in their order, where each part changes nothing."""
 
-    def newton_round_(scene, problem, decisions, *_):
-        calls.append("newton")
-        begun.append(decisions.albedo)
-        return NewtonRound()
+    def solve(told, paint=False, whole=False, found=False, sharpens=False, **changes):
+        scene, told_of = scene_of((0.5, 0.5, 0.5), 0.4, 12), []
+        sharp = torch.ones(5, dtype=torch.bool)
+        mirrors = Mirrors(sharp, sharp, torch.eye(3)[[0] * 5], torch.full((5, 3), 0.8))
+        objective = stage.objective
 
-    def minimise_entropy_(*_):
-        calls.append("entropy")
-        return changed
+        def does(what, result=None):
+            return lambda *_: told_of.append(what) or result
 
-    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
-    monkeypatch.setattr(stage, "find_metal", lambda *_: torch.zeros(5, dtype=torch.bool))
-    monkeypatch.setattr(stage, "initialise_", lambda scene, problem, decisions, *_: (decisions, []))
-    monkeypatch.setattr(stage, "fit_sun_", lambda *_: None)
-    monkeypatch.setattr(stage, "diffuse_albedo", lambda *_: torch.full((5, 3), 0.3))
-    monkeypatch.setattr(stage, "teach_albedo_", lambda *_: calls.append("teach"))
-    monkeypatch.setattr(stage, "minimise_entropy_", minimise_entropy_)
-    monkeypatch.setattr(stage, "newton_round_", newton_round_)
-    stage.solve(scene, photos_of(1, 8), replace(CFG, rounds=2), 0, Steps(4))
-    first = ["entropy", "newton", "entropy", *["teach"] * changed]
-    assert calls == [*first, "newton", "entropy"]
-    assert [albedo is not None for albedo in begun] == [changed, False]
-    calls.clear()
-    stage.solve(scene, photos_of(1, 8), replace(CFG, rounds=2, colors=False), 0, Steps(4))
-    assert calls == ["newton", "newton"]
+        def newton(scene, problem, decisions, *_):
+            starts = ", from albedos" * (decisions.albedo is not None)
+            told_of.append("newton" + ", all metal" * bool(decisions.metal.all()) + starts)
+            return NewtonRound()
 
+        def adam(scene, problem, decisions, cfg):
+            told_of.append("adam" + ", all metal" * bool(decisions.metal.all()))
+            return objective(scene, problem, decisions, cfg)
 
-def test_light_on_metal_alone_is_neutral_in_every_round(monkeypatch):
-    calls = []
-    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+        for name, stand_in in {
+            "build_problem": lambda *_: random_problem(scene=scene),
+            "find_metal": lambda *_: torch.zeros(5, dtype=torch.bool),
+            "find_mirrors": lambda *_: mirrors if found else None,
+            "initialise_": lambda s, p, found, *_: (replace(found, only_metal=whole), []),
+            "fit_sun_": lambda *_: None,
+            "diffuse_albedo": lambda *_: torch.full((5, 3), 0.3),
+            "minimise_entropy_": does("entropy", paint),
+            "teach_albedo_": does("albedos"),
+            "teach_mirrors_": does("mirrors"),
+            "neutralise_": does("neutral"),
+            "sharpen_sky_": lambda *_: sharpens,
+            "newton_round_": newton,
+            "objective": adam,
+        }.items():
+            if not (name == "initialise_" and changes.get("only_metal")):
+                monkeypatch.setattr(stage, name, stand_in)
+        cfg = replace(CFG, rounds=2, **({"colors": False} | changes))
+        stage.solve(scene, photos_of(1, 8), cfg, 0, told)
+        return told_of
 
-    def newton_round_(scene, problem, decisions, *_):
-        calls.append(bool(decisions.metal.all()))
-        return NewtonRound()
-
-    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
-    monkeypatch.setattr(stage, "neutralise_", lambda *_: calls.append("neutral"))
-    monkeypatch.setattr(stage, "newton_round_", newton_round_)
-    known = replace(CFG, rounds=2, colors=False, only_metal=True, newton_steps=1)
-    stage.solve(scene, photos_of(1, 8), known, 0, Steps(4))
-    assert calls == ["neutral", True] * 2
+    return solve
 
 
-def test_a_solve_that_found_nothing_but_metal_goes_on_with_it(monkeypatch):
-    calls = []
-    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
-    objective = stage.objective
-
-    def looked_at(scene, problem, decisions, cfg):
-        calls.append(bool(decisions.metal.all()))
-        return objective(scene, problem, decisions, cfg)
-
-    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
-    monkeypatch.setattr(stage, "neutralise_", lambda *_: calls.append("neutral"))
-    monkeypatch.setattr(stage, "newton_round_", lambda *_: NewtonRound())
-    monkeypatch.setattr(stage, "objective", looked_at)
+def within(**known) -> Steps:
+    """A training that goes on in its second round."""
     told = Steps(4)
-    told.within = asdict(stage.Round(0.0, 0.5, rounds_after=1, solved=True, only_metal=True))
-    stage.solve(scene, photos_of(1, 8), replace(CFG, rounds=2, colors=False), 0, told)
-    assert calls == [True, True, "neutral", True, True]
+    told.within = asdict(stage.Round(0.0, 0.5, rounds_after=1, solved=True, **known))
+    return told
 
 
-def test_what_is_known_to_be_metal_stays_so_where_nothing_is_solved(monkeypatch):
-    """Without steps of Newton, and in a run that goes on from before that was noted."""
-    scene, metals, objective = scene_of((0.5, 0.5, 0.5), 0.4, 12), [], stage.objective
-
-    def looked_at(scene, problem, decisions, cfg):
-        metals.append(bool(decisions.metal.all()) and decisions.only_metal)
-        return objective(scene, problem, decisions, cfg)
-
-    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
-    monkeypatch.setattr(stage, "objective", looked_at)
-    cfg = replace(CFG, rounds=2, colors=False, only_metal=True, newton_steps=0)
-    stage.solve(scene, photos_of(1, 8), cfg, 0, Steps(4))
-    told = Steps(4)
-    told.within = asdict(stage.Round(0.0, 0.5, rounds_after=1, solved=True))
-    stage.solve(scene, photos_of(1, 8), cfg, 0, told)
-    assert metals == [True] * 8
+ADAM, METAL = ["adam"] * 2, ["adam, all metal"] * 2
+KNOWN = {"only_metal": True, "newton_steps": 1}
+OF_METAL = ["neutral", "newton, all metal", *METAL]
 
 
-def test_training_says_and_keeps_that_there_is_nothing_but_metal(monkeypatch):
-    scene, told = scene_of((0.5, 0.5, 0.5), 0.4, 12), Steps(4)
-    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
-    monkeypatch.setattr(stage, "newton_round_", lambda *_: NewtonRound())
-    monkeypatch.setattr(
-        stage, "initialise_", lambda s, p, decisions, *_: (replace(decisions, only_metal=True), [])
-    )
-    kept, set_rates_ = [], stage.set_rates_
+@pytest.mark.parametrize(
+    ("told", "options", "wanted"),
+    [
+        # Newton starts from the albedos under a map that the materials do not follow yet
+        (
+            Steps(4),
+            {"colors": True, "paint": True},
+            [
+                *("entropy", "newton, from albedos", "entropy", "albedos", *ADAM),
+                *("newton", "entropy", *ADAM),
+            ],
+        ),
+        (
+            Steps(4),
+            {"colors": True},
+            ["entropy", "newton", "entropy", *ADAM, "newton", "entropy", *ADAM],
+        ),
+        (Steps(4), {}, ["newton", *ADAM] * 2),
+        (
+            Steps(4),
+            {"found": True},
+            ["newton", "mirrors", *METAL, "newton, all metal", "mirrors", *METAL],
+        ),
+        # Light on metal alone is neutral in every round
+        (Steps(4), KNOWN, OF_METAL * 2),
+        (Steps(4), {"whole": True}, ["neutral", "newton", *METAL, *OF_METAL]),
+        # What is known to be metal stays so where nothing is solved, and in a run that goes on
+        (Steps(4), KNOWN | {"newton_steps": 0}, OF_METAL * 2),
+        (within(), KNOWN, [*METAL, *OF_METAL]),
+        (within(only_metal=True), {}, [*METAL, *OF_METAL]),
+    ],
+)
+def test_what_a_round_does_and_when(events, told, options, wanted):
+    assert events(told, **options) == wanted
+
+
+def test_training_says_and_keeps_that_there_is_nothing_but_metal(events, monkeypatch):
+    told, kept, set_rates_ = Steps(4), [], stage.set_rates_
     monkeypatch.setattr(
         stage, "set_rates_", lambda *a: kept.append(told.within["only_metal"]) or set_rates_(*a)
     )
-    cfg = replace(CFG, rounds=2, colors=False)
-    stage.solve(scene, photos_of(1, 8), cfg, 0, told)
+    events(told, whole=True)
     assert kept == [True] * 4  # for a run that goes on within the stage
     assert told.said[0].startswith("the whole object is taken for metal")
     assert told.said[0].endswith("see --metal")
     told = Steps(4)
-    stage.solve(scene, photos_of(1, 8), replace(cfg, only_metal=True), 0, told)
+    events(told, only_metal=True)
     assert not told.said  # it was asked for
 
 
-def test_mirrors_are_taught_before_adam_in_every_round(monkeypatch):
-    calls, found = [], torch.ones(5, dtype=torch.bool)
-    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
-    mirrors = Mirrors(found, found, torch.eye(3)[[0] * 5], torch.full((5, 3), 0.8))
-    monkeypatch.setattr(stage, "build_problem", lambda *_: random_problem(scene=scene))
-    monkeypatch.setattr(stage, "find_metal", lambda *_: found)
-    monkeypatch.setattr(stage, "find_mirrors", lambda *_: mirrors)
-    monkeypatch.setattr(stage, "initialise_", lambda scene, problem, decisions, *_: (decisions, []))
-    monkeypatch.setattr(stage, "newton_round_", lambda *_: calls.append("newton") or NewtonRound())
-    monkeypatch.setattr(stage, "teach_mirrors_", lambda *_: calls.append("teach"))
-    cfg, told = replace(CFG, rounds=2, colors=False), Steps(4)
-    stage.solve(scene, photos_of(1, 8), cfg, 0, told)
-    assert calls == ["newton", "teach"] * 2
-    assert not told.said
-    monkeypatch.setattr(stage, "sharpen_sky_", lambda *args: args[3] is mirrors)
-    stage.solve(scene, photos_of(1, 8), cfg, 0, told)
-    assert told.said == ["the map of the light is as sharp as what is polished shows it"]
+def test_training_says_that_mirrors_made_the_map_sharper(events):
+    for told, sharpens in ((Steps(4), False), (Steps(4), True)):
+        events(told, found=True, sharpens=sharpens)
+        says = ["the map of the light is as sharp as what is polished shows it"]
+        assert told.said == says * sharpens
 
 
 def test_materials_follow_a_map_that_was_changed(monkeypatch):

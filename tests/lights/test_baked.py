@@ -3,15 +3,13 @@
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 import torch
 from balls import ball, views
 
 from univoxel import losses
 from univoxel.fields.heads import MaterialHead
-from univoxel.lights import BakedConfig, BakedLight, build
+from univoxel.lights import BakedLight, build
 from univoxel.presets import preset
-from univoxel.scene import SceneConfig
 
 
 def test_albedo_is_what_is_sent_in_every_direction():
@@ -42,9 +40,3 @@ def test_its_scene_has_one_roughness_and_no_metal():
     _, roughness, metallic = head(torch.randn(20, 8))
     assert torch.equal(roughness, torch.full((20,), 0.5))
     assert not metallic.any()
-
-
-@pytest.mark.parametrize("roughness", [0.0, 1.5, "rough"])
-def test_a_known_roughness_out_of_range(roughness):
-    with pytest.raises(ValueError, match=r"roughness must be None or in \(0, 1\]"):
-        SceneConfig(light=BakedConfig(), roughness=roughness)

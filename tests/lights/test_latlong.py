@@ -182,25 +182,3 @@ def test_regularisation_sees_noise_and_colour():
     torch.testing.assert_close(before, latlong.chroma(red.latlong(64)), rtol=1e-3, atol=1e-4)
     red.raw[:, 4] += 0.1
     assert red.regularisation(s, s).white_light > before
-
-
-@pytest.mark.parametrize(
-    ("kind", "change", "message"),
-    [
-        (EnvmapConfig, {"rows": 0}, "EnvmapConfig: rows must be at least 1, got 0"),
-        (EnvmapConfig, {"directions": 0}, "EnvmapConfig: directions must be at least 1"),
-        (EnvmapConfig, {"directions_eval": 0}, "EnvmapConfig: directions_eval must be at least 1"),
-        (EnvmapSGConfig, {"lobes": 0}, "EnvmapSGConfig: lobes must be at least 1"),
-        (EnvmapSGConfig, {"rows": 0}, "EnvmapSGConfig: rows must be at least 1"),
-        (EnvmapSGConfig, {"directions": 0}, "EnvmapSGConfig: directions must be at least 1"),
-        (
-            EnvmapSGConfig,
-            {"directions_eval": 0},
-            "EnvmapSGConfig: directions_eval must be at least 1",
-        ),
-        (EnvmapSGConfig, {"max_sharpness": 0.0}, "EnvmapSGConfig: max_sharpness must be above 0"),
-    ],
-)
-def test_bad_config(kind, change, message):
-    with pytest.raises(ValueError, match=message):
-        kind(**change)

@@ -134,11 +134,3 @@ def test_one_light_for_all_has_no_views():
     assert scene.coded(features) is features
     with pytest.raises(ValueError, match="light_of: all views of this run have one light"):
         scene.show_light_of("left")
-
-
-def test_settings_of_what_varies():
-    cfg = sphere_scene(0).cfg
-    with pytest.raises(ValueError, match="varying must be none, exposure or light, got 'all'"):
-        replace(cfg, varying="all")
-    with pytest.raises(ValueError, match="codes must be at least 1, got 0"):
-        replace(cfg, codes=0)

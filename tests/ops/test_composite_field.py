@@ -1,4 +1,4 @@
-"""A field composited along rays: against the ops it stands for, sparse gradients, bad input."""
+"""A field composited along rays: against the ops it stands for."""
 
 from dataclasses import replace
 
@@ -8,8 +8,7 @@ from bricks import cut
 from check_op import check_op
 
 from univoxel import ops
-from univoxel.ops import composite_field, composite_field_reference, use_backend
-from univoxel.ops.composite_field import _composite_field
+from univoxel.ops import composite_field, composite_field_reference
 from univoxel.records import Samples
 
 SHAPE, ORIGIN, H = (7, 8, 9), [0.125, -0.25, 0.375], 0.25
@@ -130,30 +129,6 @@ def test_it_is_the_chain_of_the_ops(hashed):
     )
 
 
-@pytest.mark.parametrize("kind", ["dense", "bricks"])
-@pytest.mark.parametrize("hashed", [False, True])
-def test_sparse_gradients_and_threads(kind, hashed):
-    """The same numbers; the same bits on any number of threads, in more than one chunk."""
-    leaves, samples, options = case(kind, hashed, rays=700)
-    found = []
-    threads = torch.get_num_threads()
-    for sparse, count in ((False, 1), (True, 1), (True, 2), (True, 3)):
-        torch.set_num_threads(count)
-        got = composite_field(
-            *leaves, samples, ORIGIN, H, INV_S, min_share=0.1, sparse_grad=sparse, **options
-        )
-        pull = torch.Generator().manual_seed(1)
-        loss = sum((x * torch.randn(x.shape, generator=pull)).sum() for x in got)
-        grads = torch.autograd.grad(loss, leaves)
-        assert [g.is_sparse for g in grads] == [sparse, sparse, False, False]
-        found.append([x.detach() for x in got] + [g.to_dense() for g in grads])
-    torch.set_num_threads(threads)
-    for a, b, c, d in zip(*found, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)  # sums in another order
-        assert torch.equal(b, c)
-        assert torch.equal(b, d)
-
-
 def test_light_samples_lend_only_their_distance():
     """Features of a sample below the share do not matter; those of the heaviest do."""
     leaves, samples, options = case("dense", hashed=True)
@@ -188,79 +163,6 @@ def test_rays_that_are_nowhere():
     assert all(x[good].isfinite().all() for x in got)
     grad, _ = torch.autograd.grad(got.features[good].sum(), leaves[:2])
     assert grad.isfinite().all()
-
-
-def test_opcheck():
-    for kind, hashed in (("dense", False), ("bricks", True)):
-        leaves, samples, options = case(kind, hashed)
-        table = options["bricks"].table if kind == "bricks" else torch.empty(0, 0, 0).int()
-        corners = LEVELS if hashed else ([], [], [])
-        torch.library.opcheck(
-            _composite_field.defined,
-            (*leaves[:2], table, *leaves[2:], samples.t, samples.connected, samples.offsets,
-             list(SHAPE), ORIGIN, H, *corners, INV_S, 0.1, False),
-        )  # fmt: skip
-
-
-def test_whole_graph_compiles():
-    leaves, samples, options = case("dense", hashed=True)
-
-    @torch.compile(fullgraph=True)
-    def loss(*leaves):
-        return (
-            composite_field(*leaves, samples, ORIGIN, H, INV_S, **options).features.square().sum()
-        )
-
-    got = torch.autograd.grad(loss(*leaves), leaves[:2])
-    wanted = torch.autograd.grad(
-        composite_field_reference(*leaves, samples, ORIGIN, H, INV_S, **options)[:, 5:]
-        .square()
-        .sum(),
-        leaves[:2],
-    )
-    torch.testing.assert_close(got, wanted)
-
-
-def test_reference_backend_gives_sparse_gradients_too():
-    leaves, samples, options = case("dense", hashed=True)
-    with use_backend("reference"):
-        got = composite_field(*leaves, samples, ORIGIN, H, INV_S, sparse_grad=True, **options)
-        grads = torch.autograd.grad(got.features.sum(), leaves[:2])
-    assert all(g.is_sparse for g in grads)
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"sdf": torch.rand(3, 3)}, ValueError, r"sdf must be \[X, Y, Z\]"),
-        (
-            {"sdf": torch.rand(0, 8, 9), "features": torch.rand(0, 8, 9, 2)},
-            ValueError,
-            "have nodes",
-        ),
-        ({"features": torch.rand(7, 8, 2)}, ValueError, r"features must be \[X, Y, Z, C\]"),
-        ({"direction": torch.rand(5, 3)}, ValueError, r"direction must be \[N, 3\] .* N=6"),
-        ({"inv_s": 0.0}, ValueError, "inv_s must be positive and finite, got 0.0"),
-        ({"min_share": 1.0}, ValueError, r"min_share must be in \[0, 1\), got 1.0"),
-        ({"voxel_size": -1.0}, ValueError, "voxel_size must be above 0"),
-        ({"levels": LEVELS}, ValueError, r"features must be \[T, F\]"),
-        ({"levels": LEVELS, "features": torch.rand(6, 2)}, ValueError, "power of two rows"),
-        ({"origin": [0.0] * 6}, TypeError, "origin must be a tensor, got list"),
-    ],
-)
-def test_bad_arguments(change, error, message):
-    leaves, samples, _ = case("dense")
-    leaves = [x.detach().float() for x in leaves]
-    arguments = dict(zip(("sdf", "features", "origin", "direction"), leaves, strict=True))
-    arguments |= {
-        "samples": replace(samples, t=samples.t.float()),
-        "grid_origin": ORIGIN,
-        "voxel_size": H,
-        "inv_s": INV_S,
-    }
-    composite_field(**arguments)
-    with pytest.raises(error, match=message):
-        composite_field(**(arguments | change))
 
 
 @pytest.mark.parametrize(

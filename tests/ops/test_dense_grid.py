@@ -1,12 +1,10 @@
-"""Sampling of a dense grid: native against reference, definitions, sparse gradients, bad input."""
+"""Sampling of a dense grid: native against reference, definitions."""
 
 import pytest
 import torch
 from check_op import check_op
 
-from univoxel.ops import sample_dense, sample_dense_reference, use_backend
-from univoxel.ops.dense_grid import _sample_dense
-from univoxel.ops.grid_sampling import no_table
+from univoxel.ops import sample_dense, sample_dense_reference
 
 ORIGIN = [0.125, -0.25, 0.375]
 H = 0.25
@@ -119,44 +117,6 @@ def test_derivative_to_a_clamped_axis_is_zero():
     assert grad[0, 2] == 0
 
 
-@pytest.mark.parametrize("backend", ["native", "reference"])
-@pytest.mark.parametrize("sparse", [False, True])
-def test_nan_and_infinite_points(backend, sparse):
-    sdf, features, points, *place = case((9, 20, 4), m=50)
-    with torch.no_grad():
-        points[3, 1], points[7] = torch.nan, torch.nan
-        points[9, 0], points[11] = torch.inf, -torch.inf
-    with use_backend(backend):
-        outputs = sample_dense(sdf, features, points, *place)
-        grads = grads_of(sample_dense, (sdf, features, points, *place), sparse_grad=sparse)
-    lost = torch.zeros(50, dtype=torch.bool)
-    lost[[3, 7]] = True
-    for o in outputs:
-        assert torch.equal(o.reshape(50, -1).isnan().any(1), lost)
-        assert torch.equal(o.reshape(50, -1).isnan().all(1), lost)
-    assert torch.equal(outputs[0][11], sdf[0, 0, 0])
-    assert all(g.to_dense().isfinite().all() for g in grads)
-    assert not grads[2][[3, 7, 11]].any()
-
-
-@pytest.mark.parametrize("backend", ["native", "reference"])
-def test_sparse_gradient_is_the_dense_one(backend):
-    arguments = case((20, 11, 70), channels=4, m=30)
-    with use_backend(backend):
-        dense = grads_of(sample_dense, arguments)
-        sparse = grads_of(sample_dense, arguments, sparse_grad=True)
-    for g, d, dims in zip(sparse[:2], dense[:2], (0, 1), strict=True):
-        assert g.is_sparse
-        assert g.is_coalesced()
-        assert (g.sparse_dim(), g.dense_dim()) == (3, dims)
-        checked = torch.sparse_coo_tensor(g.indices(), g.values(), g.shape, check_invariants=True)
-        assert torch.equal(checked.coalesce().indices(), g.indices()), "rows double or unsorted"
-        assert torch.equal(g.to_dense(), d)
-        assert g._nnz() < d[..., 0].numel() / 2 if dims else d.numel() / 2
-    assert torch.equal(sparse[2], dense[2])
-    assert sparse[0]._nnz() > sparse[1]._nnz()
-
-
 def test_sparse_rows_are_the_touched_ones():
     """One point in the middle: 8 rows of features, 32 of the sdf, none of the far grid."""
     sdf, features = case((30, 30, 30))[:2]
@@ -171,116 +131,9 @@ def test_sparse_rows_are_the_touched_ones():
     ]
 
 
-@pytest.mark.parametrize("needed", range(3))
-def test_gradient_of_one_argument(needed):
-    arguments = case(needs=[i == needed for i in range(3)])
-    (wanted,) = grads_of(sample_dense_reference, arguments)
-    for sparse in (False, True):
-        (got,) = grads_of(sample_dense, arguments, sparse_grad=sparse)
-        assert got.is_sparse is (sparse and needed < 2)
-        torch.testing.assert_close(got.to_dense(), wanted)
-
-
-def test_sparse_gradients_accumulate():
-    sdf, features, points, *place = case()
-    for _ in range(2):
-        sum(o.sum() for o in sample_dense(sdf, features, points, *place, True)).backward()
-    once = torch.autograd.grad(
-        sum(o.sum() for o in sample_dense(sdf, features, points, *place)), [sdf, features]
-    )
-    torch.testing.assert_close(sdf.grad.to_dense(), 2 * once[0])
-    torch.testing.assert_close(features.grad.to_dense(), 2 * once[1])
-
-
 def test_far_origin_keeps_the_fraction_of_a_float32_point():
     sdf, features, points, *_ = case((6, 6, 6), needs=(False, False, False))
     far = (points.float() + 100).double()
     value = sample_dense(sdf.float(), features.float(), far.float(), [100.0] * 3, H)[0]
     expected = sample_dense_reference(sdf, features, far, [100.0] * 3, H)[0]
     torch.testing.assert_close(value.double(), expected, rtol=1e-5, atol=1e-6)
-
-
-def test_opcheck():
-    sdf, features, points, *place = case((4, 4, 4))
-    place = (list(sdf.shape), *place, False)
-    torch.library.opcheck(_sample_dense.defined, (sdf, features, no_table(sdf), points, *place))
-    tensors = [t.detach() for t in (sdf, features, no_table(sdf), points)]
-    *pulls, order = _sample_dense(*tensors, *place)
-    for needs in ([True, True, True], [True, False, False]):
-        torch.library.opcheck(
-            _sample_dense.backward.defined, (*tensors, order, *pulls, *place, needs)
-        )
-
-
-def test_whole_graph_compiles():
-    arguments = case((4, 4, 4), needs=(True, True, False))
-
-    @torch.compile(fullgraph=True)
-    def loss(sdf, features):
-        return sum(o.square().sum() for o in sample_dense(sdf, features, *arguments[2:]))
-
-    loss(*arguments[:2]).backward()
-    expected = sum(o.square().sum() for o in sample_dense_reference(*arguments))
-    wanted = torch.autograd.grad(expected, arguments[:2])
-    torch.testing.assert_close([a.grad for a in arguments[:2]], list(wanted))
-
-
-def test_strided_inputs():
-    sdf, features, points, *place = case()
-    strided = [t.detach().mT.contiguous().mT for t in (sdf, features, points)]
-    assert not any(t.is_contiguous() for t in strided)
-    torch.testing.assert_close(
-        sample_dense(*strided, *place), sample_dense(sdf, features, points, *place)
-    )
-
-
-def test_second_order_raises():
-    sdf, features, points, *place = case()
-    value, gradient, _ = sample_dense(sdf, features, points, *place)
-    (first,) = torch.autograd.grad(value.sum() + gradient.square().sum(), points, create_graph=True)
-    with pytest.raises(RuntimeError, match=r"differentiate twice"):
-        first.sum().backward()
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"sdf": [0.5]}, TypeError, "sdf must be a tensor, got list"),
-        ({"sdf": torch.rand(4, 5)}, ValueError, r"sdf must be \[X, Y, Z\]"),
-        ({"features": torch.rand(4, 5, 5, 2)}, ValueError, r"features must be .* Z=6"),
-        ({"points": torch.rand(7, 2)}, ValueError, r"points must be \[M, 3\]"),
-        ({"points": torch.rand(7, 3).double()}, ValueError, "points must be .* float32"),
-        ({"points": torch.rand(7, 3, device="meta")}, ValueError, "points must be .* on cpu"),
-        (
-            {"sdf": torch.rand(4, 0, 6), "features": torch.rand(4, 0, 6, 2)},
-            ValueError,
-            r"sdf must have nodes, got \[4, 0, 6\]",
-        ),
-        ({"origin": (0.0, 1.0)}, ValueError, "origin must be 3 finite numbers, got"),
-        ({"origin": (0.0, 1.0, float("nan"))}, ValueError, "origin must be 3 finite numbers"),
-        ({"voxel_size": 0.0}, ValueError, "voxel_size must be above 0, got 0.0"),
-        ({"voxel_size": float("inf")}, ValueError, "voxel_size must be above 0, got inf"),
-    ],
-)
-def test_bad_arguments(change, error, message):
-    arguments = {
-        "sdf": torch.rand(4, 5, 6),
-        "features": torch.rand(4, 5, 6, 2),
-        "points": torch.rand(7, 3),
-        "origin": (0.0, 0.0, 0.0),
-        "voxel_size": 0.5,
-    }
-    sample_dense(**arguments)
-    with pytest.raises(error, match=message):
-        sample_dense(**(arguments | change))
-
-
-def test_too_many_points():
-    with pytest.raises(ValueError, match=r"points must be fewer than 2\^31"):
-        sample_dense(
-            torch.rand(2, 2, 2),
-            torch.rand(2, 2, 2, 1),
-            torch.rand(1, 3).expand(2**31, 3),
-            (0, 0, 0),
-            1,
-        )

@@ -1,11 +1,11 @@
-"""Hash encoding: native against reference, definitions, sparse gradients, bad input."""
+"""Hash encoding: native against reference, definitions."""
 
 import pytest
 import torch
 from check_op import check_op
 
 from univoxel.ops import encode_hash, encode_hash_reference, use_backend
-from univoxel.ops.hash_grid import _encode_hash, lattice_sizes, rows_read
+from univoxel.ops.hash_grid import lattice_sizes, rows_read
 
 LOWER, UPPER = [0.125, -0.25, 0.375], [1.125, 0.5, 1.875]
 
@@ -88,33 +88,6 @@ def test_hash_of_a_node():
     assert encode_hash(table, point, [0] * 3, [9] * 3, [1.0]).item() == row
 
 
-@pytest.mark.parametrize("backend", ["native", "reference"])
-def test_sparse_gradient_is_the_dense_one(backend):
-    arguments = case((0.5, 0.05), rows=4096, m=20)
-    with use_backend(backend):
-        dense, sparse = grads_of(arguments), grads_of(arguments, sparse_grad=True)
-    g = sparse[0]
-    assert g.is_sparse
-    assert g.is_coalesced()
-    assert (g.sparse_dim(), g.dense_dim()) == (1, 1)
-    rows = g.indices()[0]
-    assert (rows[1:] > rows[:-1]).all()
-    assert g._nnz() <= 2 * 8 * 20
-    assert torch.equal(g.to_dense(), dense[0])
-    assert torch.equal(sparse[1], dense[1])
-
-
-@pytest.mark.parametrize("needed", range(2))
-def test_gradient_of_one_argument(needed):
-    arguments = case(needs=[i == needed for i in range(2)])
-    with use_backend("reference"):
-        (wanted,) = grads_of(arguments)
-    for sparse in (False, True):
-        (got,) = grads_of(arguments, sparse_grad=sparse)
-        assert got.is_sparse is (sparse and needed == 0)
-        torch.testing.assert_close(got.to_dense(), wanted)
-
-
 @pytest.mark.parametrize(
     ("backend", "felt"),
     [("native", 0), *((b, n) for b in ("native", "reference") for n in (1, 2, 5))],
@@ -137,48 +110,6 @@ def test_only_the_levels_that_are_felt_move_points(backend, felt):
 
 
 @pytest.mark.parametrize("backend", ["native", "reference"])
-@pytest.mark.parametrize("sparse", [False, True])
-def test_nan_and_infinite_points(backend, sparse):
-    arguments = case(m=12)
-    with torch.no_grad():
-        arguments[1][3, 1], arguments[1][7] = torch.nan, torch.nan
-        arguments[1][9, 0], arguments[1][11] = torch.inf, -torch.inf
-    with use_backend(backend):
-        out = encode_hash(*arguments)
-        table, points = grads_of(arguments, sparse_grad=sparse)
-    lost = torch.zeros(12, dtype=torch.bool)
-    lost[[3, 7]] = True
-    assert torch.equal(out.isnan().all(1), lost)
-    assert torch.equal(out.isnan().any(1), lost)
-    assert table.to_dense().isfinite().all()
-    assert points.isfinite().all()
-    assert not points[[3, 7, 11]].any()
-
-
-def test_opcheck():
-    arguments = case((0.5,), rows=8, m=5)
-    torch.library.opcheck(_encode_hash.defined, (*arguments, False, 1))
-    table, points = (a.detach() for a in arguments[:2])
-    pull = _encode_hash(table, points, *arguments[2:], False, 1)
-    for needs in ([True, True], [False, True]):
-        torch.library.opcheck(
-            _encode_hash.backward.defined, (table, points, pull, *arguments[2:], False, 1, needs)
-        )
-
-
-def test_whole_graph_compiles():
-    arguments = case(needs=(True, False))
-
-    @torch.compile(fullgraph=True)
-    def loss(table):
-        return encode_hash(table, *arguments[1:]).square().sum()
-
-    loss(arguments[0]).backward()
-    wanted = torch.autograd.grad(encode_hash_reference(*arguments).square().sum(), arguments[0])
-    torch.testing.assert_close(arguments[0].grad, wanted[0])
-
-
-@pytest.mark.parametrize("backend", ["native", "reference"])
 def test_rows_read_are_those_that_get_a_gradient(backend):
     arguments = case((0.5, 0.05), rows=4096, m=40)
     points = arguments[1].detach()
@@ -198,40 +129,3 @@ def test_rows_read_are_those_that_get_a_gradient(backend):
     assert (none.dtype, len(none)) == (torch.int64, 0)
     with pytest.raises(ValueError, match="rows_read: lower must be at most upper"):
         rows_read(arguments[0], points, [9.0] * 3, [0.0] * 3, [0.5])
-
-
-def test_second_order_raises():
-    arguments = case()
-    out = encode_hash(*arguments)
-    (first,) = torch.autograd.grad(out.square().sum(), arguments[1], create_graph=True)
-    with pytest.raises(RuntimeError, match=r"differentiate twice"):
-        first.sum().backward()
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"table": [0.5]}, TypeError, "table must be a tensor, got list"),
-        ({"table": torch.rand(63, 2)}, ValueError, "power of two rows for each of 2 levels"),
-        ({"table": torch.rand(24, 2)}, ValueError, "power of two rows .* got 24 in all"),
-        ({"table": torch.rand(0, 2)}, ValueError, "power of two rows .* got 0 in all"),
-        ({"points": torch.rand(7, 2)}, ValueError, r"points must be \[M, 3\]"),
-        ({"points": torch.rand(7, 3).double()}, ValueError, "points must be .* float32"),
-        ({"lower": (0.0, 1.0)}, ValueError, "lower must be 3 finite numbers"),
-        ({"upper": (0.0, 1.0, float("nan"))}, ValueError, "upper must be 3 finite numbers"),
-        ({"lower": (9.0, 0.0, 0.0)}, ValueError, "lower must be at most upper"),
-        ({"voxel_sizes": ()}, ValueError, "voxel_sizes must be numbers above 0, at least one"),
-        ({"voxel_sizes": (0.5, 0.0)}, ValueError, "voxel_sizes must be numbers above 0"),
-        ({"felt": -1}, ValueError, "felt must be at least 0, got -1"),
-    ],
-)
-def test_bad_arguments(change, error, message):
-    arguments = {
-        "table": torch.rand(64, 2),
-        "points": torch.rand(7, 3),
-        "lower": LOWER,
-        "upper": UPPER,
-        "voxel_sizes": (0.5, 0.2),
-    }
-    with pytest.raises(error, match=message):
-        encode_hash(**(arguments | change))

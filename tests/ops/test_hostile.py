@@ -11,114 +11,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from op_cases import CASES, DIFFERENTIABLE, flat, fresh, function, results
 
-from univoxel import ops, sphere
+from univoxel import ops
 from univoxel.ops import native
 
 pytestmark = pytest.mark.skipif(native.core is None, reason="without the extension")
-N = 400
-
-
-def numbers(*shape, seed=0):
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
-
-
-def units(*shape, seed=0):
-    return torch.nn.functional.normalize(numbers(*shape, 3, seed=seed) - 0.5, dim=-1)
-
-
-def composite(alpha, value):
-    return ops.composite(alpha, value, torch.arange(0, N + 1, 4))
-
-
-def mlp(x, w0, w1):
-    return ops.mlp(x, [w0, w1], [torch.zeros(8), torch.zeros(3)])
-
-
-def shade_radiance(radiance, n, wo, albedo, f0):
-    roughness, wi = torch.full((N,), 0.4), sphere.fibonacci_sphere(16)
-    return ops.shade_radiance(radiance, n, wo.detach(), albedo, roughness, wi, 0.8, f0)
-
-
-def sample_dense(values, points):
-    return ops.sample_dense(values[..., 0], values[..., 1:], points, (-1.0,) * 3, 0.25)
-
-
-CASES = {
-    composite: [numbers(N), numbers(N, 5)],
-    mlp: [numbers(N, 6), numbers(8, 6), numbers(3, 8)],
-    shade_radiance: [numbers(N, 16, 3), units(N), units(N, seed=1), numbers(N, 3), numbers(N, 3)],
-    sample_dense: [numbers(9, 9, 9, 4), 2 * numbers(N, 3) - 1],
-}
-
-
-def flat(out):
-    return [out] if isinstance(out, torch.Tensor) else [o for o in out if o is not None]
-
-
-def results(op, arguments):
-    """Outputs and gradients."""
-    leaves = [a.detach().requires_grad_() for a in arguments]
-    out = flat(op(*leaves))
-    total = sum((o * torch.cos(torch.arange(o.numel())).view(o.shape)).sum() for o in out)
-    grads = torch.autograd.grad(total, leaves, allow_unused=True)
-    return [o.detach() for o in out] + [g for g in grads if g is not None]
-
-
-def scattered(tensor):
-    """The same numbers in a larger storage, behind an offset, with strides of their own."""
-    room = torch.full((*(2 * n + 3 for n in reversed(tensor.shape)),), torch.nan)
-    view = room[tuple(slice(3, None, 2) for _ in tensor.shape)].permute(*range(tensor.dim()))
-    view = view.permute(*reversed(range(tensor.dim())))
-    return view.copy_(tensor)
-
-
-@pytest.mark.parametrize("op", CASES, ids=lambda op: op.__name__)
-def test_strides_and_offsets_of_storage(op):
-    wanted = results(op, CASES[op])
-    given = [scattered(a) for a in CASES[op]]
-    assert not any(a.is_contiguous() for a in given)
-    for a, b in zip(results(op, given), wanted, strict=True):
-        assert torch.equal(a, b)
-
-
-@pytest.mark.parametrize("op", CASES, ids=lambda op: op.__name__)
-@pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.complex64])
-def test_dtypes_that_are_no_numbers_of_ours(op, dtype):
-    for i, argument in enumerate(CASES[op]):
-        given = [*CASES[op][:i], argument.to(dtype), *CASES[op][i + 1 :]]
-        with pytest.raises((ValueError, TypeError)):
-            op(*given)
-
-
-@pytest.mark.parametrize("op", CASES, ids=lambda op: op.__name__)
-def test_rows_that_are_missing(op):
-    for i, argument in enumerate(CASES[op]):
-        for wrong in (argument[:-1], argument[0], argument[None]):
-            given = [*CASES[op][:i], wrong, *CASES[op][i + 1 :]]
-            if op is sample_dense and wrong.dim() == argument.dim() and wrong.numel():
-                continue  # another grid, or fewer points: as good
-            if op is mlp and i == 0 and wrong.shape == argument[:-1].shape:
-                continue
-            with pytest.raises((ValueError, TypeError, IndexError)):
-                op(*given)
-
-
-@pytest.mark.parametrize(
-    "offsets",
-    [[-4, N], [0, -1, N], [0, N + 1], [0, 2**62, N], [4, N], [0, 8, 4, N], [0], [], [-(2**63), N]],
-)
-def test_offsets_that_lead_elsewhere(offsets):
-    alpha, value = CASES[composite]
-    with pytest.raises(ValueError, match="composite: offsets must"):
-        ops.composite(alpha, value, torch.tensor(offsets, dtype=torch.int64))
-
-
-@pytest.mark.parametrize("row", [-1, 27, 2**40, -(2**63)])
-def test_rows_that_lie_elsewhere(row):
-    grid = numbers(3, 3, 3, 2)
-    with pytest.raises(ValueError, match="rows must lie in"):
-        ops.smooth_rows_(grid, torch.tensor([row]), 0.1, 1)
 
 
 def test_counts_beyond_all_memory():
@@ -128,24 +26,30 @@ def test_counts_beyond_all_memory():
         ops.composite(huge, torch.zeros(1, 1).expand(2**40, 1), torch.tensor([0, 2**40]))
 
 
-@pytest.mark.parametrize("op", CASES, ids=lambda op: op.__name__)
-def test_nan_everywhere_ends(op):
-    for bad in (torch.nan, torch.inf, -torch.inf):
-        out = flat(op(*(torch.full_like(a, bad) for a in CASES[op])))
-        assert all(o.shape[0] for o in out)
+@pytest.mark.parametrize("case", DIFFERENTIABLE)
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+def test_numbers_that_are_none_end(case, bad):
+    arguments, leaves = fresh(case, CASES[case](100))
+    with torch.no_grad():
+        for leaf in leaves:
+            leaf.fill_(bad)
+    for out in flat(function(case)(**arguments)):
+        assert len(out)
 
 
 def test_threads_of_python_at_once():
     """Kernels run without Python's lock; none may share what it works on with another."""
     before = torch.get_num_threads()
+    given = {case: CASES[case](400) for case in DIFFERENTIABLE}
+    work = 8 * list(given.items())
     try:
         torch.set_num_threads(2)
-        wanted = {op: results(op, arguments) for op, arguments in CASES.items()}
+        wanted = {case: results(case, arguments) for case, arguments in given.items()}
         with ThreadPoolExecutor(4) as pool:
-            jobs = [(op, pool.submit(results, op, CASES[op])) for _ in range(8) for op in CASES]
-            for op, job in jobs:
-                for a, b in zip(job.result(timeout=120), wanted[op], strict=True):
-                    assert torch.equal(a, b), op.__name__
+            jobs = [(case, pool.submit(results, case, arguments)) for case, arguments in work]
+            for case, job in jobs:
+                for a, b in zip(job.result(timeout=120), wanted[case], strict=True):
+                    assert torch.equal(a, b), case
     finally:
         torch.set_num_threads(before)
 

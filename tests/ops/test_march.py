@@ -115,21 +115,6 @@ def test_last_sample_of_a_ray_starts_no_section():
     torch.testing.assert_close(gaps, torch.full_like(gaps, voxel))
 
 
-def test_threads_do_not_change_the_bits():
-    sdf, voxel = sphere(dtype=torch.float32)
-    rays = random_rays(1000, torch.float32)
-    before = torch.get_num_threads()
-    results = []
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        results.append(
-            march(sdf, brick_minimum(sdf), *rays, (-1.0,) * 3, voxel, step=voxel, inv_s=30.0)
-        )
-    torch.set_num_threads(before)
-    assert torch.equal(results[0].t, results[1].t)
-    assert torch.equal(results[0].offsets, results[1].offsets)
-
-
 @pytest.mark.parametrize("shape", [(9, 5, 6), (4, 13, 2), (1, 1, 1)])
 def test_brick_minimum(shape):
     sdf = torch.randn(shape)
@@ -154,34 +139,3 @@ def test_rays_that_miss_or_are_not_numbers_have_no_samples():
         inv_s=30.0,
     )
     assert s.offsets.tolist() == [0, 0, 0, 0]
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"sdf": torch.zeros(4, 4)}, r"sdf must be \[X, Y, Z\]"),
-        ({"origin": torch.zeros(3, 2)}, r"origin must be \[N, 3\]"),
-        ({"direction": torch.zeros(4, 3)}, r"direction must be \[N, 3\] .* N=3"),
-        ({"jitter": torch.zeros(3).double()}, "jitter must be .* float32"),
-        ({"brick_min": torch.zeros(3, 3, 3)}, "brick_min does not belong to this sdf"),
-        ({"step": 0.0}, "step must be positive and finite, got 0.0"),
-        ({"inv_s": float("nan")}, "inv_s must be positive"),
-        ({"min_weight": -1.0}, r"min_weight must be in \[0, 1\]"),
-    ],
-)
-def test_bad_arguments(change, message):
-    sdf = torch.ones(5, 5, 5)
-    arguments = {
-        "sdf": sdf,
-        "brick_min": brick_minimum(sdf),
-        "origin": torch.zeros(3, 3),
-        "direction": torch.ones(3, 3),
-        "jitter": torch.zeros(3),
-        "grid_origin": (0.0, 0.0, 0.0),
-        "voxel_size": 0.1,
-        "step": 0.1,
-        "inv_s": 10.0,
-    }
-    march(**arguments)
-    with pytest.raises(ValueError, match=message):
-        march(**(arguments | change))

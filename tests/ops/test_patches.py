@@ -1,14 +1,12 @@
-"""Patches between photographs: native against reference, a plane that is known, bad arguments."""
+"""Patches between photographs: native against reference, a plane that is known."""
 
 import math
 
-import pytest
 import torch
 from check_op import check_op
 
 from univoxel.camera import Cameras, projection_matrices
 from univoxel.ops import patch_correlation, patch_correlation_reference
-from univoxel.ops.patches import _patch_correlation
 
 SIZE, FOCAL = 48, 60.0
 
@@ -86,23 +84,6 @@ def test_halves_are_what_they_hold():
     whole = patch_correlation(picture.double(), *others)
     for got, wanted in zip(patch_correlation(picture, *others), whole, strict=True):
         torch.testing.assert_close(got, wanted, rtol=1e-12, atol=0)
-
-
-def test_opcheck():
-    torch.library.opcheck(_patch_correlation.defined, case())
-
-
-def test_whole_graph_compiles():
-    arguments = case()
-
-    @torch.compile(fullgraph=True)
-    def loss(*arguments):
-        return patch_correlation(*arguments)[0].square().sum()
-
-    leaves = arguments[6:8]
-    wanted = patch_correlation_reference(*arguments)[0].square().sum()
-    got, wanted = (torch.autograd.grad(x, leaves) for x in (loss(*arguments), wanted))
-    torch.testing.assert_close(got, wanted)
 
 
 def textured(known, depth=0.0):
@@ -195,26 +176,3 @@ def test_a_view_that_looks_away_and_a_plane_along_the_ray():
     far = position.detach() * 1e30
     for at in (far, far * math.nan):
         patch_correlation(picture, matrix, origin, direction, own, views, at, normal, noise)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({0: torch.zeros(4, 48)}, r"brightness must be \[V, H, W\]"),
-        ({0: torch.zeros(4, 1, 48, dtype=torch.float64)}, "at least 2 rows and columns"),
-        ({0: torch.zeros(3, 48, 48, dtype=torch.float64)}, r"projection must be \[V, 3, 4\]"),
-        ({4: torch.zeros(5, 24, dtype=torch.float64)}, "square of an odd number of pixels, got 24"),
-        ({4: torch.zeros(5, 16, dtype=torch.float64)}, "square of an odd number of pixels, got 16"),
-        ({5: torch.full((5, 3), 4)}, r"views must lie in \[0, V=4\)"),
-        ({5: torch.full((5, 3), -1)}, r"views must lie in \[0, V=4\)"),
-        ({5: torch.zeros(5, 3)}, "views must be .* int64"),
-        ({6: torch.zeros(4, 3, dtype=torch.float64)}, "must be"),
-        ({7: [0.0, 0.0, 1.0]}, "normal must be a tensor"),
-        ({8: 0.0}, "noise must be above 0, got 0.0"),
-        ({8: math.nan}, "noise must be above 0, got nan"),
-    ],
-)
-def test_bad_arguments(change, message):
-    arguments = [change.get(i, a) for i, a in enumerate(case())]
-    with pytest.raises((TypeError, ValueError), match=message):
-        patch_correlation(*arguments)

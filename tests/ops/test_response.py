@@ -50,17 +50,3 @@ def test_light_times_its_rows_is_what_shading_gives_black_points():
 
 def test_no_points_have_no_rows():
     assert specular_response(*case(count=0)).shape == (0, 96)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (dict(solid_angle=0.0), "solid_angle must be above 0, got 0"),
-        (dict(f0=1.5), r"f0 must be in \[0, 1\], got 1.5"),
-        (dict(roughness=torch.rand(3, dtype=torch.float64)), r"roughness must be \[N\]"),
-    ],
-)
-def test_it_refuses(change, message):
-    names = ("normal", "wo", "roughness", "directions", "solid_angle")
-    with pytest.raises(ValueError, match=message):
-        specular_response(**(dict(zip(names, case(), strict=True)) | change))

@@ -76,16 +76,6 @@ def test_a_sparse_grid_is_smoothed_as_the_dense_one(order, shape, channels):
     assert torch.equal(many[0], many[2])
 
 
-@pytest.mark.parametrize("row", [0, 127, 256, -1])
-def test_rows_of_no_brick(row):
-    _, pool, bricks = cut(torch.linspace(-1, 1, 4)[:, None, None].expand(4, 4, 4), far=1.0)
-    assert len(pool) == 256
-    with pytest.raises(ValueError, match="rows must be of bricks that stand somewhere"):
-        smooth_rows_(pool[:, None], torch.tensor([row]), 0.1, 1, bricks)
-    with pytest.raises(ValueError, match=r"grid must be \[256, C\]"):
-        smooth_rows_(pool[:64, None], torch.tensor([row]), 0.1, 1, bricks)
-
-
 def test_thin_plate_keeps_a_plane_and_lowers_a_bump():
     x = torch.arange(9.0)
     plane = (2 * x[:, None, None] - x[None, :, None] + 0.5 * x).expand(9, 9, 9)[..., None]
@@ -96,29 +86,6 @@ def test_thin_plate_keeps_a_plane_and_lowers_a_bump():
     # L L f at the bump is 1 + 6/36
     change = smooth_rows_(bump.clone(), middle, 0.4, 2)[4, 4, 4, 0] - bump[4, 4, 4, 0]
     assert change.item() == pytest.approx(-0.4 * (1 + 1 / 6), rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"grid": torch.zeros(3, 3, 3)}, r"grid must be \[X, Y, Z, C\]"),
-        ({"rows": torch.zeros(2)}, "rows must be .* int64"),
-        ({"rows": torch.tensor([27])}, r"rows must lie in \[0, 27\)"),
-        ({"amount": 2.0}, r"amount must be in \[0, 1\], got 2.0"),
-        ({"order": 3}, "order must be 1 or 2, got 3"),
-        ({"grid": torch.zeros(3, 3, 3, 4)[..., ::2]}, "grid must be contiguous"),
-    ],
-)
-def test_bad_arguments(change, message):
-    arguments = {
-        "grid": torch.zeros(3, 3, 3, 2),
-        "rows": torch.tensor([0, 5]),
-        "amount": 0.1,
-        "order": 1,
-    }
-    smooth_rows_(**arguments)
-    with pytest.raises(ValueError, match=message):
-        smooth_rows_(**(arguments | change))
 
 
 @pytest.mark.parametrize("shape", [(9, 8, 70), (2, 1, 4)])
@@ -151,39 +118,11 @@ def test_diffusion_in_bricks_equals_that_in_the_dense_grid():
         torch.testing.assert_close(found, dense[order])
 
 
-def test_diffusion_is_the_same_on_any_number_of_threads():
-    rows = torch.arange(3, 20 * 15 * 45)
-    values, threads, found = torch.randn(len(rows)), torch.get_num_threads(), []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            found.append(diffuse_rows_(values.clone(), rows, (20, 15, 45), 0.8, 4))
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(*found)
-
-
 def test_diffusion_of_nothing_and_of_no_pass_changes_nothing():
     none = torch.zeros(0, dtype=torch.int64)
     assert diffuse_rows_(torch.zeros(0), none, (2, 2, 2), 0.5, 2).numel() == 0
     values = torch.randn(2)
     assert torch.equal(diffuse_rows_(values.clone(), torch.tensor([1, 2]), (2, 2, 2), 1, 0), values)
-
-
-@pytest.mark.parametrize(
-    ("rows", "options", "says"),
-    [
-        ([1, 0], {}, "ascend"),
-        ([0, 8], {}, "ascend"),
-        ([0, 1], {"amount": 1.5}, "amount must be in"),
-        ([0, 1], {"passes": -1}, "passes must be at least 0"),
-        ([0, 1], {"size": (2, 2)}, "size must be that of the grid"),
-    ],
-)
-def test_diffusion_refuses(rows, options, says):
-    options = {"size": (2, 2, 2), "amount": 0.5, "passes": 1} | options
-    with pytest.raises(ValueError, match=says):
-        diffuse_rows_(torch.ones(2), torch.tensor(rows), **options)
 
 
 def test_diffusion_refuses_what_does_not_fit_its_memory_or_its_bricks():

@@ -1,4 +1,4 @@
-"""Sampling of a sparse grid: against the dense one it stands for, sparse gradients, bad input."""
+"""Sampling of a sparse grid: against the dense one it stands for."""
 
 from dataclasses import replace
 
@@ -7,8 +7,7 @@ import torch
 from bricks import cut
 from check_op import check_op
 
-from univoxel.ops import sample_dense, sample_sparse, sample_sparse_reference, use_backend
-from univoxel.ops.sparse_grid import _sample_sparse
+from univoxel.ops import sample_dense, sample_sparse, sample_sparse_reference
 from univoxel.records import Bricks
 
 ORIGIN = [0.125, -0.25, 0.375]
@@ -104,23 +103,6 @@ def test_the_same_as_the_dense_grid_it_stands_for(shape):
             assert torch.equal(a, c)
 
 
-@pytest.mark.parametrize("backend", ["native", "reference"])
-def test_sparse_gradient_is_the_dense_one(backend):
-    arguments = case((20, 11, 40), channels=4, m=30)
-    with use_backend(backend):
-        dense = grads_of(sample_sparse, arguments)
-        sparse = grads_of(sample_sparse, arguments, sparse_grad=True)
-    for g, d, dims in zip(sparse[:2], dense[:2], (0, 1), strict=True):
-        assert g.is_sparse
-        assert g.is_coalesced()
-        assert (g.sparse_dim(), g.dense_dim()) == (1, dims)
-        checked = torch.sparse_coo_tensor(g.indices(), g.values(), g.shape, check_invariants=True)
-        assert torch.equal(checked.coalesce().indices(), g.indices()), "rows double or unsorted"
-        torch.testing.assert_close(g.to_dense(), d)
-        assert (g.indices() >= 128).all()
-    assert torch.equal(sparse[2], dense[2])
-
-
 def test_sparse_rows_are_the_touched_ones():
     """One point in the middle: 8 rows of features, 32 of the sdf."""
     _, pool, bricks = cut(torch.linspace(-0.5, 0.5, 30)[:, None, None].expand(30, 30, 30), 1.0)
@@ -145,74 +127,6 @@ def test_a_missing_node_is_far_and_without_features():
     assert value.tolist() == [1.0, -1.0, 1.0]
     assert not gradient[:2].any()
     assert feature[:, 0].tolist() == [0.0, 0.0, 0.75]
-
-
-@pytest.mark.parametrize("backend", ["native", "reference"])
-def test_nan_and_infinite_points(backend):
-    pool, features, bricks, points, *place = case(m=50)
-    with torch.no_grad():
-        points[3, 1], points[7] = torch.nan, torch.nan
-        points[9, 0], points[11] = torch.inf, -torch.inf
-    with use_backend(backend):
-        outputs = sample_sparse(pool, features, bricks, points, *place)
-        grads = grads_of(sample_sparse, (pool, features, bricks, points, *place))
-    for o in outputs:
-        assert o.reshape(50, -1).isnan().all(1).nonzero()[:, 0].tolist() == [3, 7]
-    assert all(g.isfinite().all() for g in grads)
-
-
-@pytest.mark.parametrize("needed", range(3))
-def test_gradient_of_one_argument(needed):
-    arguments = case(needs=[i == needed for i in range(3)])
-    (wanted,) = grads_of(sample_sparse_reference, arguments)
-    for sparse in (False, True):
-        (got,) = grads_of(sample_sparse, arguments, sparse_grad=sparse)
-        torch.testing.assert_close(got.to_dense(), wanted)
-
-
-def test_opcheck():
-    pool, features, bricks, points, *place = case((5, 4, 4))
-    place = (list(bricks.size), *place, False)
-    torch.library.opcheck(_sample_sparse.defined, (pool, features, bricks.table, points, *place))
-    tensors = [t.detach() for t in (pool, features, bricks.table, points)]
-    *pulls, order = _sample_sparse(*tensors, *place)
-    for needs in ([True, True, True], [True, False, False]):
-        torch.library.opcheck(
-            _sample_sparse.backward.defined, (*tensors, order, *pulls, *place, needs)
-        )
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"sdf": [0.5]}, TypeError, "sdf must be a tensor, got list"),
-        ({"sdf": torch.rand(64)}, ValueError, r"sdf must be \[256\]"),
-        ({"features": torch.rand(256)}, ValueError, r"features must be \[256, C\]"),
-        ({"bricks": None}, TypeError, "bricks must be Bricks, got NoneType"),
-        ({"points": torch.rand(7, 2)}, ValueError, r"points must be \[M, 3\]"),
-        ({"points": torch.rand(7, 3).double()}, ValueError, "points must be .* float32"),
-        ({"points": torch.rand(1, 3).expand(2**31, 3)}, ValueError, r"fewer than 2\^31"),
-        ({"origin": (0.0, 1.0)}, ValueError, "origin must be 3 finite numbers, got"),
-        ({"voxel_size": 0.0}, ValueError, "voxel_size must be above 0, got 0.0"),
-        (
-            {"bricks": Bricks(torch.zeros(0, 1, 1).int(), torch.full((4,), -1).int(), (0, 4, 4))},
-            ValueError,
-            r"bricks must have nodes, got size \[0, 4, 4\]",
-        ),
-    ],
-)
-def test_bad_arguments(change, error, message):
-    arguments = {
-        "sdf": torch.rand(256),
-        "features": torch.rand(256, 2),
-        "bricks": BRICKS,
-        "points": torch.rand(7, 3),
-        "origin": (0.0, 0.0, 0.0),
-        "voxel_size": 0.5,
-    }
-    sample_sparse(**arguments)
-    with pytest.raises(error, match=message):
-        sample_sparse(**(arguments | change))
 
 
 BRICKS = Bricks(

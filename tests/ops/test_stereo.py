@@ -7,7 +7,7 @@ import torch
 from analytic import look_at
 
 from univoxel.camera import Cameras, image_rays, project, projection_matrices
-from univoxel.ops import match_cost, native, semi_global, use_backend
+from univoxel.ops import match_cost, semi_global, use_backend
 
 SIZE, VIEWS, STEP, STEPS = 24, 5, 0.1, 7
 TRUE = 3  # the step that the surface lies at
@@ -130,57 +130,6 @@ def test_where_depths_may_not_change_a_line_shares_the_one_that_suits_it_best():
 def test_where_depths_may_change_freely_each_pixel_takes_its_own():
     cost, rows = volume()
     assert torch.equal(semi_global(cost, rows, 0.0, 0.0).argmin(1), cost.argmin(1))
-
-
-@pytest.mark.skipif(native.core is None, reason="without the extension")
-def test_the_same_bits_on_any_number_of_threads():
-    threads, found = torch.get_num_threads(), []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            found.append((match_cost(*case(), STEP, STEPS), semi_global(*volume(), 0.05, 0.2)))
-    finally:
-        torch.set_num_threads(threads)
-    for cost, total in found[1:]:
-        assert torch.equal(cost, found[0][0])
-        assert torch.equal(total, found[0][1])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (dict(best=5), r"best must lie in \[1, 4\], got 5"),
-        (dict(best=0), r"best must lie in \[1, 4\], got 0"),
-        (dict(steps=0), "steps must be at least 1 and radius at least 0, got 0 and 1"),
-        (dict(radius=-1), "got 7 and -1"),
-        (dict(others=torch.tensor([1, 2, 3, VIEWS])), r"others must lie in \[0, 5\)"),
-        (dict(rows=torch.zeros(SIZE, SIZE, dtype=torch.int64)), "rows must name each of the"),
-        (dict(start=torch.zeros(3)), r"start must be \[N\]"),
-        (
-            dict(pictures=torch.zeros(VIEWS, SIZE, SIZE, 3, dtype=torch.uint8)),
-            r"pictures must be \[V, H, W, 4\]",
-        ),
-    ],
-)
-def test_match_cost_refuses(change, message):
-    names = "pictures matrix origin direction start color rows others".split()
-    arguments = dict(zip(names, case(), strict=True)) | dict(step=STEP, steps=STEPS) | change
-    with pytest.raises(ValueError, match=message):
-        match_cost(**arguments)
-
-
-@pytest.mark.parametrize(
-    ("small", "large", "rows", "message"),
-    [
-        (0.2, 0.1, None, "0 <= small <= large, got 0.2 and 0.1"),
-        (-0.1, 0.1, None, "got -0.1 and 0.1"),
-        (0.1, 0.2, torch.full((9, 11), -1), "rows must name each of the"),
-    ],
-)
-def test_semi_global_refuses(small, large, rows, message):
-    cost, known = volume()
-    with pytest.raises(ValueError, match=message):
-        semi_global(cost, known if rows is None else rows, small, large)
 
 
 @pytest.mark.parametrize("backend", ["native", "reference"])

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from asymmetric_scene import lopsided
+from asymmetric_scene import Metals, lamp, lopsided
 from browser import browser, installed, pixels
 
 from univoxel.camera import Cameras
@@ -19,21 +19,12 @@ from univoxel.data.images import write_exr
 from univoxel.page import PageOptions, page_text
 from univoxel.pictures import relighting
 from univoxel.render.pipeline import surface_of_view
-from univoxel.sphere import latlong_directions
 
 pytestmark = pytest.mark.skipif(
     installed() is None, reason="needs a browser, such as Debian's package chromium"
 )
 SIZE = 160
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # of glTF, from +Z up
-
-
-class Metals(torch.nn.Module):
-    """The features are the materials; metal where the albedo is reddest."""
-
-    def forward(self, features):
-        metal = torch.sigmoid(40 * (features[:, 0] - 0.65))
-        return features[:, :3], features[:, 3], metal
 
 
 def looking(azimuth, elevation):
@@ -74,10 +65,7 @@ def scene():
 def folder(tmp_path_factory):
     """A run's folder, with a map beside it: a wide warm light at +X, dim blue all round."""
     folder = tmp_path_factory.mktemp("page")
-    direction = latlong_directions(32)
-    lamp = torch.tensor([math.cos(0.5), 0.0, math.sin(0.5)])
-    power = 6 * ((direction @ lamp - 1) / 0.15).exp()
-    radiance = power[..., None] * torch.tensor([1.0, 0.9, 0.7]) + torch.tensor([0.1, 0.12, 0.2])
+    radiance = lamp().radiance
     write_exr(folder / "lamp.exr", dict(zip("RGB", radiance.unbind(2), strict=True)), half=False)
     return folder
 

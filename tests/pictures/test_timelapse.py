@@ -7,16 +7,15 @@ import pytest
 import torch
 from analytic import write_scene
 from PIL import Image
+from tiny import three_stages
 
 from univoxel import trainer as task
 from univoxel.checkpoint import load_checkpoint, load_scene
-from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.data.images import read_image
 from univoxel.errors import DataError
-from univoxel.lights import EnvmapConfig, SGConfig
+from univoxel.lights import EnvmapConfig
 from univoxel.pictures import timelapse as module
 from univoxel.pictures.timelapse import LABEL, Timelapse
-from univoxel.scene import SceneConfig
 from univoxel.trainer import train
 from univoxel.training import clock as clock_module
 
@@ -24,15 +23,6 @@ from univoxel.training import clock as clock_module
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     return write_scene(tmp_path_factory.mktemp("sphere") / "data", views=8, size=24)
-
-
-def config(data, out, light=None) -> TrainConfig:
-    light = light or SGConfig(lobes=2, hidden=8, directions=16, directions_eval=16)
-    stage = StageConfig(voxels=0.008, iterations=20, share=0.4, rays=128, physical_from=0.5)
-    joint = JointConfig(iterations=8, rounds=2, points=100, newton_points=50, rays=64, tracing=1)
-    refit = dataclasses.replace(stage, iterations=4, refit=True, physical_from=0.0)
-    sizes = SceneConfig(4, material_channels=2, hidden=8, sky_nodes=16, light=light)
-    return TrainConfig(data, out, (stage, joint, refit), minutes=2.0, scene=sizes)
 
 
 @pytest.fixture
@@ -45,14 +35,14 @@ def often(monkeypatch):
     "light", [None, EnvmapConfig(rows=8, directions=8, directions_eval=8)], ids=["local", "traced"]
 )
 def test_training_does_not_notice(data, tmp_path, often, light):
-    plain = load_scene(train(config(data, tmp_path / "plain", light)))
+    plain = load_scene(train(three_stages(data, tmp_path / "plain", light=light)))
     frames = f"{tmp_path}/frames.1/"
-    seen = load_scene(train(config(data, tmp_path / "seen", light), timelapse=frames))
+    seen = load_scene(train(three_stages(data, tmp_path / "seen", light=light), timelapse=frames))
     for name, value in plain.state_dict().items():
         assert torch.equal(value, seen.state_dict()[name]), name
     pictures = sorted((tmp_path / "frames.1").iterdir())
-    assert [p.name for p in pictures] == [f"step_{i:06d}.png" for i in range(1, 20 + 8 + 4 + 1)]
-    assert len({picture.read_bytes() for picture in pictures}) > 20
+    assert [p.name for p in pictures] == [f"step_{i:06d}.png" for i in range(1, 12 + 6 + 4 + 1)]
+    assert len({picture.read_bytes() for picture in pictures}) > 15
     assert read_image(pictures[0]).shape == (24 + LABEL, 3 * 24, 3)
 
 
@@ -72,14 +62,14 @@ def test_frames_do_not_count_as_time(data, tmp_path, monkeypatch, often):
     monkeypatch.setattr(clock_module, "time", clock)
     monkeypatch.setattr(task, "time", clock)
     monkeypatch.setattr(module, "frame", slow)
-    run = train(config(data, tmp_path / "run"), timelapse=tmp_path / "frames")
+    run = train(three_stages(data, tmp_path / "run"), timelapse=tmp_path / "frames")
     assert load_checkpoint(run)[1]["seconds"] == 0.0
     assert load_checkpoint(run)[1]["made"] == [1.0, 1.0, 1.0]
 
 
 def test_a_gif(data, tmp_path, often):
     out = tmp_path / "new" / "film.gif"
-    run = train(config(data, tmp_path / "run"), timelapse=out)
+    run = train(three_stages(data, tmp_path / "run"), timelapse=out)
     with Image.open(out) as image:
         assert image.n_frames > 10
         assert image.info["duration"] == 100
@@ -89,12 +79,12 @@ def test_a_gif(data, tmp_path, often):
 
 def test_frames_come_at_equal_shares_of_the_work(data, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "FRAMES", 4)
-    train(config(data, tmp_path / "run"), timelapse=tmp_path / "frames")
+    train(three_stages(data, tmp_path / "run"), timelapse=tmp_path / "frames")
     assert len(list((tmp_path / "frames").iterdir())) == 4 + 1  # and the last
 
 
 def test_without_test_views_a_training_view_is_shown(data, tmp_path):
-    cfg = config(data, tmp_path / "run")
+    cfg = three_stages(data, tmp_path / "run")
     for name in ("train", "transforms_train.json"):
         (tmp_path / "data").mkdir(exist_ok=True)
         (tmp_path / "data" / name).symlink_to(data / name)
@@ -108,22 +98,22 @@ def test_without_test_views_a_training_view_is_shown(data, tmp_path):
 @pytest.mark.parametrize("name", ["film.avi", "film.GIFF"])
 def test_another_ending(data, tmp_path, name):
     with pytest.raises(ValueError, match=rf"ends in \.gif, \.mp4 or / \(a folder\), got {name}"):
-        train(config(data, tmp_path / "run"), timelapse=name)
+        train(three_stages(data, tmp_path / "run"), timelapse=name)
     assert not (tmp_path / "run").exists()
 
 
 def test_what_is_missing_is_said_before_the_work(data, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ImportError, match="an MP4 needs imageio-ffmpeg"):
-        train(config(data, tmp_path / "run"), timelapse="film.mp4")
+        train(three_stages(data, tmp_path / "run"), timelapse="film.mp4")
     with pytest.raises(DataError, match="transforms_train"):
-        train(config(tmp_path, tmp_path / "run"), timelapse="film.gif")
+        train(three_stages(tmp_path, tmp_path / "run"), timelapse="film.gif")
     assert not (tmp_path / "run").exists()
 
 
 def test_light_that_varies_is_shown(data, tmp_path, often):
     """The radiance head then reads a code of the view beside the features."""
-    cfg = config(data, tmp_path / "run")
+    cfg = three_stages(data, tmp_path / "run")
     cfg = dataclasses.replace(cfg, scene=dataclasses.replace(cfg.scene, varying="light"))
     train(cfg, timelapse=f"{tmp_path}/frames/")
-    assert len(list((tmp_path / "frames").iterdir())) == 20 + 8 + 4
+    assert len(list((tmp_path / "frames").iterdir())) == 12 + 6 + 4

@@ -12,7 +12,7 @@ from browser import browser, installed
 
 from univoxel.page import PageOptions
 from univoxel.render.relight import traced_mesh
-from univoxel.viewer import film
+from univoxel.viewer import film, studio
 from univoxel.viewer.server import serving
 from univoxel.viewer.subject import Subject, mesh_of
 
@@ -26,10 +26,13 @@ LEFT = (slice(100, 400), slice(100, 330))  # of the window, where nothing lies o
 
 @pytest.fixture(scope="module")
 def address():
+    """Pictures at rest are small, and so soon done."""
     scene = lopsided(24**3)
     subject = Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size))
-    with serving(subject, PageOptions(title="Balls"), port=0) as address:
-        yield address
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(studio, "REST_WIDTH", 320)
+        with serving(subject, PageOptions(title="Balls"), port=0) as address:
+            yield address
 
 
 @pytest.fixture(scope="module")

@@ -7,34 +7,25 @@ import types
 from dataclasses import replace
 from itertools import islice
 
+import asymmetric_scene
 import pytest
 import torch
-from asymmetric_scene import lopsided
+from asymmetric_scene import Metals, lopsided
 
 from univoxel.camera import Cameras
 from univoxel.cli.relight import RelightOptions, relight_images
 from univoxel.color import linear_to_srgb
-from univoxel.envmap import EnvMap
 from univoxel.errors import UserError
 from univoxel.metrics import psnr
 from univoxel.ops import Sun
 from univoxel.pictures import relighting
 from univoxel.render.pipeline import surface_of_view
 from univoxel.render.relight import traced_mesh
-from univoxel.sphere import latlong_directions
 from univoxel.viewer import denoise
 from univoxel.viewer.frames import LAYERS, Look, quick_picture, refined_pictures
 from univoxel.viewer.subject import Subject, mesh_of
 
 SIZE = 40
-
-
-class Metals(torch.nn.Module):
-    """The features are the materials; metal where the albedo is reddest."""
-
-    def forward(self, features):
-        metal = torch.sigmoid(40 * (features[:, 0] - 0.65))
-        return features[:, :3], features[:, 3], metal
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +43,7 @@ def subject(scene):
 
 @pytest.fixture(scope="module")
 def lamp():
-    """A wide warm light at +X, dim blue all round."""
-    direction = latlong_directions(32)
-    towards = torch.tensor([math.cos(0.5), 0.0, math.sin(0.5)])
-    power = 6 * ((direction @ towards - 1) / 0.15).exp()
-    radiance = power[..., None] * torch.tensor([1.0, 0.9, 0.7]) + torch.tensor([0.1, 0.12, 0.2])
-    return EnvMap(radiance)
+    return asymmetric_scene.lamp()
 
 
 @pytest.fixture

@@ -11,15 +11,14 @@ import torch
 from analytic import write_scene
 from asymmetric_scene import lopsided
 from browser import browser, installed
+from tiny import three_stages
 
 from univoxel.checkpoint import load_checkpoint, load_scene
 from univoxel.cli import main
-from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.errors import MissingExtra, UserError
-from univoxel.lights import SGConfig
 from univoxel.pictures.timelapse import LABEL
-from univoxel.scene import SceneConfig
+from univoxel.preparation import registration
 from univoxel.trainer import train
 from univoxel.training import progress as progress_module
 from univoxel.training.clock import Clock
@@ -34,16 +33,6 @@ ANY = ("127.0.0.1", 0)
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     return write_scene(tmp_path_factory.mktemp("sphere") / "data", views=8, size=24)
-
-
-def config(data, out, iterations=12, **sizes) -> TrainConfig:
-    light = SGConfig(lobes=2, hidden=8, directions=16, directions_eval=16)
-    stage = StageConfig(voxels=0.008, iterations=iterations, share=0.4, rays=128, physical_from=0.5)
-    joint = JointConfig(iterations=6, rounds=2, points=100, newton_points=50, rays=64, tracing=1)
-    refit = dataclasses.replace(stage, iterations=4, refit=True, physical_from=0.0)
-    options = {"channels": 4, "material_channels": 2, "hidden": 8, "sky_nodes": 16} | sizes
-    scene = SceneConfig(light=light, **options)
-    return TrainConfig(data, out, (stage, joint, refit), minutes=60.0, scene=scene)
 
 
 class Client:
@@ -71,7 +60,7 @@ def looking(monkeypatch):
 
 @pytest.fixture(scope="module")
 def plain(data, tmp_path_factory):
-    return load_scene(train(config(data, tmp_path_factory.mktemp("plain") / "run")))
+    return load_scene(train(three_stages(data, tmp_path_factory.mktemp("plain") / "run")))
 
 
 def assert_same(scene, run):
@@ -80,7 +69,7 @@ def assert_same(scene, run):
 
 
 def test_training_does_not_notice(data, tmp_path, looking, plain):
-    assert_same(plain, train(config(data, tmp_path / "run"), view=ANY))
+    assert_same(plain, train(three_stages(data, tmp_path / "run"), view=ANY))
     assert len(looking.pictures) == 12 + 6 + 4
     picture = looking.pictures[-1]
     assert picture.dtype == np.uint8
@@ -101,7 +90,7 @@ def test_a_view_that_fails_is_told_once_and_training_goes_on(
         raise RuntimeError("no such picture")
 
     monkeypatch.setattr(module, "frame", fail)
-    assert_same(plain, train(config(data, tmp_path / "run"), view=ANY))
+    assert_same(plain, train(three_stages(data, tmp_path / "run"), view=ANY))
     assert looking.pictures == []
     assert caplog.text.count("training goes on") == 1
     assert caplog.text.count("RuntimeError: no such picture") == 1
@@ -110,7 +99,7 @@ def test_a_view_that_fails_is_told_once_and_training_goes_on(
 def test_nothing_is_rendered_where_nobody_looks(data, tmp_path, plain, monkeypatch):
     monkeypatch.setattr(module, "EVERY", 0.0)
     monkeypatch.setattr(module, "frame", lambda *arguments: pytest.fail("rendered"))
-    assert_same(plain, train(config(data, tmp_path / "run"), view=ANY))
+    assert_same(plain, train(three_stages(data, tmp_path / "run"), view=ANY))
 
 
 def test_pictures_are_rare_where_they_are_slow(monkeypatch):
@@ -151,7 +140,9 @@ def test_a_training_is_ended_from_a_browser(data, tmp_path, looking, caplog):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "Spectators", Stops)
-        cfg = dataclasses.replace(config(data, tmp_path / "run", iterations=100_000), minutes=1.0)
+        cfg = dataclasses.replace(
+            three_stages(data, tmp_path / "run", iterations=100_000), minutes=1.0
+        )
         run = train(cfg, view=ANY)
     scene, state = load_checkpoint(run)
     assert state["finished"]
@@ -163,8 +154,9 @@ def test_a_training_is_ended_from_a_browser(data, tmp_path, looking, caplog):
     assert "Result: unfinished, it was stopped: of the planned steps it made" in caplog.text
 
 
-def test_light_that_varies_and_cameras_that_move(data, tmp_path, looking):
-    cfg = config(data, tmp_path / "run", varying="light")
+def test_light_that_varies_and_cameras_that_move(data, tmp_path, looking, monkeypatch):
+    monkeypatch.setattr(registration, "STEPS", 10)
+    cfg = three_stages(data, tmp_path / "run", varying="light")
     train(dataclasses.replace(cfg, cameras="refined"), view=ANY)
     assert len(looking.pictures) == 12 + 6 + 4
 
@@ -176,7 +168,7 @@ def test_the_port_is_taken_which_is_said_before_anything(tmp_path, capfd):
         port = other.getsockname()[1]
         missing = tmp_path / "photographs"
         with pytest.raises(UserError, match=f"^127.0.0.1:{port} is taken"):
-            train(config(missing, tmp_path / "run"), view=("127.0.0.1", port))
+            train(three_stages(missing, tmp_path / "run"), view=("127.0.0.1", port))
         arguments = ["train", str(missing), "--out", str(tmp_path / "run")]
         assert main([*arguments, "--view", "--port", str(port)]) == 2
         said = capfd.readouterr().err
@@ -210,7 +202,7 @@ def test_by_the_command_line(data, tmp_path, capfd, monkeypatch):
 def test_without_viser(data, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
     with pytest.raises(MissingExtra, match=r"univoxel\[view\]"):
-        train(config(data, tmp_path / "run"), view=ANY)
+        train(three_stages(data, tmp_path / "run"), view=ANY)
     assert not (tmp_path / "run").exists()
 
 
@@ -225,7 +217,7 @@ def test_reports_become_curves(data, tmp_path, monkeypatch):
 
     mine = []
     monkeypatch.setattr(module, "Spectators", Told)
-    train(config(data, tmp_path / "run"), view=ANY, on_progress=mine.append)
+    train(three_stages(data, tmp_path / "run"), view=ANY, on_progress=mine.append)
     assert len(mine) == len(seen) > 15
     curves, status, share = seen[-1]
     assert curves.count("<svg") == 2
@@ -253,7 +245,7 @@ def test_in_a_browser(data, tmp_path, monkeypatch):
     """A picture comes, and a click on the button ends the training."""
     monkeypatch.setattr(module, "EVERY", 0.2)
     scene, photos = lopsided(24**3), load_photos(data, "train")
-    cfg = config(data, tmp_path / "run")
+    cfg = three_stages(data, tmp_path / "run")
     clock = Clock(cfg, time.monotonic(), {})
     with watched(*ANY, "run") as spectators, browser() as tab:
         spectators.show(photos)

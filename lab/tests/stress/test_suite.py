@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 import pytest
+from tiny import OPTIONS
 
 from lab.record import Outcome
 from lab.stress import axes, render, suite
@@ -16,16 +17,6 @@ from lab.stress.scenes import Spec
 from univoxel.cli import main
 from univoxel.config import JointConfig
 from univoxel.names import LIGHTS
-
-TINY = (
-    *(f"stages.{i}.{field}" for i in (0, 1, 3) for field in ("voxels=0.004", "rays=64")),
-    *(f"stages.{i}.iterations=2" for i in (0, 2, 3)),
-    *("stages.1.iterations=8", "stages.1.physical_from=0.0"),
-    *("stages.2.rays=64", "stages.2.points=64", "stages.2.newton_points=8"),
-    *("stages.2.newton_steps=1", "scene.sky_nodes=32"),
-    *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
-    *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
-)
 
 
 def test_every_axis_begins_with_its_reference_or_an_easier_level():
@@ -228,7 +219,7 @@ def test_a_small_scene_from_end_to_end(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(suite, "SAMPLES", 1)
     monkeypatch.setattr(render, "VARIANTS", ("scalar_rgb",))  # there everywhere, nothing to compile
     arguments = ["stress", "--out", str(tmp_path), "--quick", "--only", "views"]
-    assert main([*arguments, *(f"--set={c}" for c in TINY)]) == 0
+    assert main([*arguments, *OPTIONS[1:]]) == 0
     assert capfd.readouterr().out.strip().endswith("stress.md")
     record = json.loads((tmp_path / "stress.json").read_text())
     assert record["counts"] == {"trainings": 2, "refused": 0, "not finite": 0, "crashed": 0}
@@ -237,4 +228,4 @@ def test_a_small_scene_from_end_to_end(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(render, "require", lambda: pytest.fail("it rendered again"))
     monkeypatch.setattr(suite.runner, "_train", lambda *_: pytest.fail("it trained again"))
     monkeypatch.setattr(suite.render, "require", lambda: None)
-    assert main([*arguments, *(f"--set={c}" for c in TINY)]) == 0
+    assert main([*arguments, *OPTIONS[1:]]) == 0

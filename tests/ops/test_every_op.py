@@ -1,0 +1,458 @@
+"""What holds for all ops: what they refuse, strides, threads, and what torch asks of an op.
+
+Declarations of sizes are read from the ops themselves, by looking on as a call is checked.
+"""
+
+import dataclasses
+import inspect
+import math
+import re
+import sys
+from typing import Any
+
+import pytest
+import torch
+from op_cases import (
+    CASES,
+    CHANGED,
+    DIFFERENTIABLE,
+    LEVELS,
+    RAYS,
+    flat,
+    fresh,
+    function,
+    projection,
+    results,
+    soup,
+)
+from torch import Tensor
+
+from univoxel import ops
+from univoxel.ops import checks, native
+from univoxel.ops.differentiable import Differentiable
+from univoxel.records import Bricks, Mesh
+
+ANOTHER = {
+    torch.float32: torch.float64,
+    torch.int64: torch.int32,
+    torch.int32: torch.int16,
+    torch.uint8: torch.int16,
+    torch.bool: torch.uint8,
+}
+NAN, INF = math.nan, math.inf
+
+
+def declared(case: str, arguments: dict) -> dict[str, tuple[list[str], torch.dtype | None]]:
+    """Sizes and dtype of each tensor as a call checks them."""
+    found, modules = {}, [m for k, m in sys.modules.items() if k.startswith("univoxel.ops.")]
+
+    def looked_at(op, **named):
+        if op == case.split()[0]:
+            named_sizes = {k: (s.split(), *dtype, None)[:2] for k, (_, s, *dtype) in named.items()}
+            found.update(named_sizes)
+        return checks.check(op, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in modules:
+            if module is not checks and hasattr(module, "check"):
+                patch.setattr(module, "check", looked_at)
+        function(case)(**fresh(case, arguments)[0])
+    return found
+
+
+def of(arguments: dict, name: str) -> Tensor:
+    """The tensor that a declaration names: an argument, one of a list, or the field of a record."""
+    key, _, index = name.partition("[")
+    if key in arguments:
+        return arguments[key][int(index[:-1])] if index else arguments[key]
+    return getattr(arguments[record_with(arguments, name)], name.removeprefix("mesh_"))
+
+
+def record_with(arguments: dict, name: str) -> str:
+    """The argument that has it as a field."""
+    field = name.removeprefix("mesh_")
+    return next(
+        k for k, v in arguments.items() if dataclasses.is_dataclass(v) and hasattr(v, field)
+    )
+
+
+def instead(arguments: dict, name: str, value: Any) -> dict:
+    """The same arguments with another value there."""
+    key, _, index = name.partition("[")
+    if index:
+        several = list(arguments[key])
+        several[int(index[:-1])] = value
+        return arguments | {key: several}
+    if key in arguments:
+        return arguments | {key: value}
+    record = record_with(arguments, name)
+    change = {name.removeprefix("mesh_"): value}
+    return arguments | {record: dataclasses.replace(arguments[record], **change)}
+
+
+def longer(tensor: Tensor, axis: int) -> Tensor:
+    return torch.cat([tensor, tensor.narrow(axis, 0, 1)], axis)
+
+
+def wrong_values(name: str, tensor: Tensor, sizes: list[str], dtype, everything: str):
+    """(fault, value): all that a declaration excludes.
+
+    Args:
+        everything: sizes of all arguments; a letter that stands there once may have any size.
+    """
+    yield "another dtype", tensor.to(ANOTHER[dtype] if dtype else torch.int64)
+    yield "another rank", tensor[None]
+    yield "another rank", tensor[0]
+    if len(everything.split("|")) > 1:
+        yield "another device", tensor.to("meta")
+        if not dtype and len(re.findall("floating", everything)) > 1:
+            yield "another dtype", tensor.double()
+    for axis, word in enumerate(sizes):
+        letter = word.partition("+")[0]
+        if word.isdigit() or len(re.findall(rf"\b{letter}\b", everything)) > 1:
+            yield f"another {word}", longer(tensor, axis)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_tensors_that_do_not_fit_are_refused(case):
+    arguments = CASES[case](6)
+    found, op = declared(case, arguments), case.split()[0]
+    everything = "|".join(f"{' '.join(s)} {d or 'floating'}" for s, d in found.values())
+    for name, (sizes, dtype) in found.items():
+        if name == "mesh_vertices":  # of the scene, checked as that is made
+            continue
+        tensor = of(arguments, name)
+        wanted = rf"{op}: ({re.escape(name)} must be a|f0 must be a number or a) tensor, got list"
+        with pytest.raises(TypeError, match=wanted):
+            function(case)(**instead(arguments, name, tensor.tolist()))
+        for fault, value in wrong_values(name, tensor, sizes, dtype, everything):
+            message = refusal(case, instead(arguments, name, value))
+            assert re.match(f"{op}: .* must .* got ", message), f"{name} of {fault}: {message}"
+
+
+def refusal(case: str, arguments: dict) -> str:
+    try:
+        function(case)(**arguments)
+    except ValueError as error:
+        return str(error)
+    return "taken"
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if hasattr(ops, c) and c != "mlp"])
+def test_sizes_are_checked_as_documented(case):
+    """By the comments of the signature and by the docstring, letter by letter."""
+    op = function(case)
+    found = {name: sizes for name, (sizes, _) in declared(case, CASES[case](6)).items()}
+    parameters = inspect.signature(op).parameters
+    tensors = {name for name, p in parameters.items() if p.annotation == "Tensor"}
+    assert tensors <= {*found}
+    text = inspect.getsource(op)
+    documented = re.findall(r"^    (\w+): Tensor.*,  # \[([^]]+)\]", text, re.MULTILINE)
+    documented += re.findall(r"^ {8}([\w, ]+): \[([^]]+)\]", text, re.MULTILINE)
+    assert tensors <= {name for names, _ in documented for name in names.split(", ")} | {
+        "brick_min"
+    }
+    for names, sizes in documented:
+        for name in tensors & {*names.split(", ")}:
+            if "*" not in sizes:  # levels and their rows are told apart by voxel_sizes
+                assert [re.sub(r"\s", "", word) for word in sizes.split(",")] == found[name], name
+
+
+EMPTY = Bricks(torch.zeros(0, 1, 1).int(), torch.full((4,), -1).int(), (0, 4, 4))
+F0 = [
+    ({"f0": 1.5}, r"f0 must be in \[0, 1\], got 1.5"),
+    ({"f0": NAN}, r"f0 must be in \[0, 1\], got nan"),
+    ({"f0": [0.04]}, "f0 must be a number or a tensor, got list"),
+]
+LIT = [
+    *F0,
+    ({"solid_angle": 0.0}, "solid_angle must be above 0 and finite, got 0.0"),
+    ({"wo": torch.rand(6, 3, requires_grad=True)}, "no gradient to wo"),
+]
+PLACE = [
+    ({"origin": (0.0, 1.0)}, "origin must be 3 finite numbers, got"),
+    ({"origin": (0.0, 1.0, NAN)}, "origin must be 3 finite numbers"),
+    ({"voxel_size": 0.0}, "voxel_size must be above 0, got 0.0"),
+    ({"voxel_size": INF}, "voxel_size must be above 0, got inf"),
+    ({"points": torch.rand(1, 3).expand(2**31, 3)}, r"points must be fewer than 2\^31"),
+]
+# Beside sizes: changes of good arguments, and what the error says
+REFUSED = {
+    "composite": [
+        *(({"offsets": torch.tensor(x)}, "offsets must rise from 0") for x in (
+            *([0, 12, 6, 18], [0, 6, 17], [-4, 18], [0, -1, 18], [0, 19], [0, 2**62, 18]),
+            *([4, 18], [0], [-(2**63), 18]),
+        )),
+        ({"offsets": torch.tensor([], dtype=torch.int64)}, "offsets must be"),
+        ({"early_stop": 1.5}, r"early_stop must be in \[0, 1\], got 1.5"),
+    ],
+    "sample_dense": [
+        *PLACE,
+        ({"sdf": torch.rand(4, 0, 6), "features": torch.rand(4, 0, 6, 2)}, "sdf must have nodes"),
+    ],
+    "sample_sparse": [
+        *PLACE,
+        ({"bricks": None}, "bricks must be Bricks, got NoneType"),
+        (
+            {"bricks": EMPTY, "sdf": torch.rand(256), "features": torch.rand(256, 2)},
+            r"bricks must have nodes, got size \[0, 4, 4\]",
+        ),
+    ],
+    "encode_hash": [
+        ({"table": torch.rand(63, 2)}, "power of two rows for each of 2 levels"),
+        ({"table": torch.rand(24, 2)}, "power of two rows .* got 24 in all"),
+        ({"table": torch.rand(0, 2)}, "power of two rows .* got 0 in all"),
+        ({"lower": (0.0, 1.0)}, "lower must be 3 finite numbers"),
+        ({"upper": (0.0, 1.0, NAN)}, "upper must be 3 finite numbers"),
+        ({"lower": (9.0, 0.0, 0.0)}, "lower must be at most upper"),
+        ({"voxel_sizes": ()}, "voxel_sizes must be numbers above 0, at least one"),
+        ({"voxel_sizes": (0.5, 0.0)}, "voxel_sizes must be numbers above 0"),
+        ({"felt": -1}, "felt must be at least 0, got -1"),
+    ],
+    "composite_field": [
+        ({"sdf": torch.rand(0, 8, 9), "features": torch.rand(0, 8, 9, 2)}, "sdf must have nodes"),
+        ({"inv_s": 0.0}, "inv_s must be positive and finite, got 0.0"),
+        ({"min_share": 1.0}, r"min_share must be in \[0, 1\), got 1.0"),
+        ({"voxel_size": -1.0}, "voxel_size must be above 0"),
+        ({"levels": LEVELS}, r"features must be \[T, F\]"),
+        ({"levels": LEVELS, "features": torch.rand(6, 2)}, "power of two rows"),
+    ],
+    "march": [
+        ({"brick_min": torch.zeros(4, 3, 3)}, "brick_min does not belong to this sdf"),
+        ({"voxel_size": 0.0}, "voxel_size must be positive and finite"),
+        ({"step": 0.0}, "step must be positive and finite, got 0.0"),
+        ({"inv_s": NAN}, "inv_s must be positive"),
+        ({"min_weight": -1.0}, r"min_weight must be in \[0, 1\]"),
+        ({"early_stop": 2.0}, r"early_stop must be in \[0, 1\]"),
+    ],
+    "shade_sg": [*F0, ({"directions": torch.rand(0, 3)}, "at least one direction")],
+    "shade_radiance": [
+        *LIT,
+        ({"directions": torch.rand(0, 3), "radiance": torch.rand(6, 0, 3)}, "at least one direct"),
+    ],
+    "shade_map": [
+        *LIT,
+        ({"visibility": torch.rand(5, 16, requires_grad=True)}, "no gradient to visibility"),
+        ({"indirect": torch.rand(5, 16, 3, requires_grad=True)}, "no gradient to indirect"),
+        ({"visibility": torch.ones(5, 7).byte()}, r"visibility must be \[P, D\] uint8"),
+        ({"indirect": torch.rand(5, 16).half()}, r"indirect must be \[P, D, 3\] float16"),
+        ({"index": torch.tensor([0, 1, 5, 0, 0, 0])}, r"index must lie in \[0, P=5\)"),
+        ({"index": torch.tensor([0, 1, -1, 0, 0, 0])}, r"index must lie in \[0, P=5\)"),
+        (
+            {"directions": torch.rand(0, 3), "map": torch.rand(0, 3),
+             "visibility": torch.rand(5, 0), "indirect": torch.rand(5, 0, 3)},
+            "at least one direction",
+        ),
+    ],
+    "specular_response": [
+        ({"solid_angle": 0.0}, "solid_angle must be above 0, got 0"),
+        ({"f0": 1.5}, r"f0 must be in \[0, 1\], got 1.5"),
+    ],
+    "decode_lobes": [
+        *(({"min_sharpness": x}, "min_sharpness must be at least 0") for x in (-0.1, NAN)),
+        *(({"max_sharpness": x}, "max_sharpness must be above 0") for x in (0.0, INF)),
+    ],
+    "mlp": [
+        ({"biases": [torch.rand(8)]}, "one for each of the layers.* got 2 and 1"),
+        ({"weights": [], "biases": []}, "at least one, got 0 and 0"),
+        (
+            {"x": torch.rand(5, 0), "weights": [torch.rand(2, 0)], "biases": [torch.rand(2)]},
+            "every size must be at least 1, got H0=0",
+        ),
+    ],
+    "patch_correlation": [
+        ({"brightness": torch.zeros(3, 1, 48)}, "at least 2 rows and columns"),
+        ({"brightness": torch.zeros(2, 9, 9).half()}, r"projection must be \[V, 3, 4\]"),
+        ({"own": torch.zeros(6, 24)}, "square of an odd number of pixels, got 24"),
+        ({"own": torch.zeros(6, 16)}, "square of an odd number of pixels, got 16"),
+        ({"views": torch.full((6, 2), 3)}, r"views must lie in \[0, V=3\)"),
+        ({"views": torch.full((6, 2), -1)}, r"views must lie in \[0, V=3\)"),
+        *(({"noise": x}, f"noise must be above 0, got {x}") for x in (0.0, NAN)),
+    ],
+    "match_cost": [
+        *(({"best": x}, rf"best must lie in \[1, 4\], got {x}") for x in (0, 5)),
+        ({"steps": 0}, "steps must be at least 1 and radius at least 0, got 0 and 1"),
+        ({"radius": -1}, "got 7 and -1"),
+        ({"others": torch.tensor([1, 2, 3, 5])}, r"others must lie in \[0, 5\)"),
+        ({"rows": torch.zeros(2, 6, dtype=torch.int64)}, "rows must name each of the"),
+    ],
+    "semi_global": [
+        ({"small": 0.2, "large": 0.1}, "0 <= small <= large, got 0.2 and 0.1"),
+        ({"small": -0.1}, "got -0.1 and 0.2"),
+        ({"rows": torch.full((2, 6), -1)}, "rows must name each of the"),
+    ],
+    "smooth_rows_": [
+        *(({"rows": torch.tensor([x])}, r"rows must lie in \[0, 180\)")
+          for x in (-1, 180, 2**40, -(2**63))),
+        ({"amount": 2.0}, r"amount must be in \[0, 1\], got 2.0"),
+        ({"order": 3}, "order must be 1 or 2, got 3"),
+        ({"grid": torch.zeros(3, 3, 3, 4)[..., ::2]}, "grid must be contiguous"),
+    ],
+    "smooth_rows_ of bricks": [
+        *(({"rows": torch.tensor([x])}, "rows must be of bricks that stand somewhere")
+          for x in (0, 127, 64 * 1000, -1)),
+        ({"grid": torch.zeros(64, 1)}, r"grid must be \[\d+, C\]"),
+    ],
+    "diffuse_rows_": [
+        *(
+            ({"rows": torch.tensor(x), "values": torch.ones(2)}, "ascend")
+            for x in ([1, 0], [0, 180])
+        ),
+        ({"amount": 1.5}, "amount must be in"),
+        ({"passes": -1}, "passes must be at least 0"),
+        ({"size": (2, 2)}, "size must be that of the grid"),
+        ({"values": torch.ones(354)[::2]}, "values must be contiguous"),
+    ],
+    "adam_rows_": [
+        ({"param": torch.zeros(4, 12).T}, "param must be contiguous, got strides"),
+        ({"exp_avg_sq": torch.zeros(4, 12).T}, "exp_avg_sq must be contiguous"),
+        ({"rows": torch.arange(7, 13)}, r"rows must lie in \[0, R=12\)"),
+        ({"rows": torch.arange(-1, 5)}, r"rows must lie in \[0, R=12\)"),
+        ({"lr": -1.0}, "lr must be at least 0, got -1.0"),
+        ({"beta1": 1.0}, r"beta1 must be in \[0, 1\), got 1.0"),
+        ({"beta2": -0.1}, r"beta2 must be in \[0, 1\), got -0.1"),
+        ({"eps": NAN}, "eps must be at least 0, got nan"),
+        ({"step": 0}, "step must be at least 1, got 0"),
+    ],
+    "sum_rows": [
+        ({"rows": [], "values": []}, "at least one"),
+        ({"rows": [torch.tensor([1, 2])]}, "as many lists"),
+        *(({"rows": [torch.tensor(x)], "values": [torch.ones(2, 3)]}, "rows must ascend in")
+          for x in ([5, 5], [5, 4], [-1, 3], [3, 12])),
+        *(({"shape": x}, "shape must be sizes of at least 1") for x in ((), (4, 0))),
+    ],
+}  # fmt: skip
+if RAYS:
+    vertices, faces = soup(6)
+    rays = [
+        ({"t_min": -1.0}, "0 <= t_min <= t_max must hold, got -1.0"),
+        ({"t_min": 2.0, "t_max": 1.0}, "0 <= t_min <= t_max must hold"),
+        ({"t_max": NAN}, "0 <= t_min <= t_max must hold"),
+        ({"origin": torch.rand(6, 3).to("meta"), "direction": torch.rand(6, 3).to("meta")}, "cpu"),
+    ]
+    REFUSED |= {
+        "VisibilityScene": [
+            ({"faces": faces + 1}, "index the 18 vertices, got indices 1 to 18"),
+            ({"faces": faces - 1}, "index the 18 vertices, got indices -1 to 16"),
+            ({"faces": faces.long() + 2**32}, "index the 18 vertices"),
+            ({"vertices": vertices * NAN}, "vertices must be finite, got .*nan.* row 0"),
+            ({"vertices": vertices.to("meta"), "faces": faces.to("meta")}, "must be on the cpu"),
+        ],
+        "occluded": rays,
+        "closest_hit": rays,
+        "relight": [
+            ({"offset": -1.0}, "offset must be finite and at least 0, got -1.0"),
+            ({"offset": NAN}, "offset must be finite"),
+            ({"samples": 0}, "samples must be at least 1, got 0"),
+            ({"bounces": -1}, "bounces must be at least 0, got -1"),
+            ({"first": -1}, "first must be at least 0"),
+            ({"first": 2**31}, r"first \+ samples must be at most 2\^31"),
+            ({"seed": -1}, "seed must be in"),
+            ({"strategy": "best"}, "strategy must be mis, map or brdf, got 'best'"),
+            ({"mesh": Mesh(vertices, faces)}, "bounces need a mesh with"),
+            ({"scene": ops.VisibilityScene(vertices, faces)}, "mesh_normals"),
+        ],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("case", "change", "message"), [(c, *row) for c, rows in REFUSED.items() for row in rows]
+)
+@pytest.mark.skipif(native.core is None, reason="rows and offsets are checked by the kernels")
+def test_values_out_of_range_are_refused(case, change, message):
+    arguments = fresh(case, CASES[case](6))[0] | change
+    with pytest.raises((TypeError, ValueError, NotImplementedError), match=message):
+        function(case)(**arguments)
+
+
+def scattered(tensor: Tensor) -> Tensor:
+    """The same numbers in a larger storage, behind an offset, with strides of their own."""
+    room = tensor.new_full([2 * n + 3 for n in reversed(tensor.shape)], 77)
+    view = room[tuple(slice(3, None, 2) for _ in tensor.shape)]
+    return view.permute(*reversed(range(tensor.dim()))).copy_(tensor)
+
+
+UNFIT = pytest.mark.xfail(reason="its output has the strides of the cost", raises=TypeError)
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=[UNFIT] * (c == "semi_global")) for c in CASES]
+)
+def test_strides_and_offsets_of_storage_change_nothing(case):
+    given = CASES[case](40)
+    moved = {
+        k: scattered(v) if isinstance(v, Tensor) and k not in CHANGED.get(case.split()[0], ())
+        else [scattered(t) for t in v] if isinstance(v, list) else v
+        for k, v in given.items()
+    }  # fmt: skip
+    for a, b in zip(results(case, moved), results(case, given), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.skipif(native.core is None, reason="without the extension")
+@pytest.mark.parametrize("case", CASES)
+def test_the_bits_do_not_depend_on_the_number_of_threads(case):
+    """With more work than one chunk."""
+    before, given, runs = torch.get_num_threads(), CASES[case](3000), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            runs.append(results(case, given))
+    finally:
+        torch.set_num_threads(before)
+    for other in runs[1:]:
+        for a, b in zip(runs[0], other, strict=True):
+            assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("case", DIFFERENTIABLE)
+def test_second_order_raises(case):
+    arguments, leaves = fresh(case, CASES[case](6))
+    out = [o.square() for o in flat(function(case)(**arguments)) if o.requires_grad]
+    first = torch.autograd.grad(projection(out), leaves, create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        sum(g.square().sum() for g in first).backward()
+
+
+@pytest.mark.parametrize("case", DIFFERENTIABLE)
+def test_a_whole_graph_compiles(case):
+    """To kernels of the machine for one of them: what they hold is no op's affair."""
+    arguments, leaves = fresh(case, CASES[case](6))
+
+    def loss():
+        return projection(flat(function(case)(**arguments)))
+
+    torch.compiler.reset()
+    backend = "inductor" if case == "composite" else "aot_eager"
+    got = torch.autograd.grad(torch.compile(loss, fullgraph=True, backend=backend)(), leaves)
+    torch.testing.assert_close(got, torch.autograd.grad(loss(), leaves))
+
+
+@pytest.mark.skipif(native.core is None, reason="without the extension")
+@pytest.mark.parametrize("case", [*DIFFERENTIABLE, "adam_rows_"])
+def test_torch_knows_the_op_in_full(case, monkeypatch):
+    """Schema, sizes without values and gradients of it, and of its backward pass."""
+    called = {}
+    for kind in (native.Operator, Differentiable):
+
+        def recorded(self, *inputs, call=kind.__call__):
+            called[self] = inputs
+            return call(self, *inputs)
+
+        monkeypatch.setattr(kind, "__call__", recorded)
+    arguments, _ = fresh(case, CASES[case](6))
+    function(case)(**arguments)
+    monkeypatch.undo()
+    ((op, inputs),) = called.items()
+    torch.library.opcheck(op.defined, inputs)
+    if isinstance(op, Differentiable) and not op._traced:
+        held, shown = op._held, op._shown
+        saved = [[t.detach() for t in x] if isinstance(x, list) else x.detach()
+                 for x in inputs[: op._tensors]]  # fmt: skip
+        out = op(*saved, *inputs[op._tensors :])
+        out = [out] if isinstance(out, Tensor) else list(out)
+        pulls = [torch.ones_like(o) for o in out[:shown]]
+        asked = [t.requires_grad for t in flat([inputs[i] for i in op._to])]
+        for needs in (asked, [i == 0 for i in range(len(asked))]):
+            given = (*saved, *out[shown : shown + held], *pulls, *inputs[op._tensors :], needs)
+            torch.library.opcheck(op.backward.defined, given)
