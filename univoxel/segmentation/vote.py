@@ -18,9 +18,9 @@ from univoxel.bars import track
 from univoxel.camera import Cameras, looked_at, pixel_rays, project
 from univoxel.errors import UserError
 from univoxel.grid import GridShape, fit_grid
+from univoxel.preparation.gaps import carve_gaps_
 from univoxel.preparation.hull import mask_distances
 from univoxel.segmentation.config import VoteConfig
-from univoxel.segmentation.gaps import carve_gaps_
 
 # Sides of the first grid, in those of what half of the pictures show whole
 ROOM = 1.6
