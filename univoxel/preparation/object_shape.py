@@ -24,6 +24,7 @@ from univoxel.fields.dense import DenseDistances
 from univoxel.grid import GridShape, fit_grid, resample
 from univoxel.ops import VisibilityScene
 from univoxel.preparation.gaps import carve_gaps_
+from univoxel.preparation.hull import votes_needed
 from univoxel.preparation.stereo import DepthMaps, pixels_of, reach
 from univoxel.threads import side_by_side
 
@@ -34,7 +35,7 @@ ROOM = 1.6
 # Share of its largest vote: what may be the object
 AROUND = 0.5
 # Voxels around it that the grid takes in
-MARGIN = 3
+MARGIN = 1
 # Share of the photographs that have to see a place: what few see, few decide on
 SEEN_BY = 0.25
 # Voxels before and behind a depth in which a surface may lie
@@ -71,11 +72,12 @@ class Votes:
     open_masks: Tensor  # of them, the sum of the masks
 
 
-def find_object(masks: Sequence[Tensor], maps: DepthMaps) -> ObjectShape:
+def find_object(masks: Sequence[Tensor], maps: DepthMaps, voxels: int = VOXELS) -> ObjectShape:
     """The object that masks and depth maps agree on.
 
     Args:
         masks: V, [H, W] in [0, 1] of pictures of any size.
+        voxels: along a side of its grid, on average.
 
     Raises:
         UserError: the masks have nothing in common.
@@ -87,13 +89,12 @@ def find_object(masks: Sequence[Tensor], maps: DepthMaps) -> ObjectShape:
     share = share_of(votes(shown, maps, first), len(masks))
     if not float(share.max()):
         raise UserError("the masks of the photographs have nothing in common: check masks, cameras")
-    grid = around(first, share >= AROUND * share.max(), VOXELS**3, 0)
     coarse = around(first, share >= AROUND * share.max(), FIRST_VOXELS**3, 0)
-    threshold = best_threshold(
-        share_of(votes(shown, maps, coarse), len(masks)), shown, maps, coarse
-    )
-    found = votes(shown, maps, grid)
-    inside, surface = evidence(found, threshold, shown, maps, grid)
+    found = votes(shown, maps, coarse)
+    threshold = best_threshold(share_of(found, len(masks)), shown, maps, coarse)
+    likely = largest_part(evidence(found, threshold, shown, maps, coarse)[0]) > 0
+    grid = around(coarse, likely, voxels**3) if likely.any() else coarse
+    inside, surface = evidence(votes(shown, maps, grid), threshold, shown, maps, grid)
     return ObjectShape(grid, largest_part(inside), surface)
 
 
@@ -169,7 +170,7 @@ def best_threshold(
     share: Tensor, masks: Sequence[Tensor], maps: DepthMaps, grid: GridShape
 ) -> float:
     """The share from which on a node belongs to the hull whose silhouettes fit the masks best, in
-    the median of their IoU."""
+    the median of their IoU; low enough that as many masks as `votes_needed` outvote fewer."""
     nodes, values = grid.nodes().reshape(-1, 3), share.reshape(-1)
     agreed = torch.stack(
         side_by_side(
@@ -177,7 +178,8 @@ def best_threshold(
             range(len(masks)),
         )
     )
-    return float(THRESHOLDS[int(agreed.quantile(0.5, 0).argmax())])
+    highest = 1 - (votes_needed(len(masks)) - 0.5) / len(masks)
+    return min(float(THRESHOLDS[int(agreed.quantile(0.5, 0).argmax())]), highest)
 
 
 def overlaps(

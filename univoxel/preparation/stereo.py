@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from univoxel.camera import (
     looked_at,
     project,
     projection_matrices,
-    sizes_of,
+    resize,
     stacked,
 )
 from univoxel.color import linear_to_srgb
@@ -47,6 +47,9 @@ FLAT = 0.05
 MOST = 0.12
 # Differences that a step of one depth, and a larger one, between neighbouring pixels cost
 SLOPE, JUMP = 0.002, 0.02
+# Differences that count as the same, and the share of depths above which a pixel that has the least
+# of them has no texture that could be matched
+SAME, PLAIN = 0.005, 0.15
 # Steps between depths of two views that agree, at most
 AGREE = 1.5
 # Neighbours that have to agree on a depth
@@ -59,7 +62,7 @@ class DepthMaps:
 
     cameras: Cameras  # V, of the small photographs
     distance: Tensor  # [V, H, W] float32 along the rays, world units; NaN outside of the ball
-    known: Tensor  # [V, H, W] bool: neighbouring views agree
+    known: Tensor  # [V, H, W] bool: there is texture, and neighbouring views agree
     step: float  # between depths, world units
 
 
@@ -84,6 +87,7 @@ def depth_maps(photos: Photos) -> DepthMaps:
     step, matrix = 2 * radius / DEPTHS, projection_matrices(cameras)
     compared = views_to_compare(cameras)
     distance = torch.full(pictures.shape[:3], math.nan)
+    textured = torch.zeros(pictures.shape[:3], dtype=torch.bool)
     for view, others in enumerate(compared):
         if not len(others):
             continue
@@ -109,30 +113,31 @@ def depth_maps(photos: Photos) -> DepthMaps:
         )
         depth = start + step * lowest(semi_global(cost, rows, SLOPE, JUMP))
         distance[view, :height, :width][pixels] = depth
-    maps = DepthMaps(cameras, distance, torch.zeros(distance.shape, dtype=torch.bool), step)
-    for view, others in enumerate(compared):
-        maps.known[view] = agreeing(maps, view, others) >= AGREEING
-    return maps
+        alike = (cost < cost.amin(1, keepdim=True) + SAME).float().mean(1)
+        textured[view, :height, :width][pixels] = alike < PLAIN
+    maps = DepthMaps(cameras, distance, textured, step)
+    agreed = [agreeing(maps, view, others) >= AGREEING for view, others in enumerate(compared)]
+    return replace(maps, known=textured & torch.stack(agreed))
 
 
 def small_photographs(photos: Photos) -> tuple[list[Tensor], Cameras]:
-    """Photographs [h, w, 3] in sRGB of at most PIXELS, and their cameras."""
-    cameras = photos.cameras
-    share = min(1.0, PIXELS / max(cameras.width, cameras.height))
+    """Photographs [h, w, 3] in sRGB, and their cameras, as `small_cameras` has them."""
+    cameras = small_cameras(photos.cameras)
 
     def small(view: int) -> Tensor:
         color, _ = photos.stored(view)
         encoded = color.float() / 255 if color.dtype == torch.uint8 else linear_to_srgb(color)
-        height, width = (max(2, round(share * n)) for n in color.shape[:2])
-        return interpolate(encoded.movedim(2, 0)[None], (height, width), mode="area")[0].movedim(
-            0, 2
-        )
+        width, height = cameras.size(view)
+        pixels = interpolate(encoded.movedim(2, 0)[None], (height, width), mode="area")
+        return pixels[0].movedim(0, 2)
 
-    pictures = side_by_side(small, range(len(photos)))
-    sizes = [(p.shape[1], p.shape[0]) for p in pictures]
-    scale = torch.tensor(sizes) / cameras.size_of_each()
-    pose, focal, centre = cameras.camera_to_world, cameras.focal * scale, cameras.centre * scale
-    return pictures, Cameras(pose, focal, centre, *sizes_of(sizes))
+    return side_by_side(small, range(len(photos))), cameras
+
+
+def small_cameras(cameras: Cameras) -> Cameras:
+    """The same views in pictures of at most PIXELS."""
+    share = min(1.0, PIXELS / max(cameras.width, cameras.height))
+    return resize(cameras, max(2, round(share * cameras.width)))
 
 
 def comparable(picture: Tensor) -> Tensor:
