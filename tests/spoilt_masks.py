@@ -1,11 +1,14 @@
 """Masks of an object on a table, and what a network may make of them."""
 
+import math
+
 import torch
 
 from univoxel.camera import Cameras, image_rays
-from univoxel.segmentation.vote import BESIDE, MISSING
+from univoxel.preparation.stereo import DepthMaps
+from univoxel.segmentation.mask_repair import BESIDE, MISSING
 
-__all__ = ["BESIDE", "MISSING", "iou", "kept_table", "lost_part", "true_mask"]
+__all__ = ["BESIDE", "MISSING", "iou", "kept_table", "lost_part", "true_mask", "without_depth"]
 
 BALLS = ((0.0, 0.0, 0.0, 0.4), (0.4, 0.1, 0.1, 0.2))  # centre and radius
 TABLE, EDGE = -0.4, 0.7  # height and radius of a round table
@@ -42,3 +45,10 @@ def iou(found: torch.Tensor, true: torch.Tensor) -> float:
     """Intersection over union."""
     found, true = found >= 0.5, true >= 0.5
     return float((found & true).sum() / (found | true).sum().clamp_min(1))
+
+
+def without_depth(cameras: Cameras) -> DepthMaps:
+    """Depth maps of photographs in which nothing can be matched."""
+    shape = len(cameras), cameras.height, cameras.width
+    known = torch.zeros(shape, dtype=torch.bool)
+    return DepthMaps(cameras, torch.full(shape, math.nan), known, 0.1)

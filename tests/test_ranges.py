@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from univoxel.segmentation.config import VoteConfig
 
 from univoxel import config, scene
 from univoxel.capture.config import CaptureConfig
@@ -24,7 +23,7 @@ STAGE = StageConfig(voxels=1.0, iterations=10, share=1.0)
 TRAIN = TrainConfig(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
 NO_SKY = SceneConfig(sky_nodes=0)
 CLASSES = {
-    *(CaptureConfig, AdviceConfig, VoteConfig, *get_args(LightConfig)),
+    *(CaptureConfig, AdviceConfig, *get_args(LightConfig)),
     *(kind for module in (config, scene) for kind in vars(module).values() if is_dataclass(kind)),
 }
 CONFIGS = {

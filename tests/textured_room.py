@@ -126,6 +126,21 @@ def _band(
     return color.mean((1, 3)), own.reshape(shape).mean((1, 3))
 
 
+def distance(view: View) -> np.ndarray:
+    """Along each pixel's ray to what it shows: [H, W] float32."""
+    row, column = np.mgrid[: view.height, : view.width].reshape(2, -1) + 0.5
+    scale = view.focal * max(view.width, view.height)
+    local = np.stack(
+        [(column - view.width / 2) / scale, (view.height / 2 - row) / scale, -np.ones(len(row))]
+    )
+    direction, origin = view.pose[:, :3] @ local, view.pose[:, 3:]
+    boxes = [_box(*(np.array(x)[:, None] for x in box), origin, direction) for box in BOXES]
+    balls = [_ball(np.array(c)[:, None], r, origin, direction) for c, r in BALLS]
+    near = np.minimum.reduce([*boxes, *balls, _inside(origin, direction)])
+    distance = near * np.linalg.norm(direction, axis=0)
+    return distance.reshape(view.height, view.width).astype(np.float32)
+
+
 def noise(points: np.ndarray) -> np.ndarray:
     """Colours [N, 3] in [0, 1] of points [3, N]."""
     color = np.zeros((points.shape[1], 3), np.float32)

@@ -16,10 +16,8 @@ from univoxel.data import load_photos
 from univoxel.data.shots import read_photo
 from univoxel.errors import DataError, MissingExtra
 from univoxel.segmentation import cutout as task
-from univoxel.segmentation.vote import VoteConfig
 
 VIEWS, SIZE = 16, 40
-SMALL = VoteConfig(voxels=40, first_voxels=20)
 
 
 def write_masks(folder, masks, stems):
@@ -60,7 +58,7 @@ def test_what_is_written_can_be_trained_on(tmp_path, caplog, by_brightness):
         load_photos(data)
     out = tmp_path / "cut"
     caplog.set_level("INFO", "univoxel")
-    assert task.cutout(str(data), str(out), vote=SMALL) == out
+    assert task.cutout(str(data), str(out)) == out
     assert "photographs of 40x40 pixels" in caplog.text
     for split, count in (("train", VIEWS), ("test", 2)):
         cut, source = load_photos(out, split), load_photos(data, split, masks=False)
@@ -87,7 +85,7 @@ def test_linear_photographs_stay_linear(tmp_path):
 def test_a_data_set_without_test_views(tmp_path, by_brightness):
     data = write_scene(tmp_path / "data", VIEWS, SIZE)
     (data / "transforms_test.json").unlink()
-    out = task.cutout(data, tmp_path / "cut", vote=SMALL)
+    out = task.cutout(data, tmp_path / "cut")
     assert sorted(path.name for path in out.iterdir()) == [
         "masks.html",
         "masks.png",
@@ -112,7 +110,7 @@ def test_masks_of_a_folder_are_mended(tmp_path, with_masks, caplog):
     masks[5][SIZE // 2 :] = 1  # what stands below
     folder, out = write_masks(tmp_path / "masks", masks, photos.names), tmp_path / "cut"
     caplog.set_level("INFO", "univoxel")
-    assert task.cutout(data, out, folder, vote=SMALL) == out
+    assert task.cutout(data, out, folder) == out
     told = f"{VIEWS - 2} of {VIEWS} agree with the hull"
     assert told in caplog.text
     assert "1 keep something beside the object (r_5), 1 miss a part (r_2): mended" in caplog.text
@@ -132,7 +130,7 @@ def test_masks_that_are_mostly_wrong_stay(tmp_path, with_masks, caplog):
     data, photos, true = with_masks
     masks = [mask.roll((11 * (v % 3 - 1), 11 * (v % 4 - 1)), (0, 1)) for v, mask in enumerate(true)]
     folder, out = write_masks(tmp_path / "masks", masks, photos.names), tmp_path / "cut"
-    task.cutout(data, out, folder, vote=SMALL)
+    task.cutout(data, out, folder)
     said = [r for r in caplog.records if r.levelno == logging.WARNING]
     assert len(said) == 1
     assert "none is mended" in said[0].getMessage()
@@ -162,7 +160,7 @@ def test_few_masks_stay_as_they_are(tmp_path, caplog):
 
 def test_masks_of_a_network(tmp_path, with_masks, by_brightness):
     data, _, true = with_masks
-    out = task.cutout(data, tmp_path / "cut", vote=SMALL)
+    out = task.cutout(data, tmp_path / "cut")
     cut = load_photos(out)
     assert all(iou(cut.picture(view)[1], true[view]) > 0.95 for view in range(VIEWS))
 
@@ -184,7 +182,7 @@ def test_what_stands_on_a_pattern(tmp_path, with_masks, monkeypatch, caplog):
     caplog.set_level("INFO", "univoxel")
     monkeypatch.setattr(task, "find_ground", lambda photographs, cameras: len(photographs))
     monkeypatch.setattr(task, "ground_mask", lambda ground, photo, cameras, view: true[view])
-    cut = load_photos(task.cutout(data, tmp_path / "cut", "none", vote=SMALL))
+    cut = load_photos(task.cutout(data, tmp_path / "cut", "none"))
     assert "patterned ground" in caplog.text
     assert f"{VIEWS} of {VIEWS} agree with the hull" in caplog.text
     assert all(iou(cut.picture(view)[1], true[view]) > 0.95 for view in range(VIEWS))
@@ -196,5 +194,5 @@ def test_where_no_pattern_is_the_way_out_is_told(tmp_path, with_masks, monkeypat
     monkeypatch.setattr(task, "find_ground", lambda *_: least > VIEWS or None)
     monkeypatch.setattr(task, "PHOTOGRAPHS", least)
     with pytest.raises(DataError, match="expected source=rembg or a folder of masks, got none"):
-        task.cutout(with_masks[0], tmp_path / "cut", "none", vote=SMALL)
+        task.cutout(with_masks[0], tmp_path / "cut", "none")
     assert not (tmp_path / "cut").exists()

@@ -100,6 +100,7 @@ def test_wider_masks_than_are_looked_for_stay(monkeypatch):
 
 def test_of_many_photographs_some_are_looked_at(monkeypatch):
     monkeypatch.setattr(task, "VIEWS", 2)
+    monkeypatch.setattr(task, "PIXELS", 0)
     color, alpha = before(patterned(0, 0.0, 0.4), patterned(1, 0.3, 0.9)), coverage(0)
     alpha[::3] = coverage(3)[::3]  # two of six
     assert found(color, alpha) == 3

@@ -6,28 +6,16 @@ import logging
 import math
 from dataclasses import dataclass
 
-import numpy as np
-import torch
-from scipy import ndimage
 from torch import Tensor
 
-from univoxel import memmap
 from univoxel.camera import Cameras
 from univoxel.data import Photos
 from univoxel.errors import UserError
-from univoxel.grid import fit_grid
 from univoxel.names import CamerasFrom, MasksFrom
-from univoxel.preparation.depth_sweep import surface_depths
-from univoxel.preparation.hull import BOX_NODES, estimate_bounds, visual_hull, votes_needed
+from univoxel.preparation.hull import estimate_bounds, votes_needed
 from univoxel.preparation.matches import Agreement, agreement, find_matches
 from univoxel.preparation.registration import MAX_CONTRADICTION, contradiction
-from univoxel.threads import side_by_side
 
-# Half the width of what a doubted mask lacks or shows too much, in pixels: narrower pieces are
-# its jagged edge
-ROUGH_PIXELS = 1.5
-# The same as a share of a picture's larger side; the larger of both counts
-ROUGH_SHARE = 0.01
 # Pixels of the median match, up to which cameras can be right: those of structure from motion are
 # off by 0.2 to 0.8, those that are off by more are worth refining
 MAX_DISTANCE = 1.0
@@ -136,37 +124,3 @@ def _say(seen: Agreement | None, off: float, believed: bool, refined: bool) -> N
     else:
         then = "cameras are refined" if refined else "see cameras=refined"
     log.info("%s: %s", contradicting, then, extra={"arguments": ("cameras",)})
-
-
-def doubted_pixels(
-    distance: Tensor,
-    cameras: Cameras,
-    belief: Belief,
-    carving: Tensor | None = None,
-) -> Tensor:
-    """Where a mask lacks a part that the others show, or shows what they do not: [V, H, W] bool.
-
-    Nothing can be learned there: the photograph may show the object, or be cut away.
-
-    Args:
-        distance: [V, H, W] from `hull.mask_distances`.
-        carving: the same of masks that the hull is made of, where these are others.
-    """
-    grid = fit_grid(*belief.box, BOX_NODES)
-    silhouettes = distance if carving is None else carving
-    hull = visual_hull(silhouettes, cameras, grid, belief.votes)
-    doubted = memmap.zeros(distance.shape, torch.bool)
-
-    def doubt_(view_and_depth: tuple[int, Tensor]) -> None:
-        view, depth = view_and_depth
-        shown = cameras.cut(view, distance[view] < 0)
-        differs = (shown != cameras.cut(view, depth.isfinite())).numpy()
-        reach = max(ROUGH_PIXELS, ROUGH_SHARE * max(shown.shape))
-        deep = np.asarray(ndimage.distance_transform_edt(np.pad(differs, 1)))[1:-1, 1:-1] > reach
-        if not deep.any():
-            return
-        near = np.asarray(ndimage.distance_transform_edt(~deep)) <= reach + 1
-        cameras.cut(view, doubted[view]).copy_(torch.from_numpy(differs & near))
-
-    side_by_side(doubt_, enumerate(surface_depths(hull, grid, cameras)))
-    return doubted

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from univoxel import memmap
 from univoxel.camera import Cameras, looked_at, project
@@ -16,10 +17,11 @@ from univoxel.threads import side_by_side
 
 # The half of the first box over what the widest view shows at its distance
 FIRST_BOX = 1.2
-# Nodes of the grid that finds the box: a node is a 64th of the box
-BOX_NODES = 64**3
-# Grids in a row, each around what the one before found, and so finer
-BOX_ROUNDS = 2
+# Nodes of the grids that find the box, each around what the one before found, and so finer
+BOX_NODES = (32**3, 48**3)
+# Pixels of the longer side from which on distances to edges are found in pictures half as large: to
+# a quarter of a pixel, in a quarter of the time
+LARGE = 1000
 # Share of the box's diagonal, left free around the hull
 MARGIN = 0.03
 # Nodes at which the hull is evaluated, about; finer grids are interpolated, for time
@@ -42,7 +44,8 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
     stored as in `Photos`: [V, H, W] float32, in a file where they are large.
 
     Sub-pixel: a half-covered pixel lies on the silhouette. Infinite beyond a picture. Where the
-    object leaves the picture there is no silhouette: the picture's edge is none.
+    object leaves the picture there is no silhouette: the picture's edge is none. Of LARGE pictures
+    the distances are those of smaller ones, interpolated.
 
     Args:
         cameras: V, which know the sizes of the pictures, where these differ.
@@ -52,12 +55,24 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
 
     def fill_(view: int) -> None:
         covered = coverage_of(alpha[view])
-        a = (covered if cameras is None else cameras.cut(view, covered)).numpy()
+        a = covered if cameras is None else cameras.cut(view, covered)
         result[view] = np.inf
-        result[view, : a.shape[0], : a.shape[1]] = _mask_distance(a)
+        result[view, : a.shape[0], : a.shape[1]] = _mask_distance_of_any(a)
 
     side_by_side(fill_, range(len(alpha)))
     return distances
+
+
+def _mask_distance_of_any(alpha: Tensor) -> np.ndarray | float:
+    """That of one picture [H, W], or of all its pixels."""
+    factor = max(1, round(2 * max(alpha.shape) / LARGE))
+    if factor == 1:
+        return _mask_distance(alpha.numpy())
+    size = [max(1, round(n / factor)) for n in alpha.shape]
+    small = interpolate(alpha[None, None], size, mode="area")[0, 0]
+    distance = torch.as_tensor(_mask_distance(small.numpy()), dtype=torch.float32)
+    distance = factor * distance.expand(small.shape)
+    return interpolate(distance[None, None], alpha.shape, mode="bilinear")[0, 0].numpy()
 
 
 def _mask_distance(alpha: np.ndarray) -> np.ndarray | float:
@@ -171,8 +186,8 @@ def estimate_bounds(
     field_of_view = longer_side / (2 * cameras.focal.min(1).values)
     half = float((eye_distance * field_of_view).max()) * FIRST_BOX
     lower, upper = centre - half, centre + half
-    for _ in range(BOX_ROUNDS):  # each round sees the hull at a finer grid
-        grid = fit_grid(lower, upper, BOX_NODES)
+    for count in BOX_NODES:
+        grid = fit_grid(lower, upper, count)
         nodes = grid.nodes().reshape(-1, 3)
         seen_by = views_needed(len(cameras), votes)
         sdf = hull_sdf(distance, cameras, nodes, votes, seen_by, wider)

@@ -18,8 +18,8 @@ from univoxel.names import MasksFrom
 from univoxel.preparation.hull import mask_distances
 from univoxel.threads import side_by_side
 
-# Photographs that are looked at, at most: the excess is a mean over them
-VIEWS = 32
+# Pixels that are looked at, about, and photographs at least: the excess is a mean over them
+PIXELS, VIEWS = 8e6, 8
 # Share of a picture's larger side up to which an excess is looked for: wider masks stay as they
 # are
 REACH_SHARE = 0.015
@@ -64,7 +64,8 @@ def mask_excess(
     """
     longest = max(max(d.shape) for d in distance)
     reach = max(REACH_PIXELS, round(REACH_SHARE * longest))
-    step = -(-len(color) // VIEWS)
+    views = max(VIEWS, int(PIXELS / distance[0].numel()))
+    step = -(-len(color) // views)
     near, far = COMPARISON
     change = _change(color[::step], coverage[::step], distance[::step], reach + far)
     if change.isnan().all():

@@ -22,9 +22,10 @@ from univoxel.preparation.exposures import say_clipped, varying_and_gains
 from univoxel.preparation.hull import visual_hull
 from univoxel.preparation.light_frame import turntable_of
 from univoxel.preparation.masks import fitted_masks
-from univoxel.preparation.mending import mended
+from univoxel.preparation.object_shape import ObjectShape, signed_distance
 from univoxel.preparation.pinned import PinnedHull, pinned_hull
 from univoxel.preparation.registration import registered_poses
+from univoxel.preparation.rough_masks import doubt_masks
 from univoxel.preparation.strays import say_strays
 from univoxel.scene import Scene
 
@@ -47,6 +48,7 @@ class Silhouettes:
     votes: int = 1  # views that have to carve a node of the hull, >= 1
     doubted: Tensor | None = None  # [V, H, W] bool: nothing is learned there; None: nowhere
     edges_given: bool = True  # whether masks are as given, and none of their edges doubted
+    shape: ObjectShape | None = None  # told in 3D, where masks are rough; None: they are believed
 
 
 @dataclass(frozen=True)
@@ -87,16 +89,16 @@ def find_silhouettes(
             belief = unweighed(photos, distance, cfg.cameras)
         found = None
         if belief.votes > 1 and begins("rough masks"):
-            found = mended(photos, distance, belief)
+            found = doubt_masks(photos, belief)
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
     # Rough masks that there was no time to mend are no measure of how sharp edges are
-    doubted, edges_given = None, photos is given and belief.votes == 1
+    doubted, shape, edges_given = None, None, photos is given and belief.votes == 1
     if found is not None:
-        photos, doubted = found.photos, found.doubted
+        doubted, shape = found.pixels, found.shape
         distance, belief = found.distance, found.belief
     believed = belief.box, belief.refined, belief.votes
-    return Silhouettes(photos, distance, *believed, doubted, edges_given)
+    return Silhouettes(photos, distance, *believed, doubted, edges_given, shape)
 
 
 def prepare(
@@ -118,6 +120,8 @@ def prepare(
         photos = replace(photos, cameras=poses.corrected(photos.cameras))
     begins("hull", needed=True)
     hull = visual_hull(distance, photos.cameras, grid, silhouettes.votes)
+    if silhouettes.shape is not None:
+        hull = torch.maximum(hull, signed_distance(silhouettes.shape, grid))
     begins("exposures", needed=True)
     say_clipped(photos)
     varying, gains = varying_and_gains(photos, hull, grid, cfg.scene.varying, cfg.exposures)
@@ -126,6 +130,7 @@ def prepare(
     if varying == "none" and turntable is None and begins(PINNED):
         pinned = find_pinned(silhouettes, photos.cameras, hull, grid)
     carves = cfg.carving_seconds and varying != "light" and turntable is None
+    carves = carves and silhouettes.shape is None  # which has its concavities
     if carves and begins("concavities"):
         seconds = cfg.carving_seconds
         carved = carve_within_time(hull, grid, photos, gains, seconds)

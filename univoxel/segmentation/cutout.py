@@ -1,8 +1,8 @@
 """Cut an object out of photographs without masks.
 
 Masks come from a network, from a folder, or, of what stands on a patterned ground, from the colours
-of all photographs: it hides the pattern. They vote for a hull, and those that it contradicts are
-mended.
+of all photographs: it hides the pattern. With the depth that the photographs show they tell the
+object in 3D, and masks that its silhouettes contradict are repaired.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import logging
 import shutil
+import statistics
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,13 +25,17 @@ from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.errors import DataError, ExistingFile
 from univoxel.names import GROUND, REMBG
+from univoxel.preparation.object_shape import find_object, shrunk, silhouettes
+from univoxel.preparation.stereo import depth_maps, small_cameras
 from univoxel.segmentation.ground import find_ground, ground_mask
+from univoxel.segmentation.mask_repair import BESIDE, MISSING, Verdict, iou, judge, voxel_pixels
 from univoxel.segmentation.mask_sheet import MaskTile, darkened, mask_sheet, worst_first, write_page
 from univoxel.segmentation.network import network
-from univoxel.segmentation.vote import BESIDE, MISSING, VOTE, Verdict, VoteConfig, elect, judge
 
 # Photographs at least, for a vote; fewer do not outvote one another
 PHOTOGRAPHS = 12
+# Share of the object's surface that depth has to show for it to be believed against most masks
+SURE = 0.5
 
 
 log: logging.Logger = logging.getLogger("univoxel")
@@ -45,12 +50,11 @@ def cutout(
     source: str | Path = REMBG,
     downscale: int = 0,
     allow_outside: bool = False,
-    vote: VoteConfig = VOTE,
 ) -> Path:
     """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
 
     All splits are written, in the layout of NeRF-synthetic scenes, without lens distortion, beside
-    masks.png and masks.html, which show the masks, worst first. Hull and ground are found from
+    masks.png and masks.html, which show the masks, worst first. Object and ground are found from
     the training photographs alone.
 
     Args:
@@ -59,7 +63,6 @@ def cutout(
             that the object stands on; else a folder of masks with the stems of the photographs.
         downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
         allow_outside: as of `load_photos`.
-        vote: how masks are judged and mended.
 
     Raises:
         DataError: photographs or masks that cannot be used, or no patterned ground in them.
@@ -85,7 +88,7 @@ def cutout(
         masks = _from_ground(splits)
     else:  # of shrunk photographs those with masks are black outside of them
         masks = _as_read({n: load(n, photos.downscale, masks=Path(origin)) for n in splits})
-    verdicts, told = _judged(splits, masks, vote)
+    verdicts, told = _judged(splits, masks)
     _write(out, splits, masks, verdicts, told)
     return out
 
@@ -128,10 +131,14 @@ def _as_read(splits: dict[str, Photos]) -> Masks:
     }
 
 
-def _judged(
-    splits: dict[str, Photos], masks: Masks, cfg: VoteConfig
-) -> tuple[dict[str, list[Verdict]], str]:
-    """What the vote says about each mask, mended if it may be, and what to tell people."""
+def _judged(splits: dict[str, Photos], masks: Masks) -> tuple[dict[str, list[Verdict]], str]:
+    """What the object's silhouettes say about each mask, repaired if it may be, and what to tell
+    people.
+
+    Raises:
+        DataError: a mask shows nothing, and there are too few for a vote.
+        UserError: the masks have nothing in common.
+    """
     train, count = splits["train"], len(splits["train"])
     if count < PHOTOGRAPHS:
         for name, split in splits.items():
@@ -144,18 +151,27 @@ def _judged(
         )
         verdicts = {name: [Verdict(None, "", m) for m in those] for name, those in masks.items()}
         return verdicts, "too few photographs for a vote: masks as they came"
-    hull, largest = elect((m.float() / 255 for m in masks["train"]), train.cameras, cfg)
+    coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
+    shape = find_object(coverage["train"], depth_maps(train))
+    shown = {n: list(silhouettes(shape, small_cameras(s.cameras))) for n, s in splits.items()}
+    agreements = [
+        iou(shrunk(mask, one.shape[1], one.shape[0]) >= 0.5, one)
+        for mask, one in zip(coverage["train"], shown["train"], strict=True)
+    ]
+    usual = statistics.median(agreements)
     verdicts = {}
     for name, split in splits.items():
+        cameras = small_cameras(split.cameras)
         verdicts[name] = []
-        for view, one in enumerate(track(masks[name], "mending masks")):
-            known = largest[view] if name == "train" else None
-            found = judge(hull, one.float() / 255, split.cameras, view, known, cfg)
-            verdicts[name].append(replace(found, mask=_bytes(found.mask)))
+        for view, mask in enumerate(track(coverage[name], "repairing masks")):
+            voxel = voxel_pixels(shape.grid, cameras, view)
+            found = judge(mask, shown[name][view], usual, voxel)
+            kept = masks[name][view] if not found.fault else _bytes(found.mask)
+            verdicts[name].append(replace(found, mask=kept))
     wrong = sum(bool(v.fault) for v in verdicts["train"])
-    told = _told(splits, verdicts, hull.usual)
-    if 2 * wrong > count:
-        told += ": none is mended, as it may be the hull that is wrong"
+    told = _told(splits, verdicts, usual)
+    if 2 * wrong > count and shape.surface < SURE:
+        told += ": none is repaired, as it may be the object's shape that is wrong"
         log.warning(
             f"{told}. The masks keep or miss the same everywhere, or the cameras are wrong; "
             "look at masks.html",
@@ -165,13 +181,13 @@ def _judged(
             verdicts[name] = [replace(verdict, mask=one) for verdict, one in kept]
         return verdicts, told
     if any(v.fault for those in verdicts.values() for v in those):
-        told += ": mended from the other photographs; look at masks.html"
+        told += ": repaired from the other photographs; look at masks.html"
     log.info(told)
     return verdicts, told
 
 
 def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: float) -> str:
-    """How many masks agree with the hull, and what is wrong with the others."""
+    """How many masks agree with the object's silhouettes, and what is wrong with the others."""
     faults: dict[str, list[str]] = {BESIDE: [], MISSING: []}
     count = 0
     for name, split in splits.items():
@@ -180,7 +196,7 @@ def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: 
             if verdict.fault:
                 faults[verdict.fault].append(stem)
     wrong = sum(map(len, faults.values()))
-    told = f"masks: {count - wrong} of {count} agree with the hull ({usual:.2f})"
+    told = f"masks: {count - wrong} of {count} agree with the object's silhouette ({usual:.2f})"
     if not wrong:
         return told
     parts = []

@@ -21,9 +21,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate, max_pool2d, max_pool3d, pad
 
 from univoxel.bars import track
-from univoxel.camera import Cameras, image_rays, pixel_width, project, resize
+from univoxel.camera import Cameras, image_rays, looked_at, pixel_rays, pixel_width, project, resize
 from univoxel.grid import GridShape, fit_grid
-from univoxel.segmentation.vote import largest_votes, overlaps, shrunk, surroundings, votes
 
 # Pixels of the widest picture that is compared
 PIXELS = 480
@@ -396,3 +395,89 @@ def _without_specks(found: np.ndarray, share: float) -> np.ndarray:
         size[0] = found.size
         found = np.where(size[parts] < least, not value, found)
     return found
+
+
+SEEN_BY = 0.25
+SAMPLES = 1 << 20
+
+
+def surroundings(cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """A cube around what the cameras look at, as large as half of their pictures show whole."""
+    centre = looked_at(cameras)
+    away = (cameras.camera_to_world[:, :, 3] - centre).norm(dim=1)
+    tangent = cameras.size_of_each().amin(1) / (2 * cameras.focal.max(1).values)
+    half = float((away * tangent / (1 + tangent.square()).sqrt()).median())
+    return centre - half, centre + half
+
+
+def votes(masks: Sequence[Tensor], cameras: Cameras, grid: GridShape) -> Tensor:
+    """Mean of the masks [H, W] over the cameras that see a node: [X, Y, Z] in [0, 1].
+
+    It is 0 where fewer than their share see it.
+    """
+    nodes = grid.nodes().reshape(-1, 3)
+    total, seen_by = torch.zeros(len(nodes)), torch.zeros(len(nodes))
+    for view, mask in enumerate(track(masks, "masks vote")):
+        pixel, depth = project(cameras, view, nodes)
+        uv = pixel * (2 / torch.tensor(cameras.size(view))) - 1
+        seen = (depth > 0) & (uv.abs() <= 1).all(1)
+        found = grid_sample(
+            mask[None, None], uv[None, None], align_corners=False, padding_mode="border"
+        )
+        total += torch.where(seen, found[0, 0, 0], 0.0)
+        seen_by += seen
+    enough = seen_by >= max(SEEN_BY * len(masks), 1)
+    return torch.where(enough, total / seen_by.clamp_min(1), 0.0).reshape(grid.size)
+
+
+def largest_votes(
+    grid: GridShape, vote: Tensor, cameras: Cameras, view: int, shape: tuple[int, ...]
+) -> Tensor:
+    """The largest vote along the rays of a picture [H, W] of this shape; 0 beside the grid."""
+    width, height = cameras.size(view)
+    row, column = (torch.arange(n) + 0.5 for n in shape)
+    y, x = torch.meshgrid(row * (height / shape[0]), column * (width / shape[1]), indexing="ij")
+    rays = pixel_rays(cameras, torch.tensor(view), torch.stack([x, y], -1).reshape(-1, 2))
+    lower, upper = grid.bounds()
+    # Where a ray is within the slabs of the three axes
+    away = torch.where(rays.direction.abs() < 1e-9, 1e-9, rays.direction)
+    ends = torch.stack([(lower - rays.origin) / away, (upper - rays.origin) / away])
+    enters = ends.amin(0).amax(1).clamp_min(0)
+    leaves = ends.amax(0).amin(1)
+    meets = (leaves > enters).nonzero()[:, 0]
+    result = torch.zeros(len(away))
+    if not len(meets):
+        return result.reshape(shape)
+    steps = max(2, round(float((leaves - enters)[meets].max()) / grid.voxel_size))
+    along = (torch.arange(steps) + 0.5) / steps
+    volume = vote.permute(2, 1, 0)[None, None]  # grid_sample's x is the last axis
+    for some in meets.split(max(1, SAMPLES // steps)):
+        begin, length = enters[some, None], (leaves - enters)[some, None]
+        t = begin + length * along
+        points = rays.origin[some, None] + t[..., None] * rays.direction[some, None]
+        where = 2 * (points - lower) / (upper - lower) - 1
+        found = grid_sample(volume, where[None, None], align_corners=True)
+        result[some] = found[0, 0, 0].amax(1)
+    return result.reshape(shape)
+
+
+def overlaps(largest: Tensor, mask: Tensor, levels: Tensor) -> Tensor:
+    """IoU of a mask [H, W] with what has a vote [H, W] of at least each level [K]: [K].
+
+    1 where both are empty.
+    """
+    shown = mask >= 0.5
+    # Counted from the highest vote down, so that each level is one look-up
+    order, known = largest.flatten().sort()
+    first = torch.searchsorted(order, levels)
+    after = torch.cat([shown.flatten()[known].flip(0).cumsum(0).flip(0), torch.zeros(1).long()])
+    both, hull = after[first], len(order) - first
+    either = hull + shown.sum() - both
+    return torch.where(either > 0, both / either.clamp_min(1), 1.0)
+
+
+def shrunk(mask: Tensor, pixels: int) -> Tensor:
+    """A mask [H, W] whose longer side has at most so many pixels: means of its pixels."""
+    share = min(1.0, pixels / max(mask.shape))
+    height, width = (max(1, round(share * n)) for n in mask.shape)
+    return interpolate(mask[None, None], (height, width), mode="area")[0, 0]

@@ -5,15 +5,16 @@ import math
 import pytest
 import torch
 from analytic import look_at
-from spoilt_masks import MISSING, iou, lost_part
+from spoilt_masks import MISSING, iou, lost_part, without_depth
 
 from univoxel.camera import Cameras, image_rays
-from univoxel.segmentation import gaps, vote
-from univoxel.segmentation.vote import VoteConfig
+from univoxel.preparation import gaps
+from univoxel.preparation.object_shape import find_object, share_of, silhouettes, votes
+from univoxel.segmentation.mask_repair import judge, voxel_pixels
 
 SIZE = 96
 ABOVE, BESIDE = 24, 3  # cameras that look down on a gate, and that see through it
-SMALL = VoteConfig(pixels=96, voxels=48, first_voxels=24)
+VOXELS, THRESHOLD = 48, 0.9
 # Two posts on a plate: lower and upper corner of each
 GATE = (
     ((-0.6, -0.6, -0.3), (0.6, 0.6, -0.2)),
@@ -59,11 +60,12 @@ def test_what_few_see_through_is_no_object(true, spoilt):
     masks = list(masks)
     if spoilt:
         masks[LOST] = lost_part(masks[LOST])
-    hull, largest = vote.elect(masks, seen, SMALL)
+    shape = find_object(masks, without_depth(seen), VOXELS)
+    shown = list(silhouettes(shape, seen))
     for view in range(ABOVE, ABOVE + BESIDE):
-        assert iou(largest[view] >= hull.threshold, masks[view]) > 0.8  # filled: below 0.63
-        assert vote.judge(hull, masks[view], seen, view, largest[view], SMALL).fault == ""
-    found = vote.judge(hull, masks[LOST], seen, LOST, largest[LOST], SMALL)
+        assert iou(shown[view], masks[view]) > 0.8  # filled: below 0.63
+        assert judge(masks[view], shown[view], 0.95, 1.0).fault == ""
+    found = judge(masks[LOST], shown[LOST], 0.95, voxel_pixels(shape.grid, seen, LOST))
     assert found.fault == (MISSING if spoilt else "")
     assert iou(found.mask, true[1][LOST]) > 0.93
 
@@ -71,13 +73,15 @@ def test_what_few_see_through_is_no_object(true, spoilt):
 def test_a_gap_that_others_contradict_stays(true):
     """A part that a single mask lost is in the hull as it was."""
     seen, masks = true
-    hull, _ = vote.elect(masks, seen, SMALL)
-    before = hull.vote.clone()
+    grid = find_object(masks, without_depth(seen), VOXELS).grid
+    share = share_of(votes(masks, without_depth(seen), grid), len(masks))
+    gaps.carve_gaps_(share, THRESHOLD, masks, seen, grid)
+    inside = share >= THRESHOLD
     spoilt = [lost_part(m) if v == LOST else m for v, m in enumerate(masks)]
-    gaps.carve_gaps_(hull.vote, hull.threshold, spoilt, seen, hull.grid)
-    inside = before >= hull.threshold
-    assert ((hull.vote < hull.threshold) & inside).sum() < 0.02 * inside.sum()
+    after = share.clone()
+    gaps.carve_gaps_(after, THRESHOLD, spoilt, seen, grid)
+    assert ((after < THRESHOLD) & inside).sum() < 0.02 * inside.sum()
     # Where nearly all lose it, those that do not are outvoted
     spoilt = [m if v == LOST else lost_part(m) for v, m in enumerate(masks)]
-    gone = gaps.carve_gaps_(hull.vote, hull.threshold, spoilt, seen, hull.grid)
+    gone = gaps.carve_gaps_(after, THRESHOLD, spoilt, seen, grid)
     assert gone > 0.1 * inside.sum()

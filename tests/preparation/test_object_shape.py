@@ -1,0 +1,143 @@
+"""The object in 3D: from masks of which some are wrong, with depth maps and without."""
+
+import numpy as np
+import pytest
+import textured_room
+import torch
+from analytic import cameras_around
+from spoilt_masks import BESIDE, MISSING, iou, kept_table, lost_part, true_mask, without_depth
+
+from univoxel.data.base import Photos
+from univoxel.errors import UserError
+from univoxel.grid import GridShape
+from univoxel.preparation import object_shape
+from univoxel.preparation.object_shape import ObjectShape, find_object, silhouettes
+from univoxel.preparation.stereo import depth_maps
+from univoxel.segmentation.mask_repair import judge, voxel_pixels
+
+VIEWS, SIZE, VOXELS = 40, 64, 48
+
+
+@pytest.fixture(scope="module")
+def fake():
+    """Masks of a network that keeps the table in 45 % of them and loses a part in 5 %."""
+    cameras = cameras_around(VIEWS, SIZE)
+    true = [true_mask(cameras, view) for view in range(VIEWS)]
+    order = torch.randperm(VIEWS, generator=torch.Generator().manual_seed(3)).tolist()
+    masks, faults = list(true), [""] * VIEWS
+    for view in order[:18]:
+        masks[view], faults[view] = kept_table(cameras, view), BESIDE
+    for view in order[18:20]:
+        masks[view], faults[view] = lost_part(true[view]), MISSING
+    shape = find_object(masks, without_depth(cameras), VOXELS)
+    return cameras, true, masks, faults, shape, list(silhouettes(shape, cameras))
+
+
+def test_masks_outvote_those_that_are_wrong(fake):
+    cameras, true, masks, faults, shape, shown = fake
+    before = torch.tensor([iou(m, t) for m, t in zip(masks, true, strict=True)])
+    assert before.mean() < 0.85  # or there is nothing to repair
+    usual = float(np.median([iou(m, s) for m, s in zip(masks, shown, strict=True)]))
+    found = [
+        judge(mask, shown[view], usual, voxel_pixels(shape.grid, cameras, view))
+        for view, mask in enumerate(masks)
+    ]
+    wrong = before < 0.9
+    flagged = torch.tensor([bool(verdict.fault) for verdict in found])
+    assert (flagged & wrong).sum() >= 0.9 * flagged.sum()  # precision
+    assert (flagged & wrong).sum() >= 0.9 * wrong.sum()  # recall
+    after = torch.tensor([iou(v.mask, t) for v, t in zip(found, true, strict=True)])
+    assert after.mean() >= 0.97
+    assert after.min() >= 0.85  # an edge that is seen flat spoils little, and stays
+    for verdict, fault, mask in zip(found, faults, masks, strict=True):
+        if verdict.fault:
+            assert verdict.fault == fault
+        else:
+            assert torch.equal(verdict.mask, mask)  # what is right stays, bit for bit
+
+
+def test_masks_that_show_nothing():
+    cameras = cameras_around(12, 32)
+    with pytest.raises(UserError, match="nothing in common"):
+        find_object([torch.zeros(32, 32)] * 12, without_depth(cameras), VOXELS)
+
+
+@pytest.fixture(scope="module")
+def room():
+    """Photographs of an object on a patterned floor, its masks, and depth maps."""
+    views = textured_room.orbit(30, 160, 120)
+    made = [textured_room.photograph(view, samples=2) for view in views]
+    color, masks = (
+        torch.from_numpy(np.stack([np.array(x) for x in xs])) for xs in zip(*made, strict=True)
+    )
+    names = [f"v{i}" for i in range(len(views))]
+    photos = Photos(None, names, color, masks, textured_room.cameras(views))
+    return photos, list(photos.coverage()), depth_maps(photos)
+
+
+@pytest.mark.parametrize("spoilt", ["none", "lost", "whole picture"])
+def test_depth_and_masks_find_the_object(room, spoilt):
+    """One mask in five lacks a part, or shows all of the picture."""
+    photos, masks, maps = room
+    given = list(masks)
+    for view in range(0, len(masks), 5):
+        if spoilt == "lost":
+            given[view] = lost_part(masks[view])
+        if spoilt == "whole picture":
+            given[view] = torch.ones_like(masks[view])
+    shape = find_object(given, maps, 64)
+    agree = [iou(s, m) for s, m in zip(silhouettes(shape, photos.cameras), masks, strict=True)]
+    assert np.mean(agree) > 0.95
+    assert min(agree) > 0.9
+    assert shape.surface > 0.7
+
+
+def test_depth_empties_the_air_that_masks_keep(room):
+    """All masks show the whole picture; around the object's head there is only air."""
+    photos, masks, maps = room
+    everything = [torch.ones_like(mask) for mask in masks]
+    for known, least, most in ((maps, 0.0, 0.05), (without_depth(photos.cameras), 0.9, 1.0)):
+        shape = find_object(everything, known, 64)
+        nodes = shape.grid.nodes()
+        away, height = nodes[..., :2].norm(dim=-1), nodes[..., 2]
+        air = (away > 0.65) & (away < 0.9) & (height > 0.4) & (height < 1.0)
+        assert air.any()
+        assert least <= float((shape.inside[air] > 0).float().mean()) <= most
+
+
+def test_a_hidden_place_is_not_asked():
+    """A view from which a known surface hides a node has no vote on whose it is."""
+    cameras = cameras_around(8, 32)
+    grid = GridShape((-0.1, -0.1, -0.1), 0.1, (3, 3, 3))
+    maps = without_depth(cameras)
+    maps.distance[:4], maps.known[:4] = 1.0, True  # of 2 to the middle
+    maps.distance[4:6], maps.known[4:6] = 3.0, True
+    found = object_shape.votes([torch.ones(32, 32)] * 8, maps, grid)
+    assert (found.seen == 8).all()
+    assert (found.open == 4).all()
+    assert (found.free == 2).all()
+    assert (found.near == 0).all()
+
+
+def test_the_largest_part_remains():
+    inside = torch.full((8, 8, 8), -1.0)
+    inside[1:4, 1:4, 1:4], inside[6, 6, 6] = 0.5, 0.5
+    found = object_shape.largest_part(inside)
+    assert (found > 0).sum() == 27
+    assert found[6, 6, 6] < 0
+
+
+def test_masks_that_are_too_faint():
+    cameras = cameras_around(12, 32)
+    masks = [0.2 * torch.ones(32, 32)] * 12
+    with pytest.raises(UserError, match="too faint"):
+        find_object(masks, without_depth(cameras), VOXELS)
+
+
+def test_signed_distance_of_a_ball():
+    grid = GridShape((-1.0, -1.0, -1.0), 0.1, (21, 21, 21))
+    away = grid.nodes().norm(dim=-1)
+    finer = GridShape((-0.9, -0.9, -0.9), 0.05, (37, 37, 37))
+    found = object_shape.signed_distance(ObjectShape(grid, 0.6 - away, 1.0), finer)
+    off = (found - (finer.nodes().norm(dim=-1) - 0.6)).abs()
+    assert off.quantile(0.99) < 0.05

@@ -1,0 +1,114 @@
+"""Rough masks of a ball whose outline is known: what is doubted, and what is left."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import RADIUS, photos_of
+
+from univoxel.data import Photos
+from univoxel.errors import DataError, UserError
+from univoxel.preparation import prepare
+from univoxel.preparation.belief import Belief
+from univoxel.preparation.hull import hull_sdf, mask_distances
+from univoxel.preparation.registration import MAX_CONTRADICTION
+from univoxel.preparation.rough_masks import doubt_masks, thick
+from univoxel.presets import preset
+
+VIEWS, SIZE = 24, 96
+BOX = torch.full((3,), -0.7), torch.full((3,), 0.7)
+ROUGH = Belief(BOX, False, 2, 5.0)
+PIXEL = 2 * 1.8 / SIZE / 2  # world units, at the ball
+
+
+@pytest.fixture(scope="module")
+def photos():
+    return photos_of(VIEWS, SIZE)
+
+
+def without_a_part(photos: Photos, views: tuple[int, ...]) -> Photos:
+    """Masks of some views that lack what lies above 0.2."""
+    alpha = photos.alpha.clone()
+    for view in views:
+        alpha[view, : SIZE // 2 - 10] = 0
+    return replace(photos, alpha=alpha)
+
+
+def on_the_ball(radius: float) -> torch.Tensor:
+    points = torch.randn(2000, 3, generator=torch.Generator().manual_seed(0))
+    return radius * points / points.norm(dim=1, keepdim=True)
+
+
+def test_a_part_that_a_mask_lacks_is_doubted_and_no_more_carved(photos):
+    spoilt = without_a_part(photos, (3,))
+    found = doubt_masks(spoilt, ROUGH)
+    assert found.belief.votes == 1
+    assert found.belief.off <= MAX_CONTRADICTION
+    lost = (photos.alpha > 0.5) & (spoilt.alpha < 0.5)
+    assert found.pixels[lost].float().mean() > 0.9
+    assert found.pixels[~lost].float().mean() < 2e-3
+    held = hull_sdf(found.distance, photos.cameras, on_the_ball(RADIUS))
+    exact = hull_sdf(mask_distances(photos.alpha), photos.cameras, on_the_ball(RADIUS))
+    assert (held - exact).abs().quantile(0.99) < PIXEL
+    assert held.max() < PIXEL  # nothing is bitten off
+
+
+def test_what_two_masks_lack_together_comes_back(photos):
+    alpha = photos.alpha.clone()
+    alpha[11:13, :, : SIZE // 2 - 5] = 0  # seen from directions that are 137 degrees apart
+    spoilt = replace(photos, alpha=alpha)
+    found = doubt_masks(spoilt, ROUGH)
+    bitten, whole = (
+        hull_sdf(d, photos.cameras, on_the_ball(0.9 * RADIUS), votes=2)
+        for d in (mask_distances(alpha), found.distance)
+    )
+    assert bitten.max() > 0.1 * RADIUS
+    assert whole.max() < 0
+
+
+def test_ground_that_a_mask_keeps_is_doubted(photos):
+    alpha = photos.alpha.clone()
+    alpha[5, -30:, 20:60] = 1
+    found = doubt_masks(replace(photos, alpha=alpha), ROUGH)
+    kept = (alpha > 0.5) & (photos.alpha < 0.5)
+    assert found.pixels[kept].float().mean() > 0.9
+
+
+def test_what_all_masks_show_is_nowhere_doubted(photos):
+    assert not doubt_masks(photos, ROUGH).pixels.any()
+
+
+def test_jagged_edges_are_not_doubted():
+    differs = torch.zeros(40, 40, dtype=torch.bool)
+    differs[10, :], differs[20:30, 20:30] = True, True
+    found = thick(differs)
+    assert not found[10].any()
+    assert found[20:30, 20:30].all()
+    assert not thick(differs & False).any()
+
+
+def test_silhouettes_in_which_nothing_lies(photos, tmp_path):
+    cfg = preset("fast", tmp_path / "data", tmp_path / "run")
+    with pytest.raises(DataError, match=r"data: .*(share no volume|nothing in common)"):
+        prepare.find_silhouettes(replace(photos, alpha=torch.zeros_like(photos.alpha)), cfg)
+
+
+def test_masks_that_show_nothing(photos):
+    with pytest.raises(UserError, match="nothing in common"):
+        doubt_masks(replace(photos, alpha=torch.zeros_like(photos.alpha)), ROUGH)
+
+
+def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(
+    photos, tmp_path, caplog, monkeypatch
+):
+    monkeypatch.setattr(prepare, "weighed", lambda *_: ROUGH)  # of the plain ball no match tells
+    spoilt = without_a_part(photos, (3, 9))
+    cfg = preset("fast", tmp_path, tmp_path / "run")
+    with caplog.at_level("INFO"):
+        found = prepare.find_silhouettes(spoilt, cfg)
+    assert "of the pixels are doubted" in caplog.text
+    assert found.shape is not None
+    assert found.doubted.any()
+    assert not found.edges_given
+    hull = prepare.prepare(found, cfg).hull
+    assert hull.min() < 0 < hull.max()

@@ -1,0 +1,242 @@
+"""The object told in 3D: what masks of all photographs and their depth maps say of each place.
+
+A place is free where views see a surface behind it. On a surface, masks of the views that see it
+say whose it is; a view from which something else hides it says nothing. Where no view finds a
+depth, as on smooth or mirroring things, all masks that show a place vote. So a mask that lost a
+part of the object, or kept what it stands on, is outvoted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+from skimage.measure import label
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from univoxel.camera import Cameras, image_rays, looked_at
+from univoxel.errors import UserError
+from univoxel.fields.dense import DenseDistances
+from univoxel.grid import GridShape, fit_grid, resample
+from univoxel.ops import VisibilityScene
+from univoxel.preparation.gaps import carve_gaps_
+from univoxel.preparation.hull import votes_needed
+from univoxel.preparation.stereo import DepthMaps, pixels_of, reach
+from univoxel.threads import side_by_side
+
+# Voxels along a side of the grid, and of the one that only looks where the object is
+VOXELS, FIRST_VOXELS = 96, 48
+# Half the side of that first grid, over `reach`
+ROOM = 1.6
+# Share of its largest vote: what may be the object
+AROUND = 0.5
+# Voxels around it that the grid takes in
+MARGIN = 1
+# Share of the photographs that have to see a place: what few see, few decide on
+SEEN_BY = 0.25
+# Voxels before and behind a depth in which a surface may lie
+BAND = 2.0
+# Views that have to see a surface before it counts
+SURE = 3
+# Share of the views with a depth there or behind it that have to see through a free place
+FREE = 0.5
+# Share of the masks that see a surface which take it for the object's
+SHOWN = 0.5
+# Thresholds for places without a surface: the one is taken whose silhouettes fit the masks best
+THRESHOLDS = torch.linspace(0.3, 0.98, 35)
+
+
+@dataclass(frozen=True)
+class ObjectShape:
+    """Where the object is, as far as photographs and masks say."""
+
+    grid: GridShape
+    inside: Tensor  # [X, Y, Z] above 0 inside of the object, in no unit
+    surface: float  # share of its surface, in [0, 1], that depth maps show
+
+
+@dataclass(frozen=True)
+class Votes:
+    """What views say of each node of a grid: all [X, Y, Z] float32, counts of views or sums."""
+
+    seen: Tensor  # views whose picture shows it
+    masks: Tensor  # of them, the sum of the masks
+    free: Tensor  # views that see a surface behind it
+    near: Tensor  # views that see a surface there
+    behind: Tensor  # of these, the sum of how far it lies behind the surface, in [-1, 1]
+    open: Tensor  # views from which no surface hides it
+    open_masks: Tensor  # of them, the sum of the masks
+
+
+def find_object(masks: Sequence[Tensor], maps: DepthMaps, voxels: int = VOXELS) -> ObjectShape:
+    """The object that masks and depth maps agree on.
+
+    Args:
+        masks: V, [H, W] in [0, 1] of pictures of any size.
+        voxels: along a side of its grid, on average.
+
+    Raises:
+        UserError: the masks have nothing in common, or too little.
+    """
+    cameras = maps.cameras
+    shown = [shrunk(m, *cameras.size(v)) for v, m in enumerate(masks)]
+    centre, half = looked_at(cameras), ROOM * reach(cameras)
+    first = fit_grid(centre - half, centre + half, FIRST_VOXELS**3)
+    share = share_of(votes(shown, maps, first), len(masks))
+    if not float(share.max()):
+        raise UserError("the masks of the photographs have nothing in common: check masks, cameras")
+    coarse = around(first, share >= AROUND * share.max(), FIRST_VOXELS**3, 0)
+    found = votes(shown, maps, coarse)
+    threshold = best_threshold(share_of(found, len(masks)), shown, maps, coarse)
+    likely = largest_part(evidence(found, threshold, shown, maps, coarse)[0]) > 0
+    grid = around(coarse, likely, voxels**3) if likely.any() else coarse
+    inside, surface = evidence(votes(shown, maps, grid), threshold, shown, maps, grid)
+    if not (inside > 0).any():
+        raise UserError(
+            "the masks of the photographs are too faint or too few for any common shape"
+        )
+    return ObjectShape(grid, largest_part(inside), surface)
+
+
+def evidence(
+    found: Votes, threshold: float, masks: Sequence[Tensor], maps: DepthMaps, grid: GridShape
+) -> tuple[Tensor, float]:
+    """Values [X, Y, Z] above 0 inside, and the share of their surface that depth maps show."""
+    share = share_of(found, len(masks))
+    carve_gaps_(share, threshold, masks, maps.cameras, grid)
+    free = (found.free >= SURE) & (found.free > FREE * (found.free + found.near))
+    surface = (found.near >= SURE) & ~free
+    # Next to a surface its own views decide, blurred by a voxel
+    votes_here = blurred(torch.where(surface, found.open, 0.0))
+    whose = blurred(torch.where(surface, found.open_masks, 0.0)) / votes_here.clamp_min(1e-6)
+    sure = (votes_here / SURE).clamp(0, 1)
+    inside = sure * (whose - SHOWN) + (1 - sure) * (share - threshold)
+    depth = found.behind / found.near.clamp_min(1)
+    inside = torch.where(surface, torch.minimum(inside, SHOWN * depth), inside)
+    inside = torch.where(free, inside.clamp_max(-0.5 * SHOWN), inside)
+    inside = torch.where(found.seen < SEEN_BY * len(masks), -SHOWN, inside)
+    border = (inside > 0) & torch.from_numpy(ndimage.binary_dilation((inside <= 0).numpy()))
+    return inside, float((border & surface).sum() / border.sum().clamp_min(1))
+
+
+def votes(masks: Sequence[Tensor], maps: DepthMaps, grid: GridShape) -> Votes:
+    """What views say of the nodes of a grid.
+
+    Args:
+        masks: V, [H, W] in [0, 1] of the sizes of the depth maps.
+    """
+    nodes, band = grid.nodes().reshape(-1, 3), BAND * grid.voxel_size
+
+    def of_piece(piece: Tensor) -> Tensor:
+        total = torch.zeros(7, len(piece))
+        for view, mask in enumerate(masks):
+            row, column, seen = pixels_of(maps.cameras, view, piece)
+            eye = maps.cameras.camera_to_world[view, :, 3]
+            clear = maps.distance[view][row, column] - (piece - eye).norm(dim=1)
+            known = maps.known[view][row, column] & seen
+            near = known & (clear.abs() <= band)
+            shown = torch.where(seen, mask[row, column], 0.0)
+            hidden = known & (clear < -band)
+            total += torch.stack(
+                [
+                    seen,
+                    shown,
+                    known & (clear > band),
+                    near,
+                    torch.where(near, -clear / band, 0.0),
+                    seen & ~hidden,
+                    torch.where(hidden, 0.0, shown),
+                ]
+            )
+        return total
+
+    pieces = side_by_side(of_piece, nodes.split(1 << 15))
+    return Votes(*torch.cat(pieces, 1).view(-1, *grid.size))
+
+
+def share_of(found: Votes, views: int) -> Tensor:
+    """Mean of the masks of the views that show a node; 0 where few do: [X, Y, Z]."""
+    enough = found.seen >= max(SEEN_BY * views, 1)
+    return torch.where(enough, found.masks / found.seen.clamp_min(1), 0.0)
+
+
+def around(grid: GridShape, inside: Tensor, voxels: int, margin: int = MARGIN) -> GridShape:
+    """A grid over the nodes [X, Y, Z] that are inside, and some voxels around them."""
+    nodes, room = grid.nodes()[inside], (1 + margin) * grid.voxel_size
+    return fit_grid(nodes.amin(0) - room, nodes.amax(0) + room, voxels)
+
+
+def best_threshold(
+    share: Tensor, masks: Sequence[Tensor], maps: DepthMaps, grid: GridShape
+) -> float:
+    """The share from which on a node belongs to the hull whose silhouettes fit the masks best, in
+    the median of their IoU; low enough that as many masks as `votes_needed` outvote fewer."""
+    nodes, values = grid.nodes().reshape(-1, 3), share.reshape(-1)
+    agreed = torch.stack(
+        side_by_side(
+            lambda view: overlaps(nodes, values, masks[view], maps.cameras, view, grid),
+            range(len(masks)),
+        )
+    )
+    highest = 1 - (votes_needed(len(masks)) - 0.5) / len(masks)
+    return min(float(THRESHOLDS[int(agreed.quantile(0.5, 0).argmax())]), highest)
+
+
+def overlaps(
+    nodes: Tensor, values: Tensor, mask: Tensor, cameras: Cameras, view: int, grid: GridShape
+) -> Tensor:
+    """IoU of a mask [H, W] with the nodes [P, 3] whose values [P] reach each threshold: [K]; in
+    pixels as wide as a voxel. 1 where both are empty."""
+    eye = cameras.camera_to_world[view, :, 3]
+    depth = float((nodes.mean(0) - eye).norm())
+    wide = max(1.0, 1.5 * grid.voxel_size * float(cameras.focal[view].max()) / depth)
+    row, column, seen = pixels_of(cameras, view, nodes)
+    height, width = (max(1, round(n / wide)) for n in mask.shape)
+    at = (row * height // mask.shape[0]) * width + column * width // mask.shape[1]
+    highest = torch.zeros(height * width).scatter_reduce_(0, at[seen], values[seen], "amax")
+    shown = interpolate(mask[None, None], (height, width), mode="area").flatten() >= 0.5
+    covered = highest >= THRESHOLDS[:, None]
+    both, either = (covered & shown).sum(1), (covered | shown).sum(1)
+    return torch.where(either > 0, both / either.clamp_min(1), 1.0)
+
+
+def largest_part(inside: Tensor) -> Tensor:
+    """The same values [X, Y, Z], below 0 in all but the largest connected part inside."""
+    parts = np.asarray(label((inside > 0).numpy(), connectivity=1))
+    if parts.max() <= 1:
+        return inside
+    counts = np.bincount(parts.ravel())
+    counts[0] = 0
+    other = torch.from_numpy((parts > 0) & (parts != counts.argmax()))
+    return torch.where(other, -inside, inside)
+
+
+def silhouettes(shape: ObjectShape, cameras: Cameras) -> Iterator[Tensor]:
+    """Which pixels of each view show the object: [h, w] bool, view after view."""
+    scene = VisibilityScene(*DenseDistances(shape.grid, -shape.inside).isosurface())
+    for view in range(len(cameras)):
+        width, height = cameras.size(view)
+        rays = image_rays(cameras, view)
+        yield scene.closest_hit(rays.origin, rays.direction).t.isfinite().view(height, width)
+
+
+def signed_distance(shape: ObjectShape, grid: GridShape) -> Tensor:
+    """Distance [X, Y, Z] to the object's surface on another grid, world units, negative inside."""
+    inside = resample(shape.inside, shape.grid, grid).numpy() > 0
+    outer, inner = (np.asarray(ndimage.distance_transform_edt(side)) for side in (~inside, inside))
+    # The surface lies halfway between nodes; a blur takes the steps off
+    distance = ndimage.gaussian_filter(np.where(inside, 0.5 - inner, outer - 0.5), 1.0)
+    return torch.from_numpy(distance).float() * grid.voxel_size
+
+
+def shrunk(mask: Tensor, width: int, height: int) -> Tensor:
+    """A mask [H, W] of another size, of means of its pixels: [height, width]."""
+    return interpolate(mask[None, None], (height, width), mode="area")[0, 0]
+
+
+def blurred(values: Tensor) -> Tensor:
+    return torch.from_numpy(ndimage.gaussian_filter(values.numpy(), 1.0))
