@@ -34,7 +34,7 @@ from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
-from univoxel.segmentation.cutout import GROUND, REMBG, cutout
+from univoxel.segmentation.cutout import DEPTH, REMBG, cutout
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "tests"))
@@ -161,7 +161,7 @@ def main() -> None:
                 overlap(masks.picture(masks.names.index(name))[1], mask)
                 for name, mask in zip(names, true, strict=True)
             ]
-            label = {REMBG: "a network", GROUND: "the ground"}.get(source, source)
+            label = {REMBG: "a network", DEPTH: "the ground"}.get(source, source)
             rows.append([room, label, sum(found) / len(found), min(found), used])
             print(rows[-1], flush=True)
     record = {

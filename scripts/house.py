@@ -18,12 +18,12 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 37_300,
+    "lines of the package": 37_010,
     "lines of the laboratory": 3_100,
-    "lines of tests": 37_500,
-    "modules of the package": 261,
+    "lines of tests": 36_300,
+    "modules of the package": 262,
     "loose modules at the top": 35,
-    "configuration fields": 131,
+    "configuration fields": 128,
     "fields that nothing sets": 0,
     "layers": 15,
     "imports that go up": 0,

@@ -35,7 +35,7 @@ Origin: TypeAlias = Literal["world", "bottom", "centre"]  # what of an exported 
 TEXTURE_FORMATS: tuple[TextureFormat, ...] = get_args(TextureFormat)
 ORIGINS: tuple[Origin, ...] = get_args(Origin)
 
-GROUND, REMBG = "none", "rembg"  # where masks come from, if not from a folder
+DEPTH, REMBG = "none", "rembg"  # where masks come from, if not from a folder
 SAMPLES = 64  # of the light, per pixel of relit pictures
 BOUNCES = 2  # reflections between parts of the object in relit pictures
 ELEVATION = 25.0  # degrees, of an orbit's cameras above the object's middle

@@ -65,6 +65,7 @@ class SceneConfig:
     def __post_init__(self) -> None:
         counts = ("channels", "material_channels", "hidden", "codes")
         check_fields(self, "at least 1", lambda x: x >= 1, *counts)
+        check_fields(self, "at least 0", lambda x: x >= 0, "sky_nodes")
         check_fields(self, "in [0, 8]", lambda x: 0 <= x <= 8, "mirror_levels")
         check_fields(self, f"in [0, {MOST_ROWS}]", lambda x: 0 <= x <= MOST_ROWS, "sky_rows")
         most = f"at most channels ({self.channels})"

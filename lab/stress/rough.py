@@ -15,7 +15,7 @@ SHIFTED = 0.1  # share of the photographs whose edge cuts the object, at 1 %
 CUT = 0.15  # share of the object's width that lies beyond the picture then
 ENDS = 0.03  # share of the object's height by which masks end too early, at most, at 1 %
 PART = 0.25  # radius of what is missing, shares of the object's larger side
-GROUND = 0.3  # radius of what is kept of the ground, the same
+DEPTH = 0.3  # radius of what is kept of the ground, the same
 
 
 def shifted(photos: Photos, percent: float, random: np.random.Generator) -> Photos:
@@ -79,7 +79,7 @@ def _without_a_part(mask: np.ndarray, random: np.random.Generator) -> np.ndarray
 def _with_ground(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
     rows, columns = mask.nonzero()
     place = np.array([rows.max(), random.uniform(columns.min(), columns.max())])
-    return mask | _disc(mask, place, GROUND)
+    return mask | _disc(mask, place, DEPTH)
 
 
 def _disc(mask: np.ndarray, middle: np.ndarray, radius: float) -> np.ndarray:

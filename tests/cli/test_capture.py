@@ -273,16 +273,15 @@ def pictures(tmp_path) -> Path:
     return folder
 
 
-def test_without_a_network_or_masks_there_is_one_line(steps, pictures, tmp_path, monkeypatch):
-    """Cameras are kept: the same call with masks goes on."""
+def test_without_a_network_or_masks_depth_tells_the_object(
+    steps, pictures, tmp_path, monkeypatch, caplog
+):
     out = tmp_path / "mug"
     monkeypatch.setattr("univoxel.data.load_photos", without_masks)
-    monkeypatch.setattr(
-        "univoxel.segmentation.cutout.cutout", lambda data, out, source: no_network()
-    )
-    with pytest.raises(MissingExtra, match=r"pip install 'univoxel\[masks\]'"):
+    with caplog.at_level("INFO"):
         task.capture(pictures, out)
-    assert steps == [("poses", pictures, None)]
+    assert ("cutout", out / "scene", "none") in steps
+    assert "depth alone tells the object" in caplog.text
 
 
 def test_masks_of_ones_own_go_on(steps, pictures, tmp_path):
@@ -421,7 +420,7 @@ def test_a_turntable_without_anything_for_masks_is_one_line(steps, pictures, tmp
     monkeypatch.setattr("univoxel.capture.poses.poses", still)
     with pytest.raises(MissingExtra, match="need rembg"):
         task.capture(pictures, tmp_path / "mug")
-    with pytest.raises(UserError, match=r"and its ground with it: expected masks=rembg"):
+    with pytest.raises(UserError, match=r"so cameras need masks: expected masks=rembg"):
         task.capture(pictures, tmp_path / "mug", masks="none")
 
 

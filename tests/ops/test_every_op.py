@@ -372,12 +372,7 @@ def scattered(tensor: Tensor) -> Tensor:
     return view.permute(*reversed(range(tensor.dim()))).copy_(tensor)
 
 
-UNFIT = pytest.mark.xfail(reason="its output has the strides of the cost", raises=TypeError)
-
-
-@pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=[UNFIT] * (c == "semi_global")) for c in CASES]
-)
+@pytest.mark.parametrize("case", CASES)
 def test_strides_and_offsets_of_storage_change_nothing(case):
     given = CASES[case](40)
     moved = {

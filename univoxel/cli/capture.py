@@ -19,12 +19,13 @@ from univoxel.cli.train import code_of
 from univoxel.errors import (
     DataError,
     ExistingFile,
+    MissingExtra,
     StillBackground,
     UserError,
     WithoutMasks,
 )
 from univoxel.files import read_json, replacing
-from univoxel.names import GROUND, KEEP_SIZE, REMBG, SAMPLES, LightName, PresetOrAuto, Until
+from univoxel.names import DEPTH, KEEP_SIZE, REMBG, SAMPLES, LightName, PresetOrAuto, Until
 
 if TYPE_CHECKING:
     from univoxel.capture.project import Given, Project
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 log: logging.Logger = logging.getLogger("univoxel")
 
-AUTO = "auto"  # masks that the photographs have, or else of a network
+AUTO = "auto"  # masks that the photographs have, or else of a network, or of depth alone
 STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
 
 
@@ -45,8 +46,8 @@ class CaptureOptions:
     out: Annotated[Path, written("DIR")]
     """folder to write: scene/, cut/, run/, pictures/, the mesh and the page"""
     masks: Annotated[str, written("auto|rembg|FOLDER|none")] = AUTO
-    """where masks come from: rembg, a network; a folder of masks; none, the pattern of the ground,
-    as of cutout; auto takes those that the photographs bring, else the network"""
+    """where masks come from: rembg, a network; a folder of masks; none, depth alone, as of cutout;
+    auto takes those that the photographs bring, or else the network, or depth if there is none"""
     preset: PresetOrAuto = "auto"
     """as of train"""
     light: LightName = "hybrid"
@@ -127,7 +128,7 @@ def capture(
         photographs: a folder of photographs or a video; or photographs with cameras, of any layout
             that `train` reads; or a trained run.
         out: folder to write.
-        masks: a folder of masks; rembg, a network; none, the pattern of the ground, as of `cutout`;
+        masks: a folder of masks; rembg, a network; none, depth alone, as of `cutout`;
             auto: what the photographs bring, else a network.
         preset, minutes, light, changes, on_progress: as of `univoxel.train`.
         config: how cameras are found.
@@ -239,9 +240,9 @@ def _check_machine(given: Given, masks: str | Path) -> None:
         require_pycolmap()
     if str(masks) == REMBG:
         network()
-    elif str(masks) not in (AUTO, GROUND) and not Path(masks).is_dir():
+    elif str(masks) not in (AUTO, DEPTH) and not Path(masks).is_dir():
         raise DataError(
-            f"masks: expected {REMBG}, {GROUND} or a folder of masks, got {masks}", "masks"
+            f"masks: expected {REMBG}, {DEPTH} or a folder of masks, got {masks}", "masks"
         )
 
 
@@ -278,14 +279,14 @@ def _masks_before_cameras(project: Project, given: Given, masks: str | Path) -> 
     from univoxel.capture.poses import folders_of, photographs_of
     from univoxel.segmentation.network import network
 
-    if str(masks) not in (AUTO, REMBG, GROUND):
+    if str(masks) not in (AUTO, REMBG, DEPTH):
         return Path(masks)
     if project.masks.exists():
         _skip("masks", project.masks)
         return project.masks
-    if str(masks) == GROUND:
+    if str(masks) == DEPTH:
         raise UserError(
-            f"{given.path}: the object was turned before a still camera, and its ground with it: "
+            f"{given.path}: the object was turned before a still camera, so cameras need masks: "
             f"expected masks={REMBG} or a folder, got {masks}",
             "masks",
         )
@@ -337,10 +338,22 @@ def _find_masks(project: Project, scene: Path, masks: str | Path) -> Path:
     if turned:
         source = scene / "masks"  # those that the cameras were found with
     else:
-        source = REMBG if asked == AUTO else masks
-    words = {REMBG: "from a network", GROUND: "from the pattern of the ground"}
+        source = _network_or_depth() if asked == AUTO else masks
+    words = {REMBG: "from a network", DEPTH: "from depth alone"}
     _say("masks", words.get(str(source), f"from {source}"))
     return cutout(scene, project.cut, source)
+
+
+def _network_or_depth() -> str:
+    """Where masks come from that nobody has: a network, if one is installed."""
+    from univoxel.segmentation.network import network
+
+    try:
+        network()
+    except MissingExtra as missing:
+        log.info(f"no network is installed, so depth alone tells the object ({missing})")
+        return DEPTH
+    return REMBG
 
 
 def _have_masks(project: Project, scene: Path) -> bool:

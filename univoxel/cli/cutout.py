@@ -16,9 +16,9 @@ class CutoutOptions:
     out: Annotated[Path, written("DIR")]
     """folder to write"""
     source: Annotated[str, written("rembg|FOLDER|none", "rembg", name="from")] = "rembg"
-    """where masks come from: rembg, a network on single photographs; a folder of masks with the
-    stems of the photographs; or none, the pattern of the ground that the object stands on, which it
-    hides. Masks vote for a hull, and those that it contradicts are mended"""
+    """where masks come from: rembg, a network on single photographs; a folder of masks; or none,
+    depth alone: what stands out from its support, in the middle of what the cameras look at. Masks
+    that contradict the object in 3D are repaired"""
     downscale: DownscaleBy = "auto"
     """write photographs of 1/N of their width and height; auto as of train"""
     allow_outside: bool = False

@@ -155,7 +155,8 @@ def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tenso
         raise ValueError(f"semi_global: 0 <= small <= large, got {small} and {large}")
     if not native.serves(cost):
         return semi_global_reference(cost, rows, small, large)
-    cost, rows, total = cost.contiguous(), rows.contiguous(), torch.empty_like(cost)
+    cost, rows = cost.contiguous(), rows.contiguous()
+    total = torch.empty_like(cost)
     options = small, large, native.threads()
     native.require().semi_global(*native.arrays(cost, rows, total), *options)
     return total

@@ -1,8 +1,7 @@
 """Cut an object out of photographs without masks.
 
-Masks come from a network, from a folder, or, of what stands on a patterned ground, from the colours
-of all photographs: it hides the pattern. With the depth that the photographs show they tell the
-object in 3D, and masks that its silhouettes contradict are repaired.
+Masks come from a network, from a folder, or from the depth that the photographs show, alone. Masks
+and depth tell the object in 3D, and masks that its silhouettes contradict are repaired.
 """
 
 from __future__ import annotations
@@ -17,23 +16,29 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from univoxel.bars import track
+from univoxel.camera import resize
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.errors import DataError, ExistingFile
-from univoxel.names import GROUND, REMBG
-from univoxel.preparation.object_shape import find_object, shrunk, silhouettes
-from univoxel.preparation.stereo import depth_maps, small_cameras
-from univoxel.segmentation.ground import find_ground, ground_mask
+from univoxel.names import DEPTH, REMBG
+from univoxel.preparation.hull import mask_distances
+from univoxel.preparation.object_shape import ObjectShape, find_object, shrunk, silhouettes
+from univoxel.preparation.standing_object import masks_by_depth
+from univoxel.preparation.stereo import DepthMaps, depth_maps, small_cameras
 from univoxel.segmentation.mask_repair import BESIDE, MISSING, Verdict, iou, judge, voxel_pixels
 from univoxel.segmentation.mask_sheet import MaskTile, darkened, mask_sheet, worst_first, write_page
 from univoxel.segmentation.network import network
 
 # Photographs at least, for a vote; fewer do not outvote one another
 PHOTOGRAPHS = 12
+# Voxels along a side of the grid whose silhouettes are masks themselves, and pixels that they are
+# wide at most
+FINE, WIDTH = 128, 500
 # Share of the object's surface that depth has to show for it to be believed against most masks
 SURE = 0.5
 
@@ -54,18 +59,18 @@ def cutout(
     """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
 
     All splits are written, in the layout of NeRF-synthetic scenes, without lens distortion, beside
-    masks.png and masks.html, which show the masks, worst first. Object and ground are found from
-    the training photographs alone.
+    masks.png and masks.html, which show the masks, worst first. The object is found from the
+    training photographs alone.
 
     Args:
         out: folder to write.
-        source: where masks come from: rembg, from a network; none, from the pattern of the ground
-            that the object stands on; else a folder of masks with the stems of the photographs.
+        source: where masks come from: rembg, from a network; none, from depth alone, of what
+            stands out from its support in the middle; else a folder of masks.
         downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
         allow_outside: as of `load_photos`.
 
     Raises:
-        DataError: photographs or masks that cannot be used, or no patterned ground in them.
+        DataError: photographs or masks that cannot be used, or nothing stands out in depth.
         ExistingFile: out is there already.
         MissingExtra: there is no network.
         UserError: the masks have nothing in common.
@@ -84,32 +89,43 @@ def cutout(
     log.info(photos.about)
     if masked:
         masks = _from_network(splits, masked)
-    elif origin == GROUND:
-        masks = _from_ground(splits)
+    elif origin == DEPTH:
+        masks = _from_depth(splits, depth_maps(photos))
     else:  # of shrunk photographs those with masks are black outside of them
         masks = _as_read({n: load(n, photos.downscale, masks=Path(origin)) for n in splits})
-    verdicts, told = _judged(splits, masks)
+    if origin == DEPTH:  # silhouettes have nothing to say against themselves
+        verdicts, told = _as_they_are(masks), "masks of the object that stands out in depth"
+    else:
+        verdicts, told = _judged(splits, masks)
     _write(out, splits, masks, verdicts, told)
     return out
 
 
-def _from_ground(splits: dict[str, Photos]) -> Masks:
-    """Masks of what stands on a patterned ground."""
-    train = splits["train"]
-    photographs = [_encoded(train, view) for view in range(len(train))]
-    enough = len(train) >= PHOTOGRAPHS
-    ground = find_ground(photographs, train.cameras) if enough else None
-    if ground is None:
+def _from_depth(splits: dict[str, Photos], maps: DepthMaps) -> Masks:
+    """Masks of what stands out in depth."""
+    small = masks_by_depth(maps)
+    if small is None:
         raise DataError(
-            f"{train.folder}: no object on a patterned ground was found, and colours tell no other "
-            f"from its room: expected source={REMBG} or a folder of masks, got {GROUND}",
+            f"{splits['train'].folder}: no object that stands out in depth was found; it needs "
+            f"texture, and cameras all around: expected source={REMBG} or a folder of masks, got "
+            f"{DEPTH}",
             "source",
         )
-    log.info("patterned ground: the object is what stands on it")
-    return _of_all(
-        splits,
-        lambda split, view: ground_mask(ground, _encoded(split, view), split.cameras, view),
-    )
+    shape = find_object(small, maps, FINE)
+    log.info("masks: of the object that stands out in depth; look at masks.html")
+    return {name: _silhouettes_of(shape, split) for name, split in splits.items()}
+
+
+def _silhouettes_of(shape: ObjectShape, photos: Photos) -> list[Tensor]:
+    """The object's silhouettes as masks of photographs, their edges a pixel soft."""
+    width = min(photos.cameras.width, WIDTH)
+    found = []
+    for view, shown in enumerate(silhouettes(shape, resize(photos.cameras, width))):
+        size = photos.cameras.size(view)[::-1]
+        away = mask_distances(shown.float()[None]) * (size[1] / shown.shape[1])
+        fine = interpolate(away[None], size, mode="bilinear")[0, 0]
+        found.append(_bytes((0.5 - fine).clamp(0, 1)))
+    return found
 
 
 def _from_network(splits: dict[str, Photos], masked: Callable[[Tensor], Tensor]) -> Masks:
@@ -131,6 +147,10 @@ def _as_read(splits: dict[str, Photos]) -> Masks:
     }
 
 
+def _as_they_are(masks: Masks) -> dict[str, list[Verdict]]:
+    return {name: [Verdict(None, "", mask) for mask in those] for name, those in masks.items()}
+
+
 def _judged(splits: dict[str, Photos], masks: Masks) -> tuple[dict[str, list[Verdict]], str]:
     """What the object's silhouettes say about each mask, repaired if it may be, and what to tell
     people.
@@ -149,8 +169,7 @@ def _judged(splits: dict[str, Photos], masks: Masks) -> tuple[dict[str, list[Ver
             "masks are taken as they are: a vote needs %d photographs, there are %d",
             *(PHOTOGRAPHS, count),
         )
-        verdicts = {name: [Verdict(None, "", m) for m in those] for name, those in masks.items()}
-        return verdicts, "too few photographs for a vote: masks as they came"
+        return _as_they_are(masks), "too few photographs for a vote: masks as they came"
     coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
     shape = find_object(coverage["train"], depth_maps(train))
     shown = {n: list(silhouettes(shape, small_cameras(s.cameras))) for n, s in splits.items()}

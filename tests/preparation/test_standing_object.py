@@ -1,0 +1,69 @@
+"""The object told by depth alone: planes behind it, and what stands before them."""
+
+import numpy as np
+import pytest
+import textured_room
+import torch
+from spoilt_masks import iou, without_depth
+
+from univoxel.camera import looked_at
+from univoxel.data.base import Photos
+from univoxel.grid import fit_grid
+from univoxel.preparation.object_shape import ROOM, shrunk
+from univoxel.preparation.standing_object import (
+    Plane,
+    background_planes,
+    fitted,
+    masks_by_depth,
+    middle_part,
+    surface_nodes,
+)
+from univoxel.preparation.stereo import depth_maps, reach
+
+
+@pytest.fixture(scope="module")
+def room():
+    """Photographs of an object on a floor, in a room with furniture, and their depth maps."""
+    views = textured_room.orbit(30, 200, 150)
+    made = [textured_room.photograph(view) for view in views]
+    color, masks = (
+        torch.from_numpy(np.stack([np.array(x) for x in xs])) for xs in zip(*made, strict=True)
+    )
+    names = [f"v{i}" for i in range(len(views))]
+    photos = Photos(None, names, color, masks, textured_room.cameras(views))
+    return photos, depth_maps(photos)
+
+
+def test_masks_are_those_of_the_object(room):
+    photos, maps = room
+    found = masks_by_depth(maps)
+    true = [shrunk(m, *maps.cameras.size(v)) for v, m in enumerate(photos.coverage())]
+    agreed = [iou(one, other) for one, other in zip(found, true, strict=True)]
+    assert np.mean(agreed) > 0.8  # ragged where no depth is known; the shape of them all is not
+
+
+def test_the_plane_is_the_floor(room):
+    _, maps = room
+    centre, half = looked_at(maps.cameras), ROOM * reach(maps.cameras)
+    grid = fit_grid(centre - half, centre + half, 64**3)
+    surface = surface_nodes(maps, grid)
+    planes = background_planes(maps, grid, surface)
+    assert planes[0].normal[2] > 0.999
+    assert abs(planes[0].offset) < maps.step
+    part = grid.nodes()[middle_part(maps, grid, surface, planes)]
+    assert part[:, 2].min() > 0
+    assert part[:, :2].norm(dim=1).max() < 0.7  # neither furniture nor walls
+
+
+def test_nothing_stands_out_where_nothing_is_matched(room):
+    assert masks_by_depth(without_depth(room[0].cameras)) is None
+
+
+def test_a_plane_through_points():
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
+    points[:, 2] = 0.3 + 0.1 * points[:, 0]
+    plane = fitted(points)
+    assert plane.height(points).abs().max() < 1e-5
+    assert plane.near(points, 0.1).all()
+    assert torch.equal(plane.turned().height(points), -plane.height(points))
+    assert Plane(torch.tensor([0.0, 0.0, 1.0]), 1.0).height(torch.tensor([5.0, 5.0, 3.0])) == 2

@@ -1,0 +1,156 @@
+"""What the photographs are of, told by depth alone: without masks, a network or a box.
+
+Cameras look at the object. Planes that all of them and what they look at lie on one side of are
+its support, and walls behind it. What is left of the surface and hangs together around the middle
+is the object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+from skimage.measure import label
+from torch import Tensor
+
+from univoxel.camera import image_rays, looked_at
+from univoxel.grid import GridShape, fit_grid
+from univoxel.preparation.object_shape import FREE, ROOM, SURE, VOXELS, around, votes
+from univoxel.preparation.stereo import DepthMaps, reach
+
+# Planes that are looked for one after the other, and triples of points that are tried for each
+PLANES, TRIALS = 4, 500
+# Steps of the depth maps from a plane within which surface belongs to it
+THICK = 1.5
+# Share of the surface near the middle that a plane has at least
+LARGE = 0.08
+# Share of the cameras that have to stand before a plane
+BEFORE = 0.95
+# Distance of a plane from the middle, over `reach`, below which it may be a side of the object
+CLEAR = 0.1
+# What counts as near the middle, over `reach`: standard deviation of the weight of surface
+NEAR = 0.5
+# Nodes of surface that an object has at least
+LEAST = 200
+
+
+@dataclass(frozen=True)
+class Plane:
+    """normal . x = offset; cameras stand where it is more."""
+
+    normal: Tensor  # [3] unit
+    offset: float  # world units
+
+    def height(self, points: Tensor) -> Tensor:
+        """Of points [..., 3] above it, world units."""
+        return points @ self.normal - self.offset
+
+    def near(self, points: Tensor, step: float) -> Tensor:
+        """Which of points [..., 3] lie in it: bool."""
+        return self.height(points).abs() < THICK * step
+
+    def turned(self) -> Plane:
+        return Plane(-self.normal, -self.offset)
+
+
+def masks_by_depth(maps: DepthMaps) -> list[Tensor] | None:
+    """A mask [h, w] in [0, 1] of each small photograph; None: no object stands out.
+
+    A pixel whose depth nobody knows is what its nearest neighbour with a depth is.
+    """
+    cameras = maps.cameras
+    centre, half = looked_at(cameras), ROOM * reach(cameras)
+    room = fit_grid(centre - half, centre + half, VOXELS**3)
+    surface = surface_nodes(maps, room)
+    planes = background_planes(maps, room, surface)
+    part = middle_part(maps, room, surface, planes)
+    if part.sum() < LEAST:
+        return None
+    grid = around(room, part, VOXELS**3)  # again, finer
+    surface = surface_nodes(maps, grid)
+    part = middle_part(maps, grid, surface, planes)
+    if part.sum() < LEAST:
+        return None
+    return [_shown(maps, view, grid, part) for view in range(len(cameras))]
+
+
+def surface_nodes(maps: DepthMaps, grid: GridShape) -> Tensor:
+    """Which nodes [X, Y, Z] depth maps have a surface at."""
+    sizes = [maps.cameras.size(view) for view in range(len(maps.cameras))]
+    found = votes([torch.ones(height, width) for width, height in sizes], maps, grid)
+    free = (found.free >= SURE) & (found.free > FREE * (found.free + found.near))
+    return (found.near >= SURE) & ~free
+
+
+def background_planes(maps: DepthMaps, grid: GridShape, surface: Tensor) -> list[Plane]:
+    """The support of the object and walls behind it, the largest first, by RANSAC (Fischler and
+    Bolles 1981)."""
+    centre, radius = looked_at(maps.cameras), reach(maps.cameras)
+    eyes = maps.cameras.camera_to_world[:, :, 3]
+    points = grid.nodes()[surface]
+    points = points[(points - centre).norm(dim=1) < ROOM * radius]
+    count, generator = len(points), torch.Generator().manual_seed(0)
+    planes: list[Plane] = []
+    while len(points) >= 3 and len(planes) < PLANES:
+        a, b, c = points[torch.randint(len(points), (3, TRIALS), generator=generator)]
+        normal = torch.linalg.cross(b - a, c - a)
+        normal = normal / normal.norm(dim=1, keepdim=True).clamp_min(1e-9)
+        offset = (normal * a).sum(1)
+        before = eyes @ normal.T > offset
+        sign = torch.where(before.float().mean(0) < 0.5, -1.0, 1.0)
+        normal, offset = sign[:, None] * normal, sign * offset
+        usable = (before == (sign > 0)).float().mean(0) >= BEFORE
+        usable &= normal @ centre - offset > CLEAR * radius
+        some = points[torch.randperm(len(points), generator=generator)[:4000]]
+        near = ((some @ normal.T - offset).abs() < THICK * maps.step).float().mean(0)
+        best = int(torch.where(usable, near, -1.0).argmax())
+        if not usable[best] or near[best] * len(points) < LARGE * count:
+            break
+        plane = fitted(points[Plane(normal[best], float(offset[best])).near(points, maps.step)])
+        planes.append(plane if plane.normal @ normal[best] > 0 else plane.turned())
+        points = points[planes[-1].height(points) > THICK * maps.step]
+    return planes
+
+
+def fitted(points: Tensor) -> Plane:
+    """The plane nearest to points [N, 3], in least squares."""
+    middle = points.mean(0)
+    normal = torch.linalg.svd(points - middle, full_matrices=False)[2][2]
+    return Plane(normal, float(normal @ middle))
+
+
+def middle_part(maps: DepthMaps, grid: GridShape, surface: Tensor, planes: list[Plane]) -> Tensor:
+    """The nodes [X, Y, Z] of the surface before all planes that hang together around the middle."""
+    nodes = grid.nodes()
+    before = surface.clone()
+    for plane in planes:
+        before &= plane.height(nodes) > THICK * maps.step
+    parts = np.asarray(label(before.numpy(), connectivity=3))
+    away = (nodes - looked_at(maps.cameras)).norm(dim=-1) / (NEAR * reach(maps.cameras))
+    weight = np.bincount(parts.ravel(), (-away.square()).exp().numpy().ravel())
+    weight[0] = 0.0
+    part = (parts == weight.argmax()) & before.numpy()
+    return torch.from_numpy(part)
+
+
+def _shown(maps: DepthMaps, view: int, grid: GridShape, part: Tensor) -> Tensor:
+    """Which pixels of a view see a part [X, Y, Z] of the surface: [h, w], 0 or 1."""
+    width, height = maps.cameras.size(view)
+    rays, known = image_rays(maps.cameras, view), maps.known[view, :height, :width]
+    distance = maps.distance[view, :height, :width].reshape(-1).nan_to_num()
+    place = rays.origin + distance[:, None] * rays.direction - torch.tensor(grid.origin)
+    index = (place / grid.voxel_size).round().long()
+    size = torch.tensor(grid.size)
+    within = ((index >= 0) & (index < size)).all(1)
+    x, y, z = index.clamp_min(0).minimum(size - 1).unbind(1)
+    thick = torch.from_numpy(ndimage.binary_dilation(part.numpy()))
+    shown = (thick[x, y, z] & within).view(height, width).float()
+    if not known.any():
+        return torch.zeros(height, width)
+    nearest = ndimage.distance_transform_edt(
+        ~known.numpy(), return_distances=False, return_indices=True
+    )
+    row, column = torch.from_numpy(np.asarray(nearest)).long()
+    return shown[row, column]
