@@ -61,7 +61,7 @@ net: dev
 
 page-test: dev
 	scripts/browser.sh
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/page tests/viewer
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/output tests/viewer
 
 fuzz: dev
 	$(BIN)/python tests/fuzz.py --cases 300
@@ -80,7 +80,7 @@ build/network/u2netp.onnx: $(SETUP)
 
 network-test: dev build/network/u2netp.onnx
 	OMP_NUM_THREADS=1 U2NET_HOME=build/network NETWORK_SITE=build/network/site \
-		$(BIN)/python -m pytest -q tests/segmentation/test_network.py
+		$(BIN)/python -m pytest -q tests/capture/test_network.py
 
 lint: $(SETUP)
 	$(BIN)/python scripts/house.py

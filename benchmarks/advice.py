@@ -21,15 +21,14 @@ import torch
 from torch.nn.functional import normalize
 
 from univoxel.camera import looked_at
-from univoxel.checkpoint import FILE, load_scene
 from univoxel.cli.evaluate import evaluate
-from univoxel.confidence.advice import ADVICE, Advice, advise, azimuths
-from univoxel.confidence.survey import POINTS, Survey, survey
+from univoxel.cli.trainer import train
+from univoxel.core.files import replacing
 from univoxel.data import Photos, load_photos
-from univoxel.files import replacing
+from univoxel.evaluation.confidence import ADVICE, POINTS, Advice, Survey, advise, azimuths, survey
 from univoxel.presets import preset
 from univoxel.run import photos_of
-from univoxel.trainer import train
+from univoxel.scene import FILE, load_scene
 
 FRAMES = "transforms_train.json"
 MINUTES = 60.0  # no limit: presets are compared, and not the machine's load

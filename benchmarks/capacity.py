@@ -22,13 +22,13 @@ from made import made
 
 from lab import plots
 from lab.record import result_text
-from univoxel.checkpoint import FILE
 from univoxel.cli.evaluate import evaluate
 from univoxel.cli.info import info
+from univoxel.cli.trainer import train
 from univoxel.config import StageConfig, TrainConfig
-from univoxel.files import replacing
+from univoxel.core.files import replacing
 from univoxel.presets import preset, with_field
-from univoxel.trainer import train
+from univoxel.scene import FILE
 
 SETTINGS = ["dense", "sparse", "hash", "adaptive"]
 PANELS = [plots.NVS, plots.ALBEDO, plots.RELIT]

@@ -20,10 +20,10 @@ from made import made
 
 from lab.record import result_text
 from univoxel.capture.poses import poses
-from univoxel.checkpoint import FILE
 from univoxel.cli.evaluate import evaluate
+from univoxel.cli.trainer import train
 from univoxel.presets import preset
-from univoxel.trainer import train
+from univoxel.scene import FILE
 
 FIELD = {"test_every": 16, "background": "white"}  # its protocol
 COLUMNS = [

@@ -29,12 +29,12 @@ from torch.nn.functional import normalize
 
 from lab.record import result_text
 from univoxel.camera import Cameras, Rays, image_rays
+from univoxel.capture.cutout import DEPTH, REMBG, cutout
 from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.envmap import EnvMap, lookup
-from univoxel.segmentation.cutout import DEPTH, REMBG, cutout
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "tests"))

@@ -27,13 +27,13 @@ import torch
 from made import made
 
 from lab.record import result_text
+from univoxel.core.records import Rays
 from univoxel.fields.features import PER_LEVEL, Levels
 from univoxel.fields.field import Field, dense_field, hash_field
-from univoxel.grid import GridShape
+from univoxel.fields.grid import GridShape
 from univoxel.ops import composite, section_alpha
 from univoxel.optim import RowAdam, rows_of
-from univoxel.records import Rays
-from univoxel.training import loop, surface_update
+from univoxel.training import descent, loop
 
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "field_scaling.json"
@@ -85,7 +85,7 @@ def step(field: Field, optimizer: RowAdam) -> None:
     loss = (seen[:, :channels] - wanted).square().mean() + 0.1 * (length - 1).square().mean()
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
-    surface_update.smooth_sdf_gradient_(field, 4)
+    descent.smooth_sdf_gradient_(field, 4)
     optimizer.step()
 
 

@@ -31,16 +31,16 @@ from made import made
 from lab.record import result_text
 from univoxel import envmap
 from univoxel.camera import Cameras, resize
-from univoxel.metrics import psnr
-from univoxel.page import PageOptions, lights_of
-from univoxel.pictures.viewpoints import orbit
+from univoxel.output.page import PageOptions, lights_of
+from univoxel.output.viewpoints import orbit
+from univoxel.render.metrics import psnr
 from univoxel.render.relight import Lighting
 from univoxel.run import trained_on
-from univoxel.viewer import denoise
+from univoxel.viewer import frames
 from univoxel.viewer.frames import Look, refined_pictures
+from univoxel.viewer.render_queue import QUICK_WIDTHS, REST_SECONDS, REST_WIDTH, Studio
 from univoxel.viewer.server import serving
-from univoxel.viewer.studio import QUICK_WIDTHS, REST_SECONDS, REST_WIDTH, Studio
-from univoxel.viewer.subject import Subject, subject_of
+from univoxel.viewer.viewer_scene import Subject, subject_of
 
 WINDOW = (1160, 720)
 PATIENCE = 60.0  # seconds
@@ -156,7 +156,7 @@ def rest_seconds(subject: Subject) -> float | None:
     plain = Look(lighting)
     *_, best = (x for x in refined_pictures(subject, cameras, plain) if x is not None)
     begin = time.monotonic()
-    for picture in refined_pictures(subject, cameras, Look(lighting, denoise=denoise.available())):
+    for picture in refined_pictures(subject, cameras, Look(lighting, denoise=frames.available())):
         if picture is None:
             continue
         quality = float(psnr(picture[..., :3] * picture[..., 3:], best[..., :3] * best[..., 3:]))

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from univoxel import ops
-from univoxel.records import Samples
+from univoxel.core.records import Samples
 
 Peers = dict[str, Callable[[], Callable[[], object]]]  # by name: sets up and returns the work
 

@@ -38,7 +38,7 @@ import univoxel
 from lab.record import result_text
 from univoxel.capture.poses import poses
 from univoxel.data.colmap import read_images
-from univoxel.data.shots import TEST_EVERY
+from univoxel.data.load_images import TEST_EVERY
 from univoxel.data.transforms import write_cameras
 
 HERE = Path(__file__).parent

@@ -25,14 +25,14 @@ from torch import Tensor
 from varying import exposed
 
 from lab.record import result_text
-from univoxel.checkpoint import FILE
 from univoxel.cli.evaluate import evaluate
+from univoxel.cli.trainer import train
 from univoxel.config import LossConfig, TrainConfig, save_config
+from univoxel.core.files import replacing
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
-from univoxel.files import replacing
 from univoxel.presets import preset
-from univoxel.trainer import train
+from univoxel.scene import FILE
 
 matplotlib.use("agg")
 import matplotlib.pyplot as plt

@@ -2,7 +2,7 @@
 
     python benchmarks/profile_run.py SCENE [--preset fast] [--part 6] [--cpu]
 
-`univoxel.trainer` itself runs; what it calls is timed where it is called. Of every 16th
+`univoxel.cli.trainer` itself runs; what it calls is timed where it is called. Of every 16th
 backward pass the profiler says which part of the forward pass its nodes belong to; the time of all
 of them is divided in these proportions.
 """
@@ -23,24 +23,24 @@ from made import made
 from train_step import OTHER, STAGES, Clock
 
 from lab.record import result_text
-from univoxel import trainer
+from univoxel.cli import trainer
 from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.fields.field import Field
-from univoxel.joint import observations, stage
 from univoxel.ops import VisibilityScene
 from univoxel.preparation import prepare
 from univoxel.presets import chosen
-from univoxel.training import loop, patches
+from univoxel.render import observations
+from univoxel.training import joint_solve, loop, patches
 
 HERE = Path(__file__).parent
 ONCE = {
-    "joint: observations and visibility": [(stage, "build_problem")],
-    "joint: hypothesis trials": [(stage, "initialise_")],
+    "joint: observations and visibility": [(joint_solve, "build_problem")],
+    "joint: hypothesis trials": [(joint_solve, "initialise_")],
     "joint: entropy": [
-        (stage, name) for name in ("fit_sun_", "minimise_entropy_", "diffuse_albedo")
+        (joint_solve, name) for name in ("fit_sun_", "minimise_entropy_", "diffuse_albedo")
     ],
-    "joint: Newton": [(stage, "newton_round_")],
-    "joint: metal decision": [(stage, "find_metal")],
+    "joint: Newton": [(joint_solve, "newton_round_")],
+    "joint: metal decision": [(joint_solve, "find_metal")],
     "held-out rays": [(loop, "held_out_psnr")],
     "previews": [(trainer, "preview")],
     "checkpoints": [(trainer, "save_scene"), (loop, "save_scene")],
@@ -52,7 +52,7 @@ PARTS = {
     **STAGES,
     "sample": [(Field, n) for n in ("sample", "features_at")],
     "light": [*STAGES["light"], (observations, "shade_map")],
-    "hull": [(prepare, name) for name in ("fitted_masks", "weighed", "visual_hull")],
+    "hull": [(prepare, name) for name in ("fitted_masks", "choose_masks_or_poses", "visual_hull")],
     "carving": [(prepare, "carve_within_time")],
     "cameras": [(prepare, "registered_poses")],
     "loading": [(trainer, "load_photos")],
@@ -156,7 +156,7 @@ def profile(cfg: TrainConfig, now: Callable[[], float] = time.perf_counter) -> d
             patch(owner, attribute, lambda f, name=name: clock.timed(name, f))
     patch(torch.Tensor, "backward", clock.backward_pass)
     patch(trainer, "run_stage", clock.stage)
-    patch(stage, "solve", clock.stage)
+    patch(joint_solve, "solve", clock.stage)
     begin = now()
     try:
         trainer.train(cfg)

@@ -82,8 +82,8 @@ def read(args: argparse.Namespace, kept: Path) -> dict[str, float]:
 
 def train(args: argparse.Namespace, kept: Path) -> dict[str, float]:
     """Train for so long, from photographs that were not kept."""
+    from univoxel.cli.trainer import train as task
     from univoxel.presets import chosen
-    from univoxel.trainer import train as task
 
     begin = time.perf_counter()
     task(chosen(args.preset, args.minutes, args.folder, args.folder / "run"))

@@ -31,11 +31,11 @@ from torch import Tensor
 from lab.record import result_text
 from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb, srgb_to_linear
+from univoxel.core.records import Mesh
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.envmap import EnvMap, tables
 from univoxel.ops import VisibilityScene, relight
-from univoxel.records import Mesh
 
 SPP = [1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024]
 TRUTH_SPP = 8192

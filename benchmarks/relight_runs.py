@@ -20,18 +20,17 @@ import torch
 from made import made
 
 from lab.record import result_text
-from univoxel.checkpoint import load_scene
 from univoxel.color import linear_to_srgb
+from univoxel.core.records import Surface
 from univoxel.data import load_photos, load_relit, relight_maps
-from univoxel.data.base import decode
-from univoxel.data.maps import read_map
-from univoxel.envmap import tables
+from univoxel.data.photos import decode
+from univoxel.envmap import read_map, tables
 from univoxel.evaluation.measures import albedo_scales
-from univoxel.metrics import on_black, psnr
-from univoxel.records import Surface
+from univoxel.render.metrics import on_black, psnr
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, TracedMesh, relight_surface, traced_mesh
 from univoxel.run import trained_on
+from univoxel.scene import load_scene
 
 BOUNCES = [0, 1, 2, 4]
 EXPONENTS = [1.0, 1.5]

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from univoxel import brdf
 from univoxel.camera import image_rays, resize
+from univoxel.core.records import Mesh, Rays
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.envmap import EnvMap, lookup, tables
 from univoxel.ops import VisibilityScene
-from univoxel.records import Mesh, Rays
 
 TESTS = Path(__file__).parent.parent / "tests"
 ALBEDO, ROUGHNESS = torch.tensor([[0.6, 0.4, 0.3]]), torch.tensor([0.4])  # of the data's mesh

@@ -27,30 +27,28 @@ from trimesh.triangles import closest_point
 
 from lab.record import result_text
 from univoxel import lights
-from univoxel.assets.bake import with_materials
 from univoxel.camera import image_rays
-from univoxel.checkpoint import load_scene, save_scene
 from univoxel.cli.evaluate import evaluate
+from univoxel.cli.trainer import train
 from univoxel.color import linear_to_srgb
 from univoxel.config import JointConfig, StageConfig, TrainConfig, save_config
+from univoxel.core.records import Mesh, Surface
 from univoxel.data import load_photos, load_relit, load_truth, relight_maps
-from univoxel.data.base import decode
-from univoxel.data.maps import read_map, true_map
-from univoxel.envmap import tables
+from univoxel.data.photos import decode
+from univoxel.envmap import read_map, tables, true_map
 from univoxel.evaluation.measures import albedo_scales
 from univoxel.fields.field import dense_field
-from univoxel.grid import GridShape, fit_grid
-from univoxel.lights.nodes import DistantLight
-from univoxel.metrics import on_black, psnr
+from univoxel.fields.grid import GridShape, fit_grid
+from univoxel.lights.latlong import DistantLight
 from univoxel.ops import VisibilityScene
+from univoxel.output.mesh import with_materials
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
 from univoxel.presets import preset
-from univoxel.records import Mesh, Surface
+from univoxel.render.metrics import on_black, psnr
 from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.render.relight import Lighting, relight_surface, traced_mesh
-from univoxel.scene import Scene
+from univoxel.scene import Scene, load_scene, save_scene
 from univoxel.sphere import latlong_directions, texel_solid_angles
-from univoxel.trainer import train
 
 TERMS = ("none", "geometry", "light", "both")
 NEIGHBOURS = 4  # samples of the surface whose triangles a node is measured to

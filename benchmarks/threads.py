@@ -29,7 +29,7 @@ def measure(scene: Path, preset: str, folder: Path, threads: int) -> list[list]:
     """Name, seconds on the clock and seconds of the processor of each stage of a training here."""
     import torch
 
-    from univoxel import trainer
+    from univoxel.cli import trainer
     from univoxel.config import JointConfig
     from univoxel.presets import chosen
 

@@ -2,7 +2,7 @@
 
     python benchmarks/train_step.py [--rays 4096] [--out benchmarks/results/train_step.json]
 
-The bundled scene is trained natively for some steps, then the loop of univoxel.trainer itself
+The bundled scene is trained natively for some steps, then the loop of univoxel.cli.trainer itself
 runs on, once on each backend: its stages are timed where they are called. With the kernels the
 backward pass is divided too: a node belongs to the stage in which its forward was called. The
 references' is not: under the profiler that this takes their memory grew past 20 GB.
@@ -23,17 +23,17 @@ import torch
 from made import made
 
 from lab.record import result_text
-from univoxel import losses, ops
+from univoxel import ops
 from univoxel.data import load_photos
-from univoxel.fields.field import Field, dense_field
-from univoxel.fields.heads import MaterialHead, RadianceHead
-from univoxel.grid import fit_grid
-from univoxel.lights import priors
-from univoxel.lights.mirrored import MirroredLight
+from univoxel.fields.field import Field, MaterialHead, RadianceHead, dense_field
+from univoxel.fields.grid import fit_grid
+from univoxel.lights import base
+from univoxel.lights.base import MirroredLight
 from univoxel.lights.sg import LocalSG
 from univoxel.optim import RowAdam
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
 from univoxel.presets import preset
+from univoxel.render import metrics
 from univoxel.scene import Scene
 from univoxel.training import loop
 from univoxel.training.pixels import TrainingPixels, split_pixels
@@ -51,8 +51,8 @@ STAGES = {
     ],
     "light": [(LocalSG, "reflected"), (LocalSG, "lobes_from_raw")],
     "losses": [
-        *((losses, name) for name in ("photometric", "silhouette")),
-        *((priors, name) for name in ("smoothness", "chroma", "total_variation")),
+        *((metrics, name) for name in ("photometric", "silhouette")),
+        *((base, name) for name in ("smoothness", "chroma", "total_variation")),
     ],
     "optimiser": [(RowAdam, "step")],
     "smoothing": [(loop, "smooth_touched_"), (loop, "smooth_sdf_gradient_")],

@@ -30,19 +30,18 @@ from torch.nn.functional import normalize
 
 from lab.record import result_text
 from univoxel.camera import image_rays
-from univoxel.checkpoint import FILE, load_scene
 from univoxel.cli.evaluate import evaluate
+from univoxel.cli.trainer import train
 from univoxel.color import linear_to_srgb, luminance
+from univoxel.core.files import replacing
+from univoxel.core.records import Mesh, Surface
 from univoxel.data import Photos, load_photos, load_truth
 from univoxel.data.images import write_png
-from univoxel.data.maps import read_map
-from univoxel.data.mesh import read_ply
-from univoxel.envmap import tables
-from univoxel.files import replacing
+from univoxel.data.truth import read_ply
+from univoxel.envmap import read_map, tables
 from univoxel.presets import preset
-from univoxel.records import Mesh, Surface
 from univoxel.render.relight import Lighting, relight_surface, rotated, traced_mesh
-from univoxel.trainer import train
+from univoxel.scene import FILE, load_scene
 
 # kind: what it is compared with, and the models that are trained on it
 KINDS = {

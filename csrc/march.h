@@ -35,7 +35,7 @@ struct March {
     BrickNodes sparse() const { return {table, bricks_y, bricks_z}; }
 };
 
-/// Packed samples; see records.py. Sample i starts a section when connected[i] is 1.
+/// Packed samples; see core/records.py. Sample i starts a section when connected[i] is 1.
 template <class T>
 struct PackedSamples {
     std::vector<T> t;

@@ -6,7 +6,7 @@
 
 namespace univoxel {
 
-/// Arguments of match_cost; see univoxel/ops/stereo.py.
+/// Arguments of match_cost; see univoxel/ops/patches.py.
 struct Match {
     const int32_t* pictures;  // [V, H, W] colour times coverage, coverage: bytes, red the lowest
     const float* matrix;      // [V, 3, 4] world to (x z, y z, z) of pixels

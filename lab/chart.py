@@ -11,9 +11,9 @@ from lab import plots, runner
 from lab.plots import Measure
 from lab.record import Outcome, Setting, result_text
 from univoxel.config import StageConfig, TrainConfig
+from univoxel.core.choices import LIGHTS, LightName
+from univoxel.core.files import replacing
 from univoxel.errors import ProcessFailed, UserError
-from univoxel.files import replacing
-from univoxel.names import LIGHTS, LightName
 
 BETWEEN = (3, 6)  # minutes, where the curve is looked at between the presets
 PRESETS = ("draft", "fast", "full", "best")

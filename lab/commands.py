@@ -16,7 +16,7 @@ from univoxel.cli.parsing import (
     check_minutes,
     written,
 )
-from univoxel.names import BOUNCES, LIGHTS, SAMPLES, LightName, PresetName, PresetOrAuto
+from univoxel.core.choices import BOUNCES, LIGHTS, SAMPLES, LightName, PresetName, PresetOrAuto
 
 
 def submit(

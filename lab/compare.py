@@ -9,9 +9,9 @@ from statistics import fmean
 from lab import plots, runner
 from lab.plots import Measure
 from lab.record import Outcome, Setting, result_text
+from univoxel.core.choices import LIGHTS, LightName
+from univoxel.core.files import replacing
 from univoxel.errors import ProcessFailed, UserError
-from univoxel.files import replacing
-from univoxel.names import LIGHTS, LightName
 
 COLUMNS = (
     plots.NVS,

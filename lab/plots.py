@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import torch
 
 from univoxel import __version__
+from univoxel.core.files import replacing
+from univoxel.core.machine import processor
 from univoxel.errors import MissingExtra
-from univoxel.files import replacing
-from univoxel.machine import processor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

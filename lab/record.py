@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from univoxel.config import TrainConfig
+from univoxel.core.choices import LightName
+from univoxel.core.files import read_json, replacing
+from univoxel.core.validation import changed, check_fields
 from univoxel.errors import DataError
-from univoxel.files import read_json, replacing
-from univoxel.names import LightName
-from univoxel.overrides import changed
 from univoxel.presets import chosen
-from univoxel.validation import check_fields
 
 RESULT = "result.json"
 

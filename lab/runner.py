@@ -10,11 +10,10 @@ from pathlib import Path
 
 from lab import worker
 from lab.record import RESULT, Outcome, Setting, identity, load_outcome
+from univoxel.batch.jobs import Job, Result, Step, connect, run_jobs
+from univoxel.core.machine import threads_asked
 from univoxel.data import load_photos
 from univoxel.errors import UserError
-from univoxel.jobs.job import Job, Result, Step
-from univoxel.jobs.scheduler import connect, run_jobs
-from univoxel.machine import threads_asked
 from univoxel.training.progress import LOG
 
 log: logging.Logger = logging.getLogger("univoxel")

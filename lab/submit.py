@@ -9,7 +9,7 @@ DIR/depth/<name>.exr                along -Z
 DIR/albedo/<name>.exr               linear
 DIR/mesh.obj
 
-Read beside what univoxel.data.orb reads, for the light of other scenes:
+Read beside what univoxel.data.truth reads, for the light of other scenes:
 
 ground_truth/<scene>/env_map/<name>.exr    the light in which <name> was photographed, around its
                                            camera: -Z in the middle, X to the right, Y on top
@@ -26,25 +26,23 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from univoxel.bars import track
 from univoxel.camera import Cameras, resize
-from univoxel.checkpoint import load_scene
 from univoxel.cli.export import export
+from univoxel.core.choices import BOUNCES, SAMPLES
+from univoxel.core.files import replacing
+from univoxel.core.progress_bar import track
+from univoxel.core.records import Mesh
 from univoxel.data import Photos
 from univoxel.data.images import write_exr
-from univoxel.data.maps import read_map
-from univoxel.data.shots import cameras_of
+from univoxel.data.load_images import cameras_of
 from univoxel.data.transforms import read_frames
-from univoxel.envmap import EnvMap, lookup, tables
+from univoxel.envmap import EnvMap, lookup, read_map, tables
 from univoxel.errors import DataError, ExistingFile, UserError
-from univoxel.files import replacing
-from univoxel.names import BOUNCES, SAMPLES
-from univoxel.pictures.layers import Relighting, render_layers
-from univoxel.records import Mesh
+from univoxel.evaluation.measures import Relighting, render_layers
 from univoxel.render.pipeline import extract_mesh
 from univoxel.render.relight import Lighting, traced_mesh
 from univoxel.run import photos_of
-from univoxel.scene import Scene
+from univoxel.scene import Scene, load_scene
 from univoxel.sphere import latlong_directions
 
 SIZE = 512  # pixels along a side of the benchmark's pictures

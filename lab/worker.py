@@ -16,15 +16,15 @@ from pathlib import Path
 from typing import Any
 
 from lab.record import RESULT, Outcome, Setting, identity, load_outcome
-from univoxel.checkpoint import load_checkpoint
+from univoxel.batch.jobs import Job
 from univoxel.cli.envmap import envmap
 from univoxel.cli.evaluate import evaluate
+from univoxel.cli.trainer import train
 from univoxel.config import TrainConfig, check_same
+from univoxel.core.machine import load
 from univoxel.errors import UserError
 from univoxel.evaluation.recovered_map import Comparison
-from univoxel.jobs.job import Job
-from univoxel.machine import load
-from univoxel.trainer import train
+from univoxel.scene import load_checkpoint
 
 JOB = "job"  # beginning of the names of its record, its lock and what it said
 RUN = "run"  # the training's own folder

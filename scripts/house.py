@@ -18,14 +18,14 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 37_010,
-    "lines of the laboratory": 3_100,
+    "lines of the package": 36_400,
+    "lines of the laboratory": 3_000,
     "lines of tests": 36_300,
-    "modules of the package": 262,
-    "loose modules at the top": 35,
+    "modules of the package": 161,
+    "loose modules at the top": 12,
     "configuration fields": 128,
     "fields that nothing sets": 0,
-    "layers": 15,
+    "layers": 10,
     "imports that go up": 0,
     "circles": 0,
 }

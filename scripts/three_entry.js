@@ -1,4 +1,5 @@
-// What the page takes of three.js: scripts/vendor_three.sh bundles it for univoxel/page/vendor/.
+// What the page takes of three.js: scripts/vendor_three.sh bundles it for
+// univoxel/output/web/vendor/.
 export {
   BufferAttribute, Color, DataTexture, DataUtils, EquirectangularReflectionMapping, Euler, HalfFloatType,
   LinearFilter, LinearMipmapLinearFilter, LinearSRGBColorSpace, Matrix4, Mesh, MeshBasicMaterial, MeshStandardMaterial,

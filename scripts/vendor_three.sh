@@ -1,11 +1,11 @@
 #!/bin/bash
-# Fetch three.js again and bundle what the page uses of it into univoxel/page/vendor/. The bundle is
-# committed: nobody but whoever changes the version or three_entry.js needs npm.
+# Fetch three.js again and bundle what the page uses of it into univoxel/output/web/vendor/. The
+# bundle is committed: nobody but whoever changes the version or three_entry.js needs npm.
 # Usage: scripts/vendor_three.sh
 set -euo pipefail
 cd "$(dirname "$0")/.."
 three=0.187.0 esbuild=0.28.2
-work=$PWD/build/three vendor=$PWD/univoxel/page/vendor
+work=$PWD/build/three vendor=$PWD/univoxel/output/web/vendor
 
 rm -rf "$work" && mkdir -p "$work/node_modules/three" "$work/esbuild"
 cd "$work"

@@ -11,7 +11,7 @@ from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.fields.field import dense_field
-from univoxel.grid import GridShape
+from univoxel.fields.grid import GridShape
 from univoxel.lights import (
     BakedConfig,
     EnvmapConfig,

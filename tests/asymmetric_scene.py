@@ -6,7 +6,7 @@ import torch
 
 from univoxel.envmap import EnvMap
 from univoxel.fields.field import dense_field
-from univoxel.grid import fit_grid
+from univoxel.fields.grid import fit_grid
 from univoxel.lights import SGConfig
 from univoxel.scene import Scene, SceneConfig
 from univoxel.sphere import latlong_directions

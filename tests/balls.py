@@ -4,7 +4,7 @@ import torch
 from torch.nn.functional import normalize
 
 from univoxel import sphere
-from univoxel.records import Surface
+from univoxel.core.records import Surface
 
 
 def ball(n=200, features=4, albedo=0.5, roughness=0.5, seed=0):

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from univoxel.records import Bricks
+from univoxel.core.records import Bricks
 
 
 def cut(sdf: Tensor, far: float, spare: int = 1) -> tuple[Tensor, Tensor, Bricks]:

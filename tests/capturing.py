@@ -13,12 +13,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from univoxel import trainer
-from univoxel.capture import structure
+from univoxel.capture import cutout, structure
 from univoxel.capture.config import CaptureConfig
 from univoxel.cli import capture as task
+from univoxel.cli import trainer
 from univoxel.data import images
-from univoxel.segmentation import cutout
 
 # Enough for pictures of this size
 CONFIG = CaptureConfig(features=1000, first_octave=0, exhaustive=10, partners=8)

@@ -41,18 +41,18 @@ from layouts import scene, write_colmap, write_llff, write_nerf, write_nerfstudi
 from PIL import Image
 
 from lab.record import load_outcome
-from univoxel.assets.ply import write_ply
-from univoxel.checkpoint import load_checkpoint, save_scene
 from univoxel.config import check_same, save_config
+from univoxel.core.records import Mesh
 from univoxel.data import Photos, keep_photos, load_cameras, load_photos, load_points, load_truth
 from univoxel.data.images import image_size, read_image, write_exr
-from univoxel.data.maps import read_map
-from univoxel.data.mesh import read_ply
+from univoxel.data.truth import read_ply
+from univoxel.envmap import read_map
 from univoxel.errors import NoSurface, UserError
+from univoxel.output.mesh_files import write_ply
 from univoxel.presets import preset
-from univoxel.records import Mesh
 from univoxel.render.pipeline import shade_hits, surface_of_view
 from univoxel.run import photos_of, trained_on
+from univoxel.scene import load_checkpoint, save_scene
 
 MEMORY = 3 << 30  # bytes beyond what the worker has when it begins
 SECONDS = 60.0  # of a case, at most; most take milliseconds, but the machine may be shared

@@ -4,9 +4,9 @@ import math
 
 import torch
 
+from univoxel.core.records import Mesh
 from univoxel.envmap import EnvMap, tables
 from univoxel.ops import VisibilityScene, relight
-from univoxel.records import Mesh
 
 WHITE = EnvMap(torch.ones(8, 16, 3))
 DARK = EnvMap(torch.zeros(1, 2, 3))

@@ -11,22 +11,16 @@ from pathlib import Path
 # From the bottom up. A folder or file imports only from layers below its own; inside a folder
 # anything goes that is no circle.
 LAYERS = [
-    {"bars", "errors", "guard", "installation", "machine", "names", "records", "retired", "memmap"}
-    | {"threads", "files", "overrides", "validation", "jobs", "steps"},
-    {"brdf", "camera", "color", "grid", "losses", "metrics", "orbit", "sphere"},
-    {"ops"},
-    {"envmap", "networks", "optim", "poses"},
-    {"data", "fields", "lights"},
-    {"checkpoint", "run", "scene", "verdict"},
-    {"assets", "config", "presets", "render"},
-    {"capture", "preparation", "training"},
-    {"compression", "joint", "page"},
-    {"build", "confidence", "segmentation"},
-    {"pictures"},
-    {"evaluation", "report", "viewer"},
-    {"batch", "trainer"},
-    {"cli"},
-    {"api"},
+    {"core", "brdf", "camera", "color", "errors", "sphere"},
+    {"ops", "optim"},
+    {"data", "envmap", "fields", "lights"},
+    {"run", "scene"},
+    {"config", "presets", "render"},
+    {"preparation"},
+    {"capture", "evaluation", "training"},
+    {"output"},
+    {"batch", "viewer"},
+    {"api", "cli"},
 ]
 
 # Of lab/, which imports from the package what it likes, and which the package does not import

@@ -28,12 +28,12 @@ import univoxel
 from univoxel.color import srgb_to_linear
 from univoxel.config import TrainConfig
 from univoxel.data.images import read_image
-from univoxel.joint import initialise
-from univoxel.preparation import registration
+from univoxel.preparation import pose_refinement
 from univoxel.presets import preset, with_field
+from univoxel.training import metals
 
 # What looks for a start by trials, with less to look at: each has tests of its own
-FEWER = {(registration, "STEPS"): 60, (initialise, "TRIAL_POINTS"): 150}
+FEWER = {(pose_refinement, "STEPS"): 60, (metals, "TRIAL_POINTS"): 150}
 DATA = Path(univoxel.__file__).parent / "example_data" / "tiny"
 COPY = 16  # pixels along a side of the small copies
 

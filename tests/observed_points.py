@@ -14,13 +14,18 @@ from torch.nn.functional import normalize
 from univoxel import brdf
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.data import Photos
-from univoxel.joint.equations import LinearTransport
-from univoxel.joint.observations import Decisions, JointProblem, prefiltered_roughness
-from univoxel.lights.nodes import DistantLight
+from univoxel.lights.latlong import DistantLight
 from univoxel.ops import shade_map
-from univoxel.render.transport import Observations, Transport
+from univoxel.render.observations import (
+    JointProblem,
+    MaterialLabels,
+    Observations,
+    Transport,
+    prefiltered_roughness,
+)
 from univoxel.scene import Scene
 from univoxel.sphere import fibonacci_sphere
+from univoxel.training.equations import LinearTransport
 
 
 def facing(normal: torch.Tensor, least: float) -> torch.Tensor:
@@ -51,9 +56,9 @@ def problem_on_a_sphere(
     return JointProblem(observations, transport, black, 0.05, sky)
 
 
-def no_metal(problem: JointProblem) -> Decisions:
+def no_metal(problem: JointProblem) -> MaterialLabels:
     """Nothing is decided yet, and nothing is metal."""
-    return Decisions(torch.zeros(len(problem.observations.position), dtype=torch.bool))
+    return MaterialLabels(torch.zeros(len(problem.observations.position), dtype=torch.bool))
 
 
 def photographed(problem: JointProblem, map, albedo, roughness, f0=None) -> JointProblem:

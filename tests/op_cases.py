@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from univoxel import ops, sphere
+from univoxel.core.records import Mesh, Samples
 from univoxel.envmap import EnvMap, tables
 from univoxel.ops import native
-from univoxel.records import Mesh, Samples
 
 ORIGIN, H, SHAPE = (-1.0, -1.0, -1.0), 0.25, (9, 10, 11)
 # Corners and voxel sizes of a hash table of two levels

@@ -3,8 +3,8 @@
 import torch
 from analytic import photos_of, sphere_scene
 
-from univoxel.compression.search import reference_rays
 from univoxel.lights import SGConfig
+from univoxel.training.compression import reference_rays
 
 LIGHT = SGConfig(lobes=4, hidden=16, directions=16, directions_eval=16)
 

@@ -5,8 +5,8 @@ import math
 import torch
 
 from univoxel.camera import Cameras, image_rays
+from univoxel.capture.masks import BESIDE, MISSING
 from univoxel.preparation.stereo import DepthMaps
-from univoxel.segmentation.mask_repair import BESIDE, MISSING
 
 __all__ = ["BESIDE", "MISSING", "iou", "kept_table", "lost_part", "true_mask", "without_depth"]
 

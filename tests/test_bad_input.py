@@ -14,9 +14,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from tiny import OPTIONS
 
-from univoxel.checkpoint import FILE
 from univoxel.cli import main
 from univoxel.data.images import read_exr, read_image, write_exr
+from univoxel.scene import FILE
 from univoxel.training import progress
 
 

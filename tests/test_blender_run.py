@@ -22,11 +22,11 @@ from torch.nn.functional import avg_pool2d
 
 import univoxel
 from univoxel.camera import Cameras, project, resize
-from univoxel.checkpoint import save_scene
 from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
-from univoxel.metrics import psnr
+from univoxel.render.metrics import psnr
+from univoxel.scene import save_scene
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "blender_run.py"
 BLENDER = os.environ.get("BLENDER_PYTHON")

@@ -19,18 +19,12 @@ from univoxel import cli, errors
 from univoxel.cli import COMMANDS, LABORATORY, SPINS, laboratory, main
 from univoxel.cli.parsing import meanings, takes
 from univoxel.config import JointConfig
-from univoxel.errors import (
-    ExistingFile,
-    MissingExtra,
-    MissingFile,
-    ProcessFailed,
-    UserError,
-)
+from univoxel.errors import ExistingFile, MissingExtra, MissingFile, ProcessFailed, UserError
 from univoxel.presets import chosen
 
 # What a command calls, by the module that holds it; and commands that do all themselves
-WORK = {"train": "univoxel.trainer", "poses": "univoxel.capture.poses"}
-WORK |= {"cutout": "univoxel.segmentation.cutout"}
+WORK = {"train": "univoxel.cli.trainer", "poses": "univoxel.capture.poses"}
+WORK |= {"cutout": "univoxel.capture.cutout"}
 ALONE = ("demo", "export", "inspect", "view")
 KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, UserError)]
 

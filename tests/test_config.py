@@ -17,9 +17,9 @@ from univoxel.config import (
     load_config,
     save_config,
 )
+from univoxel.core.choices import LIGHTS
 from univoxel.errors import MissingFile, UserError
 from univoxel.lights.sg import SGConfig
-from univoxel.names import LIGHTS
 from univoxel.presets import PRESETS, budget, chosen, preset, with_field, with_metal, work_in
 from univoxel.scene import SceneConfig
 from univoxel.training.clock import expected_seconds

@@ -11,8 +11,8 @@ import torch
 from analytic import cameras_around, sphere_normals, write_scene
 from PIL import Image
 
-from univoxel.checkpoint import load_scene
 from univoxel.cli import main
+from univoxel.scene import load_scene
 from univoxel.training import progress
 
 SIZE, VIEWS = 16, 6

@@ -161,7 +161,7 @@ def test_a_link_to_markdown_outside_of_docs_is_found():
         ),
         (
             partial(doc_names.unknown, ROOT),
-            "`StageConfig.rays`, `pictures/timelapse.py`, `DATA`",
+            "`StageConfig.rays`, `output/timelapse.py`, `DATA`",
             0,
         ),
     ],

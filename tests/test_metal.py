@@ -14,12 +14,18 @@ from PIL import Image
 from univoxel import brdf
 from univoxel.camera import Cameras
 from univoxel.cli import export as task
+from univoxel.core.records import Mesh, Surface
 from univoxel.envmap import EnvMap, lookup, tables
 from univoxel.ops import VisibilityScene
-from univoxel.records import Mesh, Surface
-from univoxel.render.frame import Quality, channels, render_picture
 from univoxel.render.pipeline import at_rays, extract_mesh, surface_of_view
-from univoxel.render.relight import Lighting, TracedMesh, relight_surface
+from univoxel.render.relight import (
+    Lighting,
+    Quality,
+    TracedMesh,
+    channels,
+    relight_surface,
+    render_picture,
+)
 from univoxel.sphere import fibonacci_sphere
 
 BASE = torch.tensor([0.95, 0.6, 0.3])  # copper, about
@@ -157,7 +163,7 @@ def test_views_and_pictures_carry_it(scene):
 def test_files_hold_it(scene, tmp_path, monkeypatch):
     pygltflib = pytest.importorskip("pygltflib")
     trimesh = pytest.importorskip("trimesh")
-    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: scene)
+    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: scene)
     for name in ("a.glb", "a.obj", "a.ply"):
         task.export("run", tmp_path / name, faces=500, texture_size=64)
     file = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))

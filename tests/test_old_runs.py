@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import univoxel
-from univoxel.checkpoint import load_checkpoint
 from univoxel.cli.info import info, tables
 from univoxel.config import check_same, load_config
+from univoxel.scene import load_checkpoint
 
 RUNS = sorted((Path(__file__).parent / "runs").iterdir())
 

@@ -8,8 +8,7 @@ import torch
 from analytic import cameras_around, look_at
 from scipy.spatial.transform import Rotation
 
-from univoxel.camera import Cameras
-from univoxel.orbit import circle_of
+from univoxel.camera import Cameras, circle_of
 
 VIEWS = 40
 TILT = torch.from_numpy(Rotation.from_rotvec([0.4, -0.3, 0.2]).as_matrix()).float()

@@ -6,8 +6,7 @@ import pytest
 import torch
 from analytic import cameras_around
 
-from univoxel.camera import pixel_rays, project
-from univoxel.poses import PoseSteps
+from univoxel.camera import PoseSteps, pixel_rays, project
 
 VIEWS = 12
 

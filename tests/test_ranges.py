@@ -12,9 +12,9 @@ import pytest
 
 from univoxel import config, scene
 from univoxel.capture.config import CaptureConfig
-from univoxel.confidence.advice import AdviceConfig
 from univoxel.config import JointConfig, MirrorConfig, StageConfig, TrainConfig
 from univoxel.errors import ConfigError
+from univoxel.evaluation.confidence import AdviceConfig
 from univoxel.lights import BakedConfig, EnvmapConfig, EnvmapSGConfig
 from univoxel.lights.base import MOST_DIRECTIONS
 from univoxel.scene import LightConfig, SceneConfig

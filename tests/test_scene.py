@@ -12,14 +12,12 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from univoxel.checkpoint import FILE, SHELL, load_checkpoint, load_scene, save_scene
-from univoxel.compression.search import drop_mirror_levels_
 from univoxel.errors import ConfigError
 from univoxel.fields import field as fields
 from univoxel.fields.bricks import BrickDistances
 from univoxel.fields.features import Levels
 from univoxel.fields.field import dense_field, hash_field
-from univoxel.grid import fit_grid
+from univoxel.fields.grid import fit_grid
 from univoxel.lights import (
     AbstractLocalLight,
     BakedConfig,
@@ -32,7 +30,8 @@ from univoxel.lights import (
     read_config,
     scaled,
 )
-from univoxel.scene import Scene, SceneConfig
+from univoxel.scene import FILE, SHELL, Scene, SceneConfig, load_checkpoint, load_scene, save_scene
+from univoxel.training.compression import drop_mirror_levels_
 from univoxel.training.loop import restore_surface_
 
 LIGHTS = [
@@ -105,7 +104,7 @@ def test_reading_does_not_import_the_compiler(tmp_path):
         runs.append(str(run))
     program = """
 import sys
-from univoxel.checkpoint import load_checkpoint
+from univoxel.scene import load_checkpoint
 for run in sys.argv[1:]:
     load_checkpoint(run)
     if "torch._dynamo" in sys.modules:

@@ -14,9 +14,9 @@ PACKAGE = Path(univoxel.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 # What is used of them all the same
 NAMES_ONLY = {
-    "batch/sheet.py": {"urllib"},  # names of files as addresses
-    "data/arrays.py": {"zipfile"},  # the errors of broken archives
-    "viewer/hosting.py": {"socket", "urllib"},  # is a port free; of what host is a page
+    "batch/scenes.py": {"urllib"},  # names of files as addresses
+    "data/path_sandbox.py": {"zipfile"},  # the errors of broken archives
+    "viewer/training.py": {"socket", "urllib"},  # is a port free; of what host is a page
 }
 FORBIDDEN = {
     *("pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"),
@@ -82,7 +82,7 @@ def test_a_module_that_does_is_found(line):
 
 def test_archives_of_numpy_are_the_only_ones():
     """`zipfile` serves to name what NumPy raises."""
-    tree = ast.parse((PACKAGE / "data" / "arrays.py").read_text(encoding="utf-8"))
+    tree = ast.parse((PACKAGE / "data" / "path_sandbox.py").read_text(encoding="utf-8"))
     used = {
         ast.unparse(n)
         for n in ast.walk(tree)

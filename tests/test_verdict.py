@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from univoxel.verdict import Evidence, as_json, judge, load_verdict, save_verdict
+from univoxel.run import Evidence, as_json, judge, load_verdict, save_verdict
 
 CLEAN = Evidence(steps={}, psnr=31.0, outline=0.01, hidden=0.05, residual=0.02)
 

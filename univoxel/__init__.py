@@ -13,18 +13,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from univoxel.api import Run as Run
-    from univoxel.api import TrainingProgress as TrainingProgress
-    from univoxel.api import open_run as open_run
-    from univoxel.api import train as train
+    from univoxel.api import Run, TrainingProgress, open_run, train
+    from univoxel.capture.cutout import cutout
     from univoxel.capture.poses import poses as find_poses
     from univoxel.cli.capture import capture as capture_object
-    from univoxel.cli.evaluate import evaluate as evaluate
-    from univoxel.cli.export import export as export
+    from univoxel.cli.evaluate import evaluate
+    from univoxel.cli.export import export
     from univoxel.cli.relight import relight_images as relight
-    from univoxel.errors import Cancelled as Cancelled
-    from univoxel.errors import UserError as UserError
-    from univoxel.segmentation.cutout import cutout as cutout
+    from univoxel.errors import Cancelled, UserError
 
 __version__ = "0.2.0"
 __all__ = [
@@ -50,7 +46,7 @@ _PLACES = {
     "UserError": ("univoxel.errors", "UserError"),
     "capture_object": ("univoxel.cli.capture", "capture"),
     "find_poses": ("univoxel.capture.poses", "poses"),
-    "cutout": ("univoxel.segmentation.cutout", "cutout"),
+    "cutout": ("univoxel.capture.cutout", "cutout"),
     "evaluate": ("univoxel.cli.evaluate", "evaluate"),
     "export": ("univoxel.cli.export", "export"),
     "open_run": ("univoxel.api", "open_run"),

@@ -12,25 +12,24 @@ import torch
 from torch import Tensor
 
 from univoxel.camera import Cameras, stacked
-from univoxel.checkpoint import load_scene
 from univoxel.cli.evaluate import evaluate
 from univoxel.cli.export import export
 from univoxel.cli.relight import relight_images
 from univoxel.cli.report import report
 from univoxel.cli.train import TrainOptions
+from univoxel.cli.trainer import train as train_config
 from univoxel.config import TrainConfig
+from univoxel.core.choices import ELEVATION, MAP_ROWS
+from univoxel.core.records import Mesh
 from univoxel.envmap import EnvMap
 from univoxel.errors import UserError
 from univoxel.evaluation.recovered_map import recovered_map
-from univoxel.names import ELEVATION, MAP_ROWS
-from univoxel.page import SMALL, page_text, write_page
-from univoxel.pictures.viewpoints import views_of
-from univoxel.records import Mesh
+from univoxel.output.page import SMALL, page_text, write_page
+from univoxel.output.viewpoints import views_of
 from univoxel.render.pipeline import extract_mesh, shade_hits, surface_of_view
-from univoxel.scene import Scene
-from univoxel.trainer import train as train_config
+from univoxel.run import Verdict, load_verdict
+from univoxel.scene import Scene, load_scene
 from univoxel.training.progress import LOG, TrainingProgress
-from univoxel.verdict import Verdict, load_verdict
 
 __all__ = ["Run", "TrainingProgress", "open_run", "train"]
 
@@ -126,7 +125,7 @@ class Run:
         """Write one web page to look at it, to light it and to send it; return the file.
 
         Args:
-            options: fields of `univoxel.page.PageOptions`.
+            options: fields of `univoxel.output.page.PageOptions`.
 
         Raises:
             UserError: a map cannot be used, or there is no surface.
@@ -139,7 +138,7 @@ class Run:
 
         Args:
             path: .html file; report.html in the run's folder when left out.
-            options: fields of `univoxel.report.ReportOptions`.
+            options: fields of `univoxel.output.report.ReportOptions`.
 
         Raises:
             UserError: an option is out of range, or there is no surface.

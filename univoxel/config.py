@@ -10,14 +10,20 @@ from pathlib import Path
 from typing import Any, get_args
 
 from univoxel import __version__
+from univoxel.core.choices import (
+    FIELDS,
+    CamerasFrom,
+    Capacity,
+    FieldName,
+    LightFrameOrAuto,
+    MasksFrom,
+)
+from univoxel.core.files import read_json, replacing
+from univoxel.core.validation import check_fields, record, without_retired
 from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.fields.features import PER_LEVEL
-from univoxel.files import read_json, replacing
 from univoxel.lights import read_config
-from univoxel.names import FIELDS, CamerasFrom, Capacity, FieldName, LightFrameOrAuto, MasksFrom
-from univoxel.retired import without_retired
 from univoxel.scene import SceneConfig
-from univoxel.validation import check_fields, record
 
 # Arguments that a configuration is made of
 CHOICES = (
@@ -108,7 +114,7 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class MetalConfig:
-    """Which points are metal, see joint/metals.py."""
+    """Which points are metal, see training/metals.py."""
 
     # brightest channel of a metal at least, [0, 1]: metals in use reflect 0.4 and more
     min_reflectance: float = 0.25
@@ -119,7 +125,7 @@ class MetalConfig:
 
 @dataclass(frozen=True)
 class MirrorConfig:
-    """The map that mirrors show, see joint/sharp_sky.py."""
+    """The map that mirrors show, see training/mirrors.py."""
 
     # rows of the map as sharp points show it, a multiple of 32; 0: it is not kept
     rows: int = 128
@@ -131,7 +137,7 @@ class MirrorConfig:
 
 @dataclass(frozen=True)
 class EntropyConfig:
-    """The prior that paint comes in few colours, see joint/albedo_entropy.py."""
+    """The prior that paint comes in few colours, see training/albedo_entropy.py."""
 
     # steps, >= 1, in which the materials learn the albedos under a map that was changed
     teaching_steps: int = 60
@@ -142,7 +148,7 @@ class EntropyConfig:
 
 @dataclass(frozen=True)
 class JointConfig:
-    """The stage that solves for one map, the materials and normals, see joint/stage.py."""
+    """The stage that solves for one map, the materials and normals, see training/joint_solve.py."""
 
     iterations: int = 700  # Adam steps in all rounds, >= 1; fewer when time runs out
     share: float = 0.4  # of the time budget, (0, 1]
@@ -220,7 +226,7 @@ class TrainConfig:
     carving_seconds: float = 0.0
     # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
     patience: float = 0.0
-    capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see compression/plan.py
+    capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see training/compression.py
     budget_mb: float | None = None  # 1e6 bytes that the model's file may have, > 0; adaptive only
     # sizes of the model, and what light it has
     scene: SceneConfig = field(default_factory=SceneConfig)

@@ -1,15 +1,19 @@
-"""Equirectangular environment maps: lookup, and sampling in proportion to their light."""
+"""Equirectangular environment maps: from files, lookup, and sampling in proportion to their
+light."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from univoxel.color import luminance
+from univoxel.data.images import read_image
+from univoxel.errors import DataError
 from univoxel.ops.integrator import EnvTables
 from univoxel.sphere import direction_to_latlong, rotate_z, texel_solid_angles
 
@@ -148,3 +152,41 @@ def _invert(cdf: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     i = i.clamp(0, cdf.shape[1] - 2)
     low, high = cdf.gather(1, i)[:, 0], cdf.gather(1, i + 1)[:, 0]
     return i[:, 0], ((u - low) / (high - low).clamp_min(1e-30)).clamp_max(1 - 2**-24)
+
+
+# Environment maps from files.
+
+
+UNDERSHOOT = 0.01  # of the largest radiance: texels that are less below 0 are 0
+
+
+def read_map(path: Path) -> EnvMap:
+    """A file as an environment map.
+
+    Raises:
+        DataError: it cannot be used as one; the message names it.
+        OSError: it cannot be read.
+    """
+    radiance = read_image(path)
+    if not radiance.is_floating_point():
+        raise DataError(
+            f"{path}: expected a map of light, .hdr or .exr, got a picture of 8 bits: the sun is "
+            "thousands of times as bright as they can say"
+        )
+    if radiance.dim() == 3 and radiance.shape[2] == 4:
+        radiance = radiance[..., :3]  # some writers add an alpha that says nothing
+    if radiance.min() >= -UNDERSHOOT * radiance.max():  # as filters and denoisers leave it
+        radiance = radiance.clamp_min(0)
+    try:
+        return EnvMap(radiance.contiguous())
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def true_map(data: Path) -> Tensor | None:
+    """The light of the photographs, where the data set has it."""
+    for suffix in (".hdr", ".exr"):
+        path = data / "envmaps" / f"train{suffix}"
+        if path.is_file():
+            return read_map(path).radiance
+    return None

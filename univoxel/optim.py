@@ -176,3 +176,8 @@ def rows_of(grad: Tensor) -> Tensor:
     for index, size in zip(indices[1:], grad.shape[1:], strict=False):
         rows = torch.add(index, rows, alpha=size)
     return rows
+
+
+def geometric(ends: tuple[float, float], done: float) -> float:
+    """Geometric interpolation."""
+    return ends[0] * (ends[1] / ends[0]) ** done

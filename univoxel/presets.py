@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from univoxel.config import PREPARATION, JointConfig, LossConfig, StageConfig, TrainConfig
+from univoxel.core.choices import LIGHTS, Differing, FieldName, LightName, Metal
 from univoxel.errors import UserError
 from univoxel.lights import (
     BakedConfig,
@@ -18,7 +19,6 @@ from univoxel.lights import (
     SGConfig,
     SHConfig,
 )
-from univoxel.names import LIGHTS, Differing, FieldName, LightName, Metal
 from univoxel.scene import SceneConfig
 
 

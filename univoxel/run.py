@@ -1,13 +1,17 @@
-"""The folder of a run: what data it was trained on."""
+"""The folder of a run: what data it was trained on, and whether it came out well."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Literal
 
+from univoxel.core.files import read_json, replacing
 from univoxel.data import Photos, keep_photos, load_photos
-from univoxel.errors import DataError
-from univoxel.files import read_json
+from univoxel.errors import DataError, UserError
 
 
 @dataclass(frozen=True)
@@ -71,3 +75,146 @@ def _source_of(run: Path) -> Source:
         f"{path}: expected data, a folder, and downscale, at least 0, got "
         f"{values.get('data')!r:.80} and {values.get('downscale')!r:.80}"
     )
+
+
+# Whether a run came out well, by evidence: good, usable, retake or unfinished.
+
+
+FILE = "verdict.json"  # in the folder of a run
+Word = Literal["good", "usable", "retake", "unfinished"]
+
+# Validation PSNR, dB, over pixels of the object and around it that training did not see. Rendered
+# scenes and clean captures reach 28 and more; below 20 a picture shows another object
+GOOD_DB, POOR_DB = 26.0, 20.0
+# Share of the validation pixels that lie on the other side of the silhouette than their masks say
+GOOD_OUTLINE, POOR_OUTLINE = 0.03, 0.10
+# Shares of the surface: too few cameras see it; it differs visibly from its photographs
+GOOD_HIDDEN, POOR_HIDDEN = 0.25, 0.6
+GOOD_RESIDUAL, POOR_RESIDUAL = 0.15, 0.8
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a verdict rests on; None: not measured."""
+
+    steps: Mapping[str, float]  # share made, by name of the stages that were cut
+    stopped: bool = False  # by hand
+    minutes: float | None = None  # in which all steps would have been made
+    limit: float | None = None  # minutes; None: there was none
+    psnr: float | None = None  # dB, of held-out pixels
+    outline: float | None = None  # share of held-out pixels on the wrong side of the silhouette
+    hidden: float | None = None  # share of the surface that too few cameras see
+    residual: float | None = None  # share of the surface that differs from its photographs
+    troubles: int = 0  # steps or stages that went wrong and were mended
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a run is worth, why, and what would help."""
+
+    word: Word
+    complete: bool  # whether all planned steps were made
+    reasons: tuple[str, ...]  # what speaks against "good", the worst first
+    remedies: tuple[str, ...]  # at most two, the most helpful first
+    evidence: Evidence
+
+    @property
+    def empty(self) -> bool:
+        """Whether a stage made no step at all: what it is for is missing."""
+        return any(made == 0 for made in self.evidence.steps.values())
+
+    def sentence(self) -> str:
+        """The verdict in a line."""
+        quality = "" if self.evidence.psnr is None else f"validation {self.evidence.psnr:.1f} dB"
+        said = f"Result: {self.word}"
+        told = "; ".join(self.reasons) or quality
+        help_ = f". What helps: {'; or '.join(self.remedies)}" if self.remedies else ""
+        return f"{said}, {told}{help_}" if told else f"{said}{help_}"
+
+
+def judge(evidence: Evidence) -> Verdict:
+    """The verdict that evidence leads to."""
+    faults: list[tuple[bool, str, str]] = []  # whether it is poor, the reason, the remedy
+
+    def check(value: float | None, good: float, poor: float, reason: str, remedy: str) -> None:
+        """Note a value that is not good; NaN is poor. Which way is better is told by the limits."""
+        if value is None:
+            return
+        sign = 1 if good > poor else -1
+        if not sign * value >= sign * good:
+            faults.append((not sign * value >= sign * poor, reason.format(value), remedy))
+
+    check(
+        evidence.psnr,
+        GOOD_DB,
+        POOR_DB,
+        f"validation {{:.1f}} dB, where {GOOD_DB:g} and more are good",
+        "sharp photographs of one exposure, with the object still and the light unchanged",
+    )
+    check(
+        evidence.outline,
+        GOOD_OUTLINE,
+        POOR_OUTLINE,
+        "{:.0%} of the outline is not where the masks have it",
+        "better masks: look at them with `univoxel inspect`",
+    )
+    check(
+        evidence.hidden,
+        GOOD_HIDDEN,
+        POOR_HIDDEN,
+        "{:.0%} of the surface is seen by too few cameras",
+        "more photographs: `univoxel report` shows from where",
+    )
+    check(
+        evidence.residual,
+        GOOD_RESIDUAL,
+        POOR_RESIDUAL,
+        "{:.0%} of the surface differs visibly from its photographs",
+        "`--preset full`, if the object did not move and its masks are right",
+    )
+    if evidence.troubles:
+        times = "once" if evidence.troubles == 1 else f"{evidence.troubles} times"
+        faults.append((False, f"training met trouble {times} and went on", "another `--seed`"))
+    faults.sort(key=lambda found: not found[0])
+    word: Word = "good" if not faults else "retake" if faults[0][0] else "usable"
+    reasons = [reason for _, reason, _ in faults]
+    remedies = [remedy for _, _, remedy in faults]
+    if evidence.steps:
+        word = "unfinished"
+        made = ", ".join(f"{share:.0%} for {name}" for name, share in evidence.steps.items())
+        why = "it was stopped" if evidence.stopped else "the time was up"
+        reasons.insert(0, f"{why}: of the planned steps it made {made}")
+        needed = None if evidence.minutes is None else math.ceil(evidence.minutes)
+        if evidence.stopped or evidence.limit is None:
+            remedies.insert(0, "train it to the end")
+        elif needed is not None:
+            remedies.insert(0, f"`--minutes {max(needed, math.floor(evidence.limit) + 1)}`")
+    remedies = list(dict.fromkeys(remedies))[:2]
+    return Verdict(word, not evidence.steps, tuple(reasons), tuple(remedies), evidence)
+
+
+def save_verdict(verdict: Verdict, run: Path) -> None:
+    """Write the verdict to verdict.json in the run's folder, whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    with replacing(run / FILE) as temporary:
+        temporary.write_text(json.dumps(as_json(verdict), indent=1) + "\n", encoding="utf-8")
+
+
+def as_json(verdict: Verdict) -> dict[str, Any]:
+    """`complete`, `verdict`, `reasons`, `remedies`, `evidence`."""
+    values = json.loads(json.dumps(asdict(verdict)))  # lists for tuples
+    return {"complete": values.pop("complete"), "verdict": values.pop("word"), **values}
+
+
+def load_verdict(run: Path) -> Verdict | None:
+    """The verdict on a run; None where there is none: it has not ended, or an older version trained
+    it."""
+    try:
+        values = read_json(run / FILE)
+        evidence = Evidence(**values["evidence"])
+    except (OSError, UserError, LookupError, TypeError):
+        return None
+    return judge(evidence)

@@ -1,20 +1,32 @@
-"""A scene: field, heads and light."""
+"""A scene: field, heads and light; its file, what that holds, and reading it back."""
 
 from __future__ import annotations
 
+import json
+import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
+from pathlib import Path
 from typing import Any, get_args
 
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from univoxel.camera import PoseSteps
+from univoxel.core.choices import FieldName, Varying
+from univoxel.core.records import HALF_MAX, Bricks
+from univoxel.core.validation import check_fields, record
 from univoxel.data import Photos
-from univoxel.errors import ConfigError, UserError
-from univoxel.fields.distances import SurfaceVersion
-from univoxel.fields.field import Field
-from univoxel.fields.heads import MaterialHead, RadianceHead
+from univoxel.errors import ConfigError, DataError, FileError, MissingFile, UserError
+from univoxel.fields.bricks import BrickDistances, pack_bricks, unpack_bricks
+from univoxel.fields.distances import PACKED, DenseDistances, SurfaceVersion, pack, unpack
+from univoxel.fields.features import HashFeatures, Levels, NodeFeatures
+from univoxel.fields.field import Field, MaterialHead, RadianceHead
+from univoxel.fields.grid import GridShape
 from univoxel.lights import (
     AbstractLight,
     AbstractLocalLight,
@@ -24,16 +36,13 @@ from univoxel.lights import (
     LocalLightConfig,
     SGConfig,
     build,
+    read_config,
 )
-from univoxel.lights.base import MOST_ROWS
-from univoxel.lights.mirrored import MirroredLight
-from univoxel.lights.nodes import DistantLight
-from univoxel.lights.turntable import Turntable
-from univoxel.lights.views import ViewLights
-from univoxel.names import Varying
+from univoxel.lights.base import MOST_ROWS, MirroredLight
+from univoxel.lights.latlong import DistantLight
+from univoxel.lights.views import Turntable, ViewLights
 from univoxel.ops import VisibilityScene
-from univoxel.poses import PoseSteps
-from univoxel.validation import check_fields
+from univoxel.ops.networks import DirectionTable
 
 
 @dataclass(frozen=True)
@@ -219,3 +228,298 @@ class Scene(nn.Module):
         if self.sky is None or self.views is None or self.views.chosen is None or change is None:
             return self.sky
         return self.sky.changed(change[self.views.chosen])
+
+
+# The file of a scene: what it holds, and reading it back.
+
+
+FORMAT = 1  # of scene.safetensors; rises when older files cannot be read any more
+FILE = "scene.safetensors"
+# A file holds their rows that are not 0: parameter, and names of the numbers and values of rows
+TABLES = {
+    "field.features": ("field.feature_rows", "field.feature_values"),
+    "radiance.directions.table": ("radiance.direction_rows", "radiance.direction_values"),
+}
+SDF = tuple(f"field.sdf_{name}" for name in PACKED)  # the same for distances
+LEVELS = "lower", "upper", "voxel_sizes", "rows"
+# Rows of a table for each that a file holds, at most, beyond a small table: a surface of 4 voxels'
+# width in a grid has more, and what claims to have fewer wants memory for nothing
+ROWS_FOR_ONE = 4096
+SHELL = 4.0  # voxels around the surface, beyond which a finished scene needs no features
+
+
+def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict[str, Tensor]:
+    """The tensors of a scene's file, see `save_scene`."""
+    tensors = {k: v.contiguous() for k, v in scene.state_dict().items() if k not in TABLES}
+    sdf = scene.field.sdf.detach()
+    if isinstance(bricks := scene.field.distances, BrickDistances):
+        tensors |= {f"field.{k}": v for k, v in pack_bricks(bricks).items()}
+        sdf = tensors["field.sdf"] = sdf[: Bricks.NODES * bricks.count]
+    # Features that no sample has touched are 0: only the others are stored.
+    features = scene.field.features.detach().flatten(0, -2)
+    if isinstance(scene.field.encoding, NodeFeatures):
+        features = features[: sdf.numel()]
+    touched = features.any(1)
+    if slim:
+        shell = (reach or SHELL) * scene.field.voxel_size
+        touched &= scene.field.rows_near(shell)[: len(features)]
+        if reach is not None:
+            packed = pack(tensors.pop("field.sdf"), shell)
+            tensors |= {f"field.sdf_{name}": value for name, value in packed.items()}
+    directions = scene.radiance.directions.table.detach()
+    tables = (features, touched), (directions, directions.any(1))
+    for (rows_name, values_name), (table, kept) in zip(TABLES.values(), tables, strict=True):
+        rows = kept.nonzero()[:, 0]
+        tensors[rows_name], tensors[values_name] = rows.int(), table[rows]
+    if slim:
+        # sdf next to the surface is a small number: half precision keeps it to 1e-3 voxels
+        halves = {
+            "field.sdf",
+            "field.sdf_values",
+            "sky.sharp",
+            *(values for _, values in TABLES.values()),
+        }
+        for name in halves & tensors.keys():
+            tensors[name] = tensors[name].clamp(-HALF_MAX, HALF_MAX).half()
+    return tensors
+
+
+def save_scene(
+    scene: Scene, run: Path, state: dict[str, Any], slim: bool = False, reach: float | None = None
+) -> Path:
+    """Write run/scene.safetensors whole or not at all; `state` (JSON) travels in its metadata.
+
+    Args:
+        slim: for a scene that is done: the grids in half precision, and features only where rays
+            meet the surface; otherwise what is loaded equals what was saved, bit by bit.
+        reach: voxels from the surface, > 0, beyond which a slim file says of a node only on which
+            side it lies; SHELL for features and no limit for distances when left out.
+
+    Raises:
+        FileError: names the file when it cannot be written; the one before stays.
+    """
+    tensors = stored(scene, slim, reach)
+    meta = {
+        "format": FORMAT,
+        "scene": asdict(scene.cfg),
+        "field": scene.field.kind,
+        "grid": asdict(scene.field.grid),
+        "inv_s": scene.inv_s,
+        "state": state,
+    }
+    if isinstance(scene.field.encoding, HashFeatures):
+        meta["levels"] = astuple(scene.field.encoding.levels)
+    path = run / FILE
+    temporary = path.with_suffix(".partial")
+    try:
+        save_file(tensors, temporary, {"univoxel": json.dumps(meta)})
+        os.replace(temporary, path)
+    except (OSError, SafetensorError) as error:
+        temporary.unlink(missing_ok=True)
+        raise FileError(f"{path}: cannot write the checkpoint: {error}") from error
+    return path
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A size that was chosen, as training's state has it."""
+
+    what: str
+    before: float
+    after: float
+    cost: float
+    why: str
+    said: str = ""
+
+
+@dataclass(frozen=True)
+class Within:
+    """Where in a stage of rounds a run is, as `univoxel.training.joint_solve` has it."""
+
+    begin: float
+    end: float
+    rounds_after: int
+    solved: bool
+    only_metal: bool = False
+
+    def __post_init__(self) -> None:
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "begin", "end")
+        check_fields(self, "at least 0", lambda x: x >= 0, "rounds_after")
+
+
+@dataclass(frozen=True)
+class State:
+    """What of a run's state is known here; a file may have less and more."""
+
+    stage: int = 0
+    progress: float = 0.0  # of the stage, in [0, 1]
+    step: int = 0
+    made: tuple[float, ...] = ()
+    early: tuple[int, ...] = ()
+    stage_steps: int = 0
+    took: tuple[float, ...] = ()
+    stage_took: float = 0.0
+    finished: bool = False
+    within: Within | None = None  # None: at the begin of a stage, or in one without rounds
+    seconds: float = 0.0
+    chosen: tuple[Choice, ...] = ()
+    troubles: tuple[str, ...] = ()
+    threads: int = 1
+    peak_rss_mb: float = 0.0
+
+    def __post_init__(self) -> None:
+        counts = "stage", "step", "stage_steps", "seconds"
+        check_fields(self, "finite, at least 0", lambda x: 0 <= x < math.inf, *counts)
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "progress")
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a file says of its tensors."""
+
+    scene: SceneConfig
+    grid: GridShape
+    inv_s: float
+    field: FieldName = "dense"
+    levels: Levels | None = None  # of a hash field
+
+    def __post_init__(self) -> None:
+        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "inv_s")
+        if (self.field == "hash") != (self.levels is not None):
+            raise ConfigError(
+                f"Description: levels must be those of a hash field, got {self.field}"
+            )
+
+
+def load_checkpoint(run: str | Path) -> tuple[Scene, dict[str, Any]]:
+    """The scene of a run, in evaluation mode, and the state it was saved with.
+
+    Sizes that the file claims are compared with its tensors before memory is taken for them.
+
+    Raises:
+        MissingFile: no checkpoint there.
+        DataError: one that is cut short, damaged, or of another version.
+    """
+    path = Path(run) / FILE
+    if not path.is_file():
+        raise MissingFile(f"no checkpoint in {run} (looked for {FILE}); run `univoxel train` first")
+    meta, tensors = _read(path)
+    state = meta.get("state", {})
+    try:
+        record(State, {k: v for k, v in state.items() if k in State.__dataclass_fields__})
+        about = _description(meta, tensors)
+        bricks = None
+        if "field.place" in tensors:
+            where = tensors.pop("field.place"), tensors.pop("field.inside")
+            bricks = unpack_bricks(*where, about.grid.size)
+        with torch.device("meta"):  # sizes alone
+            _compare(_scene(about, bricks), tensors)
+        scene = _scene(about, bricks)
+        _unpack_(scene, tensors)
+        scene.load_state_dict(tensors)
+        return scene.eval(), state
+    except (RuntimeError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise DataError(f"{path}: does not fit its own description: {error}") from error
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """What a file says of itself, and its tensors, all finite."""
+    try:
+        with safe_open(path, "pt") as file:
+            meta = json.loads((file.metadata() or {}).get("univoxel", "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: damaged or cut short: {error}") from error
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        came = meta.get("format") if isinstance(meta, dict) else meta
+        raise DataError(
+            f"{path}: expected checkpoint format {FORMAT}, got {came!r:.60}; "
+            "it was written by another version of univoxel"
+        )
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise DataError(f"{path}: damaged: NaN or infinity in {name}")
+    return meta, tensors
+
+
+def _description(meta: dict[str, Any], tensors: dict[str, Tensor]) -> Description:
+    """The description, also of files from before there were all of its parts, which get them."""
+    scene = dict(meta["scene"])
+    scene["light"] = read_config(scene["light"])
+    if "mirror_levels" not in scene:
+        scene["mirror_levels"] = 0
+        none = torch.zeros(0, dtype=torch.int32), torch.zeros(0, DirectionTable.per_level)
+        tensors |= zip(TABLES["radiance.directions.table"], none, strict=True)
+    known = {k: meta[k] for k in ("grid", "inv_s", "field") if k in meta}
+    if levels := meta.get("levels"):
+        known["levels"] = dict(zip(LEVELS[: len(levels)], levels, strict=True))
+    return record(Description, known | {"scene": scene})
+
+
+def _scene(about: Description, bricks: Bricks | None) -> Scene:
+    """A scene as described, its values yet unknown."""
+    distances = DenseDistances(about.grid) if bricks is None else BrickDistances(about.grid, bricks)
+    if about.levels:
+        encoding = HashFeatures(about.levels)
+    else:
+        encoding = NodeFeatures(torch.zeros(*distances.sdf.shape, about.scene.channels))
+    field = Field(distances, encoding)
+    if field.channels != about.scene.channels:
+        raise ValueError(
+            f"{field.channels} channels in its field, {about.scene.channels} in its networks"
+        )
+    return Scene(about.scene, field, about.inv_s)
+
+
+def _compare(scene: Scene, tensors: dict[str, Tensor]) -> None:
+    """Refuse tensors of a file that are not those of the scene, which need hold no memory."""
+    expected = scene.state_dict()
+    parts: dict[str, tuple[str, ...]] = dict(TABLES)
+    if not tensors.keys().isdisjoint(SDF):
+        parts["field.sdf"] = SDF
+    names = {n for name in expected for n in parts.get(name, (name,))}
+    if different := names ^ tensors.keys():
+        what = "is missing" if min(different) in names else "belongs to no part"
+        raise ValueError(f"{min(different)} {what}")
+    for name, value in expected.items():
+        if name in parts:
+            rows, values, *_ = (tensors[n] for n in parts[name])
+            _compare_rows(name, value, rows, values)
+        elif tensors[name].shape != value.shape:
+            came = list(tensors[name].shape)
+            raise ValueError(f"{name} is expected as {list(value.shape)}, got {came}")
+        elif tensors[name].is_floating_point() != value.is_floating_point():
+            raise ValueError(f"{name} is expected as {value.dtype}, got {tensors[name].dtype}")
+
+
+def _compare_rows(name: str, table: Tensor, rows: Tensor, values: Tensor) -> None:
+    """Refuse rows that are no table's."""
+    channels = [] if name == "field.sdf" else [table.shape[-1]]
+    count = table.numel() // math.prod(channels)
+    if rows.dtype != torch.int32 or list(values.shape) != [*rows.shape, *channels]:
+        raise ValueError(
+            f"{name} is expected as rows and their {channels} values, got {list(rows.shape)} "
+            f"{rows.dtype} and {list(values.shape)}"
+        )
+    if count > ROWS_FOR_ONE * (len(rows) + ROWS_FOR_ONE):
+        raise ValueError(f"{name} is expected with {count} rows, got no more than {len(rows)}")
+    if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
+        raise ValueError(f"{name} is expected with rows below {count}, got others")
+
+
+def _unpack_(scene: Scene, tensors: dict[str, Tensor]) -> None:
+    """Replace what files hold of tables, and of distances, by the whole of them."""
+    tables = scene.field.features.data, scene.radiance.directions.table.data
+    for (name, stored_as), table in zip(TABLES.items(), tables, strict=True):
+        rows, values = (tensors.pop(k) for k in stored_as)
+        table.flatten(0, -2)[rows.long()] = values.float()
+        tensors[name] = table
+    packed = {n: tensors.pop(k) for n, k in zip(PACKED, SDF, strict=True) if k in tensors}
+    if packed:
+        grid = scene.field.grid
+        tensors["field.sdf"] = unpack(packed, grid.size, SHELL * grid.voxel_size)
+
+
+def load_scene(run: str | Path) -> Scene:
+    """The scene of a run, see `load_checkpoint`."""
+    return load_checkpoint(run)[0]

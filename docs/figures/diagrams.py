@@ -26,13 +26,14 @@ from layers import LAYERS
 INK, SOFT, PALE = "#22333b", "#5b6f7a", "#eef2f4"
 BLUE, GREEN, ORANGE, RED = "#3a6ea5", "#4f8f5b", "#c9822b", "#b0413e"
 MIDDLE = 11.5  # nodes, of the shape in the section
+COMMANDS = "tasks" if any("tasks" in row for row in LAYERS) else "cli"
 # What the layers are for: name, a module of the lowest layer, colour; from the bottom up
 BANDS = (
-    ("plain things", "errors", BLUE),
+    ("plain things", "core", BLUE),
     ("one scene", "data", GREEN),
     ("configuration", "config", SOFT),
     ("training", "preparation", ORANGE),
-    ("after training", "confidence", RED),
+    ("after training", "output", RED),
     ("what a person runs", "cli", SOFT),
 )
 STYLE = {

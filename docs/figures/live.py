@@ -18,9 +18,9 @@ from PIL import Image
 sys.path.append(str(Path(__file__).parents[2] / "tests"))
 from browser import browser
 
-from univoxel.page import PageOptions
+from univoxel.output.page import PageOptions
 from univoxel.viewer.server import serving
-from univoxel.viewer.subject import subject_of
+from univoxel.viewer.viewer_scene import subject_of
 
 WINDOW = (1160, 720)
 PLACE = (400, 330)  # of the click: where the one hides the sky from the other

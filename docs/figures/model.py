@@ -25,7 +25,7 @@ from torch import Tensor
 import univoxel
 from univoxel.cli.relight import relight_images
 from univoxel.color import linear_to_srgb
-from univoxel.pictures.layers import Layers, render_layers
+from univoxel.evaluation.measures import Layers, render_layers
 from univoxel.run import photos_of
 
 VIEW = 0  # of the test views

@@ -17,9 +17,9 @@ from lab.stress.axes import BASE, INTACT, SECOND, Axis, Level
 from lab.stress.damage import Damage, clipped, damaged
 from lab.stress.report import Cell
 from lab.stress.scenes import Spec
+from univoxel.core.choices import LIGHTS, LightName
+from univoxel.core.files import replacing
 from univoxel.errors import UserError
-from univoxel.files import replacing
-from univoxel.names import LIGHTS, LightName
 
 log: logging.Logger = logging.getLogger("univoxel")
 

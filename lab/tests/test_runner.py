@@ -13,10 +13,10 @@ from filelock import FileLock
 
 from lab import runner, worker
 from lab.record import Setting, load_outcome
-from univoxel.checkpoint import FILE
+from univoxel.batch.jobs import Result
 from univoxel.errors import DataError
 from univoxel.evaluation.measures import MEASURES
-from univoxel.jobs.job import Result
+from univoxel.scene import FILE
 
 TINY = (
     *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),

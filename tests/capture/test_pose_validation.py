@@ -7,8 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from univoxel.capture.database import WATERMARK, Pair
-from univoxel.capture.model import NO_POINT, Model, Placed, Points
+from univoxel.capture.model import NO_POINT, WATERMARK, Model, Pair, Placed, Points
 from univoxel.capture.pose_validation import Partner, doubt, partners, weak
 from univoxel.data.lens import Lens
 

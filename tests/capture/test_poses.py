@@ -18,13 +18,14 @@ import textured_room
 from PIL import Image
 
 import univoxel
-from univoxel import steps
-from univoxel.capture import database, pose_validation, sfm, structure
+from univoxel.capture import model as database
+from univoxel.capture import pose_validation, sfm, structure
 from univoxel.capture import poses as poses_task
 from univoxel.capture.config import CaptureConfig
 from univoxel.capture.photographs import find_photographs
 from univoxel.capture.poses import poses
 from univoxel.capture.prepare import Folders, gather
+from univoxel.core import files
 from univoxel.data.colmap import read_cameras, read_images
 from univoxel.errors import DataError, ExistingFile, MissingExtra, ProcessFailed
 
@@ -208,12 +209,12 @@ def test_a_search_goes_on_from_what_is_there(scene, photographs, tmp_path, monke
 
 def as_of_0_2(work: Path) -> None:
     """Put the notes of version 0.2 in the place of ours."""
-    settings = steps.recorded(work, "search")
+    settings = files.recorded(work, "search")
     settings["config"] |= poses_task.CONSTANTS_0_2
     (work / "request.json").write_text(json.dumps(settings))
     for name in ("matched", "models/done"):
         (work / name).touch()
-    (work / steps.FILE).unlink()
+    (work / files.FILE).unlink()
 
 
 def test_a_search_of_version_0_2_is_gone_on_with(scene, photographs, tmp_path, monkeypatch):
@@ -251,8 +252,8 @@ def test_an_unfinished_search_with_other_settings_begins_anew(
         poses(photographs, tmp_path, config=replace(SMALL, features=500))
     assert not (work / "database.db").exists()
     assert not (work / "models").exists()
-    assert steps.recorded(work, "search")["config"]["features"] == 500
-    assert steps.recorded(work, "matching") is None
+    assert files.recorded(work, "search")["config"]["features"] == 500
+    assert files.recorded(work, "matching") is None
 
 
 def test_features_are_found_once_in_the_camera_that_was_begun(scene, photographs, tmp_path):

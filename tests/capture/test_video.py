@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-import univoxel.capture.poses as tasks_poses
-from univoxel.capture import video
+from univoxel.capture import photographs
+from univoxel.capture import poses as tasks_poses
+from univoxel.capture.photographs import is_video, seconds, sharpest, sharpness, write_frames
 from univoxel.capture.prepare import Folders
-from univoxel.capture.video import is_video, seconds, sharpest, sharpness, write_frames
 from univoxel.errors import DataError, MissingExtra
 
 
@@ -56,7 +56,7 @@ def test_sharp_frames_are_kept_all_along(film, tmp_path):
 
 
 def test_the_number_of_frames_is_limited(film, tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "KEPT", 5)
+    monkeypatch.setattr(photographs, "KEPT", 5)
     assert write_frames(film, tmp_path) == 5
 
 
@@ -130,8 +130,10 @@ def test_what_is_no_video_is_one_line(tmp_path):
 
 def test_frames_are_chosen_once_and_anew_for_other_wishes(film, tmp_path, monkeypatch):
     calls = []
-    write = video.write_frames
-    monkeypatch.setattr(video, "write_frames", lambda *args: calls.append(args[2]) or write(*args))
+    write = photographs.write_frames
+    monkeypatch.setattr(
+        photographs, "write_frames", lambda *args: calls.append(args[2]) or write(*args)
+    )
     folders = Folders(tmp_path)
     for every, frames in ((0.5, 8), (0.5, 8), (2.0, 2)):
         files, others, doubles = tasks_poses.photographs_of(film, folders, every)
@@ -140,7 +142,7 @@ def test_frames_are_chosen_once_and_anew_for_other_wishes(film, tmp_path, monkey
 
 
 def test_without_ffmpeg_nothing_is_read(film, tmp_path, monkeypatch):
-    monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(photographs.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtra, match="a video needs imageio-ffmpeg"):
         tasks_poses.photographs_of(film, Folders(tmp_path), None)
 

@@ -15,17 +15,23 @@ import pytest
 from analytic import write_scene
 from clusters import scheduler, wait_for, worker
 
-from univoxel.batch.results import SceneResult, write_results
-from univoxel.batch.scenes import PER_PIXEL, bytes_of, named, share
-from univoxel.batch.sheet import write_sheet
-from univoxel.checkpoint import FILE, load_checkpoint
+from univoxel.batch.scenes import (
+    PER_PIXEL,
+    SceneResult,
+    bytes_of,
+    named,
+    share,
+    write_results,
+    write_sheet,
+)
 from univoxel.cli import batch as task
 from univoxel.cli import main
 from univoxel.cli.batch import BatchOptions, job_of
 from univoxel.config import save_config
+from univoxel.core.machine import Memory
 from univoxel.errors import ExistingFile, MissingExtra, ProcessFailed, UserError
-from univoxel.machine import Memory
-from univoxel.training.memory import PER_PIXEL as FURTHER
+from univoxel.scene import FILE, load_checkpoint
+from univoxel.training.pixels import PER_PIXEL as FURTHER
 
 TINY = (
     *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),

@@ -243,14 +243,14 @@ def steps(monkeypatch, tmp_path) -> list[tuple]:
         path.write_text(f"{title}: {notes} {measures}")
 
     monkeypatch.setattr("univoxel.capture.poses.poses", poses)
-    monkeypatch.setattr("univoxel.segmentation.cutout.cutout", cutout)
-    monkeypatch.setattr("univoxel.trainer.train", train)
+    monkeypatch.setattr("univoxel.capture.cutout.cutout", cutout)
+    monkeypatch.setattr("univoxel.cli.trainer.train", train)
     monkeypatch.setattr(task, "evaluate", evaluate)
     monkeypatch.setattr(task, "_check_trained", lambda wanted, done: None)
     monkeypatch.setattr(task, "export", lambda run, mesh: mesh.write_bytes(b"glTF"))
     monkeypatch.setattr(task, "relight_to_files", lambda *_, **__: None)
-    monkeypatch.setattr("univoxel.segmentation.network.network", no_network)
-    monkeypatch.setattr("univoxel.page.write_page", write_page)
+    monkeypatch.setattr("univoxel.capture.masks.network", no_network)
+    monkeypatch.setattr("univoxel.output.page.write_page", write_page)
     return noted
 
 
@@ -305,7 +305,7 @@ def without_masks(*_, **__):
 
 def test_with_a_network_masks_come_from_it(steps, pictures, tmp_path, monkeypatch):
     monkeypatch.setattr("univoxel.data.load_photos", without_masks)
-    monkeypatch.setattr("univoxel.segmentation.network.network", red_is_the_object)
+    monkeypatch.setattr("univoxel.capture.masks.network", red_is_the_object)
     task.capture(pictures, tmp_path / "mug")
     assert steps[1] == ("cutout", tmp_path / "mug/scene", "rembg")
 
@@ -361,7 +361,7 @@ def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, ca
         return (found if masks else still)(photographs, scene, masks)
 
     monkeypatch.setattr("univoxel.capture.poses.poses", poses)
-    monkeypatch.setattr("univoxel.segmentation.network.network", red_is_the_object)
+    monkeypatch.setattr("univoxel.capture.masks.network", red_is_the_object)
     with caplog.at_level(logging.INFO, "univoxel"):
         task.capture(pictures, out)
     assert "9 of 10 pairs: the object was turned before a still camera, so masks first" in (
@@ -391,7 +391,7 @@ def test_a_turntable_goes_on_with_the_masks_that_are_there(steps, pictures, tmp_
 
         return mask
 
-    monkeypatch.setattr("univoxel.segmentation.network.network", killed)
+    monkeypatch.setattr("univoxel.capture.masks.network", killed)
     with pytest.raises(KeyboardInterrupt):
         task.capture(pictures, out)
     assert not (out / "masks").exists()

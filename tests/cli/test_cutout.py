@@ -12,12 +12,12 @@ from analytic import photograph, write_scene
 from PIL import Image
 from spoilt_masks import iou
 
+from univoxel.capture import cutout as task
 from univoxel.cli import main
 from univoxel.data import load_photos
-from univoxel.data.shots import read_photo
+from univoxel.data.load_images import read_photo
 from univoxel.data.transforms import write_cameras
 from univoxel.errors import DataError, MissingExtra
-from univoxel.segmentation import cutout as task
 
 VIEWS, SIZE = 16, 40
 

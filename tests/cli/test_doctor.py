@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import univoxel
-from univoxel import machine
 from univoxel.cli import doctor, main
+from univoxel.core import machine
 from univoxel.errors import MissingNative
 from univoxel.ops import native, native_status, use_backend
 from univoxel.presets import preset

@@ -8,13 +8,13 @@ import torch
 from analytic import sphere_scene
 from torch.nn.functional import normalize
 
-from univoxel.checkpoint import save_scene
 from univoxel.cli.envmap import envmap
 from univoxel.data.images import read_image, write_exr
 from univoxel.errors import DataError
 from univoxel.evaluation.recovered_map import brightest, compare
 from univoxel.lights import EnvmapConfig, EnvmapSGConfig
-from univoxel.pictures.balls import GREY, grey_ball
+from univoxel.render.pictures import GREY, grey_ball
+from univoxel.scene import save_scene
 from univoxel.sphere import fibonacci_sphere
 
 LAMP = normalize(torch.tensor([1.0, -0.5, 0.7]), dim=0)

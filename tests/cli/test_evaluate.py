@@ -13,14 +13,14 @@ from torch import nn
 
 from univoxel.cli import evaluate as task
 from univoxel.color import linear_to_srgb, srgb_to_linear
+from univoxel.core.records import Mesh, Surface
 from univoxel.data import load_photos
 from univoxel.data.images import read_exr, read_image, write_png
 from univoxel.errors import DataError
 from univoxel.evaluation import measures
-from univoxel.evaluation.truth import expected_view
-from univoxel.pictures import layers as layers_module
-from univoxel.pictures.contact_sheet import TILE, Panel, contact_sheet, heat, shrink
-from univoxel.records import Mesh, Surface
+from univoxel.evaluation import measures as layers_module
+from univoxel.evaluation.measures import expected_view
+from univoxel.render.pictures import TILE, Panel, contact_sheet, heat, shrink
 
 SIZE = 16
 SCALE = torch.tensor([2.0, 1.5, 0.5])  # true albedo over the estimate's
@@ -124,7 +124,7 @@ def relit_calls(monkeypatch):
     monkeypatch.setattr(layers_module, "relight_surface", relight_surface)
     monkeypatch.setattr("univoxel.render.pipeline.extract_mesh", extract_mesh)
     state = {"seconds": 8.5, "threads": 2, "peak_rss_mb": 700.0}
-    monkeypatch.setattr("univoxel.checkpoint.load_checkpoint", lambda run: (scene, state))
+    monkeypatch.setattr("univoxel.scene.load_checkpoint", lambda run: (scene, state))
     return calls
 
 

@@ -61,7 +61,7 @@ def written(scene, tmp_path_factory):
     """The scene in each format: name -> path."""
     folder = tmp_path_factory.mktemp("out")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("univoxel.checkpoint.load_scene", lambda run: {"run": scene}[str(run)])
+        patch.setattr("univoxel.scene.load_scene", lambda run: {"run": scene}[str(run)])
         for name in ("a.glb", "a.obj", "a.ply"):
             task.export("run", folder / "deep" / name, faces=FACES, texture_size=SIZE)
     return folder / "deep"
@@ -203,7 +203,7 @@ def test_the_validator_of_khronos_has_nothing_to_say(written):
 
 def test_defaults(tmp_path, scene, monkeypatch):
     """All faces without textures, fewer with; the same shape."""
-    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: scene)
+    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: scene)
     monkeypatch.setattr(task, "TEXTURED_FACES", 500)
     task.export("run", tmp_path / "a.PLY")
     task.export("run", tmp_path / "a.glb", texture_size=64)
@@ -215,7 +215,7 @@ def test_defaults(tmp_path, scene, monkeypatch):
 def test_watertight(tmp_path, monkeypatch):
     cut = lopsided(24**3, change=lambda nodes, sdf: nodes.norm(dim=-1) - 0.55)
     cut.material = Identity()
-    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: cut)
+    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: cut)
     task.export("run", tmp_path / "open.ply", faces=400)
     task.export("run", tmp_path / "closed.ply", faces=400, watertight=True)
     assert not trimesh.load(tmp_path / "open.ply").is_watertight
@@ -253,7 +253,7 @@ def test_bad_arguments(tmp_path, name, options, message):
 def test_errors_leave_nothing_behind(tmp_path, scene, monkeypatch):
     with pytest.raises(FileNotFoundError, match="no checkpoint"):
         task.export(tmp_path, tmp_path / "mesh.ply")
-    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: scene)
+    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: scene)
     with pytest.raises(ValueError, match="without spaces"):
         task.export("run", tmp_path / "a b.obj", faces=100, texture_size=64)
     (tmp_path / "a.glb").mkdir()

@@ -25,7 +25,7 @@ def scene():
 
 @pytest.fixture
 def export(tmp_path, scene, monkeypatch):
-    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: scene)
+    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: scene)
 
     def write(name, **options):
         return task.export("run", tmp_path / name, **{"texture_size": 64, "faces": 500} | options)
@@ -160,6 +160,6 @@ def test_levels_need_triangles(export, monkeypatch, tmp_path):
 
 def test_watertight_levels(tmp_path, monkeypatch):
     cut = lopsided(24**3, change=lambda nodes, sdf: nodes.norm(dim=-1) - 0.55)
-    monkeypatch.setattr("univoxel.checkpoint.load_scene", lambda run: cut)
+    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: cut)
     for file in task.export("run", tmp_path / "a.ply", faces=800, watertight=True, lods=2):
         assert trimesh.load(file).is_watertight, file

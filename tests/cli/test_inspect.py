@@ -8,14 +8,14 @@ import pytest
 import torch
 from analytic import cameras_around, sphere_normals, sphere_scene, write_scene
 
-from univoxel.assets.ply import write_ply
-from univoxel.checkpoint import save_scene
 from univoxel.cli.inspect import inspect, parse_pixel
 from univoxel.data.images import read_exr, read_image, write_exr
 from univoxel.errors import DataError
 from univoxel.lights import EnvmapConfig, EnvmapSGConfig, MLPLightConfig, SHConfig
-from univoxel.pictures.light_at_point import irradiance
+from univoxel.output.mesh_files import write_ply
+from univoxel.render.light_at_point import irradiance
 from univoxel.render.pipeline import extract_mesh
+from univoxel.scene import save_scene
 from univoxel.sphere import latlong_directions
 
 

@@ -7,27 +7,29 @@ import pytest
 from analytic import write_scene
 
 from univoxel.cli.evaluate import evaluate
+from univoxel.cli.trainer import train
 from univoxel.config import StageConfig, TrainConfig
-from univoxel.data import kept, load_photos, shots
+from univoxel.data import image_cache, load_images, load_photos
 from univoxel.errors import UserError
 from univoxel.lights import SGConfig
 from univoxel.run import kept_photos, photos_of
 from univoxel.scene import SceneConfig
-from univoxel.trainer import train
 
 
 @pytest.fixture
 def large(monkeypatch):
     """Photographs of 32 pixels are twice as large as grids can use."""
-    monkeypatch.setattr(shots, "FINE", 16)
+    monkeypatch.setattr(load_images, "FINE", 16)
 
 
 @pytest.fixture
 def read(monkeypatch):
     """Counts the photographs that are read from their files."""
     files = []
-    original = shots.read_photo
-    monkeypatch.setattr(shots, "read_photo", lambda p, *rest: files.append(p) or original(p, *rest))
+    original = load_images.read_photo
+    monkeypatch.setattr(
+        load_images, "read_photo", lambda p, *rest: files.append(p) or original(p, *rest)
+    )
     return files
 
 
@@ -55,7 +57,7 @@ def test_what_was_found_is_remembered(tmp_path, large, read, monkeypatch):
     assert len(read) == 8
     assert {kept_photos(run, s).is_file() for s in ("train", "test")} == {True}
     # Whatever would be found now, the run goes by what was
-    monkeypatch.setattr(shots, "FINE", 8)
+    monkeypatch.setattr(load_images, "FINE", 8)
     assert photos_of(run).cameras.width == 16
     assert photos_of(run, split="train").cameras.width == 16
     with pytest.raises(UserError, match="the run began with other downscale"):
@@ -111,7 +113,7 @@ def test_the_disk_may_be_full(tmp_path, large, monkeypatch, caplog):
     def full(*_):
         raise OSError(28, "no space left")
 
-    monkeypatch.setattr(kept, "save_file", full)
+    monkeypatch.setattr(image_cache, "save_file", full)
     run = train(config(tmp_path))
     assert "photographs are not kept for the next time" in caplog.text
     assert load_photos(tmp_path / "data").downscale == 2

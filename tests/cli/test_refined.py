@@ -9,18 +9,17 @@ import torch
 from analytic import LIGHTS, RADIUS, cameras_around, write_scene
 
 from lab.stress.damage import turned
-from univoxel import trainer as task
 from univoxel.camera import project
-from univoxel.checkpoint import load_scene
-from univoxel.confidence.survey import survey
+from univoxel.cli import trainer as task
+from univoxel.cli.trainer import train
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
+from univoxel.evaluation.confidence import survey
 from univoxel.lights import SGConfig
 from univoxel.preparation.prepare import find_silhouettes
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import SceneConfig
-from univoxel.trainer import train
+from univoxel.scene import SceneConfig, load_scene
 
 
 @pytest.fixture(scope="module")

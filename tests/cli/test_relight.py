@@ -10,13 +10,13 @@ import torch
 from univoxel.camera import image_rays, project
 from univoxel.cli import relight as task
 from univoxel.color import linear_to_srgb
+from univoxel.core.records import Mesh, Surface
 from univoxel.data.images import read_exr, read_image, write_exr
 from univoxel.envmap import EnvMap
 from univoxel.errors import DataError
 from univoxel.ops import Sun, VisibilityScene
-from univoxel.pictures import relighting
-from univoxel.pictures.viewpoints import orbit
-from univoxel.records import Mesh, Surface
+from univoxel.output import viewpoints
+from univoxel.output.viewpoints import orbit
 
 SIZE, RADIUS, ALBEDO = 24, 0.5, 0.6
 
@@ -58,9 +58,9 @@ def surface_of_view(scene, cameras, view):
 def run(tmp_path, monkeypatch):
     """A run whose data has two test cameras at +X and +Y, and two maps beside it."""
     scene = SimpleNamespace(field=SimpleNamespace(voxel_size=0.02))
-    monkeypatch.setattr(relighting, "load_scene", lambda run: scene)
-    monkeypatch.setattr(relighting, "extract_mesh", lambda scene: sphere())
-    monkeypatch.setattr(relighting, "surface_of_view", surface_of_view)
+    monkeypatch.setattr(viewpoints, "load_scene", lambda run: scene)
+    monkeypatch.setattr(viewpoints, "extract_mesh", lambda scene: sphere())
+    monkeypatch.setattr(viewpoints, "surface_of_view", surface_of_view)
     poses = [
         [[0, 0, 1, 2], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]],
         [[-1, 0, 0, 0], [0, 0, 1, 2], [0, 1, 0, 0], [0, 0, 0, 1]],

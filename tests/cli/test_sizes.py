@@ -10,19 +10,19 @@ from analytic import write_scene
 from cropped import windows, write_cropped
 from PIL import Image
 
+from univoxel.capture import cutout as task
 from univoxel.cli.evaluate import evaluate
 from univoxel.cli.inspect import inspect
 from univoxel.cli.relight import relight_images, relight_to_files
+from univoxel.cli.trainer import train
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import load_photos, load_truth
 from univoxel.data.images import image_size, read_exr, read_image, write_exr, write_png
 from univoxel.errors import DataError, UserError
 from univoxel.lights import SGConfig
-from univoxel.pictures import timelapse
+from univoxel.output import timelapse
 from univoxel.run import photos_of as photos_of_run
 from univoxel.scene import SceneConfig
-from univoxel.segmentation import cutout as task
-from univoxel.trainer import train
 
 VIEWS, SIZE = 12, 40
 

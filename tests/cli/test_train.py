@@ -10,10 +10,10 @@ from layouts import Scene, write_colmap
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from univoxel import trainer as task
-from univoxel.checkpoint import FILE, load_scene
 from univoxel.cli import main
+from univoxel.cli import trainer as task
 from univoxel.cli.info import info
+from univoxel.cli.trainer import train
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.config import JointConfig, StageConfig, TrainConfig, save_config
 from univoxel.data import load_photos
@@ -22,14 +22,13 @@ from univoxel.lights import SGConfig
 from univoxel.preparation import prepare as preparation
 from univoxel.presets import preset, with_field
 from univoxel.render.pipeline import extract_mesh
+from univoxel.run import load_verdict
 from univoxel.run import photos_of as photos_of_run
-from univoxel.scene import SceneConfig
-from univoxel.trainer import train
-from univoxel.training import clock, loop, surface_update
+from univoxel.scene import FILE, SceneConfig, load_scene
+from univoxel.training import clock, descent, loop
 from univoxel.training import pixels as pixels_module
 from univoxel.training.loop import batch_at
 from univoxel.training.pixels import split_pixels
-from univoxel.verdict import load_verdict
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +104,7 @@ def test_the_map_of_mirrors_keeps_to_the_budget(data, tmp_path, monkeypatch, meg
     given = []
     monkeypatch.setattr(task, "run_stage", lambda *_: None)
     monkeypatch.setattr(task.joint_stage, "solve", lambda *args: given.append(args[2].mirror.rows))
-    monkeypatch.setattr(task.plan, "adapt_", lambda *_: [])
+    monkeypatch.setattr(task.compression, "adapt_", lambda *_: [])
     cfg = config(data, tmp_path / "run", budget_mb=megabytes, capacity="adaptive")
     task.train(dataclasses.replace(cfg, stages=(*cfg.stages, JointConfig(share=0.1))))
     assert given == [rows]
@@ -188,7 +187,7 @@ def test_a_gradient_spreads_over_the_nodes_that_it_touches():
     values[middle] = 1.0
     grad = torch.sparse_coo_tensor(rows, values, field.sdf.shape, check_invariants=True)
     field.sdf.grad = grad.coalesce()
-    surface_update.smooth_sdf_gradient_(field, 2)
+    descent.smooth_sdf_gradient_(field, 2)
     spread = field.sdf.grad.to_dense()
     beside = [spread[3, 4, 4], spread[5, 4, 4], spread[4, 3, 4], spread[4, 4, 5]]
     assert spread[4, 4, 4] > beside[0] > spread[2, 4, 4] > 0

@@ -14,22 +14,20 @@ from observed_points import (
     problem_on_a_sphere,
 )
 
-from univoxel.checkpoint import load_scene, save_scene
 from univoxel.config import JointConfig
+from univoxel.core.records import Surface
 from univoxel.errors import ConfigError, DataError
-from univoxel.grid import fit_grid
-from univoxel.joint import stage
-from univoxel.joint.equations import channel_radiance
-from univoxel.joint.newton import linear_transport
-from univoxel.joint.observations import shade_observations, turned_maps
+from univoxel.fields.grid import fit_grid
 from univoxel.lights import EnvmapConfig
-from univoxel.lights.turntable import Turntable, resampling
-from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
-from univoxel.preparation.light_frame import explained, turntable_of
-from univoxel.preparation.observed_hull import observe_hull
-from univoxel.records import Surface
+from univoxel.lights.views import Turntable, resampling
+from univoxel.preparation.hull import estimate_bounds, mask_distances, observe_hull, visual_hull
+from univoxel.preparation.turntable import explained, turntable_of
+from univoxel.render.observations import shade_observations, turned_maps
 from univoxel.render.pipeline import extract_mesh, radiance_of, shade
-from univoxel.scene import Scene
+from univoxel.scene import Scene, load_scene, save_scene
+from univoxel.training import joint_solve
+from univoxel.training.equations import channel_radiance
+from univoxel.training.newton import linear_transport
 
 NODES, VIEWS = 128, 16
 TURNTABLE = Turntable.of(cameras_around(VIEWS))
@@ -133,7 +131,7 @@ def test_the_equations_see_the_map_as_the_renders_do():
 def test_solve_finds_map_and_albedo_under_light_that_turns(photographs):
     scene = turning(sphere_scene(NODES))
     cfg = JointConfig(points=800, newton_points=800, rays=512, tracing=1, rounds=3)
-    stage.solve(scene, photographs["turning"], cfg, 0, Steps(300))
+    joint_solve.solve(scene, photographs["turning"], cfg, 0, Steps(300))
     mesh = extract_mesh(scene)
     x = mesh.vertices[:, 0]
     ratio = torch.stack([mesh.albedo[x > 0.1].mean(0) / RED, mesh.albedo[x < -0.1].mean(0) / BLUE])

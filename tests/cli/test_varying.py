@@ -19,21 +19,20 @@ from observed_points import (
     random_problem,
 )
 
-from univoxel import trainer as task
-from univoxel.checkpoint import load_checkpoint, load_scene, save_scene
 from univoxel.cli import main
+from univoxel.cli import trainer as task
+from univoxel.cli.trainer import train
 from univoxel.color import linear_to_srgb_unclipped
 from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
-from univoxel.joint import equations, newton, stage
-from univoxel.joint.newton import newton_round_
-from univoxel.joint.observations import prefiltered_roughness, shade_observations
 from univoxel.lights import SGConfig
+from univoxel.render.observations import prefiltered_roughness, shade_observations
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import Scene, SceneConfig
-from univoxel.trainer import train
+from univoxel.scene import Scene, SceneConfig, load_checkpoint, load_scene, save_scene
+from univoxel.training import equations, joint_solve, newton
 from univoxel.training.loop import held_out_psnr
+from univoxel.training.newton import newton_round_
 
 NODES = 12
 
@@ -160,7 +159,7 @@ def test_solve_finds_gains_and_the_albedo_under_them():
     with torch.no_grad():
         scene.views.gain_steps.zero_()
     cfg = JointConfig(points=800, newton_points=800, rays=512, tracing=1, rounds=3)
-    stage.solve(scene, photos, cfg, 0, Steps(600))
+    joint_solve.solve(scene, photos, cfg, 0, Steps(600))
     error = scene.views.log_gain.detach() / math.log(2) - wanted
     mesh = extract_mesh(scene)
     x = mesh.vertices[:, 0]

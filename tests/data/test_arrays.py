@@ -6,7 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from univoxel.data.arrays import read_npy, read_npz
+from univoxel.data.path_sandbox import read_npy, read_npz
 from univoxel.errors import DataError
 
 

@@ -8,7 +8,7 @@ import torch
 from univoxel.camera import Cameras
 from univoxel.color import srgb_to_linear
 from univoxel.data import Photos
-from univoxel.data.base import decode
+from univoxel.data.photos import decode
 
 
 def photos(color, alpha):

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from layouts import scene, write_colmap, write_nerf, write_nerfstudio, write_tensoir
 
+from univoxel.core.files import read_json
 from univoxel.data import load_cameras, load_photos
 from univoxel.data.images import write_png
 from univoxel.errors import DataError
-from univoxel.files import read_json
 
 GIANT = 10**400  # float() raises OverflowError
 

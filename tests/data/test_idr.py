@@ -8,8 +8,8 @@ import pytest
 from layouts import FOCAL, refused, scene, write_idr
 
 from univoxel.data import load_photos
-from univoxel.data.idr import decomposed
 from univoxel.data.images import write_png
+from univoxel.data.research import decomposed
 
 
 def load_arrays(folder):

@@ -12,13 +12,21 @@ import pytest
 import torch
 from PIL import Image, ImageCms
 
+from univoxel.core.files import replacing
 from univoxel.data import images
-from univoxel.data.images import image_size, read_exr, read_image, write_exr, write_png
-from univoxel.data.maps import read_map
-from univoxel.data.radiance import OF_RADIANCE, REC_709, write_radiance
-from univoxel.data.shots import read_photo
+from univoxel.data.images import (
+    OF_RADIANCE,
+    REC_709,
+    image_size,
+    read_exr,
+    read_image,
+    write_exr,
+    write_png,
+    write_radiance,
+)
+from univoxel.data.load_images import read_photo
+from univoxel.envmap import read_map
 from univoxel.errors import DataError
-from univoxel.files import replacing
 
 
 def noise(*shape, dtype=np.float32):

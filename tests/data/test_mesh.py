@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from univoxel.assets.ply import write_ply
-from univoxel.data.mesh import read_ply
+from univoxel.core.records import Mesh
+from univoxel.data.truth import read_ply
 from univoxel.errors import DataError
-from univoxel.records import Mesh
+from univoxel.output.mesh_files import write_ply
 
 VERTICES = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
 FACES = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from layouts import FOCAL, HEIGHT, WIDTH, refused, scene, write_metashape
 
-from univoxel.data import load_photos, metashape
+from univoxel.data import load_photos, photogrammetry
 
 TERMS = {"k1": 0.03, "k2": -0.02, "k3": 0.01, "k4": 0.05, "p1": 0.004, "p2": -0.007}
 OFFSETS = {"cx": 0.75, "cy": -0.5, "b1": 0.4}
@@ -19,8 +19,8 @@ def test_lenses_bend_as_the_manual_says(tmp_path):
     """x' = x (1 + K1 r2 + ..) + P1 (r2 + 2 x2) + 2 P2 x y, u = w / 2 + cx + x' f + x' B1."""
     text = calibration(**TERMS, **OFFSETS)
     path = write_metashape(tmp_path, scene(), text) / "cameras.xml"
-    sensor = metashape._chunk(path).find("sensors/sensor")
-    u, v = metashape._lens(sensor, "here").seen(
+    sensor = photogrammetry._chunk(path).find("sensors/sensor")
+    u, v = photogrammetry._sensor_lens(sensor, "here").seen(
         x := np.array([0.3, -0.2]), y := np.array([0.1, 0.25])
     )
     rr = x * x + y * y

@@ -9,7 +9,7 @@ from layouts import HEIGHT, WIDTH, scene, write_nerf, write_nerfstudio
 from PIL import Image
 from safetensors import safe_open
 
-from univoxel.data import keep_photos, load_photos, shots
+from univoxel.data import keep_photos, load_images, load_photos
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.lens import Lens, sources, straightened
 from univoxel.errors import DataError
@@ -31,12 +31,12 @@ def same(one, other):
 def test_readers_and_bands_do_not_matter(tmp_path, monkeypatch, downscale, bent):
     written = scene(20, width=37, height=29)
     folder = write_nerfstudio(tmp_path, written, **(BENT if bent else {}))
-    monkeypatch.setattr(shots, "READERS", 1)
+    monkeypatch.setattr(load_images, "READERS", 1)
     wanted = load_photos(folder, downscale=downscale)
     assert wanted.color.shape[1:3] == (29 // downscale, 37 // downscale)
     for readers, band in ((4, 1 << 20), (4, 1), (1, 200)):
-        monkeypatch.setattr(shots, "READERS", readers)
-        monkeypatch.setattr(shots, "BAND", band)
+        monkeypatch.setattr(load_images, "READERS", readers)
+        monkeypatch.setattr(load_images, "BAND", band)
         assert same(load_photos(folder, downscale=downscale), wanted)
     if not bent and downscale == 1:
         assert np.array_equal(wanted.color[0], written.pictures[1, ..., :3])
@@ -45,14 +45,14 @@ def test_readers_and_bands_do_not_matter(tmp_path, monkeypatch, downscale, bent)
 def test_pixels_are_decoded_in_bands(data, monkeypatch):
     """No more of a large photograph at once than the constant says, in linear light."""
     rows = []
-    linear = shots._premultiplied
+    linear = load_images._premultiplied
 
     def noted(color, alpha):
         rows.append(len(color))
         return linear(color, alpha)
 
-    monkeypatch.setattr(shots, "_premultiplied", noted)
-    monkeypatch.setattr(shots, "BAND", 8 * 37)
+    monkeypatch.setattr(load_images, "_premultiplied", noted)
+    monkeypatch.setattr(load_images, "BAND", 8 * 37)
     written = write_nerfstudio(data.parent / "plain", scene(3, width=37, height=29))
     load_photos(written, downscale=2)
     assert max(rows) == 8
@@ -68,9 +68,9 @@ def test_only_what_a_mask_shows_is_straightened(monkeypatch, window, factor):
     alpha[top:bottom, left:right] = 255
     lens = Lens(40, 31, (40.0, 40.0), (20.0, 15.5), (-0.3, 0.0, 0.0), (0.02, 0.01))
     grid = sources(lens, straightened(lens))
-    found = shots.resampled(color, alpha, factor, grid)
-    monkeypatch.setattr(shots, "_span", lambda there, factor: (0, len(there) // factor))
-    wanted = shots.resampled(color, alpha, factor, grid)
+    found = load_images.resampled(color, alpha, factor, grid)
+    monkeypatch.setattr(load_images, "_span", lambda there, factor: (0, len(there) // factor))
+    wanted = load_images.resampled(color, alpha, factor, grid)
     assert 0 < (wanted[1] > 0).float().mean() < 0.6
     assert torch.equal(found[0], wanted[0])
     assert torch.equal(found[1], wanted[1])
@@ -81,13 +81,13 @@ def test_only_what_a_mask_shows_is_decoded(monkeypatch):
     color = torch.randint(1, 256, (31, 40, 3), dtype=torch.uint8)
     alpha = torch.zeros(31, 40, dtype=torch.uint8)
     alpha[11:20, 7:25] = 255
-    found = shots.resampled(color, alpha, 3)
-    monkeypatch.setattr(shots, "_span", lambda there, factor: (0, len(there) // factor))
-    wanted = shots.resampled(color, alpha, 3)
+    found = load_images.resampled(color, alpha, 3)
+    monkeypatch.setattr(load_images, "_span", lambda there, factor: (0, len(there) // factor))
+    wanted = load_images.resampled(color, alpha, 3)
     assert torch.equal(found[0], wanted[0])
     assert torch.equal(found[1], wanted[1])
     assert (wanted[1] > 0).sum() == 4 * 7
-    empty = shots.resampled(color, torch.zeros_like(alpha), 3)
+    empty = load_images.resampled(color, torch.zeros_like(alpha), 3)
     assert torch.equal(empty[0], color[1:30:3, 1:39:3])
     assert not empty[1].any()
 
@@ -102,8 +102,8 @@ def test_surroundings_that_a_mask_hides_are_kept(factor, bent):
     alpha[30:60, 40:80] = 255
     lens = Lens(120, 90, (120.0, 120.0), (60.0, 45.0), (-0.3 if bent else 0.0, 0.0, 0.0))
     grid = sources(lens, straightened(lens)) if bent else None
-    found, covered = shots.resampled(color, alpha, factor, grid)
-    whole, _ = shots.resampled(color, torch.full_like(alpha, 255), factor, grid)
+    found, covered = load_images.resampled(color, alpha, factor, grid)
+    whole, _ = load_images.resampled(color, torch.full_like(alpha, 255), factor, grid)
     hidden = covered == 0
     assert 0.5 < hidden.float().mean() < 0.95
     # Of a square the mean, in linear light, is not its middle; a step is 255 grey levels here
@@ -116,7 +116,7 @@ def test_the_first_broken_photograph_is_named(data, monkeypatch):
     for name in ("p_003", "p_010", "p_017"):
         (data / "images" / f"{name}.png").write_bytes((data / "images/p_001.png").read_bytes()[:80])
     for readers in (1, 4):
-        monkeypatch.setattr(shots, "READERS", readers)
+        monkeypatch.setattr(load_images, "READERS", readers)
         with pytest.raises(DataError, match=r"p_003\.png: expected a PNG or JPEG"):
             load_photos(data)
 
@@ -138,13 +138,13 @@ def test_masks_of_16_bits_may_come_later(tmp_path):
 def read(monkeypatch):
     """Counts the photographs that are read from their files."""
     files = []
-    original = shots.read_photo
+    original = load_images.read_photo
 
     def counted(path, *rest):
         files.append(path.name)
         return original(path, *rest)
 
-    monkeypatch.setattr(shots, "read_photo", counted)
+    monkeypatch.setattr(load_images, "read_photo", counted)
     return files
 
 

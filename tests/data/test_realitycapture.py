@@ -7,7 +7,7 @@ import pytest
 import torch
 from layouts import FOCAL, refused, scene, write_realitycapture
 
-from univoxel.data import load_photos, realitycapture
+from univoxel.data import load_photos, photogrammetry
 from univoxel.errors import DataError
 
 NEWER = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
@@ -28,8 +28,8 @@ def test_lenses_bend_as_the_vendor_says(tmp_path):
     """px and py in longer sides; t1 along x, as OpenCV's p2."""
     lens = "0.05,-0.025,0.03,-0.02,0.01,0.05,0.004,-0.007"
     path = write_realitycapture(tmp_path, scene(), lens=lens) / "cameras.csv"
-    _, row = realitycapture._rows(path)[0]
-    found = realitycapture._lens(row, tmp_path / "images" / "p_000.png", "here")
+    _, row = photogrammetry._rows(path)[0]
+    found = photogrammetry._row_lens(row, tmp_path / "images" / "p_000.png", "here")
     u, v = found.seen(x := np.array([0.3, -0.2]), y := np.array([0.1, 0.25]))
     rr = x * x + y * y
     radial = 1 + 0.03 * rr - 0.02 * rr**2 + 0.01 * rr**3 + 0.05 * rr**4

@@ -14,7 +14,7 @@ from univoxel.camera import project
 from univoxel.data import load_cameras, load_photos
 from univoxel.data.images import orientation, write_png
 from univoxel.data.lens import Lens
-from univoxel.data.shots import Shot, upright
+from univoxel.data.load_images import Shot, upright
 from univoxel.errors import DataError
 
 LENS = Lens(4, 4, (4.0, 4.0), (2.0, 2.0))

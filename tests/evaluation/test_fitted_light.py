@@ -8,14 +8,12 @@ import pytest
 import torch
 from analytic import cameras_around, sphere_scene
 
-from univoxel import metrics
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
-from univoxel.evaluation.fitted_light import fit_light_
-from univoxel.evaluation.truth import every_nth
+from univoxel.evaluation.measures import every_nth, fit_light_, render_layers
 from univoxel.lights import SGConfig
 from univoxel.lights.views import ShownLight
-from univoxel.pictures.layers import render_layers
+from univoxel.render import metrics
 from univoxel.scene import Scene
 
 

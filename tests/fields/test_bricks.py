@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from univoxel.fields import bricks as bricks_module
 from univoxel.fields.bricks import BAND, pack_bricks, unpack_bricks
 from univoxel.fields.field import dense_field
-from univoxel.grid import GridShape, fit_grid
+from univoxel.fields.grid import GridShape, fit_grid
 from univoxel.ops import brick_minimum
 from univoxel.optim import RowAdam
 from univoxel.render.pipeline import surface_of_view

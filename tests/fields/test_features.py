@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import nn
 
+from univoxel.core.records import Rays
 from univoxel.fields import field as fields
 from univoxel.fields.bricks import BrickDistances
 from univoxel.fields.features import COARSEST, PER_LEVEL, ROWS, HashFeatures, Levels
 from univoxel.fields.field import Field, dense_field, hash_field
-from univoxel.grid import GridShape
+from univoxel.fields.grid import GridShape
 from univoxel.ops import encode_hash
-from univoxel.records import Rays
 
 GRID = GridShape((-0.7,) * 3, 1.4 / 39, (40, 40, 40))
 COUNT = 4  # levels

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from univoxel.fields.heads import MaterialHead, RadianceHead
+from univoxel.fields.field import MaterialHead, RadianceHead
 
 
 @pytest.fixture(autouse=True)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from univoxel.fields.packing import pack, unpack
+from univoxel.fields.distances import pack, unpack
 
 
 def two_balls():

@@ -6,10 +6,10 @@ from pathlib import Path
 import torch
 from balls import ball, views
 
-from univoxel import losses
-from univoxel.fields.heads import MaterialHead
+from univoxel.fields.field import MaterialHead
 from univoxel.lights import BakedLight, build
 from univoxel.presets import preset
+from univoxel.render import metrics
 
 
 def test_albedo_is_what_is_sent_in_every_direction():
@@ -28,7 +28,7 @@ def test_albedo_becomes_the_median_of_the_photographs():
     for _ in range(200):
         optimizer.zero_grad()
         rgb = BakedLight().reflected(surface, views(surface)).expand(9, 3)
-        losses.photometric(rgb, shown).backward()
+        metrics.photometric(rgb, shown).backward()
         optimizer.step()
     torch.testing.assert_close(surface.albedo[0], torch.full((3,), 0.3), atol=0.02, rtol=0)
 

@@ -9,6 +9,7 @@ from balls import ball, fit, views
 from torch.nn.functional import normalize
 
 from univoxel import sphere
+from univoxel.core.records import Occlusion
 from univoxel.lights import (
     EnvmapConfig,
     EnvmapLight,
@@ -17,7 +18,6 @@ from univoxel.lights import (
     latlong,
     quadrature,
 )
-from univoxel.records import Occlusion
 from univoxel.sphere import latlong_directions
 
 LAMP = normalize(torch.tensor([0.5, -0.3, 0.8]), dim=0)

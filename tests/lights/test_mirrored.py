@@ -4,9 +4,9 @@ import torch
 from torch.nn.functional import normalize
 
 from univoxel import brdf
-from univoxel.lights.mirrored import MirroredLight
-from univoxel.networks import DirectionTable
-from univoxel.records import Surface
+from univoxel.core.records import Surface
+from univoxel.lights.base import MirroredLight
+from univoxel.ops.networks import DirectionTable
 
 NO_TABLE = DirectionTable(0)
 

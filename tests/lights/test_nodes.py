@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from univoxel.lights.nodes import NODES_AT_ONCE, DistantLight
+from univoxel.lights.latlong import NODES_AT_ONCE, DistantLight
 from univoxel.sphere import direction_to_latlong, texel_solid_angles
 
 

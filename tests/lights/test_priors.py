@@ -5,22 +5,22 @@ import math
 import pytest
 import torch
 
-from univoxel.lights import priors
+from univoxel.lights import base
 from univoxel.sphere import latlong_directions
 
 
 def test_chroma_is_of_the_sum_only():
-    assert priors.chroma(torch.ones(1, 3)).item() == pytest.approx(0.0, abs=1e-6)
-    assert priors.chroma(torch.tensor([[1.0, 0.0, 0.0]])).item() > 0.5
+    assert base.chroma(torch.ones(1, 3)).item() == pytest.approx(0.0, abs=1e-6)
+    assert base.chroma(torch.tensor([[1.0, 0.0, 0.0]])).item() > 0.5
     # not the brightness: twice the light has the same chroma
     tinted = torch.tensor([[1.0, 0.9, 0.8]])
-    assert priors.chroma(2 * tinted).item() == pytest.approx(priors.chroma(tinted).item())
+    assert base.chroma(2 * tinted).item() == pytest.approx(base.chroma(tinted).item())
 
 
 def test_smoothness_vanishes_where_equal():
     a = torch.rand(5, 7)
-    assert priors.smoothness(a, a) == 0
-    assert priors.smoothness(a + 0.5, a).item() == pytest.approx(0.5)
+    assert base.smoothness(a, a) == 0
+    assert base.smoothness(a + 0.5, a).item() == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("axis", [[0.0, 0, 1], [1.0, 0, 0], [0.6, 0, 0.8]])
@@ -32,19 +32,19 @@ def test_total_variation_of_a_ramp(axis):
     integrand = ((1 + (k * t.sin()) ** 2).sqrt() - 1) * t.sin() / 2
     wanted = torch.trapezoid(integrand, t).item()
     # the rows beside the poles see the ramp at finite steps: about one in 128 of the map
-    assert priors.total_variation(ramp).item() == pytest.approx(wanted, rel=0.01)
+    assert base.total_variation(ramp).item() == pytest.approx(wanted, rel=0.01)
 
 
 def test_total_variation_knows_no_seam_and_no_level():
     torch.manual_seed(0)
     noise = torch.randn(16, 32, 3)
-    value = priors.total_variation(noise)
-    torch.testing.assert_close(priors.total_variation(noise.roll(5, 1)), value)
-    torch.testing.assert_close(priors.total_variation(noise + 3), value)
-    assert priors.total_variation(torch.ones(1, 2, 3)) == 0
+    value = base.total_variation(noise)
+    torch.testing.assert_close(base.total_variation(noise.roll(5, 1)), value)
+    torch.testing.assert_close(base.total_variation(noise + 3), value)
+    assert base.total_variation(torch.ones(1, 2, 3)) == 0
 
 
 def test_an_even_map_has_a_finite_gradient():
     even = torch.ones(8, 16, 3, requires_grad=True)
-    priors.total_variation(even).backward()
+    base.total_variation(even).backward()
     assert bool(even.grad.isfinite().all())

@@ -7,8 +7,8 @@ import torch
 from balls import ball, views
 
 from univoxel import sphere
+from univoxel.core.records import Occlusion
 from univoxel.lights import AbstractLight, quadrature
-from univoxel.records import Occlusion
 
 
 class Ramp(AbstractLight):

@@ -7,8 +7,8 @@ import torch
 from balls import ball, shaken, views
 
 from univoxel import ops, sphere
+from univoxel.core.records import Occlusion
 from univoxel.lights import LocalSG, SGConfig, quadrature
-from univoxel.records import Occlusion
 from univoxel.render.pipeline import at_rays
 
 

@@ -8,10 +8,9 @@ import torch
 from analytic import cameras_around, look_at
 from scipy.spatial.transform import Rotation
 
-from univoxel.camera import Cameras
+from univoxel.camera import Cameras, circle_of
 from univoxel.errors import ConfigError
-from univoxel.lights.turntable import Turntable, resampling
-from univoxel.orbit import circle_of
+from univoxel.lights.views import Turntable, resampling
 from univoxel.sphere import fibonacci_sphere
 
 TILTED = Rotation.from_rotvec([0.4, -0.3, 0.2])

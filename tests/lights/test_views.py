@@ -7,10 +7,9 @@ import torch
 from analytic import sphere_scene
 from balls import ball, views
 
-from univoxel.checkpoint import load_scene, save_scene
 from univoxel.lights import MLPLightConfig, SGConfig, SHConfig
 from univoxel.lights.views import ViewLights
-from univoxel.scene import Scene
+from univoxel.scene import Scene, load_scene, save_scene
 from univoxel.sphere import fibonacci_sphere
 
 NAMES = ("left", "right", "above")

@@ -8,8 +8,8 @@ from bricks import cut
 from check_op import check_op
 
 from univoxel import ops
+from univoxel.core.records import Samples
 from univoxel.ops import composite_field, composite_field_reference
-from univoxel.records import Samples
 
 SHAPE, ORIGIN, H = (7, 8, 9), [0.125, -0.25, 0.375], 0.25
 LEVELS = ([0.125, -0.25, 0.375], [1.625, 1.5, 2.375], [0.7, 0.3])

@@ -28,9 +28,9 @@ from op_cases import (
 from torch import Tensor
 
 from univoxel import ops
-from univoxel.ops import checks, native
+from univoxel.core.records import Bricks, Mesh
+from univoxel.ops import differentiable, native
 from univoxel.ops.differentiable import Differentiable
-from univoxel.records import Bricks, Mesh
 
 ANOTHER = {
     torch.float32: torch.float64,
@@ -50,11 +50,11 @@ def declared(case: str, arguments: dict) -> dict[str, tuple[list[str], torch.dty
         if op == case.split()[0]:
             named_sizes = {k: (s.split(), *dtype, None)[:2] for k, (_, s, *dtype) in named.items()}
             found.update(named_sizes)
-        return checks.check(op, **named)
+        return differentiable.check(op, **named)
 
     with pytest.MonkeyPatch.context() as patch:
         for module in modules:
-            if module is not checks and hasattr(module, "check"):
+            if module is not differentiable and hasattr(module, "check"):
                 patch.setattr(module, "check", looked_at)
         function(case)(**fresh(case, arguments)[0])
     return found

@@ -8,9 +8,9 @@ from extremes import few, pick, same, seeds
 from hypothesis import given
 from hypothesis import strategies as st
 
+from univoxel.core.records import Mesh
 from univoxel.envmap import EnvMap, tables
 from univoxel.ops import PointLight, Sun, VisibilityScene, native, relight
-from univoxel.records import Mesh
 
 pytestmark = pytest.mark.skipif(
     native.core is None or not native.core.embree_version(), reason="without rays"

@@ -7,9 +7,9 @@ import torch
 from integrator_scenes import WHITE, octahedron, shade, sphere_points
 
 from univoxel import brdf
+from univoxel.core.records import Mesh
 from univoxel.envmap import EnvMap, lookup
 from univoxel.ops import VisibilityScene, occluded_reference, use_backend
-from univoxel.records import Mesh
 from univoxel.sphere import fibonacci_sphere
 
 

@@ -7,8 +7,8 @@ import torch
 from integrator_scenes import DARK, WHITE, octahedron, shade, sphere_points
 
 from univoxel import brdf
+from univoxel.core.records import Mesh
 from univoxel.ops import PointLight, Sun, VisibilityScene
-from univoxel.records import Mesh
 
 ALBEDO, ROUGHNESS = torch.tensor([0.7, 0.4, 0.2]), torch.tensor(0.5)
 UP = torch.tensor([[0.0, 0, 1]])

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from univoxel import brdf
+from univoxel.core.records import Mesh
 from univoxel.envmap import EnvMap, tables
 from univoxel.ops import VisibilityScene, relight
-from univoxel.records import Mesh
 
 SIZE = 24  # pixels along the picture
 ALBEDO = torch.tensor([[0.8, 0.3, 0.2], [0.5, 0.6, 0.7]])  # of the sphere and of the plane

@@ -7,8 +7,8 @@ import torch
 from bricks import cut
 from check_op import check_op
 
+from univoxel.core.records import Bricks
 from univoxel.ops import sample_dense, sample_sparse, sample_sparse_reference
-from univoxel.records import Bricks
 
 ORIGIN = [0.125, -0.25, 0.375]
 H = 0.25

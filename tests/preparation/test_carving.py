@@ -11,10 +11,9 @@ from cropped import cropped
 
 from univoxel.camera import Cameras, image_rays, pixel_rays
 from univoxel.data import Photos
-from univoxel.grid import fit_grid
-from univoxel.preparation import carving, depth_sweep
-from univoxel.preparation.carving import carve_concavities, carving_pictures
-from univoxel.preparation.depth_sweep import log_colors
+from univoxel.fields.grid import fit_grid
+from univoxel.preparation import carving
+from univoxel.preparation.carving import carve_concavities, carving_pictures, log_colors
 from univoxel.preparation.hull import mask_distances, visual_hull
 
 SIZE, VIEWS = 48, 30
@@ -112,7 +111,7 @@ def test_a_dark_pit_is_opened(monkeypatch):
     hull, found, truth, voxel = opened(with_pit, dim, from_above())
     pit = (hull < -voxel) & (truth > voxel)
     assert (found[pit] > 0).float().mean() > 0.8
-    monkeypatch.setattr(depth_sweep, "LOG_SHARE", 0.0)
+    monkeypatch.setattr(carving, "LOG_SHARE", 0.0)
     as_it_is = carve_concavities(*hull_of(with_pit, dim, from_above()))
     assert (as_it_is[pit] > 0).float().mean() < (found[pit] > 0).float().mean() - 0.2
 

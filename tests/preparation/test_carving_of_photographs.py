@@ -7,7 +7,7 @@ import torch
 from analytic import RADIUS, photos_of
 
 from univoxel.color import linear_to_srgb
-from univoxel.grid import fit_grid
+from univoxel.fields.grid import fit_grid
 from univoxel.preparation import carving as task
 
 

@@ -8,11 +8,11 @@ import torch
 from analytic import photos_of
 
 from univoxel.color import CLIPPED, linear_to_srgb
-from univoxel.grid import fit_grid
-from univoxel.names import Varying
-from univoxel.preparation import exposures as task
-from univoxel.preparation.exposures import log_gains, varying_and_gains
+from univoxel.core.choices import Varying
+from univoxel.fields.grid import fit_grid
+from univoxel.preparation import prepare as task
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
+from univoxel.preparation.prepare import log_gains, varying_and_gains
 
 VIEWS = 16
 

@@ -8,9 +8,9 @@ from analytic import look_at
 from spoilt_masks import MISSING, iou, lost_part, without_depth
 
 from univoxel.camera import Cameras, image_rays
-from univoxel.preparation import gaps
+from univoxel.capture.masks import judge, voxel_pixels
+from univoxel.preparation import object_shape
 from univoxel.preparation.object_shape import find_object, share_of, silhouettes, votes
-from univoxel.segmentation.mask_repair import judge, voxel_pixels
 
 SIZE = 96
 ABOVE, BESIDE = 24, 3  # cameras that look down on a gate, and that see through it
@@ -75,13 +75,13 @@ def test_a_gap_that_others_contradict_stays(true):
     seen, masks = true
     grid = find_object(masks, without_depth(seen), VOXELS).grid
     share = share_of(votes(masks, without_depth(seen), grid), len(masks))
-    gaps.carve_gaps_(share, THRESHOLD, masks, seen, grid)
+    object_shape.carve_gaps_(share, THRESHOLD, masks, seen, grid)
     inside = share >= THRESHOLD
     spoilt = [lost_part(m) if v == LOST else m for v, m in enumerate(masks)]
     after = share.clone()
-    gaps.carve_gaps_(after, THRESHOLD, spoilt, seen, grid)
+    object_shape.carve_gaps_(after, THRESHOLD, spoilt, seen, grid)
     assert ((after < THRESHOLD) & inside).sum() < 0.02 * inside.sum()
     # Where nearly all lose it, those that do not are outvoted
     spoilt = [m if v == LOST else lost_part(m) for v, m in enumerate(masks)]
-    gone = gaps.carve_gaps_(after, THRESHOLD, spoilt, seen, grid)
+    gone = object_shape.carve_gaps_(after, THRESHOLD, spoilt, seen, grid)
     assert gone > 0.1 * inside.sum()

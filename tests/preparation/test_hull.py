@@ -5,7 +5,7 @@ import torch
 from analytic import RADIUS, cameras_around, sphere_normals
 
 from univoxel.camera import Cameras
-from univoxel.grid import GridShape, fit_grid, resample
+from univoxel.fields.grid import GridShape, fit_grid, resample
 from univoxel.preparation.hull import (
     estimate_bounds,
     hull_sdf,

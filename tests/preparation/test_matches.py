@@ -13,9 +13,8 @@ from lab.stress.damage import turned
 from univoxel.camera import Cameras, image_rays, project
 from univoxel.data import Photos
 from univoxel.errors import UserError
-from univoxel.preparation import belief
 from univoxel.preparation import matches as task
-from univoxel.preparation.belief import right, weighed
+from univoxel.preparation import pose_refinement
 from univoxel.preparation.hull import mask_distances
 from univoxel.preparation.matches import (
     Agreement,
@@ -25,6 +24,7 @@ from univoxel.preparation.matches import (
     find_matches,
     neighbours,
 )
+from univoxel.preparation.pose_refinement import choose_masks_or_poses, right
 from univoxel.training.pixels import MARGIN, split_pixels
 
 VIEWS, SIZE = 8, 200
@@ -162,7 +162,7 @@ def bitten(photos):
 def test_a_mask_that_lacks_a_part_is_outvoted_and_cameras_stay(photos, caplog):
     spoilt, distance = bitten(photos)
     with caplog.at_level("INFO"):
-        found = weighed(spoilt, distance, "auto", "auto")
+        found = choose_masks_or_poses(spoilt, distance, "auto", "auto")
     assert (found.refined, found.votes) == (False, 2)
     assert "cameras are believed" in caplog.text
     assert "the masks are rough" in caplog.text
@@ -171,7 +171,7 @@ def test_a_mask_that_lacks_a_part_is_outvoted_and_cameras_stay(photos, caplog):
 
 def test_masks_as_given_are_not_doubted(photos):
     spoilt, distance = bitten(photos)
-    found = weighed(spoilt, distance, "auto", "given")
+    found = choose_masks_or_poses(spoilt, distance, "auto", "given")
     assert (found.refined, found.votes) == (False, 1)
     assert found.box[1][2] < 0.5 * RADIUS
 
@@ -179,17 +179,19 @@ def test_masks_as_given_are_not_doubted(photos):
 def test_cameras_that_photographs_contradict_are_refined(photos, distance, caplog):
     off = replace(photos, cameras=wrong(photos, 1.0))
     with caplog.at_level("INFO"):
-        found = weighed(off, distance, "auto", "auto")
+        found = choose_masks_or_poses(off, distance, "auto", "auto")
     assert (found.refined, found.votes) == (True, 1)
     assert "from where the cameras put them; silhouettes contradict" in caplog.text
-    assert not weighed(off, distance, "given", "auto").refined
+    assert not choose_masks_or_poses(off, distance, "given", "auto").refined
 
 
 def test_silhouettes_that_agree_are_not_asked_twice(photos, distance, monkeypatch):
-    monkeypatch.setattr(belief, "find_matches", lambda *_: pytest.fail("nobody doubts anything"))
-    found = weighed(photos, distance, "auto", "auto")
+    monkeypatch.setattr(
+        pose_refinement, "find_matches", lambda *_: pytest.fail("nobody doubts anything")
+    )
+    found = choose_masks_or_poses(photos, distance, "auto", "auto")
     assert (found.refined, found.votes) == (False, 1)
-    assert weighed(photos, distance, "refined", "auto").refined
+    assert choose_masks_or_poses(photos, distance, "refined", "auto").refined
 
 
 def test_one_empty_place_in_masks_is_outvoted_or_refused(photos):
@@ -198,11 +200,11 @@ def test_one_empty_place_in_masks_is_outvoted_or_refused(photos):
     alpha[3] = 0
     alpha[3, :8, :8] = 1
     spoilt, distance = replace(photos, alpha=alpha), mask_distances(alpha)
-    found = weighed(spoilt, distance, "auto", "auto")
+    found = choose_masks_or_poses(spoilt, distance, "auto", "auto")
     assert found.votes == 2
     assert found.box[1].min() > 0.9 * RADIUS
     with pytest.raises(UserError, match="share no volume"):
-        weighed(spoilt, distance, "auto", "given")
+        choose_masks_or_poses(spoilt, distance, "auto", "given")
 
 
 def test_doubted_pixels_are_not_trained_on(photos, distance):

@@ -7,13 +7,13 @@ import torch
 from analytic import cameras_around
 from spoilt_masks import BESIDE, MISSING, iou, kept_table, lost_part, true_mask, without_depth
 
-from univoxel.data.base import Photos
+from univoxel.capture.masks import judge, voxel_pixels
+from univoxel.data.photos import Photos
 from univoxel.errors import UserError
-from univoxel.grid import GridShape
+from univoxel.fields.grid import GridShape
 from univoxel.preparation import object_shape
 from univoxel.preparation.object_shape import ObjectShape, find_object, silhouettes
 from univoxel.preparation.stereo import depth_maps
-from univoxel.segmentation.mask_repair import judge, voxel_pixels
 
 VIEWS, SIZE, VOXELS = 40, 64, 48
 

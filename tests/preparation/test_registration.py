@@ -8,10 +8,9 @@ import torch
 from analytic import cameras_around, photos_of
 
 from lab.stress.damage import turned
-from univoxel.camera import project
-from univoxel.poses import PoseSteps
+from univoxel.camera import PoseSteps, project
 from univoxel.preparation.hull import mask_distances
-from univoxel.preparation.registration import Edges, align_, contradiction
+from univoxel.preparation.pose_refinement import Edges, align_, contradiction
 
 VIEWS, SIZE = 16, 64
 BOX = torch.full((3,), -0.7), torch.full((3,), 0.7)

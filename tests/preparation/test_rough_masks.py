@@ -9,9 +9,8 @@ from analytic import RADIUS, photos_of
 from univoxel.data import Photos
 from univoxel.errors import DataError, UserError
 from univoxel.preparation import prepare
-from univoxel.preparation.belief import Belief
 from univoxel.preparation.hull import hull_sdf, mask_distances
-from univoxel.preparation.registration import MAX_CONTRADICTION
+from univoxel.preparation.pose_refinement import MAX_CONTRADICTION, Belief
 from univoxel.preparation.rough_masks import doubt_masks, thick
 from univoxel.presets import preset
 
@@ -101,7 +100,9 @@ def test_masks_that_show_nothing(photos):
 def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(
     photos, tmp_path, caplog, monkeypatch
 ):
-    monkeypatch.setattr(prepare, "weighed", lambda *_: ROUGH)  # of the plain ball no match tells
+    monkeypatch.setattr(
+        prepare, "choose_masks_or_poses", lambda *_: ROUGH
+    )  # of the plain ball no match tells
     spoilt = without_a_part(photos, (3, 9))
     cfg = preset("fast", tmp_path, tmp_path / "run")
     with caplog.at_level("INFO"):

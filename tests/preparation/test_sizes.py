@@ -9,14 +9,14 @@ from cropped import cropped, windows
 
 from univoxel.camera import pixel_rays
 from univoxel.color import linear_to_srgb
-from univoxel.grid import fit_grid
+from univoxel.fields.grid import fit_grid
 from univoxel.ops import VisibilityScene
-from univoxel.preparation import masks, registration
-from univoxel.preparation.exposures import log_gains
+from univoxel.preparation import masks, pose_refinement
 from univoxel.preparation.hull import estimate_bounds, hull_sdf, mask_distances, visual_hull
 from univoxel.preparation.masks import fitted_masks
-from univoxel.preparation.registration import Edges, contradiction, registered_poses
-from univoxel.render.transport import observe
+from univoxel.preparation.pose_refinement import Edges, contradiction, registered_poses
+from univoxel.preparation.prepare import log_gains
+from univoxel.render.observations import observe
 from univoxel.training.loop import batch_at
 from univoxel.training.pixels import split_pixels
 
@@ -112,7 +112,7 @@ def test_contradictions_are_those_of_whole_pictures(whole, cut, monkeypatch):
     assert ((less - more).abs() < 1e-3).float().mean() > 0.9
     # A ball may be turned as it likes, so its cameras end at other places, but as well
     for name, few in {"STEPS": 60, "RAYS": 128, "VIEWS": 16}.items():
-        monkeypatch.setattr(registration, name, few)
+        monkeypatch.setattr(pose_refinement, name, few)
     rest = [contradiction(d, registered_poses(d, c, BOX).corrected(c), BOX) for d, c in pairs]
     assert rest[0] == pytest.approx(rest[1], abs=0.05)
     assert rest[1] < 0

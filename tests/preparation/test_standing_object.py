@@ -7,8 +7,8 @@ import torch
 from spoilt_masks import iou, without_depth
 
 from univoxel.camera import looked_at
-from univoxel.data.base import Photos
-from univoxel.grid import fit_grid
+from univoxel.data.photos import Photos
+from univoxel.fields.grid import fit_grid
 from univoxel.preparation.object_shape import ROOM, shrunk
 from univoxel.preparation.standing_object import (
     Plane,

@@ -6,7 +6,7 @@ import textured_room
 import torch
 
 from univoxel.camera import image_rays
-from univoxel.data.base import Photos
+from univoxel.data.photos import Photos
 from univoxel.preparation import stereo
 
 VIEWS, WIDTH, HEIGHT = 24, 160, 120

@@ -11,7 +11,7 @@ from analytic import look_at
 from univoxel.camera import Cameras, image_rays
 from univoxel.data import Photos
 from univoxel.preparation.prepare import find_silhouettes
-from univoxel.preparation.strays import find_strays, say_strays
+from univoxel.preparation.turntable import find_strays, say_strays
 from univoxel.presets import preset
 
 VIEWS, SIZE = 16, 64

@@ -6,11 +6,10 @@ from asymmetric_scene import lopsided
 from balls import views
 
 from univoxel.color import srgb_to_linear
+from univoxel.core.records import Surface
 from univoxel.lights import EnvmapConfig
 from univoxel.lights.quadrature import half_sphere
-from univoxel.records import Surface
-from univoxel.render.occlusion import occlusion, outgoing
-from univoxel.render.pipeline import TRACED_AT_ONCE, shade
+from univoxel.render.pipeline import TRACED_AT_ONCE, occlusion, outgoing, shade
 from univoxel.scene import Scene
 
 # On the large ball of lopsided.BALLS, beside the small one, and far from both

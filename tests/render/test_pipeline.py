@@ -6,7 +6,7 @@ from analytic import RADIUS, cameras_around, sphere_normals
 
 from univoxel.camera import image_rays
 from univoxel.fields.field import dense_field
-from univoxel.grid import fit_grid
+from univoxel.fields.grid import fit_grid
 from univoxel.render.pipeline import (
     at_rays,
     extract_mesh,

@@ -7,11 +7,11 @@ import torch
 from integrator_scenes import DARK, WHITE, octahedron, sphere_points
 
 from univoxel.camera import Cameras
+from univoxel.core.records import Mesh, Rays, Surface
 from univoxel.envmap import EnvMap, tables
 from univoxel.ops import PointLight, Sun, VisibilityScene
-from univoxel.records import Mesh, Rays, Surface
 from univoxel.render import relight as task
-from univoxel.render.frame import Quality, channels, render_picture, rgba, srgb
+from univoxel.render.relight import Quality, channels, render_picture, rgba, srgb
 
 SUN = Sun((0.0, 0.0, 1.0), (2.0, 2.0, 2.0), 0.0)
 

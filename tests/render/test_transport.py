@@ -10,10 +10,9 @@ from torch.nn.functional import normalize
 
 from univoxel.camera import project
 from univoxel.color import linear_to_srgb, srgb_to_linear
+from univoxel.core.records import Mesh
 from univoxel.ops import VisibilityScene
-from univoxel.records import Mesh
-from univoxel.render.pipeline import extract_mesh
-from univoxel.render.transport import (
+from univoxel.render.observations import (
     MIN_COSINE,
     POINTS_AT_ONCE,
     Observations,
@@ -22,6 +21,7 @@ from univoxel.render.transport import (
     surface_points,
     trace,
 )
+from univoxel.render.pipeline import extract_mesh
 from univoxel.sphere import fibonacci_sphere
 
 OFFSET = 0.05

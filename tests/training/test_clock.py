@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from univoxel.config import PREPARATION, StageConfig, TrainConfig
-from univoxel.files import append_line
+from univoxel.core.files import append_line
 from univoxel.training import clock as clock_module
 from univoxel.training.clock import HURRY, LEAST, RESERVE_SECONDS, REST, expected_seconds
 from univoxel.training.progress import Progress

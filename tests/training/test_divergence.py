@@ -8,16 +8,14 @@ import torch
 from analytic import photos_of, sphere_scene, write_scene
 from observed_points import Steps, no_metal, problem_on_a_sphere
 
-from univoxel import trainer as task
-from univoxel.checkpoint import load_scene
+from univoxel.cli import trainer as task
 from univoxel.config import JointConfig, StageConfig, TrainConfig
-from univoxel.joint import equations, newton, stage
 from univoxel.lights import SGConfig
 from univoxel.optim import RowAdam
-from univoxel.scene import SceneConfig
-from univoxel.training import divergence, loop
+from univoxel.scene import SceneConfig, load_scene
+from univoxel.training import descent, equations, joint_solve, loop, newton
 from univoxel.training import progress as progress_module
-from univoxel.training.divergence import LIMIT, PROOF, Guard
+from univoxel.training.descent import LIMIT, PROOF, Guard
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +114,7 @@ def test_nothing_but_failure_leaves_the_state_it_began_with(data, tmp_path, monk
 def test_a_collapse_goes_back(data, tmp_path, monkeypatch):
     """The surface is lost between two reports: the state of the report before comes back."""
     monkeypatch.setattr(progress_module, "REPORT_SECONDS", -1.0)  # a report after every step
-    monkeypatch.setattr(divergence, "COPYING", 1e9)  # and a copy
+    monkeypatch.setattr(descent, "COPYING", 1e9)  # and a copy
     original, states = loop.held_out_psnr, []
 
     def judged(scene, *rest, **named):
@@ -139,8 +137,8 @@ def test_a_collapse_goes_back(data, tmp_path, monkeypatch):
 
 def test_one_failure_in_the_joint_stage(monkeypatch):
     scene, steps = sphere_scene(32), Steps(40)
-    failing(monkeypatch, stage, "objective", bad_joint, lambda i: i == 5)
-    stage.solve(scene, photos_of(8, 16), JOINT, 0, steps)
+    failing(monkeypatch, joint_solve, "objective", bad_joint, lambda i: i == 5)
+    joint_solve.solve(scene, photos_of(8, 16), JOINT, 0, steps)
     assert finite(scene)
     assert len(steps.troubles) == 1
     assert "step 5: the loss is nan; dropped this step" in steps.troubles[0]
@@ -149,8 +147,8 @@ def test_one_failure_in_the_joint_stage(monkeypatch):
 
 def test_repeated_failure_in_the_joint_stage(monkeypatch):
     scene, steps = sphere_scene(32), Steps(40)
-    failing(monkeypatch, stage, "objective", bad_joint, lambda i: i >= 5)
-    stage.solve(scene, photos_of(8, 16), JOINT, 0, steps)
+    failing(monkeypatch, joint_solve, "objective", bad_joint, lambda i: i >= 5)
+    joint_solve.solve(scene, photos_of(8, 16), JOINT, 0, steps)
     assert finite(scene)
     assert len(steps.troubles) == LIMIT + 1
     assert steps.abandoned
@@ -171,7 +169,7 @@ def test_a_surface_that_is_gone_leaves_light_and_materials():
     steps.skip = lambda: steps.asked.append("skip")
     scene.field.sdf.data.fill_(1.0)
     before = {k: v.clone() for k, v in scene.state_dict().items()}
-    stage.solve(scene, photos_of(2, 8), JOINT, 0, steps)
+    joint_solve.solve(scene, photos_of(2, 8), JOINT, 0, steps)
     assert steps.asked == ["skip"]
     assert "the field has no surface" in steps.troubles[0]
     assert all(torch.equal(before[k], v) for k, v in scene.state_dict().items())
@@ -181,7 +179,7 @@ def test_a_surface_that_no_photograph_sees_leaves_light_and_materials():
     scene, steps, photos = sphere_scene(8), Steps(10), photos_of(2, 8)
     steps.skip = lambda: steps.asked.append("skip")
     photos = dataclasses.replace(photos, alpha=torch.zeros_like(photos.alpha))
-    stage.solve(scene, photos, JOINT, 0, steps)
+    joint_solve.solve(scene, photos, JOINT, 0, steps)
     assert steps.asked == ["skip"]
     assert "no photograph sees a point of the surface" in steps.troubles[0]
 

@@ -12,17 +12,17 @@ import pytest
 import torch
 from analytic import write_scene
 
+from univoxel.cli.trainer import train
 from univoxel.config import LossConfig, StageConfig, TrainConfig
 from univoxel.data import load_photos
 from univoxel.fields.features import Levels
 from univoxel.fields.field import dense_field, hash_field
-from univoxel.grid import fit_grid
+from univoxel.fields.grid import fit_grid
 from univoxel.lights import SGConfig
 from univoxel.lights.base import Regularisation
 from univoxel.preparation.hull import mask_distances, visual_hull
 from univoxel.render.pipeline import surface_at
 from univoxel.scene import Scene, SceneConfig
-from univoxel.trainer import train
 from univoxel.training import loop, progress
 from univoxel.training.loop import add_gradient_, batch_at, light_priors, losses_of
 from univoxel.training.pixels import TrainingPixels, split_pixels

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from univoxel.camera import Cameras
+from univoxel.core.machine import Memory
 from univoxel.data import Photos
 from univoxel.errors import UserError
-from univoxel.machine import Memory
 from univoxel.presets import preset
-from univoxel.training.memory import check_memory, needed
+from univoxel.training.pixels import check_memory, needed
 
 GB = 10**9
 

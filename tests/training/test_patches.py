@@ -9,8 +9,8 @@ import torch
 from torch.nn.functional import normalize
 
 from univoxel.camera import Cameras, image_rays, projection_matrices
+from univoxel.core.records import Rays, Surface
 from univoxel.data import Photos
-from univoxel.records import Rays, Surface
 from univoxel.training import patches
 
 EYES = torch.tensor(

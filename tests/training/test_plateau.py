@@ -5,12 +5,11 @@ import dataclasses
 import pytest
 from analytic import write_scene
 
-from univoxel.checkpoint import load_checkpoint
+from univoxel.cli.trainer import train
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.lights import SGConfig
-from univoxel.scene import SceneConfig
-from univoxel.trainer import train
-from univoxel.training.plateau import CHECK, WINDOW, Plateau
+from univoxel.scene import SceneConfig, load_checkpoint
+from univoxel.training.descent import CHECK, WINDOW, Plateau
 
 
 def looks(patience, quality, steps=1000, physical_from=0.0):

@@ -10,11 +10,11 @@ import pytest
 from asymmetric_scene import lopsided
 from browser import browser, installed
 
-from univoxel.page import PageOptions
+from univoxel.output.page import PageOptions
 from univoxel.render.relight import traced_mesh
-from univoxel.viewer import film, studio
+from univoxel.viewer import render_queue
 from univoxel.viewer.server import serving
-from univoxel.viewer.subject import Subject, mesh_of
+from univoxel.viewer.viewer_scene import Subject, mesh_of
 
 pytest.importorskip("viser")
 pytestmark = pytest.mark.skipif(
@@ -30,7 +30,7 @@ def address():
     scene = lopsided(24**3)
     subject = Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(studio, "REST_WIDTH", 320)
+        patch.setattr(render_queue, "REST_WIDTH", 320)
         with serving(subject, PageOptions(title="Balls"), port=0) as address:
             yield address
 
@@ -95,7 +95,7 @@ def click(tab, x, y):
 
 def test_a_turntable_is_sent(tab, monkeypatch):
     """As a download, in a form that the installation can write."""
-    monkeypatch.setattr(film, "FRAMES", 2)
+    monkeypatch.setattr(render_queue, "FRAMES", 2)
     tab.run("""
         window.sent = [];
         const made = URL.createObjectURL;

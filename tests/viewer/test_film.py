@@ -12,13 +12,12 @@ from PIL import Image
 from univoxel.camera import project
 from univoxel.envmap import EnvMap
 from univoxel.errors import MissingExtra
-from univoxel.pictures.relighting import lighting
-from univoxel.pictures.viewpoints import orbit
+from univoxel.output.viewpoints import lighting, orbit
 from univoxel.render.relight import traced_mesh
-from univoxel.viewer import film as module
-from univoxel.viewer.film import film, kind, turned_about
+from univoxel.viewer import render_queue as module
 from univoxel.viewer.frames import Look
-from univoxel.viewer.subject import Subject, mesh_of
+from univoxel.viewer.render_queue import film, kind, turned_about
+from univoxel.viewer.viewer_scene import Subject, mesh_of
 
 
 @pytest.fixture(scope="module")

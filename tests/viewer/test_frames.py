@@ -16,14 +16,14 @@ from univoxel.camera import Cameras
 from univoxel.cli.relight import RelightOptions, relight_images
 from univoxel.color import linear_to_srgb
 from univoxel.errors import UserError
-from univoxel.metrics import psnr
 from univoxel.ops import Sun
-from univoxel.pictures import relighting
+from univoxel.output import viewpoints
+from univoxel.render.metrics import psnr
 from univoxel.render.pipeline import surface_of_view
 from univoxel.render.relight import traced_mesh
-from univoxel.viewer import denoise
+from univoxel.viewer import frames
 from univoxel.viewer.frames import LAYERS, Look, quick_picture, refined_pictures
-from univoxel.viewer.subject import Subject, mesh_of
+from univoxel.viewer.viewer_scene import Subject, mesh_of
 
 SIZE = 40
 
@@ -67,7 +67,7 @@ def on_black(picture):
 
 
 def relit(monkeypatch, scene, lamp, camera, **options):
-    monkeypatch.setattr(relighting, "load_scene", lambda run: scene)
+    monkeypatch.setattr(viewpoints, "load_scene", lambda run: scene)
     return straight(relight_images("run", lamp, camera, samples=1024, **options)[0])
 
 
@@ -96,7 +96,7 @@ def test_at_rest_it_becomes_the_relit_picture(monkeypatch, scene, subject, lamp,
 def test_a_quick_picture_is_about_the_same(monkeypatch, scene, subject, lamp, camera):
     """Of few samples: noise, and the silhouette of triangles."""
     expected = relit(monkeypatch, scene, lamp, camera)
-    look = Look(relighting.lighting(lamp))
+    look = Look(viewpoints.lighting(lamp))
     assert psnr(on_black(quick_picture(subject, camera, look)), on_black(expected)) >= 20
 
 
@@ -117,7 +117,7 @@ def test_layers_are_the_materials(scene, subject, lamp, camera):
     }
     assert set(expected) == set(LAYERS) - {"render", "doubt"}
     for layer, values in expected.items():
-        look = Look(relighting.lighting(lamp), layer)
+        look = Look(viewpoints.lighting(lamp), layer)
         quick, *_, last = shown(refined_pictures(subject, camera, look))
         exact = (last.reshape(-1, 4)[:, :3] - values.clamp(0, 1)).abs()[inside]
         assert exact.max() < 1e-4, layer
@@ -130,7 +130,7 @@ def test_doubts_are_those_at_the_vertices(scene, subject, lamp, camera):
     height = subject.traced.mesh.vertices[:, 2]
     known = replace(subject)
     vars(known)["doubt"] = (height > 0).float()
-    look = Look(relighting.lighting(lamp), "doubt")
+    look = Look(viewpoints.lighting(lamp), "doubt")
     (found,) = shown(refined_pictures(known, camera, look))
     surface, _ = surface_of_view(scene, camera, 0)
     up = surface.position[:, 2].reshape(SIZE, SIZE)
@@ -141,7 +141,7 @@ def test_doubts_are_those_at_the_vertices(scene, subject, lamp, camera):
 
 def test_doubts_need_photographs(subject, lamp, camera):
     with pytest.raises(UserError, match="photographs"):
-        quick_picture(subject, camera, Look(relighting.lighting(lamp), "doubt"))
+        quick_picture(subject, camera, Look(viewpoints.lighting(lamp), "doubt"))
 
 
 def test_a_mesh_may_be_coarser(scene):
@@ -151,7 +151,7 @@ def test_a_mesh_may_be_coarser(scene):
 
 def test_a_caller_can_leave_between_steps(subject, lamp, camera):
     """Steps are short: a picture of many samples comes in many of them."""
-    look = Look(relighting.lighting(lamp))
+    look = Look(viewpoints.lighting(lamp))
     steps = list(islice(refined_pictures(subject, camera, look), 6))
     assert steps[0] is not None
     assert steps[1] is None
@@ -159,10 +159,10 @@ def test_a_caller_can_leave_between_steps(subject, lamp, camera):
 
 def test_denoised_pictures_are_better(monkeypatch, scene, subject, lamp, camera):
     """With the package itself: five times less error from the same few samples."""
-    if not denoise.available():
+    if not frames.available():
         pytest.skip("needs pyoidn")
     expected = relit(monkeypatch, scene, lamp, camera, ground="lowest")
-    looks = [Look(relighting.lighting(lamp), ground=True, denoise=d) for d in (False, True)]
+    looks = [Look(viewpoints.lighting(lamp), ground=True, denoise=d) for d in (False, True)]
     noisy, clean = (shown(refined_pictures(subject, camera, look, samples=4)) for look in looks)
     for found in (noisy, clean):
         assert found[-1].shape == (SIZE, SIZE, 4)
@@ -184,8 +184,8 @@ def test_a_denoiser_goes_beside(monkeypatch, subject, lamp, camera):
 
     package = types.SimpleNamespace(denoise=slow)
     monkeypatch.setitem(sys.modules, "pyoidn", package)
-    noisy = shown(refined_pictures(subject, camera, Look(relighting.lighting(lamp)), samples=20))
-    look = Look(relighting.lighting(lamp), denoise=True)
+    noisy = shown(refined_pictures(subject, camera, Look(viewpoints.lighting(lamp)), samples=20))
+    look = Look(viewpoints.lighting(lamp), denoise=True)
     pictures, steps = refined_pictures(subject, camera, look, samples=20), []
     for picture in pictures:
         steps.append(picture)
@@ -200,11 +200,11 @@ def test_a_denoiser_goes_beside(monkeypatch, subject, lamp, camera):
         assert values.shape == (SIZE, SIZE, 3)
         assert (values[nothing] == 0).all()
         assert (values[~nothing] != 0).any()
-    half = Look(relighting.lighting(lamp), exposure=-1.0)
+    half = Look(viewpoints.lighting(lamp), exposure=-1.0)
     last = shown(refined_pictures(subject, camera, half, samples=20))[-1]
     torch.testing.assert_close(found[-1], last, rtol=0, atol=1e-5)
 
 
 def test_without_a_denoiser(monkeypatch):
-    monkeypatch.setattr(denoise, "find_spec", lambda name: None)
-    assert not denoise.available()
+    monkeypatch.setattr(frames, "find_spec", lambda name: None)
+    assert not frames.available()

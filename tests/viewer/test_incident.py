@@ -7,14 +7,20 @@ import torch
 from asymmetric_scene import BALLS, lopsided
 
 from univoxel.camera import Cameras, pixel_rays
+from univoxel.core.records import Rays
 from univoxel.envmap import EnvMap, lookup
 from univoxel.ops import Sun
-from univoxel.pictures.relighting import lighting
-from univoxel.records import Rays
+from univoxel.output.viewpoints import lighting
 from univoxel.render.relight import relight_surface, traced_mesh
 from univoxel.sphere import latlong_directions, texel_solid_angles
-from univoxel.viewer.incident import incident_light, incident_picture, point_on_mesh
-from univoxel.viewer.subject import Subject, mesh_of, mesh_surface
+from univoxel.viewer.viewer_scene import (
+    Subject,
+    incident_light,
+    incident_picture,
+    mesh_of,
+    mesh_surface,
+    point_on_mesh,
+)
 
 ROWS = 32
 

@@ -13,13 +13,13 @@ from asymmetric_scene import lopsided
 from browser import browser, installed
 from tiny import three_stages
 
-from univoxel.checkpoint import load_checkpoint, load_scene
 from univoxel.cli import main
+from univoxel.cli.trainer import train
 from univoxel.data import load_photos
 from univoxel.errors import MissingExtra, UserError
-from univoxel.pictures.timelapse import LABEL
-from univoxel.preparation import registration
-from univoxel.trainer import train
+from univoxel.output.timelapse import LABEL
+from univoxel.preparation import pose_refinement
+from univoxel.scene import load_checkpoint, load_scene
 from univoxel.training import progress as progress_module
 from univoxel.training.clock import Clock
 from univoxel.training.progress import TrainingProgress
@@ -155,7 +155,7 @@ def test_a_training_is_ended_from_a_browser(data, tmp_path, looking, caplog):
 
 
 def test_light_that_varies_and_cameras_that_move(data, tmp_path, looking, monkeypatch):
-    monkeypatch.setattr(registration, "STEPS", 10)
+    monkeypatch.setattr(pose_refinement, "STEPS", 10)
     cfg = three_stages(data, tmp_path / "run", varying="light")
     train(dataclasses.replace(cfg, cameras="refined"), view=ANY)
     assert len(looking.pictures) == 12 + 6 + 4
@@ -186,7 +186,7 @@ def test_the_port_is_taken_which_is_said_before_anything(tmp_path, capfd):
 def test_by_the_command_line(data, tmp_path, capfd, monkeypatch):
     asked = {}
     monkeypatch.setattr(
-        "univoxel.trainer.train", lambda cfg, **options: asked.update(options) or cfg.out
+        "univoxel.cli.trainer.train", lambda cfg, **options: asked.update(options) or cfg.out
     )
     monkeypatch.setattr("univoxel.cli.train.with_page", lambda run: run)
     arguments = ["train", str(data), "--out", str(tmp_path / "run")]

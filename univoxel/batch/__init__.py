@@ -1,1 +1,1 @@
-"""Many scenes: the steps of each, what came out of them, and pages of it."""
+"""Many scenes: jobs on one machine or on many, and what came out of them."""

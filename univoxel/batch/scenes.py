@@ -1,17 +1,31 @@
-"""Scenes of a batch by name, and how many run at once."""
+"""Many scenes as jobs: the steps of each, what came out of them, and a page of it."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Sequence
+import csv
+import dataclasses
+import json
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import quote
 
+from PIL import Image
+
+from univoxel.batch.jobs import Job, Result
+from univoxel.capture.project import Project
 from univoxel.config import TrainConfig
+from univoxel.core.files import read_json, replacing
+from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph, table, write_html
+from univoxel.core.machine import Memory
 from univoxel.data.images import image_size
-from univoxel.data.shots import LARGE
+from univoxel.data.load_images import LARGE
 from univoxel.errors import UserError
-from univoxel.machine import Memory
-from univoxel.training.memory import needed_for
+from univoxel.evaluation.measures import MEASURES
+from univoxel.run import Word, load_verdict
+from univoxel.training.pixels import needed_for
 
 MEASURED = "measures.json"  # in the folder of a scene
 LOGS = "logs"  # the folder in a batch's of what processes said, records and locks
@@ -76,3 +90,151 @@ def bytes_of(data: Path, config: TrainConfig) -> int:
                 pixels += width * height
     pixels = min(pixels, LARGE) // max(config.downscale, 1) ** 2
     return PER_PROCESS + PER_PIXEL * pixels + needed_for(pixels, config)
+
+
+# What came out of the scenes of a batch: records, batch.json and batch.csv.
+
+
+DOUBTS = ("doubt_albedo", "doubt_roughness")
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """What came out of a scene."""
+
+    name: str
+    data: str
+    folder: str  # below that of the batch
+    state: Literal["done", "failed", "left"]  # left: not all of it is done yet
+    errors: dict[str, str]  # a line each, by step
+    seconds: dict[str, float]  # spent in all sittings, by step
+    verdict: Word | None = None  # None: it was not trained to an end
+    measures: dict[str, float | int | None] = field(default_factory=dict)  # as of `evaluate`
+    doubts: dict[str, float] = field(default_factory=dict)  # means over the surface, in [0, 1]
+
+    @property
+    def error(self) -> str:
+        """Its errors in a line."""
+        return "; ".join(f"{step}: {said}" for step, said in self.errors.items())
+
+
+def result_of(job: Job, data: Path, out: Path, ended: Result | None = None) -> SceneResult:
+    """What the files of a scene in the folder of a batch say, and how this sitting of it ended."""
+    project, record = Project(out / job.name), job.record()
+    errors = ended.errors if ended else record["errors"]
+    whole = all(step.done() or (step.makes is None and ended) for step in job.steps)
+    state = "failed" if errors else "done" if whole else "left"
+    verdict = load_verdict(project.run)
+    try:
+        found = read_json(project.out / MEASURED)
+    except (OSError, UserError):
+        found = {}
+    measures = {key: found[key] for key in MEASURES if key in found}
+    doubts = {key: found["trust"][key] for key in DOUBTS if key in found.get("trust", {})}
+    told = (errors, record["seconds"], verdict and verdict.word, measures, doubts)
+    return SceneResult(job.name, str(data), job.name, state, *told)
+
+
+def write_results(
+    results: Sequence[SceneResult], options: Mapping[str, Any], out: Path, other: Path | None = None
+) -> None:
+    """Write batch.json and batch.csv, each whole or not at all.
+
+    Args:
+        other: one more file for what batch.json holds.
+    """
+    record = {"options": dict(options), "scenes": [dataclasses.asdict(r) for r in results]}
+    for path in (out / "batch.json", *([other] if other else [])):
+        with replacing(path) as temporary:
+            text = json.dumps(record, indent=1, default=str)
+            temporary.write_text(text + "\n", encoding="utf-8")
+    steps = dict.fromkeys(step for result in results for step in result.seconds)
+    head = ("name", "state", "verdict", "error", *(f"{step}_s" for step in steps))
+    with replacing(out / "batch.csv") as temporary, temporary.open("w", encoding="utf-8") as file:
+        rows = csv.DictWriter(file, (*head, *DOUBTS, *MEASURES), "", lineterminator="\n")
+        rows.writeheader()
+        for r in results:
+            row = {"name": r.name, "state": r.state, "verdict": r.verdict, "error": r.error}
+            seconds = {f"{step}_s": spent for step, spent in r.seconds.items()}
+            rows.writerow(row | seconds | r.doubts | r.measures)
+
+
+# A batch as one page: a picture of each scene, what was measured, how sure it is, what failed.
+
+
+TILE = 120  # pixels of the longer side
+COLUMNS = {  # measures that the page shows, by key, with their digits
+    "nvs_psnr": ("novel views, dB", 1),
+    "albedo_psnr_3ch": ("albedo, dB", 1),
+    "roughness_mse": ("roughness, MSE", 3),
+    "relit_psnr": ("relit, dB", 1),
+    "normal_mae_deg": ("normals, degrees", 1),
+}
+WORSE_FIRST = {"failed": 0, "left": 1, "done": 2}
+
+_STYLE = f"""{DARK_STYLE}
+table {{ border-collapse: collapse }}
+th, td {{ padding: 4px 12px; text-align: right; border-bottom: 1px solid #444 }}
+th {{ position: sticky; top: 0; background: #202020 }}
+:is(th, td):is(:nth-child(2), :nth-child(3)), td:last-child {{ text-align: left }}
+td img {{ display: block }}
+a {{ color: #9cf }}
+.failed td {{ color: #ffb347 }}"""
+
+
+def write_sheet(results: Sequence[SceneResult], out: Path) -> Path:
+    """Write out/index.html, which holds its pictures; return it. Failed scenes come first.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    shown = [key for key in COLUMNS if any(r.measures.get(key) is not None for r in results)]
+    heads = ["", "scene", "verdict", *(COLUMNS[key][0] for key in shown)]
+    heads += ["doubt of albedo", "of roughness", "training", "all", ""]
+    ordered = sorted(results, key=lambda r: (WORSE_FIRST[r.state], r.name))
+    counts = [(state, sum(r.state == state for r in results)) for state in WORSE_FIRST]
+    about = ", ".join(f"{count} {state}" for state, count in counts if count)
+    rows = table((_row(r, shown, out) for r in ordered), heads, [r.state for r in ordered])
+    title, page = out.absolute().name, out / "index.html"
+    body = f"<h1>{escape(title)}</h1>\n{paragraph(about)}\n{rows}"
+    write_html(page, document(title, _STYLE, body))
+    return page
+
+
+def _row(result: SceneResult, shown: Sequence[str], out: Path) -> list[str]:
+    project = Project(out / result.folder)
+    cells = [_thumbnail(project.run / "preview.png"), _link(project.page, result.name, out)]
+    cells.append(result.verdict or "-")
+    cells += [_number(result.measures.get(key), COLUMNS[key][1]) for key in shown]
+    cells += [_number(result.doubts.get(key), 2) for key in ("doubt_albedo", "doubt_roughness")]
+    whole = sum(result.seconds.values()) if result.seconds else None
+    cells += [_seconds(result.seconds.get("train")), _seconds(whole)]
+    output = _link(out / LOGS / f"{result.name}.txt", "what it said", out)
+    return [*cells, f"{escape(result.error)} {output}"]
+
+
+def _link(path: Path, text: str, out: Path) -> str:
+    """The text, as a link where there is something."""
+    said = escape(text)
+    if not path.exists():
+        return said
+    return f'<a href="{quote(path.relative_to(out).as_posix())}">{said}</a>'
+
+
+def _number(value: float | int | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _seconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f} s"
+
+
+def _thumbnail(path: Path) -> str:
+    """The left of a run's preview, its picture of the object, as an image in the page."""
+    try:
+        with Image.open(path) as picture:
+            small = picture.convert("RGB")
+    except (OSError, ValueError):  # none yet
+        return ""
+    small.thumbnail((TILE * 4, TILE), Image.Resampling.BOX)
+    return image(small)

@@ -1,1 +1,2 @@
-"""Photographs in, cameras out: reading of any format, structure from motion, what may be wrong."""
+"""Photographs in, cameras and masks out: reading of any format, structure from motion, masks,
+what may be wrong."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from univoxel.names import FEATURE_SIZE
-from univoxel.validation import check_fields
+from univoxel.core.choices import FEATURE_SIZE
+from univoxel.core.validation import check_fields
 
 
 @dataclass(frozen=True)

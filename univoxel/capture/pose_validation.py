@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from univoxel.capture.database import WATERMARK, Pair
-from univoxel.capture.model import NO_POINT, Model, Placed
+from univoxel.capture.model import NO_POINT, WATERMARK, Model, Pair, Placed
 from univoxel.data.lens import Lens
 
 STEPS = 10  # of turning a bent lens back: far below a thousandth of a pixel

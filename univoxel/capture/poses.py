@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from univoxel import __version__, steps
-from univoxel.bars import bar
-from univoxel.capture import database, pose_validation, structure, video
+from univoxel import __version__
+from univoxel.capture import model as database
+from univoxel.capture import photographs, pose_validation, structure
 from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.capture.model import Model, without
 from univoxel.capture.photographs import find_photographs, require_readers
@@ -33,9 +33,11 @@ from univoxel.capture.scene import (
     written_name,
 )
 from univoxel.capture.sfm import require_pycolmap
+from univoxel.core import files as steps
+from univoxel.core.choices import KEEP_SIZE
+from univoxel.core.files import read_json
+from univoxel.core.progress_bar import bar
 from univoxel.errors import DataError, ExistingFile, StillBackground
-from univoxel.files import read_json
-from univoxel.names import KEEP_SIZE
 from univoxel.sphere import gaps
 
 log: logging.Logger = logging.getLogger("univoxel")
@@ -184,18 +186,20 @@ def photographs_of(
     source: Path, folders: Folders, every: float | None = None
 ) -> tuple[list[Path], list[str], int]:
     """Photographs of a folder or frames of a video; other files; how many came twice."""
-    if video.is_video(source):
-        video.require_ffmpeg()
+    if photographs.is_video(source):
+        photographs.require_ffmpeg()
         stamp = [source.name, source.stat().st_size, source.stat().st_mtime, every]
         if steps.recorded(folders.work, FRAMES) != stamp:
             log.info(f"{source}: choosing frames")
             steps.forget(folders.work, FRAMES)
             shutil.rmtree(folders.frames, ignore_errors=True)
-            video.write_frames(source, folders.frames, every)
+            photographs.write_frames(source, folders.frames, every)
             steps.finish(folders.work, FRAMES, stamp)
         return sorted(folders.frames.glob("*.jpg")), [], 0
     if every is not None:
-        raise DataError(f"{source}: every is for videos ({' '.join(video.SUFFIXES)})", "every")
+        raise DataError(
+            f"{source}: every is for videos ({' '.join(photographs.SUFFIXES)})", "every"
+        )
     if not source.is_dir():
         raise DataError(f"{source}: expected a folder of photographs or a video")
     return find_photographs(source)

@@ -12,17 +12,11 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import maximum_filter
 
-from univoxel.capture.photographs import (
-    SIDEWAYS,
-    Photograph,
-    describe,
-    fitted,
-    read_upright,
-)
+from univoxel.capture.photographs import SIDEWAYS, Photograph, describe, fitted, read_upright
+from univoxel.core.files import replacing
 from univoxel.data.images import upright_from_stored
 from univoxel.data.masks import laid_over, masks_in
 from univoxel.errors import DataError
-from univoxel.files import replacing
 
 SFM_QUALITY = 95  # of JPEG
 MASK_MARGIN = 0.006  # that masks grow by before features are sought, of the longer side

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from univoxel import steps
-from univoxel.capture import video
+from univoxel.capture import photographs
 from univoxel.capture.photographs import find_photographs
-from univoxel.checkpoint import FILE
+from univoxel.core import files
+from univoxel.core.files import read_json
 from univoxel.data import has_cameras
 from univoxel.errors import DataError, ExistingFile
-from univoxel.files import read_json
+from univoxel.scene import FILE
 
 Kind = Literal["photographs", "scene", "run"]
 # Steps of a capture, beside its files, that leave a word for later ones: the choice of masks, and
@@ -60,7 +60,7 @@ def look_at(path: Path) -> Given:
         return Given(path, "run", [(str(path.absolute()), 0)])
     if has_cameras(path):
         return Given(path, "scene", [(str(path.absolute()), 0)])
-    if video.is_video(path):
+    if photographs.is_video(path):
         files = [path]
     elif path.is_dir():
         files, _, _ = find_photographs(path)
@@ -81,7 +81,7 @@ def begin(project: Project, given: Given) -> None:
         raise ExistingFile(f"{out} is a file: choose another out", "out")
     if (out / RECORD_0_2).exists():
         before = read_json(out / RECORD_0_2)
-        steps.adopt(out, {step: before[step] for step in ("files", *FACTS) if step in before})
+        files.adopt(out, {step: before[step] for step in ("files", *FACTS) if step in before})
 
     def other(files: list) -> ExistingFile:
         why = _difference(files, given.files)
@@ -89,7 +89,7 @@ def begin(project: Project, given: Given) -> None:
             f"{out} holds a capture of {_words(files)}; {why}: choose another out", "out"
         )
 
-    begun = steps.done(out, "files", given.files, other)
+    begun = files.done(out, "files", given.files, other)
     if out.exists() and not begun:
         foreign = sorted(p.name for p in out.iterdir() if p.suffix != ".tmp")
         if foreign:
@@ -98,7 +98,7 @@ def begin(project: Project, given: Given) -> None:
     for path in out.rglob(".*.tmp"):  # of `files.replacing`, whose process was killed
         path.unlink()
     if not begun:
-        steps.finish(out, "files", given.files)
+        files.finish(out, "files", given.files)
 
 
 def discard_older(folder: Path, than: Path) -> None:

@@ -15,9 +15,9 @@ from PIL import Image
 from univoxel.capture.model import Model, Placed, write_model
 from univoxel.capture.photographs import Photograph, fitted, read_upright
 from univoxel.capture.prepare import Capture, read_mask
+from univoxel.core.files import replacing
 from univoxel.data.lens import Lens
-from univoxel.data.shots import turn_to_z, up_direction
-from univoxel.files import replacing
+from univoxel.data.load_images import turn_to_z, up_direction
 
 DISTANCE = 4.0  # median distance of the cameras from the origin, in the written world
 FLIP = np.array([1.0, -1.0, -1.0])  # camera axes of COLMAP to those of `Cameras`

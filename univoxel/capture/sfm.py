@@ -78,7 +78,7 @@ def run(request: Request, log: Path, done: Callable[[], int] | None = None) -> I
     with log.open("wb") as file:
         process = subprocess.Popen(
             [
-                *(sys.executable, "-m", "univoxel.guard", str(os.getpid())),
+                *(sys.executable, "-m", "univoxel.core.guard", str(os.getpid())),
                 *(sys.executable, "-m", "univoxel.capture.sfm", str(asked)),
             ],
             **{"stdin": subprocess.DEVNULL, "stdout": file, "stderr": file},

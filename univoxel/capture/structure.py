@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from univoxel.capture import database
+from univoxel.capture import model
 from univoxel.capture.config import CaptureConfig
 from univoxel.capture.model import Model, read_models
 from univoxel.capture.photographs import fitted
 from univoxel.capture.prepare import Capture, Folders
 from univoxel.capture.sfm import Request, run
-from univoxel.files import replacing
+from univoxel.core.files import replacing
 
 COARSE_FEATURES = 512  # largest features that pairs are chosen by
 # Photographs up to which so many are compared: beyond, fewer of each, for the time of the
@@ -32,8 +32,8 @@ def extract(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterat
     pictures = capture.pictures
     for g, members in enumerate(capture.groups):
         names = [pictures[i] for i in members if (folders.pictures / pictures[i]).exists()]
-        known = database.images(folders.database)
-        done = database.feature_counts(folders.database) if known else {}
+        known = model.images(folders.database)
+        done = model.feature_counts(folders.database) if known else {}
         left = [n for n in names if n not in known or known[n][0] not in done]
         if not left:
             continue
@@ -50,22 +50,21 @@ def extract(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterat
         yield from run(
             request,
             folders.work / f"extract{g}.log",
-            lambda: database.count(folders.database, "descriptors"),
+            lambda: model.count(folders.database, "descriptors"),
         )
 
 
 def select(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Write which pairs to match; yields how many photographs were compared with all others."""
     pictures = capture.pictures
-    numbers = database.images(folders.database)
+    numbers = model.images(folders.database)
     there = [i for i, name in enumerate(pictures) if name in numbers]
     if len(there) <= config.exhaustive:
         chosen = list(itertools.combinations(range(len(there)), 2))
     else:
         most = features_each(len(there))
         features = [
-            database.largest_features(folders.database, numbers[pictures[i]][0], most)
-            for i in there
+            model.largest_features(folders.database, numbers[pictures[i]][0], most) for i in there
         ]
         rows = []
         for row in similarities(features):
@@ -137,7 +136,7 @@ def match(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator
     yield from run(
         _request("match", capture, folders, config),
         folders.work / "match.log",
-        lambda: database.count(folders.database, "two_view_geometries"),
+        lambda: model.count(folders.database, "two_view_geometries"),
     )
 
 

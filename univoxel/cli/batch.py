@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from univoxel import machine
 from univoxel.cli.parsing import (
     STDOUT,
     Changes,
@@ -23,16 +22,24 @@ from univoxel.cli.parsing import (
     takes,
     written,
 )
+from univoxel.core import machine
+from univoxel.core.choices import (
+    BATCH_STEPS,
+    SAMPLES,
+    USUAL_STEPS,
+    BatchStep,
+    LightName,
+    PresetOrAuto,
+)
+from univoxel.core.files import read_json
 from univoxel.errors import ProcessFailed, UserError
-from univoxel.files import read_json
-from univoxel.names import BATCH_STEPS, SAMPLES, USUAL_STEPS, BatchStep, LightName, PresetOrAuto
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from univoxel.batch.results import SceneResult
+    from univoxel.batch.jobs import Job, Result, Step
+    from univoxel.batch.scenes import SceneResult
     from univoxel.config import TrainConfig
-    from univoxel.jobs.job import Job, Result, Step
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -81,7 +88,7 @@ class BatchOptions:
             UserError: there is none of that kind.
         """
         from univoxel.config import load_config
-        from univoxel.overrides import changed
+        from univoxel.core.validation import changed
         from univoxel.presets import chosen
 
         if self.config is None:
@@ -146,10 +153,8 @@ def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
         ProcessFailed: the scheduler does not answer, or is gone.
         OSError: out cannot be written.
     """
-    from univoxel.batch.results import result_of, write_results
-    from univoxel.batch.scenes import named, share
-    from univoxel.batch.sheet import write_sheet
-    from univoxel.jobs.scheduler import connect, run_jobs
+    from univoxel.batch.jobs import connect, run_jobs
+    from univoxel.batch.scenes import named, result_of, share, write_results, write_sheet
 
     unknown = [step for step in asked.steps if step not in BATCH_STEPS]
     if unknown or not asked.steps:
@@ -199,11 +204,11 @@ def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
 
 def job_of(name: str, data: Path, asked: BatchOptions, threads: int | None) -> Job:
     """The steps of a scene, data (absolute), that are asked for, below the folder of a batch."""
+    from univoxel.batch.jobs import Job, Step
     from univoxel.batch.scenes import LOGS, MEASURED
     from univoxel.capture.project import Project
     from univoxel.capture.scene import REPORT
-    from univoxel.checkpoint import FILE
-    from univoxel.jobs.job import Job, Step
+    from univoxel.scene import FILE
     from univoxel.training.progress import LOG
 
     out = asked.out.absolute()

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from univoxel import steps
 from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.cli.demo import MAPS, SCENE
 from univoxel.cli.evaluate import evaluate
@@ -16,6 +15,9 @@ from univoxel.cli.export import export
 from univoxel.cli.parsing import Changes, Minutes, check_minutes, takes, written
 from univoxel.cli.relight import relight_to_files
 from univoxel.cli.train import code_of
+from univoxel.core import files
+from univoxel.core.choices import DEPTH, KEEP_SIZE, REMBG, SAMPLES, LightName, PresetOrAuto, Until
+from univoxel.core.files import read_json, replacing
 from univoxel.errors import (
     DataError,
     ExistingFile,
@@ -24,8 +26,6 @@ from univoxel.errors import (
     UserError,
     WithoutMasks,
 )
-from univoxel.files import read_json, replacing
-from univoxel.names import DEPTH, KEEP_SIZE, REMBG, SAMPLES, LightName, PresetOrAuto, Until
 
 if TYPE_CHECKING:
     from univoxel.capture.project import Given, Project
@@ -145,10 +145,10 @@ def capture(
         OSError: a file cannot be written.
     """
     from univoxel.capture.project import Project, begin, look_at
-    from univoxel.checkpoint import FILE
-    from univoxel.overrides import changed
+    from univoxel.cli.trainer import duration
+    from univoxel.core.validation import changed
     from univoxel.presets import chosen
-    from univoxel.trainer import duration
+    from univoxel.scene import FILE
     from univoxel.training.clock import expected_seconds
     from univoxel.training.probe import slowdown
 
@@ -230,9 +230,9 @@ def _check_unused(given: Given, masks: str | Path, training: TrainConfig) -> Non
 
 def _check_machine(given: Given, masks: str | Path) -> None:
     """Refuse now what would fail after minutes."""
+    from univoxel.capture.masks import network
     from univoxel.capture.sfm import require_pycolmap
     from univoxel.ops import native
-    from univoxel.segmentation.network import network
 
     if not native.reference_asked():
         native.require_embree("capture")
@@ -256,13 +256,13 @@ def _find_cameras(project: Project, given: Given, masks: str | Path, config: Cap
     if given.kind == "scene" or (done / REPORT).exists():
         _skip("cameras", done)
         return done
-    if not steps.recorded(project.out, TURNED):
+    if not files.recorded(project.out, TURNED):
         _say("cameras", f"of {given.path}")
         try:
             return poses(given.path, done, config=config)
         except StillBackground as error:
             log.info(f"{error.seen}: the object was turned before a still camera, so masks first")
-            steps.finish(project.out, TURNED, True)
+            files.finish(project.out, TURNED, True)
     first = _masks_before_cameras(project, given, masks)
     _say("cameras", f"of what masks show of {given.path}")
     return poses(given.path, done, masks=first, config=config)
@@ -274,10 +274,10 @@ def _masks_before_cameras(project: Project, given: Given, masks: str | Path) -> 
     import torch
     from PIL import Image
 
-    from univoxel.bars import track
+    from univoxel.capture.masks import network
     from univoxel.capture.photographs import read_upright, require_readers
     from univoxel.capture.poses import folders_of, photographs_of
-    from univoxel.segmentation.network import network
+    from univoxel.core.progress_bar import track
 
     if str(masks) not in (AUTO, REMBG, DEPTH):
         return Path(masks)
@@ -314,8 +314,8 @@ def _masks_before_cameras(project: Project, given: Given, masks: str | Path) -> 
 
 def _find_masks(project: Project, scene: Path, masks: str | Path) -> Path:
     """The folder of photographs with masks and cameras."""
+    from univoxel.capture.cutout import cutout
     from univoxel.capture.project import MASKS, TURNED
-    from univoxel.segmentation.cutout import cutout
 
     asked = str(masks)
 
@@ -327,14 +327,14 @@ def _find_masks(project: Project, scene: Path, masks: str | Path) -> Path:
         )
 
     if project.cut.exists():
-        steps.done(project.out, MASKS, asked, other)
+        files.done(project.out, MASKS, asked, other)
         _skip("masks", project.cut)
         return project.cut
-    turned = bool(steps.recorded(project.out, TURNED))
+    turned = bool(files.recorded(project.out, TURNED))
     if asked == AUTO and not turned and _have_masks(project, scene):
         _skip("masks", scene)
         return scene
-    steps.finish(project.out, MASKS, asked)  # before: the folder appears whole, at the end
+    files.finish(project.out, MASKS, asked)  # before: the folder appears whole, at the end
     if turned:
         source = scene / "masks"  # those that the cameras were found with
     else:
@@ -346,7 +346,7 @@ def _find_masks(project: Project, scene: Path, masks: str | Path) -> Path:
 
 def _network_or_depth() -> str:
     """Where masks come from that nobody has: a network, if one is installed."""
-    from univoxel.segmentation.network import network
+    from univoxel.capture.masks import network
 
     try:
         network()
@@ -375,8 +375,8 @@ def _have_masks(project: Project, scene: Path) -> bool:
 
 def _train(wanted: TrainConfig, on_progress: Callable[[TrainingProgress], None] | None) -> Path:
     """The folder of the run, trained to its end."""
-    from univoxel.checkpoint import FILE
-    from univoxel.trainer import train
+    from univoxel.cli.trainer import train
+    from univoxel.scene import FILE
 
     run, data = wanted.out, wanted.data
     done, begun = (run / "trust.txt").exists(), (run / FILE).exists()
@@ -420,7 +420,7 @@ def _export(project: Project, run: Path) -> None:
 
 def _up_to_date(file: Path, run: Path) -> bool:
     """Whether a file was made since the run was trained."""
-    from univoxel.checkpoint import FILE
+    from univoxel.scene import FILE
 
     return file.exists() and file.stat().st_mtime_ns >= (run / FILE).stat().st_mtime_ns
 
@@ -428,7 +428,7 @@ def _up_to_date(file: Path, run: Path) -> bool:
 def _picture(project: Project, run: Path, config: PicturesConfig) -> None:
     """Write the object under other light, and measures; what is there of this run stays."""
     from univoxel.capture.project import discard_older
-    from univoxel.checkpoint import FILE
+    from univoxel.scene import FILE
 
     folder = project.pictures
     measures = folder / "measures.json"
@@ -455,7 +455,7 @@ def _picture(project: Project, run: Path, config: PicturesConfig) -> None:
 def _write_page(project: Project, given: Given, run: Path) -> None:
     """Write the page of the object, which also says what lies beside it."""
     from univoxel.evaluation.measures import in_words
-    from univoxel.page import write_page
+    from univoxel.output.page import write_page
 
     beside = [
         ("the mesh with its materials", project.mesh),

@@ -32,7 +32,7 @@ def command(asked: CutoutOptions) -> Path:
     Writes them with their alpha, and their cameras, as a new folder to train on: look at its
     masks.html, worst first, and mend what is wrong in any image editor.
     """
-    from univoxel.segmentation.cutout import cutout
+    from univoxel.capture.cutout import cutout
 
     downscale = check_downscale(asked.downscale)
     return cutout(asked.data, asked.out, asked.source, downscale, asked.allow_outside)

@@ -39,12 +39,12 @@ def command(asked: DemoOptions) -> Path:
         OSError: `out` cannot be written.
         UserError: the run that is there cannot be read.
     """
-    from univoxel.checkpoint import FILE
+    from univoxel.cli.trainer import train
     from univoxel.config import StageConfig
     from univoxel.evaluation.measures import in_words
-    from univoxel.page import write_page
+    from univoxel.output.page import write_page
     from univoxel.presets import preset
-    from univoxel.trainer import train
+    from univoxel.scene import FILE
 
     out = asked.out
     run = out / "run"

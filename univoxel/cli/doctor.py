@@ -10,10 +10,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from univoxel import __version__, machine
+from univoxel import __version__
 from univoxel.cli.parsing import STDOUT, JsonFile, json_file, takes
+from univoxel.core import machine
+from univoxel.core.files import replacing
 from univoxel.errors import MissingNative
-from univoxel.files import replacing
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -69,7 +70,7 @@ def look() -> list[Finding]:
     """What was found of the installation and the machine."""
     import torch
 
-    from univoxel.installation import openmp_runtimes, torch_build
+    from univoxel.core.installation import openmp_runtimes, torch_build
     from univoxel.ops import native_status
 
     status = native_status()
@@ -141,7 +142,7 @@ def memory(found: machine.Memory | None) -> Finding:
 
 def extra_findings() -> list[Finding]:
     """A finding for each extra."""
-    from univoxel.installation import extras
+    from univoxel.core.installation import extras
 
     known = extras()
     if known is None:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from univoxel.cli.parsing import File, LightOf, Run, takes, written
+from univoxel.core.choices import MAP_ROWS
 from univoxel.errors import UserError
-from univoxel.names import MAP_ROWS
 
 if TYPE_CHECKING:
     from univoxel.evaluation.recovered_map import Comparison
@@ -59,14 +59,13 @@ def envmap(asked: EnvmapOptions) -> Comparison | None:
     """
     import torch
 
-    from univoxel.checkpoint import load_scene
     from univoxel.color import linear_to_srgb
-    from univoxel.data.images import write_exr, write_png
-    from univoxel.data.maps import true_map
-    from univoxel.data.radiance import write_radiance
+    from univoxel.data.images import write_exr, write_png, write_radiance
+    from univoxel.envmap import true_map
     from univoxel.evaluation.recovered_map import compare, exposure_of, recovered_map, scale_to
-    from univoxel.pictures.balls import map_and_balls
+    from univoxel.render.pictures import map_and_balls
     from univoxel.run import trained_on
+    from univoxel.scene import load_scene
 
     run, out = Path(asked.run), Path(asked.out)
     height = asked.height

@@ -18,9 +18,9 @@ from univoxel.cli.parsing import (
     takes,
     written,
 )
+from univoxel.core.choices import BOUNCES, SAMPLES, Behind
+from univoxel.core.files import replacing
 from univoxel.errors import UserError
-from univoxel.files import replacing
-from univoxel.names import BOUNCES, SAMPLES, Behind
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -89,9 +89,9 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
 
     Arguments are the fields of `EvaluateOptions`. Pictures are compared as sRGB in [0, 1], whole
     image, composited on black, novel views on `background`. Numbers are means over the views (and
-    maps) of numbers per view; `univoxel.evaluation.measures` and `univoxel.metrics` define each. A
-    measure that the data has no truth for is None. What is weakly determined is said in words
-    through the log.
+    maps) of numbers per view; `univoxel.evaluation.measures` and `univoxel.render.metrics` define
+    each. A measure that the data has no truth for is None. What is weakly determined is said in
+    words through the log.
 
     Into the folder `save` go <name>.exr of each view, contact_sheet.png, and trust.txt, what is
     weakly determined. The channels are half floats: rgb.*, albedo.* and relit_<map>.* linear,
@@ -107,12 +107,17 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     """
     from statistics import fmean
 
-    from univoxel.checkpoint import load_checkpoint
     from univoxel.evaluation import views
-    from univoxel.evaluation.measures import albedo_scales, doubt_correlation, mesh_chamfer
-    from univoxel.evaluation.truth import every_nth, load_scene_truth
+    from univoxel.evaluation.measures import (
+        albedo_scales,
+        doubt_correlation,
+        every_nth,
+        load_scene_truth,
+        mesh_chamfer,
+    )
     from univoxel.render.pipeline import extract_mesh
     from univoxel.run import photos_of
+    from univoxel.scene import load_checkpoint
 
     run = Path(asked.run)
     paths = asked.data, asked.save, asked.json
@@ -165,7 +170,7 @@ def table(result: dict[str, float | int | None]) -> Table:
 
 def _costs(run: Path, scene: Scene, report: dict) -> dict[str, float | int | None]:
     """What training took, and the size of the model."""
-    from univoxel.checkpoint import FILE
+    from univoxel.scene import FILE
 
     return {
         "train_seconds": report.get("seconds"),
@@ -178,7 +183,7 @@ def _costs(run: Path, scene: Scene, report: dict) -> dict[str, float | int | Non
 
 def _verdict(run: Path) -> dict[str, Any]:
     """How training came out, for JSON."""
-    from univoxel.verdict import load_verdict
+    from univoxel.run import load_verdict
 
     verdict = load_verdict(run)
     if verdict is None:

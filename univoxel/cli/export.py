@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from univoxel.cli.parsing import File, Run, takes, written
-from univoxel.errors import UserError
-from univoxel.names import (
+from univoxel.core.choices import (
     ORIGINS,
     TEXTURE_FORMATS,
     TEXTURE_QUALITY,
@@ -17,10 +16,11 @@ from univoxel.names import (
     Origin,
     TextureFormat,
 )
+from univoxel.errors import UserError
 
 if TYPE_CHECKING:
-    from univoxel.assets.placement import Placement
-    from univoxel.records import Mesh
+    from univoxel.core.records import Mesh
+    from univoxel.output.mesh import Placement
     from univoxel.scene import Scene
 
 SUFFIXES = (".glb", ".obj", ".ply", ".usdz")
@@ -123,11 +123,11 @@ def export(asked: ExportOptions) -> list[Path]:
         MissingExtra: .usdz without usd-core.
         OSError: a file cannot be written.
     """
-    from univoxel.assets.placement import placement_of
-    from univoxel.assets.topology import clean, close, simplify
-    from univoxel.assets.usd import require_usd
-    from univoxel.checkpoint import load_scene
-    from univoxel.records import Mesh
+    from univoxel.core.records import Mesh
+    from univoxel.output.mesh import placement_of
+    from univoxel.output.mesh_files import require_usd
+    from univoxel.output.topology import clean, close, simplify
+    from univoxel.scene import load_scene
 
     mesh = Path(asked.mesh)
     suffix = mesh.suffix.lower()
@@ -163,12 +163,8 @@ def _write(
     path: Path, scene: Scene, surface: Mesh, placement: Placement, size: int, jpeg: int | None
 ) -> None:
     """Write a surface, given in the scene's world, as its file's name says."""
-    from univoxel.assets.bake import bake, with_materials
-    from univoxel.assets.gltf import write_glb
-    from univoxel.assets.obj import write_obj
-    from univoxel.assets.placement import placed
-    from univoxel.assets.ply import write_ply
-    from univoxel.assets.usd import write_usdz
+    from univoxel.output.mesh import bake, placed, with_materials
+    from univoxel.output.mesh_files import write_glb, write_obj, write_ply, write_usdz
 
     match path.suffix.lower():
         case ".glb":

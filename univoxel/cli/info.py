@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.cli.parsing import STDOUT, File, JsonFile, Run, json_file, takes, written
+from univoxel.core.files import replacing
 from univoxel.errors import UserError
-from univoxel.files import replacing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -97,9 +97,9 @@ def info(asked: InfoOptions) -> dict[str, Any]:
         UserError: no model there, or one that cannot be read.
         OSError: a file cannot be written.
     """
-    from univoxel.checkpoint import FILE, load_checkpoint
     from univoxel.data.images import write_png
-    from univoxel.verdict import as_json, load_verdict
+    from univoxel.run import as_json, load_verdict
+    from univoxel.scene import FILE, load_checkpoint
 
     run = Path(asked.run)
     json, picture = (None if p is None else Path(p) for p in (asked.json, asked.picture))
@@ -157,7 +157,7 @@ def parts(run: Path) -> dict[str, Part]:
     """What every part takes up in the file, the largest first."""
     from safetensors import safe_open
 
-    from univoxel.checkpoint import FILE
+    from univoxel.scene import FILE
 
     found: dict[str, Part] = {}
     with safe_open(run / FILE, "pt") as file:
@@ -249,7 +249,7 @@ def capacity_picture(scene: Scene, found: dict[str, Any]) -> np.ndarray:
     import numpy as np
     from PIL import Image, ImageDraw, ImageFont
 
-    from univoxel.pictures.contact_sheet import heat
+    from univoxel.render.pictures import heat
 
     used = scene.field.occupied()
     counts = [used.sum(axis).float() for axis in range(3)]

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from univoxel.cli.parsing import File, LightOf, Run, takes, written
+from univoxel.core.choices import MAP_ROWS
 from univoxel.errors import UserError
-from univoxel.names import MAP_ROWS
 
 MIN_OPACITY = 0.5  # of a pixel that has a surface
 
@@ -54,11 +54,11 @@ def inspect(asked: InspectOptions) -> Path:
     # per channel, that photographs hardly fix. Directions from below the horizon are dimmed. On the
     # left the photograph, with the point marked. The EXR beside it holds everything as it is:
     # <layer>.R .G .B, <layer>.open.
-    from univoxel.checkpoint import load_scene
     from univoxel.data.images import write_exr, write_png
-    from univoxel.pictures.light_at_point import arriving, ray_of, sheet, true_light, view_of
+    from univoxel.render.light_at_point import arriving, ray_of, sheet, true_light, view_of
     from univoxel.render.pipeline import surface_at
     from univoxel.run import photos_of
+    from univoxel.scene import load_scene
 
     run, height = Path(asked.run), asked.height
     out = None if asked.out is None else Path(asked.out)

@@ -31,8 +31,8 @@ from typing import (
     get_type_hints,
 )
 
+from univoxel.core.choices import Downscale
 from univoxel.errors import UserError
-from univoxel.names import Downscale
 
 # What a command returns is printed, if it is a file or several; a number is the exit code
 Result: TypeAlias = int | Path | Sequence[Path] | None

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 from univoxel.cli.parsing import takes, written
+from univoxel.core.choices import FEATURE_SIZE, KEEP_SIZE
 from univoxel.errors import UserError
-from univoxel.names import FEATURE_SIZE, KEEP_SIZE
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.cli.parsing import Run, takes, written
+from univoxel.core.choices import BOUNCES, ELEVATION, SAMPLES, Animation, Background, Ground
 from univoxel.errors import UserError
-from univoxel.names import BOUNCES, ELEVATION, SAMPLES, Animation, Background, Ground
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from univoxel.camera import Cameras
     from univoxel.envmap import EnvMap
     from univoxel.ops import PointLight, Sun
-    from univoxel.pictures.relighting import Studio
-    from univoxel.render.frame import Quality
-    from univoxel.render.relight import Lighting
+    from univoxel.output.viewpoints import Studio
+    from univoxel.render.relight import Lighting, Quality
 
 NO_MAP = "lights"  # name of light without a map
 
@@ -94,7 +93,7 @@ class RelightOptions:
         Raises:
             UserError: a number is out of range.
         """
-        from univoxel.render.frame import Quality
+        from univoxel.render.relight import Quality
 
         ground = parse_ground(self.ground)
         ground = None if ground == "lowest" else ground
@@ -107,7 +106,7 @@ class RelightOptions:
             DataError: the map cannot be used; the message names its file.
             UserError: there is no light, or a number is out of range.
         """
-        from univoxel.pictures.relighting import lighting
+        from univoxel.output.viewpoints import lighting
 
         suns = [sun_light(values) for values in self.suns]
         point_lights = [point_light(values) for values in self.point_lights]
@@ -115,7 +114,7 @@ class RelightOptions:
 
     def studio(self, run: Path) -> tuple[Studio, Quality]:
         """The scene of a run, ready for frames, and how they are rendered."""
-        from univoxel.pictures.relighting import open_studio
+        from univoxel.output.viewpoints import open_studio
 
         quality = self.quality()
         studio = open_studio(run, self.cameras, self.resolution, self.elevation)
@@ -235,12 +234,11 @@ def relight_to_files(
         MissingExtra: an MP4 without imageio-ffmpeg.
         OSError: a file cannot be read or written.
     """
-    from univoxel.bars import bar
+    from univoxel.core.progress_bar import bar
     from univoxel.data.images import write_exr, write_png
-    from univoxel.pictures.animation import require, write_animation
-    from univoxel.pictures.relighting import pictures_of
-    from univoxel.pictures.viewpoints import frames_of
-    from univoxel.render.frame import channels, srgb
+    from univoxel.output.timelapse import require, write_animation
+    from univoxel.output.viewpoints import frames_of, pictures_of
+    from univoxel.render.relight import channels, srgb
 
     run, out, chosen = Path(run), Path(out), RelightOptions(**options)
     chosen.quality()  # now, and not after maps are read
@@ -299,9 +297,8 @@ def relight_images(
         UserError: as of `relight_to_files`.
     """
     from univoxel.camera import stacked
-    from univoxel.pictures.relighting import pictures_of
-    from univoxel.pictures.viewpoints import frames_of
-    from univoxel.render.frame import rgba
+    from univoxel.output.viewpoints import frames_of, pictures_of
+    from univoxel.render.relight import rgba
 
     options["cameras"] = cameras
     chosen = RelightOptions(**options)

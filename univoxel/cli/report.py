@@ -36,11 +36,11 @@ def command(asked: ReportOptions) -> Path:
 
 
 def report(run: File, html: File | None = None, **options: Any) -> Path:
-    """Write the report of a run; arguments and errors as of `univoxel.report.write_report`.
+    """Write the report of a run; arguments and errors as of `univoxel.output.report.write_report`.
 
     Args:
         html: the page; in the run's folder when left out.
     """
-    from univoxel.report import write_report
+    from univoxel.output.report import write_report
 
     return write_report(run, Path(run) / REPORT if html is None else html, **options)

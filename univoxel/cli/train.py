@@ -18,8 +18,7 @@ from univoxel.cli.parsing import (
     written,
 )
 from univoxel.cli.view import with_page
-from univoxel.errors import ExistingFile, UserError
-from univoxel.names import (
+from univoxel.core.choices import (
     CamerasFrom,
     CapacityOrAuto,
     Differing,
@@ -30,6 +29,7 @@ from univoxel.names import (
     Metal,
     PresetOrAuto,
 )
+from univoxel.errors import ExistingFile, UserError
 
 if TYPE_CHECKING:
     from univoxel.config import TrainConfig
@@ -102,7 +102,7 @@ class TrainOptions:
             UserError: an option is out of range; the file of a configuration cannot be read, or a
                 choice was made that it makes itself.
         """
-        from univoxel.overrides import changed
+        from univoxel.core.validation import changed
 
         check_minutes(self.minutes)
         config = self._chosen() if self.config is None else self._loaded(Path(self.config))
@@ -171,7 +171,7 @@ class Train(TrainOptions):
 @takes(Train)
 def command(asked: Train) -> int:
     """Recover geometry, materials and light from posed photographs."""
-    from univoxel.trainer import train
+    from univoxel.cli.trainer import train
 
     watched = {"timelapse": asked.timelapse, "view": asked.view_at()}
     if not asked.resume and (Path(asked.out) / "scene.safetensors").exists():
@@ -185,7 +185,7 @@ def command(asked: Train) -> int:
 
 def code_of(run: Path) -> int:
     """The exit code of a training: 3 where a stage made no step at all, or else 0."""
-    from univoxel.verdict import load_verdict
+    from univoxel.run import load_verdict
 
     verdict = load_verdict(run)
     return 3 if verdict is not None and verdict.empty else 0

@@ -44,12 +44,12 @@ def command(asked: ViewOptions) -> Path | None:
         MissingExtra: viser is missing, which the server needs.
         OSError: a file cannot be read or written.
     """
-    from univoxel.page import PageOptions, write_page
+    from univoxel.output.page import PageOptions, write_page
 
     if asked.html is not None:
         return write_page(asked.run, asked.html, envmaps=asked.envmap, title=asked.title)
     from univoxel.viewer.server import serving
-    from univoxel.viewer.subject import subject_of
+    from univoxel.viewer.viewer_scene import subject_of
 
     options = PageOptions(title=asked.title, envmaps=asked.envmap)
     with serving(subject_of(Path(asked.run)), options, asked.host, asked.port) as address:
@@ -67,7 +67,7 @@ def with_page(run: Path) -> Path:
     Returns:
         The run.
     """
-    from univoxel.page import write_page
+    from univoxel.output.page import write_page
 
     try:
         page = write_page(run, run / PAGE)

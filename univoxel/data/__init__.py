@@ -2,20 +2,35 @@
 
 from pathlib import Path
 
-from univoxel.data.base import Photos, Truth
-from univoxel.data.blender import is_blender, load_blender
 from univoxel.data.colmap import is_colmap, load_colmap
-from univoxel.data.idr import is_idr, load_idr
-from univoxel.data.inside import staying_in
-from univoxel.data.kept import keep_photos, looking_in
-from univoxel.data.llff import is_llff, load_llff
-from univoxel.data.metashape import is_metashape, load_metashape
-from univoxel.data.neilf import is_neilf, load_neilf
-from univoxel.data.nerfstudio import is_nerfstudio, load_nerfstudio
-from univoxel.data.polycam import is_polycam, load_polycam
-from univoxel.data.realitycapture import is_realitycapture, load_realitycapture
-from univoxel.data.tensoir import is_tensoir, load_tensoir
-from univoxel.data.transforms import load_cameras
+from univoxel.data.image_cache import keep_photos, looking_in
+from univoxel.data.path_sandbox import staying_in
+from univoxel.data.photogrammetry import (
+    is_metashape,
+    is_polycam,
+    is_realitycapture,
+    load_metashape,
+    load_polycam,
+    load_realitycapture,
+)
+from univoxel.data.photos import Photos, Truth
+from univoxel.data.research import (
+    is_idr,
+    is_llff,
+    is_neilf,
+    is_tensoir,
+    load_idr,
+    load_llff,
+    load_neilf,
+    load_tensoir,
+)
+from univoxel.data.transforms import (
+    is_blender,
+    is_nerfstudio,
+    load_blender,
+    load_cameras,
+    load_nerfstudio,
+)
 from univoxel.data.truth import load_points, load_relit, load_truth, relight_maps
 from univoxel.errors import DataError
 

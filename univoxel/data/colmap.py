@@ -16,13 +16,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from univoxel.data.base import Photos
-from univoxel.data.foreign import TO_OPENGL, find_photo, listed_split
+from univoxel.data.conventions import TO_OPENGL, find_photo, listed_split
 from univoxel.data.images import image_size, turn_note
-from univoxel.data.inside import inside
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
-from univoxel.data.missing import left_out
-from univoxel.data.shots import Shot, read_shots, upright
+from univoxel.data.load_images import Shot, read_shots, upright
+from univoxel.data.path_sandbox import inside, left_out
+from univoxel.data.photos import Photos
 from univoxel.errors import DataError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")

@@ -1,11 +1,5 @@
-"""Cameras in the JSON of NeRF: what its layouts share, and camera paths without pictures.
-
-{"camera_angle_x" (or "fl_x", "fl_y", "cx", "cy"), "w", "h", "k1" .., "p1", "p2", "frames": [
-    {"file_path": .., "transform_matrix": camera-to-world with OpenGL axes, "mask_path": ..}]}
-
-Everything but frames may stand with a frame too. Where it has a scene_name, its file_path is
-relative to the folder of that name beside the file's (Stanford-ORB's transforms_novel.json).
-"""
+"""Cameras in the JSON of NeRF: what its layouts share, NeRF-synthetic's and nerfstudio's, and
+camera paths without pictures."""
 
 from __future__ import annotations
 
@@ -21,13 +15,29 @@ from typing import Any
 import numpy as np
 
 from univoxel.camera import Cameras
+from univoxel.core.files import read_json, replacing
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
-from univoxel.data.inside import inside
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
-from univoxel.data.missing import left_out
-from univoxel.data.shots import Shot, cameras_of, check_name
+from univoxel.data.load_images import (
+    Shot,
+    cameras_of,
+    check_name,
+    every_eighth,
+    read_shots,
+    upright,
+)
+from univoxel.data.path_sandbox import inside, left_out
+from univoxel.data.photos import Photos
 from univoxel.errors import DataError, UserError
-from univoxel.files import read_json, replacing
+
+# Cameras in the JSON of NeRF: what its layouts share, and camera paths without pictures.
+#
+# {"camera_angle_x" (or "fl_x", "fl_y", "cx", "cy"), "w", "h", "k1" .., "p1", "p2", "frames": [
+#     {"file_path": .., "transform_matrix": camera-to-world with OpenGL axes, "mask_path": ..}]}
+#
+# Everything but frames may stand with a frame too. Where it has a scene_name, its file_path is
+# relative to the folder of that name beside the file's (Stanford-ORB's transforms_novel.json).
+
 
 # How far the axes of a camera may be from orthonormal. Six printed digits give 1e-6; what is off
 # by more than this was scaled or sheared.
@@ -70,7 +80,7 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
         where = f"{path}: frame {index}"
         poses.append(pose_of(frame.get("transform_matrix"), where))
         values = {"w": size, "h": size} | root | frame
-        width, height = (int(number(values, key, where, 0, WIDEST)) for key in ("w", "h"))
+        width, height = (int(read_number(values, key, where, 0, WIDEST)) for key in ("w", "h"))
         lens = lens_of(values, where, width, height)
         if lens.bent:
             raise DataError(f"{where}: expected cameras without lens distortion, got some")
@@ -304,18 +314,18 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
     if more := [key for key in ("k4", "k5", "k6") if values.get(key)]:
         raise DataError(f"{where}: expected distortion by k1 k2 k3 p1 p2, got {more[0]} too")
     if "fl_x" in values:
-        x = number(values, "fl_x", where, 0.0, math.inf)
-        y = number(values, "fl_y", where, 0.0, math.inf) if "fl_y" in values else x
+        x = read_number(values, "fl_x", where, 0.0, math.inf)
+        y = read_number(values, "fl_y", where, 0.0, math.inf) if "fl_y" in values else x
     else:
-        angle = number(values, "camera_angle_x", where, 0.0, math.pi)
+        angle = read_number(values, "camera_angle_x", where, 0.0, math.pi)
         x = y = 0.5 * width / math.tan(0.5 * angle)
     bent = {
-        key: number(values, key, where, -math.inf, math.inf) if key in values else 0.0
+        key: read_number(values, key, where, -math.inf, math.inf) if key in values else 0.0
         for key in ("k1", "k2", "k3", "p1", "p2")
     }
     centre = (
-        number(values, "cx", where, -width, 2 * width) if "cx" in values else width / 2,
-        number(values, "cy", where, -height, 2 * height) if "cy" in values else height / 2,
+        read_number(values, "cx", where, -width, 2 * width) if "cx" in values else width / 2,
+        read_number(values, "cy", where, -height, 2 * height) if "cy" in values else height / 2,
     )
     radial, tangential = (bent["k1"], bent["k2"], bent["k3"]), (bent["p1"], bent["p2"])
     try:
@@ -324,7 +334,7 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
         raise DataError(f"{where}: {error}") from None
 
 
-def number(values: dict[str, Any], key: str, where: str, low: float, high: float) -> float:
+def read_number(values: dict[str, Any], key: str, where: str, low: float, high: float) -> float:
     """A number of a frame that lies between two others.
 
     Raises:
@@ -376,4 +386,86 @@ def _mask(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
         found = listed_image(folder, named, where)
     if found is None:
         raise DataError(f"{where}: no mask {folder / str(named)[:200]} (mask_path)")
+    return found
+
+
+# The layout of NeRF-synthetic scenes, of Shiny Blender, Synthetic4Relight and Stanford-ORB.
+#
+# transforms_<split>.json     see univoxel.data.transforms
+# <file_path>[.png]           RGBA photograph, straight alpha, sRGB; or with <file_path>_alpha.png
+# <file_path>_rgba.png        the same
+# <file_path>_rgb.exr         linear photograph, with <file_path>_mask.png
+# train/0001.exr              linear photograph, with train_mask/0001.png
+# transforms_novel.json       views of other scenes, as of Stanford-ORB: split "novel"
+
+
+def is_blender(folder: Path, split: str) -> bool:
+    return any((folder / f"transforms_{s}.json").is_file() for s in ("train", split))
+
+
+def load_blender(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
+    """Photographs and cameras of one split.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    path = folder / f"transforms_{split}.json"
+    if not path.is_file():
+        raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
+    _, shots, remarks = read_frames(path)
+    return read_shots(folder, "NeRF layout", split, shots, downscale, remarks, masks)
+
+
+# The layout of nerfstudio and instant-ngp.
+#
+# transforms.json             see univoxel.data.transforms; aabb_scale, scale and offset say nothing
+# images/frame_00001.jpg      photographs, where file_path says
+# masks/frame_00001.png       masks, where mask_path says, or as COLMAP names them
+#
+# train_filenames and test_filenames in the file are its splits, as far as they are there.
+
+
+def is_nerfstudio(folder: Path, split: str) -> bool:
+    return (folder / "transforms.json").is_file()
+
+
+def load_nerfstudio(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
+    """Photographs and cameras of one split: without one in the file, every eighth is for tests.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    path = folder / "transforms.json"
+    root, shots, lost = read_frames(path)
+    shots, remarks = upright(shots)
+    chosen = root.get(f"{split}_filenames")
+    if chosen is None:
+        shots = every_eighth(folder, shots, split)
+    else:
+        listed = [frame["file_path"] for frame in root["frames"]]
+        shots = _named(path, shots, listed, f"{split}_filenames", chosen)
+    return read_shots(
+        folder, "nerfstudio layout", split, shots, downscale, [*lost, *remarks], masks
+    )
+
+
+def _named(
+    path: Path, shots: list[Shot], listed: list[str], key: str, chosen: object
+) -> list[Shot]:
+    """The shots of a split. What is listed and has no picture is left out of it, too."""
+    if not isinstance(chosen, list) or not all(isinstance(name, str) for name in chosen):
+        raise DataError(f"{path}: expected {key} as a list of file_paths, got {short(chosen)}")
+    by_name, every = {shot.name: shot for shot in shots}, view_names(listed)
+    known = {name: name for name in every} | dict(zip(listed, every, strict=True))
+    names = [known.get(name) or known.get(view_name(name)) for name in chosen]
+    if None in names or not names:
+        came = view_name(chosen[names.index(None)]) if names else "an empty list"
+        raise DataError(f"{path}: expected frames of the file in {key}, got {came}")
+    found = [by_name[name] for name in names if name in by_name]
+    if not found:
+        raise DataError(f"{path}: expected frames with pictures in {key}, got {len(names)} without")
     return found

@@ -1,14 +1,5 @@
-"""Ground truth beside the photographs: materials, normals, relit views, points on the surface.
-
-test/gt/<name>.npz                                  of this project's scenes
-test/<name>_albedo.png, _rough.png, _normal.png     Synthetic4Relight, Shiny Blender
-<name>/albedo.png, normal.png                       TensoIR-Synthetic
-../../ground_truth/<scene>/                         Stanford-ORB, see univoxel.data.orb
-relight/<map>/<name>.png                            test views under envmaps/<map>.hdr
-test_rli/<map>_<name>.png                           the same in Synthetic4Relight
-<name>/rgba_<map>.png                               the same in TensoIR-Synthetic
-points.npz                                          points on the true surface
-"""
+"""Ground truth beside the photographs: materials, normals, relit views, points and meshes of the
+surface."""
 
 from __future__ import annotations
 
@@ -20,15 +11,139 @@ from torch import Tensor
 
 from univoxel.camera import stacked
 from univoxel.color import srgb_to_linear
-from univoxel.data.arrays import read_npz
-from univoxel.data.base import Photos, Truth
+from univoxel.core.records import Mesh
 from univoxel.data.images import read_image
 from univoxel.data.lens import shrink
-from univoxel.data.orb import orb_files, orb_geometry
-from univoxel.data.shots import read_photo, resampled, size_of
-from univoxel.data.tensoir import is_tensoir, photographed
+from univoxel.data.load_images import read_photo, resampled, size_of
+from univoxel.data.path_sandbox import read_npy, read_npz
+from univoxel.data.photos import Photos, Truth
+from univoxel.data.research import is_tensoir, photographed
 from univoxel.data.transforms import find_image
 from univoxel.errors import DataError
+
+# What Stanford-ORB has beside its photographs, in the folders above a scene.
+#
+# blender_HDR/<scene>/                                    photographs, in the layout of NeRF
+# ground_truth/<scene>/surface_normal/<name>.npy          [H, W, 3], axes of the camera
+# ground_truth/<scene>/z_depth/<name>.npy                 [H, W] along -Z; 0 or less: nothing there
+# ground_truth/<scene>/pseudo_gt_albedo/<name>.png        sRGB
+#
+# Camera axes are x right, y up, z backwards.
+#
+# Source: the public code of Kuang et al. 2023 (Stanford-ORB), README and
+# scripts/preprocess.
+
+
+FILES = {
+    "albedo": "pseudo_gt_albedo/{}.png",
+    "normal": "surface_normal/{}.npy",
+    "depth": "z_depth/{}.npy",
+}
+
+
+def orb_files(photos: Photos, view: int) -> dict[str, Path]:
+    """The files of truth of a view, by what they hold, as far as there are any."""
+    folder = photos.folder.resolve()
+    truth = folder.parent.parent / "ground_truth" / folder.name
+    found = {key: truth / name.format(photos.names[view]) for key, name in FILES.items()}
+    return {key: path for key, path in found.items() if path.is_file()}
+
+
+def orb_geometry(path: Path, key: str, camera_to_world: Tensor) -> tuple[Tensor, Tensor]:
+    """A file of normals or depths: its values, normals in the world, and where there are any.
+
+    Args:
+        camera_to_world: [3, 4] of its view.
+
+    Returns:
+        [H, W, 3] or [H, W] float32, 0 where there is nothing, and [H, W] float32 of 0 and 1.
+    """
+    array = read_npy(path)
+    shape = "[H, W, 3]" if key == "normal" else "[H, W]"
+    fits = array.ndim == 3 and array.shape[2] == 3 if key == "normal" else array.ndim == 2
+    if not fits or array.dtype.kind != "f" or not np.isfinite(array).all():
+        raise DataError(
+            f"{path}: expected finite {shape}, got {list(array.shape)} of {array.dtype}"
+        )
+    value = torch.from_numpy(array.astype(np.float32))
+    if key == "depth":
+        return value.clamp_min(0), (value > 0).float()
+    there = value.norm(dim=-1) > 0.5  # unit, or 0
+    world = torch.nn.functional.normalize(value, dim=-1) @ camera_to_world[:, :3].T
+    return world * there[..., None], there.float()
+
+
+# Triangle meshes in PLY files.
+
+
+_TYPES = {
+    **dict.fromkeys(("char", "int8"), "<i1"),
+    **dict.fromkeys(("uchar", "uint8"), "<u1"),
+    **dict.fromkeys(("short", "int16"), "<i2"),
+    **dict.fromkeys(("ushort", "uint16"), "<u2"),
+    **dict.fromkeys(("int", "int32"), "<i4"),
+    **dict.fromkeys(("uint", "uint32"), "<u4"),
+    **dict.fromkeys(("float", "float32"), "<f4"),
+    **dict.fromkeys(("double", "float64"), "<f8"),
+}
+
+
+def read_ply(path: Path) -> Mesh:
+    """Vertices and faces of a binary little-endian PLY file of triangles; the rest is passed over.
+
+    Raises:
+        DataError: the file is missing, cut off, of another kind, or holds other polygons or
+            places that are not finite.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
+    head, mark, body = data.partition(b"end_header\n")
+    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    if lines[:1] != [["ply"]] or not mark or ["format", "binary_little_endian", "1.0"] not in lines:
+        raise DataError(f"{path}: expected a binary little-endian PLY file")
+    counts: dict[str, int] = {}
+    fields: dict[str, list[tuple]] = {}
+    try:
+        for word, *rest in (line for line in lines if line):
+            if word == "element":
+                counts[rest[0]], fields[rest[0]] = int(rest[1]), []
+                if counts[rest[0]] < 0:
+                    raise ValueError(f"{rest[1]} of {rest[0]}")
+            elif word == "property" and rest[0] == "list":
+                row = ("count", _TYPES[rest[1]]), ("corner", _TYPES[rest[2]], (3,))
+                fields[list(fields)[-1]] += row
+            elif word == "property":
+                fields[list(fields)[-1]].append((rest[1], _TYPES[rest[0]]))
+        if list(counts)[:2] != ["vertex", "face"]:
+            raise KeyError("vertex and face first")
+        vertex = np.frombuffer(body, np.dtype(fields["vertex"]), counts["vertex"])
+        face = np.frombuffer(body[vertex.nbytes :], np.dtype(fields["face"]), counts["face"])
+        corner = np.stack([vertex[axis] for axis in "xyz"], -1).astype(np.float32)
+        index, sides = face["corner"].astype(np.int32), face["count"]
+    except (KeyError, IndexError, ValueError, OverflowError) as error:
+        raise DataError(
+            f"{path}: expected vertices x y z and triangles, got something else: {error}"
+        ) from None
+    if (sides != 3).any() or (len(index) and not 0 <= index.min() <= index.max() < len(corner)):
+        raise DataError(f"{path}: expected triangles of the {len(corner)} vertices")
+    if not np.isfinite(corner).all():
+        raise DataError(f"{path}: expected vertices at finite places, got NaN or infinity")
+    return Mesh(torch.from_numpy(corner), torch.from_numpy(index))
+
+
+# Ground truth beside the photographs: materials, normals, relit views, points on the surface.
+#
+# test/gt/<name>.npz                                  of this project's scenes
+# test/<name>_albedo.png, _rough.png, _normal.png     Synthetic4Relight, Shiny Blender
+# <name>/albedo.png, normal.png                       TensoIR-Synthetic
+# ../../ground_truth/<scene>/                         Stanford-ORB, see univoxel.data.truth
+# relight/<map>/<name>.png                            test views under envmaps/<map>.hdr
+# test_rli/<map>_<name>.png                           the same in Synthetic4Relight
+# <name>/rgba_<map>.png                               the same in TensoIR-Synthetic
+# points.npz                                          points on the true surface
+
 
 WHOLE = 250 / 255  # coverage above which a pixel is well inside the object
 MAP_ENDINGS = (".hdr", ".exr")

@@ -1,32 +1,288 @@
-"""The measures of a trained scene, and what decides on them.
-
-- albedo_psnr_raw, _1ch, _3ch: albedo as it is; with one scale; with a scale per channel.
-- albedo_psnr_fg: as _3ch, over the pixels of the mask only.
-- relit_psnr: rendered with the albedo times the scale per channel, clipped to 1, on the surface
-  and on what it sees of itself; relit_psnr_raw: with the albedo as it is.
-- chamfer: samples of the mesh against points of the true surface.
-- trust_spearman: of doubt (see `univoxel.confidence.survey`) and error over the pixels of the mask
-  in all views: of the albedo, with a scale per channel, mean absolute difference in sRGB; of the
-  roughness, absolute difference.
-"""
+"""The measures of a trained scene against the truth of its test views, and pictures of them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import torch
 from torch import Tensor
 
-from univoxel import metrics
-from univoxel.color import linear_to_srgb
-from univoxel.data import Photos
-from univoxel.evaluation.truth import Expected, view_truth
-from univoxel.pictures.layers import Layers
-from univoxel.records import Mesh
-from univoxel.render.pipeline import surface_of_view
+from univoxel.camera import Cameras
+from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
+from univoxel.core.choices import Behind
+from univoxel.core.records import Mesh, Surface
+from univoxel.data import Photos, Truth, load_points, load_relit, load_truth, relight_maps
+from univoxel.data.photos import decode
+from univoxel.envmap import EnvMap, read_map
+from univoxel.errors import DataError, UserError
+from univoxel.evaluation.confidence import Doubts
+from univoxel.lights.views import ShownLight, ViewLights
+from univoxel.optim import RowAdam, geometric
+from univoxel.render import metrics
+from univoxel.render.pipeline import at_rays, shade, surface_of_view
+from univoxel.render.relight import Lighting, TracedMesh, relight_surface
 from univoxel.scene import Scene
+
+DOUBTS = ("albedo", "roughness")
+
+
+@dataclass(frozen=True)
+class Layers:
+    """One view, row 0 on top; colours linear and composited on black, the rest as it is."""
+
+    rgb: Tensor  # [H, W, 3] physically based render
+    albedo: Tensor  # [H, W, 3]
+    roughness: Tensor  # [H, W], 0 where nothing is
+    normal: Tensor  # [H, W, 3] world, 0 where nothing is
+    alpha: Tensor  # [H, W]
+    depth: Tensor  # [H, W] along the camera's -Z, world units, 0 where nothing is
+    relit: dict[str, Tensor]  # [H, W, 3] by map
+    relit_scaled: dict[str, Tensor]  # the same with the scaled albedo
+    doubt: Tensor | None = None  # [H, W, 2] in [0, 1] of albedo and roughness, 0 where nothing is
+
+
+@dataclass(frozen=True)
+class Relighting:
+    """How relit layers are made."""
+
+    lights: dict[str, Lighting]  # by the name of their map
+    traced: TracedMesh  # casts shadows and sends bounces
+    scale: Tensor  # [3] of the albedo, for the second set of pictures
+    samples: int  # of the light, per pixel
+    bounces: int
+
+
+def render_layers(
+    scene: Scene,
+    cameras: Cameras,
+    view: int,
+    relighting: Relighting | None = None,
+    doubts: Doubts | None = None,
+) -> Layers:
+    """Render one view. Nothing is shaded where the opacity is 0."""
+    whole, wo = surface_of_view(scene, cameras, view)
+    there = whole.opacity > 0
+    width, height = cameras.size(view)
+    surface, wo = at_rays(whole, there), wo[there]
+
+    def picture(values: Tensor) -> Tensor:
+        out = values.new_zeros(len(there), *values.shape[1:])
+        out[there] = values
+        return out.reshape(height, width, *values.shape[1:])
+
+    opacity = surface.opacity[:, None]
+    relit, relit_scaled = {}, {}
+    if relighting:
+        # A scale above 1 must not make a surface that reflects more than it receives.
+        bright = replace(surface, albedo=(surface.albedo * relighting.scale).clamp_max(1))
+        mesh = relighting.traced.mesh
+        if mesh.albedo is not None:
+            mesh = replace(mesh, albedo=(mesh.albedo * relighting.scale).clamp_max(1))
+        scaled_mesh = replace(relighting.traced, mesh=mesh)
+        for name in relighting.lights:
+            relit[name] = picture(opacity * _relight(relighting, name, surface, wo))
+            scaled = _relight(replace(relighting, traced=scaled_mesh), name, bright, wo)
+            relit_scaled[name] = picture(opacity * scaled)
+    backward = cameras.camera_to_world[view, :, 2]
+    return Layers(
+        rgb=picture(opacity * shade(scene, surface, wo)),
+        albedo=picture(opacity * surface.albedo),
+        roughness=picture(surface.roughness),
+        normal=picture(surface.normal),
+        alpha=picture(surface.opacity),
+        depth=picture(surface.depth * (wo @ backward)),
+        relit=relit,
+        relit_scaled=relit_scaled,
+        doubt=picture(doubts.at(surface.position, surface.normal)) if doubts else None,
+    )
+
+
+def exr_channels(layers: Layers) -> dict[str, Tensor]:
+    """The channels of a saved EXR file, [H, W] each: rgb.R, normal.X, relit_<map>.R and so on."""
+    channels = {"alpha": layers.alpha, "depth": layers.depth, "roughness": layers.roughness}
+    if layers.doubt is not None:
+        channels |= {f"doubt.{c}": layers.doubt[..., k] for k, c in enumerate(DOUBTS)}
+    colors = {"rgb": layers.rgb, "albedo": layers.albedo}
+    colors |= {f"relit_{name}": rgb for name, rgb in layers.relit.items()}
+    for name, value in colors.items():
+        channels |= {f"{name}.{c}": value[..., k] for k, c in enumerate("RGB")}
+    return channels | {f"normal.{c}": layers.normal[..., k] for k, c in enumerate("XYZ")}
+
+
+def _relight(relighting: Relighting, name: str, surface: Surface, wo: Tensor) -> Tensor:
+    return relight_surface(
+        surface,
+        wo,
+        relighting.traced,
+        relighting.lights[name],
+        samples=relighting.samples,
+        bounces=relighting.bounces,
+    )
+
+
+# The light of a test photograph, fitted to that photograph: how the field measures where light
+# differs from photograph to photograph.
+
+
+STEPS = 100  # of Adam, as of NeRD (Boss et al. 2021) and Neural-PIL
+RAYS = 2048  # of a step
+LR = 0.05, 0.005  # at begin and end, of log gains and of codes
+
+
+def fit_light_(scene: Scene, photos: Photos, view: int) -> None:
+    """Show the light in which a view looks most like its photograph; all else stays.
+
+    That is a gain per channel and, where light varies (`SceneConfig.varying`), the code that the
+    networks of light read.
+    """
+    whole, wo = surface_of_view(scene, photos.cameras, view)
+    color, alpha = photos.picture(view)
+    hit = (whole.opacity > 0.5) & (alpha.flatten() > 0.5)
+    if scene.views is None:
+        scene.views = ViewLights(("test",))
+    if not hit.any():  # nothing says what the light is
+        scene.views.shown = None
+        return
+    surface, wo = at_rays(whole, hit), wo[hit]
+    target = linear_to_srgb(color.view(-1, 3)[hit])
+    log_gain = torch.zeros(3, requires_grad=True)
+    codes = scene.views.raw_codes
+    code = None if codes is None else torch.zeros(codes.shape[1], requires_grad=True)
+    optimizer = RowAdam([log_gain] if code is None else [log_gain, code])
+    generator = torch.Generator().manual_seed(view)
+    for step in range(STEPS):
+        optimizer.param_groups[0]["lr"] = geometric(LR, step / STEPS)
+        rays = torch.randint(len(wo), (min(RAYS, len(wo)),), generator=generator)
+        with torch.enable_grad():
+            scene.views.shown = ShownLight(log_gain.exp(), code)
+            shaded = shade(scene, at_rays(surface, rays), wo[rays])
+            loss = metrics.photometric(linear_to_srgb_unclipped(shaded), target[rays])
+            optimizer.zero_grad()
+            loss.backward()
+        optimizer.step()
+    fitted = None if code is None else code.detach()
+    scene.views.shown = ShownLight(log_gain.detach().exp(), fitted)
+
+
+# What the test views of a data set should look like.
+
+
+@dataclass(frozen=True)
+class SceneTruth:
+    """What a data set knows beside its views, as far as it does."""
+
+    relit: dict[str, tuple[Tensor, Tensor]]  # stored colour and alpha of the test views, by map
+    maps: dict[str, EnvMap]
+    points: Tensor | None  # [P, 3] of the true surface
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a test view should look like; sRGB on black, but for the photograph."""
+
+    photo: Tensor  # [H, W, 3]
+    albedo: Tensor | None  # [H, W, 3]
+    relit: dict[str, Tensor]  # [H, W, 3] by map
+    truth: Truth
+    behind: float = 0.0  # linear grey that the photograph, and what is compared with it, stands on
+
+
+def load_scene_truth(photos: Photos) -> SceneTruth:
+    """The truth beside the test views.
+
+    Raises:
+        DataError: a file cannot be used, or has other pixels than the views.
+    """
+    relit = _relit_photos(photos)
+    points = load_points(photos.folder)
+    maps = {name: read_map(path) for name, path in relight_maps(photos.folder).items()}
+    return SceneTruth(relit, maps, points)
+
+
+def expected_view(
+    photos: Photos, relit: dict[str, tuple[Tensor, Tensor]], view: int, background: Behind = "black"
+) -> Expected:
+    """The truth of one test view.
+
+    Args:
+        relit: as of `SceneTruth`.
+        background: what the photograph is composited on.
+
+    Raises:
+        DataError: a file cannot be used, or has other pixels than the views.
+    """
+    truth = view_truth(photos, view)
+    color, alpha = photos.picture(view)
+    behind = 1.0 if background == "white" else 0.0
+    photo = color * alpha[..., None] + behind * (1 - alpha[..., None])
+    return Expected(
+        photo=linear_to_srgb(photo),
+        albedo=None if truth.albedo is None else metrics.on_black(truth.albedo, alpha),
+        relit={
+            name: metrics.on_black(*decode(*(photos.cameras.cut(view, x[view]) for x in stored)))
+            for name, stored in relit.items()
+        },
+        truth=truth,
+        behind=behind,
+    )
+
+
+def every_nth(photos: Photos, trained: list[str], every: int) -> Photos:
+    """The first of every so many photographs, in order of the names of all.
+
+    Args:
+        photos: that were kept for tests.
+        trained: names of those that were trained on.
+
+    Raises:
+        UserError: some were trained on, or none is left.
+    """
+    if every < 1:
+        raise UserError(f"test_every must be at least 1, got {every}", "test_every")
+    chosen = sorted([*photos.names, *trained])[::every]
+    if seen := sorted(set(chosen) & set(trained)):
+        raise UserError(
+            f"test_every {every} asks for {len(seen)} photographs that were trained on, such as "
+            f"{seen[0]}: novel views are those that training has not seen",
+            "test_every",
+        )
+    return photos.of(torch.tensor([photos.names.index(name) for name in chosen]))
+
+
+def view_truth(photos: Photos, view: int) -> Truth:
+    """The layers of truth of one test view, as far as there are any."""
+    truth = load_truth(photos, view)
+    if truth.mask is not None:
+        _check_size(photos, view, truth.mask, f"truth of {photos.names[view]}")
+    return truth
+
+
+def _relit_photos(photos: Photos) -> dict[str, tuple[Tensor, Tensor]]:
+    """Stored colour and alpha of the test views, by map."""
+    return {name: load_relit(photos, name) for name in relight_maps(photos.folder)}
+
+
+def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
+    width, height = photos.cameras.size(view)
+    if picture.shape != (height, width):
+        raise DataError(
+            f"{photos.folder}: expected {what} to have {width}x{height} pixels like the test "
+            f"view, got {picture.shape[1]}x{picture.shape[0]}"
+        )
+
+
+# The measures of a trained scene, and what decides on them.
+#
+# - albedo_psnr_raw, _1ch, _3ch: albedo as it is; with one scale; with a scale per channel. -
+# albedo_psnr_fg: as _3ch, over the pixels of the mask only. - relit_psnr: rendered with the albedo
+# times the scale per channel, clipped to 1, on the surface   and on what it sees of itself;
+# relit_psnr_raw: with the albedo as it is. - chamfer: samples of the mesh against points of the
+# true surface. - trust_spearman: of doubt (see `univoxel.evaluation.confidence`) and error over the
+# pixels of the mask   in all views: of the albedo, with a scale per channel, mean absolute
+# difference in sRGB; of the   roughness, absolute difference.
+
 
 # By key: what the table says of it
 MEASURES = {

@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from univoxel import metrics
 from univoxel.color import linear_to_srgb, luminance
 from univoxel.errors import UserError
-from univoxel.pictures.balls import BLOCK, grey_ball, mirror_ball, summed_light
+from univoxel.render import metrics
+from univoxel.render.pictures import BLOCK, grey_ball, mirror_ball, summed_light
 from univoxel.scene import Scene
 from univoxel.sphere import fibonacci_sphere
 

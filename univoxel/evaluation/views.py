@@ -9,23 +9,32 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from univoxel.bars import track
 from univoxel.color import linear_to_srgb
-from univoxel.confidence.doubts import Doubts
-from univoxel.confidence.report import numbers, words
-from univoxel.confidence.survey import POINTS, Survey, survey
+from univoxel.core.choices import Behind
+from univoxel.core.files import replacing
+from univoxel.core.progress_bar import track
+from univoxel.core.records import Mesh
 from univoxel.data import Photos
 from univoxel.data.images import write_exr, write_png
 from univoxel.envmap import tables
 from univoxel.errors import UserError
-from univoxel.evaluation.fitted_light import fit_light_
-from univoxel.evaluation.measures import MEASURES, Pairs, Scales, doubts_and_errors, score
-from univoxel.evaluation.truth import Expected, SceneTruth, expected_view
-from univoxel.files import replacing
-from univoxel.names import Behind
-from univoxel.pictures.contact_sheet import Panel, contact_sheet, heat, shrink
-from univoxel.pictures.layers import Layers, Relighting, exr_channels, render_layers
-from univoxel.records import Mesh
+from univoxel.evaluation.confidence import POINTS, Doubts, Survey, numbers, survey, words
+from univoxel.evaluation.measures import (
+    MEASURES,
+    Expected,
+    Layers,
+    Pairs,
+    Relighting,
+    Scales,
+    SceneTruth,
+    doubts_and_errors,
+    expected_view,
+    exr_channels,
+    fit_light_,
+    render_layers,
+    score,
+)
+from univoxel.render.pictures import Panel, contact_sheet, heat, shrink
 from univoxel.render.relight import Lighting, traced_mesh
 from univoxel.run import photos_of
 from univoxel.scene import Scene

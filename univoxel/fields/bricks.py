@@ -10,10 +10,10 @@ from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
+from univoxel.core.records import Bricks
 from univoxel.errors import NoSurface
 from univoxel.fields.distances import BAND, AbstractDistances
-from univoxel.grid import GridShape
-from univoxel.records import Bricks
+from univoxel.fields.grid import GridShape
 
 SLAB = 64  # planes of the grid whose surface is found at once; whole bricks
 SPARE = 0.05  # share of the bricks that may come without moving the others in memory

@@ -1,14 +1,20 @@
-"""What every grid of signed distances offers."""
+"""What every grid of signed distances offers, the dense one, and how a finished scene stores
+them."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy import ndimage
+from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
-from univoxel.grid import GridShape
+from univoxel.core.records import Bricks, FieldSample, Rays, Samples
+from univoxel.errors import NoSurface
+from univoxel.fields.grid import GridShape, resample
 from univoxel.ops import (
     brick_minimum,
     composite_field,
@@ -18,8 +24,7 @@ from univoxel.ops import (
     sample_sparse,
     smooth_rows_,
 )
-from univoxel.ops.composite_field import FieldAlongRays, Lattices
-from univoxel.records import Bricks, FieldSample, Rays, Samples
+from univoxel.ops.compositing import FieldAlongRays, Lattices
 
 BAND = 4.0  # voxels from the surface beyond which density is nothing: 8 s at a sharpness of 0.5
 
@@ -205,3 +210,107 @@ def nodes_within(distances: AbstractDistances, far: float) -> Tensor:
 def no_values(sdf: Tensor) -> Tensor:
     """Values of nodes with no channels."""
     return sdf.detach().new_empty(*sdf.shape, 0)
+
+
+# A dense grid of signed distances: one at every node.
+
+
+class DenseDistances(AbstractDistances):
+    """SDF [X, Y, Z] as a parameter."""
+
+    def __init__(self, grid: GridShape, sdf: Tensor | None = None) -> None:
+        """
+        Args:
+            sdf: [X, Y, Z] world units; 0 everywhere when left out.
+        """
+        start = torch.zeros(grid.size) if sdf is None else sdf
+        super().__init__(grid, start.contiguous())
+
+    def on_grid(self, values: Tensor) -> Tensor:
+        return values
+
+    def blocks(self, far: float) -> Tensor:
+        sdf = self.sdf.detach()
+        return (brick_minimum(sdf) < far) & (brick_minimum(-sdf) < far)
+
+    def isosurface(self) -> tuple[Tensor, Tensor]:
+        sdf = self.sdf.detach().numpy()
+        if not sdf.min() < 0 < sdf.max():
+            raise NoSurface("the field has no surface: its sdf does not change sign")
+        vertices, faces, _, _ = marching_cubes(sdf, 0.0, gradient_direction="descent")
+        origin = torch.tensor(self.grid.origin)
+        world = origin + self.voxel_size * torch.from_numpy(vertices.copy())
+        return world.float(), torch.from_numpy(faces.astype("int32"))
+
+    @torch.no_grad()
+    def resized(self, grid: GridShape) -> DenseDistances:
+        return DenseDistances(grid, resample(self.sdf, self.grid, grid))
+
+    @torch.no_grad()
+    def values_from(self, source: AbstractDistances, values: Tensor) -> Tensor:
+        return resample(source.on_grid(values), source.grid, self.grid)
+
+
+# Signed distances as a finished scene stores them: numbers near the surface, sides beyond.
+
+
+PACKED = ("rows", "values", "side")
+
+
+def pack(sdf: Tensor, reach: float) -> dict[str, Tensor]:
+    """What is left of distances [X, Y, Z] when beyond `reach` of the surface only the side counts.
+
+    Args:
+        reach: world units, > 0. Nodes next to one on the other side of the surface are near too.
+
+    Returns:
+        rows: [R] int32, flat numbers of the near nodes.
+        values: [R] their distances.
+        side: [K] int8, -1 inside and 1 outside, of every connected piece of the others, in the
+            order of their first nodes.
+    """
+    inside = sdf.numpy() < 0
+    near = sdf.abs().numpy() < reach
+    for axis in range(3):
+        change = np.diff(inside, axis=axis)
+        low = [slice(None)] * 3
+        high = list(low)
+        low[axis], high[axis] = slice(0, -1), slice(1, None)
+        near[tuple(low)] |= change
+        near[tuple(high)] |= change
+    _, first = _pieces(near)
+    rows = torch.from_numpy(np.flatnonzero(near))
+    side = torch.from_numpy(np.where(inside.reshape(-1)[first], -1, 1).astype(np.int8))
+    return {"rows": rows.int(), "values": sdf.reshape(-1)[rows], "side": side}
+
+
+def unpack(packed: dict[str, Tensor], size: tuple[int, int, int], far: float) -> Tensor:
+    """Distances [X, Y, Z] from what `pack` gave: `far` or minus that where no number is kept.
+
+    Raises:
+        IndexError, ValueError: they do not belong to a grid of this size.
+    """
+    near = np.zeros(size, bool)
+    rows = packed["rows"].long()
+    near.reshape(-1)[rows.numpy()] = True
+    piece, first = _pieces(near)
+    side = packed["side"].float()
+    if len(side) != len(first):
+        raise ValueError(f"expected the sides of {len(first)} pieces of the grid, got {len(side)}")
+    side = torch.cat([torch.zeros(1), side])
+    sdf = far * side[torch.from_numpy(piece).long()]
+    sdf.view(-1)[rows] = packed["values"].float()
+    return sdf
+
+
+def _pieces(near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number of the connected piece of every node that is not near, from 1 in the order of their
+    first nodes, 0 for near ones; and the flat number of each piece's first node."""
+    piece = np.empty(near.shape, np.int32)
+    ndimage.label(~near, output=piece)
+    numbers, first = np.unique(piece, return_index=True)
+    first = first[numbers > 0]
+    order = np.argsort(first)
+    renumber = np.zeros(int(piece.max()) + 1, np.int32)
+    renumber[numbers[numbers > 0][order]] = np.arange(1, len(order) + 1)
+    return renumber[piece], first[order]

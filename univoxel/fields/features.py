@@ -10,13 +10,13 @@ from operator import le
 import torch
 from torch import Tensor, nn
 
+from univoxel.core.records import FieldSample, Rays, Samples
+from univoxel.core.validation import check_fields
 from univoxel.errors import ConfigError
 from univoxel.fields.distances import BAND, AbstractDistances, nodes_within
 from univoxel.ops import encode_hash
-from univoxel.ops.composite_field import FieldAlongRays, Lattices
+from univoxel.ops.compositing import FieldAlongRays, Lattices
 from univoxel.ops.hash_grid import rows_read
-from univoxel.records import FieldSample, Rays, Samples
-from univoxel.validation import check_fields
 
 PER_LEVEL = 2  # channels; so levels are half as many as channels
 COARSEST = 16  # voxels along the longest side of the box at the coarsest level

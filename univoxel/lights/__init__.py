@@ -7,16 +7,14 @@ from typing import Any, TypeAlias, get_args
 
 import torch
 
+from univoxel.core.validation import record
 from univoxel.errors import ConfigError
 from univoxel.lights.baked import BakedConfig, BakedLight
-from univoxel.lights.base import AbstractLight
-from univoxel.lights.lobes_map import EnvmapSGConfig, EnvmapSGLight
-from univoxel.lights.local import AbstractLocalLight, LocalLightConfig
+from univoxel.lights.base import AbstractLight, AbstractLocalLight, LocalLightConfig
+from univoxel.lights.envmap import EnvmapConfig, EnvmapLight, EnvmapSGConfig, EnvmapSGLight
 from univoxel.lights.mlp import LocalMLP, MLPLightConfig
 from univoxel.lights.sg import LocalSG, SGConfig
 from univoxel.lights.sh import LocalSH, SHConfig
-from univoxel.lights.texels import EnvmapConfig, EnvmapLight
-from univoxel.validation import record
 
 LightConfig: TypeAlias = (
     SGConfig | SHConfig | MLPLightConfig | EnvmapSGConfig | EnvmapConfig | BakedConfig

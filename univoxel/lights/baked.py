@@ -8,8 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from univoxel.core.records import Occlusion, Surface
 from univoxel.lights.base import AbstractLight, Regularisation
-from univoxel.records import Occlusion, Surface
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,9 @@
-"""The interface of all lights."""
+"""The interface of all lights, what is likely of them, and what those share that vary over the
+surface."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
@@ -9,7 +11,47 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from univoxel.records import Occlusion, Surface
+from univoxel import brdf
+from univoxel.core.records import Occlusion, Surface
+from univoxel.ops.networks import MLP, DirectionTable, waves
+
+
+def smoothness(value: Tensor, near: Tensor) -> Tensor:
+    """L1 between what holds at surface points and at places right beside them, [N, ...]."""
+    return (value - near).abs().mean()
+
+
+def chroma(light: Tensor) -> Tensor:
+    """Mean distance of RGB sums of light [N, 3] from their own grey, relative to the mean grey.
+
+    Images fix albedo and light only up to a colour; a white light on the whole is the likeliest
+    guess.
+    """
+    grey = light.mean(1, keepdim=True)
+    return ((light - grey).abs() / grey.detach().mean().clamp_min(1e-6)).mean()
+
+
+def total_variation(log_map: Tensor) -> Tensor:
+    """How much a lat-long map [H, 2 H, 3] goes up and down over the sphere.
+
+        (1 / 4 pi) integral of (1 + |grad log L|^2)^(1/2) - 1 dw,   gradients per radian
+
+    In logarithms, so that a wall counts as much as the sky. About the length of the gradient where
+    it is steep, so that noise is dear and the edge of a lamp is not; its square, without a kink,
+    where it is even. Source: Rudin, Osher and Fatemi 1992; Charbonnier et al. 1994.
+    """
+    height, width, _ = log_map.shape
+    step = math.pi / height
+    elevation = math.pi / 2 - step * (torch.arange(height, device=log_map.device) + 0.5)
+    across = elevation.cos()[:, None, None]
+    down = torch.nn.functional.pad(log_map.diff(dim=0), (0, 0, 0, 0, 0, 1)) / step
+    right = (log_map.roll(-1, 1) - log_map) / (step * across)
+    length = (down.square() + right.square() + 1).sqrt() - 1
+    return (across * length).sum() / (across.sum() * 3 * width)
+
+
+# The interface of all lights.
+
 
 MOST_DIRECTIONS = 1 << 16  # that light is summed up over: memory of a batch grows with them
 MOST_LAYERS = 32  # of a network: without shortcuts deeper ones do not learn
@@ -73,3 +115,110 @@ class AbstractLight(nn.Module, ABC):
         Args:
             surface, near: N points of the surface, and one right beside each.
         """
+
+
+# What the local lights share: a global light, and a network that adds to it at each point.
+
+
+FREQUENCIES = 3  # of the position: sines of 1, 2, 4 half-turns over the scale
+
+
+class LocalLightConfig(ABC):
+    """What the configurations of all local lights have."""
+
+    hidden: int  # width of the head, >= 1
+    scale: float  # world units: half the extent of what is lit, > 0
+
+
+class AbstractLocalLight(AbstractLight):
+    """Light that differs from point to point and holds direct light, indirect light and visibility
+    together: `base`, the same everywhere, plus what `head` makes of a point."""
+
+    traced = False
+    config: LocalLightConfig
+    head: MLP  # from `encode` of the surface
+    base: nn.Parameter
+
+
+def build_head(
+    features: int, hidden: int, layers: int, outputs: int, generator: torch.Generator | None
+) -> MLP:
+    """A network from `encode` to what is added to a global light: at first nothing.
+
+    Args:
+        features: C of Surface.features, >= 0.
+        hidden, layers: width and number of the hidden layers.
+        generator: draws the first weights.
+    """
+    inputs = features + 3 + 6 * FREQUENCIES
+    head = MLP([inputs, *[hidden] * layers, outputs], generator or torch.default_generator)
+    nn.init.zeros_(head.linear[-1].weight)  # the global light is the starting point
+    return head
+
+
+def encode(surface: Surface, scale: float) -> Tensor:
+    """Features, position and sines of it: [N, C + 3 + 18].
+
+    Args:
+        scale: world units: half the extent of what is lit.
+    """
+    fine = waves(surface.position * (math.pi / scale), FREQUENCIES)
+    return torch.cat([surface.features, surface.position / scale, *fine], -1)
+
+
+# Light that is finer than the lobes of a local light, as a surface mirrors it.
+
+
+_OCTAVES = 4  # of the mirrored direction: sines of 1, 2, 4, 8 radians
+
+
+class MirroredLight(nn.Module):
+    """What the mirrored direction holds beyond a local light's lobes: E(n.wo, roughness) times a
+    network of place, roughness and mirrored direction.
+
+    Lobes and quadratures blur what a smooth surface mirrors sharply. The split sum (Karis 2013,
+    Real Shading in Unreal Engine 4) asks for one blurred radiance a point instead, which a network
+    can hold (Liu et al. 2023, NeRO). Signed, for it corrects the lobes; at first it is 0.
+    """
+
+    def __init__(self, features: int, hidden: int, scale: float, known: int = 0) -> None:
+        """
+        Args:
+            features: C of Surface.features.
+            hidden: width of the network.
+            scale: world units: half the extent of what is lit.
+            known: channels of the table of directions.
+        """
+        super().__init__()
+        self.scale = scale
+        inputs = features + 3 + 6 * FREQUENCIES + 6 * _OCTAVES + 2 + known
+        self.net: MLP = MLP([inputs, hidden, hidden, 3])
+        last = self.net.linear[-1]
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    @property
+    def silent(self) -> bool:
+        """Whether training may pass it over: it is 0 everywhere, and is not learned."""
+        last = self.net.linear[-1]
+        return (
+            self.training
+            and not last.weight.requires_grad
+            and not bool(last.weight.any() or last.bias.any())
+        )
+
+    def forward(self, surface: Surface, wo: Tensor, table: DirectionTable) -> Tensor:
+        """Radiance [N, 3] towards unit directions wo [N, 3], to be added.
+
+        Args:
+            table: of mirrored directions, with `known` channels; another network's too.
+        """
+        cosine = (surface.normal * wo).sum(1, keepdim=True)
+        mirrored = 2 * cosine * surface.normal - wo
+        roughness = surface.roughness[:, None]
+        place = encode(surface, self.scale)
+        way = [*waves(mirrored, _OCTAVES), roughness, cosine, table(mirrored)]
+        light = self.net(torch.cat([place, *way], 1))
+        _, f0 = brdf.split(surface.albedo, surface.metallic)
+        share = brdf.specular_albedo(cosine[:, 0], surface.roughness, f0)
+        return (share if share.dim() == 2 else share[:, None]) * light

@@ -10,12 +10,19 @@ import torch
 from torch import Tensor, nn
 
 from univoxel import sphere
-from univoxel.lights import priors, quadrature
-from univoxel.lights.base import MOST_DIRECTIONS, MOST_LAYERS, Regularisation
-from univoxel.lights.local import AbstractLocalLight, LocalLightConfig, build_head, encode
-from univoxel.networks import MLP, waves
-from univoxel.records import Occlusion, Surface
-from univoxel.validation import check_fields
+from univoxel.core.records import Occlusion, Surface
+from univoxel.core.validation import check_fields
+from univoxel.lights import base, quadrature
+from univoxel.lights.base import (
+    MOST_DIRECTIONS,
+    MOST_LAYERS,
+    AbstractLocalLight,
+    LocalLightConfig,
+    Regularisation,
+    build_head,
+    encode,
+)
+from univoxel.ops.networks import MLP, waves
 
 _MEAN_OVER = 32  # directions that stand for the whole sphere where light is averaged
 _START = 0.5  # radiance from everywhere
@@ -118,6 +125,6 @@ class LocalMLP(AbstractLocalLight):
         wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)
         light = nn.functional.softplus(self.basis(wi) @ here)
         return Regularisation(
-            light_smoothness=priors.smoothness(here, beside),
-            white_light=priors.chroma(light.mean(1)),
+            light_smoothness=base.smoothness(here, beside),
+            white_light=base.chroma(light.mean(1)),
         )

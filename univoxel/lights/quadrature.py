@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from univoxel import brdf, ops, sphere
+from univoxel.core.records import Occlusion, Surface
 from univoxel.lights.base import AbstractLight
-from univoxel.records import Occlusion, Surface
 
 
 def rotations(

@@ -10,12 +10,51 @@ import torch
 from torch import Tensor, nn
 
 from univoxel import brdf, ops, sphere
-from univoxel.lights import lobes, priors, quadrature
-from univoxel.lights.base import MOST_DIRECTIONS, MOST_LAYERS, Regularisation
-from univoxel.lights.local import AbstractLocalLight, LocalLightConfig, build_head, encode
-from univoxel.networks import MLP
-from univoxel.records import Occlusion, Surface
-from univoxel.validation import check_fields
+from univoxel.core.records import Occlusion, Surface
+from univoxel.core.validation import check_fields
+from univoxel.lights import base, quadrature
+from univoxel.lights.base import (
+    MOST_DIRECTIONS,
+    MOST_LAYERS,
+    AbstractLocalLight,
+    LocalLightConfig,
+    Regularisation,
+    build_head,
+    encode,
+)
+from univoxel.ops import decode_lobes
+from univoxel.ops.networks import MLP
+
+_MIN_SHARPNESS = 0.1
+
+
+def decode(parameters: Tensor, max_sharpness: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit axis [..., K, 3], sharpness [..., K] and amplitude [..., K, 3] >= 0.
+
+    Args:
+        parameters: [..., K, 7] any numbers: three for the axis, one for the sharpness, three for
+            the amplitude.
+    """
+    *leading, count, numbers = parameters.shape
+    flat = parameters.reshape(-1, numbers)
+    axis, sharpness, amplitude = decode_lobes(flat, _MIN_SHARPNESS, max_sharpness)
+    shape = *leading, count
+    return axis.view(*shape, 3), sharpness.view(shape), amplitude.view(*shape, 3)
+
+
+def white_light(count: int, max_sharpness: float) -> Tensor:
+    """Parameters [K, 7] of lobes spread evenly: together radiance about 1/2 from everywhere."""
+    # As wide as the lobes lie apart, within the range: the sum is then nearly constant.
+    target = min(max(count / 2, _MIN_SHARPNESS + 0.05 * max_sharpness), 0.8 * max_sharpness)
+    share = (target - _MIN_SHARPNESS) / max_sharpness
+    # One lobe integrates to 2 pi / s (1 - exp(-2 s)) over the sphere; the mean radiance is K times
+    # that over 4 pi.
+    amplitude = 0.5 * 2 * target / (count * -math.expm1(-2 * target))
+    parameters = torch.empty(count, 7)
+    parameters[:, :3] = sphere.fibonacci_sphere(count)
+    parameters[:, 3] = math.log(share / (1 - share))
+    parameters[:, 4:] = math.log(math.expm1(amplitude))
+    return parameters
 
 
 @dataclass(frozen=True)
@@ -72,7 +111,7 @@ class LocalSG(AbstractLocalLight):
             features, config.hidden, config.layers, 7 * config.lobes, generator
         )
         self.base: nn.Parameter = nn.Parameter(
-            lobes.white_light(config.lobes, config.max_sharpness)
+            white_light(config.lobes, config.max_sharpness)
         )  # [K, 7]
 
     @property
@@ -86,7 +125,7 @@ class LocalSG(AbstractLocalLight):
     def lobes_from_raw(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Unit axis [N, K, 3], sharpness [N, K] and amplitude [N, K, 3] >= 0 of deviations."""
         parameters = self.base + raw.unflatten(-1, (self.config.lobes, 7))
-        return lobes.decode(parameters, self.config.max_sharpness)
+        return decode(parameters, self.config.max_sharpness)
 
     def lobes(self, surface: Surface) -> tuple[Tensor, Tensor, Tensor]:
         """Axis [N, K, 3], sharpness [N, K] and amplitude [N, K, 3] at each point."""
@@ -125,6 +164,6 @@ class LocalSG(AbstractLocalLight):
         raw = self.raw(surface)
         _, _, amplitude = self.lobes_from_raw(raw)
         return Regularisation(
-            light_smoothness=priors.smoothness(raw, self.raw(near)),
-            white_light=priors.chroma(amplitude.sum(1)),
+            light_smoothness=base.smoothness(raw, self.raw(near)),
+            white_light=base.chroma(amplitude.sum(1)),
         )

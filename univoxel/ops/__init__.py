@@ -1,28 +1,41 @@
 """Differentiable torch ops over native CPU kernels, each beside its eager reference."""
 
-from univoxel.ops.adam import adam_rows_, adam_rows_reference_
-from univoxel.ops.composite import composite, composite_reference
-from univoxel.ops.composite_field import (
+from univoxel.ops.compositing import (
     FieldAlongRays,
+    composite,
     composite_field,
     composite_field_reference,
+    composite_reference,
+    section_alpha,
 )
-from univoxel.ops.dense_grid import sample_dense, sample_dense_reference
-from univoxel.ops.density import section_alpha
+from univoxel.ops.grid import (
+    sample_dense,
+    sample_dense_reference,
+    sample_sparse,
+    sample_sparse_reference,
+)
 from univoxel.ops.hash_grid import encode_hash, encode_hash_reference
 from univoxel.ops.integrator import EnvTables, PointLight, Sun, relight
-from univoxel.ops.lobes import decode_lobes, decode_lobes_reference
 from univoxel.ops.march import brick_minimum, march, march_reference
-from univoxel.ops.mlp import mlp, mlp_reference
 from univoxel.ops.native import NativeStatus, native_status, use_backend
-from univoxel.ops.patches import patch_correlation, patch_correlation_reference
-from univoxel.ops.response import specular_response, specular_response_reference
-from univoxel.ops.sg import shade_sg, shade_sg_reference
+from univoxel.ops.networks import mlp, mlp_reference
+from univoxel.ops.patches import (
+    match_cost,
+    match_cost_reference,
+    patch_correlation,
+    patch_correlation_reference,
+    semi_global,
+    semi_global_reference,
+)
+from univoxel.ops.rows import adam_rows_, adam_rows_reference_, sum_rows, sum_rows_reference
+from univoxel.ops.sg import decode_lobes, decode_lobes_reference, shade_sg, shade_sg_reference
 from univoxel.ops.shade import (
     shade_map,
     shade_map_reference,
     shade_radiance,
     shade_radiance_reference,
+    specular_response,
+    specular_response_reference,
 )
 from univoxel.ops.smooth import (
     diffuse_rows_,
@@ -30,9 +43,6 @@ from univoxel.ops.smooth import (
     smooth_rows_,
     smooth_rows_reference_,
 )
-from univoxel.ops.sparse_grid import sample_sparse, sample_sparse_reference
-from univoxel.ops.stereo import match_cost, match_cost_reference, semi_global, semi_global_reference
-from univoxel.ops.sum_rows import sum_rows, sum_rows_reference
 from univoxel.ops.visibility import Hit, VisibilityScene, closest_hit_reference, occluded_reference
 
 __all__ = [

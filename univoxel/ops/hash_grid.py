@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from univoxel.ops import native
-from univoxel.ops.checks import check
-from univoxel.ops.differentiable import differentiable
-from univoxel.ops.grid_sampling import SparseGrad
+from univoxel.ops.differentiable import check, differentiable
+from univoxel.ops.grid import SparseGrad
 
 PRIMES = (1, 2654435761, 805459861)
 # Numbers of nodes of each level, the lower corner and voxel sizes, as the extension takes them

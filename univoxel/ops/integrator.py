@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from univoxel.brdf import F0
+from univoxel.core.records import Mesh
 from univoxel.ops import native
-from univoxel.ops.checks import check
-from univoxel.ops.reflectance import stored_f0
+from univoxel.ops.differentiable import check
+from univoxel.ops.shade import stored_f0
 from univoxel.ops.visibility import VisibilityScene
-from univoxel.records import Mesh
 
 Strategy = Literal["mis", "map", "brdf"]
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from univoxel.core.records import Bricks, Samples
 from univoxel.ops import native
-from univoxel.ops.checks import check, check_bricks
-from univoxel.records import Bricks, Samples
+from univoxel.ops.differentiable import check, check_bricks
 
 BRICK = 4  # voxels along the side of a brick that is skipped as a whole; as kBrick in csrc/nodes.h
 

@@ -1,4 +1,5 @@
-"""Small patches of a surface, correlated between photographs."""
+"""Photographs compared: patches of a surface correlated between them, and depth from how well
+pixels agree along rays."""
 
 from __future__ import annotations
 
@@ -9,8 +10,7 @@ import torch
 from torch import Tensor
 
 from univoxel.ops import native
-from univoxel.ops.checks import check
-from univoxel.ops.differentiable import differentiable
+from univoxel.ops.differentiable import check, differentiable
 
 NEAREST = 1e-6  # along the axis of a view: what lies before it is not seen
 
@@ -170,3 +170,189 @@ def _patch_correlation(
     n, k = views.shape
     seen = torch.empty(n, k, dtype=torch.bool, device=position.device)
     return position.new_empty(n, k), seen, position.new_empty(n, k, 6)
+
+
+# Depth from photographs: how well pixels agree along rays, and which depths neighbours share.
+
+
+@torch.no_grad()
+def match_cost(
+    pictures: Tensor,  # [V, H, W, 4]
+    matrix: Tensor,  # [V, 3, 4]
+    origin: Tensor,  # [N, 3]
+    direction: Tensor,  # [N, 3]
+    start: Tensor,  # [N]
+    color: Tensor,  # [N, 3]
+    rows: Tensor,  # [H, W]
+    others: Tensor,  # [M]
+    step: float,
+    steps: int,
+    *,
+    most: float = 0.2,
+    radius: int = 1,
+    best: int = 4,
+) -> Tensor:
+    """How badly the photographs disagree if a pixel's surface lay at points along its ray.
+
+    Points start + k step are looked up in other views (bilinear); the mean absolute difference of
+    the colours, `most` at the highest and where nothing is to be seen there, is averaged over a
+    window of pixels of one k, and over the `best` views that agree most: others may not see it.
+
+    Args:
+        pictures: [V, H, W, 4] uint8 colours times coverage, and coverage.
+        matrix: [V, 3, 4] float32 world to (x z, y z, z): pixels from the top left corner, depth.
+        origin, direction: [N, 3] float32 rays of the pixels.
+        start: [N] float32 where they start.
+        color: [N, 3] float32 straight colours of the pixels, in [0, 1].
+        rows: [H, W] int64 which ray is a pixel's; -1: none.
+        others: [M] int64 views to compare with.
+        step: between points, world units where directions are unit.
+        steps: K, points of a ray.
+        radius: pixels around one in its window; 0: itself alone.
+        best: views, 1 to M.
+
+    Returns:
+        [N, K] float32 in [0, most].
+
+    Raises:
+        TypeError, ValueError: an argument of another size, dtype, device or range than above.
+    """
+    sizes = check(
+        "match_cost",
+        pictures=(pictures, "V H W 4", torch.uint8),
+        matrix=(matrix, "V 3 4", torch.float32),
+        origin=(origin, "N 3", torch.float32),
+        direction=(direction, "N 3", torch.float32),
+        start=(start, "N", torch.float32),
+        color=(color, "N 3", torch.float32),
+        rows=(rows, "H W", torch.int64),
+        others=(others, "M", torch.int64),
+    )
+    _check_rows("match_cost", rows, sizes["N"])
+    if sizes["M"] and not 0 <= int(others.min()) <= int(others.max()) < sizes["V"]:
+        raise ValueError(f"match_cost: others must lie in [0, {sizes['V']}), got {others.tolist()}")
+    if not 1 <= best <= sizes["M"]:
+        raise ValueError(f"match_cost: best must lie in [1, {sizes['M']}], got {best}")
+    if steps < 1 or radius < 0:
+        raise ValueError(
+            f"match_cost: steps must be at least 1 and radius at least 0, got {steps} and {radius}"
+        )
+    rays = (origin, direction, start, color, rows, others)
+    if not native.serves(start):
+        return match_cost_reference(pictures, matrix, *rays, step, steps, most, radius, best)
+    cost = start.new_empty(sizes["N"], steps)
+    aligned = pictures.clone() if pictures.storage_offset() % 4 else pictures
+    pixels = aligned.contiguous().view(torch.int32)[..., 0]  # four bytes are looked up at once
+    tensors = [t.contiguous() for t in (pixels, matrix, *rays)]
+    native.require().match_cost(
+        *native.arrays(*tensors, cost), step, most, radius, best, native.threads()
+    )
+    return cost
+
+
+def match_cost_reference(
+    pictures: Tensor,
+    matrix: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    start: Tensor,
+    color: Tensor,
+    rows: Tensor,
+    others: Tensor,
+    step: float,
+    steps: int,
+    most: float,
+    radius: int,
+    best: int,
+) -> Tensor:
+    """The same in eager torch."""
+    height, width = rows.shape
+    t = start[:, None] + step * torch.arange(steps, dtype=start.dtype, device=start.device)
+    point = origin[:, None] + t[..., None] * direction[:, None]  # [N, K, 3]
+    differences = []
+    for view in others.tolist():
+        x, y, z = (point @ matrix[view, :, :3].T + matrix[view, :, 3]).unbind(-1)
+        at = torch.stack([x / z / width, y / z / height], -1) * 2 - 1
+        texel = torch.nn.functional.grid_sample(
+            pictures[view].permute(2, 0, 1)[None].to(at) / 255, at[None], align_corners=False
+        )[0].permute(1, 2, 0)
+        off = (texel[..., :3] / texel[..., 3:] - color[:, None]).abs().mean(-1)
+        half = at.new_tensor([1 / width, 1 / height])  # of a pixel: pictures are 2 wide
+        inside = ((at >= half - 1) & (at < 1 - half)).all(-1) & (z > 0)
+        visible = inside & (texel[..., 3] >= 0.5)
+        differences.append(torch.where(visible, off.clamp_max(most), most))
+    pixel = (rows.flatten() >= 0).nonzero()[:, 0]
+    spread = start.new_zeros(len(differences) * steps + 1, height * width)
+    values = torch.stack(differences).permute(0, 2, 1).reshape(-1, len(start))
+    spread[:-1, pixel], spread[-1, pixel] = values[:, rows.flatten()[pixel]], 1.0
+    mean = torch.nn.functional.avg_pool2d(
+        spread.view(-1, height, width), 2 * radius + 1, 1, radius, count_include_pad=True
+    ).flatten(1)[:, pixel]
+    cost = (mean[:-1] / mean[-1]).view(len(differences), steps, -1).sort(0).values[:best].mean(0).T
+    return torch.empty_like(cost).index_copy_(0, rows.flatten()[pixel], cost)
+
+
+@torch.no_grad()
+def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tensor:
+    """Costs of depths that neighbours share: sums over the four straight paths to each pixel.
+
+        L(p, k) = C(p, k) + min(L(q, k), L(q, k -+ 1) + small, m + large) - m,   m = min_i L(q, i)
+
+    with q the pixel before p on the path; a pixel without a ray ends it. The least sum says which k
+    a pixel should take.
+    Source: Hirschmueller 2005, "Accurate and efficient stereo processing by semi-global matching",
+    equation 13.
+
+    Args:
+        cost: [N, K] float32.
+        rows: [H, W] int64 which row of cost is a pixel's; -1: none.
+        small: for a step of 1 between neighbours.
+        large: for a greater one; at least small.
+
+    Returns:
+        [N, K] float32.
+
+    Raises:
+        TypeError, ValueError: an argument of another size, dtype, device or range than above.
+    """
+    sizes = check("semi_global", cost=(cost, "N K", torch.float32), rows=(rows, "H W", torch.int64))
+    _check_rows("semi_global", rows, sizes["N"])
+    if not 0 <= small <= large:
+        raise ValueError(f"semi_global: 0 <= small <= large, got {small} and {large}")
+    if not native.serves(cost):
+        return semi_global_reference(cost, rows, small, large)
+    cost, rows = cost.contiguous(), rows.contiguous()
+    total = torch.empty_like(cost)
+    options = small, large, native.threads()
+    native.require().semi_global(*native.arrays(cost, rows, total), *options)
+    return total
+
+
+def semi_global_reference(cost: Tensor, rows: Tensor, small: float, large: float) -> Tensor:
+    """The same in eager torch, line after line."""
+    has_ray = rows >= 0
+    volume = cost.new_zeros(*rows.shape, cost.shape[1])
+    volume[has_ray] = cost[rows[has_ray]]
+    total = torch.zeros_like(volume)
+    for across in (False, True):
+        for back in (False, True):
+            turn = (lambda v: v.transpose(0, 1)) if across else (lambda v: v)
+            c, s, t = (turn(v) for v in (volume, has_ray[..., None].to(cost.dtype), total))
+            before, continues = torch.zeros_like(c[0]), torch.zeros_like(s[0])
+            for i in range(len(c))[:: -1 if back else 1]:
+                wide = torch.nn.functional.pad(before, (1, 1), value=torch.inf)
+                neighbor = torch.minimum(wide[:, :-2], wide[:, 2:]) + small
+                least = before.amin(1, keepdim=True)
+                transition = torch.minimum(torch.minimum(before, neighbor), least + large) - least
+                before, continues = c[i] + continues * transition, s[i]
+                t[i] += before * s[i]
+    result = torch.zeros_like(cost)
+    result[rows[has_ray]] = total[has_ray]
+    return result
+
+
+def _check_rows(op: str, rows: Tensor, count: int) -> None:
+    """Each of the N rays is the ray of one pixel."""
+    named = rows[rows >= 0].sort().values
+    if not torch.equal(named, torch.arange(count, device=rows.device)):
+        raise ValueError(f"{op}: rows must name each of the {count} rays once, and -1 elsewhere")

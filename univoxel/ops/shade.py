@@ -1,4 +1,5 @@
-"""Shading under light that is given on fixed directions of the sphere."""
+"""Shading under light that is given on fixed directions of the sphere, and each direction's part
+in it."""
 
 from __future__ import annotations
 
@@ -9,9 +10,31 @@ from torch import Tensor
 
 from univoxel import brdf
 from univoxel.ops import native
-from univoxel.ops.checks import check
-from univoxel.ops.differentiable import differentiable
-from univoxel.ops.reflectance import sizes_of_f0, stored_f0
+from univoxel.ops.differentiable import check, differentiable
+
+
+def sizes_of_f0(f0: Tensor | float) -> dict[str, tuple[Tensor, str]]:
+    """What ops.checks.check needs to know of it: nothing of a number."""
+    return {"f0": (f0, "N 3")} if isinstance(f0, Tensor) else {}
+
+
+def stored_f0(op: str, f0: Tensor | float, like: Tensor) -> Tensor:
+    """[N, 3] as it came, or a number as a tensor [] of the dtype of ``like``.
+
+    Raises:
+        TypeError: neither a tensor nor a number.
+        ValueError: a number outside [0, 1].
+    """
+    if isinstance(f0, Tensor):
+        return f0
+    if not isinstance(f0, int | float):
+        raise TypeError(f"{op}: f0 must be a number or a tensor, got {type(f0).__name__}")
+    if not 0.0 <= f0 <= 1.0:
+        raise ValueError(f"{op}: f0 must be in [0, 1], got {f0}")
+    return like.new_full((), f0)
+
+
+# Shading under light that is given on fixed directions of the sphere.
 
 
 def shade_radiance(
@@ -221,3 +244,69 @@ def _shade_map(
     solid_angle: float,
 ) -> Tensor:
     return torch.empty_like(normal)
+
+
+# What a point would send to the eye of light from each of many directions.
+
+
+@torch.no_grad()
+def specular_response(
+    normal: Tensor,  # [N, 3]
+    wo: Tensor,  # [N, 3]
+    roughness: Tensor,  # [N]
+    directions: Tensor,  # [D, 3]
+    solid_angle: float,
+    f0: float = 0.04,
+) -> Tensor:
+    """Radiance towards the eye by the specular layer, for unit radiance from each direction.
+
+        response_nd = solid_angle f_specular(w_d, wo_n) max(n.w_d, 0)
+
+    with f of docs/reference/conventions.md. These are rows of an equation for a light that is not
+    known yet. Linear in F0.
+
+    Args:
+        normal, wo: [N, 3] unit, world; wo points to the eye.
+        roughness: [N] perceptual, in [0, 1].
+        directions: [D, 3] unit, world.
+        solid_angle: of each direction, steradians.
+        f0: reflectance at normal incidence, in [0, 1].
+
+    Returns:
+        [N, D]; without gradients.
+
+    Raises:
+        TypeError, ValueError: an argument of another size, dtype or device than above; solid_angle
+            not above 0; f0 outside [0, 1].
+    """
+    sizes = check(
+        "specular_response",
+        normal=(normal, "N 3"),
+        wo=(wo, "N 3"),
+        roughness=(roughness, "N"),
+        directions=(directions, "D 3"),
+    )
+    if not solid_angle > 0:
+        raise ValueError(f"specular_response: solid_angle must be above 0, got {solid_angle}")
+    if not 0 <= f0 <= 1:
+        raise ValueError(f"specular_response: f0 must be in [0, 1], got {f0}")
+    if not native.serves(normal):
+        return specular_response_reference(normal, wo, roughness, directions, solid_angle, f0)
+    response = normal.new_empty(sizes["N"], sizes["D"])
+    inputs = [x.contiguous() for x in (normal, wo, roughness, directions)]
+    options = float(f0), float(solid_angle), native.threads()
+    native.require().specular_response(*native.arrays(*inputs, response), *options)
+    return response
+
+
+def specular_response_reference(
+    normal: Tensor,
+    wo: Tensor,
+    roughness: Tensor,
+    directions: Tensor,
+    solid_angle: float,
+    f0: float = 0.04,
+) -> Tensor:
+    """The same in eager torch."""
+    layer = brdf.specular(normal[:, None], wo[:, None], directions, roughness[:, None], f0)
+    return solid_angle * layer * (normal @ directions.T).clamp_min(0)

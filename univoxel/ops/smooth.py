@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from univoxel.core.records import Bricks
 from univoxel.ops import native
-from univoxel.ops.checks import check, check_bricks
-from univoxel.records import Bricks
+from univoxel.ops.differentiable import check, check_bricks
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from univoxel.ops import native
-from univoxel.ops.checks import check
+from univoxel.ops.differentiable import check
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-"""Where the object can be: bounds and a first SDF from silhouettes."""
+"""Where the object can be: bounds and a first SDF from silhouettes, and what photographs show of
+its points."""
 
 from __future__ import annotations
 
@@ -6,14 +7,19 @@ import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, normalize
 
-from univoxel import memmap
 from univoxel.camera import Cameras, looked_at, project
-from univoxel.data.base import coverage_of
+from univoxel.core import memmap
+from univoxel.core.memmap import parallel_map
+from univoxel.core.records import Mesh
+from univoxel.data import Photos
+from univoxel.data.photos import coverage_of
 from univoxel.errors import UserError
-from univoxel.grid import GridShape, fit_coarse, fit_grid, resample
-from univoxel.threads import side_by_side
+from univoxel.fields.distances import DenseDistances
+from univoxel.fields.grid import GridShape, fit_coarse, fit_grid, resample
+from univoxel.ops import VisibilityScene
+from univoxel.render.observations import Observations, observe, surface_points
 
 # The half of the first box over what the widest view shows at its distance
 FIRST_BOX = 1.2
@@ -59,7 +65,7 @@ def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
         result[view] = np.inf
         result[view, : a.shape[0], : a.shape[1]] = _mask_distance_of_any(a)
 
-    side_by_side(fill_, range(len(alpha)))
+    parallel_map(fill_, range(len(alpha)))
     return distances
 
 
@@ -116,7 +122,7 @@ def hull_sdf(
     def of_piece(piece: Tensor) -> Tensor:
         return _hull_sdf(distance, cameras, piece, votes, seen_by, wider)
 
-    return torch.cat(side_by_side(of_piece, points.split(PIECE)))
+    return torch.cat(parallel_map(of_piece, points.split(PIECE)))
 
 
 def _hull_sdf(
@@ -215,3 +221,24 @@ def visual_hull(distance: Tensor, cameras: Cameras, grid: GridShape, votes: int 
     sdf = sdf.reshape(coarse.size)
     far = sum(n * n for n in grid.size) ** 0.5 * grid.voxel_size
     return resample(sdf.clamp(-far, far), coarse, grid)
+
+
+# What the photographs show of points of the visual hull.
+
+
+@torch.no_grad()
+def observe_hull(photos: Photos, sdf: Tensor, grid: GridShape, points: int) -> Observations | None:
+    """Observations of points spread over the hull; None: it has no surface.
+
+    Args:
+        photos: their cameras where they are believed to be.
+        sdf: [X, Y, Z] of the hull on the grid, world units.
+    """
+    if not sdf.min() < 0 < sdf.max():
+        return None
+    field = DenseDistances(grid, sdf)
+    vertices, faces = field.isosurface()
+    normals = normalize(field.sample(vertices).gradient, dim=1, eps=1e-6)
+    mesh = Mesh(vertices, faces, normals)
+    spread = surface_points(mesh, points, torch.Generator().manual_seed(0))
+    return observe(*spread, photos, VisibilityScene(vertices, faces), grid.voxel_size)

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from univoxel import memmap
 from univoxel.color import linear_to_srgb
+from univoxel.core import memmap
+from univoxel.core.choices import MasksFrom
+from univoxel.core.memmap import parallel_map
 from univoxel.data import Photos
-from univoxel.data.base import coverage_of
-from univoxel.names import MasksFrom
+from univoxel.data.photos import coverage_of
 from univoxel.preparation.hull import mask_distances
-from univoxel.threads import side_by_side
 
 # Pixels that are looked at, about, and photographs at least: the excess is a mean over them
 PIXELS, VIEWS = 8e6, 8
@@ -102,7 +102,7 @@ def _change(
         return torch.bincount(at, inward, deepest + 1), torch.bincount(at, minlength=deepest + 1)
 
     total, count = torch.zeros(2, deepest + 1)
-    for change, pixels in side_by_side(of_view, zip(color, coverage, distance, strict=True)):
+    for change, pixels in parallel_map(of_view, zip(color, coverage, distance, strict=True)):
         total += change
         count += pixels
     return torch.where(count >= MIN_PIXELS, total / count, torch.nan)

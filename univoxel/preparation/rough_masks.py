@@ -16,15 +16,14 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from univoxel import memmap
+from univoxel.core import memmap
+from univoxel.core.memmap import parallel_map
 from univoxel.data import Photos
-from univoxel.data.base import coverage_of
-from univoxel.preparation.belief import Belief
+from univoxel.data.photos import coverage_of
 from univoxel.preparation.hull import estimate_bounds, mask_distances
 from univoxel.preparation.object_shape import ObjectShape, find_object, shrunk, silhouettes
-from univoxel.preparation.registration import MAX_CONTRADICTION, contradiction
+from univoxel.preparation.pose_refinement import MAX_CONTRADICTION, Belief, contradiction
 from univoxel.preparation.stereo import depth_maps
-from univoxel.threads import side_by_side
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -64,7 +63,7 @@ def doubt_masks(photos: Photos, belief: Belief) -> Doubted:
         own = cameras.cut(view, pixels[view])
         own.copy_(interpolate(doubted[None, None].float(), own.shape)[0, 0] > 0)
 
-    side_by_side(doubt_, range(len(photos)))
+    parallel_map(doubt_, range(len(photos)))
     distance = filled_distances(photos, pixels)
     box = estimate_bounds(distance, cameras, belief.votes)
     off = contradiction(distance, cameras, box, pixels)

@@ -16,7 +16,7 @@ from skimage.measure import label
 from torch import Tensor
 
 from univoxel.camera import image_rays, looked_at
-from univoxel.grid import GridShape, fit_grid
+from univoxel.fields.grid import GridShape, fit_grid
 from univoxel.preparation.object_shape import FREE, ROOM, SURE, VOXELS, around, votes
 from univoxel.preparation.stereo import DepthMaps, reach
 

@@ -23,9 +23,9 @@ from univoxel.camera import (
     stacked,
 )
 from univoxel.color import linear_to_srgb
+from univoxel.core.memmap import parallel_map
 from univoxel.data import Photos
 from univoxel.ops import match_cost, semi_global
-from univoxel.threads import side_by_side
 
 # Pixels of the longer side of the photographs that are compared
 PIXELS = 224
@@ -82,7 +82,7 @@ def depth_maps(photos: Photos) -> DepthMaps:
     unstructured multi-view stereo".
     """
     small, cameras = small_photographs(photos)
-    pictures = stacked(side_by_side(comparable, small))
+    pictures = stacked(parallel_map(comparable, small))
     centre, radius = looked_at(cameras), BALL * reach(cameras)
     step, matrix = 2 * radius / DEPTHS, projection_matrices(cameras)
     compared = views_to_compare(cameras)
@@ -131,7 +131,7 @@ def small_photographs(photos: Photos) -> tuple[list[Tensor], Cameras]:
         pixels = interpolate(encoded.movedim(2, 0)[None], (height, width), mode="area")
         return pixels[0].movedim(0, 2)
 
-    return side_by_side(small, range(len(photos))), cameras
+    return parallel_map(small, range(len(photos))), cameras
 
 
 def small_cameras(cameras: Cameras) -> Cameras:

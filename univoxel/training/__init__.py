@@ -1,1 +1,1 @@
-"""The training loop: its clock, its optimiser, and what guards it."""
+"""Training: the loop and its clock, the joint solve of light and materials, compression."""

@@ -7,33 +7,32 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from univoxel import losses, memmap
 from univoxel.camera import pixel_rays
-from univoxel.checkpoint import save_scene
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.config import LossConfig, StageConfig, TrainConfig
+from univoxel.core import memmap
+from univoxel.core.records import Rays, Surface
 from univoxel.data import Photos
-from univoxel.lights import priors
+from univoxel.lights import base
 from univoxel.lights.base import Regularisation
-from univoxel.metrics import psnr
 from univoxel.ops import sum_rows
-from univoxel.optim import RowAdam, parameters_of, rows_of
-from univoxel.records import Rays, Surface
+from univoxel.optim import RowAdam, geometric, parameters_of, rows_of
+from univoxel.render import metrics
+from univoxel.render.metrics import psnr
 from univoxel.render.pipeline import at_rays, radiance_of, shade, surface_at
-from univoxel.scene import Scene
+from univoxel.scene import Scene, save_scene
 from univoxel.training import patches
-from univoxel.training.divergence import Guard
-from univoxel.training.pixels import TrainingPixels, unpacked
-from univoxel.training.plateau import Plateau
-from univoxel.training.progress import Listener
-from univoxel.training.surface_update import (
+from univoxel.training.descent import (
     EPS_FEATURES,
     EPS_SDF,
     MOMENTS,
-    geometric,
+    Guard,
+    Plateau,
     smooth_sdf_gradient_,
     smooth_touched_,
 )
+from univoxel.training.pixels import TrainingPixels, unpacked
+from univoxel.training.progress import Listener
 
 # Cadences: steps from one to the next. plateau.CHECK is a share of the schedule instead; reports
 # and checkpoints come by time, REPORT_SECONDS and CHECKPOINT_SECONDS in progress.py
@@ -238,8 +237,8 @@ def losses_of(
     radiance = radiance_of(scene, surface, batch.wo, batch.view)
     drawn = radiance * opacity + linear_to_srgb(behind) * (1 - opacity)
     terms = {
-        "radiance": weight.radiance * losses.photometric(drawn, target),
-        "silhouette": weight.silhouette * losses.silhouette(surface.opacity, batch.alpha),
+        "radiance": weight.radiance * metrics.photometric(drawn, target),
+        "silhouette": weight.silhouette * metrics.silhouette(surface.opacity, batch.alpha),
     }
     hit = (surface.opacity.detach() > MIN_OPACITY).nonzero()[:, 0]
     if not physical or not len(hit):
@@ -251,7 +250,7 @@ def losses_of(
     encoded = linear_to_srgb_unclipped(shaded * opacity + behind * (1 - opacity))
     assert met.metallic is not None
     terms |= {
-        "physical": losses.photometric(encoded, target),
+        "physical": metrics.photometric(encoded, target),
         "metallic": weight.metallic * met.metallic.mean(),
     }
     some = torch.arange(0, len(hit), COMPARED)
@@ -279,8 +278,8 @@ def smoothness_losses(
     here = replace(met, features=scene.coded(met.features, view))
     near = replace(met, features=scene.coded(near, view), position=beside)
     terms = {
-        "albedo": ALBEDO_SMOOTHNESS * priors.smoothness(met.albedo, albedo),
-        "roughness": ROUGHNESS_SMOOTHNESS * priors.smoothness(met.roughness, roughness),
+        "albedo": ALBEDO_SMOOTHNESS * base.smoothness(met.albedo, albedo),
+        "roughness": ROUGHNESS_SMOOTHNESS * base.smoothness(met.roughness, roughness),
     }
     return terms | light_priors(scene.light.regularisation(here, near), weight)
 

@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from univoxel import memmap
 from univoxel.camera import Cameras, projection_matrices
 from univoxel.color import linear_to_srgb
+from univoxel.core import memmap
+from univoxel.core.records import Surface
 from univoxel.data import Photos
-from univoxel.data.base import coverage_of
+from univoxel.data.photos import coverage_of
 from univoxel.ops import patch_correlation
-from univoxel.records import Surface
 from univoxel.scene import Scene
 
 HALF = 2  # pixels from a patch's middle to its side
@@ -45,7 +45,7 @@ BACKGROUND = -1.0  # stands for the brightness of pixels that show it
 def comparable(photos: Photos) -> Tensor:
     """Brightness of all pixels [V, H, W], float16; BACKGROUND where they are not opaque.
 
-    It spreads dark colours, as `univoxel.preparation.depth_sweep.log_colors` does.
+    It spreads dark colours, as `univoxel.preparation.carving.log_colors` does.
     """
     result = memmap.zeros(photos.alpha.shape, torch.float16)
     result[:] = BACKGROUND

@@ -15,7 +15,7 @@ from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import Photos
 from univoxel.fields.features import PER_LEVEL, Levels
 from univoxel.fields.field import hash_field
-from univoxel.grid import fit_grid
+from univoxel.fields.grid import fit_grid
 from univoxel.scene import Scene, SceneConfig
 from univoxel.training.clock import expected_seconds
 from univoxel.training.loop import run_stage

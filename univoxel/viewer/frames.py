@@ -1,12 +1,15 @@
-"""Pictures of a subject: a quick one while something moves, better and better ones at rest."""
+"""Pictures of a subject: a quick one while something moves, better and better ones at rest,
+noise taken out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Literal, TypeAlias, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,13 +17,56 @@ from univoxel import envmap as env
 from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
-from univoxel.names import BOUNCES
-from univoxel.pictures.contact_sheet import heat
-from univoxel.records import Rays, Surface
+from univoxel.core.choices import BOUNCES
+from univoxel.core.records import Rays, Surface
+from univoxel.render.pictures import heat
 from univoxel.render.pipeline import at_rays, surface_at
 from univoxel.render.relight import Lighting, ground_shadow, relight_surface
-from univoxel.viewer.denoise import denoised_beside
-from univoxel.viewer.subject import Subject, at_hits, mesh_surface
+from univoxel.viewer.viewer_scene import Subject, at_hits, mesh_surface
+
+# It takes about a second of all cores, without holding Python's lock: a view that moves meanwhile
+# is answered as ever.
+_BESIDE = ThreadPoolExecutor(1, "univoxel denoiser")
+
+
+def available() -> bool:
+    """Whether the extra `denoise` is installed."""
+    return find_spec("pyoidn") is not None
+
+
+def denoised_beside(
+    rgb: Tensor, albedo: Tensor, normal: Tensor, shadow: Tensor | None
+) -> Future[tuple[Tensor, Tensor | None]]:
+    """`denoised` in a thread of its own, of the values as they are now."""
+    copies = (rgb.clone(), albedo.clone(), normal.clone())
+    return _BESIDE.submit(denoised, *copies, None if shadow is None else shadow.clone())
+
+
+def denoised(
+    rgb: Tensor, albedo: Tensor, normal: Tensor, shadow: Tensor | None
+) -> tuple[Tensor, Tensor | None]:
+    """Radiance without its noise, and a floor's shadow likewise.
+
+    Args:
+        rgb: [H, W, 3] linear.
+        albedo, normal: [H, W, 3], free of noise, 0 where there is no surface.
+        shadow: [H, W] in [0, 1].
+    """
+    import pyoidn  # pyright: ignore[reportMissingImports]  the extra `denoise`
+
+    def array(values: Tensor) -> np.ndarray:
+        return np.ascontiguousarray(values.numpy(), np.float32)
+
+    aside = {"albedo": array(albedo), "normal": array(normal)}
+    light = torch.from_numpy(pyoidn.denoise(array(rgb), **aside, hdr=True)).clamp_min(0)
+    if shadow is None:
+        return light, None
+    grey = pyoidn.denoise(array(shadow[..., None].expand(-1, -1, 3)))
+    return light, torch.from_numpy(grey)[..., 0].clamp(0, 1)
+
+
+# Pictures of a subject: a quick one while something moves, better and better ones at rest.
+
 
 Layer: TypeAlias = Literal["render", "albedo", "roughness", "metal", "normal", "depth", "doubt"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)

@@ -23,32 +23,30 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from univoxel import envmap as env
-from univoxel.assets.bake import bake
-from univoxel.assets.gltf import glb
-from univoxel.assets.topology import simplify
 from univoxel.camera import Cameras, image_rays, looked_at, pixel_rays, project, resize
 from univoxel.color import linear_to_srgb
+from univoxel.core.choices import TEXTURE_SIZE
 from univoxel.data import Photos
 from univoxel.errors import UserError
-from univoxel.names import TEXTURE_SIZE
 from univoxel.ops import Sun
-from univoxel.page import FACES, JPEG_QUALITY, PageOptions, lights_of
-from univoxel.page.maps import Light, light_of_file
-from univoxel.pictures.viewpoints import VIEW_ANGLE, orbit
+from univoxel.output.mesh import bake
+from univoxel.output.mesh_files import glb
+from univoxel.output.page import FACES, JPEG_QUALITY, Light, PageOptions, light_of_file, lights_of
+from univoxel.output.topology import simplify
+from univoxel.output.viewpoints import VIEW_ANGLE, orbit
 from univoxel.render.relight import Lighting, rotated
-from univoxel.viewer import denoise
-from univoxel.viewer.film import film, kind
+from univoxel.viewer import frames
 from univoxel.viewer.frames import LAYERS, Look
-from univoxel.viewer.hosting import HOST, PORT, address_of, hosted
-from univoxel.viewer.incident import (
+from univoxel.viewer.render_queue import Studio, Viewer, film, kind
+from univoxel.viewer.training import HOST, PORT, address_of, hosted
+from univoxel.viewer.viewer_scene import (
     ROWS,
     Point,
+    Subject,
     incident_light,
     incident_picture,
     point_on_mesh,
 )
-from univoxel.viewer.studio import Studio, Viewer
-from univoxel.viewer.subject import Subject
 
 DARK = "no map"  # the light that leaves the sun alone
 PLAIN = 0.16  # sRGB, behind a transparent picture
@@ -126,9 +124,7 @@ class Panel:
         self._elevation = gui.add_slider("sun elevation", 0.0, 90.0, 1.0, 45.0)
         self._ground = gui.add_checkbox("ground", False)
         self._backdrop = gui.add_checkbox("backdrop", False)
-        self._denoise = gui.add_checkbox(
-            "denoise", denoise.available(), visible=denoise.available()
-        )
+        self._denoise = gui.add_checkbox("denoise", frames.available(), visible=frames.available())
         for control in (self._layer, self._ground, self._backdrop, self._denoise):
             control.on_update(lambda event: self._ask())
         for control in (

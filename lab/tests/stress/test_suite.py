@@ -16,7 +16,7 @@ from lab.stress.axes import AXES, BASE, INTACT
 from lab.stress.scenes import Spec
 from univoxel.cli import main
 from univoxel.config import JointConfig
-from univoxel.names import LIGHTS
+from univoxel.core.choices import LIGHTS
 
 
 def test_every_axis_begins_with_its_reference_or_an_easier_level():

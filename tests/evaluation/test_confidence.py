@@ -1,0 +1,195 @@
+"""What is said of a sphere whose cameras, light and material are known."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import RADIUS, photos_of, scene_of
+from observed_points import RED, lamps, photographs_under
+
+from univoxel.data import Photos
+from univoxel.evaluation import confidence
+from univoxel.evaluation import confidence as task
+from univoxel.evaluation.confidence import Doubts, numbers, spread_observations, survey, words
+from univoxel.render.observations import MIN_COSINE, Observations
+
+NODES, ROUGHNESS = 64, 0.4
+
+
+@pytest.fixture(scope="module")
+def scene():
+    scene = scene_of(RED, ROUGHNESS, NODES)
+    with torch.no_grad():
+        scene.sky.log_radiance.copy_(lamps(NODES).log())
+    return scene
+
+
+@pytest.fixture(scope="module")
+def photos():
+    return photographs_under(lamps(NODES), ROUGHNESS, views=16, size=48)
+
+
+@pytest.fixture(scope="module")
+def surveyed(scene, photos):
+    return survey(scene, photos, 1000)
+
+
+def trust_text(run) -> str:
+    return (run / "trust.txt").read_text()
+
+
+def some_views(photos: Photos, keep) -> Photos:
+    cameras = replace(
+        photos.cameras,
+        **{
+            name: getattr(photos.cameras, name)[keep]
+            for name in ("camera_to_world", "focal", "centre")
+        },
+    )
+    index = torch.arange(len(photos))[keep].tolist()
+    return replace(
+        photos,
+        names=[photos.names[i] for i in index],
+        color=photos.color[keep],
+        alpha=photos.alpha[keep],
+        cameras=cameras,
+    )
+
+
+def test_views_and_visibility_of_a_convex_body(surveyed, photos):
+    eye = photos.cameras.camera_to_world[:, :, 3]
+    towards = torch.nn.functional.normalize(eye - surveyed.position[:, None], dim=2)
+    cosine = (towards * surveyed.normal[:, None]).sum(2)
+    # Pixels of the silhouette are left out: in between the views there may or may not see a point
+    for least, sign in ((MIN_COSINE, 1), (0.5, -1)):
+        seen = cosine > least
+        straight = (seen * cosine.square()).sum(1)
+        assert (sign * (seen.sum(1) - surveyed.views) >= 0).all()
+        assert (sign * (straight - surveyed.straight) >= -0.05).all()  # normals are the grid's
+    assert surveyed.visibility.min() > 0.97
+    assert surveyed.spread.min() > 20
+    assert not surveyed.black.any()
+
+
+def test_doubt_is_where_the_photographs_differ(scene, surveyed):
+    """The sphere is red on one side, as the scene has it everywhere, and blue on the other."""
+    red, blue = surveyed.position[:, 0] > 0.1, surveyed.position[:, 0] < -0.1
+    assert surveyed.disagreement[red].mean() < 0.02
+    assert surveyed.disagreement[blue].mean() > 0.1
+    assert surveyed.albedo[blue].mean() > surveyed.albedo[red].mean() + 0.2
+    assert (surveyed.roughness >= surveyed.albedo).all()
+    assert (surveyed.roughness <= 1).all()
+
+
+def test_what_no_camera_sees_is_a_guess(scene, photos):
+    ahead = photos.cameras.camera_to_world[:, 2, 3] > 1.0
+    surveyed = survey(scene, some_views(photos, ahead), 1000)
+    below = surveyed.normal[:, 2] < -0.6
+    assert (surveyed.views[below] == 0).all()
+    assert (surveyed.albedo[below] == 1).all()
+    assert (surveyed.roughness[below] == 1).all()
+    figures = numbers(surveyed)
+    assert 0.1 < figures["unseen"] <= figures["few_views"] < 0.9
+    said = words(figures, [])
+    assert f"{figures['few_views']:.0%} of the surface is seen by fewer than 3 cameras" in said
+    one = survey(scene, some_views(photos, slice(0, 1)), 100)
+    assert (one.spread < 0.1).all()  # an arc cosine next to 1
+
+
+def test_clipped_and_black_pixels_say_nothing(scene):
+    photos = photos_of(6, 24)
+    bright = survey(scene, replace(photos, color=100 * photos.color), 200)
+    dark = survey(scene, replace(photos, color=1e-4 * photos.color), 200)
+    for surveyed, share in ((bright, bright.clipped), (dark, dark.black)):
+        seen = surveyed.views > 0
+        assert (share[seen] == 1).all()
+        assert (surveyed.straight == 0).all()
+        assert (surveyed.albedo == 1).all()
+    assert "clipped in most photographs" in words(numbers(bright), [])
+    assert "black in most photographs" in words(numbers(dark), [])
+
+
+def test_the_formula(surveyed):
+    one = torch.ones(1)
+    point = replace(
+        surveyed,
+        views=9 * one,
+        straight=task.ENOUGH_VIEWS * one,
+        visibility=one,
+        disagreement=0 * one,
+        gloss=12**0.5 * task.NOISE * one,
+    )
+    assert point.albedo.item() == pytest.approx(0.5)
+    assert point.roughness.item() == pytest.approx(1 - 0.5 * 0.5**0.5)
+    shut = replace(point, visibility=0.4 * one)
+    assert shut.albedo.item() == pytest.approx(0.8)
+    wrong = replace(point, disagreement=task.NOISE * one)
+    assert wrong.albedo.item() == pytest.approx(0.75)
+    dull = replace(point, gloss=0 * one)
+    assert dull.roughness.item() == 1
+
+
+def test_the_report_names_its_thresholds(surveyed, monkeypatch):
+    for name, value in {"FEW_VIEWS": 17, "MIN_SHARE": 0.0, "MAX_DISAGREEMENT": 0.5}.items():
+        monkeypatch.setattr(confidence, name, value)
+    figures = numbers(surveyed)
+    assert figures["few_views"] == 1.0  # there are 16 photographs
+    said = words(figures, [])
+    assert "100% of the surface is seen by fewer than 17 cameras" in said
+    assert "0% of the surface differs from its photographs by more than 0.5 in sRGB" in said
+    monkeypatch.setattr(confidence, "MIN_SHARE", 1.0)
+    assert "0% of the surface differs" not in words(figures, [])
+
+
+def test_some_observations_are_spread_over_all():
+    counts = torch.tensor([0, 3, 17])
+    offsets = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
+    nothing = torch.zeros(20, 3)
+    seen = Observations(nothing[:3], nothing[:3], offsets, nothing, nothing, offsets, nothing[:1])
+    point, observation = spread_observations(seen, 4)
+    assert point.tolist() == [1, 1, 1, 2, 2, 2, 2]
+    assert observation.tolist() == [0, 1, 2, 3, 7, 11, 15]
+
+
+def test_doubts_are_those_of_the_nearest_on_the_same_side(surveyed):
+    doubts = Doubts(surveyed)
+    exact = doubts.at(surveyed.position, surveyed.normal)
+    torch.testing.assert_close(exact[:, 0], surveyed.albedo, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(exact[:, 1], surveyed.roughness, rtol=1e-4, atol=1e-4)
+    # A sheet of no thickness, well determined above and not at all below
+    x = torch.rand(200, 2)
+    top = torch.cat([x, torch.zeros(200, 1)], 1)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(200, 3)
+    sheet = replace(
+        surveyed,
+        position=torch.cat([top, top]),
+        normal=torch.cat([up, -up]),
+        voxel_size=0.5,
+        **{
+            name: torch.cat([above * torch.ones(200), below * torch.ones(200)])
+            for name, above, below in (
+                ("views", 9, 0), ("straight", 1e6, 0.0), ("visibility", 1.0, 1.0),
+                ("disagreement", 0.0, 0.0), ("gloss", 1e3, 0.0),
+            )
+        },
+    )  # fmt: skip
+    doubts = Doubts(sheet)
+    assert doubts.at(top, up).max() < 0.01
+    assert doubts.at(top, -up).min() > 0.99
+
+
+def test_words_leave_out_what_is_not_the_case(surveyed):
+    agreeing, views = 0 * surveyed.disagreement, 9 + surveyed.views
+    still = replace(surveyed, disagreement=agreeing, views=views)
+    figures = numbers(still)
+    said = words(figures, [])
+    assert said.startswith("Doubt of albedo 0.")
+    assert "cameras" not in said
+    assert "differs" not in said
+    assert "a factor that photographs cannot fix" in said
+    assert "trouble" not in said
+    assert "trouble 2 times, the last in stage 1: b." in words(figures, ["a", "stage 1: b"])
+
+
+def test_points_lie_on_the_sphere(surveyed):
+    assert (surveyed.position.norm(dim=1) - RADIUS).abs().max() < 0.02

@@ -1,0 +1,117 @@
+"""Charts, vertex frames and texels against constructions by hand."""
+
+import math
+
+import pytest
+import torch
+from asymmetric_scene import lopsided
+
+from univoxel.core.records import Mesh
+from univoxel.output.mesh import dilated, rasterise, unwrap, vertex_normals, vertex_tangents
+from univoxel.output.topology import clean, simplify
+
+SQUARE = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
+CORNERS = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return simplify(clean(Mesh(*lopsided().field.isosurface())), 1000)
+
+
+def test_charts_keep_the_triangles_and_do_not_overlap(mesh):
+    size = 256
+    source, faces, uv = unwrap(mesh, size)
+    assert torch.equal(source[faces.long()], mesh.faces.long())
+    assert ((uv >= 0) & (uv <= 1)).all()
+    a, b, c = uv.double()[faces.long()].unbind(1)
+    area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    assert (area > -1e-9).all()  # none mirrored
+    texel, _, _ = rasterise(uv, faces, size)
+    # The area in texels that triangles have is the number of texels they own, so none own the same;
+    # one per cent for borders.
+    assert len(texel) == pytest.approx(float(area.sum()) * size * size, rel=0.01)
+    assert area.sum() > 0.4  # padding takes much of so small a texture
+
+
+def test_normals_of_a_cube_point_along_its_diagonals():
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box()
+    normals = vertex_normals(
+        Mesh(torch.tensor(box.vertices).float(), torch.tensor(box.faces).int())
+    )
+    # Weighing by angle, not by face, makes it independent of the diagonals of the squares.
+    expected = torch.tensor(box.vertices).float().sign() / math.sqrt(3)
+    torch.testing.assert_close(normals, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_tangents_of_a_turned_square(mirrored):
+    turn, _ = torch.linalg.qr(torch.tensor([[1.0, 2, 0], [0, 1, 3], [2, 0, 1]]))
+    turn = turn * turn.det().sign()
+    u, v, n = turn.T
+    flat = CORNERS * 2 - 1
+    vertices = flat[:, :1] * u + flat[:, 1:] * v
+    uv = torch.stack([1 - CORNERS[:, 0], CORNERS[:, 1]], 1) if mirrored else CORNERS
+    tangents = vertex_tangents(vertices, SQUARE, n.expand(4, 3), uv)
+    torch.testing.assert_close(tangents[:, :3], (-u if mirrored else u).expand(4, 3))
+    assert (tangents[:, 3] == (-1 if mirrored else 1)).all()
+    # +y of the frame is +v in either case
+    b = tangents[:, 3:] * torch.linalg.cross(n.expand(4, 3), tangents[:, :3])
+    torch.testing.assert_close(b, v.expand(4, 3))
+
+
+def test_tangents_are_a_frame_on_a_curved_mesh(mesh):
+    source, faces, uv = unwrap(mesh, 256)
+    normals = vertex_normals(mesh)[source]
+    tangents = vertex_tangents(mesh.vertices[source], faces, normals, uv)
+    torch.testing.assert_close(tangents[:, :3].norm(dim=1), torch.ones(len(uv)))
+    assert (tangents[:, :3] * normals).sum(1).abs().max() < 1e-5
+    # Along a triangle's edges the texture's u grows as they go along its corners' tangents.
+    corner, flat = mesh.vertices[source][faces.long()], uv[faces.long()]
+    edge, du = corner[:, 1] - corner[:, 0], (flat[:, 1] - flat[:, 0])
+    cosine = torch.nn.functional.cosine_similarity(edge, tangents[faces[:, 0].long(), :3])
+    steep = (du[:, 0].abs() > 3 * du[:, 1].abs()) & (du[:, 0].abs() > 0.01)
+    assert steep.sum() > 30
+    assert (cosine.sign() == du[:, 0].sign())[steep].float().mean() > 0.99
+
+
+def test_a_face_without_texture_still_has_a_frame():
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    normal = torch.tensor([0.0, 0, 1]).expand(4, 3)
+    tangents = vertex_tangents(vertices, SQUARE, normal, torch.full((4, 2), 0.5))
+    torch.testing.assert_close(tangents[:, :3].norm(dim=1), torch.ones(4))
+    assert (tangents[:, 2] == 0).all()
+    assert (tangents[:, 3] == 1).all()
+
+
+def test_texels_of_a_square(monkeypatch):
+    monkeypatch.setattr("univoxel.output.mesh.CANDIDATES", 100)  # several chunks
+    size = 16
+    uv = torch.cat([CORNERS * 0.5, CORNERS * 0.5 + 0.5])  # lower left and upper right quarter
+    faces = torch.cat([SQUARE, SQUARE + 4])
+    texel, face, weight = rasterise(uv, faces, size)
+    row, column = texel // size, texel % size
+    expected = torch.zeros(size, size, dtype=torch.bool)
+    expected[8:, :8] = expected[:8, 8:] = True
+    assert torch.equal(texel, expected.reshape(-1).nonzero()[:, 0])
+    point = torch.einsum("kc,kcd->kd", weight, uv[faces[face].long()])
+    torch.testing.assert_close(point[:, 0], (column + 0.5) / size)
+    torch.testing.assert_close(point[:, 1], 1 - (row + 0.5) / size)
+    assert (weight >= -1e-6).all()
+
+
+def test_thin_and_outer_triangles_hold_no_texel():
+    uv = torch.tensor(
+        [[0.1, 0.1], [0.9, 0.1], [0.5, 0.1], [0.26, 0.26], [0.27, 0.26], [0.26, 0.27]]
+    )
+    faces = torch.tensor([[0, 1, 2], [3, 4, 5]], dtype=torch.int32)
+    assert len(rasterise(uv, faces, 4)[0]) == 0
+
+
+def test_the_background_takes_the_nearest_texel():
+    size = 5
+    place = dilated(torch.tensor([0, 24]), size)  # two opposite corners
+    row, column = torch.meshgrid(torch.arange(5), torch.arange(5), indexing="ij")
+    assert (place[row + column < 4] == 0).all()
+    assert (place[row + column > 4] == 1).all()

@@ -1,0 +1,169 @@
+"""Newton's method for the map, on points of a sphere whose truth is known."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic import scene_of
+from observed_points import (
+    lamps,
+    no_metal,
+    photographed,
+    problem_on_a_sphere,
+    random_problem,
+)
+
+from univoxel import brdf
+from univoxel.config import JointConfig
+from univoxel.render.observations import MaterialLabels, prefiltered_roughness
+from univoxel.training import newton
+from univoxel.training.newton import (
+    MAX_ALBEDO_CHANGE,
+    MAX_ROUGHNESS_CHANGE,
+    NewtonPoints,
+    NewtonRound,
+    newton_round_,
+)
+
+CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
+
+
+def test_newton_recovers_a_known_map():
+    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
+    scene = scene_of(albedo, roughness, nodes)
+    problem = problem_on_a_sphere(400, 12, nodes, scene)
+    torch.manual_seed(2)
+    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
+    shown = prefiltered_roughness(torch.full((400,), roughness), nodes)  # a node is a patch of sky
+    problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
+    costs = newton_round_(scene, problem, no_metal(problem), CFG).costs
+    costs += newton_round_(scene, problem, no_metal(problem), CFG).costs
+    assert len(costs) == 2 * CFG.newton_steps
+    error = scene.sky.log_radiance.detach() - true.log()
+    assert costs[-1] < 1e-3 * costs[0]
+    # What is left is the smoothness, which this uneven map has none of
+    assert error.abs().mean() < 0.25 * true.log().abs().mean()
+
+
+def test_newton_finds_the_map_under_a_roughness_that_is_wrong():
+    """Where roughness may change, the map is right; where it stays, the map takes the error on."""
+    errors = []
+    for free in (0.0, CFG.newton_roughness):
+        nodes, albedo = 64, torch.tensor([0.5, 0.4, 0.3])
+        scene = scene_of(tuple(albedo.tolist()), 0.45, nodes)
+        problem = problem_on_a_sphere(400, 12, nodes, scene)
+        shown = prefiltered_roughness(torch.full((400,), 0.3), nodes)
+        problem = photographed(problem, lamps(nodes), albedo.expand(400, 3), shown)
+        for _ in range(2):
+            cfg = replace(CFG, newton_roughness=free)
+            newton_round_(scene, problem, no_metal(problem), cfg)
+        errors.append((scene.sky.log_radiance.detach() - lamps(nodes).log()).abs().mean())
+    assert errors[1] < 0.5 * errors[0]  # not all: roughness has a pull to where it was
+
+
+@pytest.mark.parametrize("views", [2, 3])
+def test_newton_learns_from_few_photographs(views):
+    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
+    scene = scene_of(albedo, roughness, nodes)
+    problem = problem_on_a_sphere(400, views, nodes, scene)
+    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
+    shown = prefiltered_roughness(torch.full((400,), roughness), nodes)
+    problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
+    costs = newton_round_(scene, problem, no_metal(problem), CFG).costs
+    assert len(costs) == CFG.newton_steps
+    assert costs[-1] < 0.1 * costs[0]
+
+
+def test_newton_in_no_time_takes_few_points(monkeypatch):
+    scene, counts = scene_of((0.5, 0.4, 0.3), 0.4, 32), []
+    problem = problem_on_a_sphere(100, 12, 32, scene)
+    equations = newton.normal_equations
+
+    def counted(transport, *arguments):
+        counts.append(len(transport.diffuse))
+        return equations(transport, *arguments)
+
+    monkeypatch.setattr(newton, "normal_equations", counted)
+    monkeypatch.setattr(newton, "NEWTON_CHUNK", 20)
+    cfg = replace(CFG, newton_steps=2)
+    newton_round_(scene, problem, no_metal(problem), cfg, seconds=0.0)
+    assert counts == [20] * (1 + cfg.newton_steps * newton.MIN_PARTS)  # one to measure
+    counts.clear()
+    newton_round_(scene, problem, no_metal(problem), cfg, seconds=1e3)
+    assert counts == [20] * (1 + cfg.newton_steps * 5)
+
+
+def test_no_steps_of_newton_leave_the_map():
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
+    problem = problem_on_a_sphere(20, 8, 32, scene)
+    cfg = replace(CFG, newton_steps=0)
+    assert newton_round_(scene, problem, no_metal(problem), cfg, seconds=10.0) == NewtonRound()
+    assert (scene.sky.log_radiance == 0).all()
+
+
+def test_newton_without_rich_points_leaves_the_map():
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
+    problem = problem_on_a_sphere(
+        20, 1, 32, scene
+    )  # of one observation the albedo explains everything
+    assert newton_round_(scene, problem, no_metal(problem), CFG) == NewtonRound()
+    assert (scene.sky.log_radiance == 0).all()
+
+
+def test_parts_are_of_one_material(monkeypatch):
+    monkeypatch.setattr(newton, "NEWTON_CHUNK", 4)
+    point, metal = torch.randperm(30)[:22], torch.arange(30) % 3 == 0
+    order, parts = newton.in_parts(point, metal)
+    assert sorted(order.tolist()) == sorted(point.tolist())
+    assert torch.equal(torch.cat(parts), torch.arange(22))
+    for part in parts:
+        assert 1 <= len(part) <= 4
+        assert len(metal[order[part]].unique()) == 1
+
+
+def test_metals_show_the_map():
+    """Half of a sphere in copper: light is found, whose colour is not that of the metal."""
+    nodes, count = 64, 600
+    base, roughness = torch.tensor([0.9, 0.6, 0.4]), 0.3
+    scene = scene_of(tuple(base.tolist()), roughness, nodes)
+    problem = problem_on_a_sphere(count, 12, nodes, scene)
+    metal = problem.observations.normal[:, 0] > 0
+    torch.manual_seed(2)
+    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
+    shown = prefiltered_roughness(torch.full((count,), roughness), nodes)
+    diffuse, f0 = brdf.split(base.expand(count, 3), metal.float())
+    problem = photographed(problem, true, diffuse, shown, f0)
+    costs = newton_round_(scene, problem, MaterialLabels(metal), CFG).costs
+    costs += newton_round_(scene, problem, MaterialLabels(metal), CFG).costs
+    assert costs[-1] < 1e-3 * costs[0]
+    error = scene.sky.log_radiance.detach() - true.log()
+    # What is left is the smoothness, as above
+    assert error.abs().mean() < 0.25 * true.log().abs().mean()
+
+
+def test_newton_starts_from_the_albedo_that_it_is_given():
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+    problem = random_problem(50, scene=scene)
+    cfg = replace(CFG, newton_points=20, newton_views=2)
+    albedo = torch.rand(50, 3)
+    nothing, given = no_metal(problem), replace(no_metal(problem), albedo=albedo)
+    points = newton.choose_points(scene, problem, given, cfg)
+    torch.testing.assert_close(points.log_albedo, albedo[points.point].clamp_min(1e-3).log())
+    torch.testing.assert_close(
+        newton.choose_points(scene, problem, nothing, cfg).log_albedo,
+        torch.full((20, 3), 0.5).log(),
+    )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_step_changes_a_point_by_no_more_than_so_much(sign):
+    class Far:
+        def back_substituted(self, _):
+            return torch.full((5, 3), 9.0 * sign), torch.full((5,), 9.0 * sign)
+
+    nothing, of_all = torch.zeros(5, dtype=torch.int64), [torch.arange(5)]
+    numbers = torch.full((5, 3), -2.0), torch.full((5,), 0.5), torch.full((5,), 0.5)
+    points = NewtonPoints(None, nothing.bool(), nothing, nothing[:, None], of_all, *numbers, 1.0)
+    points.step_([Far()], torch.zeros(3, 1))
+    assert torch.equal(points.log_albedo, numbers[0] + sign * MAX_ALBEDO_CHANGE)
+    assert torch.equal(points.roughness, numbers[1] + sign * MAX_ROUGHNESS_CHANGE)

@@ -1,1 +1,0 @@
-"""Meshes with textures for other programs."""

@@ -1,0 +1,389 @@
+"""Objects cut out of photographs without masks, and their masks to look through."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import shutil
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from univoxel.camera import resize
+from univoxel.capture.masks import BESIDE, MISSING, Verdict, iou, judge, network, voxel_pixels
+from univoxel.color import linear_to_srgb
+from univoxel.core.choices import DEPTH, REMBG
+from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph, write_html
+from univoxel.core.progress_bar import track
+from univoxel.data import Photos, load_photos, splits_of
+from univoxel.data.images import write_exr, write_png
+from univoxel.data.transforms import write_cameras
+from univoxel.errors import DataError, ExistingFile
+from univoxel.preparation.hull import mask_distances
+from univoxel.preparation.object_shape import ObjectShape, find_object, shrunk, silhouettes
+from univoxel.preparation.standing_object import masks_by_depth
+from univoxel.preparation.stereo import DepthMaps, depth_maps, small_cameras
+
+TILE = 240  # pixels of the longer side
+GAP, LABEL = 6, 34  # pixels
+COLUMNS = 6  # tiles in a row of the picture, at most
+DARK = 0.25  # of the light is left outside of a mask
+
+_STYLE = f"""{DARK_STYLE}
+main {{ display: flex; flex-wrap: wrap; gap: 16px }}
+figure {{ margin: 0 }}
+figure.wrong figcaption {{ color: #ffb347 }}"""
+
+
+@dataclass(frozen=True)
+class MaskTile:
+    """A photograph and its mask."""
+
+    name: str
+    agreement: float | None  # IoU with the silhouette that the others vote for; None: no vote
+    fault: str  # what is wrong with the mask, or nothing
+    before: Tensor  # [h, w, 3] in [0, 1], from `darkened`
+    after: Tensor | None  # the same with the mended mask
+
+
+def darkened(photograph: Tensor, mask: Tensor) -> Tensor:
+    """A small picture [h, w, 3] in [0, 1] of a photograph [H, W, 3], dark outside its mask [H, W].
+
+    Args:
+        photograph: sRGB, uint8 or in [0, 1].
+    """
+    scale = 1 if photograph.is_floating_point() else 255
+    picture = torch.cat([photograph.float() / scale, mask[..., None]], -1).permute(2, 0, 1)
+    share = min(1.0, TILE / max(mask.shape))
+    height, width = (max(1, round(share * n)) for n in mask.shape)
+    small = interpolate(picture[None], (height, width), mode="area")[0].permute(1, 2, 0)
+    return small[..., :3].clamp(0, 1) * (DARK + (1 - DARK) * small[..., 3:])
+
+
+def worst_first(tiles: Sequence[MaskTile]) -> list[MaskTile]:
+    """Those with a fault first, then by how little they agree, then by name."""
+    return sorted(tiles, key=lambda t: (not t.fault, t.agreement or 0.0, t.name))
+
+
+def mask_sheet(tiles: Sequence[MaskTile]) -> np.ndarray:
+    """All of them in rows, in their order, before and after beside each other: [H, W, 3] uint8.
+
+    Raises:
+        ValueError: there are none.
+    """
+    if not tiles:
+        raise ValueError("mask_sheet: expected photographs, got none")
+    pictures = [
+        (tile, picture)
+        for tile in tiles
+        for picture in (tile.before, tile.after)
+        if picture is not None
+    ]
+    columns = min(COLUMNS, len(pictures))
+    width = max(picture.shape[1] for _, picture in pictures)
+    width = max(width, TILE) + GAP  # the words need their room
+    height = max(picture.shape[0] for _, picture in pictures) + LABEL + GAP
+    rows = -(-len(pictures) // columns)
+    sheet = Image.new("RGB", (columns * width, rows * height), (32, 32, 32))
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
+    for k, (tile, picture) in enumerate(pictures):
+        x, y = k % columns * width, k // columns * height
+        after = picture is tile.after
+        colour = "orange" if tile.fault and not after else "white"
+        words = "mended" if after else tile.fault
+        draw.text((x + 2, y + 1), f"{tile.name}{_number(tile)}", colour, font)
+        draw.text((x + 2, y + 16), words, colour, font)
+        sheet.paste(Image.fromarray(_as_bytes(picture)), (x, y + LABEL))
+    return np.asarray(sheet)
+
+
+def write_page(path: Path, tiles: Sequence[MaskTile], about: str) -> None:
+    """A page that holds its pictures and needs no other file.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    figures = []
+    for tile in tiles:
+        words = escape(f"{tile.name}{_number(tile)} {tile.fault}")
+        images = [image(picture) for picture in (tile.before, tile.after) if picture is not None]
+        kind = ' class="wrong"' if tile.fault else ""
+        mended = "" if tile.after is None else "; mended on the right"
+        caption = f"<figcaption>{words}{mended}</figcaption>"
+        figures.append(f"<figure{kind}>{''.join(images)}{caption}</figure>")
+    main = "\n".join(["<main>", *figures, "</main>"])
+    body = f"<h1>Masks</h1>\n{paragraph(about)}\n{main}"
+    write_html(path, document("masks", _STYLE, body))
+
+
+def _number(tile: MaskTile) -> str:
+    return "" if tile.agreement is None else f"  {tile.agreement:.2f}"
+
+
+def _as_bytes(picture: Tensor) -> np.ndarray:
+    return (picture.numpy() * 255 + 0.5).astype(np.uint8)
+
+
+# Cut an object out of photographs without masks.
+#
+# Masks come from a network, from a folder, or from the depth that the photographs show, alone.
+# Masks and depth tell the object in 3D, and masks that its silhouettes contradict are repaired.
+
+
+# Photographs at least, for a vote; fewer do not outvote one another
+PHOTOGRAPHS = 12
+# Voxels along a side of the grid whose silhouettes are masks themselves, and pixels that they are
+# wide at most
+FINE, WIDTH = 128, 500
+# Share of the object's surface that depth has to show for it to be believed against most masks
+SURE = 0.5
+
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+NAMED = 5  # photographs in a message, at most
+Masks = dict[str, list[Tensor]]  # [H, W] uint8 of each photograph of each split
+
+
+def cutout(
+    data: str | Path,
+    out: str | Path,
+    source: str | Path = REMBG,
+    downscale: int = 0,
+    allow_outside: bool = False,
+) -> Path:
+    """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
+
+    All splits are written, in the layout of NeRF-synthetic scenes, without lens distortion, beside
+    masks.png and masks.html, which show the masks, worst first. The object is found from the
+    training photographs alone.
+
+    Args:
+        out: folder to write.
+        source: where masks come from: rembg, from a network; none, from depth alone, of what
+            stands out from its support in the middle; else a folder of masks.
+        downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
+        allow_outside: as of `load_photos`.
+
+    Raises:
+        DataError: photographs or masks that cannot be used, or nothing stands out in depth.
+        ExistingFile: out is there already.
+        MissingExtra: there is no network.
+        UserError: the masks have nothing in common.
+        OSError: a file cannot be written.
+    """
+    data, out, origin = Path(data), Path(out), str(source)
+    if out.exists():
+        raise ExistingFile(f"{out} is there already: choose another out", "out")
+    masked = network() if origin == REMBG else None
+    load = functools.partial(load_photos, data, allow_outside=allow_outside)
+    photos = load("train", downscale, masks=False)
+    splits = {
+        name: photos if name == "train" else load(name, photos.downscale, masks=False)
+        for name in splits_of(data)
+    }
+    log.info(photos.about)
+    if masked:
+        masks = _from_network(splits, masked)
+    elif origin == DEPTH:
+        masks = _from_depth(splits, depth_maps(photos))
+    else:  # of shrunk photographs those with masks are black outside of them
+        masks = _as_read({n: load(n, photos.downscale, masks=Path(origin)) for n in splits})
+    if origin == DEPTH:  # silhouettes have nothing to say against themselves
+        verdicts, told = _as_they_are(masks), "masks of the object that stands out in depth"
+    else:
+        verdicts, told = _judged(splits, masks)
+    _write(out, splits, masks, verdicts, told)
+    return out
+
+
+def _from_depth(splits: dict[str, Photos], maps: DepthMaps) -> Masks:
+    """Masks of what stands out in depth."""
+    small = masks_by_depth(maps)
+    if small is None:
+        raise DataError(
+            f"{splits['train'].folder}: no object that stands out in depth was found; it needs "
+            f"texture, and cameras all around: expected source={REMBG} or a folder of masks, got "
+            f"{DEPTH}",
+            "source",
+        )
+    shape = find_object(small, maps, FINE)
+    log.info("masks: of the object that stands out in depth; look at masks.html")
+    return {name: _silhouettes_of(shape, split) for name, split in splits.items()}
+
+
+def _silhouettes_of(shape: ObjectShape, photos: Photos) -> list[Tensor]:
+    """The object's silhouettes as masks of photographs, their edges a pixel soft."""
+    width = min(photos.cameras.width, WIDTH)
+    found = []
+    for view, shown in enumerate(silhouettes(shape, resize(photos.cameras, width))):
+        size = photos.cameras.size(view)[::-1]
+        away = mask_distances(shown.float()[None]) * (size[1] / shown.shape[1])
+        fine = interpolate(away[None], size, mode="bilinear")[0, 0]
+        found.append(_bytes((0.5 - fine).clamp(0, 1)))
+    return found
+
+
+def _from_network(splits: dict[str, Photos], masked: Callable[[Tensor], Tensor]) -> Masks:
+    return _of_all(splits, lambda split, view: masked(_encoded(split, view)))
+
+
+def _of_all(splits: dict[str, Photos], masked: Callable[[Photos, int], Tensor]) -> Masks:
+    """Masks of all photographs, of each by its split and number."""
+    return {
+        name: [_bytes(masked(split, view)) for view in track(range(len(split)), "masks")]
+        for name, split in splits.items()
+    }
+
+
+def _as_read(splits: dict[str, Photos]) -> Masks:
+    return {
+        name: [_bytes(split.picture(view)[1]) for view in range(len(split))]
+        for name, split in splits.items()
+    }
+
+
+def _as_they_are(masks: Masks) -> dict[str, list[Verdict]]:
+    return {name: [Verdict(None, "", mask) for mask in those] for name, those in masks.items()}
+
+
+def _judged(splits: dict[str, Photos], masks: Masks) -> tuple[dict[str, list[Verdict]], str]:
+    """What the object's silhouettes say about each mask, repaired if it may be, and what to tell
+    people.
+
+    Raises:
+        DataError: a mask shows nothing, and there are too few for a vote.
+        UserError: the masks have nothing in common.
+    """
+    train, count = splits["train"], len(splits["train"])
+    if count < PHOTOGRAPHS:
+        for name, split in splits.items():
+            for stem, one in zip(split.names, masks[name], strict=True):
+                if not bool((one >= 128).any()):
+                    raise DataError(f"{split.folder}: the mask of {stem} shows nothing")
+        log.warning(
+            "masks are taken as they are: a vote needs %d photographs, there are %d",
+            *(PHOTOGRAPHS, count),
+        )
+        return _as_they_are(masks), "too few photographs for a vote: masks as they came"
+    coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
+    shape = find_object(coverage["train"], depth_maps(train))
+    shown = {n: list(silhouettes(shape, small_cameras(s.cameras))) for n, s in splits.items()}
+    agreements = [
+        iou(shrunk(mask, one.shape[1], one.shape[0]) >= 0.5, one)
+        for mask, one in zip(coverage["train"], shown["train"], strict=True)
+    ]
+    usual = statistics.median(agreements)
+    verdicts = {}
+    for name, split in splits.items():
+        cameras = small_cameras(split.cameras)
+        verdicts[name] = []
+        for view, mask in enumerate(track(coverage[name], "repairing masks")):
+            voxel = voxel_pixels(shape.grid, cameras, view)
+            found = judge(mask, shown[name][view], usual, voxel)
+            kept = masks[name][view] if not found.fault else _bytes(found.mask)
+            verdicts[name].append(replace(found, mask=kept))
+    wrong = sum(bool(v.fault) for v in verdicts["train"])
+    told = _told(splits, verdicts, usual)
+    if 2 * wrong > count and shape.surface < SURE:
+        told += ": none is repaired, as it may be the object's shape that is wrong"
+        log.warning(
+            f"{told}. The masks keep or miss the same everywhere, or the cameras are wrong; "
+            "look at masks.html",
+        )
+        for name, those in verdicts.items():
+            kept = zip(those, masks[name], strict=True)
+            verdicts[name] = [replace(verdict, mask=one) for verdict, one in kept]
+        return verdicts, told
+    if any(v.fault for those in verdicts.values() for v in those):
+        told += ": repaired from the other photographs; look at masks.html"
+    log.info(told)
+    return verdicts, told
+
+
+def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: float) -> str:
+    """How many masks agree with the object's silhouettes, and what is wrong with the others."""
+    faults: dict[str, list[str]] = {BESIDE: [], MISSING: []}
+    count = 0
+    for name, split in splits.items():
+        count += len(split)
+        for stem, verdict in zip(split.names, verdicts[name], strict=True):
+            if verdict.fault:
+                faults[verdict.fault].append(stem)
+    wrong = sum(map(len, faults.values()))
+    told = f"masks: {count - wrong} of {count} agree with the object's silhouette ({usual:.2f})"
+    if not wrong:
+        return told
+    parts = []
+    for stems, words in (
+        (faults[BESIDE], "keep something beside the object"),
+        (faults[MISSING], "miss a part"),
+    ):
+        if stems:
+            more = ", ..." if len(stems) > NAMED else ""
+            parts.append(f"{len(stems)} {words} ({', '.join(stems[:NAMED])}{more})")
+    return f"{told}; {wrong} do not: {', '.join(parts)}"
+
+
+def _write(
+    out: Path,
+    splits: dict[str, Photos],
+    masks: Masks,
+    verdicts: dict[str, list[Verdict]],
+    told: str,
+) -> None:
+    """The folder, whole or not at all: photographs, cameras, and the sheet of masks."""
+    # Nothing half-written goes by the name of out
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    tiles = []
+    for name, split in splits.items():
+        (partial / name).mkdir(parents=True)
+        for view in track(range(len(split)), f"writing {name}"):
+            before, verdict, stem = masks[name][view], verdicts[name][view], split.names[view]
+            write_photo(partial / name / stem, split, view, verdict.mask.float() / 255)
+            photograph = _encoded(split, view)
+            mended = not torch.equal(before, verdict.mask)
+            tiles.append(
+                MaskTile(
+                    name=f"{name}/{stem}",
+                    agreement=verdict.agreement,
+                    fault=verdict.fault,
+                    before=darkened(photograph, before.float() / 255),
+                    after=darkened(photograph, verdict.mask.float() / 255) if mended else None,
+                )
+            )
+        write_cameras(partial, name, split.cameras, split.names)
+    tiles = worst_first(tiles)
+    write_png(partial / "masks.png", mask_sheet(tiles))
+    write_page(partial / "masks.html", tiles, told)
+    partial.rename(out)
+
+
+def _encoded(photos: Photos, view: int) -> Tensor:
+    """A photograph [H, W, 3] uint8, sRGB."""
+    color, _ = photos.stored(view)
+    return color if color.dtype == torch.uint8 else _bytes(linear_to_srgb(color).clamp(0, 1))
+
+
+def _bytes(values: Tensor) -> Tensor:
+    """Values in [0, 1] as uint8."""
+    return (255 * values).round().to(torch.uint8)
+
+
+def write_photo(stem: Path, photos: Photos, view: int, alpha: Tensor) -> None:
+    """Write a photograph as STEM.png, or STEM.exr where it is linear, with that alpha."""
+    color, _ = photos.stored(view)
+    if color.dtype == torch.uint8:
+        rgba = torch.cat([color, torch.round(255 * alpha)[..., None].byte()], -1)
+        write_png(stem.with_name(f"{stem.name}.png"), rgba)
+    else:
+        planes = {c: color[..., i] * alpha for i, c in enumerate("RGB")}
+        write_exr(stem.with_name(f"{stem.name}.exr"), {**planes, "A": alpha})

@@ -1,0 +1,315 @@
+"""Photographs in, a scene out: what training does, in order."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from univoxel.config import (
+    PREPARATION,
+    JointConfig,
+    StageConfig,
+    TrainConfig,
+    check_same,
+    save_config,
+)
+from univoxel.core import memmap
+from univoxel.core.files import replacing
+from univoxel.data import Photos, keep_photos, load_photos
+from univoxel.errors import Cancelled, ExistingFile, UserError
+from univoxel.evaluation.confidence import REPORT_POINTS, Survey, numbers, survey, words
+from univoxel.fields.grid import fit_grid
+from univoxel.ops import native
+from univoxel.output.timelapse import Timelapse
+from univoxel.preparation.hull_constraint import PinnedHull
+from univoxel.preparation.prepare import find_silhouettes, pinned_in, prepare
+from univoxel.render.pictures import preview
+from univoxel.render.pipeline import surface_at
+from univoxel.run import FILE as VERDICT
+from univoxel.run import Evidence, Verdict, judge, kept_photos, save_verdict
+from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
+from univoxel.training import compression
+from univoxel.training import joint_solve as joint_stage
+from univoxel.training.clock import LEAST, RESERVE_SECONDS, Clock
+from univoxel.training.init_scene import build_scene
+from univoxel.training.loop import batch_at, fit_sharpness_, held_out_psnr, run_stage
+from univoxel.training.pixels import TrainingPixels, check_memory, split_pixels
+from univoxel.training.probe import slowdown
+from univoxel.training.progress import LOG, Progress, TrainingProgress, chosen_reach
+
+if TYPE_CHECKING:
+    from univoxel.viewer.training import Spectators
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+# Of preparation, a million pixels that are trained on, on two quiet cores of a Xeon
+PREPARATION_SECONDS = 1.0
+
+
+def train(
+    cfg: TrainConfig,
+    resume: bool = False,
+    timelapse: str | Path | None = None,
+    on_progress: Callable[[TrainingProgress], None] | None = None,
+    view: tuple[str, int] | None = None,
+) -> Path:
+    """Train a scene; leave model, log, preview, configuration, verdict.json and trust.txt in
+    cfg.out; return it.
+
+    Args:
+        resume, timelapse, on_progress, view: as of `univoxel.train`. Where there is no checkpoint
+            to resume from, training begins; making pictures does not count as time.
+
+    Raises:
+        MissingExtra: view without viser.
+        MissingNative: the compiled extension is missing or was built without Embree.
+        DataError: input that cannot be used.
+        ExistingFile: cfg.out holds a run already and resume is False.
+        OSError: a file of the run cannot be written; what was there before stays.
+        UserError: with resume, the checkpoint cannot be read, or it belongs to another
+            configuration; or training needs more memory than there is; or the port is taken.
+    """
+    if not native.reference_asked():
+        native.require_embree("train")  # now, and not minutes later
+    film = None if timelapse is None else Timelapse(timelapse, cfg)
+    if view is None:
+        with memmap.large_arrays_in(cfg.out):
+            return _train(cfg, resume, film, None, on_progress)
+    from univoxel.viewer.training import watched
+
+    with watched(*view, cfg.out.resolve().name) as spectators, memmap.large_arrays_in(cfg.out):
+        log.info(f"to look at while it trains, in a browser: {spectators.address}")
+        return _train(cfg, resume, film, spectators, on_progress)
+
+
+def _train(
+    cfg: TrainConfig,
+    resume: bool,
+    film: Timelapse | None,
+    spectators: Spectators | None,
+    on_progress: Callable[[TrainingProgress], None] | None,
+) -> Path:
+    """`train`, with those who look at it between steps."""
+    begin = time.monotonic()
+    torch.manual_seed(cfg.seed)
+    if not resume and (cfg.out / FILE).exists():
+        raise ExistingFile(
+            f"{cfg.out} holds a run already: pass resume or another out", "resume", "out"
+        )
+    kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
+    photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
+    cfg = replace(cfg, downscale=photos.downscale)
+    log.info(photos.about)
+    check_memory(photos, cfg)
+    begun = resumed(cfg) if resume else None
+    state = begun[1] if begun else {}
+    (cfg.out / VERDICT).unlink(missing_ok=True)  # of a run that goes on
+
+    begin -= state.get("seconds", 0.0)
+    told = _told(spectators, on_progress)
+    with Progress(cfg, begin, state, told, slowdown(cfg)) as progress:
+        announce(progress, photos)
+        silhouettes = find_silhouettes(photos, cfg, progress.preparing)
+        pixels = split_pixels(silhouettes.photos, silhouettes.distance, silhouettes.doubted)
+        pixels = replace(pixels, edges_given=silhouettes.edges_given)
+        limited = compression.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
+        if begun:
+            scene = begun[0]
+            pinned = pinned_in(silhouettes, scene, limited, progress.preparing)
+        else:
+            prepared = prepare(silhouettes, limited, progress.preparing)
+            scene, pinned = build_scene(prepared, limited), prepared.pinned
+        cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what fails
+        if not state:  # of a run that was killed before anything was saved
+            (cfg.out / LOG).unlink(missing_ok=True)
+        save_config(cfg)
+        keep_photos(photos, kept)
+        if spectators:
+            spectators.show(pixels.photos)
+        progress.prepared()
+        progress.clock.watch = _between_steps(scene, progress.clock, film, spectators)
+        try:
+            for index in range(progress.clock.stage, len(cfg.stages)):
+                make_stage_(scene, limited, index, silhouettes.box, pinned, pixels, progress)
+        except Cancelled:
+            save_scene(scene, cfg.out, progress.state())
+            raise
+        if film:
+            film.finish(scene, progress.clock)
+    surveyed = trusted(scene, pixels.photos)
+    verdict = judge(evidence(scene, pixels, progress, surveyed))
+    save_verdict(verdict, cfg.out)
+    save_trust(verdict, surveyed, progress.troubles, cfg)
+    for choice in progress.chosen:
+        log.info(choice.sentence)
+    return cfg.out
+
+
+def resumed(cfg: TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
+    """The scene that a run goes on with, and its state; None where nothing was saved yet.
+
+    Raises:
+        UserError: the checkpoint cannot be read, or it belongs to another configuration.
+    """
+    if not (cfg.out / FILE).is_file():
+        log.info(f"nothing was saved in {cfg.out} yet: training begins")
+        return None
+    scene, state = load_checkpoint(cfg.out)
+    check_same(cfg)
+    return scene, state
+
+
+def announce(progress: Progress, photos: Photos) -> None:
+    """Say how long all will take on this machine, and what a limit leaves out."""
+    clock, cfg = progress.clock, progress.cfg
+    pixels = len(photos) * photos.cameras.width * photos.cameras.height / 1e6
+    before = clock.seconds + PREPARATION_SECONDS * progress.slower * pixels
+    whole = before + clock.planned + RESERVE_SECONDS
+    size = photos.downscale**2 * pixels / len(photos)
+    what = f"{len(photos)} photographs of {size:.2g} MP"
+    clock.preparation = min(before, PREPARATION * clock.limit)
+    if whole <= clock.limit:
+        log.info(f"{what}: about {duration(whole)} on this machine")
+        return
+    fits = max(clock.limit - clock.preparation - RESERVE_SECONDS, 0.0) / clock.planned
+    said = f"{what}: about {duration(whole)} on this machine; minutes={cfg.minutes:g} are enough "
+    said += f"for about {fits:.0%} of the steps"
+    if fits < LEAST:
+        said += f", minutes={math.ceil(whole / 60)} for all of them"
+    log.info(said, extra={"arguments": ("minutes",)})
+
+
+def duration(seconds: float) -> str:
+    """A duration for people: tens of seconds, or minutes."""
+    return f"{10 * math.ceil(seconds / 10)} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+
+
+def evidence(
+    scene: Scene, pixels: TrainingPixels, progress: Progress, surveyed: Survey | None
+) -> Evidence:
+    """What the verdict on a training rests on."""
+    clock, held_out = progress.clock, pixels.held_out
+    batch = batch_at(scene.registered(pixels.photos), held_out)
+    with torch.no_grad():
+        surface = surface_at(scene, batch.rays)
+    wrong = (surface.opacity - batch.alpha).abs() > 0.5
+    shares = numbers(surveyed) if surveyed else {}
+    return Evidence(
+        steps=clock.short(),
+        stopped=clock.finished,
+        minutes=clock.minutes_for_all(),
+        limit=progress.cfg.minutes,
+        psnr=held_out_psnr(scene, pixels.photos, held_out, physical=True),
+        outline=wrong.float().mean().item(),
+        hidden=shares.get("few_views"),
+        residual=shares.get("disagreeing"),
+        troubles=len(progress.troubles),
+    )
+
+
+def _told(
+    spectators: Spectators | None, on_progress: Callable[[TrainingProgress], None] | None
+) -> Callable[[TrainingProgress], None] | None:
+    """What takes the reports of a training."""
+    if spectators is None:
+        return on_progress
+
+    def told(now: TrainingProgress) -> None:
+        spectators.tell(now)
+        if on_progress is not None:
+            on_progress(now)
+
+    return told
+
+
+def _between_steps(
+    scene: Scene, clock: Clock, film: Timelapse | None, spectators: Spectators | None
+) -> Callable[[], None] | None:
+    """What is done between steps, off the clock."""
+    if film is None and spectators is None:
+        return None
+
+    def between() -> None:
+        if film:
+            film.take_frame(scene, clock)
+        if spectators:
+            spectators.look(scene, clock)
+
+    return between
+
+
+def make_stage_(
+    scene: Scene,
+    cfg: TrainConfig,
+    index: int,
+    box: tuple[torch.Tensor, torch.Tensor],
+    pinned: PinnedHull | None,
+    pixels: TrainingPixels,
+    progress: Progress,
+) -> None:
+    """Run a stage on the scene, fit the model to what comes after it, and save both.
+
+    Args:
+        box: corners [3], [3] of the grids.
+        pinned: where the surface stays; None: nowhere.
+    """
+    stage, photos = cfg.stages[index], pixels.photos
+    if isinstance(stage, StageConfig):
+        bring_to_grid_(scene, stage, box, progress)
+    if pinned is not None:
+        pinned.pin_(scene.field)
+    if isinstance(stage, JointConfig):
+        rows = compression.sky_rows(stage.mirror.rows, cfg.budget_mb)
+        stage = replace(stage, mirror=replace(stage.mirror, rows=rows))
+        joint_stage.solve(scene, scene.registered(photos), stage, cfg.seed, progress)
+    else:
+        if cfg.capacity == "adaptive":
+            stage = compression.on_grid(stage, box, scene.field.voxel_size)
+        run_stage(scene, cfg, stage, pixels, progress)
+    last = index + 1 == len(cfg.stages)
+    if last:
+        fit_sharpness_(scene, pixels)
+    if cfg.capacity == "adaptive" and (last or not progress.clock.over):
+        progress.chosen += compression.adapt_(scene, cfg, index, pixels)
+    reach, state = chosen_reach(progress.chosen), progress.state()
+    save_scene(scene, cfg.out, state, slim=last, reach=reach)
+    preview(scene, scene.registered(photos), cfg.out / "preview.png")
+
+
+def bring_to_grid_(
+    scene: Scene, stage: StageConfig, box: tuple[torch.Tensor, torch.Tensor], progress: Progress
+) -> None:
+    """Bring the scene's field to the grid of a stage."""
+    grid = fit_grid(*box, compression.stage_voxels(stage, progress.chosen))
+    if stage.field == "sparse" and scene.field.kind != "sparse":
+        scene.field = scene.field.in_bricks(grid)
+    elif scene.field.grid != grid:
+        scene.field = scene.field.resized(grid)
+
+
+def trusted(scene: Scene, photos: Photos) -> Survey | None:
+    """What the photographs leave open; None where there is no surface that they show."""
+    try:
+        return survey(scene, photos, REPORT_POINTS)
+    except UserError as error:
+        log.info(f"no trust report: {error}")
+        return None
+
+
+def save_trust(
+    verdict: Verdict, surveyed: Survey | None, troubles: list[str], cfg: TrainConfig
+) -> None:
+    """Write to the run's trust.txt, and log, how it came out and what photographs leave open."""
+    text = verdict.sentence() + "."
+    if surveyed is not None:
+        text += " " + words(numbers(surveyed), troubles)
+    with replacing(cfg.out / "trust.txt") as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+    log.info(text)

@@ -1,1 +1,0 @@
-"""What makes a scene as small as it may be: what is chosen, when, and what it costs."""

@@ -1,1 +1,0 @@
-"""What the photographs fix of a scene's materials, and what they leave open."""

@@ -1,0 +1,205 @@
+"""Checks of what configurations hold, fields that files of earlier versions hold still, and
+fields changed by their path."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import types
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from univoxel.errors import ConfigError, UserError
+
+# By class. What they said is a constant now, beside the code that uses it, or gone with that code
+RETIRED: dict[str, frozenset[str]] = {
+    "TrainConfig": frozenset({"compression", "confidence", "hollows", "preparation"}),
+    "LossConfig": frozenset({"albedo_smoothness", "roughness_smoothness"}),
+    "StageConfig": frozenset({"lr_poses"}),
+    "JointConfig": frozenset(
+        "adam albedo_smoothness metallic newton roughness_smoothness surface trials".split()
+    ),
+    "MetalConfig": frozenset(
+        (
+            "alike base max_evidence metallic_before near neighbours only_metal_albedo roughness "
+            "steps threshold"
+        ).split()
+    ),
+    "MirrorConfig": frozenset(
+        (
+            "alike around change darkest flat min_cosine min_reflectance min_views neighbours "
+            "reflected reflected_at_most sharp turn turns views voters weight"
+        ).split()
+    ),
+    "EntropyConfig": frozenset(
+        (
+            "albedo albedo_views cell degree min_color min_gain min_paint min_points min_reach "
+            "min_sky min_views points steps sun_gain sun_shares sweeps teaching_weight"
+        ).split()
+    ),
+}
+
+
+def without_retired(kind: Any, values: dict[str, Any]) -> dict[str, Any]:
+    """What a file holds of a configuration, but for fields that its class no longer has."""
+    gone = RETIRED.get(kind.__name__, frozenset())
+    return {name: value for name, value in values.items() if name not in gone}
+
+
+# Checks of what configurations hold, in one form.
+
+
+T = TypeVar("T")
+
+
+def check_fields(config: object, wanted: str, holds: Callable[[Any], bool], *names: str) -> None:
+    """Refuse a configuration whose named fields are not as wanted.
+
+    Args:
+        config: a dataclass.
+        wanted: the range in words, such as "at least 1".
+        holds: whether a value is in it; a TypeError counts as no.
+
+    Raises:
+        ConfigError: names class and field, says what is wanted and what came.
+    """
+    for name in names:
+        value = getattr(config, name)
+        try:
+            held = holds(value)
+        except TypeError:
+            held = False
+        if not held:
+            raise ConfigError(f"{type(config).__name__}: {name} must be {wanted}, got {value!r}")
+
+
+def record(kind: type[T], values: object) -> T:
+    """A dataclass from JSON: what dataclasses.asdict made of one and a file held.
+
+    Tuples are lists in JSON, and paths are text; dataclasses are objects or, where they were read
+    before, instances. Retired fields are passed over.
+
+    Raises:
+        ConfigError: names class and field: one that is missing or unknown, or a value of another
+            type than the field's annotation; or what the class itself refuses.
+    """
+    name = kind.__name__
+    if not isinstance(values, dict):
+        raise ConfigError(f"{name}: expected an object, got {values!r:.60}")
+    values = without_retired(kind, values)
+    hints, known = get_type_hints(kind), {f.name: f for f in _fields(kind) if f.init}
+    if unknown := values.keys() - known.keys():
+        raise ConfigError(f"{name}: no field {min(map(str, unknown))!r:.60}")
+    found = {}
+    for field in known.values():
+        if field.name in values:
+            value = values[field.name]
+            try:
+                found[field.name] = _typed(hints[field.name], value)
+            except (TypeError, OverflowError):
+                wanted = getattr(hints[field.name], "__name__", hints[field.name])
+                raise ConfigError(
+                    f"{name}: {field.name} must be {wanted}, got {value!r:.60}"
+                ) from None
+        elif field.default is field.default_factory is dataclasses.MISSING:
+            raise ConfigError(f"{name}: {field.name} is missing")
+    return kind(**found)
+
+
+def _fields(kind: Any) -> tuple[dataclasses.Field[Any], ...]:
+    return dataclasses.fields(kind)
+
+
+def _typed(hint: Any, value: Any) -> Any:
+    """A value of JSON as the annotation has it.
+
+    Raises:
+        TypeError, OverflowError: it is of another type, or an integer that no float holds.
+    """
+    origin, inner = get_origin(hint), get_args(hint)
+    if hasattr(value, "__dataclass_fields__") and isinstance(value, hint):  # read before
+        return value
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in inner:
+            return None
+        for one in [kind for kind in inner if _has_fields(kind, value)] or inner:
+            try:
+                return _typed(one, value)
+            except (TypeError, OverflowError):
+                continue
+    elif origin is Literal:
+        if any(type(value) is type(one) and value == one for one in inner):
+            return value
+    elif origin is tuple and isinstance(value, list | tuple):
+        many = inner[1:] == (...,)
+        if many or len(inner) == len(value):
+            each = inner[:1] * len(value) if many else inner
+            return tuple(_typed(one, v) for one, v in zip(each, value, strict=True))
+    elif hint is Path and isinstance(value, str):
+        return Path(value)
+    elif hint is float and type(value) in (int, float):
+        return float(value)
+    elif isinstance(hint, type) and (type(value) is hint or dataclasses.is_dataclass(hint)):
+        return record(hint, value) if dataclasses.is_dataclass(hint) else value
+    raise TypeError
+
+
+def _has_fields(kind: Any, value: Any) -> bool:
+    """Whether a type is no dataclass, or one with all fields that an object of JSON has."""
+    if not dataclasses.is_dataclass(kind) or not isinstance(value, dict):
+        return True
+    return without_retired(kind, value).keys() <= {f.name for f in _fields(kind)}
+
+
+# Fields of a configuration by their path and a value in text, such as stages.1.voxels=3.
+
+
+def changed(config: Any, changes: Iterable[str]) -> Any:
+    """A frozen config with fields replaced: changes are "field.field=value".
+
+    Raises:
+        ConfigError: no such field, or a value of another type than the field has.
+    """
+    for change in changes:
+        path, equals, text = change.partition("=")
+        if not equals:
+            raise ConfigError(f"changes={change}: expected FIELD=VALUE", "changes")
+        try:
+            config = _replaced(config, path.split("."), text)
+        except UserError as error:
+            raise ConfigError(f"changes={change}: {error}", "changes") from None
+    return config
+
+
+def _replaced(node: Any, path: list[str], text: str) -> Any:
+    """A config, or a tuple of configs, in which the value at the path is what the text says."""
+    if not path:
+        return _value(node, text)
+    name, *rest = path
+    known = [str(i) for i in range(len(node))] if isinstance(node, tuple) else _field_names(node)
+    if name not in known:
+        raise ConfigError(f"no field {name!r}, there are: {', '.join(known) or 'none'}")
+    if isinstance(node, tuple):
+        i = int(name)
+        return (*node[:i], _replaced(node[i], rest, text), *node[i + 1 :])
+    return dataclasses.replace(node, **{name: _replaced(getattr(node, name), rest, text)})
+
+
+def _field_names(node) -> list[str]:
+    return [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
+
+
+def _value(old, text: str):
+    """The text as a value of the same type as the old one."""
+    if isinstance(old, Path):
+        return Path(text)
+    try:
+        new = ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        new = text
+    if isinstance(old, float) and type(new) is int:
+        new = float(new)
+    if type(new) is not type(old):
+        raise ConfigError(f"expected a {type(old).__name__} such as {old!r}, got {text!r}")
+    return new

@@ -1,0 +1,542 @@
+"""From posed files to `Photos`: what the loaders of all layouts share."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from univoxel.camera import Cameras, sizes_of
+from univoxel.color import linear_to_srgb, srgb_to_linear
+from univoxel.data.image_cache import Reading, kept_pixels, origin_of, to_be_kept
+from univoxel.data.images import orientation, read_image
+from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
+from univoxel.data.masks import (
+    find_masks,
+    made_upright,
+    masks_beside,
+    masks_in,
+    premultiplied,
+    read_mask,
+    require_all,
+    require_fit,
+)
+from univoxel.data.path_sandbox import inside
+from univoxel.data.photos import Photos, coverage_of, decode
+from univoxel.errors import DataError, UserError, WithoutMasks
+
+# Pixels along the longer side that photographs are shrunk to, about. An object that fills half of
+# it is 500 pixels wide, the finest grid of the presets some 160 voxels: pixels stay finer
+FINE = 1000
+LARGE = 200_000_000  # pixels in all photographs, at most: training takes 25 bytes for each, about
+READERS = 4  # photographs that are read at once, at most: each may take 0.4 GB while it is shrunk
+BAND = 1 << 18  # pixels of a file, about, that are shrunk at once
+SIZES_TOLD = 3  # of the photographs, that are named one by one, at most
+TEST_EVERY = 8
+log: logging.Logger = logging.getLogger("univoxel")
+LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
+# How far +Z may be from the cameras' common up direction in a world that is taken as upright:
+# cameras are held askew and lean over, but worlds that are not upright are turned by much more.
+LEAN = math.radians(30)
+# Distance of cameras from the origin, in their distances from one another, beyond which float32
+# loses what they see: it has 7 digits, and pixels need 4
+FAR = 1000
+LOOKED_AT = 12  # photographs, at most, on which it is tried whether masks can be right
+HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/guide/masks.md"
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A photograph in a file, and its camera."""
+
+    name: str
+    where: str  # for messages: what says that it is there
+    image: Path
+    mask: Path | None  # a picture of its own that the data name; None: `read_shots` looks for it
+    pose: np.ndarray  # [3, 4] camera-to-world, axes as of `Cameras`
+    lens: Lens
+    beside: Path | None = None  # a mask that counts where the photograph has no alpha
+
+
+def read_shots(
+    folder: Path,
+    kind: str,
+    split: str,
+    shots: Sequence[Shot],
+    downscale: int = 0,
+    remarks: Sequence[str] = (),
+    masks: bool | Path = True,
+) -> Photos:
+    """Photographs as pinholes see them, each in its own size.
+
+    Distortion is taken out, and pixels are averaged, in linear light with premultiplied alpha.
+    Pixels are those of the file: an orientation in its EXIF is not looked at.
+
+    Args:
+        kind: of the data set, for people.
+        downscale: means over squares of so many pixels; 0: what `fitting_downscale` says.
+        remarks: on how the files were read, for people.
+        masks: False for photographs as they are, the whole picture opaque; or a folder of masks,
+            which takes the place of what the layout names.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    if downscale < 0:
+        raise ValueError(f"downscale must be at least 1, got {downscale}")
+    named = masks if isinstance(masks, Path) else None
+    if named is None and masks:
+        shots = _with_masks(folder, shots)
+    for shot in shots:
+        for path in _files(shot):
+            inside(path, shot.where)
+    if named is not None:  # by the caller: they may lie anywhere
+        found = masks_in(named, [(shot.name, shot.image) for shot in shots])
+        shots = [replace(shot, mask=mask) for shot, mask in zip(shots, found, strict=True)]
+    masks = bool(masks)
+    _check(folder, shots, downscale)
+    if split == "train" and len(shots) == 1:
+        log.warning("%s: one photograph shows no shape: at least 3 views are needed", folder)
+    factor = downscale or fitting_downscale(shots)
+    pinholes = _pinholes(shots)
+    cameras = cameras_of([s.pose for s in shots], [shrunk(lens, factor) for lens in pinholes])
+    origin = ""
+    large = to_be_kept(len(cameras), cameras.height, cameras.width)
+    if factor > 1 or large or any(shot.lens.bent for shot in shots):
+        lenses = [(shot.lens, pinhole) for shot, pinhole in zip(shots, pinholes, strict=True)]
+        origin = origin_of([f for shot in shots for f in _files(shot)], lenses, factor, masks)
+    pixels = kept_pixels(origin) if origin else None
+    color, alpha = pixels or _read_all(folder, shots, pinholes, cameras, factor, masks, origin)
+
+    told = [f"{len(shots)} photographs of {_words(cameras)} pixels in {split}"]
+    told += ["lens distortion taken out"] if any(shot.lens.bent for shot in shots) else []
+    told += [f"shrunk to 1/{factor}"] if factor > 1 else []
+    return Photos(
+        folder=folder,
+        names=[shot.name for shot in shots],
+        color=color,
+        alpha=alpha,
+        cameras=cameras,
+        about=f"{folder}: {kind}, {', '.join([*told, *remarks])}",
+        downscale=factor,
+        origin=origin,
+    )
+
+
+def fitting_downscale(shots: Sequence[Shot]) -> int:
+    """The side of the squares of pixels whose means are as much as grids and memory can use.
+
+    The longer side of the median photograph is then FINE pixels, about, and all photographs
+    together are LARGE at most. Those of 1499 pixels and fewer stay as they are, unless they are
+    very many.
+    """
+    sizes = [(shot.lens.width, shot.lens.height) for shot in shots]
+    most = min(map(min, sizes))
+    factor = min(max(1, round(median(map(max, sizes)) / FINE)), most)
+    while factor < most and sum((w // factor) * (h // factor) for w, h in sizes) > LARGE:
+        factor += 1
+    return factor
+
+
+def _pinholes(shots: Sequence[Shot]) -> list[Lens]:
+    """The pinhole that each photograph is turned into."""
+    known: dict[Lens, Lens] = {}  # one lens often took all photographs
+    for shot in shots:
+        try:
+            known[shot.lens] = known.get(shot.lens) or straightened(shot.lens)
+        except UserError as error:
+            raise DataError(f"{shot.where}: {error}") from None
+    return [known[shot.lens] for shot in shots]
+
+
+def _with_masks(folder: Path, shots: Sequence[Shot]) -> list[Shot]:
+    """The shots with the masks that lie in folders of masks and beside photographs.
+
+    Raises:
+        DataError: some photographs have a mask in such a folder, and others none at all.
+    """
+    photographs = [(shot.name, shot.image) for shot in shots]
+    found, beside = find_masks(folder, photographs), masks_beside(photographs)
+    masked = [
+        replace(shot, mask=shot.mask or mask, beside=other)
+        for shot, mask, other in zip(shots, found, beside, strict=True)
+    ]
+    place = next((mask.parent for mask in found if mask), None)
+    if place and not all(shot.mask for shot in masked):
+        there = [bool(s.mask or s.beside) or _is_cut_out(s.image) for s in masked]
+        require_all(place, photographs, there)
+    return masked
+
+
+def _is_cut_out(path: Path) -> bool:
+    """Whether a photograph has an alpha that says something."""
+    image = read_image(path)
+    return image.shape[-1] == 4 and bool((image[..., 3] < image[..., 3].max()).any())
+
+
+def _files(shot: Shot) -> list[Path]:
+    """The files that say what a photograph looks like."""
+    return [shot.image, *(mask for mask in (shot.mask or shot.beside,) if mask)]
+
+
+def _read_all(
+    folder: Path,
+    shots: Sequence[Shot],
+    pinholes: Sequence[Lens],
+    cameras: Cameras,
+    factor: int,
+    masks: bool,
+    origin: str,
+) -> tuple[Tensor, Tensor]:
+    """Colour [V, H, W, 3] and alpha [V, H, W] of all photographs as `Photos` has them."""
+    pairs = [(s.image, mask) for s in shots if masks and (mask := s.mask or s.beside)]
+    upright = made_upright(pairs)
+    if upright is not None:
+        turned = sum(orientation(image) != 1 for image, _ in pairs)
+        log.info(
+            "%d photographs have an EXIF orientation: their masks are taken as made of %s",
+            *(turned, "the upright picture" if upright else "the pixels as they are stored"),
+        )
+    reading = Reading.resumed(origin)
+    begin = reading.read if reading else 0
+    # Closed here: a reader left to the garbage collector would be waited for in any thread, even in
+    # one that holds what the reader's end waits for
+    arguments = factor, masks, bool(upright)
+    with closing(_read_each(shots[begin:], pinholes[begin:], *arguments)) as pictures:
+        for view, (color, alpha) in enumerate(pictures, begin):
+            if reading is None:
+                size = len(shots), cameras.height, cameras.width
+                reading = Reading.begun(origin, color, alpha, size)
+            if color.dtype != reading.color.dtype:
+                raise DataError(
+                    f"{shots[view].image}: expected the format of {shots[0].name} in all "
+                    "photographs"
+                )
+            if alpha.dtype != reading.alpha.dtype:
+                alpha, reading = coverage_of(alpha), reading.with_floating_alpha()
+            reading.empty &= not alpha.any()
+            reading.opaque &= bool((alpha == (1 if alpha.is_floating_point() else 255)).all())
+            cameras.cut(view, reading.color[view]).copy_(color)
+            cameras.cut(view, reading.alpha[view]).copy_(alpha)
+            reading.done(view)
+    assert reading is not None
+    if reading.empty or (masks and reading.opaque):
+        reading.drop()
+    if reading.empty:
+        raise DataError(f"{folder}: all {len(shots)} pictures are fully transparent")
+    if masks and reading.opaque:
+        raise WithoutMasks(f"{folder}: all {len(shots)} pictures are fully opaque: {HOW_TO_MASK}")
+    if masks:
+        looked = range(0, len(shots), -(-len(shots) // LOOKED_AT))
+        some = [[cameras.cut(v, r[v]) for r in (reading.color, reading.alpha)] for v in looked]
+        try:
+            require_fit(folder, [(color, coverage_of(alpha)) for color, alpha in some])
+        except DataError:
+            reading.drop()
+            raise
+        if premultiplied(some):
+            log.warning(
+                "%s: colours seem to be multiplied by alpha: they come out dark along the object's "
+                "edge. Write photographs with straight alpha",
+                folder,
+            )
+    return reading.finished()
+
+
+def _read_each(
+    shots: Sequence[Shot], pinholes: Sequence[Lens], factor: int, masks: bool, upright: bool
+) -> Generator[tuple[Tensor, Tensor], None, None]:
+    """Colour and alpha of each photograph, in order; some are read at once."""
+    grid_of = lru_cache(2)(sources)  # one lens often took all photographs, upright and across
+
+    def read(shot: Shot, pinhole: Lens) -> tuple[Tensor, Tensor]:
+        color, alpha = read_photo(shot.image, shot.mask, masks, shot.beside, upright)
+        grid = grid_of(shot.lens, pinhole) if shot.lens.bent else None
+        return (
+            (color, alpha)
+            if grid is None and factor == 1
+            else resampled(color, alpha, factor, grid)
+        )
+
+    pool = ThreadPoolExecutor(min(READERS, os.cpu_count() or 1))
+    try:
+        yield from pool.map(read, shots, pinholes)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _words(cameras: Cameras) -> str:
+    """The size of the pictures; of several, how many have which."""
+    sizes, counts = cameras.size_of_each().unique(dim=0, return_counts=True)
+    order = counts.argsort(descending=True, stable=True).tolist()
+    if len(order) == 1:
+        return f"{cameras.width}x{cameras.height}"
+    if len(order) > SIZES_TOLD:
+        return f"{len(order)} sizes up to {cameras.width}x{cameras.height}"
+    *first, last = (f"{sizes[i, 0]}x{sizes[i, 1]} ({counts[i]})" for i in order)
+    return f"{', '.join(first)} and {last}"
+
+
+def cameras_of(poses: Sequence[np.ndarray], lenses: Sequence[Lens]) -> Cameras:
+    """Pinholes, each with its picture's size."""
+    width, height, sizes = sizes_of([(lens.width, lens.height) for lens in lenses])
+    return Cameras(
+        camera_to_world=torch.from_numpy(np.stack(poses).astype(np.float32)),
+        focal=torch.tensor([lens.focal for lens in lenses], dtype=torch.float32),
+        centre=torch.tensor([lens.centre for lens in lenses], dtype=torch.float32),
+        width=width,
+        height=height,
+        sizes=sizes,
+    )
+
+
+def read_photo(
+    path: Path,
+    mask: Path | None = None,
+    masks: bool = True,
+    beside: Path | None = None,
+    upright: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Colour [H, W, 3] and alpha [H, W] of one photograph, stored as in `Photos`.
+
+    Without a mask: its alpha channel, or the mask beside it where that is opaque everywhere or not
+    there. The colour of an EXR with alpha is premultiplied, as OpenEXR has it, and is divided;
+    negative values, which denoisers and filters leave, become 0.
+
+    Args:
+        masks: False to look for none: alpha is 1 everywhere.
+        upright: as of `masks.laid_over`.
+    """
+    image = read_image(path, in_srgb=True)
+    channels = image.shape[-1]
+    if channels not in (3, 4):
+        raise DataError(f"{path}: expected a picture with 3 or 4 channels, got {channels}")
+    color, linear = image[..., :3], image.is_floating_point()
+    alpha = image[..., 3] if channels == 4 else None
+    opaque = 1 if linear else 255
+    if linear and alpha is not None:
+        alpha = alpha.clamp(0, 1)
+        color = torch.where(alpha[..., None] > 0, color / alpha[..., None], 0.0)
+    if not masks:
+        alpha, mask = torch.full_like(color[..., 0], opaque), None
+    elif mask is None and (alpha is None or bool((alpha == opaque).all())):
+        mask = beside
+    if mask is not None:
+        alpha = read_mask(mask, color.shape[1], color.shape[0], path, upright)
+    if alpha is None:
+        stem = path.stem.removesuffix("_rgb")
+        raise WithoutMasks(
+            f"{path}: expected an alpha channel or a mask {stem}_mask.png, got neither: "
+            f"{HOW_TO_MASK}"
+        )
+    return (color.clamp_min(0) if linear else color).contiguous(), alpha.contiguous()
+
+
+def resampled(
+    color: Tensor, alpha: Tensor, factor: int, grid: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Stored colour and alpha, straightened and then shrunk in linear light; stored as before.
+
+    What a mask hides keeps single colours, that of a pixel near the middle of each square: how the
+    surroundings look is asked, and not how exactly.
+    """
+    height, width = (n // factor for n in alpha.shape)
+    colors, alphas = color.new_zeros(height, width, 3), alpha.new_zeros(height, width)
+    there = alpha > 0 if grid is None else _looked_up(alpha > 0, grid)
+    top, bottom = _span(there.any(1), factor)
+    left, right = _span(there.any(0), factor)
+    whole = color if grid is None else _premultiplied(color, alpha)
+    rows = max(1, BAND // (factor * color.shape[1]))  # in bands, to save memory
+    for row in range(top, bottom, rows):
+        into = slice(row, min(row + rows, bottom)), slice(left, right)
+        of = tuple(slice(factor * s.start, factor * s.stop) for s in into)
+        if grid is None:
+            part = _premultiplied(color[of], alpha[of])
+        else:
+            part = straighten(whole, grid[of])
+        colors[into], alphas[into] = _stored(shrink(part, factor), color.dtype, alpha.dtype)
+    hidden = alphas == 0
+    colors[hidden] = _picked(color, factor, grid)[hidden]
+    return colors, alphas
+
+
+def _picked(color: Tensor, factor: int, grid: Tensor | None) -> Tensor:
+    """Stored colours [H // factor, W // factor, 3] of pixels near the middles of squares."""
+    height, width = color.shape[:2]
+    middle = slice(factor // 2, None, factor)
+    if grid is None:
+        return color[middle, middle][: height // factor, : width // factor]
+    size = torch.tensor([width, height])
+    column, row = ((grid[middle, middle] + 1) / 2 * size).long().unbind(-1)
+    picked = color[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+    return picked[: height // factor, : width // factor]
+
+
+def _looked_up(there: Tensor, grid: Tensor) -> Tensor:
+    """Where lookups [H, W, 2] of `straighten` may find what is true in a picture: [H, W]."""
+    inside = torch.ones(grid.shape[:2], dtype=torch.bool)
+    for axis, found in enumerate((there.any(0), there.any(1))):
+        first, end = _span(found, 1)
+        # The centre of a pixel may be one from that of the next. Beyond the border is the border
+        low = 2 * (first - 1) / len(found) - 1 if first else -torch.inf
+        high = 2 * (end + 1) / len(found) - 1 if end < len(found) else torch.inf
+        inside &= (grid[..., axis] > low) & (grid[..., axis] < high)
+    return inside if there.any() else torch.zeros_like(inside)
+
+
+def _span(there: Tensor, factor: int) -> tuple[int, int]:
+    """The first and the end of the blocks of `factor` numbers [N] of which one is true."""
+    found = there.nonzero()[:, 0]
+    if not len(found):
+        return 0, 0
+    return int(found[0]) // factor, min(int(found[-1]) // factor + 1, len(there) // factor)
+
+
+def _premultiplied(color: Tensor, alpha: Tensor) -> Tensor:
+    """Stored colour and alpha as linear light times coverage, and coverage: [H, W, 4] float32.
+
+    Channel by channel in memory, as what comes next wants it.
+    """
+    if color.dtype == torch.uint8:  # a table is many times as fast as the curve
+        color = torch.from_numpy(LINEAR[color.numpy()])
+    linear, coverage = decode(color, alpha)
+    planes = torch.empty(4, *alpha.shape)
+    for plane, channel in zip(planes, linear.unbind(-1), strict=False):
+        torch.mul(channel, coverage, out=plane)
+    planes[3] = coverage
+    return planes.movedim(0, -1)
+
+
+def _stored(picture: Tensor, of_color: torch.dtype, of_alpha: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Straight colour and alpha of a picture from `_premultiplied`, as files have them."""
+    linear, coverage = picture[..., :3], picture[..., 3]
+    linear = torch.where(coverage[..., None] > 0, linear / coverage[..., None], 0.0)
+    if of_color == torch.uint8:
+        linear = (255 * linear_to_srgb(linear)).round().to(torch.uint8)
+    if of_alpha == torch.uint8:
+        coverage = (255 * coverage).round().to(torch.uint8)
+    return linear.contiguous(), coverage.contiguous()
+
+
+def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
+    """The test split: the first of every eight photographs in order of names; train: the others."""
+    if split not in ("train", "test"):
+        raise DataError(f"{folder}: expected split train or test, got {split}")
+    ordered = sorted(shots, key=lambda shot: shot.name)
+    chosen = [s for i, s in enumerate(ordered) if (i % TEST_EVERY == 0) == (split == "test")]
+    if not chosen:
+        raise DataError(f"{folder}: expected two photographs at least, got {len(ordered)}")
+    return chosen
+
+
+def _near_origin(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
+    """The shots in a world that float32 can hold, and what was done.
+
+    Surveyed worlds have coordinates of the Earth, with cameras millions of metres from the origin.
+    Such a world is moved by whole units, so that the cameras' mean is near its origin.
+    """
+    places = np.stack([shot.pose[:, 3] for shot in shots])
+    middle = places.mean(0)
+    if np.linalg.norm(middle) <= FAR * np.linalg.norm(places - middle, axis=1).mean():
+        return list(shots), []
+    offset = np.round(middle)
+    moved = [
+        replace(s, pose=np.column_stack([s.pose[:, :3], s.pose[:, 3] - offset])) for s in shots
+    ]
+    return moved, ["world moved by " + " ".join(f"{-x:.0f}" for x in offset)]
+
+
+def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
+    """The shots in a world whose +Z is up and whose origin is not far away, and what was done.
+
+    The world of structure from motion has any direction. Cameras are held level, mostly, or a
+    quarter turn from that, as EXIF then says: what is to the right in their photographs lies in the
+    horizontal plane, and up is what is across to all of that. A world
+    that is upright already, to within LEAN, stays as it is; and one whose cameras do not agree.
+    """
+    shots, moved = _near_origin(shots)
+    held = np.stack([_right_and_up(shot) for shot in shots])
+    up = up_direction(held)
+    if up is None:
+        return shots, [*moved, "world as in the files: its cameras do not say what is up"]
+    if up[2] >= math.cos(LEAN):
+        return shots, moved
+    turn = turn_to_z(up)
+    turned = [replace(shot, pose=turn @ shot.pose) for shot in shots]
+    return turned, [*moved, "world turned to +Z up"]
+
+
+def size_of(image: Tensor) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def _right_and_up(shot: Shot) -> np.ndarray:
+    """To the right and up, in the world, of a photograph as it is looked at: [2, 3]."""
+    right, up = shot.pose[:, 0], shot.pose[:, 1]
+    match orientation(shot.image):  # 2, 4, 5 and 7 are mirrored: no camera makes them
+        case 3:
+            right, up = -right, -up
+        case 6:
+            right, up = up, -right
+        case 8:
+            right, up = -up, right
+    return np.stack([right, up])
+
+
+def turn_to_z(up: np.ndarray) -> np.ndarray:
+    """The smallest rotation that takes a unit vector to +Z."""
+    if up[2] < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, z = up
+    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + z)
+
+
+def up_direction(held: np.ndarray) -> np.ndarray | None:
+    """The unit vector that is across to what is to the right in all photographs, if there is one.
+
+    Args:
+        held: [V, 2, 3] to the right and up, in the world, of each photograph as it is looked at.
+    """
+    right, mean_up = held[:, 0], held[:, 1].mean(0)
+    _, spread, directions = np.linalg.svd(right, full_matrices=True)
+    up = directions[2] * (1 if directions[2] @ mean_up >= 0 else -1)
+    if len(spread) < 2 or spread[1] < 0.1 * spread[0] or up @ mean_up < math.sin(LEAN):
+        return None
+    return up
+
+
+def check_name(name: str, where: str) -> None:
+    """Refuse names of views that files made of them would not stay in their folder with.
+
+    Raises:
+        DataError: no name, or one that means another folder.
+    """
+    if name in ("", "..") or Path(name).name != name:
+        raise DataError(f"{where}: expected names that files can have, got {name!r}")
+
+
+def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
+    """Names and sizes, before anything large is read."""
+    names: set[str] = set()
+    for shot in shots:
+        check_name(shot.name, shot.where)
+        if shot.name in names:
+            raise DataError(f"{shot.where}: the name {shot.name} of {shot.image} came before")
+        names.add(shot.name)
+        width, height = shot.lens.width, shot.lens.height
+        if downscale > min(width, height):
+            raise DataError(
+                f"{folder}: downscale={downscale} leaves nothing of {width}x{height}", "downscale"
+            )

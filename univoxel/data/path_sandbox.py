@@ -1,0 +1,132 @@
+"""Files that a data set names: whether they lie in its folder and are there, and arrays in those
+of NumPy."""
+
+from __future__ import annotations
+
+import logging
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+
+import numpy as np
+
+from univoxel.errors import DataError
+
+# The folder that files must lie in, resolved. Layouts find files and need not know of it
+_folder: ContextVar[Path | None] = ContextVar("folder of the data", default=None)
+
+
+@contextmanager
+def staying_in(folder: Path | None) -> Iterator[None]:
+    """Let `inside` refuse, in the block, what does not lie in the folder; None: nothing."""
+    token = _folder.set(None if folder is None else folder.resolve())
+    try:
+        yield
+    finally:
+        _folder.reset(token)
+
+
+def inside(path: Path, where: str) -> Path:
+    """The path, if it may be read, once links are followed.
+
+    Args:
+        where: for messages: what says that it is there.
+
+    Raises:
+        DataError: it lies outside of the folder that `staying_in` names.
+    """
+    folder = _folder.get()
+    if folder is not None and not path.resolve().is_relative_to(folder):
+        raise DataError(
+            f"{where}: expected files in {folder}, got {path.resolve()}: if you trust where the "
+            "data comes from, set allow_outside",
+            "allow_outside",
+        )
+    return path
+
+
+# Pictures that a data set lists and does not have: left out, as long as enough remain.
+
+
+FEWEST = 3  # photographs that must be there where one is missing: a shape needs that many views
+SHARE = 0.5  # of those listed that must be there: with less, it is the names that are wrong
+NAMED = 3  # missing pictures that messages name, at most
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+
+def left_out(where: str, missing: Sequence[object], listed: int, note: str = "") -> list[str]:
+    """What is to be said of pictures that are not there; a warning in the log says which.
+
+    Args:
+        where: what lists them, for messages.
+        missing: their names or paths.
+        listed: pictures, those that are there and those that are not.
+        note: where they were looked for, for the error.
+
+    Raises:
+        DataError: fewer than FEWEST of the pictures are there, or than SHARE of them.
+    """
+    if not missing:
+        return []
+    names = ", ".join(map(str, missing[:NAMED])) + (", ..." if len(missing) > NAMED else "")
+    count = f"{len(missing)} of {listed}"
+    if listed - len(missing) < max(FEWEST, SHARE * listed):
+        raise DataError(
+            f"{where}: no picture {names}: {count} are missing, expected half of them at least, "
+            f"and {FEWEST}{note}"
+        )
+    log.warning("%s: no picture %s: %s left out", where, names, count)
+    return [f"{count} listed left out: no such pictures"]
+
+
+# Arrays in the files of NumPy.
+
+
+# What NumPy and zipfile raise of bytes that are none of theirs, or are broken
+BROKEN = (
+    *(OSError, EOFError, zipfile.BadZipFile, zlib.error, MemoryError),
+    *(ValueError, TypeError, AttributeError, OverflowError),
+    *(SyntaxError, tokenize.TokenError),  # headers are read as Python
+    *(RuntimeError, NotImplementedError),  # encrypted; packed by a method that Python lacks
+)
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array in a .npy file.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    inside(path, str(path))
+    try:
+        with path.open("rb") as stream:
+            array = np.load(stream, allow_pickle=False)
+    except BROKEN as error:
+        raise DataError(f"{path}: expected an array of NumPy, could not read it: {error}") from None
+    if not isinstance(array, np.ndarray):
+        raise DataError(f"{path}: expected one array of NumPy, got an archive of several")
+    return array
+
+
+def read_npz(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
+    """The arrays in a .npz file whose names begin with the prefix.
+
+    Raises:
+        DataError: it cannot be read, or holds something else than numbers.
+    """
+    inside(path, str(path))
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            found = {key: file[key] for key in file.files if key.startswith(prefix)}
+    except BROKEN as error:
+        raise DataError(f"{path}: expected an npz file, could not read it: {error}") from None
+    for key, value in found.items():
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
+            kind = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
+            raise DataError(f"{path}: expected arrays of numbers, got {key} of {kind}")
+    return found

@@ -1,0 +1,399 @@
+"""Cameras that photogrammetry programs export: Metashape, RealityCapture, Polycam."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import math
+import xml.etree.ElementTree as ET
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path, PureWindowsPath
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from univoxel.core.files import read_json
+from univoxel.data.conventions import TO_OPENGL, check_skew, find_photo, parsed
+from univoxel.data.images import image_size, turn_note
+from univoxel.data.lens import Lens, fitted
+from univoxel.data.load_images import Shot, every_eighth, read_shots, upright
+from univoxel.data.path_sandbox import inside, left_out
+from univoxel.data.photos import Photos
+from univoxel.data.transforms import lens_of, listed_image, pose_of, read_number, short
+from univoxel.errors import DataError
+
+# Cameras that Metashape exported, as XML.
+#
+# cameras.xml                 or any other name.xml: chunk with sensors (resolution, calibration: f,
+#                             cx, cy, b1, b2, k1 to k4, p1, p2), components and cameras (label,
+#                             sensor_id, component_id, transform)
+# images/<label>              photographs, or in the folder itself, of any ending
+# masks/<label>.png           masks, also masks/<label>_mask.png, or alpha in the photographs
+#
+# A camera's transform is camera-to-world, axes x right, y down, z forward, in its component or
+# chunk, whose own transform (rotation, translation, scale) leads to the world. cx and cy are
+# counted from the picture's middle. p1 and p2 are those of OpenCV the other way round.
+#
+# Source: Agisoft Metashape User Manual, "Camera models".
+
+
+XML_HEAD = 4096  # bytes of a file in which <document> and <chunk> stand
+OFF = ("0", "false", "False")  # as the attribute enabled of a camera
+TERMS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2", "cx", "cy")
+
+
+def is_metashape(folder: Path, split: str) -> bool:
+    return _xml_file(folder) is not None
+
+
+def load_metashape(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
+    """Photographs and cameras of one split: every eighth is for tests.
+
+    The world keeps its scale, and is turned so that +Z is up; it keeps its origin, too, unless that
+    is far away. Of several components the one with most cameras is read.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    path = _xml_file(folder) or folder / "cameras.xml"
+    chunk = _chunk(path)
+    sensors = {s.get("id"): s for s in chunk.iterfind("sensors/sensor")}
+    every = list(chunk.iterfind("cameras//camera"))
+    placed = [c for c in every if c.find("transform") is not None and c.get("enabled") not in OFF]
+    if not placed:
+        raise DataError(f"{path}: expected cameras with a transform, got {len(every)} without")
+    component, _ = Counter(c.get("component_id") for c in placed).most_common(1)[0]
+    chosen = [c for c in placed if c.get("component_id") == component]
+    world = _world(chunk, component, path)
+
+    groups = {c: g.get("label") for g in chunk.iterfind("cameras/group") for c in g.iter("camera")}
+    twice = Counter(c.get("label") for c in chosen)
+    lenses: dict[str | None, Lens] = {}
+    shots, missing = [], []
+    for camera in chosen:
+        label, sensor = camera.get("label") or "", camera.get("sensor_id")
+        where = f"{path}: camera {label}"
+        group = groups.get(camera) if twice[label] > 1 else None
+        listed = f"{group}/{label}" if group else label
+        picture = find_photo(folder, listed, where) if label else None
+        if picture is None:
+            missing.append(listed)
+            continue
+        if sensor not in lenses:
+            lenses[sensor] = _sensor_lens(
+                sensors.get(sensor), f"{path}: sensor {sensor} of {label}"
+            )
+        pose = _camera_pose(camera, world, where)
+        lens = fitted(lenses[sensor], picture, where)
+        name = f"{group}_{picture.stem}" if group else picture.stem
+        shots.append(Shot(name, where, picture, None, pose, lens))
+    note = f" (looked in {folder / 'images'} and {folder})"
+    lost = left_out(str(path), missing, len(chosen), note)
+    if len(every) > len(chosen):
+        told = "not placed, not enabled or in another component"
+        if rig := sum(c.get("master_id") is not None for c in every if c not in placed):
+            told += f"; {rig} of a rig, whose place is that of a master camera"
+        lost += [f"{len(every) - len(chosen)} of {len(every)} cameras left out: {told}"]
+    shots, remarks = upright(shots)
+    shots = every_eighth(folder, shots, split)
+    remarks = [*lost, *remarks]
+    return read_shots(folder, "Metashape cameras", split, shots, downscale, remarks, masks)
+
+
+def _xml_file(folder: Path) -> Path | None:
+    for path in sorted(folder.glob("*.xml")):
+        if path.is_file():
+            with path.open("rb") as stream:
+                head = stream.read(XML_HEAD)
+            if b"<document" in head and b"<chunk" in head:
+                return path
+    return None
+
+
+def _chunk(path: Path) -> ET.Element:
+    data = inside(path, str(path)).read_bytes()
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # which may grow without bound
+        raise DataError(f"{path}: expected XML of Metashape, got one with definitions of its own")
+    try:
+        root = ET.fromstring(data)
+    except ET.ParseError as error:
+        raise DataError(f"{path}: expected XML, could not read it: {error}") from None
+    chunks = root.findall("chunk")
+    if len(chunks) != 1:
+        raise DataError(f"{path}: expected one chunk, got {len(chunks)}")
+    return chunks[0]
+
+
+def _numbers(element: ET.Element | None, count: int, what: str, where: str) -> np.ndarray:
+    text = None if element is None else element.text
+    values = [parsed(word, what, where) for word in (text or "").split()]
+    if len(values) != count:
+        came = "nothing" if text is None else short(text)
+        raise DataError(f"{where}: expected {count} numbers as {what}, got {came}")
+    return np.array(values)
+
+
+def _world(chunk: ET.Element, component: str | None, path: Path) -> tuple[float, np.ndarray]:
+    """Scale, and [3, 4] rotation and translation, from a component to the world."""
+    found = chunk.iterfind("components/component")
+    named = next((c for c in found if c.get("id") == component), None)
+    transform = None if named is None else named.find("transform")
+    where = f"{path}: transform of " + ("chunk" if transform is None else f"component {component}")
+    transform = chunk.find("transform") if transform is None else transform
+    if transform is None or transform.find("rotation") is None:
+        return 1.0, np.eye(3, 4)
+    rotation = _numbers(transform.find("rotation"), 9, "rotation", where).reshape(3, 3)
+    translation = _numbers(transform.find("translation"), 3, "translation", where)
+    scale = _numbers(transform.find("scale"), 1, "scale", where)[0]
+    if scale <= 0:
+        raise DataError(f"{where}: expected a scale above 0, got {scale:g}")
+    return float(scale), pose_of(np.column_stack([rotation, translation]), where)
+
+
+def _camera_pose(camera: ET.Element, world: tuple[float, np.ndarray], where: str) -> np.ndarray:
+    matrix = _numbers(camera.find("transform"), 16, "transform", where).reshape(4, 4)
+    local, (scale, outer) = pose_of(matrix, where), world
+    turn, shift = outer[:, :3], outer[:, 3]
+    return np.column_stack([turn @ local[:, :3] @ TO_OPENGL, scale * turn @ local[:, 3] + shift])
+
+
+def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
+    """The lens of a sensor, in the terms of OpenCV."""
+    if sensor is None:
+        raise DataError(f"{where}: expected it among the sensors, got none")
+    if (kind := sensor.get("type", "frame")) != "frame":
+        raise DataError(f"{where}: expected a sensor of type frame, got {kind}")
+    calibrations = sensor.findall("calibration")
+    adjusted = [c for c in calibrations if c.get("class", "adjusted") == "adjusted"]
+    if not calibrations:
+        raise DataError(f"{where}: expected a calibration, got none")
+    calibration = (adjusted or calibrations)[0]
+    resolution = calibration.find("resolution")
+    resolution = sensor.find("resolution") if resolution is None else resolution
+    size = {} if resolution is None else resolution.attrib
+    width, height = (int(parsed(size.get(key), key, where)) for key in ("width", "height"))
+    if min(width, height) < 1:
+        raise DataError(f"{where}: expected a resolution above 0, got {width}x{height}")
+    focal = parsed(calibration.findtext("f"), "f", where)
+    term = {key: parsed(calibration.findtext(key, "0"), key, where) for key in TERMS}
+    if term["p3"] or term["p4"]:
+        raise DataError(f"{where}: expected distortion by k1 to k4, p1 and p2, got p3 or p4 too")
+    values = {"fl_x": focal + term["b1"], "fl_y": focal}
+    values |= {"cx": width / 2 + term["cx"], "cy": height / 2 + term["cy"]}
+    values |= {"p1": term["p2"], "p2": term["p1"]}
+    values |= {key: term[key] for key in ("k1", "k2", "k3")}
+    lens = lens_of(values, where, width, height)
+    check_skew(term["b2"], lens, where)
+    return replace(lens, radial=(*lens.radial, term["k4"]))
+
+
+# Cameras that RealityCapture or RealityScan exported as "Internal/External camera parameters".
+#
+# cameras.csv               or any other name.csv, with the columns name, x, y, alt, heading, pitch,
+#                           roll, f, and perhaps px, py, k1 to k4, t1, t2
+# images/<name>             photographs, or in the folder itself
+# masks/<name>.png          masks, or alpha in the photographs
+#
+# x, y, alt is the camera's place in a world with +Z up. Angles are in degrees: with all at 0 a
+# camera looks down, and its picture's top is at +Y; it is turned by -heading about z, pitch about x
+# and roll about y. f is of film 36 mm wide, which is the picture's longer side; px and py are how
+# far the principal point is from the middle, in longer sides. t1 and t2 are OpenCV's p2 and p1.
+#
+# Source: the vendor's "Registration export and camera orientations" and "XMP Camera Math".
+
+
+CSV_HEAD = 4096  # bytes of a file in which the names of columns stand
+DELIMITERS = (",", ";", "\t")
+FILM = 36  # millimetres along the longer side that focal lengths are for
+REQUIRED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
+# Of RealityScan 2.2 and on
+OTHER_NAMES = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
+
+
+def is_realitycapture(folder: Path, split: str) -> bool:
+    return _csv_file(folder) is not None
+
+
+def load_realitycapture(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
+    """Photographs and cameras of one split: every eighth is for tests.
+
+    The world keeps its scale, and is turned so that +Z is up, where it is not yet; it keeps its
+    origin, too, unless that is far away.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    path = _csv_file(folder) or folder / "cameras.csv"
+    rows = _rows(path)
+    shots, missing = [], []
+    for line, row in rows:
+        where = f"{path}: line {line}"
+        name = PureWindowsPath(row.get("name") or "").name
+        picture = find_photo(folder, name, where) if name else None
+        if picture is None:
+            missing.append(name or where)
+            continue
+        lens, pose = _row_lens(row, picture, where), _row_pose(row, where)
+        shots.append(Shot(picture.stem, where, picture, None, pose, lens))
+    note = f" (looked in {folder / 'images'} and {folder})"
+    lost = left_out(str(path), missing, len(rows), note)
+    shots, remarks = upright(shots)
+    shots = every_eighth(folder, shots, split)
+    remarks = [*lost, *remarks]
+    return read_shots(folder, "RealityCapture cameras", split, shots, downscale, remarks, masks)
+
+
+def _csv_file(folder: Path) -> Path | None:
+    for path in sorted(folder.glob("*.csv")):
+        if path.is_file():
+            with path.open("rb") as stream:
+                head = _text(stream.read(CSV_HEAD), "replace")
+            if any(_delimiter(line) for line in head.splitlines()[:2]):
+                return path
+    return None
+
+
+def _text(data: bytes, errors: str = "strict") -> str:
+    """Text in UTF-8, or in UTF-16, as spreadsheets write it."""
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if wide else "utf-8-sig", errors)
+
+
+def _delimiter(line: str) -> str | None:
+    """What stands between the names of the columns; None where it is no line of them."""
+    return next((d for d in DELIMITERS if set(REQUIRED) <= set(_columns(line, d))), None)
+
+
+def _columns(line: str, delimiter: str) -> list[str]:
+    names = [name.strip().lstrip("#").strip().lower() for name in line.split(delimiter)]
+    return [OTHER_NAMES.get(name, name) for name in names]
+
+
+def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
+    """Rows by the names of their columns, each with the number of its line."""
+    try:
+        lines = _text(inside(path, str(path)).read_bytes()).splitlines()
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: expected text in UTF-8, got {error.reason}") from None
+    start, delimiter = next((i, d) for i, line in enumerate(lines) if (d := _delimiter(line)))
+    columns, rows = _columns(lines[start], delimiter), []
+    for number, line in enumerate(lines[start + 1 :], start + 2):
+        if not line.strip() or line.startswith("#"):
+            continue
+        values = next(csv.reader([line], delimiter=delimiter))
+        if len(values) != len(columns):
+            raise DataError(
+                f"{path}: line {number}: expected {len(columns)} values, got {len(values)}"
+            )
+        row = dict(zip(columns, values, strict=True))
+        if delimiter != ",":  # where the comma is that of numbers
+            row |= {key: v.replace(",", ".") for key, v in row.items() if key != "name"}
+        rows.append((number, row))
+    if not rows:
+        raise DataError(f"{path}: expected a line for each camera, got none")
+    return rows
+
+
+def _row_lens(row: dict[str, str], picture: Path, where: str) -> Lens:
+    width, height = image_size(picture)
+    side = max(width, height)
+    keys = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+    term = {key: parsed(row.get(key, "0"), key, where) for key in keys}
+    focal = parsed(row["f"], "f", where) * side / FILM
+    values = {"fl_x": focal, "cx": width / 2 + side * term["px"]}
+    values |= {"cy": height / 2 + side * term["py"], "p1": term["t2"], "p2": term["t1"]}
+    values |= {key: term[key] for key in ("k1", "k2", "k3")}
+    lens = lens_of(values, where, width, height, turn_note(picture))
+    return replace(lens, radial=(*lens.radial, term["k4"]))
+
+
+def _row_pose(row: dict[str, str], where: str) -> np.ndarray:
+    place = [parsed(row[key], key, where) for key in ("x", "y", "alt")]
+    heading, pitch, roll = (parsed(row[key], key, where) for key in ("heading", "pitch", "roll"))
+    turn = Rotation.from_euler("ZXY", [-heading, pitch, roll], degrees=True).as_matrix()
+    return pose_of(np.column_stack([turn, place]), where)
+
+
+# Polycam's raw data, as its developer mode exports them.
+#
+# keyframes/corrected_cameras/<time>.json    fx, fy, cx, cy, width, height, and t_00 to t_23:
+#                                            camera-to-world, axes as of ARKit; or keyframes/cameras
+# keyframes/corrected_images/<time>.jpg      photographs; or keyframes/images
+# keyframes/masks/<time>.png                 masks, which Polycam does not make; or masks
+#
+# ARKit's camera axes are x right, y up, z backwards, of the picture as it is stored, and its world
+# has +Y up.
+#
+# Source: nerfstudio's documentation of its converter for Polycam; Apple's of ARCamera.transform.
+
+
+# Where cameras and images are; what loops were closed in comes first
+PLACES = ("keyframes/corrected_", "keyframes/", "corrected_")
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from +Y up to +Z up
+
+
+def is_polycam(folder: Path, split: str) -> bool:
+    return _place(folder) is not None
+
+
+def load_polycam(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
+    """Photographs and cameras of one split: every eighth is for tests.
+
+    The world keeps its scale, metres, and its origin, and is turned from +Y up to +Z up.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    place = _place(folder) or PLACES[0]
+    cameras, pictures = (
+        sorted((folder / f"{place}cameras").glob("*.json")),
+        folder / f"{place}images",
+    )
+    shots, missing = [], []
+    for path in cameras:
+        picture = listed_image(pictures, path.stem, str(path))
+        if picture is None:
+            missing.append(path.stem)
+            continue
+        values = _read(path)
+        width, height = (int(values[key]) for key in ("width", "height"))
+        lens = fitted(lens_of(values, str(path), width, height), picture, str(path))
+        pose = UPRIGHT @ pose_of(values["pose"], str(path))
+        shots.append(Shot(path.stem, str(path), picture, None, pose, lens))
+    note = f" (looked in {pictures}"
+    others = folder / f"{place.removesuffix('corrected_')}images"
+    if others != pictures and others.is_dir():
+        note += f"; those in {others} are of the cameras in {others.with_name('cameras')}"
+    lost = left_out(str(cameras[0].parent), missing, len(cameras), f"{note})")
+    shots = every_eighth(folder, shots, split)
+    remarks = [*lost, "world turned from +Y to +Z up"]
+    return read_shots(folder, "Polycam raw data", split, shots, downscale, remarks, masks)
+
+
+def _place(folder: Path) -> str | None:
+    for place in PLACES:
+        if any((folder / f"{place}cameras").glob("*.json")):
+            return place
+    return None
+
+
+def _read(path: Path) -> dict:
+    """Intrinsics in the words of `lens_of`, width, height and the pose [3, 4]."""
+    root = read_json(inside(path, str(path)))
+    if not isinstance(root, dict):
+        raise DataError(f"{path}: expected a JSON object, got {short(root)}")
+    found = {key: read_number(root, key, str(path), 0, math.inf) for key in ("width", "height")}
+    keys = {"fx": "fl_x", "fy": "fl_y", "cx": "cx", "cy": "cy"}
+    found |= {
+        to: read_number(root, key, str(path), -math.inf, math.inf) for key, to in keys.items()
+    }
+    rows = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
+    pose = [[read_number(root, key, str(path), -math.inf, math.inf) for key in row] for row in rows]
+    return {**found, "pose": pose}

@@ -1,0 +1,422 @@
+"""Layouts that research publishes its scenes in: LLFF, IDR, NeILF, TensoIR."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path, PureWindowsPath
+
+import numpy as np
+from scipy.linalg import rq
+
+from univoxel.core.files import read_json
+from univoxel.data.conventions import TO_OPENGL, check_skew, listed_split
+from univoxel.data.images import image_size, turn_note
+from univoxel.data.lens import Lens, fitted
+from univoxel.data.load_images import Shot, every_eighth, read_shots, upright
+from univoxel.data.masks import find_masks, photographs_in
+from univoxel.data.path_sandbox import inside, left_out, read_npy, read_npz
+from univoxel.data.photos import Photos
+from univoxel.data.transforms import lens_of, listed_image, pose_of, read_number, short
+from univoxel.errors import DataError
+
+# The layout of LLFF, which NeRD publishes its captures in.
+#
+# poses_bounds.npy            [V, 17]: a row for each photograph, in the order of their names
+# images/<name>               photographs, or images_<n>/: shrunk by n
+# view_imgs.txt               names of those that have a row, where some have none
+# masks/<name>.png            masks, where there are any; for images_<n>/ also masks_<n>/
+#
+# A row is camera-to-world [3, 4] with the camera axes down, right and backwards, beside it a column
+# of height, width and focal length, and at the end the nearest and farthest depth, which say
+# nothing here. Height, width and focal length may be those of larger originals.
+#
+# Source: Mildenhall et al. 2019 (Local Light Field Fusion), "Using your own poses".
+
+
+LLFF_FILE = "poses_bounds.npy"
+COLUMNS = 17  # 3 x 5 for the camera, and two depths
+
+
+def is_llff(folder: Path, split: str) -> bool:
+    return (folder / LLFF_FILE).is_file()
+
+
+def load_llff(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
+    """Photographs and cameras of one split, as of `listed_split`.
+
+    The world keeps its scale and origin, and is turned so that +Z is up.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    path = folder / LLFF_FILE
+    rows, pictures = _rows(path), _llff_pictures(folder)
+    if len(pictures) != len(rows):
+        pictures = _placed(folder, pictures)
+    if len(pictures) != len(rows):
+        raise DataError(
+            f"{path}: expected a row for each of {len(pictures)} photographs in "
+            f"{pictures[0].parent}, got {len(rows)}"
+        )
+    shots = []
+    for number, (row, picture) in enumerate(zip(rows, pictures, strict=True)):
+        where = f"{path}: row {number}"
+        camera = row[:15].reshape(3, 5)
+        down, right, back, position = camera[:, :4].T
+        pose = pose_of(np.stack([right, -down, back, position], 1), where)
+        lens = _llff_lens(camera[:, 4], picture, where)
+        shots.append(Shot(picture.stem, where, picture, None, pose, lens))
+    shots, remarks = upright(shots)
+    shots = listed_split(folder, shots, split)
+    return read_shots(folder, "LLFF layout", split, shots, downscale, remarks, masks)
+
+
+def _placed(folder: Path, pictures: list[Path]) -> list[Path]:
+    """The photographs that LLFF's script wrote rows for, where it left some out."""
+    listed = folder / "view_imgs.txt"
+    if not listed.is_file():
+        return pictures
+    text = inside(listed, str(listed)).read_text(encoding="utf-8", errors="replace")
+    names = {Path(line.strip()).stem for line in text.splitlines()}
+    return [path for path in pictures if path.stem in names]
+
+
+def _rows(path: Path) -> np.ndarray:
+    rows = read_npy(path)
+    if rows.ndim != 2 or rows.shape[1] != COLUMNS:
+        raise DataError(f"{path}: expected [V, {COLUMNS}] numbers, got {np.shape(rows)}")
+    if rows.dtype.kind not in "fiu" or not len(rows):
+        raise DataError(f"{path}: expected [V, {COLUMNS}] numbers, got {len(rows)} of {rows.dtype}")
+    return rows.astype(np.float64)
+
+
+def _llff_pictures(folder: Path) -> list[Path]:
+    """The photographs in order of their names, the largest that there are."""
+    shrunk = [p for p in folder.glob("images_*") if p.name.removeprefix("images_").isdigit()]
+    shrunk.sort(key=lambda p: int(p.name.removeprefix("images_")))
+    for place in (folder / "images", *shrunk):
+        if pictures := photographs_in(place):
+            return pictures
+    raise DataError(
+        f"{folder / LLFF_FILE}: no pictures in {folder / 'images'} or images_2, images_4 .."
+    )
+
+
+def _llff_lens(size_and_focal: np.ndarray, picture: Path, where: str) -> Lens:
+    """The pinhole of a picture that may be smaller than what its row describes."""
+    height, width, focal = size_and_focal.tolist()
+    if not all(1 <= x < 1e9 for x in (height, width)) or not 0 < focal < 1e9:
+        raise DataError(
+            f"{where}: expected height, width and focal length above 0, got {height:g}, "
+            f"{width:g}, {focal:g}"
+        )
+    whole = Lens(int(width), int(height), (focal, focal), (width / 2, height / 2))
+    return fitted(whole, picture, where)
+
+
+# The layout of IDR, NeuS and DTU, and of BlendedMVS as NeuS has it.
+#
+# cameras_sphere.npz      world_mat_0, world_mat_1, ..: [4, 4] or [3, 4] from the world to pixels,
+#                         K [R t]; or cameras.npz, cameras_large.npz. scale_mat_i and camera_mat_i
+#                         say nothing here
+# image/000.png           photographs: number i, or the i-th in order of their names
+# mask/000.png            masks: of the same name, number or place
+#
+# Source: Yariv et al. 2020 (IDR) and Wang et al. 2021 (NeuS), the conventions of their data.
+
+
+FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
+PREFIX = "world_mat_"
+KEY = re.compile(r"world_mat_[0-9]{1,9}")
+IMAGES = ("image", "images", "rgb")
+IDR_MASKS = ("mask", "masks")
+
+
+def is_idr(folder: Path, split: str) -> bool:
+    return _idr_file(folder) is not None
+
+
+def load_idr(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
+    """Photographs and cameras of one split: every eighth is for tests.
+
+    The world is that of world_mat: it keeps its scale and origin, and is turned so that +Z is up.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    path = _idr_file(folder) or folder / FILES[0]
+    matrices, pictures = _matrices(path), _idr_pictures(folder, path)
+    numbers = _numbers(path, sorted(matrices), pictures)
+    missing = [f"number {number}" for number in sorted(matrices) if number not in numbers]
+    lost = left_out(str(path), missing, len(matrices), f" (looked in {pictures[0].parent})")
+    shots, silhouettes = [], _masks(folder, pictures)
+    for number, picture, mask in zip(numbers, pictures, silhouettes, strict=True):
+        where = f"{path}: world_mat_{number}"
+        intrinsics, pose = decomposed(matrices[number], where)
+        size = image_size(picture)
+        (fx, skew, cx), (_, fy, cy), _ = intrinsics.tolist()
+        values = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+        lens = lens_of(values, where, *size, turn_note(picture))
+        check_skew(skew, lens, where)
+        shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
+    shots, remarks = upright(shots)
+    shots = every_eighth(folder, shots, split)
+    kind = f"IDR layout ({path.name})"
+    return read_shots(folder, kind, split, shots, downscale, [*lost, *remarks], masks)
+
+
+def decomposed(matrix: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Intrinsics K [3, 3] and camera-to-world [3, 4] of a projection K [R t].
+
+    Args:
+        matrix: [3, 4], of any scale and sign.
+
+    Returns:
+        K with 1 at its end, and the pose, its axes as of `Cameras`.
+    """
+    matrix = matrix * (1 if np.linalg.det(matrix[:, :3]) > 0 else -1)
+    if not np.linalg.cond(matrix[:, :3]) < 1e12:
+        raise DataError(f"{where}: expected a projection onto a picture, got a singular matrix")
+    upper, rotation = rq(matrix[:, :3])
+    signs = np.sign(np.diag(upper))  # focal lengths are positive; that they are so is all there is
+    upper, rotation = upper * signs, signs[:, None] * rotation
+    position = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    pose = pose_of(np.column_stack([rotation.T @ TO_OPENGL, position]), where)
+    return upper / upper[2, 2], pose
+
+
+def _idr_file(folder: Path) -> Path | None:
+    return next((path for name in FILES if (path := folder / name).is_file()), None)
+
+
+def _matrices(path: Path) -> dict[int, np.ndarray]:
+    """[3, 4] from the world to pixels, by number."""
+    arrays = read_npz(path, PREFIX)
+    found = {int(key.removeprefix(PREFIX)): a for key, a in arrays.items() if KEY.fullmatch(key)}
+    if not found:
+        raise DataError(f"{path}: expected arrays world_mat_0, world_mat_1 .., got none")
+    for number, matrix in found.items():
+        if matrix.shape not in ((4, 4), (3, 4)) or matrix.dtype.kind not in "fiu":
+            raise DataError(
+                f"{path}: expected world_mat_{number} [4, 4] of numbers, got "
+                f"{list(matrix.shape)} of {matrix.dtype}"
+            )
+        if not np.isfinite(matrix).all():
+            raise DataError(f"{path}: world_mat_{number} holds NaN or infinity")
+    return {number: matrix[:3].astype(np.float64) for number, matrix in found.items()}
+
+
+def _idr_pictures(folder: Path, path: Path) -> list[Path]:
+    """Photographs in order of their names, or of their numbers."""
+    for name in IMAGES:
+        if found := photographs_in(folder / name):
+            return _ordered(found)
+    raise DataError(f"{path}: no pictures in {folder / IMAGES[0]}")
+
+
+def _ordered(pictures: list[Path]) -> list[Path]:
+    """9.png before 10.png, where all names are numbers."""
+    if all(path.stem.isdecimal() for path in pictures):
+        return sorted(pictures, key=lambda path: int(path.stem))
+    return pictures
+
+
+def _numbers(path: Path, known: list[int], pictures: list[Path]) -> list[int]:
+    """The number of each picture's matrix."""
+    if len(pictures) == len(known):
+        return known
+    found = [int(p.stem) if p.stem.isdecimal() else -1 for p in pictures]
+    if set(found) <= set(known) and len(set(found)) == len(found):
+        return found
+    raise DataError(
+        f"{path}: expected a world_mat for each of {len(pictures)} photographs in "
+        f"{pictures[0].parent}, got {len(known)}, and names that are not their numbers"
+    )
+
+
+def _masks(folder: Path, pictures: list[Path]) -> Sequence[Path | None]:
+    """The masks of photographs: by their places where no name tells."""
+    if any(find_masks(folder, [(path.stem, path) for path in pictures])):
+        return [None] * len(pictures)  # `read_shots` finds them again
+    listed = next((found for name in IDR_MASKS if (found := photographs_in(folder / name))), [])
+    listed = _ordered(listed)
+    return listed if len(listed) == len(pictures) else [None] * len(pictures)
+
+
+# The layout of NeILF and NeILF++.
+#
+# inputs/sfm_scene.json       image_path.file_paths: names by index; camera_track_map.images: by
+#                             index size [w, h], flg (2: placed), and camera: intrinsic (focal, ppt)
+#                             and extrinsic, 16 numbers from the world to the camera
+# inputs/images/<name>        photographs, under the last part of their names, of any ending
+# inputs/masks/<name>.png     masks, also in inputs/pmasks and masks, or alpha in the photographs
+#
+# Source: the public code of Yao et al. 2022 (NeILF), `load_cams_from_sfmscene`.
+
+
+NEILF_FILE = "inputs/sfm_scene.json"
+PLACED = 2  # as flg of an image
+
+
+def is_neilf(folder: Path, split: str) -> bool:
+    return (folder / NEILF_FILE).is_file()
+
+
+def load_neilf(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
+    """Photographs and cameras of one split: every eighth is for tests.
+
+    The world keeps its scale and origin, and is turned so that +Z is up.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    path = folder / NEILF_FILE
+    names, images = _read(path)
+    shots, missing, unplaced = [], [], 0
+    for index, name in names.items():
+        where = f"{path}: image {index}"
+        image = images.get(index)
+        if not isinstance(image, dict) or image.get("flg") != PLACED:
+            unplaced += 1
+            continue
+        picture = listed_image(folder / "inputs" / "images", name, where)
+        if picture is None:
+            missing.append(name)
+            continue
+        lens, pose = _camera(image, where)
+        shots.append(Shot(picture.stem, where, picture, None, pose, fitted(lens, picture, where)))
+    if unplaced == len(names):
+        raise DataError(f"{path}: expected images with flg {PLACED}, which have cameras, got none")
+    looked = f" (looked in {folder / 'inputs' / 'images'})"
+    lost = left_out(str(path), missing, len(names) - unplaced, looked)
+    lost += [f"{unplaced} without a camera left out"] if unplaced else []
+    shots, remarks = upright(shots)
+    shots = every_eighth(folder, shots, split)
+    return read_shots(folder, "NeILF layout", split, shots, downscale, [*lost, *remarks], masks)
+
+
+def _read(path: Path) -> tuple[dict[str, str], dict]:
+    """Names of photographs and what is said of them, both by index."""
+    try:
+        root = read_json(inside(path, str(path)))
+        names = (root["image_path"] if "image_path" in root else root["image_list"])["file_paths"]
+        images = root["camera_track_map"]["images"]
+        if isinstance(names, list):
+            names = {str(index): name for index, name in enumerate(names)}
+        found = {index: PureWindowsPath(name).name for index, name in names.items()}
+        if not isinstance(images, dict) or not found:
+            raise TypeError("no images")
+    except DataError:
+        raise
+    except (KeyError, TypeError, AttributeError) as error:
+        raise DataError(
+            f"{path}: expected JSON with image_path.file_paths and camera_track_map.images, "
+            f"got {error!r}"
+        ) from None
+    return found, images
+
+
+def _camera(image: dict, where: str) -> tuple[Lens, np.ndarray]:
+    """Lens and pose of an image."""
+    try:
+        camera = image["camera"]
+        focal, centre = camera["intrinsic"]["focal"], camera["intrinsic"]["ppt"]
+        values = {"fl_x": focal[0], "fl_y": focal[1], "cx": centre[0], "cy": centre[1]}
+        values |= {"w": image["size"][0], "h": image["size"][1]}
+        matrix = camera["extrinsic"]
+        to_camera = np.array(matrix, np.float64).reshape(4, 4)
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
+        raise DataError(
+            f"{where}: expected size [w, h] and a camera of focal, ppt and 16 numbers as "
+            f"extrinsic, got {short(image)} ({error!r})"
+        ) from None
+    width, height = (int(read_number(values, key, where, 0, math.inf)) for key in ("w", "h"))
+    rotation = pose_of(to_camera, where)[:, :3].T
+    pose = np.column_stack([rotation @ TO_OPENGL, -rotation @ to_camera[:3, 3]])
+    return lens_of(values, where, width, height), pose
+
+
+# The layout of TensoIR-Synthetic, and of NeRFactor's scenes.
+#
+# <split>_NNN/metadata.json       imw, imh, cam_angle_x, cam_transform_mat: 16 numbers with commas
+# <split>_NNN/rgba_<light>.png    photograph under a light, straight alpha, sRGB; or rgba.png
+
+
+LIGHT = "sunset"  # of the photographs that the data set is trained on, where there are several
+
+
+def is_tensoir(folder: Path, split: str) -> bool:
+    return any(folder.glob("*_[0-9][0-9][0-9]/metadata.json"))
+
+
+def load_tensoir(
+    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
+) -> Photos:
+    """Photographs and cameras of one split, under the light of the training views.
+
+    Raises:
+        DataError: one line that names the file, what was expected and what came.
+    """
+    views = sorted(path.parent for path in folder.glob(f"{split}_*/metadata.json"))
+    if not views:
+        raise DataError(f"{folder}: expected {split}_000/metadata.json and more, got none")
+    picture = photographed(folder)
+    there = [view for view in views if (view / picture).is_file()]
+    missing = [view / picture for view in views if view not in there]
+    remarks = left_out(str(folder), missing, len(views))
+    shots = [_shot(view, picture) for view in there]
+    kind = f"TensoIR layout ({picture})"
+    return read_shots(folder, kind, split, shots, downscale, remarks, masks)
+
+
+def photographed(folder: Path) -> str:
+    """Name of the pictures that are trained on: rgba.png, rgba_sunset.png or the only one."""
+    views = sorted(path.parent for path in folder.glob("*_[0-9][0-9][0-9]/metadata.json"))
+    views.sort(key=lambda view: not view.name.startswith("train_"))
+    first = next((view for view in views if any(view.glob("rgba*.png"))), views[0])
+    names = sorted(path.name for path in first.glob("rgba*.png"))
+    for name in ("rgba.png", f"rgba_{LIGHT}.png"):
+        if name in names:
+            return name
+    if len(names) != 1:
+        raise DataError(
+            f"{first}: expected rgba.png, rgba_{LIGHT}.png or one rgba_<light>.png, got "
+            + (", ".join(names) or "none")
+        )
+    return names[0]
+
+
+def _shot(view: Path, picture: str) -> Shot:
+    path = view / "metadata.json"
+    try:
+        meta = read_json(inside(path, str(path)))
+        text = meta["cam_transform_mat"]
+        values = [float(value) for value in text.split(",")]
+    except DataError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(
+            f"{path}: expected JSON with cam_transform_mat, numbers between commas, got {error!r}"
+        ) from None
+    if len(values) != 16:
+        raise DataError(f"{path}: expected 16 numbers in cam_transform_mat, got {short(text)}")
+    image = view / picture
+    angle = read_number(meta, "cam_angle_x", str(path), 0.0, math.pi)
+    camera = {"camera_angle_x": angle}
+    camera |= {to: meta[key] for to, key in (("w", "imw"), ("h", "imh")) if key in meta}
+    return Shot(
+        name=view.name,
+        where=str(path),
+        image=image,
+        mask=None,
+        pose=pose_of([values[i : i + 4] for i in range(0, 16, 4)], str(path)),
+        lens=lens_of(camera, str(path), *image_size(image)),
+    )

@@ -1,0 +1,557 @@
+"""What the photographs fix of a scene's materials, and what to photograph next: points of the
+surface, doubt anywhere, figures and words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from univoxel import brdf
+from univoxel.camera import Cameras
+from univoxel.color import CLIPPED, linear_to_srgb_unclipped
+from univoxel.core.records import Surface
+from univoxel.core.validation import check_fields
+from univoxel.data import Photos
+from univoxel.ops import VisibilityScene
+from univoxel.render.observations import (
+    MIN_COSINE,
+    JointProblem,
+    Observations,
+    Transport,
+    mean_colors,
+    observe,
+    prefiltered_roughness,
+    shade_observations,
+    surface_points,
+    trace,
+    turned_maps,
+    without_exposure,
+)
+from univoxel.render.pipeline import RAYS_AT_ONCE, at_rays, extract_mesh, shade
+from univoxel.scene import Scene
+from univoxel.sphere import fibonacci_sphere, gaps, side_of
+
+# Points of the surface, and what the photographs fix of each.
+#
+# No truth is read: only the photographs that were trained on, and the scene.
+# docs/explanation/trust.md explains the terms.
+
+
+POINTS = 20_000  # of the surface that evaluation surveys, for its maps of doubt
+REPORT_POINTS = 2_000  # of the surface that are surveyed after training, for words alone
+
+# Observations of a point that are rendered again, at most
+OBSERVATIONS = 8
+# Directions that visibility is measured in where the scene has no map with its own
+DIRECTIONS = 64
+# Roughness over which the slope of the render is taken
+ROUGHNESS_STEP = 0.05
+# Views straight from above that determine an albedo to a doubt of one half
+ENOUGH_VIEWS = 3.0
+# sRGB; disagreement with the photographs that means a doubt of one half
+NOISE = 0.02
+# sRGB; darker pixels are noise
+BLACK = 0.02
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is known of P points, evenly spread over the surface; tensors are [P]."""
+
+    position: Tensor  # [P, 3]
+    normal: Tensor  # [P, 3]
+    voxel_size: float
+    views: Tensor  # photographs that see the point, nothing between
+    straight: Tensor  # sum over those that are not clipped or black there of their squared cosine
+    spread: Tensor  # degrees: arc cosine of the length of the mean of their directions
+    clipped: Tensor  # share of them that are clipped there
+    black: Tensor  # share of them that are black there
+    visibility: Tensor  # share of the light's directions, by cosine, that the object leaves open
+    disagreement: Tensor  # mean absolute difference of photographs and render, sRGB
+    gloss: Tensor  # root of the sum over the views of (change of sRGB by roughness)^2
+
+    @property
+    def albedo(self) -> Tensor:
+        """Doubt of the albedo, in [0, 1]: 1 - seen * visibility * agreeing."""
+        seen = self.seen_with(self.straight)
+        return torch.where(self.views > 0, 1 - seen * self.visibility * self.agreeing, 1.0)
+
+    def seen_with(self, straight: Tensor) -> Tensor:
+        """How well points are seen, [..., P] in [0, 1], with such sums of squared cosines."""
+        return straight / (straight + ENOUGH_VIEWS)
+
+    @property
+    def agreeing(self) -> Tensor:
+        """How well render and photographs agree, in (0, 1]."""
+        return NOISE / (self.disagreement + NOISE)
+
+    @property
+    def roughness(self) -> Tensor:
+        """Doubt of the roughness, in [0, 1]: 1 - seen * visibility * agreeing * glossy.
+
+        glossy^2 is the share by which the photographs narrow what is known of roughness, its
+        variance, when before it could be anything in [0, 1].
+        """
+        information = self.information
+        return 1 - (1 - self.albedo) * (information / (1 + information)).sqrt()
+
+    @property
+    def information(self) -> Tensor:
+        """That photographs have of roughness, over that of knowing [0, 1] alone, whose variance is
+        1/12: each sRGB value has the noise NOISE."""
+        return (self.gloss / NOISE).square() / 12
+
+
+@torch.no_grad()
+def survey(scene: Scene, photos: Photos, points: int) -> Survey:
+    """What the photographs that were trained on fix of points of the surface.
+
+    Args:
+        points: how many, >= 1, spread evenly.
+
+    Raises:
+        ValueError: the scene has no surface.
+    """
+    generator = torch.Generator().manual_seed(0)
+    photos = scene.registered(photos)
+    mesh, tracer, offset = extract_mesh(scene), scene.occluder(), scene.field.voxel_size
+    position, normal = surface_points(mesh, points, generator)
+    observations = observe(position, normal, photos, tracer, offset)
+    direction = scene.sky.direction if scene.sky else fibonacci_sphere(DIRECTIONS)
+    # What occludes light is as bright as the nearest point is in the photographs
+    nearest = KDTree(position.numpy()).query(mesh.vertices.numpy(), workers=-1)[1]
+    point_color = mean_colors(without_exposure(scene, observations))
+    vertex_color = point_color[torch.from_numpy(nearest)]
+    transport = trace(observations, tracer, mesh, vertex_color, direction, 1, offset, generator)
+
+    cosine = (normal @ direction.T).clamp_min(0)
+    visibility = (cosine * transport.visibility / 255).sum(1) / cosine.sum(1).clamp_min(1e-6)
+    counts = observations.offsets.diff()
+    point = torch.repeat_interleave(counts)
+    encoded = linear_to_srgb_unclipped(observations.color)
+    clipped, black = (encoded > CLIPPED).any(1), (encoded < BLACK).all(1)
+    usable = ~(clipped | black)
+    straight = (observations.wo * normal[point]).sum(1).square()
+
+    def total(values: Tensor) -> Tensor:
+        return torch.zeros(points, *values.shape[1:]).index_add_(0, point, values)
+
+    at_least_one = counts.clamp_min(1)
+    mean_length = (total(observations.wo).norm(dim=1) / at_least_one).clamp(0, 1)
+    spread = torch.where(counts > 0, mean_length.acos().rad2deg(), 0.0)
+    compared = spread_observations(observations, OBSERVATIONS)
+    disagreement, gloss = compare(scene, observations, transport, compared, ROUGHNESS_STEP)
+    return Survey(
+        position=position,
+        normal=normal,
+        voxel_size=offset,
+        views=counts,
+        straight=total(straight * usable),
+        spread=spread,
+        clipped=total(clipped.float()) / at_least_one,
+        black=total(black.float()) / at_least_one,
+        visibility=visibility,
+        disagreement=disagreement,
+        gloss=gloss * counts.sqrt(),
+    )
+
+
+def spread_observations(observations: Observations, most: int) -> tuple[Tensor, Tensor]:
+    """At most so many observations of each point, spread over all: their points and numbers."""
+    counts = observations.offsets.diff()[:, None]
+    which = torch.arange(most) * counts.clamp_min(most) // most
+    point, _ = (which < counts).nonzero().unbind(1)
+    return point, (observations.offsets[:-1, None] + which)[which < counts]
+
+
+def compare(
+    scene: Scene,
+    observations: Observations,
+    transport: Transport,
+    which: tuple[Tensor, Tensor],
+    roughness_step: float,
+) -> tuple[Tensor, Tensor]:
+    """Mean absolute difference in sRGB of photographs and render, and root mean square of the
+    render's slope by roughness: [P] each, 0 where there is no observation.
+
+    A clipped pixel says only that it was at least so bright.
+
+    Args:
+        which: points and numbers of the observations that are compared.
+        roughness_step: that the slope is taken over.
+    """
+    point, observation = which
+    features = scene.field.features_at(observations.position)
+    albedo, roughness, metallic = scene.material(features)
+    step = torch.where(roughness > 0.5, -roughness_step, roughness_step)
+    surface = Surface(
+        position=observations.position,
+        normal=observations.normal,
+        features=features,
+        albedo=albedo,
+        roughness=roughness,
+        opacity=torch.ones_like(roughness),
+        depth=torch.ones_like(roughness),
+        metallic=metallic,
+    )
+    changed = replace(surface, roughness=roughness + step)
+    present, other = (
+        linear_to_srgb_unclipped(render(scene, s, observations, transport, point, observation))
+        for s in (surface, changed)
+    )
+    target = linear_to_srgb_unclipped(observations.color[observation])
+    difference = (target - present).abs()
+    at_least = (target > CLIPPED) & (present > target)
+    difference = torch.where(at_least, 0.0, difference).mean(1)
+    slope = ((other - present) / step[point, None]).square()
+    slope = torch.where(target > CLIPPED, 0.0, slope).sum(1)
+    count = torch.bincount(point, minlength=len(features)).clamp_min(1)
+    disagreement, gloss = (
+        torch.zeros(len(features)).index_add_(0, point, x) / count for x in (difference, slope)
+    )
+    return disagreement, gloss.sqrt()
+
+
+def render(
+    scene: Scene,
+    surface: Surface,
+    observations: Observations,
+    transport: Transport,
+    point: Tensor,
+    observation: Tensor,
+) -> Tensor:
+    """Radiance [N, 3] of observations [N] of points [N], under the scene's map if it was fitted
+    with traced visibility: local lights would explain away what is off."""
+    if scene.sky is None:
+        parts = []
+        for k in torch.arange(len(point)).split(RAYS_AT_ONCE):
+            at_points, o = at_rays(surface, point[k]), observation[k]
+            view = observations.view[o]
+            parts.append(shade(scene, at_points, observations.wo[o], view=view))
+        return torch.cat(parts) if parts else torch.zeros(0, 3)
+    assert surface.metallic is not None
+    diffuse, f0 = brdf.split(surface.albedo, surface.metallic)
+    assert isinstance(f0, Tensor)
+    color, voxel_size = observations.color, scene.field.voxel_size
+    turned = turned_maps(scene, observations)
+    problem = JointProblem(observations, transport, color, voxel_size, scene.sky, turned)
+    roughness = prefiltered_roughness(surface.roughness, problem.nodes)
+    shaded = observations.normal[point], diffuse[point], roughness[point], f0[point]
+    return shade_observations(scene, problem, point, observation, *shaded)
+
+
+# Doubt of albedo and roughness anywhere on the surface.
+
+
+# Voxels, over 2, that opposite sides of a thin part count as farther apart: a pixel takes its doubt
+# from its own side
+NORMAL_SCALE = 3.0
+# Nearest points that a pixel takes its doubt from
+NEIGHBOURS = 4
+
+
+class Doubts:
+    """Doubts of a survey, to be looked up anywhere on the surface."""
+
+    def __init__(self, surveyed: Survey) -> None:
+        self._scale = NORMAL_SCALE * surveyed.voxel_size
+        self._values = torch.stack([surveyed.albedo, surveyed.roughness], 1)
+        self._tree = KDTree(self._key(surveyed.position, surveyed.normal))
+
+    def at(self, position: Tensor, normal: Tensor) -> Tensor:
+        """Doubt of albedo and of roughness [N, 2] at points [N, 3] with normals [N, 3]: the mean
+        of the nearest points, weighted by the inverse squared distance."""
+        count = min(NEIGHBOURS, len(self._values))
+        nearest = self._tree.query(self._key(position, normal), k=count, workers=-1)
+        distance, index = (torch.from_numpy(x.reshape(-1, count)) for x in map(np.asarray, nearest))
+        weight = 1 / (distance.square() + 1e-12)
+        weight = (weight / weight.sum(1, keepdim=True)).float()
+        return (self._values[index] * weight[..., None]).sum(1)
+
+    def _key(self, position: Tensor, normal: Tensor) -> np.ndarray:
+        return torch.cat([position, self._scale * normal], 1).numpy()
+
+
+# A survey in figures and in words.
+
+
+# Views; a material that fewer see is reported as a guess
+FEW_VIEWS = 3
+# Degrees of spread; views within are reported as one direction
+ONE_SIDE = 15.0
+# Share of a point's light; where less comes from outside, that is reported
+MIN_VISIBILITY = 0.5
+# Mean absolute difference of render and photographs, sRGB; where it is more, that is reported:
+# surface, material or light is wrong
+MAX_DISAGREEMENT = 0.05
+# Share of the surface below which nothing is reported about it
+MIN_SHARE = 0.01
+
+
+def numbers(surveyed: Survey) -> dict[str, float]:
+    """The survey in figures: means over the surface, shares of it in [0, 1]."""
+
+    def share(where: Tensor) -> float:
+        return where.float().mean().item()
+
+    seen = surveyed.views > 0
+    return {
+        "doubt_albedo": surveyed.albedo.mean().item(),
+        "doubt_roughness": surveyed.roughness.mean().item(),
+        "unseen": share(~seen),
+        "few_views": share(surveyed.views < FEW_VIEWS),
+        "one_side": share(seen & (surveyed.spread < ONE_SIDE)),
+        "clipped": share(surveyed.clipped > 0.5),
+        "black": share(surveyed.black > 0.5),
+        "shut": share(surveyed.visibility < MIN_VISIBILITY),
+        "disagreeing": share(surveyed.disagreement > MAX_DISAGREEMENT),
+        "dull": share(surveyed.information < 1),
+    }
+
+
+def words(figures: dict[str, float], troubles: list[str]) -> str:
+    """The figures as a paragraph, without what is not the case.
+
+    Args:
+        troubles: what went wrong in training, from its state.
+    """
+    sentences = [
+        f"Doubt of albedo {figures['doubt_albedo']:.2f}, of roughness "
+        f"{figures['doubt_roughness']:.2f} in the mean over the surface (0: well determined, 1: a "
+        "guess)."
+    ]
+    shares = {
+        "few_views": f"is seen by fewer than {FEW_VIEWS} cameras: its materials are a guess",
+        "one_side": f"is seen from about one direction, within {ONE_SIDE:g} degrees of it: "
+        "colour and highlight are hard to tell apart there",
+        "clipped": "is clipped in most photographs: shorter exposures would help",
+        "black": "is black in most photographs: more light would help",
+        "shut": f"gets less than {MIN_VISIBILITY:.0%} of its light from outside: what parts of "
+        "the object send to each other may be left in its albedo",
+        "disagreeing": f"differs from its photographs by more than {MAX_DISAGREEMENT:g} in "
+        "sRGB: its surface, material or light is wrong",
+        "dull": "shows no highlight that tells its roughness",
+    }
+    for name, text in shares.items():
+        if figures[name] >= MIN_SHARE:
+            sentences.append(f"{figures[name]:.0%} of the surface {text}.")
+    sentences.append(
+        "Albedo and light share a factor that photographs cannot fix: compare albedos with one "
+        "another, not with a colour chart."
+    )
+    if troubles:
+        sentences.append(f"Training met trouble {len(troubles)} times, the last in {troubles[-1]}.")
+    return " ".join(sentences)
+
+
+# What to photograph next: the directions from which most of what is in doubt would be seen.
+#
+# A photograph is worth what it adds to how well the surface is seen, see `Survey.seen`, over points
+# weighted by their doubt. Directions are taken one after another, the best first, each with those
+# before it taken as photographs. No truth is read.
+
+
+# Directions that are weighed, on the whole sphere
+CANDIDATES = 600
+# Degrees; photographs nearer to one another show much the same
+APART = 25.0
+# Degrees to the nearest photograph; directions beyond are a gap
+GAP = 30.0
+# Degrees below which nobody is sent, unless a photograph was taken from there: things stand on
+# something
+LOWEST = 0.0
+
+
+STEEP = 65.0  # degrees above or below the horizon, from where on a view has no side
+BEST = 0.9  # quantile of the agreement of render and photographs that counts as the best
+COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+
+
+@dataclass(frozen=True)
+class AdviceConfig:
+    """How directions for more photographs are chosen."""
+
+    most: int = 6  # directions that are advised, >= 1
+    # worth of a photograph, in [0, 1], from which on it is advised: the share of the surface, times
+    # its doubt, that it would show as well as many photographs
+    least: float = 0.006
+    share: float = 0.5  # of the best one's worth, in [0, 1]; less is not worth the walk
+
+    def __post_init__(self) -> None:
+        check_fields(self, "at least 1", lambda x: x >= 1, "most")
+        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "least", "share")
+
+
+ADVICE = AdviceConfig()
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Where photographs were taken around an object, and where more would help.
+
+    V photographs, C directions that were weighed, K that are advised, the best first. Directions
+    are unit vectors from the middle of the object.
+    """
+
+    taken: Tensor  # [V, 3]
+    names: list[str]  # V, of the photographs
+    front: float  # azimuth of what is called the front, degrees from +X
+    front_name: str  # the photograph that says so
+    weighed: Tensor  # [C, 3]
+    worth: Tensor  # [C] in [0, 1], before any was taken
+    least: float  # worth below which no direction is advised, `AdviceConfig.least`
+    gap: Tensor  # [C] bool: no photograph is near
+    chosen: Tensor  # [K, 3]
+    gains: Tensor  # [K] worth of each, with those before it taken
+    hidden: float  # share of the surface that no photograph shows, nor any from these directions
+
+    @property
+    def nearest(self) -> list[str]:
+        """Of each advised direction, the photograph that was taken nearest to it."""
+        return [self.names[i] for i in (self.chosen @ self.taken.T).argmax(1).tolist()]
+
+
+@torch.no_grad()
+def advise(
+    surveyed: Survey,
+    cameras: Cameras,
+    names: Sequence[str],
+    surface: VisibilityScene,
+    cfg: AdviceConfig = ADVICE,
+) -> Advice:
+    """Weigh directions for more photographs, as far away as those there are.
+
+    Args:
+        surveyed: what the photographs fix.
+        cameras, names: of the photographs, V >= 1.
+        surface: what stands in the way.
+    """
+    low, high = surveyed.position.amin(0), surveyed.position.amax(0)
+    middle = (low + high) / 2
+    away = cameras.camera_to_world[:, :, 3] - middle
+    taken, distance = normalize(away, dim=1), float(away.norm(dim=1).median())
+    lowest = min(LOWEST, float(elevations(taken).min()))
+    weighed = fibonacci_sphere(CANDIDATES)
+    weighed = weighed[elevations(weighed) >= min(lowest, 89.0)]
+    shown = torch.stack([_shown(surveyed, surface, middle + distance * w) for w in weighed])
+
+    straight, agreeing = surveyed.straight.clone(), _agreeing(surveyed)
+    nearest = _degrees(weighed, taken).amin(1)
+    gap, first = nearest > GAP, None
+    chosen, gains = [], []
+    while True:
+        gain = (surveyed.seen_with(straight + shown) - surveyed.seen_with(straight)) @ (
+            1 - surveyed.seen_with(straight) * agreeing
+        )
+        gain = gain / len(straight) * (nearest / APART).clamp_max(1)
+        first = gain if first is None else first
+        best = int(gain.argmax())
+        least = max(cfg.least, cfg.share * gains[0]) if gains else cfg.least
+        if len(chosen) == cfg.most or gain[best] < least:
+            break
+        chosen.append(best)
+        gains.append(float(gain[best]))
+        straight = straight + shown[best]
+        nearest = torch.minimum(nearest, _degrees(weighed, weighed[best : best + 1])[:, 0])
+    front = _front(taken)
+    hidden = (surveyed.views == 0) & (shown.amax(0) == 0)
+    return Advice(
+        taken=taken,
+        names=list(names),
+        front=float(azimuths(taken[front : front + 1])[0]),
+        front_name=names[front],
+        weighed=weighed,
+        worth=first,
+        least=cfg.least,
+        gap=gap,
+        chosen=weighed[chosen],
+        gains=torch.tensor(gains),
+        hidden=float(hidden.float().mean()),
+    )
+
+
+def _shown(surveyed: Survey, surface: VisibilityScene, eye: Tensor) -> Tensor:
+    """Squared cosine [P] at which a camera sees points; 0 where it does not, as of `observe`."""
+    towards = normalize(eye - surveyed.position, dim=1)
+    cosine = (surveyed.normal * towards).sum(1)
+    facing = (cosine > MIN_COSINE).nonzero()[:, 0]
+    offset = surveyed.voxel_size * (surveyed.normal[facing] + towards[facing])
+    start = surveyed.position[facing] + offset
+    reach = float((eye - start).norm(dim=1).max()) if len(facing) else 0.0
+    found = torch.zeros_like(cosine)
+    visible = ~surface.occluded(start, towards[facing], 0.0, reach)
+    found[facing] = cosine[facing].square() * visible
+    return found
+
+
+def _agreeing(surveyed: Survey) -> Tensor:
+    """`Survey.agreeing` [P] beside the best of the surface, in [0, 1]: what disagrees everywhere,
+    as after a short training, is mended by no photograph."""
+    return (surveyed.agreeing / surveyed.agreeing.quantile(BEST)).clamp_max(1)
+
+
+def _degrees(a: Tensor, b: Tensor) -> Tensor:
+    """Angles [A, B] between unit vectors [A, 3] and [B, 3]."""
+    return (a @ b.T).clamp(-1, 1).acos().rad2deg()
+
+
+def _front(taken: Tensor) -> int:
+    """The first photograph that was taken from a side."""
+    flat = (elevations(taken).abs() < STEEP).nonzero()[:, 0]
+    return int(flat[0]) if len(flat) else 0
+
+
+def azimuths(direction: Tensor) -> Tensor:
+    """Degrees [N] counter-clockwise from +X, of directions [N, 3]."""
+    return torch.atan2(direction[:, 1], direction[:, 0]).rad2deg()
+
+
+def elevations(direction: Tensor) -> Tensor:
+    """Degrees [N] above the horizon, of unit directions [N, 3]."""
+    return direction[:, 2].clamp(-1, 1).asin().rad2deg()
+
+
+def place(advice: Advice, direction: Tensor) -> str:
+    """A direction [3] in words: a side, or above or below."""
+    up = float(elevations(direction[None])[0])
+    if abs(up) >= STEEP:
+        return "above" if up > 0 else "below"
+    return f"the {side_of(float(azimuths(direction[None])[0]) - advice.front)}"
+
+
+def in_words(advice: Advice) -> list[str]:
+    """What to photograph next, a sentence for each side, the most useful first."""
+    sides: dict[str, list[int]] = {}
+    for k, direction in enumerate(advice.chosen):
+        sides.setdefault(place(advice, direction), []).append(k)
+    up = elevations(advice.chosen).tolist() if len(advice.chosen) else []
+    told = []
+    for side, which in sorted(sides.items(), key=lambda s: -float(advice.gains[s[1]].sum())):
+        count = COUNTS[len(which)] if len(which) < len(COUNTS) else str(len(which))
+        noun = "photograph" if len(which) == 1 else "photographs"
+        height = "" if side in ("above", "below") else f", {_heights([up[k] for k in which])}"
+        told.append(f"{count} {noun} from {side}{height}".capitalize())
+    return told
+
+
+def _heights(up: list[float]) -> str:
+    """Elevations in degrees as a range of tens."""
+    low, high = 10 * math.floor(min(up) / 10), 10 * math.ceil(max(up) / 10)
+    high = max(high, low + 10)
+    if low >= 0:
+        return f"{low} to {high} degrees above the horizon"
+    if high <= 0:
+        return f"{-high} to {-low} degrees below the horizon"
+    return f"from {-low} degrees below to {high} degrees above the horizon"
+
+
+def missing(advice: Advice, gap: float) -> list[str]:
+    """Sides that photographs are missing from, as `univoxel poses` tells of them."""
+    return gaps(advice.taken.numpy(), advice.names, gap, advice.front)

@@ -1,0 +1,443 @@
+"""Volume rendering of packed rays: opacity from signed distances, compositing, and a field
+sampled and composited in one pass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import torch
+from torch import Tensor
+from torch.nn.functional import logsigmoid
+
+from univoxel.core.records import Bricks, Samples
+from univoxel.ops import grid as grid_sampling
+from univoxel.ops import hash_grid, native
+from univoxel.ops.differentiable import check, check_bricks, differentiable
+from univoxel.ops.grid import (
+    SparseGrad,
+    check_place,
+    sample_dense_reference,
+    sample_sparse_reference,
+)
+from univoxel.ops.hash_grid import check_levels, encode_hash_reference, lattice_sizes
+
+
+def section_alpha(sdf: Tensor, connected: Tensor, inv_s: float) -> Tensor:
+    """Opacity of the sections that start at packed samples.
+
+        alpha_i = max(0, 1 - sigmoid(f_{i+1} / s) / sigmoid(f_i / s))
+
+    from the sdf at both ends of the section: nothing is assumed of the slope in between. Taken as a
+    difference of logarithms, it neither cancels nor divides by zero deep inside.
+
+    Args:
+        sdf: [M] world units.
+        connected: [M] bool, whether sample i + 1 ends the section that starts at i.
+        inv_s: 1 / s, 1 / world units.
+
+    Returns:
+        [M] in [0, 1]; 0 where no section starts.
+
+    Source: Wang et al. 2021 (NeuS), eq. 13.
+    """
+    log_phi = logsigmoid(sdf * inv_s)
+    fall = (log_phi.roll(-1) - log_phi).clamp_max(0)
+    return torch.where(connected, -torch.expm1(fall), 0.0)
+
+
+# Volume-render compositing of packed rays.
+
+
+def composite(
+    alpha: Tensor,  # [M]
+    value: Tensor,  # [M, C]
+    offsets: Tensor,  # [N + 1]
+    early_stop: float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Composite values along packed rays, front to back.
+
+        T_i = prod_{j < i} (1 - alpha_j),   weight_i = alpha_i T_i,   out_n = sum_i weight_i value_i
+
+    with i over the samples offsets[n] .. offsets[n + 1] of ray n.
+
+    Args:
+        alpha: [M] opacity of each sample, in [0, 1].
+        value: [M, C] what is composited: any number of channels.
+        offsets: [N + 1] int64, rising from 0 to M; ray n owns samples offsets[n] .. offsets[n + 1].
+        early_stop: a ray ends where its transmittance falls below this, in [0, 1]; later samples
+            weigh 0 and get no gradient. 0 never ends a ray early.
+
+    Returns:
+        out [N, C] and weight [M]. The opacity of a ray is the sum of its weights.
+
+    Raises:
+        TypeError, ValueError: an argument is no tensor, or of another size, dtype or device than
+            above; offsets do not rise from 0 to M; early_stop outside [0, 1].
+
+    Differentiable in: alpha, value. Second order raises.
+    Source: Max 1995, "Optical models for direct volume rendering", in the discrete form of
+    Mildenhall et al. 2020 (NeRF), eq. 3.
+    """
+    check(
+        "composite",
+        alpha=(alpha, "M"),
+        value=(value, "M C"),
+        offsets=(offsets, "N+1", torch.int64),
+    )
+    if not 0.0 <= early_stop <= 1.0:
+        raise ValueError(f"composite: early_stop must be in [0, 1], got {early_stop}")
+    if native.serves(alpha):
+        return _composite(
+            alpha.contiguous(), value.contiguous(), offsets.contiguous(), float(early_stop)
+        )
+    return composite_reference(alpha, value, offsets, early_stop)
+
+
+def composite_reference(
+    alpha: Tensor, value: Tensor, offsets: Tensor, early_stop: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """The same in eager torch: rays padded to the longest, autograd gives the backward."""
+    counts = offsets.diff()
+    ray = torch.repeat_interleave(counts)
+    slot = torch.arange(len(alpha), device=alpha.device) - offsets[ray]
+    longest = int(counts.max()) if len(counts) else 0
+    padded = alpha.new_zeros(len(counts), longest).index_put((ray, slot), alpha)
+    through = torch.cumprod(1 - padded, 1)
+    trans = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], 1)[ray, slot]
+    weight = torch.where(trans < early_stop, 0.0, trans * alpha)
+    out = value.new_zeros(len(counts), value.shape[1]).index_add(0, ray, weight[:, None] * value)
+    return out, weight
+
+
+@differentiable(to="alpha value")
+def _composite(
+    alpha: Tensor, value: Tensor, offsets: Tensor, early_stop: float
+) -> tuple[Tensor, Tensor]:
+    return value.new_empty(len(offsets) - 1, value.shape[1]), torch.empty_like(alpha)
+
+
+# A field composited along packed rays: sampling, opacity and compositing in one pass.
+
+
+# Lower and upper corner and voxel sizes of a hash table's levels, as of `encode_hash`
+Lattices: TypeAlias = "tuple[Sequence[float], Sequence[float], Sequence[float]]"
+RAY_NUMBERS = 5  # of a ray before its features: opacity, t, gradient
+SAMPLE_NUMBERS = 4  # of a held sample before its features: sdf, gradient
+
+
+class FieldAlongRays(NamedTuple):
+    """Sums over the sections of each ray, each times what it weighs."""
+
+    opacity: Tensor  # [N] of the weights themselves
+    t: Tensor  # [N] world units
+    gradient: Tensor  # [N, 3] of the sdf
+    features: Tensor  # [N, C]
+
+
+def composite_field(
+    sdf: Tensor,  # [X, Y, Z]
+    features: Tensor,  # [X, Y, Z, C]
+    origin: Tensor,  # [N, 3]
+    direction: Tensor,  # [N, 3]
+    samples: Samples,
+    grid_origin: Sequence[float],
+    voxel_size: float,
+    inv_s: float,
+    *,
+    bricks: Bricks | None = None,
+    levels: Lattices | None = None,
+    min_share: float = 0.0,
+    sparse_grad: bool = False,
+) -> FieldAlongRays:
+    """Sample a field along packed rays and composite what it says, front to back.
+
+    At the samples x_i = origin + t_i direction of a ray, the field has distances f_i, gradients and
+    features as `sample_dense` (with bricks `sample_sparse`) and `encode_hash` define them. From i
+    to i + 1, where they are connected, reaches a section. With sigmoid S its opacity and weight are
+
+        alpha_i = max(0, 1 - S(inv_s f_{i+1}) / S(inv_s f_i))
+        w_i = alpha_i prod_{j < i} (1 - alpha_j)
+
+    and its value v the mean of its ends'. A sample's share is c_i = (w_{i-1} + w_i) / 2, so that
+
+        sum_i w_i (v_i + v_{i+1}) / 2 = sum_i c_i v_i
+
+    This is `composite` of `section_alpha` of what the other ops sample, without their tensors in
+    between.
+
+    Args:
+        sdf: [X, Y, Z] world units, negative inside; with bricks [R].
+        features: [X, Y, Z, C], with bricks [R, C]; with levels [L * rows, F] as of `encode_hash`,
+            and then C = L F.
+        origin, direction: [N, 3] rays in the world.
+        samples: packed along them, as of `march`.
+        grid_origin: world position of node (0, 0, 0).
+        voxel_size: world units, above 0.
+        inv_s: 1 / s, sharpness of the density, 1 / world units, above 0.
+        bricks: of a sparse grid.
+        levels: lower and upper corner and voxel sizes of a hash table, as of `encode_hash`.
+        min_share: in [0, 1), of a ray's heaviest sample. Of samples with less only the distance is
+            read: features and gradients are then the mean of the others, times the opacity.
+        sparse_grad: gradients of sdf and features come back as coalesced ``sparse_coo`` tensors of
+            touched rows. Eager only: under torch.compile ask for dense gradients.
+
+    Raises:
+        TypeError, ValueError: an argument is no tensor, or of another size, dtype, device or range
+            than above; offsets do not rise from 0 to the number of samples.
+
+    Differentiable in: sdf, features, origin, direction; which samples weigh little is taken as
+    fixed. Second order raises.
+    Source: Wang et al. 2021 (NeuS), eq. 13; Max 1995 for the sums.
+    """
+    _check(sdf, features, origin, direction, samples, bricks, levels)
+    check_place("composite_field", len(samples.t), grid_origin, voxel_size)
+    if not 0 < inv_s < math.inf:
+        raise ValueError(f"composite_field: inv_s must be positive and finite, got {inv_s}")
+    if not 0 <= min_share < 1:
+        raise ValueError(f"composite_field: min_share must be in [0, 1), got {min_share}")
+    options = {"bricks": bricks, "levels": levels, "min_share": min_share}
+    place = [float(x) for x in grid_origin], float(voxel_size), float(inv_s)
+    rays = origin, direction, samples
+    if native.serves(sdf):
+        total = _total(sdf, features, *rays, *place, **options, sparse_grad=sparse_grad)
+    else:
+        if sparse_grad:
+            sdf = SparseGrad.apply(sdf, sdf.dim())
+            features = SparseGrad.apply(features, features.dim() - 1)
+        total = composite_field_reference(sdf, features, *rays, *place, **options)
+    opacity, t, gradient, composited = total.split([1, 1, 3, total.shape[1] - RAY_NUMBERS], 1)
+    return FieldAlongRays(opacity[:, 0], t[:, 0], gradient, composited)
+
+
+def _total(
+    sdf: Tensor,
+    features: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    samples: Samples,
+    grid_origin: list[float],
+    voxel_size: float,
+    inv_s: float,
+    bricks: Bricks | None,
+    levels: Lattices | None,
+    min_share: float,
+    sparse_grad: bool,
+) -> Tensor:
+    """As the reference, from the kernel."""
+    table = grid_sampling.no_table(sdf) if bricks is None else bricks.table
+    corners = [[float(x) for x in part] for part in levels or ((), (), ())]
+    total, _ = _composite_field(
+        *(x.contiguous() for x in (sdf, features, table, origin, direction)),
+        *(x.contiguous() for x in (samples.t, samples.connected, samples.offsets)),
+        list(sdf.shape if bricks is None else bricks.size),
+        grid_origin,
+        voxel_size,
+        *corners,
+        inv_s,
+        float(min_share),
+        sparse_grad,
+    )
+    return total
+
+
+def _check(
+    sdf: Tensor,
+    features: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    samples: Samples,
+    bricks: Bricks | None,
+    levels: Lattices | None,
+) -> None:
+    op = "composite_field"
+    nodes = "X Y Z"
+    if bricks is not None:
+        check_bricks(op, bricks, sdf=(sdf, "R"))
+        nodes = "R"
+    sizes = check(
+        op,
+        sdf=(sdf, nodes),
+        features=(features, "T F" if levels is not None else f"{nodes} C"),
+        origin=(origin, "N 3"),
+        direction=(direction, "N 3"),
+        t=(samples.t, "M"),
+        connected=(samples.connected, "M", torch.bool),
+        offsets=(samples.offsets, "N+1", torch.int64),
+    )
+    if not sdf.numel():
+        raise ValueError(f"{op}: sdf must have nodes, got {list(sdf.shape)}")
+    if levels is not None:
+        check_levels(op, sizes["T"], *levels)
+
+
+def composite_field_reference(
+    sdf: Tensor,
+    features: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    samples: Samples,
+    grid_origin: Sequence[float],
+    voxel_size: float,
+    inv_s: float,
+    *,
+    bricks: Bricks | None = None,
+    levels: Lattices | None = None,
+    min_share: float = 0.0,
+) -> Tensor:
+    """The same in eager torch, op by op: opacity, t, gradient and features, [N, 5 + C]."""
+    ray = torch.repeat_interleave(samples.offsets.diff())
+    points = origin[ray] + samples.t[:, None] * direction[ray]
+    of_nodes = features if levels is None else sdf.new_empty(*sdf.shape, 0)
+    if bricks is None:
+        value, gradient, feature = sample_dense_reference(
+            sdf, of_nodes, points, grid_origin, voxel_size
+        )
+    else:
+        value, gradient, feature = sample_sparse_reference(
+            sdf, of_nodes, bricks, points, grid_origin, voxel_size
+        )
+    if levels is not None:
+        feature = encode_hash_reference(features, points, *levels)
+    alpha = section_alpha(value, samples.connected, inv_s)
+    _, weight = composite_reference(alpha, value[:, None], samples.offsets)
+    share = (weight + weight.roll(1)) / 2  # the last sample of a ray starts no section
+    n = len(samples.offsets) - 1
+    most = share.new_zeros(n).scatter_reduce(0, ray, share.detach(), "amax")
+    read = torch.where(share.detach() >= min_share * most[ray], share, 0.0)
+
+    def summed(values: Tensor) -> Tensor:
+        return values.new_zeros(n, values.shape[1]).index_add(0, ray, values)
+
+    opacity = summed(share[:, None])
+    scale = opacity / summed(read[:, None]).clamp_min(torch.finfo(share.dtype).tiny)
+    sums = summed(read[:, None] * torch.cat([gradient, feature], 1))
+    return torch.cat([opacity, summed((share * samples.t)[:, None]), scale * sums], 1)
+
+
+def _hash_place(
+    lower: list[float], upper: list[float], voxel_sizes: list[float]
+) -> hash_grid.Place:
+    """Levels as the extension takes them; none: no hash table."""
+    if not voxel_sizes:
+        return [], [0.0] * 3, []
+    return lattice_sizes(lower, upper, voxel_sizes), lower, voxel_sizes
+
+
+def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
+    sdf, features, table, *rays = tensors
+    *place, lower, upper, voxel_sizes, inv_s, min_share, _ = options
+    native.require().composite_field_forward(
+        grid_sampling.grid_of(table, *place),
+        *native.arrays(sdf, features),
+        *_hash_place(lower, upper, voxel_sizes),
+        *native.arrays(*rays),
+        inv_s,
+        min_share,
+        *native.arrays(*outputs),
+        native.threads(),
+    )
+
+
+class _Adjoints(NamedTuple):
+    """Derivatives of the loss to what was read of each sample, and where that was."""
+
+    points: Tensor  # [M, 3]
+    feature_points: Tensor  # [M, 3] the same, or NaN where no features were read
+    value: Tensor  # [M]
+    gradient: Tensor  # [M, 3]
+    feature: Tensor  # [M, C]
+
+
+def _adjoints(
+    saved: Sequence[Tensor],
+    grad_out: Tensor,
+    grid: Any,
+    levels: hash_grid.Place,
+    density: Sequence[float],
+) -> _Adjoints:
+    """Through compositing and opacity, back to samples."""
+    sdf, features, _, *rays, held = saved
+    t = rays[2]
+    adjoints = _Adjoints(
+        t.new_empty(len(t), 3),
+        t.new_empty(len(t), 3),
+        torch.empty_like(t),
+        t.new_empty(len(t), 3),
+        t.new_empty(len(t), held.shape[1] - SAMPLE_NUMBERS),
+    )
+    native.require().composite_field_pulls(
+        grid,
+        *native.arrays(sdf, features),
+        *levels,
+        *native.arrays(*rays),
+        *density,
+        *native.arrays(held, grad_out, *adjoints),
+        native.threads(),
+    )
+    return adjoints
+
+
+def _backward(
+    saved: Sequence[Tensor], grads: Sequence[Tensor], options: Sequence, needs: list[bool]
+) -> list[Tensor | None]:
+    """From samples to nodes, or to the hash table, and to rays."""
+    sdf, features, table, _, direction, t, _, offsets, _ = saved
+    *place, lower, upper, voxel_sizes, inv_s, min_share, sparse = options
+    grid = grid_sampling.grid_of(table, *place)
+    levels = _hash_place(lower, upper, voxel_sizes)
+    at = _adjoints(saved, grads[0], grid, levels, (inv_s, min_share))
+    hashed, moved = bool(voxel_sizes), needs[2] or needs[3]
+    of_nodes = sdf.new_empty(*sdf.shape, 0) if hashed else features
+    feature = at.feature[:, :0] if hashed else at.feature
+    order = torch.empty(len(t), dtype=torch.int32)
+    native.require().sort_by_tile(grid, *native.arrays(at.points, order), native.threads())
+    of_sdf, of_features, of_points = grid_sampling.gradients(
+        grid,
+        (sdf, of_nodes, at.points, order),
+        (at.value, at.gradient, feature.contiguous()),
+        [needs[0], needs[1] and not hashed, moved],
+        sparse,
+    )
+    of_hash = None
+    if hashed:
+        hash_needs, count = [needs[1], moved], len(voxel_sizes)
+        of_features, of_hash = hash_grid.gradients(
+            features, at.feature_points, at.feature, levels, count, hash_needs, sparse
+        )
+    of_origin = of_direction = None
+    if of_points is not None:
+        of_points = of_points if of_hash is None else of_points + of_hash
+        ray = torch.repeat_interleave(offsets.diff())
+        of_origin = torch.zeros_like(direction).index_add(0, ray, of_points)
+        of_direction = torch.zeros_like(direction).index_add(0, ray, t[:, None] * of_points)
+    return [of_sdf, of_features, of_origin, of_direction]
+
+
+@differentiable(to="sdf features origin direction", forward=_forward, backward=_backward, held=1)
+def _composite_field(
+    sdf: Tensor,
+    features: Tensor,
+    table: Tensor,
+    origin: Tensor,
+    direction: Tensor,
+    t: Tensor,
+    connected: Tensor,
+    offsets: Tensor,
+    size: list[int],
+    grid_origin: list[float],
+    voxel_size: float,
+    lower: list[float],
+    upper: list[float],
+    voxel_sizes: list[float],
+    inv_s: float,
+    min_share: float,
+    sparse_grad: bool,
+) -> tuple[Tensor, Tensor]:
+    """What rays sum up to, and what is held of samples for the way back."""
+    channels = features.shape[-1] * max(len(voxel_sizes), 1)
+    return (
+        t.new_empty(len(offsets) - 1, RAY_NUMBERS + channels),
+        t.new_empty(len(t), SAMPLE_NUMBERS + channels),
+    )

@@ -1,0 +1,332 @@
+"""Sampling of dense grids, and of grids of which only bricks around a surface are stored:
+distance, its spatial gradient and features at points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from univoxel.core.records import Bricks
+from univoxel.ops import native
+from univoxel.ops.differentiable import Differentiable, check, check_bricks, differentiable
+
+# What the sampling of dense and of sparse grids shares.
+#
+# A grid here is an object of the extension: its lattice in the world, and in which rows its nodes
+# are stored.
+
+
+def check_place(op: str, points: int, origin: Sequence[float], voxel_size: float) -> None:
+    """Check how many points are sampled, and where the grid lies.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+    if points >= 2**31:
+        raise ValueError(f"{op}: points must be fewer than 2^31, got {points}")
+    if len(origin) != 3 or not all(math.isfinite(x) for x in origin):
+        raise ValueError(f"{op}: origin must be 3 finite numbers, got {list(origin)}")
+    if not 0 < voxel_size < math.inf:
+        raise ValueError(f"{op}: voxel_size must be above 0, got {voxel_size}")
+
+
+class SparseGrad(torch.autograd.Function):
+    """The same values with a gradient that is sparse in its first dimensions: for backends whose
+    own gradient is dense."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, dims: int) -> Tensor:
+        ctx.dims = dims
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        return grad.to_sparse(ctx.dims), None
+
+
+def grid_of(table: Tensor, size: list[int], origin: list[float], voxel_size: float) -> Any:
+    """The grid as the extension has it; dense where the table of bricks is empty."""
+    if table.numel():
+        return native.require().SparseGrid(*native.arrays(table), size, origin, voxel_size)
+    return native.require().DenseGrid(size, origin, voxel_size)
+
+
+def no_table(like: Tensor) -> Tensor:
+    """The table of a dense grid."""
+    return like.new_empty(0, 0, 0, dtype=torch.int32)
+
+
+def gradients(
+    grid: Any,
+    inputs: Sequence[Tensor],  # sdf, features, points, order
+    grad_outputs: Sequence[Tensor],  # of value, gradient, feature
+    needs: list[bool],
+    sparse: bool,
+) -> list[Tensor | None]:
+    """Gradients to sdf, features and points; None where not needed.
+
+    Args:
+        sparse: those to sdf and features hold touched rows alone.
+    """
+    sdf, features, points, order = inputs
+    core, threads = native.require(), native.threads()
+    rows = None, None
+    if sparse:
+        touching = native.arrays(points, order)
+        rows = core.touched_rows(grid, *touching, sdf.numel(), *needs[:2], threads)
+    into = [
+        None
+        if not need
+        else torch.empty_like(t)
+        if r is None
+        else t.new_empty(len(r), *t.shape[sdf.dim() :])
+        for t, r, need in zip((sdf, features, points), (*rows, None), needs, strict=True)
+    ]
+    core.sample_grid_backward(grid, *native.arrays(*inputs, *grad_outputs, *into), *rows, threads)
+    return [
+        g if g is None or r is None else _sparse_tensor(r, g, t.shape, sdf.dim())
+        for g, r, t in zip(into, (*rows, None), (sdf, features, points), strict=True)
+    ]
+
+
+def _sparse_tensor(rows: Any, values: Tensor, shape: torch.Size, dims: int) -> Tensor:
+    """Values of touched rows as a tensor that is sparse in its first dimensions."""
+    indices = torch.empty(dims, len(rows), dtype=torch.int64)
+    rows.write(indices.numpy(), native.threads())
+    # The rows are distinct, in order and inside by construction: checking costs more than they do.
+    return torch.sparse_coo_tensor(
+        indices, values, shape, is_coalesced=True, check_invariants=False
+    )
+
+
+def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
+    sdf, features, table, points = tensors
+    value, gradient, feature, order = outputs
+    native.require().sample_grid_forward(
+        grid_of(table, *options[:3]),
+        *native.arrays(sdf, features, points, order, value, gradient, feature),
+        native.threads(),
+    )
+
+
+def _backward(
+    saved: Sequence, grads: Sequence[Tensor], options: Sequence, needs: list[bool]
+) -> list[Tensor | None]:
+    sdf, features, table, points, order = saved
+    *place, sparse = options
+    return gradients(grid_of(table, *place), (sdf, features, points, order), grads, needs, sparse)
+
+
+def _sampled(
+    sdf: Tensor,
+    features: Tensor,
+    table: Tensor,
+    points: Tensor,
+    size: list[int],
+    origin: list[float],
+    voxel_size: float,
+    sparse_grad: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Value, gradient, feature, and the points' order by tile, which backward uses again."""
+    m = len(points)
+    return (
+        points.new_empty(m),
+        points.new_empty(m, 3),
+        features.new_empty(m, features.shape[-1]),
+        points.new_empty(m, dtype=torch.int32),
+    )
+
+
+def sampler(name: str) -> Differentiable:
+    """The op of that name. It is the same for both: a dense grid is one without a table."""
+    to = "sdf features points"
+    return differentiable(to, name=name, forward=_forward, backward=_backward, held=1)(_sampled)
+
+
+# Sampling of a dense grid: distance, its spatial gradient and features at points.
+
+
+def sample_dense(
+    sdf: Tensor,  # [X, Y, Z]
+    features: Tensor,  # [X, Y, Z, C]
+    points: Tensor,  # [M, 3]
+    origin: Sequence[float],
+    voxel_size: float,
+    sparse_grad: bool = False,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Sample a grid of distances and features at points of the world.
+
+    Node (i, j, k) lies at origin + voxel_size * (i, j, k). With F the trilinear interpolant of the
+    sdf and h the voxel size,
+
+        value = F(p),   gradient_x = (F(p + h x) - F(p - h x)) / (2 h),   y and z likewise,
+
+    and feature is the trilinear interpolant of the features. The gradient is continuous across
+    cells, unlike the derivative of F, and is the trilinear interpolant of the nodes' central
+    differences.
+
+    A point outside the grid is first moved to the nearest point of its border; along an axis on
+    which it moved, derivatives to the point are 0. F itself holds its border values outside, so
+    the central difference at the border is (f_1 - f_0) / (2 h): half of the one-sided one. A
+    NaN point yields NaN and contributes to no gradient.
+
+    Args:
+        sdf: [X, Y, Z] one distance a node, world units.
+        features: [X, Y, Z, C] any number of channels, 0 included.
+        points: [M, 3] world, fewer than 2^31.
+        origin: world position of node (0, 0, 0): 3 finite numbers.
+        voxel_size: h, world units, above 0.
+        sparse_grad: gradients of sdf and features come back as coalesced ``sparse_coo`` tensors
+            that hold only the rows some point touched: cheap where points meet few of many nodes,
+            and what ``RowAdam`` takes. The rows of the two differ: the gradient reaches further.
+            Eager only: under torch.compile ask for dense gradients.
+
+    Returns:
+        value [M], world units; gradient [M, 3], no unit; feature [M, C].
+
+    Raises:
+        TypeError, ValueError: an argument is no tensor, or of another size, dtype or device than
+            above; the grid has no nodes; origin or voxel_size out of range.
+
+    Differentiable in: sdf, features, points (the derivative of the outputs as defined: the
+    gradient's derivative is piecewise constant along each axis). Second order raises.
+    Source: the lookup of Wu et al. 2022 (Voxurf, "grid_sampler"): gradients from neighbouring
+    voxels, interpolated.
+    """
+    sizes = check(
+        "sample_dense",
+        sdf=(sdf, "X Y Z"),
+        features=(features, "X Y Z C"),
+        points=(points, "M 3"),
+    )
+    if not sdf.numel():
+        raise ValueError(f"sample_dense: sdf must have nodes, got {list(sdf.shape)}")
+    check_place("sample_dense", sizes["M"], origin, voxel_size)
+    if native.serves(sdf):
+        return _sample_dense(
+            sdf.contiguous(),
+            features.contiguous(),
+            no_table(sdf),
+            points.contiguous(),
+            list(sdf.shape),
+            [float(x) for x in origin],
+            float(voxel_size),
+            sparse_grad,
+        )[:3]
+    if sparse_grad:
+        sdf, features = SparseGrad.apply(sdf, 3), SparseGrad.apply(features, 3)
+    return sample_dense_reference(sdf, features, points, origin, voxel_size)
+
+
+def sample_dense_reference(
+    sdf: Tensor, features: Tensor, points: Tensor, origin: Sequence[float], voxel_size: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The same in eager torch: eight corners, each with its six neighbours."""
+    size = torch.tensor(sdf.shape, device=sdf.device)
+    lost = points.isnan().any(1, keepdim=True)
+    start = torch.tensor(origin, dtype=torch.float64, device=sdf.device)
+    # Locate in double, so that a float32 point far from the origin keeps its fraction.
+    at = (torch.where(lost, 0.0, points).double() - start) * (1 / voxel_size)
+    at = torch.minimum(at.clamp_min(0.0), (size - 1).double())
+    cell = torch.minimum(at.detach().long(), (size - 2).clamp_min(0))
+    t = (at - cell).to(points.dtype)
+    value = torch.zeros_like(points[:, 0])
+    gradient = torch.zeros_like(points)
+    feature = features.new_zeros(len(points), features.shape[3])
+    shifts = torch.eye(3, dtype=torch.long, device=sdf.device)
+    for corner in torch.cartesian_prod(*[torch.arange(2, device=sdf.device)] * 3):
+        weight = torch.where(corner == 1, t, 1 - t).prod(1)
+        node = torch.minimum(cell + corner, size - 1)
+        value = value + weight * sdf[node.unbind(1)]
+        feature = feature + weight[:, None] * features[node.unbind(1)]
+        ahead = [sdf[torch.minimum(node + d, size - 1).unbind(1)] for d in shifts]
+        behind = [sdf[(node - d).clamp_min(0).unbind(1)] for d in shifts]
+        slope = (torch.stack(ahead, 1) - torch.stack(behind, 1)) / (2 * voxel_size)
+        gradient = gradient + weight[:, None] * slope
+    value = torch.where(lost[:, 0], torch.nan, value)
+    return value, torch.where(lost, torch.nan, gradient), torch.where(lost, torch.nan, feature)
+
+
+_sample_dense = sampler("sample_dense")
+
+
+# Sampling of a grid of which only bricks around a surface are stored.
+
+
+def sample_sparse(
+    sdf: Tensor,  # [R]
+    features: Tensor,  # [R, C]
+    bricks: Bricks,
+    points: Tensor,  # [M, 3]
+    origin: Sequence[float],
+    voxel_size: float,
+    sparse_grad: bool = False,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Sample a sparse grid of distances and features at points of the world.
+
+    What `sample_dense` makes of the grid [X, Y, Z] that `bricks` describes. Nodes of missing bricks
+    hold what bricks 0 and 1 hold, and get no gradient.
+
+    Args:
+        sdf: [R] one distance a row, world units; R = 64 n rows of the bricks.
+        features: [R, C] any number of channels, 0 included.
+        bricks: where the nodes of the grid lie.
+        points: [M, 3] world, fewer than 2^31.
+        origin: world position of node (0, 0, 0): 3 finite numbers.
+        voxel_size: world units, above 0.
+        sparse_grad: as for `sample_dense`, over rows.
+
+    Returns:
+        value [M], world units; gradient [M, 3], no unit; feature [M, C].
+
+    Raises:
+        TypeError, ValueError: an argument is no tensor or no Bricks, or of another size, dtype or
+            device than above; the grid has no nodes; origin or voxel_size out of range.
+
+    Differentiable in: sdf, features, points. Second order raises.
+    Source: bricks over a table, as in Museth 2013 (VDB) with one level.
+    """
+    check_bricks("sample_sparse", bricks, sdf=(sdf, "R"), features=(features, "R C"))
+    sizes = check(
+        "sample_sparse", sdf=(sdf, "R"), features=(features, "R C"), points=(points, "M 3")
+    )
+    if not bricks.table.numel():
+        raise ValueError(f"sample_sparse: bricks must have nodes, got size {list(bricks.size)}")
+    check_place("sample_sparse", sizes["M"], origin, voxel_size)
+    if native.serves(sdf):
+        return _sample_sparse(
+            sdf.contiguous(),
+            features.contiguous(),
+            bricks.table,
+            points.contiguous(),
+            list(bricks.size),
+            [float(x) for x in origin],
+            float(voxel_size),
+            sparse_grad,
+        )[:3]
+    if sparse_grad:
+        sdf, features = SparseGrad.apply(sdf, 1), SparseGrad.apply(features, 1)
+    return sample_sparse_reference(sdf, features, bricks, points, origin, voxel_size)
+
+
+def sample_sparse_reference(
+    sdf: Tensor,
+    features: Tensor,
+    bricks: Bricks,
+    points: Tensor,
+    origin: Sequence[float],
+    voxel_size: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The same in eager torch, over the whole grid."""
+    rows = bricks.grid_rows()
+    stored = rows >= Bricks.MISSING * Bricks.NODES
+    whole = torch.where(stored, sdf[rows], sdf.detach()[rows])
+    of_nodes = torch.where(stored[..., None], features[rows], features.detach()[rows])
+    return sample_dense_reference(whole, of_nodes, points, origin, voxel_size)
+
+
+_sample_sparse = sampler("sample_sparse")

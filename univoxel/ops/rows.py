@@ -1,0 +1,188 @@
+"""Some rows of a table: one step of Adam in place, and sums of their gradients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from univoxel.ops import native
+from univoxel.ops.differentiable import check
+
+
+def adam_rows_(
+    param: Tensor,  # [R, C]
+    exp_avg: Tensor,  # [R, C]
+    exp_avg_sq: Tensor,  # [R, C]
+    rows: Tensor,  # [K]
+    grad: Tensor,  # [K, C]
+    lr: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    step: int,
+) -> None:
+    """Take a step of Adam on the given rows; all other rows and their moments stay as they are.
+
+        m = beta1 m + (1 - beta1) g,   v = beta2 v + (1 - beta2) g^2
+        param = param - lr / (1 - beta1^step) m / (sqrt(v / (1 - beta2^step)) + eps)
+
+    The moments of a row decay only when the row is touched, while the bias correction counts the
+    steps of the whole table, as in ``torch.optim.SparseAdam``. eps stands beside the corrected root
+    as in ``torch.optim.Adam``, so that an eps which matters means the same for rows as for dense
+    tensors; SparseAdam adds it to the root before the correction.
+
+    Args:
+        param: [R, C] contiguous, changed in place.
+        exp_avg: [R, C] contiguous: m, changed in place.
+        exp_avg_sq: [R, C] contiguous: v, at least 0, changed in place.
+        rows: [K] int64 in [0, R), distinct (not checked); ascending is fastest.
+        grad: [K, C] the gradient of these rows.
+        lr: at least 0.
+        beta1: in [0, 1).
+        beta2: in [0, 1).
+        eps: at least 0, in the unit of the gradient.
+        step: from 1: how many steps the table has taken, this one included.
+
+    Raises:
+        TypeError, ValueError: an argument is no tensor, or of another size, dtype or device than
+            above, or a tensor to change is not contiguous; rows outside the table; a number out
+            of range.
+
+    Source: Kingma and Ba 2015, "Adam", algorithm 1.
+    """
+    check(
+        "adam_rows_",
+        param=(param, "R C"),
+        exp_avg=(exp_avg, "R C"),
+        exp_avg_sq=(exp_avg_sq, "R C"),
+        rows=(rows, "K", torch.int64),
+        grad=(grad, "K C"),
+    )
+    for name, tensor in (("param", param), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
+        if not tensor.is_contiguous():
+            raise ValueError(
+                f"adam_rows_: {name} must be contiguous, got strides {tensor.stride()}"
+            )
+    for name, number in (("lr", lr), ("eps", eps)):
+        if not number >= 0:
+            raise ValueError(f"adam_rows_: {name} must be at least 0, got {number}")
+    for name, number in (("beta1", beta1), ("beta2", beta2)):
+        if not 0 <= number < 1:
+            raise ValueError(f"adam_rows_: {name} must be in [0, 1), got {number}")
+    if step < 1:
+        raise ValueError(f"adam_rows_: step must be at least 1, got {step}")
+    numbers = (float(lr), float(beta1), float(beta2), float(eps), int(step))
+    if native.serves(param):
+        _adam_rows(param, exp_avg, exp_avg_sq, rows.contiguous(), grad.contiguous(), *numbers)
+    else:
+        adam_rows_reference_(param, exp_avg, exp_avg_sq, rows, grad, *numbers)
+
+
+def adam_rows_reference_(
+    param: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    rows: Tensor,
+    grad: Tensor,
+    lr: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    step: int,
+) -> None:
+    """The same in eager torch."""
+    m = exp_avg[rows].lerp(grad, 1 - beta1)
+    v = exp_avg_sq[rows].lerp(grad.square(), 1 - beta2)
+    exp_avg[rows], exp_avg_sq[rows] = m, v
+    root = (v / (1 - beta2**step)).sqrt()
+    param[rows] -= lr / (1 - beta1**step) * m / (root + eps)
+
+
+@native.in_place("adam_rows_", ("param", "exp_avg", "exp_avg_sq"))
+def _adam_rows(
+    param: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    rows: Tensor,
+    grad: Tensor,
+    lr: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    step: int,
+) -> None:
+    native.require().adam_rows(
+        *native.arrays(param, exp_avg, exp_avg_sq, rows, grad),
+        *(lr, beta1, beta2, eps, step, native.threads()),
+    )
+
+
+# Sums of gradients that each hold some rows of a table.
+
+
+@torch.no_grad()
+def sum_rows(
+    rows: Sequence[Tensor],  # n times [K]
+    values: Sequence[Tensor],  # n times [K, C]
+    shape: Sequence[int],
+) -> tuple[Tensor, Tensor]:
+    """Add up lists of rows of one table, as sparse gradients are.
+
+    Where all lists together hold a row several times, its values are summed in the order of the
+    lists. ``torch``'s sums of sparse tensors sort, on one thread.
+
+    Args:
+        rows: lists [K] int64 of numbers of rows, strictly ascending; K may differ. At least one.
+        values: for each list [K, C].
+        shape: of the table, D sizes; rows count its last dimension fastest. [R] for a plain one.
+
+    Returns:
+        Indices [D, U] into the table of the rows that are in any list, ascending, and their sums
+        [U, C]: what ``torch.sparse_coo_tensor`` takes.
+
+    Raises:
+        TypeError, ValueError: an argument is no tensor, or of another size, dtype or device than
+            above; no list; rows that do not ascend, or outside the table.
+    """
+    if not rows or len(rows) != len(values):
+        raise ValueError(
+            f"sum_rows: rows and values must be as many lists, at least one, got {len(rows)} and "
+            f"{len(values)}"
+        )
+    arguments: dict = {}
+    for i, (r, v) in enumerate(zip(rows, values, strict=True)):
+        arguments[f"rows[{i}]"] = (r, f"K{i}", torch.int64)
+        arguments[f"values[{i}]"] = (v, f"K{i} C")
+    check("sum_rows", **arguments)
+    if not shape or any(size < 1 for size in shape):
+        raise ValueError(f"sum_rows: shape must be sizes of at least 1, got {list(shape)}")
+    if not native.serves(values[0]):
+        return sum_rows_reference(rows, values, shape)
+    core, threads = native.require(), native.threads()
+    lists = [native.arrays(*(t.contiguous() for t in several)) for several in (rows, values)]
+    union = core.union_rows(*lists, math.prod(shape), threads)
+    indices = torch.empty(len(shape), len(union), dtype=torch.int64)
+    total = values[0].new_empty(len(union), values[0].shape[1])
+    core.sum_rows(*lists, union, *native.arrays(total, indices), list(shape), threads)
+    return indices, total
+
+
+@torch.no_grad()
+def sum_rows_reference(
+    rows: Sequence[Tensor], values: Sequence[Tensor], shape: Sequence[int]
+) -> tuple[Tensor, Tensor]:
+    """The same in eager torch, over the whole table."""
+    count = math.prod(shape)
+    for r in rows:
+        inside = not len(r) or (0 <= int(r[0]) and int(r[-1]) < count)
+        if not inside or not bool((r[1:] > r[:-1]).all()):
+            raise ValueError(f"sum_rows: rows must ascend in [0, {count})")
+    total = values[0].new_zeros(count, values[0].shape[1])
+    held = torch.zeros(count, dtype=torch.bool, device=total.device)
+    for r, v in zip(rows, values, strict=True):
+        total.index_add_(0, r, v)
+        held[r] = True
+    return held.view(*shape).nonzero().T, total[held]

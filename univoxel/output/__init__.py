@@ -1,0 +1,1 @@
+"""What a run becomes: meshes, pages, reports, moving pictures."""

@@ -1,0 +1,361 @@
+"""Textured meshes: the record that writers share, its texture atlas, how a scene's field is read
+into it, and where it lies."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+import torch
+import xatlas
+from PIL import Image
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from univoxel.brdf import metal_or_none
+from univoxel.color import linear_to_srgb
+from univoxel.core.choices import Origin
+from univoxel.core.records import FieldSample, Mesh
+from univoxel.errors import UserError
+from univoxel.fields.field import Field
+from univoxel.scene import Scene
+
+# glTF and USD look along -Z with +Y up, our world has +Z up: (x, y, z) -> (x, z, -y), a quarter
+# turn.
+Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class TexturedMesh:
+    """Triangles with textures, counter-clockwise seen from outside; a vertex stands in one chart.
+
+    Row 0 of a texture is on top, at v = 1. The field's normal at a texel is the unit vector along
+
+        n = x t + y b + z n,  b = t_w cross(n, t)
+
+    where (x, y, z) is the texel of `relief`, and n, t are the vertices' normals and tangents,
+    interpolated over the triangle and not normalised: the frame of MikkTSpace.
+    """
+
+    vertices: Tensor  # [P, 3] float32, world
+    faces: Tensor  # [F, 3] int32
+    normals: Tensor  # [P, 3] float32 unit, of the triangles, smooth across them
+    tangents: Tensor  # [P, 4] float32: unit, along +u; w is 1, or -1 where the chart is mirrored
+    uv: Tensor  # [P, 2] float32 in [0, 1], u to the right and v upwards
+    relief: Tensor  # [T, T, 3] float32 unit, z > 0: the normal in the tangent frame
+    albedo: Tensor  # [T, T, 3] float32 linear, in [0, 1]; of a metal: its F0
+    roughness: Tensor  # [T, T] float32 perceptual, in [0, 1]
+    metallic: Tensor | None = None  # [T, T] float32 in [0, 1]; None: no metal anywhere
+
+
+def albedo_picture(mesh: TexturedMesh) -> np.ndarray:
+    """[T, T, 3] uint8, sRGB."""
+    return _bytes(linear_to_srgb(mesh.albedo))
+
+
+def roughness_picture(mesh: TexturedMesh) -> np.ndarray:
+    """[T, T] uint8, linear."""
+    return _bytes(mesh.roughness)
+
+
+def metallic_picture(mesh: TexturedMesh) -> np.ndarray:
+    """[T, T] uint8, linear; black where the mesh has no metal."""
+    return _bytes(torch.zeros_like(mesh.roughness) if mesh.metallic is None else mesh.metallic)
+
+
+def relief_picture(mesh: TexturedMesh) -> np.ndarray:
+    """[T, T, 3] uint8, linear, 127.5 (n + 1); green is +y, upwards in the picture."""
+    return _bytes(0.5 * (mesh.relief + 1))
+
+
+def encoded(picture: np.ndarray, jpeg: int | None) -> bytes:
+    """A picture as the bytes of a PNG file, or of a JPEG file of some quality."""
+    file = io.BytesIO()
+    if jpeg is None:
+        Image.fromarray(picture).save(file, format="PNG")
+    else:  # 4:4:4: channels of these are no colours
+        Image.fromarray(picture).save(file, format="JPEG", quality=jpeg, subsampling=0)
+    return file.getvalue()
+
+
+def _bytes(values: Tensor) -> np.ndarray:
+    return (values.clamp(0, 1) * 255).round().byte().numpy()
+
+
+# A texture over a mesh: charts, the frames of its vertices, and which texel lies where.
+
+
+PADDING = 4  # texels between charts: two mip levels stay apart
+CANDIDATES = 1 << 22  # texels looked at together: bounds memory
+
+
+def unwrap(mesh: Mesh, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Cut a mesh into charts and pack them into a square of size x size texels (xatlas).
+
+    Returns:
+        source [Q] int64, the vertex of `mesh` that each new one copies; faces [F, 3] int32, in the
+        order of `mesh`; uv [Q, 2] float32 in [0, 1], v upwards.
+    """
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(mesh.vertices.numpy(), mesh.faces.numpy().astype(np.uint32))
+    charts, pack = xatlas.ChartOptions(), xatlas.PackOptions()
+    # No mirrored charts, not every program can light them; the packer rotates by a transposition.
+    charts.fix_winding, pack.rotate_charts = True, False
+    pack.resolution, pack.padding, pack.bilinear = size, PADDING, True
+    atlas.generate(charts, pack)
+    source, faces, uv = atlas[0]
+    return (
+        torch.from_numpy(source.astype(np.int64)),
+        torch.from_numpy(faces.astype(np.int32)),
+        torch.from_numpy(uv.astype(np.float32)).clamp(0, 1),
+    )
+
+
+def vertex_normals(mesh: Mesh) -> Tensor:
+    """Unit normals [P, 3] of the vertices: the mean over their faces, weighted by the angle there.
+
+    Source: Thuermer and Wuethrich 1998.
+    """
+    corner, index = mesh.vertices.double()[mesh.faces.long()], mesh.faces.long()
+    normal = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = _unit(normal)
+    total = torch.zeros(len(mesh.vertices), 3, dtype=torch.float64)
+    for k in range(3):
+        to_next, to_last = _edges_at(corner, k)
+        total.index_add_(0, index[:, k], normal * _angle(to_next, to_last)[:, None])
+    return _unit(total).float()
+
+
+def vertex_tangents(vertices: Tensor, faces: Tensor, normals: Tensor, uv: Tensor) -> Tensor:
+    """Tangents [P, 4]: unit along +u, at right angles to the normal, and the sign of b.
+
+    The formula of MikkTSpace (Mikkelsen 2008), which renderers use that compute their own: per
+    corner dP/du, projected into the vertex's plane and normalised, weighted by the corner's angle
+    in that plane. It differs from MikkTSpace only at vertices where charts of both windings meet,
+    which are not split here.
+    """
+    index = faces.long()
+    corner, flat = vertices.double()[index], uv.double()[index]
+    d1, d2 = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+    e1, e2 = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    winding = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]).sign()
+    along_u = winding[:, None] * (d2[:, 1:] * e1 - d1[:, 1:] * e2)
+    total = torch.zeros(len(vertices), 4, dtype=torch.float64)
+    for k in range(3):
+        n = normals.double()[index[:, k]]
+        to_next, to_last = (_unit(_reject(e, n)) for e in _edges_at(corner, k))
+        angle = _angle(to_next, to_last)[:, None]
+        tangent = torch.cat([_unit(_reject(along_u, n)), winding[:, None]], 1)
+        total.index_add_(0, index[:, k], angle * tangent)
+    n = normals.double()
+    # Where faces have no extent in the texture any direction serves.
+    axis = torch.nn.functional.one_hot(n.abs().argmin(1), 3).double()
+    tangent = total[:, :3]
+    tangent = torch.where(tangent.norm(dim=1, keepdim=True) > 1e-9, tangent, _reject(axis, n))
+    sign = torch.where(total[:, 3:] < 0, -1.0, 1.0)
+    return torch.cat([_unit(_reject(tangent, n)), sign], 1).float()
+
+
+def rasterise(uv: Tensor, faces: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The texels whose centres lie in a triangle.
+
+    Texel (row r, column c) has its centre at u = (c + 0.5) / size, v = 1 - (r + 0.5) / size.
+
+    Returns:
+        texel [K] int64 = r * size + c, each once; face [K] int64; barycentric [K, 3] float32.
+    """
+    corner = uv.double().numpy()[faces.long().numpy()] * [size, -size] + [0, size]
+    low = np.ceil(corner.min(1) - 0.5).astype(np.int64).clip(0)
+    high = np.floor(corner.max(1) - 0.5).astype(np.int64).clip(None, size - 1)
+    extent = (high - low + 1).clip(0)
+    count = extent.prod(1)
+    owner = np.full(size * size, -1, np.int64)
+    weights = np.zeros((size * size, 3), np.float32)
+    chunk = (np.cumsum(count) // CANDIDATES) if len(count) else count
+    for some in np.split(np.arange(len(count)), np.flatnonzero(np.diff(chunk)) + 1):
+        face = np.repeat(some, count[some])
+        first = np.repeat(np.cumsum(count[some]) - count[some], count[some])
+        row, column = np.divmod(np.arange(len(face)) - first, extent[face, 0])
+        column, row = column + low[face, 0], row + low[face, 1]
+        a, b, c = corner[face].transpose(1, 0, 2)
+        p = np.stack([column, row], 1) + 0.5
+        area = _cross(b - a, c - a)
+        with np.errstate(divide="ignore", invalid="ignore"):  # triangles without area hold nothing
+            wb, wc = _cross(p - a, c - a) / area, _cross(b - a, p - a) / area
+        inside = (wb >= 0) & (wc >= 0) & (wb + wc <= 1)
+        texel = (row * size + column)[inside]
+        owner[texel] = face[inside]
+        weights[texel] = np.stack([1 - wb - wc, wb, wc], 1)[inside]
+    texel = np.flatnonzero(owner >= 0)
+    return torch.from_numpy(texel), torch.from_numpy(owner[texel]), torch.from_numpy(weights[texel])
+
+
+def dilated(texel: Tensor, size: int) -> Tensor:
+    """For each texel of a picture the nearest of the given ones, as an index into `texel`: [T, T].
+
+    The whole background takes colours from the charts beside it, so that neither filtering nor
+    any mip level mixes it in.
+    """
+    empty = np.ones((size, size), bool)
+    empty.reshape(-1)[texel.numpy()] = False
+    nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
+    row, column = np.asarray(nearest, np.int64)
+    place = np.zeros(size * size, np.int64)
+    place[texel.numpy()] = np.arange(len(texel))
+    return torch.from_numpy(place[row * size + column])
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _unit(x: Tensor) -> Tensor:
+    """x / |x|, and 0 for 0."""
+    return torch.nn.functional.normalize(x, dim=1, eps=1e-30)
+
+
+def _reject(x: Tensor, n: Tensor) -> Tensor:
+    """The part of x at right angles to unit n."""
+    return x - (x * n).sum(1, keepdim=True) * n
+
+
+def _edges_at(corner: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """From corner k of triangles [F, 3, 3] to the next and to the last one."""
+    return corner[:, (k + 1) % 3] - corner[:, k], corner[:, (k + 2) % 3] - corner[:, k]
+
+
+def _angle(a: Tensor, b: Tensor) -> Tensor:
+    """Between vectors, stable for small angles; 0 where one is 0."""
+    return torch.atan2(torch.linalg.cross(a, b).norm(dim=1), (a * b).sum(1))
+
+
+# Reads a scene's field into the vertices or the texture of a mesh that lies near its surface.
+
+
+POINTS_AT_ONCE = 1 << 17  # bounds memory
+NEWTON_STEPS = 4
+REACH = 2.0  # voxels: how far a point of the mesh may be moved to meet the field's surface
+MIN_Z = 0.05  # of a texel's normal in the tangent frame: it looks out of the triangle
+
+
+def nearest_surface(field: Field, points: Tensor) -> tuple[Tensor, FieldSample]:
+    """Points [M, 3] moved onto the field's zero level, and the field there.
+
+    Newton steps along the gradient, x - f grad f / |grad f|^2; where they would lead further than
+    two voxels away (the mesh cuts a corner, the field is no distance) they end there.
+    """
+    x, reach = points, REACH * field.voxel_size
+    for _ in range(NEWTON_STEPS):
+        at = field.sample(x)
+        slope = at.gradient.square().sum(1).clamp_min(1e-6)
+        moved = x - (at.sdf / slope)[:, None] * at.gradient - points
+        length = moved.norm(dim=1, keepdim=True)
+        x = points + moved * (reach / length.clamp_min(reach))
+    return x, field.sample(x)
+
+
+@torch.no_grad()
+def with_materials(scene: Scene, mesh: Mesh) -> Mesh:
+    """A mesh with the field's normal and materials at its vertices, which stay in place."""
+    parts = []
+    for points in mesh.vertices.split(POINTS_AT_ONCE):
+        _, at = nearest_surface(scene.field, points)
+        normal = torch.nn.functional.normalize(at.gradient, dim=1, eps=1e-6)
+        parts.append((normal, *scene.material(at.features)))
+    *rest, metallic = (torch.cat(p) for p in zip(*parts, strict=True))
+    return Mesh(mesh.vertices, mesh.faces, *rest, metallic=metal_or_none(metallic))
+
+
+@torch.no_grad()
+def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
+    """Textures of size x size texels for a mesh near the scene's surface.
+
+    Each texel's centre is a point of its triangle; the field at the surface beside it gives normal
+    and materials. So relief that the triangles are too coarse for lies in the texture.
+    Texels outside of the charts copy the nearest inside.
+
+    Raises:
+        ValueError: no texel lies in a triangle.
+    """
+    source, faces, uv = unwrap(mesh, size)
+    vertices, normals = mesh.vertices[source], vertex_normals(mesh)[source]
+    tangents = vertex_tangents(vertices, faces, normals, uv)
+    texel, face, weight = rasterise(uv, faces, size)
+    if not len(texel):
+        raise UserError(f"a texture of {size} x {size} is too small for {len(faces)} faces")
+    parts = []
+    for some, w in zip(face.split(POINTS_AT_ONCE), weight.split(POINTS_AT_ONCE), strict=True):
+        corner = faces[some].long()
+        point, n, t = (
+            torch.einsum("mk,mkc->mc", w, values[corner])
+            for values in (vertices, normals, tangents)
+        )
+        _, at = nearest_surface(scene.field, point)
+        parts.append((in_frame(at.gradient, n, t), *scene.material(at.features)))
+    place = dilated(texel, size)
+    *rest, metallic = (torch.cat(p)[place] for p in zip(*parts, strict=True))
+    return TexturedMesh(
+        vertices, faces, normals, tangents, uv, *rest, metallic=metal_or_none(metallic)
+    )
+
+
+def in_frame(direction: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:
+    """Unit coordinates [M, 3] of directions [M, 3] in the frame of `TexturedMesh`.
+
+    The frame is not orthonormal (it is interpolated), so this solves for them. Directions below
+    the triangle are bent up to its side.
+
+    Args:
+        normal: [M, 3], tangent: [M, 4], interpolated and not normalised.
+    """
+    t = tangent[:, :3]
+    b = tangent[:, 3:] * torch.linalg.cross(normal, t)
+    # Cramer's rule, up to the determinant, whose sign is all that normalising leaves of it.
+    rows = [torch.linalg.cross(p, q) for p, q in ((b, normal), (normal, t), (t, b))]
+    sign = (t * rows[0]).sum(1, keepdim=True).sign()
+    local = sign * torch.stack([(direction * row).sum(1) for row in rows], 1)
+    local = torch.nn.functional.normalize(local, dim=1, eps=1e-12)
+    local = torch.cat([local[:, :2], local[:, 2:].clamp_min(MIN_Z)], 1)
+    return torch.nn.functional.normalize(local, dim=1)
+
+
+# Where an exported mesh lies and how large it is.
+
+
+AnyMesh = TypeVar("AnyMesh", Mesh, TexturedMesh)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """x -> scale (x - origin), from the data set's world to an exported one."""
+
+    origin: Tensor  # [3] float64, the point of the world that comes to lie at 0
+    scale: float
+
+
+def placement_of(vertices: Tensor, size: float | None, origin: Origin) -> Placement:
+    """What brings the bounding box of vertices [P, 3] to a size and to an origin.
+
+    Args:
+        size: the longest side of the box afterwards; None: as it is.
+        origin: what comes to lie at 0: "world", the data set's origin; "bottom", the middle of the
+            box's floor; "centre", the middle of the box.
+    """
+    low, high = vertices.double().amin(0), vertices.double().amax(0)
+    middle = (low + high) / 2
+    match origin:
+        case "bottom":
+            at = torch.stack([middle[0], middle[1], low[2]])
+        case "centre":
+            at = middle
+        case _:
+            at = torch.zeros_like(middle)
+    return Placement(at, 1.0 if size is None else size / float((high - low).max()))
+
+
+def placed(mesh: AnyMesh, placement: Placement) -> AnyMesh:
+    """A mesh brought where a placement says; normals and textures stay."""
+    vertices = placement.scale * (mesh.vertices.double() - placement.origin)
+    return replace(mesh, vertices=vertices.float())

@@ -1,0 +1,420 @@
+"""A run as a report: one page without scripts and without network, which says how good the run is,
+where it is in doubt, and what to photograph next.
+
+No truth is read.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from univoxel import __version__
+from univoxel.config import TrainConfig, load_config
+from univoxel.core.html import Curve, chart, document, escape, image, paragraph, table, write_html
+from univoxel.core.records import Mesh
+from univoxel.errors import UserError
+from univoxel.evaluation.confidence import (
+    ADVICE,
+    POINTS,
+    Advice,
+    AdviceConfig,
+    Doubts,
+    Survey,
+    advise,
+    in_words,
+    missing,
+    numbers,
+    place,
+    survey,
+    words,
+)
+from univoxel.output import report_pictures
+from univoxel.output.page import START, facts_of
+from univoxel.render.pipeline import extract_mesh
+from univoxel.run import load_verdict, photos_of
+from univoxel.scene import Scene, load_checkpoint
+from univoxel.training.clock import ALL, Clock, stage_name
+from univoxel.training.progress import LOG
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+
+@dataclass(frozen=True)
+class StageFacts:
+    """A stage of a training, for people."""
+
+    name: str
+    planned: int  # steps
+    made: float | None  # share of them; None: it has not ended
+    seconds: float | None  # None: not known
+    fate: str  # what ended it
+
+
+def curves(run: Path) -> list[Curve]:
+    """Loss and held-out quality over time; empty where the log cannot be read."""
+    losses: list[list[tuple[float, float]]] = []
+    qualities: list[list[tuple[float, float]]] = []
+    stage, resumed = None, 0.0
+    try:
+        for text in (run / LOG).read_text(encoding="utf-8").splitlines():
+            line = json.loads(text)
+            seconds = float(line["seconds"])
+            if line["stage"] != stage or seconds < resumed:  # or a sitting that began again
+                stage = line["stage"]
+                losses.append([])
+                qualities.append([])
+            resumed = seconds
+            if line["losses"]:
+                losses[-1].append((seconds, float(sum(line["losses"].values()))))
+            if line["held_out_psnr"] is not None:
+                qualities[-1].append((seconds, float(line["held_out_psnr"])))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        log.info("no curves: %s cannot be read: %s", run / LOG, error)
+        return []
+    found = (
+        Curve("loss: the sum of what is minimised", losses, logarithmic=True),
+        Curve("validation, PSNR in dB", qualities),
+    )
+    return [curve for curve in found if any(curve.pieces)]
+
+
+def configuration(run: Path) -> TrainConfig | None:
+    """What the run was trained with; None where its config.json cannot be read."""
+    try:
+        return load_config(run / "config.json")
+    except (UserError, OSError) as error:
+        log.info("stages are not told: %s", error)
+        return None
+
+
+def stages(cfg: TrainConfig, state: dict[str, Any]) -> list[StageFacts]:
+    """The stages of a training, in order."""
+    made, early, took = (list(state.get(key, ())) for key in ("made", "early", "took"))
+    found = []
+    for k, stage in enumerate(cfg.stages):
+        share = made[k] if k < len(made) else None
+        if share is None:
+            fate = "not begun" if k > len(made) or not state.get("progress") else "not ended"
+        elif k in early:
+            fate = "ended early: nothing was left to gain"
+        elif share < ALL:
+            fate = "stopped early" if state.get("finished") else "cut by the time limit"
+        else:
+            fate = "whole"
+        seconds = took[k] if k < len(took) else None
+        found.append(StageFacts(stage_name(cfg.stages, k), stage.iterations, share, seconds, fate))
+    return found
+
+
+def stage_ends(state: dict[str, Any]) -> list[float]:
+    """Seconds at which stages ended, the last first counted from the end of training; empty where
+    that was not kept."""
+    took = list(state.get("took", ()))
+    if not took or "seconds" not in state:
+        return []
+    begin = state["seconds"] - sum(took) - state.get("stage_took", 0.0)  # preparation
+    return [begin + sum(took[: k + 1]) for k in range(len(took) - 1)]
+
+
+def prepared(state: dict[str, Any]) -> float | None:
+    """Seconds of training that passed outside of stages: what was done before the first."""
+    took = list(state.get("took", ()))
+    if not took or "seconds" not in state:
+        return None
+    return max(state["seconds"] - sum(took) - state.get("stage_took", 0.0), 0.0)
+
+
+def remarks(cfg: TrainConfig, state: dict[str, Any]) -> list[str]:
+    """What time cut, what went wrong, what was chosen; sentences."""
+    told = []
+    if state.get("stage", 0) < len(cfg.stages):
+        told.append(f"Training has not ended: it stands in stage {state.get('stage', 0) + 1}.")
+    if cut := Clock(cfg, 0.0, state).cut():
+        told.append(cut[0].upper() + cut[1:] + ".")
+    troubles: Sequence[str] = state.get("troubles", ())
+    if troubles:
+        told.append(f"Training met trouble {len(troubles)} times, the last in {troubles[-1]}.")
+    chosen = [entry.get("said", "") for entry in state.get("chosen", ())]
+    return told + [f"Size chosen: {said}." for said in chosen if said]
+
+
+# A run as a report: one page without scripts and without network, which says how good the run is,
+# where it is in doubt, and what to photograph next. No truth is read.
+
+
+FOLDER = Path(__file__).parent / "web"
+RING_GAP = 60.0  # degrees between neighbouring azimuths that are worth a word, as of `poses`
+TRUTH = "No truth was read: all of this is computed from the photographs and the model."
+CHARTS = (
+    "Stages minimise different sums, so the loss jumps between them. Held-out pixels are shown by "
+    "the radiance head first, and by light and materials once those are trained."
+)
+LAYERS = {
+    "render": "in the light of the photographs",
+    "albedo": "colour without light",
+    "roughness": "black mirrors, white is matte",
+    "metal": "white is metal",
+    "normal": "in the world's axes",
+}
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What a report shows.
+
+    Raises:
+        UserError: a number is out of range.
+    """
+
+    title: str | None = None  # None: the run folder's name
+    data: str | Path | None = None  # photographs; None: those that the run names
+    views: int = 4  # photographs beside their render, the worst first; >= 0
+    size: int = 256  # pixels along the longer side of pictures, >= 16
+    advice: AdviceConfig = ADVICE  # how directions are chosen
+
+    def __post_init__(self) -> None:
+        for name, least in (("views", 0), ("size", 16)):
+            if getattr(self, name) < least:
+                value = getattr(self, name)
+                raise UserError(f"report: {name} must be at least {least}, got {value}", name)
+
+
+@dataclass(frozen=True)
+class Known:
+    """What photographs say of a scene."""
+
+    splits: list[report_pictures.Split]  # those trained on first, and test views, if there are any
+    surveyed: Survey
+    advice: Advice
+
+
+def write_report(run: str | Path, path: str | Path, **options: Any) -> Path:
+    """Write the report of a run as one page that opens by double click; return its path.
+
+    Args:
+        run: folder of the trained run.
+        path: .html file, written whole or not at all.
+        options: fields of `ReportOptions`.
+
+    Raises:
+        UserError: the run cannot be used, there is no surface, or an option is out of range; or
+            `data` is given and cannot be used.
+        OSError: a file cannot be read or written.
+    """
+    run, path = Path(run), Path(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise UserError(f"html: expected a file that ends in .html, got {path}", "html")
+    asked = ReportOptions(**options)
+    scene, state = load_checkpoint(run)
+    text = report_text(run, scene, state, asked)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_html(path, text)
+    return path
+
+
+@torch.no_grad()
+def report_text(
+    run: Path,
+    scene: Scene,
+    state: dict[str, Any],
+    options: ReportOptions = ReportOptions(),
+) -> str:
+    """The report of a scene as HTML; errors as of `write_report`.
+
+    Args:
+        run: the scene's folder; what is missing of log, configuration and photographs is left out,
+            and the page says so.
+        state: of its training, as its checkpoint has it.
+    """
+    mesh = extract_mesh(scene)
+    known, why = None, ""
+    try:
+        known = what_is_known(run, scene, options)
+    except (UserError, OSError) as error:  # moved, or not on this machine
+        if options.data is not None:
+            raise
+        why = f"The photographs cannot be read, so this is left out: {error}."
+    title = options.title or run.resolve().name or "univoxel"
+    front = START[0] if known is None else known.advice.front
+    doubts = None if known is None else Doubts(known.surveyed)
+    pictures = report_pictures.layers(scene, mesh, options.size, front, doubts)
+    verdict = load_verdict(run)
+    sections = [
+        ("Result", paragraph(verdict.sentence() + ".") if verdict else ""),
+        ("What to photograph next", next_section(known.advice) if known else paragraph(why)),
+        ("Doubt", doubt_section(known, state, pictures.pop("doubt", [])) if known else ""),
+        ("Photographs and render", views_section(scene, known, options) if known else ""),
+        ("Materials", materials_section(pictures)),
+        ("Light", light_section(scene, mesh)),
+        ("Training", training_section(run, state)),
+    ]
+    facts = " · ".join(facts_of(run, state.get("seconds")))
+    shown = (f"<section><h2>{name}</h2>\n{text}\n</section>" for name, text in sections if text)
+    body = [
+        f"<header>\n  <h1>{escape(title)}</h1>\n  <p>{escape(facts)}</p>\n</header>",
+        *("<main>", *shown, "</main>"),
+        f"<footer>Made by univoxel {__version__}. {TRUTH}</footer>",
+    ]
+    return document(title, (FOLDER / "report.css").read_text("utf-8"), "\n".join(body))
+
+
+def what_is_known(run: Path, scene: Scene, options: ReportOptions) -> Known:
+    """Survey the surface by the photographs of a run, and weigh directions for more.
+
+    Raises:
+        UserError: they cannot be used; OSError: they cannot be read.
+    """
+    data = None if options.data is None else Path(options.data)
+    photos = photos_of(run, data, "train")
+    surveyed = survey(scene, photos, POINTS)
+    photos = scene.registered(photos)
+    occluder = scene.occluder()
+    advice = advise(surveyed, photos.cameras, photos.names, occluder, options.advice)
+    splits = [report_pictures.Split(photos, True)]
+    try:
+        splits.append(report_pictures.Split(photos_of(run, data, "test"), False))
+    except (UserError, OSError):  # few have any
+        pass
+    return Known(splits, surveyed, advice)
+
+
+def next_section(advice: Advice) -> str:
+    """Directions for more photographs, in words, as a list and on the sphere."""
+    parts = []
+    told = in_words(advice)
+    if told:
+        text = "".join(f"<li>{escape(line)}" for line in told)
+        parts.append(f'<ul class="advice">{text}</ul>')
+        worth = enumerate(zip(advice.nearest, advice.gains.tolist(), strict=True))
+        rows = [
+            (f"{k + 1}", _direction(advice, k), escape(near), f"{gain:.1%}")
+            for k, (near, gain) in worth
+        ]
+        parts.append(table(rows, ("", "from", "nearest so far", "worth")))
+    else:
+        parts.append(
+            paragraph("Nothing stands out: photographs are all around what can be seen from there.")
+        )
+    told = [f"{line[0].upper()}{line[1:]}." for line in missing(advice, RING_GAP)]
+    if advice.hidden >= 0.01:
+        told.append(
+            f"{advice.hidden:.0%} of the surface is seen by no photograph, nor from any of these "
+            "directions: turn the object over for a second run, or leave it as it is."
+        )
+    told.append(
+        f"The front is where {advice.front_name} was taken. Left and right are those of whoever "
+        "stands there. Keep the distance of the other photographs, and their light."
+    )
+    parts += [paragraph(line) for line in told]
+    legend = (
+        "The directions around the object, seen from above. White: photographs. Bright: what one "
+        "more would add. Ringed: a gap, no photograph is near. Numbers: what to take, the best "
+        "first. Worth: share of the surface that it would fix, at most."
+    )
+    left = "\n".join(parts)
+    figure = f"<figure>{report_pictures.sphere(advice)}<figcaption>{legend}</figcaption></figure>"
+    return f'<div class="beside"><div>{left}</div>{figure}</div>'
+
+
+def doubt_section(known: Known, state: dict[str, Any], pictures: Sequence[Tensor]) -> str:
+    """What photographs leave open, in words and painted on the object."""
+    surveyed = known.surveyed
+    text = words(numbers(surveyed), list(state.get("troubles", [])))
+    legend = "Doubt of the albedo: black is well determined, white is a guess."
+    return paragraph(text) + gallery(zip(report_pictures.SIDES, pictures, strict=True), legend)
+
+
+def views_section(scene: Scene, known: Known, options: ReportOptions) -> str:
+    """Photographs beside what the scene shows from there, the worst first."""
+    found, count = report_pictures.worst(scene, known.splits, options.views, options.size)
+    if not found:
+        return ""
+    rows = "".join(
+        f'<figure class="row">{"".join(image(tile, words) for tile in tiles)}'
+        f"<figcaption>{escape(words)}</figcaption></figure>"
+        for words, tiles in report_pictures.rows(found)
+    )
+    said = (
+        f"The {len(found)} that differ most, of {count} compared: photograph, render, and their "
+        f"difference, drawn brightest at {report_pictures.LIMIT} in sRGB. Numbers are over the "
+        "object."
+    )
+    return paragraph(said) + f'<div class="views">{rows}</div>'
+
+
+def materials_section(pictures: dict[str, list[Tensor]]) -> str:
+    """The layers from four sides."""
+    parts = [
+        gallery(
+            zip(report_pictures.SIDES, row, strict=True), f"{name.capitalize()}: {LAYERS[name]}."
+        )
+        for name, row in pictures.items()
+    ]
+    if "metal" not in pictures:
+        parts.append(paragraph("Nothing is metal."))
+    return "\n".join(parts)
+
+
+def light_section(scene: Scene, mesh: Mesh) -> str:
+    """The recovered light as a map, and a grey and a mirror ball under it."""
+    found = report_pictures.found_light(scene, mesh)
+    if found is None:
+        kind = scene.cfg.light.kind
+        return paragraph(f"No light was recovered: it was trained with {kind} light.")
+    names = ("map", "grey ball", "mirror ball")
+    tiles = zip(names, report_pictures.pictures_of(found), strict=True)
+    legend = (
+        "Balls are seen from +X, with +Z up. Light and albedo share a scale for each channel, "
+        "which photographs do not fix."
+    )
+    return paragraph(found.about) + gallery(tiles, legend, "light")
+
+
+def training_section(run: Path, state: dict[str, Any]) -> str:
+    """Curves, times of the stages, and what time cut."""
+    parts = []
+    ends = stage_ends(state)
+    drawn = [chart(curve, ends) for curve in curves(run)]
+    if any(drawn):
+        parts.append(f'<div class="charts">{"".join(drawn)}</div>')
+        parts.append(paragraph(CHARTS))
+    else:
+        parts.append(paragraph("There is no log of this training to draw."))
+    cfg = configuration(run)
+    if cfg is None:
+        return "\n".join([*parts, paragraph("config.json cannot be read: stages are not told.")])
+    rows = []
+    if (before := prepared(state)) is not None:
+        rows.append(("preparation", "", "", f"{before:.1f} s", ""))
+    for k, fact in enumerate(stages(cfg, state)):
+        made = "" if fact.made is None else f"{fact.made:.0%}"
+        took = "" if fact.seconds is None else f"{fact.seconds:.1f} s"
+        rows.append((f"{k + 1}: {fact.name}", f"{fact.planned:,}", made, took, fact.fate))
+    parts.append(table(rows, ("stage", "planned steps", "made", "time", "")))
+    limit = "" if cfg.minutes is None else f"The limit was {60 * cfg.minutes:,.0f} s."
+    told = [limit, *remarks(cfg, state)]
+    return "\n".join([*parts, *(paragraph(line) for line in told)])
+
+
+def gallery(named: Any, legend: str, kind: str = "") -> str:
+    """Pictures in a row under their names."""
+    figures = "".join(
+        f"<figure>{image(picture, name)}<figcaption>{name}</figcaption></figure>"
+        for name, picture in named
+    )
+    return f'<p class="legend">{escape(legend)}</p><div class="gallery {kind}">{figures}</div>'
+
+
+def _direction(advice: Advice, k: int) -> str:
+    """An advised direction as side and elevation."""
+    direction = advice.chosen[k]
+    up = float(torch.rad2deg(direction[2].clamp(-1, 1).asin()))
+    return f"{place(advice, direction)}, {abs(up):.0f}° {'above' if up >= 0 else 'below'}"

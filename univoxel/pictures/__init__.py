@@ -1,1 +1,0 @@
-"""Pictures of scenes: layers of a view, contact sheets, animations, timelapses."""

@@ -1,0 +1,288 @@
+"""Photographs of a turntable: a background that stood still, cameras off the circle of the
+others, light that turned."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+from univoxel.camera import Circle, circle_of
+from univoxel.color import CLIPPED, linear_to_srgb
+from univoxel.core.choices import LightFrameOrAuto
+from univoxel.data import Photos
+from univoxel.errors import DataError
+from univoxel.fields.grid import GridShape
+from univoxel.lights.views import Turntable
+from univoxel.preparation.hull import observe_hull
+from univoxel.preparation.matches import neighbours
+from univoxel.render.observations import Observations
+from univoxel.sphere import real_harmonics
+
+# Pixels along the longer side of the pictures whose surroundings are compared
+SMALL = 128
+# Of those pixels, by which a camera that stands still may wobble, or be turned a little
+WOBBLE = 3
+# By which surroundings are shifted, to see whether that fits better: less than a camera sees them
+# shift that goes some 5 degrees around the object
+SHIFT = 10
+# Correlation that surroundings which stood still have at least
+ALIKE = 0.85
+# Correlation of a picture with itself shifted, above which it is too plain to tell
+PLAIN = 0.95
+
+
+@torch.no_grad()
+def surroundings_stand_still(photos: Photos) -> bool | None:
+    """Whether neighbouring photographs show the same around the object, at the same pixels.
+
+    A camera that goes around an object sees its surroundings shift. None: they cannot tell, since
+    they are plain or cut away.
+    """
+    stand_still = []
+    for one, other in neighbours(photos.cameras):
+        if photos.cameras.size(one) == photos.cameras.size(other):
+            first, second = _shrunk(photos, one), _shrunk(photos, other)
+            stand_still.append(_same(first, second))
+    known = [same for same in stand_still if same is not None]
+    if 2 * len(known) <= len(stand_still):
+        return None
+    return 2 * sum(known) > len(known)
+
+
+def _shrunk(photos: Photos, view: int) -> tuple[Tensor, Tensor]:
+    """A small picture [h, w], grey sRGB or linear values, and where it shows no object [h, w]."""
+    color, alpha = photos.stored(view)
+    factor = max(1, round(max(alpha.shape) / SMALL))
+    grey = avg_pool2d(color.float().mean(-1)[None], factor)[0]
+    shown = max_pool2d((alpha > 0).float()[None], factor)  # of the object, anywhere in a pixel
+    return grey, max_pool2d(shown, 3, 1, 1)[0] == 0
+
+
+def _same(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> bool | None:
+    """Whether two pictures agree around the object as they lie, and not better shifted far."""
+    here = _correlation(one, other, 0, 0)
+    at_rest = [*([] if here is None else [here]), *_shifted(one, other, WOBBLE)]
+    itself, far = _shifted(one, one, SHIFT), _shifted(one, other, SHIFT)
+    # Plain surroundings look alike wherever they are
+    if not (at_rest and itself and far) or max(itself) > PLAIN:
+        return None
+    return max(at_rest) > max(ALIKE, *far)
+
+
+def _shifted(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], pixels: int) -> list[float]:
+    """Correlations with the other shifted so far, to all sides."""
+    sides = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)]
+    found = (_correlation(one, other, pixels * y, pixels * x) for y, x in sides)
+    return [correlation for correlation in found if correlation is not None]
+
+
+def _correlation(
+    one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], down: int, right: int
+) -> float | None:
+    """Of grey values around the object, the other picture shifted; None: of nothing, or of one
+    colour."""
+    height, width = one[0].shape
+    y, x = slice(max(down, 0), height + min(down, 0)), slice(max(right, 0), width + min(right, 0))
+    v, u = (
+        slice(max(-down, 0), height + min(-down, 0)),
+        slice(max(-right, 0), width + min(-right, 0)),
+    )
+    both = one[1][y, x] & other[1][v, u]
+    if both.float().mean() < 0.1:
+        return None
+    a, b = one[0][y, x][both], other[0][v, u][both]
+    a, b = a - a.mean(), b - b.mean()
+    size = float(a.norm() * b.norm())
+    return float(a @ b) / size if size > 1e-3 * len(a) else None
+
+
+# Photographs of a turntable whose cameras do not stand on the circle of the others.
+#
+# Structure from motion that finds too few matches somewhere goes on from there a few degrees off.
+# Silhouettes and matches of pairs hardly show it: along the circle a round object looks alike, and
+# what is matched moves along the lines that it is held against.
+
+
+NAMED = 8  # photographs that the message names, at most
+
+log: logging.Logger = logging.getLogger("univoxel")
+
+
+def find_strays(photos: Photos) -> Circle | None:
+    """The circle of a turntable with photographs that were placed off it; None: none were.
+
+    Only before surroundings that stood still is it known to be a circle: who walks around an object
+    may well step aside.
+    """
+    circle = circle_of(photos.cameras)
+    if circle is None or not circle.strays().any() or not surroundings_stand_still(photos):
+        return None
+    return circle
+
+
+def say_strays(photos: Photos) -> None:
+    """Warn of photographs that were placed off the circle of their turntable, and name them.
+
+    They are trained on all the same: of what they alone show, wrong views are better than none.
+    """
+    circle = find_strays(photos)
+    if circle is None:
+        return
+    strays = circle.strays()
+    found = strays.nonzero()[:, 0].tolist()
+    names = ", ".join(photos.names[view] for view in found[:NAMED])
+    log.warning(
+        "%d of %d photographs were placed off the circle of their turntable, by up to %.1f "
+        "degrees, the others by %.1f in the median: what %s%s show will not fit the rest; "
+        "`univoxel poses` with their masks places all anew; see cameras",
+        len(found),
+        len(photos),
+        math.degrees(float(circle.off[strays].max())),
+        math.degrees(float(circle.off[~strays].median())),
+        names,
+        ", .." if len(found) > NAMED else "",
+        extra={"arguments": ("cameras",)},
+    )
+
+
+# Whether the light stood still around the object, or turned about it with the camera.
+#
+# Before a camera that stands still an object is turned, and with it, in the object's world, the
+# light turns as the camera does. Then a point is bright where its normal faces the light as seen
+# from the camera. Under a light that stands still a point keeps its shade, and changes only by what
+# it mirrors. Each is a smooth function on the sphere, of the normal in the camera's frame or of the
+# mirrored direction in the world: the one that explains more of how points change from photograph
+# to photograph is believed.
+
+
+# Points of the surface whose colours are compared
+POINTS = 1500
+# sRGB; darker colours are left out: rounding to 8 bits is too large a part of them
+DARK = 0.05
+# Natural log; the scale of the Cauchy cost of a colour that is not explained
+CAUCHY = 0.1
+# Rounds of iteratively reweighted least squares
+ROUNDS = 6
+# How many times as much a light that turns has to explain as one that stands still. Of four
+# rendered scenes under a still light it was 0.1 to 0.2 times, of a bronze head on a turntable 1.8
+# times
+BETTER = 1.0
+# Share of the cost that it has to explain at least, over `better`
+LEAST = 0.03
+# `better` where the surroundings do not say whether they stood still. Of objects on rings of
+# cameras it was up to 3 under a still light, and 60 under one that turned; of a shiny ball, 3.2
+BETTER_ALONE = 3.0
+# `least` there: times `better_alone` it is above the 14 % of the cost that a light taken to turn
+# explained under a still one, and below the 30 and 70 % under one that turned
+LEAST_ALONE = 0.07
+
+
+@dataclass(frozen=True)
+class Explained:
+    """Shares, in [0, 1], of the robust cost of how points change that go away."""
+
+    by_still_light: float
+    by_turning_light: float
+
+
+def turntable_of(
+    photos: Photos,
+    hull: Tensor,
+    grid: GridShape,
+    frame: LightFrameOrAuto,
+) -> Turntable | None:
+    """The turntable that the photographs were taken on; None: the light stood still.
+
+    Args:
+        photos: their cameras where they are believed to be.
+        hull: [X, Y, Z] sdf of the visual hull on the grid, world units.
+        frame: what is known.
+
+    Raises:
+        DataError: a turntable is asked for, and the cameras do not say where its axis is.
+    """
+    if frame == "world":
+        return None
+    turntable = Turntable.of(photos.cameras)
+    if frame == "turntable":
+        if turntable is None:
+            raise DataError(
+                f"{photos.folder}: light_frame turntable: the cameras do not stand around one "
+                "upright axis, so where the turntable's is cannot be told",
+                "light_frame",
+            )
+        return turntable
+    observations = None if turntable is None else observe_hull(photos, hull, grid, POINTS)
+    if turntable is None or observations is None:
+        return None
+    found = explained(observations, turntable)
+    log.debug("light frame: %s", found)
+    still_around = surroundings_stand_still(photos)
+    if still_around is False:  # the camera went around the object
+        return None
+    better, least = BETTER, LEAST
+    if still_around is None:
+        better, least = BETTER_ALONE, LEAST_ALONE
+    if found.by_turning_light < better * max(found.by_still_light, least):
+        return None
+    log.info(
+        "the light turns with the camera, as on a turntable: that explains %.0f %% of how points "
+        "change from photograph to photograph, a light that stands still %.0f %%; see light_frame",
+        100 * found.by_turning_light,
+        100 * found.by_still_light,
+        extra={"arguments": ("light_frame",)},
+    )
+    return turntable
+
+
+@torch.no_grad()
+def explained(observations: Observations, turntable: Turntable) -> Explained:
+    """How much of the changes of points from photograph to photograph either light explains."""
+    point = torch.repeat_interleave(observations.offsets.diff())
+    encoded = linear_to_srgb(observations.color)
+    usable = (encoded.mean(1) > DARK) & (encoded < CLIPPED).all(1)
+    point, view, wo = point[usable], observations.view[usable], observations.wo[usable]
+    log_color = observations.color[usable].mean(1).log()
+    normal = observations.normal[point]
+    mirrored = 2 * (normal * wo).sum(1, keepdim=True) * normal - wo
+    cosine, sine = turntable.turn(observations.eye)
+    lit = turntable.into_light(normal, (cosine[view], sine[view]))
+    nothing = normal[:, :0]
+    none, still, turning = (
+        cost(log_color, basis, point) for basis in (nothing, smooth(mirrored), smooth(lit))
+    )
+    return Explained(1 - still / none, 1 - turning / none)
+
+
+def smooth(direction: Tensor) -> Tensor:
+    """Smooth functions [N, 8] of directions [N, 3], without the constant one."""
+    return real_harmonics(2, direction)[:, 1:]
+
+
+def cost(log_color: Tensor, basis: Tensor, point: Tensor) -> float:
+    """Cauchy cost of log colours [N] of points [N], each of which has an albedo of its own, after
+    the best sum of the basis [N, K]."""
+    log_color, basis = log_color.double(), basis.double()
+    count = int(point.max()) + 1 if len(point) else 0
+    weight = torch.ones_like(log_color)
+    rest = log_color
+    for _ in range(ROUNDS):
+        total = weight.new_zeros(count).index_add_(0, point, weight).clamp_min(1e-9)
+
+        def centred(values: Tensor, weight: Tensor = weight, total: Tensor = total) -> Tensor:
+            sums = values.new_zeros(count, values.shape[1])
+            sums.index_add_(0, point, weight[:, None] * values)
+            return values - (sums / total[:, None])[point]
+
+        shades = centred(basis)
+        rest = centred(log_color[:, None])
+        weighted = weight[:, None] * shades
+        system = weighted.T @ shades + 1e-6 * torch.eye(shades.shape[1], dtype=torch.double)
+        rest = (rest - shades @ torch.linalg.solve(system, weighted.T @ rest))[:, 0]
+        weight = 1 / (1 + (rest / CAUCHY).square())
+    return max(float(torch.log1p((rest / CAUCHY).square()).sum()), 1e-9)

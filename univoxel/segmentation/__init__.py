@@ -1,1 +1,0 @@
-"""The object told from what stands around it, in photographs without masks."""

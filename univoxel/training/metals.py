@@ -1,0 +1,344 @@
+"""Which points of the surface are metal, and where the joint solve starts from."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor, nn
+
+from univoxel.brdf import F0
+from univoxel.color import CLIPPED, linear_to_srgb_unclipped, srgb_slope, srgb_to_linear
+from univoxel.config import JointConfig
+from univoxel.render.observations import (
+    JointProblem,
+    MaterialLabels,
+    observations_of,
+    prefiltered_roughness,
+    shade_observations,
+)
+from univoxel.scene import Scene
+from univoxel.training.newton import CAUCHY, MIN_VIEWS, newton_round_
+
+# Which points of the surface are metal, by what either material would have to look like.
+#
+# Descending from one to the other fails: between a base under a dull layer and a coloured mirror
+# lie materials that look like neither. Under a known light either is one unknown base colour a
+# roughness, so both are fitted and their residuals compared.
+
+
+# Roughnesses that are tried, from a mirror to chalk
+ROUGHNESSES = (0.1, 0.2, 0.3, 0.45, 0.65, 0.9)
+# Gauss-Newton steps on a base colour
+STEPS = 5
+# Bounds of a base colour
+BASE = (0.005, 1.0)
+# Points whose evidence is averaged: that of one alone is too noisy
+NEIGHBOURS = 32
+# Voxels that count as one unit of distance between points
+NEAR = 4.0
+# Log albedo that counts as one unit of distance between points
+ALIKE = 0.5
+# Bound of the log ratio of one point: a single one does not decide for its neighbours
+MAX_EVIDENCE = 2.0
+# Log ratio of residuals, metal over dielectric, below which a point is metal: under the first map
+# and under the last. The first asks for more: the map is wrong yet, and metals make the next one
+THRESHOLD = (-0.4, -0.15)
+
+
+def find_metal(scene: Scene, problem: JointProblem, cfg: JointConfig, done: float) -> Tensor:
+    """Which of the problem's points are metal under the present map: [P] bool.
+
+    Args:
+        done: progress of the map in [0, 1], from the first round of Newton to the last.
+    """
+    first, last = THRESHOLD
+    return evidence(scene, problem, cfg) < first + done * (last - first)
+
+
+@torch.no_grad()
+def evidence(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Tensor:
+    """Log ratio [P] of the residuals of the photographs if a point is metal, over if it is not.
+
+    `cfg.newton_points` of them, in `cfg.newton_views` observations, are fitted as dielectrics and
+    as metals, with the best roughness for each. The log ratio of the two residuals is averaged over
+    points that are near and of like albedo; the other points take that of the nearest of them. A
+    metal has to reflect what metals do: black plastic would pass for a metal that is black.
+    """
+    position = problem.observations.position
+    counts = problem.observations.offsets.diff()
+    candidates = (counts >= MIN_VIEWS).nonzero()[:, 0]
+    if not len(candidates):
+        return torch.zeros(len(counts))
+    point = candidates[torch.randperm(len(candidates))[: cfg.newton_points]]
+    observation = observations_of(problem, point, cfg.newton_views)
+    costs = [residuals(scene, problem, point, observation, cfg, r) for r in ROUGHNESSES]
+    dielectric, metal = torch.stack(costs).amin(0)
+    limit = MAX_EVIDENCE
+    ratio = (metal / dielectric).log().clamp(-limit, limit)
+
+    albedo = scene.material(scene.field.features_at(position))[0].clamp_min(1e-2).log()
+    scaled = position / (NEAR * problem.voxel_size), albedo / ALIKE
+    key = torch.cat(scaled, 1).numpy()
+    key_of_point = key[point.numpy()]  # a tensor of one index would be taken for a number
+    tree = KDTree(key_of_point)
+    count = min(NEIGHBOURS, len(point))
+    nearest = tree.query(key_of_point, k=count, workers=-1)[1]
+    mean = ratio[torch.from_numpy(nearest).reshape(len(point), -1)].mean(1)
+    return mean[torch.from_numpy(tree.query(key, workers=-1)[1])]
+
+
+def residuals(
+    scene: Scene,
+    problem: JointProblem,
+    point: Tensor,
+    observation: Tensor,
+    cfg: JointConfig,
+    roughness: float,
+) -> Tensor:
+    """Robust costs [2, P] of points [P] in observations [P, V], as the best dielectric and as the
+    best metal of a roughness."""
+    count, views = observation.shape
+    index, flat = point.repeat_interleave(views), observation.flatten()
+    normal = problem.observations.normal[index]
+    filtered = prefiltered_roughness(torch.full((len(flat),), roughness), problem.nodes)
+
+    def shaded(diffuse: float, f0: float) -> Tensor:
+        white = torch.ones(len(flat), 3)
+        args = scene, problem, index, flat, normal, diffuse * white, filtered, f0 * white
+        return shade_observations(*args).view(count, views, 3)
+
+    target = problem.target[observation]
+    black, mirror = shaded(0.0, 0.0), shaded(0.0, 1.0)  # linear in F0
+    specular = black + F0 * (mirror - black)
+    dielectric = fitted(specular, shaded(1.0, F0) - specular, target, 0.0)
+    metal = fitted(black, mirror - black, target, cfg.metal.min_reflectance)
+    return torch.stack([dielectric, metal])
+
+
+def fitted(constant: Tensor, slope: Tensor, target: Tensor, min_brightest: float) -> Tensor:
+    """Cauchy costs [P] of constant + base * slope [P, V, 3], at the best base colours, against the
+    sRGB-encoded target [P, V, 3].
+
+    Args:
+        min_brightest: that a base's brightest channel has at least.
+    """
+
+    def within_bounds(base: Tensor) -> Tensor:
+        base = base.clamp(*BASE)
+        return base * (min_brightest / base.amax(1, keepdim=True)).clamp_min(1.0)
+
+    def linearised() -> tuple[Tensor, Tensor, Tensor]:  # residual, its square by the scale, slope
+        radiance = constant + base[:, None] * slope
+        residual = target - linear_to_srgb_unclipped(radiance)
+        free = (target <= CLIPPED) | (residual > 0)  # clipped pixels are lower bounds
+        return free * residual, (free * residual / CAUCHY).square(), srgb_slope(radiance) * slope
+
+    base = (srgb_to_linear(target) - constant).sum(1) / slope.sum(1).clamp_min(1e-6)
+    base = within_bounds(base)
+    for _ in range(STEPS):
+        residual, square, by_base = linearised()
+        weighted = by_base / (1 + square)
+        step = (weighted * residual).sum(1) / (weighted * by_base).sum(1).clamp_min(1e-6)
+        base = within_bounds(base + step)
+    return CAUCHY**2 * torch.log1p(linearised()[1]).mean((1, 2)) + 1e-6
+
+
+# Where the joint solve starts from: roughness and metal under no map yet, by trial.
+
+
+# Points of a round. Of a third of them residuals scatter more than they differ
+TRIAL_POINTS = 300
+# Newton steps of a round; after three, from no map, too glossy still fits better than right
+TRIAL_STEPS = 6
+# Medians of roughness that are tried beside the present one
+TRIAL_ROUGHNESS = (0.25, 0.7)
+# Rounds of Newton in all trials, at most
+TRIAL_ROUNDS = 2 * (len(TRIAL_ROUGHNESS) + 2)
+# Share of the lowest residual so far that another roughness must not exceed
+BETTER = 0.9
+# Times the others' residual that metal everywhere must not exceed for all to be metal: 0.6 to 1.1
+# where all is, 1.2 and more where some or nothing is, unless grain, fur or mixed lights leave
+# much to either. Most points have to look like metal then too, see MAJORITY
+ONLY_METAL = 1.15
+# Median of roughness from which metal looks like paint and does not count there
+LIKE_PAINT = 0.5
+# Share of the others' residual that it must not exceed to start from its metals
+ALL_METAL = 0.8
+# The same, where most is found to be metal under its map. Of objects all of metal 0.67 to 0.93
+# is; of dielectrics hardly ever as much
+MOSTLY_METAL = 0.95
+# Share of the points that are most of them: look like metal for all to be metal, and for
+# MOSTLY_METAL. Under a map for metal 0.9 do where all is, 0.34 at most elsewhere
+MAJORITY = 0.5
+# Median of the brightest channel where all is metal: nothing else tells how bright the light is
+ONLY_METAL_ALBEDO = 0.3
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What is metal, the scene's state under it, and what it leaves of the photographs."""
+
+    residual: float  # inf: nothing was solved
+    metal: Tensor  # [P] bool
+    states: list[dict[str, Any]]  # of the scene's parts
+    roughness: float  # median, [0, 1]
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What all trials have in common, and the troubles that they met."""
+
+    scene: Scene
+    problem: JointProblem
+    cfg: JointConfig
+    seconds: float  # of a round on TRIAL_POINTS
+    seed: int  # of the points: the trials differ in nothing but the hypothesis
+    parts: Sequence[nn.Module]  # of the scene, that a trial changes
+    initial: list[dict[str, Any]]  # their states
+    troubles: list[str]
+
+    def states(self) -> list[dict[str, Any]]:
+        return [copy.deepcopy(part.state_dict()) for part in self.parts]
+
+    def restore_(self, states: list[dict[str, Any]]) -> None:
+        """Bring the scene's parts back to these states."""
+        for part, state in zip(self.parts, states, strict=True):
+            part.load_state_dict(state)
+
+    def residual_(self, metal: Tensor) -> float:
+        """What is left after a round of Newton, which changes the map; inf: nothing was solved."""
+        steps = TRIAL_STEPS if self.cfg.newton_steps else 0
+        points = TRIAL_POINTS
+        cfg = replace(self.cfg, newton_steps=steps, newton_points=points, newton_roughness=0.0)
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(self.seed)
+            solved = newton_round_(
+                self.scene, self.problem, MaterialLabels(metal), cfg, self.seconds
+            )
+        self.troubles.extend(solved.troubles)
+        return solved.costs[-1] if solved.costs else math.inf
+
+
+def initialise_(
+    scene: Scene, problem: JointProblem, decisions: MaterialLabels, cfg: JointConfig, seconds: float
+) -> tuple[MaterialLabels, list[str]]:
+    """Change the scene's map and roughness to those of the best hypothesis; return the decisions
+    with its metal, and sentences about rounds that had no solution.
+
+    Light and material are found from one another. Under a roughness that is wrong everywhere the
+    map becomes too sharp or too dull for any other. Where all is metal, a map for dielectrics is so
+    bright that nothing looks like metal under it. So rounds of Newton start from what the stages
+    before took for metal and from metal everywhere, each with the roughness of the stages before
+    and with some others, as a whole. Metals are found under the best map of either, and the
+    residuals decide, unless there is nothing but metal.
+
+    Args:
+        seconds: that the rounds of Newton may take together.
+    """
+    parts = [part for part in (scene.material, problem.sky, scene.views) if part is not None]
+    seed = int(torch.randint(2**31, ()))
+    initial = [copy.deepcopy(part.state_dict()) for part in parts]
+    round_seconds = seconds / TRIAL_ROUNDS
+    trials = Trials(scene, problem, cfg, round_seconds, seed, parts, initial, [])
+    everywhere = tried_roughnesses_(trials, torch.ones_like(decisions.metal))
+    best, only_metal = best_of(everywhere), bool(cfg.only_metal)
+    if not only_metal:
+        before = best_of(tried_roughnesses_(trials, decisions.metal))
+        found = under_its_map_(trials, before)
+        # Under a light for each photograph what is mirrored may be anything
+        one_light = scene.views is None or scene.views.sky_weights is None
+        if cfg.only_metal is None and one_light:
+            explained = min(before.residual, found.residual)
+            only_metal = decide_all_metal_(trials, explained, everywhere)
+        if not only_metal:
+            best = under_its_map_(trials, best)
+            best = best if better_metals(found, best) else found
+    if math.isinf(best.residual):
+        trials.restore_(initial)
+        return decisions, trials.troubles
+    trials.restore_(best.states)
+    return replace(decisions, metal=best.metal, only_metal=only_metal), trials.troubles
+
+
+@torch.no_grad()
+def neutralise_(scene: Scene, problem: JointProblem) -> None:
+    """Make the map grey in the mean, and the albedo as bright as that of metals.
+
+    Of an object all of metal photographs show the product of map and albedo alone: in each channel
+    one may be brighter and the other darker.
+    """
+    features = scene.field.features_at(problem.observations.position)
+    median = scene.material(features)[0].median(0).values
+    wanted = median * problem.sky.radiance.mean(0)
+    wanted = wanted * (ONLY_METAL_ALBEDO / wanted.max())
+    scene.material.shift_albedo(features, wanted)
+    problem.sky.log_radiance += (median / wanted).log()
+
+
+@torch.no_grad()
+def tried_roughnesses_(trials: Trials, metal: Tensor) -> list[Hypothesis]:
+    """A hypothesis with this metal for the present roughness, and for each that is tried."""
+    scene, tried = trials.scene, []
+    features = scene.field.features_at(trials.problem.observations.position)
+    for roughness in (None, *TRIAL_ROUGHNESS):
+        trials.restore_(trials.initial)
+        if roughness is not None:
+            scene.material.shift_roughness(features, roughness)
+        median = float(scene.material(features)[1].median())
+        tried.append(Hypothesis(trials.residual_(metal), metal, trials.states(), median))
+    return tried
+
+
+def best_of(tried: Sequence[Hypothesis]) -> Hypothesis:
+    """That of the lowest residual; another roughness than the first has to be worth it."""
+    best = tried[0]
+    for hypothesis in tried[1:]:
+        if hypothesis.residual < BETTER * best.residual:
+            best = hypothesis
+    return best
+
+
+def decide_all_metal_(trials: Trials, explained: float, everywhere: Sequence[Hypothesis]) -> bool:
+    """Whether metal everywhere explains the photographs about as well as metal as it was found, and
+    most points, however dark, look like metal under its map. It may change the scene's state.
+
+    It has no diffuse light to explain them with, and so the fewer ways. Where it is rough, its
+    highlights are as wide as diffuse light, and it explains paint. Grain, fur or lights that change
+    leave so much to either that their residuals are alike; point by point paint still looks no more
+    like metal.
+
+    Args:
+        explained: residual of metal as it was found.
+    """
+    cfg = trials.cfg
+    smooth = [h for h in everywhere if h.roughness < LIKE_PAINT]
+    best = min(smooth, key=lambda h: h.residual, default=None)
+    if best is None or not best.residual < ONLY_METAL * explained:
+        return False
+    trials.restore_(best.states)
+    however_dark = replace(cfg, metal=replace(cfg.metal, min_reflectance=0.0))
+    metal = find_metal(trials.scene, trials.problem, however_dark, 1.0)
+    return bool(metal.float().mean() > MAJORITY)
+
+
+def under_its_map_(trials: Trials, assumed: Hypothesis) -> Hypothesis:
+    """The hypothesis of the metals that are found under the map of another one. It leaves the scene
+    in its state."""
+    trials.restore_(assumed.states)
+    # Under a map for metals dielectrics stand out at once: the last threshold serves
+    done = float(assumed.metal.all())
+    metal = find_metal(trials.scene, trials.problem, trials.cfg, done)
+    return Hypothesis(trials.residual_(metal), metal, trials.states(), assumed.roughness)
+
+
+def better_metals(before: Hypothesis, everywhere: Hypothesis) -> bool:
+    """Whether the metals that were found from metal everywhere are the better ones."""
+    mostly = everywhere.metal.float().mean() > MAJORITY
+    share = MOSTLY_METAL if mostly else ALL_METAL
+    return everywhere.residual < share * before.residual
