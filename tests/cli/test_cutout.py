@@ -1,5 +1,6 @@
 """Photographs written with the masks that were found."""
 
+import html
 import logging
 import sys
 from dataclasses import replace
@@ -121,7 +122,7 @@ def test_masks_of_a_folder_are_repaired(tmp_path, with_masks, caplog):
         found = cut.picture(view)[1]
         assert iou(found, mask) > 0.88 if view in (2, 5) else torch.equal(found, masks[view])
     page = (out / "masks.html").read_text()
-    assert told in page
+    assert html.escape(told) in page
     assert page.index("train/r_2") < page.index("train/r_5") < page.index("train/r_0")
     assert (out / "masks.png").is_file()
     assert torch.equal(cut.color, photos.color)

@@ -40,7 +40,7 @@ def on_the_ball(radius: float) -> torch.Tensor:
 
 def test_a_part_that_a_mask_lacks_is_doubted_and_no_more_carved(photos):
     spoilt = without_a_part(photos, (3,))
-    found = doubt_masks(spoilt, ROUGH)
+    found = doubt_masks(spoilt, mask_distances(spoilt.alpha), ROUGH)
     assert found.belief.votes == 1
     assert found.belief.off <= MAX_CONTRADICTION
     lost = (photos.alpha > 0.5) & (spoilt.alpha < 0.5)
@@ -56,7 +56,7 @@ def test_what_two_masks_lack_together_comes_back(photos):
     alpha = photos.alpha.clone()
     alpha[11:13, :, : SIZE // 2 - 5] = 0  # seen from directions that are 137 degrees apart
     spoilt = replace(photos, alpha=alpha)
-    found = doubt_masks(spoilt, ROUGH)
+    found = doubt_masks(spoilt, mask_distances(spoilt.alpha), ROUGH)
     bitten, whole = (
         hull_sdf(d, photos.cameras, on_the_ball(0.9 * RADIUS), votes=2)
         for d in (mask_distances(alpha), found.distance)
@@ -68,13 +68,13 @@ def test_what_two_masks_lack_together_comes_back(photos):
 def test_ground_that_a_mask_keeps_is_doubted(photos):
     alpha = photos.alpha.clone()
     alpha[5, -30:, 20:60] = 1
-    found = doubt_masks(replace(photos, alpha=alpha), ROUGH)
+    found = doubt_masks(replace(photos, alpha=alpha), mask_distances(alpha), ROUGH)
     kept = (alpha > 0.5) & (photos.alpha < 0.5)
     assert found.pixels[kept].float().mean() > 0.9
 
 
 def test_what_all_masks_show_is_nowhere_doubted(photos):
-    assert not doubt_masks(photos, ROUGH).pixels.any()
+    assert not doubt_masks(photos, mask_distances(photos.alpha), ROUGH).pixels.any()
 
 
 def test_jagged_edges_are_not_doubted():
@@ -93,8 +93,9 @@ def test_silhouettes_in_which_nothing_lies(photos, tmp_path):
 
 
 def test_masks_that_show_nothing(photos):
+    empty = torch.zeros_like(photos.alpha)
     with pytest.raises(UserError, match="nothing in common"):
-        doubt_masks(replace(photos, alpha=torch.zeros_like(photos.alpha)), ROUGH)
+        doubt_masks(replace(photos, alpha=empty), mask_distances(empty), ROUGH)
 
 
 def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(

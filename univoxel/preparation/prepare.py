@@ -216,7 +216,7 @@ def find_silhouettes(
             belief = masks_or_poses_as_told(photos, distance, cfg.cameras)
         found = None
         if belief.votes > 1 and begins("rough masks"):
-            found = doubt_masks(photos, belief)
+            found = doubt_masks(photos, distance, belief)
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
     # Rough masks that there was no time to mend are no measure of how sharp edges are

@@ -16,6 +16,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from univoxel.camera import Cameras
 from univoxel.core import memmap
 from univoxel.core.memmap import parallel_map
 from univoxel.data import Photos
@@ -42,29 +43,29 @@ class Doubted:
     belief: Belief  # one vote, where what is not doubted agrees
 
 
-def doubt_masks(photos: Photos, belief: Belief) -> Doubted:
+def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     """Which pixels of rough masks are not to be believed.
 
     Args:
+        distance: [V, H, W] from `hull.mask_distances`; it becomes that of the result.
         belief: of more than one vote.
 
     Raises:
         UserError: the masks have nothing in common, or silhouettes share no volume.
     """
     cameras, maps = photos.cameras, depth_maps(photos)
-    masks = [coverage_of(photos.stored(view)[1]) for view in range(len(photos))]
+    masks = parallel_map(lambda view: small_mask(photos, view, maps.cameras), range(len(photos)))
     shape = find_object(masks, maps)
     shown = list(silhouettes(shape, maps.cameras))
     pixels = memmap.zeros(photos.alpha.shape, torch.bool)
 
     def doubt_(view: int) -> None:
-        mask = shrunk(masks[view], *maps.cameras.size(view)) >= 0.5
-        doubted = thick(mask != shown[view])
+        doubted = thick((masks[view] >= 0.5) != shown[view])
         own = cameras.cut(view, pixels[view])
         own.copy_(interpolate(doubted[None, None].float(), own.shape)[0, 0] > 0)
 
     parallel_map(doubt_, range(len(photos)))
-    distance = filled_distances(photos, pixels)
+    fill_(distance, photos, pixels)
     box = estimate_bounds(distance, cameras, belief.votes)
     off = contradiction(distance, cameras, box, pixels)
     log.info(
@@ -88,10 +89,18 @@ def thick(differs: Tensor) -> Tensor:
     return differs & torch.from_numpy(near)
 
 
-def filled_distances(photos: Photos, doubted: Tensor) -> Tensor:
-    """`mask_distances` [V, H, W] of masks with all that is doubted: a view carves nothing there."""
-    alpha = memmap.zeros(photos.alpha.shape, photos.alpha.dtype)
-    full = 1 if alpha.is_floating_point() else 255
-    for view in range(len(photos)):
-        alpha[view] = photos.alpha[view].masked_fill(doubted[view], full)
-    return mask_distances(alpha, photos.cameras)
+def small_mask(photos: Photos, view: int, cameras: Cameras) -> Tensor:
+    """The mask of a photograph in the size of smaller cameras: [h, w] in [0, 1]."""
+    return shrunk(coverage_of(photos.stored(view)[1]), *cameras.size(view))
+
+
+def fill_(distance: Tensor, photos: Photos, doubted: Tensor) -> None:
+    """Make `mask_distances` [V, H, W] those of masks with all that is doubted: a view carves
+    nothing there."""
+    full = 1 if photos.alpha.is_floating_point() else 255
+
+    def one(view: int) -> None:
+        alpha = photos.alpha[view].masked_fill(doubted[view], full)
+        distance[view] = mask_distances(alpha[None], photos.cameras.of(torch.tensor([view])))[0]
+
+    parallel_map(one, doubted.flatten(1).any(1).nonzero()[:, 0].tolist())
