@@ -21,7 +21,7 @@ LIMITS = {
     "lines of the package": 36_400,
     "lines of the laboratory": 3_000,
     "lines of tests": 36_300,
-    "modules of the package": 161,
+    "modules of the package": 160,
     "loose modules at the top": 12,
     "configuration fields": 128,
     "fields that nothing sets": 0,

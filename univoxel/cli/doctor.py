@@ -5,8 +5,10 @@ from __future__ import annotations
 import json as jsonlib
 import os
 import platform
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -27,6 +29,7 @@ REINSTALL = "pip install --force-reinstall --no-deps --only-binary univoxel univ
 REBUILD = (
     f"install a wheel that has it ({REINSTALL}), or build anew with a compiler, GLM and Embree"
 )
+DEVELOPERS = {"bench", "dev", "docs", "wheel"}  # extras that no command asks for
 ENOUGH = 4 << 30  # bytes: presets on 100 photographs of about 1000 pixels stay below
 
 
@@ -70,7 +73,6 @@ def look() -> list[Finding]:
     """What was found of the installation and the machine."""
     import torch
 
-    from univoxel.core.installation import openmp_runtimes, torch_build
     from univoxel.ops import native_status
 
     status = native_status()
@@ -142,7 +144,6 @@ def memory(found: machine.Memory | None) -> Finding:
 
 def extra_findings() -> list[Finding]:
     """A finding for each extra."""
-    from univoxel.core.installation import extras
 
     known = extras()
     if known is None:
@@ -179,3 +180,56 @@ def check(findings: Sequence[Finding]) -> None:
     bad = [f"{f.what}: {f.found}" for f in findings if f.state == "bad"]
     if bad:
         raise MissingNative(f"this installation cannot train: {'; '.join(bad)}")
+
+
+@dataclass(frozen=True)
+class Extra:
+    """An optional set of packages."""
+
+    name: str
+    missing: tuple[str, ...]  # packages; none: the extra is there
+
+
+def openmp_runtimes() -> list[str]:
+    """Files of the OpenMP runtimes that this process has loaded."""
+    from threadpoolctl import threadpool_info
+
+    found = {p["filepath"] for p in threadpool_info() if p["user_api"] == "openmp"}
+    return sorted(found)
+
+
+def torch_build() -> str:
+    """Version of torch, and what it was built for."""
+    import torch
+
+    for what, version in (("CUDA", torch.version.cuda), ("ROCm", torch.version.hip)):
+        if version:
+            return f"{torch.__version__}, built for {what} {version}"
+    return f"{torch.__version__}, built for CPUs"
+
+
+def extras(distribution: str = "univoxel") -> list[Extra] | None:
+    """The extras for users, with what is missing of each; None where nothing is installed."""
+    try:
+        requirements = metadata.requires(distribution) or []
+    except metadata.PackageNotFoundError:
+        return None
+    missing: dict[str, list[str]] = {}
+    for requirement in requirements:
+        belongs = re.search(r"""extra\s*==\s*["']([\w.-]+)["']""", requirement)
+        package = re.match(r"[\w.-]+", requirement)
+        if not belongs or not package or belongs[1] in DEVELOPERS:
+            continue
+        lacks = missing.setdefault(belongs[1], [])
+        if not is_installed(package[0]):
+            lacks.append(package[0])
+    return [Extra(name, tuple(lacks)) for name, lacks in sorted(missing.items())]
+
+
+def is_installed(package: str) -> bool:
+    """Whether a distribution is there, of any version."""
+    try:
+        metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return False
+    return True

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from univoxel.core import installation
-from univoxel.core.installation import Extra
+from univoxel.cli import doctor
+from univoxel.cli.doctor import Extra
 
 
 def test_extras_and_what_is_missing_of_them(monkeypatch):
@@ -15,15 +15,15 @@ def test_extras_and_what_is_missing_of_them(monkeypatch):
         "no-such-package[all]>=3 ; python_version > '3' and extra == 'many'",
         "neither_this (>=1) ; extra == 'many'",
     ]
-    monkeypatch.setattr(installation.metadata, "requires", lambda name: requirements)
-    assert installation.extras() == [
+    monkeypatch.setattr(doctor.metadata, "requires", lambda name: requirements)
+    assert doctor.extras() == [
         Extra("many", ("no-such-package", "neither_this")),
         Extra("sums", ()),
     ]
 
 
 def test_extras_of_what_is_not_installed():
-    assert installation.extras("no-such-distribution") is None
+    assert doctor.extras("no-such-distribution") is None
 
 
 @pytest.mark.parametrize(
@@ -33,4 +33,4 @@ def test_extras_of_what_is_not_installed():
 def test_what_torch_was_built_for(monkeypatch, cuda, hip, said):
     monkeypatch.setattr(torch.version, "cuda", cuda)
     monkeypatch.setattr(torch.version, "hip", hip)
-    assert installation.torch_build() == f"{torch.__version__}, built for {said}"
+    assert doctor.torch_build() == f"{torch.__version__}, built for {said}"
