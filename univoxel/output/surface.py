@@ -54,7 +54,7 @@ def surface_of(scene: Scene, cameras: Cameras | None = None) -> Mesh:
     mesh, dropped = cleaned(Mesh(*scene.field.isosurface(closed=True)))
     if dropped.crumbs or dropped.voids:
         log.info(
-            "mesh: left out %d small pieces beside the object and %d hollows inside it",
+            "mesh: small pieces beside the object that were left out: %d; hollows inside it: %d",
             dropped.crumbs,
             dropped.voids,
         )
@@ -74,7 +74,7 @@ def cameras_of(scene: Scene, run: Path) -> Cameras | None:
     """Where the photographs that were trained on were taken; None: they are not there any more."""
     try:
         return scene.registered(photos_of(run, split="train")).cameras
-    except (UserError, OSError, RuntimeError) as error:
+    except (UserError, OSError) as error:
         log.info("mesh: nothing is smoothed, for what photographs show is not known: %s", error)
         return None
 
