@@ -8,7 +8,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch
-from asymmetric_scene import BALLS, Identity, albedo, lopsided, roughness, sdf
+from asymmetric_scene import BALLS, albedo, lopsided, roughness, sdf
 from PIL import Image
 
 from univoxel.cli import export as task
@@ -214,8 +214,8 @@ def test_defaults(tmp_path, scene, monkeypatch):
 
 def test_what_the_box_cuts_is_closed(tmp_path, monkeypatch):
     """Unasked, and with colours of the surface beside the cap."""
-    cut = lopsided(24**3, change=lambda nodes, sdf: nodes.norm(dim=-1) - 0.55)
-    cut.material = Identity()
+    middle = torch.tensor([-0.5, 0.0, 0.075])
+    cut = lopsided(32**3, change=lambda nodes, sdf: (nodes - middle).norm(dim=-1) - 0.4)
     monkeypatch.setattr("univoxel.scene.load_scene", lambda run: cut)
     with torch.no_grad():  # as of a finished scene: nothing is stored away from the surface
         cut.field.features[cut.field.sdf.abs() > 2.5 * cut.field.voxel_size] = 0
@@ -224,9 +224,10 @@ def test_what_the_box_cuts_is_closed(tmp_path, monkeypatch):
     mesh, small = (trimesh.load(tmp_path / name, process=False) for name in ("a.ply", "b.ply"))
     assert mesh.is_watertight
     assert small.is_watertight
-    beyond = mesh.vertices[:, 0] < -0.5
-    assert beyond.sum() > 50
-    assert mesh.vertices[:, 0].min() > -0.5 - cut.field.voxel_size
+    border = float(cut.field.bounds()[0][0])
+    beyond = mesh.vertices[:, 0] < border - 1e-6
+    assert beyond.sum() > 200
+    assert mesh.vertices[:, 0].min() > border - cut.field.voxel_size
     black = mesh.visual.vertex_colors[:, :3].max(1) == 0
     assert not black[beyond].any()
 
