@@ -8,7 +8,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch
-from asymmetric_scene import BALLS, Identity, albedo, lopsided, roughness, sdf
+from asymmetric_scene import BALLS, albedo, lopsided, roughness, sdf
 from PIL import Image
 
 from univoxel.cli import export as task
@@ -212,14 +212,24 @@ def test_defaults(tmp_path, scene, monkeypatch):
     assert 400 < len(trimesh.load(tmp_path / "a.glb", force="mesh").faces) <= 500
 
 
-def test_watertight(tmp_path, monkeypatch):
-    cut = lopsided(24**3, change=lambda nodes, sdf: nodes.norm(dim=-1) - 0.55)
-    cut.material = Identity()
+def test_what_the_box_cuts_is_closed(tmp_path, monkeypatch):
+    """Unasked, and with colours of the surface beside the cap."""
+    middle = torch.tensor([-0.5, 0.0, 0.075])
+    cut = lopsided(32**3, change=lambda nodes, sdf: (nodes - middle).norm(dim=-1) - 0.4)
     monkeypatch.setattr("univoxel.scene.load_scene", lambda run: cut)
-    task.export("run", tmp_path / "open.ply", faces=400)
-    task.export("run", tmp_path / "closed.ply", faces=400, watertight=True)
-    assert not trimesh.load(tmp_path / "open.ply").is_watertight
-    assert trimesh.load(tmp_path / "closed.ply").is_watertight
+    with torch.no_grad():  # as of a finished scene: nothing is stored away from the surface
+        cut.field.features[cut.field.sdf.abs() > 2.5 * cut.field.voxel_size] = 0
+    task.export("run", tmp_path / "a.ply")
+    task.export("run", tmp_path / "b.ply", faces=400, watertight=True)
+    mesh, small = (trimesh.load(tmp_path / name, process=False) for name in ("a.ply", "b.ply"))
+    assert mesh.is_watertight
+    assert small.is_watertight
+    border = float(cut.field.bounds()[0][0])
+    beyond = mesh.vertices[:, 0] < border - 1e-6
+    assert beyond.sum() > 200
+    assert mesh.vertices[:, 0].min() > border - cut.field.voxel_size
+    black = mesh.visual.vertex_colors[:, :3].max(1) == 0
+    assert not black[beyond].any()
 
 
 @pytest.mark.parametrize(

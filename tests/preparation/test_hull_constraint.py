@@ -8,6 +8,7 @@ import torch
 from analytic import RADIUS, cameras_around, sphere_normals
 
 from univoxel.camera import image_rays
+from univoxel.cli.trainer import build_scene
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.fields.field import dense_field
@@ -21,7 +22,6 @@ from univoxel.preparation.prepare import Silhouettes, pinned_in, prepare
 from univoxel.presets import preset
 from univoxel.render.observations import Observations
 from univoxel.training.descent import smooth_sdf_gradient_
-from univoxel.training.init_scene import build_scene
 
 VIEWS, SIZE = 24, 64
 GRID = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 24**3)

@@ -123,10 +123,10 @@ def export(asked: ExportOptions) -> list[Path]:
         MissingExtra: .usdz without usd-core.
         OSError: a file cannot be written.
     """
-    from univoxel.core.records import Mesh
     from univoxel.output.mesh import placement_of
     from univoxel.output.mesh_files import require_usd
-    from univoxel.output.topology import clean, close, simplify
+    from univoxel.output.surface import cameras_of, surface_of
+    from univoxel.output.topology import close, simplify
     from univoxel.scene import load_scene
 
     mesh = Path(asked.mesh)
@@ -137,8 +137,9 @@ def export(asked: ExportOptions) -> list[Path]:
         )
     if suffix == ".usdz":
         require_usd()
-    scene = load_scene(Path(asked.run))
-    surface = clean(Mesh(*scene.field.isosurface()))
+    run = Path(asked.run)
+    scene = load_scene(run)
+    surface = surface_of(scene, cameras_of(scene, run))
     if asked.watertight:
         surface = close(surface)
     most = TEXTURED_FACES if asked.faces is None and suffix != ".ply" else asked.faces

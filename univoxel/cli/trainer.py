@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from univoxel import lights
 from univoxel.config import (
     PREPARATION,
     JointConfig,
@@ -25,11 +26,13 @@ from univoxel.core.files import replacing
 from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import Cancelled, ExistingFile, UserError
 from univoxel.evaluation.confidence import REPORT_POINTS, Survey, numbers, survey, words
+from univoxel.fields.features import PER_LEVEL, Levels
+from univoxel.fields.field import Field, dense_field, hash_field
 from univoxel.fields.grid import fit_grid
 from univoxel.ops import native
 from univoxel.output.timelapse import Timelapse
 from univoxel.preparation.hull_constraint import PinnedHull
-from univoxel.preparation.prepare import find_silhouettes, pinned_in, prepare
+from univoxel.preparation.prepare import Prepared, find_silhouettes, pinned_in, prepare
 from univoxel.render.pictures import preview
 from univoxel.render.pipeline import surface_at
 from univoxel.run import FILE as VERDICT
@@ -38,7 +41,6 @@ from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
 from univoxel.training import compression
 from univoxel.training import joint_solve as joint_stage
 from univoxel.training.clock import LEAST, RESERVE_SECONDS, Clock
-from univoxel.training.init_scene import build_scene
 from univoxel.training.loop import batch_at, fit_sharpness_, held_out_psnr, run_stage
 from univoxel.training.pixels import TrainingPixels, check_memory, split_pixels
 from univoxel.training.probe import slowdown
@@ -150,6 +152,49 @@ def _train(
     for choice in progress.chosen:
         log.info(choice.sentence)
     return cfg.out
+
+
+def build_scene(prepared: Prepared, cfg: TrainConfig) -> Scene:
+    """A scene whose surface is the carved hull, with poses and gains as far as they are known.
+
+    Draws the first weights from torch's generator.
+
+    Raises:
+        UserError: cfg.budget_mb is too small for any such scene.
+    """
+    silhouettes, varying = prepared.silhouettes, prepared.varying
+    lower, upper = silhouettes.box
+    field = build_field(prepared, cfg)
+    views = tuple(silhouettes.photos.names) if silhouettes.refined or varying != "none" else ()
+    sized = replace(
+        cfg.scene,
+        light=lights.scaled(cfg.scene.light, float((upper - lower).max()) / 2),
+        varying=varying,
+        turntable=prepared.turntable,
+        refined=silhouettes.refined,
+        views=views,
+        mirror_levels=compression.mirror_levels(cfg.scene, cfg.budget_mb),
+    )
+    scene = Scene(sized, field)
+    if prepared.poses:
+        scene.poses = prepared.poses
+    if scene.views and prepared.gains is not None:
+        scene.views.add(prepared.gains[:, None].expand(-1, 3))
+    if cfg.budget_mb is not None:
+        compression.check_budget(scene, cfg.budget_mb)
+    return scene
+
+
+def build_field(prepared: Prepared, cfg: TrainConfig) -> Field:
+    """The field of the first stage, its surface that of the carved hull."""
+    grid, hull, box = prepared.grid, prepared.hull, prepared.silhouettes.box
+    stages = [s for s in cfg.stages if isinstance(s, StageConfig)]
+    if stages[0].field != "hash":
+        return dense_field(grid, cfg.scene.channels, hull)
+    finest = min(fit_grid(*box, compression.stage_voxels(s, [])).voxel_size for s in stages)
+    rows = compression.table_rows(cfg.scene, cfg.budget_mb)
+    levels = Levels.of(grid.bounds(), finest, cfg.scene.channels // PER_LEVEL, rows)
+    return hash_field(grid, levels, hull)
 
 
 def resumed(cfg: TrainConfig) -> tuple[Scene, dict[str, Any]] | None:

@@ -124,6 +124,9 @@ class Mesh:
     albedo: Tensor | None = None  # [P, 3] float32 linear
     roughness: Tensor | None = None  # [P] float32
     metallic: Tensor | None = None  # [P] float32 in [0, 1]; None: no metal anywhere
+    # [P] float32: 1 where a photograph sees the surface, 0 where it is a guess, between the two at
+    # the border; None: not known
+    seen: Tensor | None = None
 
 
 @dataclass(frozen=True)

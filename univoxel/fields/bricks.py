@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from univoxel.core.records import Bricks
 from univoxel.errors import NoSurface
-from univoxel.fields.distances import BAND, AbstractDistances
+from univoxel.fields.distances import BAND, CAP, AbstractDistances
 from univoxel.fields.grid import GridShape
 
 SLAB = 64  # planes of the grid whose surface is found at once; whole bricks
@@ -105,16 +105,21 @@ class BrickDistances(AbstractDistances):
             slab[offset : offset + Bricks.SIDE] = part[: end - first, :y, :z]
         return slab
 
-    def isosurface(self) -> tuple[Tensor, Tensor]:
+    def isosurface(self, closed: bool = False) -> tuple[Tensor, Tensor]:
         values, (planes, *_) = self.sdf.detach(), self.grid.size
         if self.count == Bricks.MISSING or not values.min() < 0 < values.max():
             raise NoSurface("the field has no surface: its sdf does not change sign")
         parts = []
         for begin in range(0, planes - 1, SLAB):  # the whole grid would take much memory
             slab = self._slab(values, begin, begin + SLAB + 1).numpy()
+            start = np.array([begin, 0, 0], np.float32)
+            if closed:  # slabs meet inside the grid: the first has a rim before it, the last after
+                ends = int(begin == 0), int(begin + SLAB + 1 >= planes)
+                slab = np.pad(slab, (ends, (1, 1), (1, 1)), constant_values=CAP * self.voxel_size)
+                start -= np.array([ends[0], 1, 1], np.float32)
             if slab.min() < 0 < slab.max():
                 vertices, faces, _, _ = marching_cubes(slab, 0.0, gradient_direction="descent")
-                parts.append((vertices + np.array([begin, 0, 0], np.float32), faces))
+                parts.append((vertices + start, faces))
         vertices, faces = _sewn(parts)
         world = torch.tensor(self.grid.origin) + self.voxel_size * torch.from_numpy(vertices)
         return world.float(), torch.from_numpy(faces.astype("int32"))

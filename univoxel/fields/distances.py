@@ -28,6 +28,10 @@ from univoxel.ops.compositing import FieldAlongRays, Lattices
 
 BAND = 4.0  # voxels from the surface beyond which density is nothing: 8 s at a sharpness of 0.5
 
+# Voxels outside that a node beyond the border counts as, where the surface is closed there: the cap
+# is rounded at its rim, and flat where the inside is deep
+CAP = 0.5
+
 # Of a ray's heaviest sample: of lighter ones, nearly half of all, only the distance is read. What
 # they would say of colour is what is seen a fraction of a voxel further on.
 MIN_SHARE = 0.05
@@ -185,9 +189,13 @@ class AbstractDistances(nn.Module, ABC):
         """Whether the sdf can be nearer to 0 than far in each block of 4^3 voxels: [A, B, C]."""
 
     @abstractmethod
-    def isosurface(self) -> tuple[Tensor, Tensor]:
+    def isosurface(self, closed: bool = False) -> tuple[Tensor, Tensor]:
         """Vertices [P, 3] float32 and faces [F, 3] int32 of the zero level (marching cubes,
         Lewiner et al. 2003), counter-clockwise seen from outside.
+
+        Args:
+            closed: whether a cap, less than a voxel beyond the grid, closes the surface where the
+                grid's border cuts it. Otherwise it is open there.
 
         Raises:
             ValueError: the sdf has no zero level.
@@ -205,6 +213,11 @@ class AbstractDistances(nn.Module, ABC):
 def nodes_within(distances: AbstractDistances, far: float) -> Tensor:
     """Which nodes of the grid have an sdf nearer to 0 than far: [X, Y, Z] bool."""
     return distances.on_grid(distances.sdf.detach().abs() < far)
+
+
+def cut_by_border(sdf: np.ndarray) -> bool:
+    """Whether the inside reaches the border of a grid's values [X, Y, Z]."""
+    return any((sdf.take(end, axis) < 0).any() for axis in range(3) for end in (0, -1))
 
 
 def no_values(sdf: Tensor) -> Tensor:
@@ -233,13 +246,15 @@ class DenseDistances(AbstractDistances):
         sdf = self.sdf.detach()
         return (brick_minimum(sdf) < far) & (brick_minimum(-sdf) < far)
 
-    def isosurface(self) -> tuple[Tensor, Tensor]:
+    def isosurface(self, closed: bool = False) -> tuple[Tensor, Tensor]:
         sdf = self.sdf.detach().numpy()
         if not sdf.min() < 0 < sdf.max():
             raise NoSurface("the field has no surface: its sdf does not change sign")
-        vertices, faces, _, _ = marching_cubes(sdf, 0.0, gradient_direction="descent")
+        rim = int(closed and cut_by_border(sdf))
+        padded = np.pad(sdf, rim, constant_values=CAP * self.voxel_size)
+        vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
         origin = torch.tensor(self.grid.origin)
-        world = origin + self.voxel_size * torch.from_numpy(vertices.copy())
+        world = origin + self.voxel_size * torch.from_numpy(vertices - np.float32(rim))
         return world.float(), torch.from_numpy(faces.astype("int32"))
 
     @torch.no_grad()

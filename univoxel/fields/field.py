@@ -195,10 +195,10 @@ class Field(nn.Module):
         """Which rows of the features are read where the sdf is nearer to 0 than far: [R] bool."""
         return self.encoding.rows_near(self.distances, far)
 
-    def isosurface(self) -> tuple[Tensor, Tensor]:
+    def isosurface(self, closed: bool = False) -> tuple[Tensor, Tensor]:
         """Vertices [P, 3] float32 and faces [F, 3] int32 of the zero level, see
         `AbstractDistances.isosurface`."""
-        return self.distances.isosurface()
+        return self.distances.isosurface(closed)
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Lower and upper corner [3], [3] of the box, world units."""

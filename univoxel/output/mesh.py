@@ -12,6 +12,7 @@ import torch
 import xatlas
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from univoxel.brdf import metal_or_none
@@ -48,6 +49,7 @@ class TexturedMesh:
     albedo: Tensor  # [T, T, 3] float32 linear, in [0, 1]; of a metal: its F0
     roughness: Tensor  # [T, T] float32 perceptual, in [0, 1]
     metallic: Tensor | None = None  # [T, T] float32 in [0, 1]; None: no metal anywhere
+    seen: Tensor | None = None  # [P] float32 in [0, 1], as of `Mesh`
 
 
 def albedo_picture(mesh: TexturedMesh) -> np.ndarray:
@@ -237,14 +239,21 @@ def _angle(a: Tensor, b: Tensor) -> Tensor:
 POINTS_AT_ONCE = 1 << 17  # bounds memory
 NEWTON_STEPS = 4
 REACH = 2.0  # voxels: how far a point of the mesh may be moved to meet the field's surface
+OFF = 1.0  # voxels of distance from which on a point counts as off the surface
 MIN_Z = 0.05  # of a texel's normal in the tangent frame: it looks out of the triangle
 
 
-def nearest_surface(field: Field, points: Tensor) -> tuple[Tensor, FieldSample]:
+def nearest_surface(
+    field: Field, points: Tensor, known: KDTree | None = None
+) -> tuple[Tensor, FieldSample]:
     """Points [M, 3] moved onto the field's zero level, and the field there.
 
     Newton steps along the gradient, x - f grad f / |grad f|^2; where they would lead further than
     two voxels away (the mesh cuts a corner, the field is no distance) they end there.
+
+    Args:
+        known: points of the zero level, see `surface_beside`. The nearest stands in for one that
+            ends off it, as on the cap of a surface that the grid's border cuts.
     """
     x, reach = points, REACH * field.voxel_size
     for _ in range(NEWTON_STEPS):
@@ -253,19 +262,44 @@ def nearest_surface(field: Field, points: Tensor) -> tuple[Tensor, FieldSample]:
         moved = x - (at.sdf / slope)[:, None] * at.gradient - points
         length = moved.norm(dim=1, keepdim=True)
         x = points + moved * (reach / length.clamp_min(reach))
+    at = field.sample(x)
+    off = (at.sdf.abs() > OFF * field.voxel_size).nonzero()[:, 0]
+    if known is None or not len(off):
+        return x, at
+    place = np.asarray(known.data[known.query(points[off].numpy(), workers=-1)[1]], np.float32)
+    x = x.index_copy(0, off, torch.from_numpy(place))
     return x, field.sample(x)
+
+
+def surface_beside(field: Field, mesh: Mesh) -> KDTree | None:
+    """Points of the field's zero level beside a mesh's vertices, for a mesh that is smoothed or has
+    a cap beyond the grid; None: it is neither, or there are none."""
+    low, high = field.bounds()
+    beyond = bool(((mesh.vertices < low) | (mesh.vertices > high)).any())
+    if mesh.seen is None and not beyond:
+        return None
+    x, at = nearest_surface(field, mesh.vertices)
+    on = x[at.sdf.abs() <= OFF * field.voxel_size]
+    return KDTree(on.numpy()) if len(on) else None
 
 
 @torch.no_grad()
 def with_materials(scene: Scene, mesh: Mesh) -> Mesh:
-    """A mesh with the field's normal and materials at its vertices, which stay in place."""
-    parts = []
+    """A mesh with the field's normal and materials at its vertices, which stay in place.
+
+    Where it is not seen it is smooth, and normals are its own.
+    """
+    parts, known = [], surface_beside(scene.field, mesh)
     for points in mesh.vertices.split(POINTS_AT_ONCE):
-        _, at = nearest_surface(scene.field, points)
+        _, at = nearest_surface(scene.field, points, known)
         normal = torch.nn.functional.normalize(at.gradient, dim=1, eps=1e-6)
         parts.append((normal, *scene.material(at.features)))
-    *rest, metallic = (torch.cat(p) for p in zip(*parts, strict=True))
-    return Mesh(mesh.vertices, mesh.faces, *rest, metallic=metal_or_none(metallic))
+    normal, *rest, metallic = (torch.cat(p) for p in zip(*parts, strict=True))
+    if mesh.seen is not None:
+        smooth = torch.lerp(vertex_normals(mesh), normal, mesh.seen[:, None])
+        normal = torch.where(mesh.seen[:, None] < 1, _unit(smooth), normal)
+    metal = metal_or_none(metallic)
+    return Mesh(mesh.vertices, mesh.faces, normal, *rest, metallic=metal, seen=mesh.seen)
 
 
 @torch.no_grad()
@@ -274,7 +308,8 @@ def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
 
     Each texel's centre is a point of its triangle; the field at the surface beside it gives normal
     and materials. So relief that the triangles are too coarse for lies in the texture.
-    Texels outside of the charts copy the nearest inside.
+    Texels outside of the charts copy the nearest inside. Where the mesh is not seen it is smooth,
+    and has no relief.
 
     Raises:
         ValueError: no texel lies in a triangle.
@@ -285,20 +320,30 @@ def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
     texel, face, weight = rasterise(uv, faces, size)
     if not len(texel):
         raise UserError(f"a texture of {size} x {size} is too small for {len(faces)} faces")
-    parts = []
+    seen = None if mesh.seen is None else mesh.seen[source]
+    parts, known = [], surface_beside(scene.field, mesh)
     for some, w in zip(face.split(POINTS_AT_ONCE), weight.split(POINTS_AT_ONCE), strict=True):
         corner = faces[some].long()
         point, n, t = (
             torch.einsum("mk,mkc->mc", w, values[corner])
             for values in (vertices, normals, tangents)
         )
-        _, at = nearest_surface(scene.field, point)
-        parts.append((in_frame(at.gradient, n, t), *scene.material(at.features)))
+        _, at = nearest_surface(scene.field, point, known)
+        relief = in_frame(at.gradient, n, t)
+        if seen is not None:
+            relief = _fading(relief, (w * seen[corner]).sum(1))
+        parts.append((relief, *scene.material(at.features)))
     place = dilated(texel, size)
     *rest, metallic = (torch.cat(p)[place] for p in zip(*parts, strict=True))
-    return TexturedMesh(
-        vertices, faces, normals, tangents, uv, *rest, metallic=metal_or_none(metallic)
-    )
+    metal = metal_or_none(metallic)
+    return TexturedMesh(vertices, faces, normals, tangents, uv, *rest, metallic=metal, seen=seen)
+
+
+def _fading(relief: Tensor, seen: Tensor) -> Tensor:
+    """Normals [M, 3] in the tangent frame, flat where seen [M] is 0."""
+    flat = torch.tensor([0.0, 0.0, 1.0])
+    faded = _unit(torch.lerp(flat.expand_as(relief), relief, seen[:, None]))
+    return torch.where(seen[:, None] < 1, faded, relief)
 
 
 def in_frame(direction: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:

@@ -51,7 +51,8 @@ def glb(
     """A textured mesh as GLB, turned to +Y up.
 
     One mesh with one metallic-roughness material: base colour (sRGB), roughness in green and
-    metallic in blue (linear), and a normal map for the tangents that are written beside it.
+    metallic in blue (linear), and a normal map for the tangents that are written beside it. Where
+    it is known what photographs saw, vertices have `_SEEN`: float, 1 for seen, 0 for a guess.
 
     Args:
         jpeg: quality of textures as JPEG, 1 to 95; None: PNG, which loses nothing.
@@ -96,6 +97,7 @@ def glb(
         textures=[gltf.Texture(sampler=0, source=i) for i in range(3)],
     )
     blob = bytearray()
+    known = {} if mesh.seen is None else {"_SEEN": mesh.seen}
     attributes = gltf.Attributes(
         POSITION=_accessor(file, blob, mesh.vertices @ Y_UP.T, gltf.VEC3, bounds=True),
         NORMAL=_accessor(file, blob, mesh.normals @ Y_UP.T, gltf.VEC3),
@@ -105,6 +107,7 @@ def glb(
             name: _accessor(file, blob, (32767 * values).round().short(), gltf.VEC4)
             for name, values in (extra or {}).items()
         },
+        **{name: _accessor(file, blob, values, gltf.SCALAR) for name, values in known.items()},
     )
     indices = _accessor(file, blob, mesh.faces.reshape(-1), gltf.SCALAR)
     primitive = gltf.Primitive(attributes=attributes, indices=indices, material=0)
@@ -372,8 +375,8 @@ def _write_text(path: Path, text: str) -> None:
 def write_ply(path: Path, mesh: Mesh) -> None:
     """Write a mesh as binary little-endian PLY, whole or not at all.
 
-    Per vertex, as far as the mesh has them: x y z, nx ny nz, roughness and metallic (float), albedo
-    as red green blue (uchar, sRGB), which is where other programs look for colour.
+    Per vertex, as far as the mesh has them: x y z, nx ny nz, roughness, metallic and seen (float),
+    albedo as red green blue (uchar, sRGB), which is where other programs look for colour.
 
     Raises:
         OSError: the file cannot be written; nothing is left behind.
@@ -394,6 +397,8 @@ def write_ply(path: Path, mesh: Mesh) -> None:
         add("roughness", mesh.roughness, "<f4")
     if mesh.metallic is not None:
         add("metallic", mesh.metallic, "<f4")
+    if mesh.seen is not None:
+        add("seen", mesh.seen, "<f4")
     vertex = np.empty(len(mesh.vertices), [(name, column.dtype) for name, column in columns])
     for name, column in columns:
         vertex[name] = column

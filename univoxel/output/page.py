@@ -7,7 +7,7 @@ import json
 import math
 import string
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,18 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from univoxel import __version__
-from univoxel.camera import looked_at
+from univoxel.camera import Cameras, looked_at
 from univoxel.core.choices import MAP_ROWS, TEXTURE_SIZE
 from univoxel.core.html import VIEWPORT, base64_text, document, escape, paragraph, table, write_html
-from univoxel.core.records import HALF_MAX, Mesh
+from univoxel.core.records import HALF_MAX
 from univoxel.envmap import read_map
 from univoxel.errors import UserError
 from univoxel.ops import VisibilityScene
 from univoxel.output.mesh import TexturedMesh, bake
 from univoxel.output.mesh_files import glb
-from univoxel.output.topology import clean, simplify
-from univoxel.run import load_verdict, photos_of
+from univoxel.output.surface import cameras_of, surface_of
+from univoxel.output.topology import simplify
+from univoxel.run import load_verdict
 from univoxel.scene import Scene, load_checkpoint
 from univoxel.sphere import (
     fibonacci_hemisphere,
@@ -335,18 +336,18 @@ def page_text(
         run: the scene's folder; what is missing of log, trust report and photographs is left out.
         seconds: of training; None: as the log has it, which ends a little earlier.
     """
-    lights = lights_of(scene, options)
+    lights, cameras = lights_of(scene, options), cameras_of(scene, run)
     title = options.title or run.resolve().name or "univoxel"
     facts = facts_of(run, seconds)
     described = {
-        "view": first_view(run),
+        "view": first_view(cameras),
         "lights": [as_json(light) for light in lights],
     }
     parts = {
         "title": escape(title),
         "facts": escape(" \u00b7 ".join(facts)),
         "about": about(run, options, [light.name for light in lights]),
-        "model": base64_text(model(scene, options)),
+        "model": base64_text(model(scene, options, cameras)),
         "scene": json.dumps(described, separators=(",", ":")).replace("<", "\\u003c"),
         "three": f"/*! {_source('vendor/LICENSE').strip()} */\n{_source('vendor/three.min.js')}",
         "viewer": _source("viewer.js"),
@@ -355,10 +356,10 @@ def page_text(
     return document(title, _source("page.css"), body, POLICY, f"{VIEWPORT}, viewport-fit=cover")
 
 
-def model(scene: Scene, options: PageOptions) -> bytes:
+def model(scene: Scene, options: PageOptions, cameras: Cameras | None) -> bytes:
     """The scene's surface as GLB with what light reaches its vertices; textures as JPEG."""
-    surface = simplify(clean(Mesh(*scene.field.isosurface())), options.faces)
-    mesh = bake(scene, surface, options.texture_size)
+    surface = simplify(surface_of(scene, cameras), options.faces)
+    mesh = replace(bake(scene, surface, options.texture_size), seen=None)  # nothing reads it
     return glb(mesh, JPEG_QUALITY, attributes(transfer(mesh, OFFSET * scene.field.voxel_size)))
 
 
@@ -379,11 +380,9 @@ def lights_of(scene: Scene, options: PageOptions) -> list[Light]:
     return own + [light for light in usual_lights() if light.name not in names]
 
 
-def first_view(run: Path) -> tuple[float, float]:
+def first_view(cameras: Cameras | None) -> tuple[float, float]:
     """Azimuth and elevation of the first photograph's camera, degrees, about what all look at."""
-    try:
-        cameras = photos_of(run, split="train").cameras
-    except (UserError, OSError):  # moved, or not on this machine
+    if cameras is None:
         return START
     x, y, z = (cameras.camera_to_world[0, :, 3] - looked_at(cameras)).tolist()
     low, high = ELEVATIONS

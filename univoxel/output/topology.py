@@ -1,10 +1,12 @@
 """Which triangles an exported mesh keeps: cleaning, closing and decimation.
 
-Functions take and give the geometry alone; what a mesh carries at its vertices is dropped.
+Functions take and give the geometry alone, and what is seen of it where that is known; what else a
+mesh carries at its vertices is dropped.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import fast_simplification
@@ -12,16 +14,25 @@ import numpy as np
 import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from univoxel.core.records import Mesh
 from univoxel.errors import NoSurface, UserError
 
 WELD = 1e-3  # of the mean edge: vertices closer than this become one
-FLOATER = 0.01  # of the largest component's area: smaller components are dropped
+CRUMB = 0.01  # of the largest component's area: smaller components are dropped
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """How many components cleaning has left out."""
+
+    crumbs: int  # small ones beside the object
+    voids: int  # what bounds a hollow inside the object, and open ones without volume
 
 
 def clean(mesh: Mesh) -> Mesh:
-    """Weld coincident vertices, drop degenerate and double faces, floaters and inner voids.
+    """Weld coincident vertices, drop degenerate and double faces, crumbs and inner voids.
 
     A component stays if it has at least a hundredth of the largest one's area and encloses volume
     with its faces outwards: what bounds a void inside the object is never seen.
@@ -29,13 +40,25 @@ def clean(mesh: Mesh) -> Mesh:
     Raises:
         ValueError: nothing is left.
     """
+    return cleaned(mesh)[0]
+
+
+def cleaned(mesh: Mesh) -> tuple[Mesh, Dropped]:
+    """As `clean`, and what was dropped.
+
+    Raises:
+        ValueError: nothing is left.
+    """
     vertices, faces = mesh.vertices.double().numpy(), mesh.faces.long().numpy()
+    dropped = Dropped(0, 0)
     if len(faces):
-        faces = _component_faces(vertices, _without_degenerate(_welded(vertices, faces)))
+        faces = _without_degenerate(_welded(vertices, faces))
+        faces, dropped = _component_faces(vertices, faces)
     if not len(faces):
         raise NoSurface("the surface has no part that encloses volume")
     used, index = np.unique(faces, return_inverse=True)
-    return _mesh(vertices[used], index.reshape(-1, 3))
+    seen = None if mesh.seen is None else mesh.seen[torch.from_numpy(used)]
+    return _mesh(vertices[used], index.reshape(-1, 3), seen), dropped
 
 
 def simplify(mesh: Mesh, faces: int) -> Mesh:
@@ -44,11 +67,15 @@ def simplify(mesh: Mesh, faces: int) -> Mesh:
     Source: Garland and Heckbert 1997, in the form of the library fast-simplification.
     """
     if len(mesh.faces) <= faces:
-        return Mesh(mesh.vertices, mesh.faces)
+        return Mesh(mesh.vertices, mesh.faces, seen=mesh.seen)
     vertices, index = fast_simplification.simplify(
         mesh.vertices.double().numpy(), mesh.faces.numpy(), target_count=faces
     )[:2]
-    return clean(_mesh(vertices, index))
+    reduced = clean(_mesh(vertices, index))
+    if mesh.seen is None:
+        return reduced
+    nearest = KDTree(mesh.vertices.numpy()).query(reduced.vertices.numpy(), workers=-1)[1]
+    return replace(reduced, seen=mesh.seen[torch.from_numpy(nearest)])
 
 
 def close(mesh: Mesh) -> Mesh:
@@ -59,11 +86,13 @@ def close(mesh: Mesh) -> Mesh:
             leave no closed surface.
     """
     vertices, faces = mesh.vertices.double().numpy(), mesh.faces.long().numpy()
-    for loop in _loops(_border(faces).tolist()):
+    loops = _loops(_border(faces).tolist())
+    for loop in loops:
         fan = [[b, a, len(vertices)] for a, b in pairwise([*loop, loop[0]])]
         faces = np.concatenate([faces, fan])
         vertices = np.concatenate([vertices, vertices[loop].mean(0, keepdims=True)])
-    mesh = _mesh(vertices, faces)
+    seen = None if mesh.seen is None else torch.cat([mesh.seen, torch.zeros(len(loops))])
+    mesh = _mesh(vertices, faces, seen)
     if bad := open_edges(mesh):
         raise UserError(f"the mesh cannot be made watertight: {bad} edges do not join two faces")
     return mesh
@@ -76,10 +105,11 @@ def open_edges(mesh: Mesh) -> int:
     return int((count > 1).sum() + (~np.isin(key, _keys(edges[:, ::-1]))).sum())
 
 
-def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+def _mesh(vertices: np.ndarray, faces: np.ndarray, seen: torch.Tensor | None = None) -> Mesh:
     return Mesh(
         torch.from_numpy(np.ascontiguousarray(vertices, np.float32)),
         torch.from_numpy(np.ascontiguousarray(faces, np.int32)),
+        seen=seen,
     )
 
 
@@ -148,10 +178,10 @@ def _without_degenerate(faces: np.ndarray) -> np.ndarray:
     return faces[np.sort(first)]
 
 
-def _component_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _component_faces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, Dropped]:
     """Faces of the components that `clean` keeps."""
     if not len(faces):
-        return faces
+        return faces, Dropped(0, 0)
     count, label = _components(_edges(faces), len(vertices))
     label = label[faces[:, 0]]
     corners = vertices[faces]
@@ -162,4 +192,7 @@ def _component_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     a, b, c = (corners - middle[label][:, None]).transpose(1, 0, 2)
     area = np.bincount(label, np.linalg.norm(np.cross(b - a, c - a), axis=1), count)
     volume = np.bincount(label, (a * np.cross(b, c)).sum(1), count)
-    return faces[((area >= FLOATER * area.max()) & (volume > 0))[label]]
+    small, hollow = area < CRUMB * area.max(), volume <= 0
+    there = area > 0  # other numbers are of vertices without a face
+    dropped = Dropped(int((there & small & ~hollow).sum()), int((there & hollow).sum()))
+    return faces[~(small | hollow)[label]], dropped

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from univoxel import envmap as env
-from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.core.records import Mesh, Rays, Surface
@@ -19,8 +18,9 @@ from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.evaluation.confidence import POINTS, Doubts, survey
 from univoxel.ops.visibility import Hit
-from univoxel.output.topology import clean, simplify
-from univoxel.render.pipeline import RAYS_AT_ONCE
+from univoxel.output.mesh import with_materials
+from univoxel.output.surface import cameras_of, surface_of
+from univoxel.output.topology import simplify
 from univoxel.render.relight import Lighting, TracedMesh, relight_surface, traced_mesh
 from univoxel.run import photos_of
 from univoxel.scene import Scene, load_scene
@@ -73,20 +73,17 @@ def subject_of(run: Path) -> Subject:
         UserError: the run cannot be used, or there is no surface.
     """
     scene = load_scene(run)
-    return Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size), run)
+    mesh = mesh_of(scene, cameras=cameras_of(scene, run))
+    return Subject(scene, traced_mesh(mesh, scene.field.voxel_size), run)
 
 
-@torch.no_grad()
-def mesh_of(scene: Scene, faces: int = FACES) -> Mesh:
-    """The surface with at most so many triangles, materials and normals at its vertices."""
-    mesh = simplify(clean(Mesh(*scene.field.isosurface())), faces)
-    parts = []
-    for points in mesh.vertices.split(RAYS_AT_ONCE):
-        sample = scene.field.sample(points)
-        normal = torch.nn.functional.normalize(sample.gradient, dim=1, eps=1e-6)
-        parts.append((normal, *scene.material(sample.features)))
-    *rest, metallic = (torch.cat(part) for part in zip(*parts, strict=True))
-    return Mesh(mesh.vertices, mesh.faces, *rest, metallic=metal_or_none(metallic))
+def mesh_of(scene: Scene, faces: int = FACES, cameras: Cameras | None = None) -> Mesh:
+    """The surface with at most so many triangles, materials and normals at its vertices.
+
+    Args:
+        cameras: as of `surface_of`.
+    """
+    return with_materials(scene, simplify(surface_of(scene, cameras), faces))
 
 
 def mesh_surface(subject: Subject, cameras: Cameras, view: int = 0) -> tuple[Surface, Tensor, Hit]:
