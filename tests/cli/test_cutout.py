@@ -33,7 +33,7 @@ def write_masks(folder, masks, stems):
 @pytest.fixture
 def by_brightness(monkeypatch):
     """A network for which what is not black is the object."""
-    monkeypatch.setattr(task, "network", lambda: lambda photo: (photo.sum(-1) > 0).float())
+    monkeypatch.setattr(task, "mask_network", lambda _: lambda photo: (photo.sum(-1) > 0).float())
 
 
 def test_what_cannot_be_written_leaves_nothing_behind_that_looks_whole(

@@ -17,15 +17,25 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from univoxel.camera import resize
-from univoxel.capture.masks import BESIDE, MISSING, Verdict, iou, judge, network, voxel_pixels
+from univoxel.capture.masks import (
+    BESIDE,
+    MISSING,
+    Verdict,
+    check_network,
+    iou,
+    judge,
+    mask_network,
+    timed,
+    voxel_pixels,
+)
 from univoxel.color import linear_to_srgb
-from univoxel.core.choices import DEPTH, REMBG
+from univoxel.core.choices import DEPTH, NETWORK, REMBG, NetworkName
 from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph, write_html
 from univoxel.core.progress_bar import track
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
-from univoxel.errors import DataError, ExistingFile
+from univoxel.errors import DataError, ExistingFile, UserError
 from univoxel.preparation.hull import mask_distances
 from univoxel.preparation.object_shape import ObjectShape, find_object, shrunk, silhouettes
 from univoxel.preparation.standing_object import masks_by_depth
@@ -158,6 +168,8 @@ def cutout(
     source: str | Path = REMBG,
     downscale: int = 0,
     allow_outside: bool = False,
+    *,
+    network: NetworkName = NETWORK,
 ) -> Path:
     """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
 
@@ -171,18 +183,20 @@ def cutout(
             stands out from its support in the middle; else a folder of masks.
         downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
         allow_outside: as of `load_photos`.
+        network: which of rembg's networks makes them, if one does.
 
     Raises:
         DataError: photographs or masks that cannot be used, or nothing stands out in depth.
         ExistingFile: out is there already.
         MissingExtra: there is no network.
-        UserError: the masks have nothing in common.
+        UserError: the masks have nothing in common, or arguments contradict one another.
         OSError: a file cannot be written.
     """
     data, out, origin = Path(data), Path(out), str(source)
     if out.exists():
         raise ExistingFile(f"{out} is there already: choose another out", "out")
-    masked = network() if origin == REMBG else None
+    check_masks(origin, network)
+    masked = mask_network(network) if origin == REMBG else None
     load = functools.partial(load_photos, data, allow_outside=allow_outside)
     photos = load("train", downscale, masks=False)
     splits = {
@@ -191,7 +205,8 @@ def cutout(
     }
     log.info(photos.about)
     if masked:
-        masks = _from_network(splits, masked)
+        count = sum(map(len, splits.values()))
+        masks = _from_network(splits, timed(masked, network, count))
     elif origin == DEPTH:
         masks = _from_depth(splits, depth_maps(photos))
     else:  # of shrunk photographs those with masks are black outside of them
@@ -202,6 +217,24 @@ def cutout(
         verdicts, told = _judged(splits, masks)
     _write(out, splits, masks, verdicts, told)
     return out
+
+
+def check_masks(origin: str, network: str) -> None:
+    """Refuse choices of masks that contradict one another.
+
+    Args:
+        origin: where masks come from.
+
+    Raises:
+        UserError: they do.
+    """
+    check_network(network)
+    if network != NETWORK and origin not in (REMBG, "auto"):
+        raise UserError(
+            f"network={network} makes masks where none are given: expected masks from {REMBG}, "
+            f"got {origin}",
+            "network",
+        )
 
 
 def _from_depth(splits: dict[str, Photos], maps: DepthMaps) -> Masks:
