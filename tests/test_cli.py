@@ -25,7 +25,7 @@ from univoxel.presets import chosen
 # What a command calls, by the module that holds it; and commands that do all themselves
 WORK = {"train": "univoxel.cli.trainer", "poses": "univoxel.capture.poses"}
 WORK |= {"cutout": "univoxel.capture.cutout"}
-USUAL = {"network": "u2netp"}  # of how masks are made
+USUAL = {"network": "u2netp", "box": None, "keep_table": False}  # of how masks are made
 ALONE = ("demo", "export", "inspect", "view")
 KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, UserError)]
 

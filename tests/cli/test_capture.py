@@ -199,7 +199,7 @@ def test_a_run_takes_the_place_of_three_steps(captured, tmp_path, caplog):
         *("again.glb", "steps.json", "index.html", "pictures")
     }
     assert f"step 3 of 6, training: there already, {captured.run}" in caplog.text
-    with pytest.raises(UserError, match="is a trained run: masks, network, preset"):
+    with pytest.raises(UserError, match="is a trained run: masks, network, box, preset"):
         task.capture(captured.run, tmp_path / "other", minutes=2.0)
     with pytest.raises(UserError, match="is a trained run: masks"):
         task.capture(captured.run, tmp_path / "other", masks="none")
@@ -321,6 +321,19 @@ def test_another_network_makes_other_masks(steps, pictures, tmp_path, monkeypatc
     assert json.loads((other / "steps.json").read_text())["masks"] == "rembg"  # as in 0.2
     with pytest.raises(ExistingFile, match="holds photographs with masks=rembg: "):
         task.find_data(pictures, other, masks="rembg", network="u2net")
+
+
+def test_another_box_makes_other_masks(steps, pictures, tmp_path, monkeypatch):
+    out, box = tmp_path / "mug", (0, 0, 0, 1, 1, 0.5)
+    task.find_data(pictures, out, masks="none", box=box, keep_table=True)
+    assert steps[1:] == [("cutout", out / "scene", "none", box, True)]
+    task.find_data(pictures, out, masks="none", box=list(box), keep_table=True)  # goes on
+    said = r"with masks=none, box=0.0 0.0 0.0 1.0 1.0 0.5, keep_table=True: to make them anew"
+    with pytest.raises(ExistingFile, match=said):
+        task.find_data(pictures, out, masks="none", box=box)
+    scene = task.SCENE
+    with pytest.raises(UserError, match="brings masks, which are trained on as they are: with a"):
+        task.find_data(scene, tmp_path / "other", box=box)
 
 
 def test_a_network_that_was_named_is_not_passed_over(steps, pictures, tmp_path, monkeypatch):

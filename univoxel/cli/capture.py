@@ -12,7 +12,7 @@ from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.cli.demo import MAPS, SCENE
 from univoxel.cli.evaluate import evaluate
 from univoxel.cli.export import export
-from univoxel.cli.parsing import Changes, Minutes, check_minutes, takes, written
+from univoxel.cli.parsing import BoxOf, Changes, Minutes, check_minutes, takes, written
 from univoxel.cli.relight import relight_to_files
 from univoxel.cli.train import code_of
 from univoxel.core import files
@@ -61,6 +61,10 @@ class CaptureOptions:
     auto takes those that the photographs bring, or else the network, or depth if there is none"""
     network: NetworkName = NETWORK
     """which network it is; as of cutout"""
+    box: BoxOf = None
+    """as of cutout; the cameras are those of scene/, which --until cameras ends with"""
+    keep_table: bool = False
+    """as of cutout, with --masks none and a box"""
     preset: PresetOrAuto = "auto"
     """as of train"""
     light: LightName = "hybrid"
@@ -85,6 +89,7 @@ def command(asked: CaptureOptions) -> int:
     check_minutes(asked.minutes)
     where, until = (asked.photographs, asked.out), asked.until
     masks: dict[str, Any] = {"masks": asked.masks, "network": asked.network}
+    masks |= {"box": asked.box, "keep_table": asked.keep_table}
     training = {"preset": asked.preset, "light": asked.light, "minutes": asked.minutes}
     if until == "page":
         made = capture(*where, **masks, **training, changes=asked.changes)
@@ -114,12 +119,18 @@ class MasksAsked:
     """Where masks come from, and how they are made."""
 
     source: str | Path
-    network: NetworkName
+    network: NetworkName = NETWORK
+    box: Sequence[float] | None = None
+    keep_table: bool = False
 
     @property
     def fingerprint(self) -> Any:
-        """What steps.json has of them: as before there were networks, unless one was chosen."""
-        chosen = {} if self.network == NETWORK else {"network": self.network}
+        """What steps.json has of them: a word, unless more was chosen."""
+        chosen: dict[str, Any] = {} if self.network == NETWORK else {"network": self.network}
+        if self.box is not None:
+            chosen["box"] = [float(value) for value in self.box]
+        if self.keep_table:
+            chosen["keep_table"] = True
         return {"masks": str(self.source), **chosen} if chosen else str(self.source)
 
 
@@ -142,6 +153,8 @@ def capture(
     light: LightName = "hybrid",
     changes: Sequence[str] = (),
     network: NetworkName = NETWORK,
+    box: Sequence[float] | None = None,
+    keep_table: bool = False,
     on_progress: Callable[[TrainingProgress], None] | None = None,
     config: CaptureConfig = DEFAULTS,
     pictures: PicturesConfig = PICTURES,
@@ -159,7 +172,7 @@ def capture(
         out: folder to write.
         masks: a folder of masks; rembg, a network; none, depth alone, as of `cutout`;
             auto: what the photographs bring, else a network.
-        network: as of `cutout`.
+        network, box, keep_table: as of `cutout`.
         preset, minutes, light, changes, on_progress: as of `univoxel.train`.
         config: how cameras are found.
         pictures: how many are made, and how large.
@@ -181,7 +194,7 @@ def capture(
     from univoxel.training.clock import expected_seconds
     from univoxel.training.probe import slowdown
 
-    given, asked = look_at(Path(photographs)), MasksAsked(masks, network)
+    given, asked = look_at(Path(photographs)), MasksAsked(masks, network, box, keep_table)
     project = Project(Path(out))
     training = chosen(preset, minutes, project.cut, project.run, light)
     training = changed(training, changes)
@@ -215,6 +228,8 @@ def find_data(
     *,
     masks: str | Path = AUTO,
     network: NetworkName = NETWORK,
+    box: Sequence[float] | None = None,
+    keep_table: bool = False,
     until: Literal["cameras", "masks"] = "masks",
     config: CaptureConfig = DEFAULTS,
 ) -> Path:
@@ -229,7 +244,7 @@ def find_data(
     """
     from univoxel.capture.project import Project, begin, look_at
 
-    given, asked = look_at(Path(photographs)), MasksAsked(masks, network)
+    given, asked = look_at(Path(photographs)), MasksAsked(masks, network, box, keep_table)
     if given.kind == "run":
         raise UserError(f"{given.path} is a trained run: there are cameras and masks", "until")
     project = Project(Path(out))
@@ -255,9 +270,9 @@ def _check_unused(given: Given, asked: MasksAsked, training: TrainConfig) -> Non
     usual = chosen("auto", None, training.data, training.out)
     if asked.fingerprint != AUTO or training != usual:
         raise UserError(
-            f"{given.path} is a trained run: masks, network, preset, minutes, light and set come "
-            "too late",
-            *("masks", "network", "preset", "minutes", "light", "set"),
+            f"{given.path} is a trained run: masks, network, box, preset, minutes, light and set "
+            "come too late",
+            *("masks", "network", "box", "preset", "minutes", "light", "set"),
         )
 
 
@@ -273,7 +288,7 @@ def _check_machine(given: Given, asked: MasksAsked) -> None:
     if given.kind == "photographs":
         require_pycolmap()
     masks = asked.source
-    check_masks(str(masks), asked.network)
+    check_masks(str(masks), asked.network, asked.box, asked.keep_table)
     if str(masks) == REMBG:
         mask_network(asked.network)
     elif str(masks) not in (AUTO, DEPTH) and not Path(masks).is_dir():
@@ -378,6 +393,7 @@ def _find_masks(project: Project, scene: Path, asked: MasksAsked) -> Path:
 
     def other(before: str | dict[str, Any]) -> ExistingFile:
         made = before if isinstance(before, dict) else {"masks": before}
+        made = {k: " ".join(map(str, v)) if k == "box" else v for k, v in made.items()}
         words = ", ".join(f"{name}={value}" for name, value in made.items())
         return ExistingFile(
             f"{project.cut} holds photographs with {words}: to make them anew, remove it "
@@ -391,6 +407,12 @@ def _find_masks(project: Project, scene: Path, asked: MasksAsked) -> Path:
         return project.cut
     turned = bool(files.recorded(project.out, TURNED))
     if str(masks) == AUTO and not turned and _have_masks(project, scene):
+        if asked.box is not None:
+            raise UserError(
+                f"{scene} brings masks, which are trained on as they are: with a box expected "
+                f"masks={REMBG}, {DEPTH} or their folder, got {masks}",
+                "masks",
+            )
         _skip("masks", scene)
         return scene
     files.finish(project.out, MASKS, noted)  # before: the folder appears whole, at the end
@@ -400,7 +422,12 @@ def _find_masks(project: Project, scene: Path, asked: MasksAsked) -> Path:
         source = _network_or_depth(asked.network) if str(masks) == AUTO else masks
     words = {REMBG: "from a network", DEPTH: "from depth alone"}
     _say("masks", words.get(str(source), f"from {source}"))
-    return cutout(scene, project.cut, source, network=asked.network if source == REMBG else NETWORK)
+    return cutout(
+        *(scene, project.cut, source),
+        network=asked.network if source == REMBG else NETWORK,
+        box=asked.box,
+        keep_table=asked.keep_table,
+    )
 
 
 def _network_or_depth(name: NetworkName) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from univoxel.cli.parsing import DownscaleBy, check_downscale, takes, written
+from univoxel.cli.parsing import BoxOf, DownscaleBy, check_downscale, takes, written
 from univoxel.core.choices import NETWORK, NetworkName
 
 
@@ -23,6 +23,11 @@ class CutoutOptions:
     network: NetworkName = NETWORK
     """which of rembg's networks makes them: the further down the list, the more megabytes, time and
     detail"""
+    box: BoxOf = None
+    """lower and upper corner, in world units of the written cameras, of a box that the object lies
+    in; outside of it nothing counts"""
+    keep_table: bool = False
+    """with --from none and a box: what stands out keeps its support, within the box"""
     downscale: DownscaleBy = "auto"
     """write photographs of 1/N of their width and height; auto as of train"""
     allow_outside: bool = False
@@ -42,4 +47,6 @@ def command(asked: CutoutOptions) -> Path:
     return cutout(
         *(asked.data, asked.out, asked.source, downscale, asked.allow_outside),
         network=asked.network,
+        box=asked.box,
+        keep_table=asked.keep_table,
     )

@@ -34,6 +34,8 @@ NetworkName: TypeAlias = Literal[
     "birefnet-general-lite",
     "birefnet-general",
 ]
+# Lower and upper corner, x y z each
+Box: TypeAlias = tuple[float, float, float, float, float, float]
 Until: TypeAlias = Literal["cameras", "masks", "page"]  # the step that a capture ends with
 BatchStep: TypeAlias = Literal["poses", "masks", "train", "eval", "export", "page"]
 BATCH_STEPS: tuple[BatchStep, ...] = get_args(BatchStep)
