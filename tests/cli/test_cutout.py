@@ -155,6 +155,8 @@ def test_few_masks_stay_as_they_are(tmp_path, caplog):
     write_masks(folder, masks, photos.names)
     with pytest.raises(DataError, match="the mask of r_1 shows nothing"):
         task.cutout(data, tmp_path / "other", folder)
+    with pytest.raises(DataError, match="the mask of r_0 shows nothing in the box"):
+        task.cutout(data, tmp_path / "other", folder, box=(0, 0, 9, 1, 1, 10))
     (folder / "r_2.png").unlink()
     with pytest.raises(DataError, match=r"got none for 1: r_2\.png"):
         task.cutout(data, tmp_path / "other", folder)

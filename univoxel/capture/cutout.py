@@ -301,9 +301,8 @@ def _within(splits: dict[str, Photos], masks: Masks, box: Tensor) -> Masks:
 def _tell_evidence(shape: ObjectShape, count: int, box: Tensor | None) -> None:
     """Log what the object was told by, masks of so many photographs among it, and where it is."""
     by = [f"masks of {count} photographs"] if count else []
-    by += [f"depth of {shape.surface:.0%} of the surface"] + (
-        ["the box"] if box is not None else []
-    )
+    by += [f"depth of {shape.surface:.0%} of the surface"]
+    by += [] if box is None else ["the box"]
     lower, upper = (words_of(corner.tolist()) for corner in inside_bounds(shape))
     log.info(f"the object is told by {', '.join(by)}; it lies between {lower} and {upper}")
 
@@ -358,7 +357,8 @@ def _judged(
         for name, split in splits.items():
             for stem, one in zip(split.names, masks[name], strict=True):
                 if not bool((one >= 128).any()):
-                    raise DataError(f"{split.folder}: the mask of {stem} shows nothing")
+                    where = "" if box is None else " in the box"
+                    raise DataError(f"{split.folder}: the mask of {stem} shows nothing{where}")
         log.warning(
             "masks are taken as they are: a vote needs %d photographs, there are %d",
             *(PHOTOGRAPHS, count),
