@@ -25,6 +25,7 @@ from univoxel.presets import chosen
 # What a command calls, by the module that holds it; and commands that do all themselves
 WORK = {"train": "univoxel.cli.trainer", "poses": "univoxel.capture.poses"}
 WORK |= {"cutout": "univoxel.capture.cutout"}
+USUAL = {"network": "u2netp", "box": None, "keep_table": False}  # of how masks are made
 ALONE = ("demo", "export", "inspect", "view")
 KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, UserError)]
 
@@ -125,7 +126,7 @@ def test_capture_until_a_step(calls, capsys):
     calls.give("univoxel.cli.capture", find_data=find)
     assert main(["capture", "photos", "--out", "mug", "--until", "masks"]) == 0
     assert capsys.readouterr().out == "mug/cut\n"
-    assert calls.noted[0][2] == {"masks": "auto", "until": "masks"}
+    assert calls.noted[0][2] == {"masks": "auto", "until": "masks", **USUAL}
     assert main(["capture", "photos", "--out", "mug", "--until", "cameras", "--minutes", "2"]) == 2
     assert "--until cameras: --preset, --light, --minutes, --set come after it" in (
         capsys.readouterr().err
@@ -137,7 +138,7 @@ def test_capture(calls, capsys):
     assert main(["capture", "photos", "--out", "mug", *options, "--set=seed=3"]) == 0
     assert capsys.readouterr().out == "mug/index.html\nmug/mug.glb\n"
     told = {"masks": "rembg", "preset": "draft", "light": "sg", "minutes": 2.0}
-    expected = {**told, "changes": ("seed=3",)}
+    expected = {**told, **USUAL, "changes": ("seed=3",)}
     assert calls.noted == [("capture", (Path("photos"), Path("mug")), expected)]
     assert main(["capture", "photos", "--out", "mug", "--minutes", "0"]) == 2
     assert "--minutes must be above 0" in capsys.readouterr().err
@@ -206,13 +207,13 @@ def test_sizes_of_poses_out_of_range(calls, capsys, option):
 
 def test_cutout(calls, capsys):
     assert main(["cutout", "photos", "--out", "cut", "--downscale", "2"]) == 0
-    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "rembg", 2, False), {})]
+    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "rembg", 2, False), USUAL)]
     assert capsys.readouterr().out == "cut\n"
 
 
 def test_cutout_from_masks(calls, capsys):
     assert main(["cutout", "photos", "--out", "cut", "--from", "masks"]) == 0
-    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "masks", 0, False), {})]
+    assert calls.noted == [("cutout", (Path("photos"), Path("cut"), "masks", 0, False), USUAL)]
 
 
 @pytest.mark.parametrize("command", ["train", "cutout"])

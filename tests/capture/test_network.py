@@ -4,13 +4,15 @@ import os
 import sys
 import types
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
 
 from univoxel.capture import masks as module
-from univoxel.errors import DataError, MissingExtra
+from univoxel.core.choices import NetworkName
+from univoxel.errors import DataError, MissingExtra, UserError
 
 
 @pytest.fixture
@@ -32,9 +34,9 @@ class FakeSession:
 
     def run(self, _, values):
         picture = values["picture"]
-        assert picture.shape == (1, 3, module.SIDE, module.SIDE)
+        assert picture.shape in {(1, 3, n.side, n.side) for n in module.NETWORKS.values()}
         assert picture.dtype == np.float32
-        return [3 * picture[:, :1] - 7]
+        return [np.where(picture[:, :1] > 0.05, 5, -5).astype(np.float32)]
 
 
 @pytest.fixture
@@ -51,9 +53,10 @@ def photograph():
     return picture
 
 
-def test_weights_that_are_there(home, onnxruntime):
-    (home / "u2netp.onnx").write_bytes(b"weights")
-    mask = module.network()(photograph())
+@pytest.mark.parametrize("name", get_args(NetworkName))
+def test_weights_that_are_there(home, onnxruntime, name):
+    (home / f"{name}.onnx").write_bytes(b"weights")
+    mask = module.mask_network(name)(photograph())
     assert mask.shape == (30, 40)
     assert 0 <= float(mask.min()) <= float(mask.max()) <= 1
     assert ((mask > 0.5) == (photograph()[..., 0] > 0)).all()
@@ -62,33 +65,81 @@ def test_weights_that_are_there(home, onnxruntime):
 def test_weights_that_are_none(home, onnxruntime):
     (home / "u2netp.onnx").write_bytes(b"web page")
     with pytest.raises(DataError, match=r"u2netp\.onnx: expected a network, .*no protobuf"):
-        module.network()
+        module.mask_network()
 
 
 def test_without_a_network_one_line_says_how_to_get_one(home, onnxruntime, monkeypatch):
     with pytest.raises(MissingExtra, match=r"pip install 'univoxel\[masks\]'.*u2netp\.onnx"):
-        module.network()
+        module.mask_network()
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     (home / "u2netp.onnx").write_bytes(b"weights")
     with pytest.raises(MissingExtra, match=r"pip install 'univoxel\[masks\]'"):
-        module.network()
+        module.mask_network()
 
 
-def test_rembg_goes_first(home, monkeypatch):
+def test_networks_see_what_they_were_trained_on():
+    """As rembg has it: colours, and whether answers are logits."""
+    seen = []
+
+    class Session(FakeSession):
+        def __init__(self):
+            pass
+
+        def run(self, _, values):
+            seen.append(values["picture"][0, :, 0, 0])
+            found = np.zeros((1, 1, *values["picture"].shape[2:]), np.float32)
+            found[..., : found.shape[-1] // 2] = 2
+            found[..., 0, 0], found[..., -1, -1] = 9, -9
+            return [found]
+
+    white = torch.full((20, 20, 3), 255, dtype=torch.uint8)
+    for name, red, left in (
+        ("u2net", (1 - 0.485) / 0.229, 11 / 18),
+        ("isnet-general-use", 0.5, 11 / 18),
+        ("birefnet-general", (1 - 0.485) / 0.229, 1 / (1 + np.exp(-2))),
+    ):
+        mask = module._prediction(module.NETWORKS[name], Session(), white)
+        assert seen.pop()[0] == pytest.approx(red)
+        assert float(mask[10, 5]) == pytest.approx(left, abs=1e-3)
+
+
+def test_a_name_of_no_network(home):
+    with pytest.raises(UserError, match=r"expected one of u2netp, .*birefnet-general, got u2"):
+        module.mask_network("u2")
+    assert list(module.NETWORKS) == list(get_args(NetworkName))
+
+
+def test_the_time_is_told_once_it_is_measured(monkeypatch, caplog):
+    caplog.set_level("INFO", "univoxel")
+    clock = iter([0.0, 5.1, 6.0, 7.0])
+    monkeypatch.setattr(module, "monotonic", lambda: next(clock))
+    masked = module.timed(lambda photo: photo[..., 0] / 255, "isnet-general-use", 60)
+    assert caplog.messages == ["masks: from the network isnet-general-use, of 179 MB"]
+    for _ in range(2):
+        assert torch.equal(masked(photograph()), photograph()[..., 0] / 255)
+    assert caplog.messages[1:] == ["masks: 5.1 s a photograph, about 5 min for 60"]
+
+
+def test_rembg_goes_first(home, monkeypatch, caplog):
+    caplog.set_level("INFO", "univoxel")
     made = types.ModuleType("rembg")
     made.new_session = lambda name: types.SimpleNamespace(
-        predict=lambda picture: [picture.getchannel("R")] if name == "u2netp" else []
+        predict=lambda picture: [picture.getchannel("R" if name == "u2netp" else "G")]
     )
     monkeypatch.setitem(sys.modules, "rembg", made)
-    mask = module.network()(photograph())
+    mask = module.mask_network()(photograph())
     torch.testing.assert_close(mask, photograph()[..., 0].float() / 255)
+    assert caplog.messages == ["u2netp: weights of 4.7 MB are fetched once"]
+    (home / "u2net.onnx").touch()
+    assert not module.mask_network("u2net")(photograph()).any()
+    assert len(caplog.messages) == 1
 
     def offline(_):
         raise ConnectionError("no network")
 
     made.new_session = offline
     with pytest.raises(DataError, match=r"expected weights of u2netp; fetching: no network"):
-        module.network()
+        module.mask_network()
 
 
 WEIGHTS = Path(os.environ.get("U2NET_HOME") or Path.home() / ".u2net") / "u2netp.onnx"
@@ -103,5 +154,5 @@ def test_the_real_network_finds_what_stands_out(monkeypatch):
     true = (row - 110.0).square() + (column - 170.0).square() < 60**2
     picture = torch.full((240, 320, 3), 225, dtype=torch.uint8)
     picture[true] = torch.tensor([170, 40, 30], dtype=torch.uint8)
-    found = module.network()(picture) > 0.5
+    found = module.mask_network()(picture) > 0.5
     assert float((found & true).sum() / (found | true).sum()) > 0.9

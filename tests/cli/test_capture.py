@@ -22,6 +22,7 @@ from univoxel.capture import poses as structure_from_motion
 from univoxel.cli import capture as task
 from univoxel.errors import DataError, ExistingFile, MissingExtra, StillBackground, UserError
 
+USUAL = ("u2netp", None, False)  # of options of cutout
 VIEWS = 11  # of 36 around the object: too few for a vote, so masks are taken as they are
 
 
@@ -198,7 +199,7 @@ def test_a_run_takes_the_place_of_three_steps(captured, tmp_path, caplog):
         *("again.glb", "steps.json", "index.html", "pictures")
     }
     assert f"step 3 of 6, training: there already, {captured.run}" in caplog.text
-    with pytest.raises(UserError, match="is a trained run: masks, preset, minutes, light and set"):
+    with pytest.raises(UserError, match="is a trained run: masks, network, box, preset"):
         task.capture(captured.run, tmp_path / "other", minutes=2.0)
     with pytest.raises(UserError, match="is a trained run: masks"):
         task.capture(captured.run, tmp_path / "other", masks="none")
@@ -220,8 +221,8 @@ def steps(monkeypatch, tmp_path) -> list[tuple]:
             shutil.copytree(masks, out / "masks")
         return out
 
-    def cutout(data, out, source):
-        noted.append(("cutout", data, source))
+    def cutout(data, out, source, **options):
+        noted.append(("cutout", data, source, *[o for o in options.values() if o not in USUAL]))
         out.mkdir()
         return out
 
@@ -249,16 +250,16 @@ def steps(monkeypatch, tmp_path) -> list[tuple]:
     monkeypatch.setattr(task, "_check_trained", lambda wanted, done: None)
     monkeypatch.setattr(task, "export", lambda run, mesh: mesh.write_bytes(b"glTF"))
     monkeypatch.setattr(task, "relight_to_files", lambda *_, **__: None)
-    monkeypatch.setattr("univoxel.capture.masks.network", no_network)
+    monkeypatch.setattr("univoxel.capture.masks.mask_network", no_network)
     monkeypatch.setattr("univoxel.output.page.write_page", write_page)
     return noted
 
 
-def no_network():
+def no_network(*_):
     raise MissingExtra("masks from a network need rembg: pip install 'univoxel[masks]'")
 
 
-def red_is_the_object():
+def red_is_the_object(*_):
     return lambda photograph: (photograph[..., 0] > 128).float()
 
 
@@ -303,9 +304,47 @@ def without_masks(*_, **__):
     raise WithoutMasks("none")
 
 
+def test_another_network_makes_other_masks(steps, pictures, tmp_path, monkeypatch):
+    out, named = tmp_path / "mug", []
+    monkeypatch.setattr(
+        "univoxel.capture.masks.mask_network",
+        lambda name: named.append(name) or red_is_the_object(),
+    )
+    task.find_data(pictures, out, masks="rembg", network="u2net")
+    assert steps[1:] == [("cutout", out / "scene", "rembg", "u2net")]
+    assert named == ["u2net"]
+    task.find_data(pictures, out, masks="rembg", network="u2net")  # goes on
+    with pytest.raises(ExistingFile, match=r"with masks=rembg, network=u2net: .*remove it and"):
+        task.find_data(pictures, out, masks="rembg")
+    other = tmp_path / "other"
+    task.find_data(pictures, other, masks="rembg")
+    assert json.loads((other / "steps.json").read_text())["masks"] == "rembg"  # as in 0.2
+    with pytest.raises(ExistingFile, match="holds photographs with masks=rembg: "):
+        task.find_data(pictures, other, masks="rembg", network="u2net")
+
+
+def test_another_box_makes_other_masks(steps, pictures, tmp_path, monkeypatch):
+    out, box = tmp_path / "mug", (0, 0, 0, 1, 1, 0.5)
+    task.find_data(pictures, out, masks="none", box=box, keep_table=True)
+    assert steps[1:] == [("cutout", out / "scene", "none", box, True)]
+    task.find_data(pictures, out, masks="none", box=list(box), keep_table=True)  # goes on
+    said = r"with masks=none, box=0.0 0.0 0.0 1.0 1.0 0.5, keep_table=True: to make them anew"
+    with pytest.raises(ExistingFile, match=said):
+        task.find_data(pictures, out, masks="none", box=box)
+    scene = task.SCENE
+    with pytest.raises(UserError, match="brings masks, which are trained on as they are: with a"):
+        task.find_data(scene, tmp_path / "other", box=box)
+
+
+def test_a_network_that_was_named_is_not_passed_over(steps, pictures, tmp_path, monkeypatch):
+    monkeypatch.setattr("univoxel.data.load_photos", without_masks)
+    with pytest.raises(MissingExtra, match="need rembg"):
+        task.capture(pictures, tmp_path / "mug", network="silueta")
+
+
 def test_with_a_network_masks_come_from_it(steps, pictures, tmp_path, monkeypatch):
     monkeypatch.setattr("univoxel.data.load_photos", without_masks)
-    monkeypatch.setattr("univoxel.capture.masks.network", red_is_the_object)
+    monkeypatch.setattr("univoxel.capture.masks.mask_network", red_is_the_object)
     task.capture(pictures, tmp_path / "mug")
     assert steps[1] == ("cutout", tmp_path / "mug/scene", "rembg")
 
@@ -361,7 +400,7 @@ def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, ca
         return (found if masks else still)(photographs, scene, masks)
 
     monkeypatch.setattr("univoxel.capture.poses.poses", poses)
-    monkeypatch.setattr("univoxel.capture.masks.network", red_is_the_object)
+    monkeypatch.setattr("univoxel.capture.masks.mask_network", red_is_the_object)
     with caplog.at_level(logging.INFO, "univoxel"):
         task.capture(pictures, out)
     assert "9 of 10 pairs: the object was turned before a still camera, so masks first" in (
@@ -372,6 +411,9 @@ def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, ca
         ("cutout", out / "scene", out / "scene" / "masks"),
         ("train", (out / "cut").absolute(), False),
     ]
+    with pytest.raises(ExistingFile, match="cameras found with masks of network=u2netp: choose"):
+        task.capture(pictures, out, network="u2net")
+    assert "s a photograph, about 10 s for 3" in caplog.text
     for v in range(3):
         mask = np.asarray(Image.open(out / "masks" / f"{v}.png"))
         assert (mask == np.asarray(Image.open(pictures / f"{v}.png"))[..., 0]).all()
@@ -382,7 +424,7 @@ def test_a_turntable_goes_on_with_the_masks_that_are_there(steps, pictures, tmp_
     out, made = tmp_path / "mug", []
     monkeypatch.setattr("univoxel.capture.poses.poses", still)
 
-    def killed():
+    def killed(_):
         def mask(photograph):
             made.append(photograph)
             if len(made) == 3:
@@ -391,7 +433,7 @@ def test_a_turntable_goes_on_with_the_masks_that_are_there(steps, pictures, tmp_
 
         return mask
 
-    monkeypatch.setattr("univoxel.capture.masks.network", killed)
+    monkeypatch.setattr("univoxel.capture.masks.mask_network", killed)
     with pytest.raises(KeyboardInterrupt):
         task.capture(pictures, out)
     assert not (out / "masks").exists()
@@ -431,6 +473,8 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
         (pictures / "0.png", {}, DataError, "got a file of another kind"),
         (pictures, {"masks": "nothing here"}, DataError, "masks: expected rembg, none or a folder"),
         (pictures, {"masks": "rembg"}, MissingExtra, "need rembg"),
+        (pictures, {"network": "u2"}, UserError, "network: expected one of u2netp, .*, got u2"),
+        (pictures, {"network": "u2net", "masks": "none"}, UserError, "network=u2net makes masks"),
         (pictures, {"preset": "quick"}, UserError, "preset must be one of draft, fast, full, best"),
         (pictures, {"minutes": -1.0}, UserError, "minutes must be above 0"),
         (pictures, {"changes": ["colour=red"]}, UserError, "no field 'colour'"),

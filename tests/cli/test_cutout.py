@@ -13,6 +13,7 @@ from analytic import photograph, write_scene
 from PIL import Image
 from spoilt_masks import iou
 
+from univoxel.camera import image_rays
 from univoxel.capture import cutout as task
 from univoxel.cli import main
 from univoxel.data import load_photos
@@ -34,7 +35,7 @@ def write_masks(folder, masks, stems):
 @pytest.fixture
 def by_brightness(monkeypatch):
     """A network for which what is not black is the object."""
-    monkeypatch.setattr(task, "network", lambda: lambda photo: (photo.sum(-1) > 0).float())
+    monkeypatch.setattr(task, "mask_network", lambda _: lambda photo: (photo.sum(-1) > 0).float())
 
 
 def test_what_cannot_be_written_leaves_nothing_behind_that_looks_whole(
@@ -155,6 +156,8 @@ def test_few_masks_stay_as_they_are(tmp_path, caplog):
     write_masks(folder, masks, photos.names)
     with pytest.raises(DataError, match="the mask of r_1 shows nothing"):
         task.cutout(data, tmp_path / "other", folder)
+    with pytest.raises(DataError, match="the mask of r_0 shows nothing in the box"):
+        task.cutout(data, tmp_path / "other", folder, box=(0, 0, 9, 1, 1, 10))
     (folder / "r_2.png").unlink()
     with pytest.raises(DataError, match=r"got none for 1: r_2\.png"):
         task.cutout(data, tmp_path / "other", folder)
@@ -203,6 +206,57 @@ def test_what_stands_out_in_depth(tmp_path, room, caplog):
     agreed = [iou(cut.picture(view)[1], mask) for view, mask in enumerate(true)]
     assert np.mean(agreed) > 0.95
     assert min(agreed) > 0.93
+
+
+def within(view, cameras, lower, upper):
+    """The pixels whose surface lies in a box, by formula."""
+    seen = textured_room.orbit(30, 200, 150)[view]
+    rays, away = image_rays(cameras, view), torch.from_numpy(textured_room.distance(seen))
+    place = rays.origin + rays.direction * away.view(-1, 1)
+    inside = (place > torch.tensor(lower)) & (place < torch.tensor(upper))
+    return inside.all(1).view(away.shape).float()
+
+
+def test_a_box_takes_the_table_out_of_all_masks(tmp_path, room, caplog):
+    data, true = room
+    photos = load_photos(data, masks=False)
+    masks = [within(v, photos.cameras, (-1.1, -1, -0.1), (0.9, 1, 2)) for v in range(len(true))]
+    assert np.mean([iou(a, b) for a, b in zip(masks, true, strict=True)]) < 0.6
+    folder, box = write_masks(tmp_path / "masks", masks, photos.names), (-0.5, -0.5, 0.03)
+    caplog.set_level("INFO", "univoxel")
+    cut = load_photos(task.cutout(data, tmp_path / "cut", folder, box=(*box, 0.6, 0.5, 1.2)))
+    assert "the object is told by masks of 30 photographs, depth of " in caplog.text
+    assert "% of the surface, the box; it lies between " in caplog.text
+    agreed = [iou(cut.picture(view)[1], mask) for view, mask in enumerate(true)]
+    assert np.mean(agreed) > 0.9
+    assert min(agreed) > 0.85
+
+
+def test_in_depth_a_box_ends_the_table_that_is_kept(tmp_path, room):
+    data, true = room
+    out, box = tmp_path / "cut", (-0.6, -0.6, -0.1, 0.6, 0.6, 1.2)
+    options = ["--from", "none", "--box", *map(str, box), "--keep-table"]
+    assert main(["cutout", str(data), "--out", str(out), *options]) == 0
+    cut = load_photos(out)
+    for view, mask in enumerate(true):
+        inside = within(view, cut.cameras, box[:3], box[3:])
+        assert iou(cut.picture(view)[1], inside) > 0.9
+        assert iou(cut.picture(view)[1], mask) < 0.75
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--box", "0", "0", "0", "1", "1", "0"], "--box: expected X0 Y0 Z0 X1 Y1 Z1, each"),
+        (["--box", "0", "0", "0", "1"], "--box"),
+        (["--keep-table", "--from", "none"], "--keep-table: expected masks from none, depth"),
+        (["--from", "none", "--network", "u2net"], "--network u2net makes masks where none are"),
+        (["--network", "u2"], "Expected one of ('u2netp', 'silueta'"),
+    ],
+)
+def test_options_of_masks_that_cannot_be(tmp_path, capsys, options, said):
+    assert main(["cutout", str(tmp_path), "--out", str(tmp_path / "cut"), *options]) == 2
+    assert said in capsys.readouterr().err
 
 
 def test_where_nothing_stands_out_the_way_out_is_told(tmp_path, with_masks):

@@ -1,5 +1,7 @@
 """The object in 3D: from masks of which some are wrong, with depth maps and without."""
 
+import math
+
 import numpy as np
 import pytest
 import textured_room
@@ -7,15 +9,16 @@ import torch
 from analytic import cameras_around
 from spoilt_masks import BESIDE, MISSING, iou, kept_table, lost_part, true_mask, without_depth
 
-from univoxel.capture.masks import judge, voxel_pixels
+from univoxel.capture.masks import grown, judge, voxel_pixels
 from univoxel.data.photos import Photos
 from univoxel.errors import UserError
-from univoxel.fields.grid import GridShape
+from univoxel.fields.grid import GridShape, fit_grid
 from univoxel.preparation import object_shape
-from univoxel.preparation.object_shape import ObjectShape, find_object, silhouettes
-from univoxel.preparation.stereo import depth_maps
+from univoxel.preparation.object_shape import ObjectShape, box_corners, find_object, silhouettes
+from univoxel.preparation.stereo import depth_maps, pixels_of
 
 VIEWS, SIZE, VOXELS = 40, 64, 48
+AROUND = (-0.5, -0.5, 0.03, 0.6, 0.5, 1.2)  # the object in the room
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +57,30 @@ def test_masks_outvote_those_that_are_wrong(fake):
             assert verdict.fault == fault
         else:
             assert torch.equal(verdict.mask, mask)  # what is right stays, bit for bit
+
+
+def test_boxes_that_are_none_or_hold_nothing():
+    for values in ((0, 0, 0, 1, 1), (0, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, math.nan)):
+        with pytest.raises(UserError, match=r"box: expected X0 Y0 Z0 X1 Y1 Z1, .*, got 0 0 0 1 1"):
+            box_corners(values)
+    cameras = cameras_around(12, 32)
+    masks, box = [true_mask(cameras, v) for v in range(12)], box_corners((1, 1, 1, 1.2, 1.2, 1.2))
+    with pytest.raises(UserError, match=r"that the object lies in, got 1 1 1 .*cameras look at"):
+        find_object(masks, without_depth(cameras), VOXELS, box)
+
+
+def test_pixels_that_see_a_box():
+    cameras = cameras_around(6, 40)
+    box = box_corners((-0.3, -0.3, -0.3, 0.3, 0.3, 0.3))
+    for view in range(6):
+        shown = object_shape.box_shown(cameras, view, box)
+        grid = fit_grid(box[0], box[1], 24**3)
+        inside = grid.nodes()[object_shape.depth_in(grid, box) >= 0]
+        row, column, _ = pixels_of(cameras, view, inside)
+        assert grown(shown)[row, column].all()
+        assert shown.sum() < 1.15 * len(set(zip(row.tolist(), column.tolist(), strict=True)))
+    around = box_corners((-3, -3, -3, 3, 3, 3))
+    assert object_shape.box_shown(cameras, 0, around).all()  # from inside
 
 
 def test_masks_that_show_nothing():
@@ -103,6 +130,17 @@ def test_depth_empties_the_air_that_masks_keep(room):
         air = (away > 0.65) & (away < 0.9) & (height > 0.4) & (height < 1.0)
         assert air.any()
         assert least <= float((shape.inside[air] > 0).float().mean()) <= most
+
+
+def test_a_box_ends_what_all_masks_keep(room):
+    photos, masks, maps = room
+    everything, box = [torch.ones_like(mask) for mask in masks], box_corners(AROUND)
+    shape = find_object(everything, maps, 64, box)
+    agree = [iou(s, m) for s, m in zip(silhouettes(shape, photos.cameras), masks, strict=True)]
+    assert np.mean(agree) > 0.9
+    lower, upper = object_shape.inside_bounds(shape)
+    assert (lower >= box[0]).all()
+    assert (upper <= box[1]).all()
 
 
 def test_a_hidden_place_is_not_asked():

@@ -6,10 +6,10 @@ import textured_room
 import torch
 from spoilt_masks import iou, without_depth
 
-from univoxel.camera import looked_at
+from univoxel.camera import image_rays, looked_at
 from univoxel.data.photos import Photos
 from univoxel.fields.grid import fit_grid
-from univoxel.preparation.object_shape import ROOM, shrunk
+from univoxel.preparation.object_shape import ROOM, box_corners, shrunk
 from univoxel.preparation.standing_object import (
     Plane,
     background_planes,
@@ -40,6 +40,38 @@ def test_masks_are_those_of_the_object(room):
     true = [shrunk(m, *maps.cameras.size(v)) for v, m in enumerate(photos.coverage())]
     agreed = [iou(one, other) for one, other in zip(found, true, strict=True)]
     assert np.mean(agreed) > 0.8  # ragged where no depth is known; the shape of them all is not
+
+
+def seen_in(box, maps):
+    """Which pixels of each small photograph see a surface in a box, by formula."""
+    for view in textured_room.orbit(30, maps.cameras.width, maps.cameras.height):
+        away = torch.from_numpy(textured_room.distance(view)).float()
+        place = torch.from_numpy(view.pose[:, 3]).float() + away.reshape(-1, 1) * directions(view)
+        yield ((place >= box[0]) & (place <= box[1])).all(1).view(away.shape).float()
+
+
+def directions(view):
+    cameras = textured_room.cameras([view])
+    return image_rays(cameras, 0).direction
+
+
+def test_in_a_box_all_surface_is_the_object(room):
+    _, maps = room
+    head = box_corners((-0.5, -0.5, 0.52, 0.6, 0.5, 1.2))
+    found = masks_by_depth(maps, head)
+    agreed = [iou(a, b) for a, b in zip(found, seen_in(head, maps), strict=True)]
+    assert np.mean(agreed) > 0.75  # of the whole object it is 0.5
+
+
+def test_a_box_leaves_the_table_out(room):
+    photos, maps = room
+    found = masks_by_depth(maps, box_corners((-0.6, -0.6, -0.1, 0.6, 0.6, 1.2)))
+    true = [shrunk(m, *maps.cameras.size(v)) for v, m in enumerate(photos.coverage())]
+    assert np.mean([iou(a, b) for a, b in zip(found, true, strict=True)]) > 0.8
+
+
+def test_a_box_in_the_air_has_nothing(room):
+    assert masks_by_depth(room[1], box_corners((0.9, 0.9, 0.6, 1.2, 1.2, 0.9))) is None
 
 
 def test_the_plane_is_the_floor(room):

@@ -16,18 +16,39 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from univoxel.camera import resize
-from univoxel.capture.masks import BESIDE, MISSING, Verdict, iou, judge, network, voxel_pixels
+from univoxel.camera import Cameras, resize
+from univoxel.capture.masks import (
+    BESIDE,
+    MISSING,
+    Verdict,
+    check_network,
+    grown,
+    iou,
+    judge,
+    mask_network,
+    timed,
+    voxel_pixels,
+)
 from univoxel.color import linear_to_srgb
-from univoxel.core.choices import DEPTH, REMBG
+from univoxel.core.choices import DEPTH, NETWORK, REMBG, NetworkName
 from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph, write_html
 from univoxel.core.progress_bar import track
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
-from univoxel.errors import DataError, ExistingFile
+from univoxel.errors import DataError, ExistingFile, UserError
 from univoxel.preparation.hull import mask_distances
-from univoxel.preparation.object_shape import ObjectShape, find_object, shrunk, silhouettes
+from univoxel.preparation.object_shape import (
+    ObjectShape,
+    box_corners,
+    box_shown,
+    find_object,
+    inside_bounds,
+    nothing_inside,
+    shrunk,
+    silhouettes,
+    words_of,
+)
 from univoxel.preparation.standing_object import masks_by_depth
 from univoxel.preparation.stereo import DepthMaps, depth_maps, small_cameras
 
@@ -158,6 +179,10 @@ def cutout(
     source: str | Path = REMBG,
     downscale: int = 0,
     allow_outside: bool = False,
+    *,
+    network: NetworkName = NETWORK,
+    box: Sequence[float] | None = None,
+    keep_table: bool = False,
 ) -> Path:
     """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
 
@@ -171,18 +196,24 @@ def cutout(
             stands out from its support in the middle; else a folder of masks.
         downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
         allow_outside: as of `load_photos`.
+        network: which of rembg's networks makes them, if one does.
+        box: X0 Y0 Z0 X1 Y1 Z1, world units of the written cameras: what lies outside is not the
+            object.
+        keep_table: whether what stands out in depth keeps its support, within the box.
 
     Raises:
         DataError: photographs or masks that cannot be used, or nothing stands out in depth.
         ExistingFile: out is there already.
         MissingExtra: there is no network.
-        UserError: the masks have nothing in common.
+        UserError: the masks have nothing in common, or arguments contradict one another.
         OSError: a file cannot be written.
     """
     data, out, origin = Path(data), Path(out), str(source)
     if out.exists():
         raise ExistingFile(f"{out} is there already: choose another out", "out")
-    masked = network() if origin == REMBG else None
+    check_masks(origin, network, box, keep_table)
+    corners = None if box is None else box_corners(box)
+    masked = mask_network(network) if origin == REMBG else None
     load = functools.partial(load_photos, data, allow_outside=allow_outside)
     photos = load("train", downscale, masks=False)
     splits = {
@@ -191,22 +222,55 @@ def cutout(
     }
     log.info(photos.about)
     if masked:
-        masks = _from_network(splits, masked)
+        count = sum(map(len, splits.values()))
+        masks = _from_network(splits, timed(masked, network, count))
     elif origin == DEPTH:
-        masks = _from_depth(splits, depth_maps(photos))
+        masks = _from_depth(splits, depth_maps(photos), corners, keep_table)
     else:  # of shrunk photographs those with masks are black outside of them
         masks = _as_read({n: load(n, photos.downscale, masks=Path(origin)) for n in splits})
     if origin == DEPTH:  # silhouettes have nothing to say against themselves
         verdicts, told = _as_they_are(masks), "masks of the object that stands out in depth"
     else:
-        verdicts, told = _judged(splits, masks)
+        masks = masks if corners is None else _within(splits, masks, corners)
+        verdicts, told = _judged(splits, masks, corners)
     _write(out, splits, masks, verdicts, told)
     return out
 
 
-def _from_depth(splits: dict[str, Photos], maps: DepthMaps) -> Masks:
+def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_table: bool) -> None:
+    """Refuse choices of masks that contradict one another.
+
+    Args:
+        origin: where masks come from.
+
+    Raises:
+        UserError: they do.
+    """
+    check_network(network)
+    if network != NETWORK and origin not in (REMBG, "auto"):
+        raise UserError(
+            f"network={network} makes masks where none are given: expected masks from {REMBG}, "
+            f"got {origin}",
+            "network",
+        )
+    if box is not None:
+        box_corners(box)
+    if keep_table and (box is None or origin != DEPTH):
+        got = "no box" if box is None else f"masks from {origin}"
+        raise UserError(
+            f"keep_table: expected masks from {DEPTH}, depth alone, and a box that ends the table, "
+            f"got {got}",
+            "keep_table",
+        )
+
+
+def _from_depth(
+    splits: dict[str, Photos], maps: DepthMaps, box: Tensor | None, keep_table: bool
+) -> Masks:
     """Masks of what stands out in depth."""
-    small = masks_by_depth(maps)
+    small = masks_by_depth(maps, box, keep_table)
+    if small is None and box is not None:
+        raise nothing_inside(box, "depth shows next to no surface", maps.cameras)
     if small is None:
         raise DataError(
             f"{splits['train'].folder}: no object that stands out in depth was found; it needs "
@@ -214,9 +278,33 @@ def _from_depth(splits: dict[str, Photos], maps: DepthMaps) -> Masks:
             f"{DEPTH}",
             "source",
         )
-    shape = find_object(small, maps, FINE)
+    shape = find_object(small, maps, FINE, box)
+    _tell_evidence(shape, 0, box)
     log.info("masks: of the object that stands out in depth; look at masks.html")
     return {name: _silhouettes_of(shape, split) for name, split in splits.items()}
+
+
+def _within(splits: dict[str, Photos], masks: Masks, box: Tensor) -> Masks:
+    """Masks that show nothing beside the box."""
+
+    def cut(cameras: Cameras, view: int, mask: Tensor) -> Tensor:
+        shown = grown(box_shown(cameras, view, box)).float()[None, None]
+        return mask * interpolate(shown, (mask.shape[0], mask.shape[1]))[0, 0].byte()
+
+    found = {}
+    for name, split in splits.items():
+        cameras = small_cameras(split.cameras)
+        found[name] = [cut(cameras, view, mask) for view, mask in enumerate(masks[name])]
+    return found
+
+
+def _tell_evidence(shape: ObjectShape, count: int, box: Tensor | None) -> None:
+    """Log what the object was told by, masks of so many photographs among it, and where it is."""
+    by = [f"masks of {count} photographs"] if count else []
+    by += [f"depth of {shape.surface:.0%} of the surface"]
+    by += [] if box is None else ["the box"]
+    lower, upper = (words_of(corner.tolist()) for corner in inside_bounds(shape))
+    log.info(f"the object is told by {', '.join(by)}; it lies between {lower} and {upper}")
 
 
 def _silhouettes_of(shape: ObjectShape, photos: Photos) -> list[Tensor]:
@@ -254,43 +342,49 @@ def _as_they_are(masks: Masks) -> dict[str, list[Verdict]]:
     return {name: [Verdict(None, "", mask) for mask in those] for name, those in masks.items()}
 
 
-def _judged(splits: dict[str, Photos], masks: Masks) -> tuple[dict[str, list[Verdict]], str]:
+def _judged(
+    splits: dict[str, Photos], masks: Masks, box: Tensor | None
+) -> tuple[dict[str, list[Verdict]], str]:
     """What the object's silhouettes say about each mask, repaired if it may be, and what to tell
     people.
 
     Raises:
         DataError: a mask shows nothing, and there are too few for a vote.
-        UserError: the masks have nothing in common.
+        UserError: the masks have nothing in common, or nothing in the box.
     """
     train, count = splits["train"], len(splits["train"])
     if count < PHOTOGRAPHS:
         for name, split in splits.items():
             for stem, one in zip(split.names, masks[name], strict=True):
                 if not bool((one >= 128).any()):
-                    raise DataError(f"{split.folder}: the mask of {stem} shows nothing")
+                    where = "" if box is None else " in the box"
+                    raise DataError(f"{split.folder}: the mask of {stem} shows nothing{where}")
         log.warning(
             "masks are taken as they are: a vote needs %d photographs, there are %d",
             *(PHOTOGRAPHS, count),
         )
         return _as_they_are(masks), "too few photographs for a vote: masks as they came"
     coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
-    shape = find_object(coverage["train"], depth_maps(train))
+    shape = find_object(coverage["train"], depth_maps(train), box=box)
+    _tell_evidence(shape, count, box)
     shown = {n: list(silhouettes(shape, small_cameras(s.cameras))) for n, s in splits.items()}
     agreements = [
         iou(shrunk(mask, one.shape[1], one.shape[0]) >= 0.5, one)
         for mask, one in zip(coverage["train"], shown["train"], strict=True)
     ]
     usual = statistics.median(agreements)
+    # All may keep the same table: then the box says what is wrong, and not the others
+    expected = usual if box is None else 1.0
     verdicts = {}
     for name, split in splits.items():
         cameras = small_cameras(split.cameras)
         verdicts[name] = []
         for view, mask in enumerate(track(coverage[name], "repairing masks")):
             voxel = voxel_pixels(shape.grid, cameras, view)
-            found = judge(mask, shown[name][view], usual, voxel)
+            found = judge(mask, shown[name][view], expected, voxel)
             kept = masks[name][view] if not found.fault else _bytes(found.mask)
             verdicts[name].append(replace(found, mask=kept))
-    wrong = sum(bool(v.fault) for v in verdicts["train"])
+    wrong = sum(bool(v.fault) and (box is None or v.fault == MISSING) for v in verdicts["train"])
     told = _told(splits, verdicts, usual)
     if 2 * wrong > count and shape.surface < SURE:
         told += ": none is repaired, as it may be the object's shape that is wrong"

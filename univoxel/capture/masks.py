@@ -3,10 +3,12 @@ contradicts."""
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -16,37 +18,78 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 from univoxel.camera import Cameras, project
-from univoxel.errors import DataError, MissingExtra
+from univoxel.core.choices import NETWORK, NetworkName
+from univoxel.core.progress_bar import duration
+from univoxel.errors import DataError, MissingExtra, UserError
 from univoxel.fields.grid import GridShape
 from univoxel.preparation.hull import mask_distances
 from univoxel.preparation.object_shape import shrunk
 
-NETWORK = "u2netp"  # U^2-Net, small (Qin et al. 2020): a second a photograph on one core
-SIDE = 320  # pixels of the pictures that it sees
-# Of the pictures that it was trained on
-MEAN = np.array([0.485, 0.456, 0.406], np.float32)
-SPREAD = np.array([0.229, 0.224, 0.225], np.float32)
+log: logging.Logger = logging.getLogger("univoxel")
+
+Values = tuple[float, float, float]  # of red, green and blue
+IMAGENET: tuple[Values, Values] = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+CENTRED: tuple[Values, Values] = (0.5, 0.5, 0.5), (1.0, 1.0, 1.0)
 
 
-def network() -> Callable[[Tensor], Tensor]:
+@dataclass(frozen=True)
+class Network:
+    """One of rembg's networks, and the pictures that it was trained on."""
+
+    name: str
+    megabytes: float  # of its weights
+    side: int  # pixels of the pictures that it sees
+    colors: tuple[Values, Values]  # mean and spread of these, of 1
+    sigmoid: bool = False  # whether what it answers are logits
+
+
+NETWORKS: dict[str, Network] = {
+    network.name: network
+    for network in (
+        Network("u2netp", 4.7, 320, IMAGENET),  # U^2-Net, small (Qin et al. 2020)
+        Network("silueta", 43, 320, IMAGENET),  # the same, pruned
+        Network("u2net", 176, 320, IMAGENET),
+        Network("isnet-general-use", 179, 1024, CENTRED),  # Qin et al. 2022
+        Network("birefnet-general-lite", 224, 1024, IMAGENET, sigmoid=True),  # Zheng et al. 2024
+        Network("birefnet-general", 973, 1024, IMAGENET, sigmoid=True),
+    )
+}
+
+
+def check_network(name: str) -> Network:
+    """The network of a name.
+
+    Raises:
+        UserError: there is none.
+    """
+    if name not in NETWORKS:
+        raise UserError(f"network: expected one of {', '.join(NETWORKS)}, got {name}", "network")
+    return NETWORKS[name]
+
+
+def mask_network(name: NetworkName = NETWORK) -> Callable[[Tensor], Tensor]:
     """What makes a mask [H, W] in [0, 1] of a photograph [H, W, 3] uint8, sRGB.
 
     rembg runs the network, and fetches its weights once. Without rembg, onnxruntime runs weights
-    that are there: u2netp.onnx in $U2NET_HOME, or in ~/.u2net.
+    that are there: NAME.onnx in $U2NET_HOME, or in ~/.u2net.
 
     Raises:
         DataError: rembg could not fetch the weights.
         MissingExtra: neither is installed, or onnxruntime has no weights.
+        UserError: there is no network of that name.
     """
-    weights = Path(os.environ.get("U2NET_HOME") or Path.home() / ".u2net") / f"{NETWORK}.onnx"
+    network = check_network(name)
+    weights = Path(os.environ.get("U2NET_HOME") or Path.home() / ".u2net") / f"{name}.onnx"
     try:
         import rembg  # pyright: ignore[reportMissingImports]  the extra `masks`
     except (ImportError, SystemExit):  # it ends Python where onnxruntime is missing
-        return _by_onnxruntime(weights)
+        return _by_onnxruntime(network, weights)
+    if not weights.is_file():
+        log.info("%s: weights of %g MB are fetched once", name, network.megabytes)
     try:
-        session = rembg.new_session(NETWORK)
+        session = rembg.new_session(name)
     except OSError as error:  # requests' errors are some
-        raise DataError(f"{weights}: expected weights of {NETWORK}; fetching: {error}") from None
+        raise DataError(f"{weights}: expected weights of {name}; fetching: {error}") from None
 
     def masked(photograph: Tensor) -> Tensor:
         mask = session.predict(Image.fromarray(photograph.numpy()))[0]
@@ -55,7 +98,7 @@ def network() -> Callable[[Tensor], Tensor]:
     return masked
 
 
-def _by_onnxruntime(weights: Path) -> Callable[[Tensor], Tensor]:
+def _by_onnxruntime(network: Network, weights: Path) -> Callable[[Tensor], Tensor]:
     try:
         import onnxruntime  # pyright: ignore[reportMissingImports]  the extra `masks`
     except ImportError:
@@ -72,20 +115,44 @@ def _by_onnxruntime(weights: Path) -> Callable[[Tensor], Tensor]:
         session = onnxruntime.InferenceSession(str(weights), options, ["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own have no common root but this
         raise DataError(f"{weights}: expected a network, could not read it: {error}") from None
-    return lambda photograph: _prediction(session, photograph)
+    return lambda photograph: _prediction(network, session, photograph)
 
 
-def _prediction(session: Any, photograph: Tensor) -> Tensor:
+def _prediction(network: Network, session: Any, photograph: Tensor) -> Tensor:
     """A mask [H, W] in [0, 1] of a photograph [H, W, 3] uint8."""
-    small = Image.fromarray(photograph.numpy()).resize((SIDE, SIDE), Image.Resampling.LANCZOS)
+    size = (network.side, network.side)
+    small = Image.fromarray(photograph.numpy()).resize(size, Image.Resampling.LANCZOS)
+    mean, spread = np.array(network.colors, np.float32)
     values = np.asarray(small, np.float32)
-    values = (values / max(values.max(), 1) - MEAN) / SPREAD
+    values = (values / max(values.max(), 1) - mean) / spread
     name = session.get_inputs()[0].name
     found = session.run(None, {name: values.transpose(2, 0, 1)[None]})[0][0, 0]
+    if network.sigmoid:
+        found = torch.from_numpy(found).sigmoid().numpy()
     found = (found - found.min()) / max(found.max() - found.min(), 1e-6)
     height, width = photograph.shape[:2]
     mask = Image.fromarray(found).resize((width, height), Image.Resampling.BICUBIC)
     return torch.from_numpy(np.asarray(mask).clip(0, 1))
+
+
+def timed(
+    masked: Callable[[Tensor], Tensor], name: NetworkName, count: int
+) -> Callable[[Tensor], Tensor]:
+    """The same function, which tells after the first photograph how long so many take."""
+    log.info("masks: from the network %s, of %g MB", name, NETWORKS[name].megabytes)
+    first = True
+
+    def measured(photograph: Tensor) -> Tensor:
+        nonlocal first
+        begun = monotonic()
+        mask = masked(photograph)
+        if first:
+            first, seconds = False, monotonic() - begun
+            whole = duration(count * seconds)
+            log.info("masks: %.1f s a photograph, about %s for %d", seconds, whole, count)
+        return mask
+
+    return measured
 
 
 # Which masks the object's silhouettes contradict, and how those are repaired.

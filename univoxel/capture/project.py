@@ -19,6 +19,7 @@ Kind = Literal["photographs", "scene", "run"]
 # Steps of a capture, beside its files, that leave a word for later ones: the choice of masks, and
 # that the object was turned before a still camera
 FACTS = MASKS, TURNED = "masks", "turned"
+SINGLE = "single masks"  # and which network made masks before there were cameras
 RECORD_0_2 = "capture.json"  # what version 0.2 noted steps in
 
 

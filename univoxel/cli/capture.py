@@ -6,18 +6,29 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.cli.demo import MAPS, SCENE
 from univoxel.cli.evaluate import evaluate
 from univoxel.cli.export import export
-from univoxel.cli.parsing import Changes, Minutes, check_minutes, takes, written
+from univoxel.cli.parsing import BoxOf, Changes, Minutes, check_minutes, takes, written
 from univoxel.cli.relight import relight_to_files
 from univoxel.cli.train import code_of
 from univoxel.core import files
-from univoxel.core.choices import DEPTH, KEEP_SIZE, REMBG, SAMPLES, LightName, PresetOrAuto, Until
+from univoxel.core.choices import (
+    DEPTH,
+    KEEP_SIZE,
+    NETWORK,
+    REMBG,
+    SAMPLES,
+    LightName,
+    NetworkName,
+    PresetOrAuto,
+    Until,
+)
 from univoxel.core.files import read_json, replacing
+from univoxel.core.progress_bar import duration
 from univoxel.errors import (
     DataError,
     ExistingFile,
@@ -48,6 +59,12 @@ class CaptureOptions:
     masks: Annotated[str, written("auto|rembg|FOLDER|none")] = AUTO
     """where masks come from: rembg, a network; a folder of masks; none, depth alone, as of cutout;
     auto takes those that the photographs bring, or else the network, or depth if there is none"""
+    network: NetworkName = NETWORK
+    """which network it is; as of cutout"""
+    box: BoxOf = None
+    """as of cutout; the cameras are those of scene/, which --until cameras ends with"""
+    keep_table: bool = False
+    """as of cutout, with --masks none and a box"""
     preset: PresetOrAuto = "auto"
     """as of train"""
     light: LightName = "hybrid"
@@ -71,15 +88,17 @@ def command(asked: CaptureOptions) -> int:
     """
     check_minutes(asked.minutes)
     where, until = (asked.photographs, asked.out), asked.until
+    masks: dict[str, Any] = {"masks": asked.masks, "network": asked.network}
+    masks |= {"box": asked.box, "keep_table": asked.keep_table}
     training = {"preset": asked.preset, "light": asked.light, "minutes": asked.minutes}
     if until == "page":
-        made = capture(*where, masks=asked.masks, **training, changes=asked.changes)
+        made = capture(*where, **masks, **training, changes=asked.changes)
         print(made.page)
         print(made.mesh)
         return code_of(made.run)
     if (*training.values(), asked.changes) != ("auto", "hybrid", None, ()):
         raise UserError(f"--until {until}: --preset, --light, --minutes, --set come after it")
-    print(find_data(*where, masks=asked.masks, until=until))
+    print(find_data(*where, **masks, until=until))
     return 0
 
 
@@ -93,6 +112,26 @@ class PicturesConfig:
 
 
 PICTURES = PicturesConfig()
+
+
+@dataclass(frozen=True)
+class MasksAsked:
+    """Where masks come from, and how they are made."""
+
+    source: str | Path
+    network: NetworkName = NETWORK
+    box: Sequence[float] | None = None
+    keep_table: bool = False
+
+    @property
+    def fingerprint(self) -> Any:
+        """What steps.json has of them: a word, unless more was chosen."""
+        chosen: dict[str, Any] = {} if self.network == NETWORK else {"network": self.network}
+        if self.box is not None:
+            chosen["box"] = [float(value) for value in self.box]
+        if self.keep_table:
+            chosen["keep_table"] = True
+        return {"masks": str(self.source), **chosen} if chosen else str(self.source)
 
 
 @dataclass(frozen=True)
@@ -113,6 +152,9 @@ def capture(
     minutes: float | None = None,
     light: LightName = "hybrid",
     changes: Sequence[str] = (),
+    network: NetworkName = NETWORK,
+    box: Sequence[float] | None = None,
+    keep_table: bool = False,
     on_progress: Callable[[TrainingProgress], None] | None = None,
     config: CaptureConfig = DEFAULTS,
     pictures: PicturesConfig = PICTURES,
@@ -130,6 +172,7 @@ def capture(
         out: folder to write.
         masks: a folder of masks; rembg, a network; none, depth alone, as of `cutout`;
             auto: what the photographs bring, else a network.
+        network, box, keep_table: as of `cutout`.
         preset, minutes, light, changes, on_progress: as of `univoxel.train`.
         config: how cameras are found.
         pictures: how many are made, and how large.
@@ -145,21 +188,21 @@ def capture(
         OSError: a file cannot be written.
     """
     from univoxel.capture.project import Project, begin, look_at
-    from univoxel.cli.trainer import duration
     from univoxel.core.validation import changed
     from univoxel.presets import chosen
     from univoxel.scene import FILE
     from univoxel.training.clock import expected_seconds
     from univoxel.training.probe import slowdown
 
-    given = look_at(Path(photographs))
+    given, asked = look_at(Path(photographs)), MasksAsked(masks, network, box, keep_table)
     project = Project(Path(out))
     training = chosen(preset, minutes, project.cut, project.run, light)
     training = changed(training, changes)
     if given.kind == "run":
-        _check_unused(given, masks, training)
-    _check_machine(given, masks)
+        _check_unused(given, asked, training)
+    _check_machine(given, asked)
     begin(project, given)
+    _check_network(project, asked)
     if given.kind == "run":
         run = given.path
         for step in STEPS[:3]:
@@ -169,8 +212,8 @@ def capture(
             seconds = slowdown(training) * sum(map(expected_seconds, training.stages))
             said = f"training takes about {duration(seconds)} on this machine"
             log.info(f"{said}; cameras and masks come on top")
-        scene = _find_cameras(project, given, masks, config)
-        data = _find_masks(project, scene, masks)
+        scene = _find_cameras(project, given, asked, config)
+        data = _find_masks(project, scene, asked)
         run = _train(replace(training, data=data.absolute(), out=project.run), on_progress)
     _export(project, run)
     _picture(project, run, pictures)
@@ -184,6 +227,9 @@ def find_data(
     out: str | Path,
     *,
     masks: str | Path = AUTO,
+    network: NetworkName = NETWORK,
+    box: Sequence[float] | None = None,
+    keep_table: bool = False,
     until: Literal["cameras", "masks"] = "masks",
     config: CaptureConfig = DEFAULTS,
 ) -> Path:
@@ -198,14 +244,15 @@ def find_data(
     """
     from univoxel.capture.project import Project, begin, look_at
 
-    given = look_at(Path(photographs))
+    given, asked = look_at(Path(photographs)), MasksAsked(masks, network, box, keep_table)
     if given.kind == "run":
         raise UserError(f"{given.path} is a trained run: there are cameras and masks", "until")
     project = Project(Path(out))
-    _check_machine(given, masks)
+    _check_machine(given, asked)
     begin(project, given)
-    scene = _find_cameras(project, given, masks, config)
-    return scene if until == "cameras" else _find_masks(project, scene, masks)
+    _check_network(project, asked)
+    scene = _find_cameras(project, given, asked, config)
+    return scene if until == "cameras" else _find_masks(project, scene, asked)
 
 
 def _say(step: str, what: str) -> None:
@@ -216,21 +263,23 @@ def _skip(step: str, what: Path) -> None:
     _say(step, f"there already, {what}")
 
 
-def _check_unused(given: Given, masks: str | Path, training: TrainConfig) -> None:
+def _check_unused(given: Given, asked: MasksAsked, training: TrainConfig) -> None:
     """Refuse options of steps that a run has behind it."""
     from univoxel.presets import chosen
 
     usual = chosen("auto", None, training.data, training.out)
-    if str(masks) != AUTO or training != usual:
+    if asked.fingerprint != AUTO or training != usual:
         raise UserError(
-            f"{given.path} is a trained run: masks, preset, minutes, light and set come too late",
-            *("masks", "preset", "minutes", "light", "set"),
+            f"{given.path} is a trained run: masks, network, box, preset, minutes, light and set "
+            "come too late",
+            *("masks", "network", "box", "preset", "minutes", "light", "set"),
         )
 
 
-def _check_machine(given: Given, masks: str | Path) -> None:
+def _check_machine(given: Given, asked: MasksAsked) -> None:
     """Refuse now what would fail after minutes."""
-    from univoxel.capture.masks import network
+    from univoxel.capture.cutout import check_masks
+    from univoxel.capture.masks import mask_network
     from univoxel.capture.sfm import require_pycolmap
     from univoxel.ops import native
 
@@ -238,15 +287,35 @@ def _check_machine(given: Given, masks: str | Path) -> None:
         native.require_embree("capture")
     if given.kind == "photographs":
         require_pycolmap()
+    masks = asked.source
+    check_masks(str(masks), asked.network, asked.box, asked.keep_table)
     if str(masks) == REMBG:
-        network()
+        mask_network(asked.network)
     elif str(masks) not in (AUTO, DEPTH) and not Path(masks).is_dir():
         raise DataError(
             f"masks: expected {REMBG}, {DEPTH} or a folder of masks, got {masks}", "masks"
         )
 
 
-def _find_cameras(project: Project, given: Given, masks: str | Path, config: CaptureConfig) -> Path:
+def _check_network(project: Project, asked: MasksAsked) -> None:
+    """Refuse to go on with masks of single photographs that another network made."""
+    from univoxel.capture.project import SINGLE
+
+    def other(before: str) -> ExistingFile:
+        return ExistingFile(
+            f"{project.out} holds cameras found with masks of network={before}: choose another out",
+            *("network", "out"),
+        )
+
+    if str(asked.source) not in (AUTO, REMBG):
+        return
+    if not files.done(project.out, SINGLE, asked.network, other):
+        before = NETWORK  # which versions without a choice had, and did not note
+        if project.masks.exists() and asked.network != before:
+            raise other(before)
+
+
+def _find_cameras(project: Project, given: Given, asked: MasksAsked, config: CaptureConfig) -> Path:
     """The folder of photographs with cameras."""
     from univoxel.capture.poses import poses
     from univoxel.capture.project import TURNED
@@ -263,22 +332,24 @@ def _find_cameras(project: Project, given: Given, masks: str | Path, config: Cap
         except StillBackground as error:
             log.info(f"{error.seen}: the object was turned before a still camera, so masks first")
             files.finish(project.out, TURNED, True)
-    first = _masks_before_cameras(project, given, masks)
+    first = _masks_before_cameras(project, given, asked)
     _say("cameras", f"of what masks show of {given.path}")
     return poses(given.path, done, masks=first, config=config)
 
 
-def _masks_before_cameras(project: Project, given: Given, masks: str | Path) -> Path:
+def _masks_before_cameras(project: Project, given: Given, asked: MasksAsked) -> Path:
     """A folder of masks of single photographs."""
     import numpy as np
     import torch
     from PIL import Image
 
-    from univoxel.capture.masks import network
+    from univoxel.capture.masks import mask_network, timed
     from univoxel.capture.photographs import read_upright, require_readers
     from univoxel.capture.poses import folders_of, photographs_of
+    from univoxel.capture.project import SINGLE
     from univoxel.core.progress_bar import track
 
+    masks = asked.source
     if str(masks) not in (AUTO, REMBG, DEPTH):
         return Path(masks)
     if project.masks.exists():
@@ -291,66 +362,83 @@ def _masks_before_cameras(project: Project, given: Given, masks: str | Path) -> 
             "masks",
         )
     _say("masks", "of single photographs, from a network")
-    masked = network()
-    files, _, _ = photographs_of(given.path, folders_of(project.scene))
-    require_readers(files)
+    masked = mask_network(asked.network)
+    pictures, _, _ = photographs_of(given.path, folders_of(project.scene))
+    require_readers(pictures)
+    files.finish(project.out, SINGLE, asked.network)
     # Nothing half-made goes by its name
     partial = project.masks.with_name(f".{project.masks.name}.partial")
     partial.mkdir(exist_ok=True)
-    for file in track(files, "masks"):
-        path = partial / f"{file.stem}.png"
-        if path.exists():
-            continue
+    paths = {file: partial / f"{file.stem}.png" for file in pictures}
+    missing = [file for file, path in paths.items() if not path.exists()]
+    masked = timed(masked, asked.network, len(missing))
+    for file in track(missing, "masks"):
         try:
             picture = read_upright(file, KEEP_SIZE).convert("RGB")
         except DataError:  # which `poses` counts and names
             continue
         mask = (255 * masked(torch.from_numpy(np.array(picture)))).round().byte()
-        with replacing(path) as temporary:
+        with replacing(paths[file]) as temporary:
             Image.fromarray(mask.numpy()).save(temporary, format="PNG")
     partial.rename(project.masks)
     return project.masks
 
 
-def _find_masks(project: Project, scene: Path, masks: str | Path) -> Path:
+def _find_masks(project: Project, scene: Path, asked: MasksAsked) -> Path:
     """The folder of photographs with masks and cameras."""
     from univoxel.capture.cutout import cutout
     from univoxel.capture.project import MASKS, TURNED
 
-    asked = str(masks)
+    masks, noted = asked.source, asked.fingerprint
 
-    def other(before: str) -> ExistingFile:
+    def other(before: str | dict[str, Any]) -> ExistingFile:
+        made = before if isinstance(before, dict) else {"masks": before}
+        made = {k: " ".join(map(str, v)) if k == "box" else v for k, v in made.items()}
+        words = ", ".join(f"{name}={value}" for name, value in made.items())
         return ExistingFile(
-            f"{project.cut} holds photographs with masks={before}: to make them anew, remove it "
+            f"{project.cut} holds photographs with {words}: to make them anew, remove it "
             f"and {project.run}",
-            "masks",
+            *made,
         )
 
     if project.cut.exists():
-        files.done(project.out, MASKS, asked, other)
+        files.done(project.out, MASKS, noted, other)
         _skip("masks", project.cut)
         return project.cut
     turned = bool(files.recorded(project.out, TURNED))
-    if asked == AUTO and not turned and _have_masks(project, scene):
+    if str(masks) == AUTO and not turned and _have_masks(project, scene):
+        if asked.box is not None:
+            raise UserError(
+                f"{scene} brings masks, which are trained on as they are: with a box expected "
+                f"masks={REMBG}, {DEPTH} or their folder, got {masks}",
+                "masks",
+            )
         _skip("masks", scene)
         return scene
-    files.finish(project.out, MASKS, asked)  # before: the folder appears whole, at the end
+    files.finish(project.out, MASKS, noted)  # before: the folder appears whole, at the end
     if turned:
         source = scene / "masks"  # those that the cameras were found with
     else:
-        source = _network_or_depth() if asked == AUTO else masks
+        source = _network_or_depth(asked.network) if str(masks) == AUTO else masks
     words = {REMBG: "from a network", DEPTH: "from depth alone"}
     _say("masks", words.get(str(source), f"from {source}"))
-    return cutout(scene, project.cut, source)
+    return cutout(
+        *(scene, project.cut, source),
+        network=asked.network if source == REMBG else NETWORK,
+        box=asked.box,
+        keep_table=asked.keep_table,
+    )
 
 
-def _network_or_depth() -> str:
+def _network_or_depth(name: NetworkName) -> str:
     """Where masks come from that nobody has: a network, if one is installed."""
-    from univoxel.capture.masks import network
+    from univoxel.capture.masks import mask_network
 
     try:
-        network()
+        mask_network(name)
     except MissingExtra as missing:
+        if name != NETWORK:  # which nobody names for nothing
+            raise
         log.info(f"no network is installed, so depth alone tells the object ({missing})")
         return DEPTH
     return REMBG

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from univoxel.cli.parsing import DownscaleBy, check_downscale, takes, written
+from univoxel.cli.parsing import BoxOf, DownscaleBy, check_downscale, takes, written
+from univoxel.core.choices import NETWORK, NetworkName
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,14 @@ class CutoutOptions:
     """where masks come from: rembg, a network on single photographs; a folder of masks; or none,
     depth alone: what stands out from its support, in the middle of what the cameras look at. Masks
     that contradict the object in 3D are repaired"""
+    network: NetworkName = NETWORK
+    """which of rembg's networks makes them: the further down the list, the more megabytes, time and
+    detail"""
+    box: BoxOf = None
+    """lower and upper corner, in world units of the written cameras, of a box that the object lies
+    in; outside of it nothing counts"""
+    keep_table: bool = False
+    """with --from none and a box: what stands out keeps its support, within the box"""
     downscale: DownscaleBy = "auto"
     """write photographs of 1/N of their width and height; auto as of train"""
     allow_outside: bool = False
@@ -35,4 +44,9 @@ def command(asked: CutoutOptions) -> Path:
     from univoxel.capture.cutout import cutout
 
     downscale = check_downscale(asked.downscale)
-    return cutout(asked.data, asked.out, asked.source, downscale, asked.allow_outside)
+    return cutout(
+        *(asked.data, asked.out, asked.source, downscale, asked.allow_outside),
+        network=asked.network,
+        box=asked.box,
+        keep_table=asked.keep_table,
+    )

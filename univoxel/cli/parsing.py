@@ -31,7 +31,7 @@ from typing import (
     get_type_hints,
 )
 
-from univoxel.core.choices import Downscale
+from univoxel.core.choices import Box, Downscale
 from univoxel.errors import UserError
 
 # What a command returns is printed, if it is a file or several; a number is the exit code
@@ -78,6 +78,7 @@ LightOf: TypeAlias = Annotated[str | None, written("VIEW", "the mean of all")]
 
 DataOf: TypeAlias = Annotated[File | None, written("DATA", "the data trained on")]
 Title: TypeAlias = Annotated[str | None, written("TEXT", "the folder's name")]
+BoxOf: TypeAlias = Annotated[Box | None, written("X0 Y0 Z0 X1 Y1 Z1", "none")]
 DownscaleBy: TypeAlias = Annotated[Downscale, written("auto|N")]
 
 STDOUT = Path("-")  # as a file for JSON: print it, and it alone

@@ -23,6 +23,7 @@ from univoxel.config import (
 )
 from univoxel.core import memmap
 from univoxel.core.files import replacing
+from univoxel.core.progress_bar import duration
 from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import Cancelled, ExistingFile, UserError
 from univoxel.evaluation.confidence import REPORT_POINTS, Survey, numbers, survey, words
@@ -229,11 +230,6 @@ def announce(progress: Progress, photos: Photos) -> None:
     if fits < LEAST:
         said += f", minutes={math.ceil(whole / 60)} for all of them"
     log.info(said, extra={"arguments": ("minutes",)})
-
-
-def duration(seconds: float) -> str:
-    """A duration for people: tens of seconds, or minutes."""
-    return f"{10 * math.ceil(seconds / 10)} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
 def evidence(

@@ -25,6 +25,17 @@ Behind: TypeAlias = Literal["black", "white"]  # what measured novel views are c
 Ground: TypeAlias = float | Literal["lowest"] | None  # height of a floor, or at the lowest point
 Downscale: TypeAlias = Literal["auto"] | int  # side of the squares of pixels that become one
 Animation: TypeAlias = Literal["gif", "mp4"]
+# Of rembg's networks those that find what stands out, by its names
+NetworkName: TypeAlias = Literal[
+    "u2netp",
+    "silueta",
+    "u2net",
+    "isnet-general-use",
+    "birefnet-general-lite",
+    "birefnet-general",
+]
+# Lower and upper corner, x y z each
+Box: TypeAlias = tuple[float, float, float, float, float, float]
 Until: TypeAlias = Literal["cameras", "masks", "page"]  # the step that a capture ends with
 BatchStep: TypeAlias = Literal["poses", "masks", "train", "eval", "export", "page"]
 BATCH_STEPS: tuple[BatchStep, ...] = get_args(BatchStep)
@@ -36,6 +47,7 @@ TEXTURE_FORMATS: tuple[TextureFormat, ...] = get_args(TextureFormat)
 ORIGINS: tuple[Origin, ...] = get_args(Origin)
 
 DEPTH, REMBG = "none", "rembg"  # where masks come from, if not from a folder
+NETWORK: NetworkName = "u2netp"  # the smallest: a second a photograph on one core
 SAMPLES = 64  # of the light, per pixel of relit pictures
 BOUNCES = 2  # reflections between parts of the object in relit pictures
 ELEVATION = 25.0  # degrees, of an orbit's cameras above the object's middle

@@ -6,6 +6,7 @@ A bar on stderr where that is a terminal; elsewhere a line of the log now and th
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from time import monotonic
 from typing import TypeVar
@@ -54,6 +55,11 @@ def bar(*columns: ProgressColumn, shown: bool = True) -> Progress:
     if not console.is_terminal:
         return _Lines(*columns, console=console)
     return Progress(*columns, console=console)
+
+
+def duration(seconds: float) -> str:
+    """A duration for people: tens of seconds, or minutes."""
+    return f"{10 * math.ceil(seconds / 10)} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
 def track(items: Sequence[T], description: str) -> Iterator[T]:

@@ -3,6 +3,7 @@ that few see through included."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -177,29 +178,91 @@ class Votes:
     open_masks: Tensor  # of them, the sum of the masks
 
 
-def find_object(masks: Sequence[Tensor], maps: DepthMaps, voxels: int = VOXELS) -> ObjectShape:
+def box_corners(box: Sequence[float]) -> Tensor:
+    """The lower and the upper corner [2, 3] of a box, of X0 Y0 Z0 X1 Y1 Z1.
+
+    Raises:
+        UserError: these are no box.
+    """
+    values = [float(value) for value in box]
+    sides = list(zip(values[:3], values[3:], strict=False))
+    if len(values) != 6 or not all(-math.inf < a < b < math.inf for a, b in sides):
+        raise UserError(
+            "box: expected X0 Y0 Z0 X1 Y1 Z1, each of the first three below its counterpart, got "
+            f"{words_of(values)}",
+            "box",
+        )
+    return torch.tensor(values).view(2, 3)
+
+
+def words_of(values: Sequence[float]) -> str:
+    return " ".join(f"{value:.4g}" for value in values)
+
+
+def depth_in(grid: GridShape, box: Tensor) -> Tensor:
+    """How far nodes [X, Y, Z] lie inside of a box [2, 3], world units, negative outside."""
+    nodes = grid.nodes()
+    return torch.minimum(nodes - box[0], box[1] - nodes).amin(-1)
+
+
+def in_box(share: Tensor, grid: GridShape, box: Tensor | None) -> Tensor:
+    """Values [X, Y, Z] of nodes, 0 outside of a box [2, 3] if there is one."""
+    return share if box is None else torch.where(depth_in(grid, box) >= 0, share, 0.0)
+
+
+def box_shown(cameras: Cameras, view: int, box: Tensor) -> Tensor:
+    """Which pixels of a view see a box [2, 3]: [h, w] bool."""
+    width, height = cameras.size(view)
+    rays = image_rays(cameras, view)
+    direction = torch.where(rays.direction == 0, 1e-9, rays.direction)
+    hits = (box[:, None] - rays.origin) / direction
+    near, far = hits.amin(0).amax(1), hits.amax(0).amin(1)
+    return (far > near.clamp_min(0)).view(height, width)
+
+
+def nothing_inside(box: Tensor, what: str, cameras: Cameras) -> UserError:
+    """What to raise where the box [2, 3] is in the wrong place."""
+    return UserError(
+        f"box: expected one that the object lies in, got {words_of(box.flatten().tolist())}, where "
+        f"{what}; the cameras look at {words_of(looked_at(cameras).tolist())}, and half of them "
+        f"show {reach(cameras):.4g} around it",
+        "box",
+    )
+
+
+def find_object(
+    masks: Sequence[Tensor], maps: DepthMaps, voxels: int = VOXELS, box: Tensor | None = None
+) -> ObjectShape:
     """The object that masks and depth maps agree on.
 
     Args:
         masks: V, [H, W] in [0, 1] of pictures of any size.
         voxels: along a side of its grid, on average.
+        box: [2, 3] lower and upper corner, outside of which there is no object; masks show nothing
+            beside it.
 
     Raises:
-        UserError: the masks have nothing in common, or too little.
+        UserError: the masks have nothing in common, or too little, or nothing in the box.
     """
     cameras = maps.cameras
     shown = [shrunk(m, *cameras.size(v)) for v, m in enumerate(masks)]
     centre, half = looked_at(cameras), ROOM * reach(cameras)
-    first = fit_grid(centre - half, centre + half, FIRST_VOXELS**3)
-    share = share_of(votes(shown, maps, first), len(masks))
+    corners = (centre - half, centre + half) if box is None else (box[0], box[1])
+    first = fit_grid(*corners, FIRST_VOXELS**3)
+    share = in_box(share_of(votes(shown, maps, first), len(masks)), first, box)
+    if box is not None and share.max() < AROUND:
+        raise nothing_inside(box, "most masks show nothing in common", cameras)
     if not float(share.max()):
         raise UserError("the masks of the photographs have nothing in common: check masks, cameras")
     coarse = around(first, share >= AROUND * share.max(), FIRST_VOXELS**3, 0)
     found = votes(shown, maps, coarse)
-    threshold = best_threshold(share_of(found, len(masks)), shown, maps, coarse)
-    likely = largest_part(evidence(found, threshold, shown, maps, coarse)[0]) > 0
+    share = in_box(share_of(found, len(masks)), coarse, box)
+    threshold = best_threshold(share, shown, maps, coarse)
+    likely = largest_part(evidence(found, threshold, shown, maps, coarse, box)[0]) > 0
     grid = around(coarse, likely, voxels**3) if likely.any() else coarse
-    inside, surface = evidence(votes(shown, maps, grid), threshold, shown, maps, grid)
+    inside, surface = evidence(votes(shown, maps, grid), threshold, shown, maps, grid, box)
+    if not (inside > 0).any() and box is not None:
+        raise nothing_inside(box, "masks and depth leave no shape", cameras)
     if not (inside > 0).any():
         raise UserError(
             "the masks of the photographs are too faint or too few for any common shape"
@@ -208,10 +271,15 @@ def find_object(masks: Sequence[Tensor], maps: DepthMaps, voxels: int = VOXELS) 
 
 
 def evidence(
-    found: Votes, threshold: float, masks: Sequence[Tensor], maps: DepthMaps, grid: GridShape
+    found: Votes,
+    threshold: float,
+    masks: Sequence[Tensor],
+    maps: DepthMaps,
+    grid: GridShape,
+    box: Tensor | None = None,
 ) -> tuple[Tensor, float]:
     """Values [X, Y, Z] above 0 inside, and the share of their surface that depth maps show."""
-    share = share_of(found, len(masks))
+    share = in_box(share_of(found, len(masks)), grid, box)
     carve_gaps_(share, threshold, masks, maps.cameras, grid)
     free = (found.free >= SURE) & (found.free > FREE * (found.free + found.near))
     surface = (found.near >= SURE) & ~free
@@ -224,6 +292,8 @@ def evidence(
     inside = torch.where(surface, torch.minimum(inside, SHOWN * depth), inside)
     inside = torch.where(free, inside.clamp_max(-0.5 * SHOWN), inside)
     inside = torch.where(found.seen < SEEN_BY * len(masks), -SHOWN, inside)
+    if box is not None:
+        inside = torch.minimum(inside, SHOWN * depth_in(grid, box) / grid.voxel_size)
     border = (inside > 0) & torch.from_numpy(ndimage.binary_dilation((inside <= 0).numpy()))
     return inside, float((border & surface).sum() / border.sum().clamp_min(1))
 
@@ -327,6 +397,12 @@ def silhouettes(shape: ObjectShape, cameras: Cameras) -> Iterator[Tensor]:
         width, height = cameras.size(view)
         rays = image_rays(cameras, view)
         yield scene.closest_hit(rays.origin, rays.direction).t.isfinite().view(height, width)
+
+
+def inside_bounds(shape: ObjectShape) -> tuple[Tensor, Tensor]:
+    """Lower and upper corner [3] of the nodes inside."""
+    nodes = shape.grid.nodes()[shape.inside > 0]
+    return nodes.amin(0), nodes.amax(0)
 
 
 def signed_distance(shape: ObjectShape, grid: GridShape) -> Tensor:

@@ -1,8 +1,8 @@
-"""What the photographs are of, told by depth alone: without masks, a network or a box.
+"""What the photographs are of, told by depth alone: without masks or a network.
 
 Cameras look at the object. Planes that all of them and what they look at lie on one side of are
 its support, and walls behind it. What is left of the surface and hangs together around the middle
-is the object.
+is the object; or, in a box that people gave, all that is left of the surface.
 """
 
 from __future__ import annotations
@@ -17,7 +17,16 @@ from torch import Tensor
 
 from univoxel.camera import image_rays, looked_at
 from univoxel.fields.grid import GridShape, fit_grid
-from univoxel.preparation.object_shape import FREE, ROOM, SURE, VOXELS, around, votes
+from univoxel.preparation.object_shape import (
+    FREE,
+    ROOM,
+    SURE,
+    VOXELS,
+    around,
+    box_shown,
+    depth_in,
+    votes,
+)
 from univoxel.preparation.stereo import DepthMaps, reach
 
 # Planes that are looked for one after the other, and triples of points that are tried for each
@@ -55,25 +64,37 @@ class Plane:
         return Plane(-self.normal, -self.offset)
 
 
-def masks_by_depth(maps: DepthMaps) -> list[Tensor] | None:
+def masks_by_depth(
+    maps: DepthMaps, box: Tensor | None = None, keep_table: bool = False
+) -> list[Tensor] | None:
     """A mask [h, w] in [0, 1] of each small photograph; None: no object stands out.
 
     A pixel whose depth nobody knows is what its nearest neighbour with a depth is.
+
+    Args:
+        box: [2, 3] lower and upper corner, outside of which there is no object; inside all surface
+            is the object's.
+        keep_table: whether planes behind it are, too.
     """
     cameras = maps.cameras
     centre, half = looked_at(cameras), ROOM * reach(cameras)
-    room = fit_grid(centre - half, centre + half, VOXELS**3)
-    surface = surface_nodes(maps, room)
-    planes = background_planes(maps, room, surface)
-    part = middle_part(maps, room, surface, planes)
-    if part.sum() < LEAST:
-        return None
-    grid = around(room, part, VOXELS**3)  # again, finer
+    grid = fit_grid(centre - half, centre + half, VOXELS**3)
     surface = surface_nodes(maps, grid)
-    part = middle_part(maps, grid, surface, planes)
+    planes = [] if keep_table else background_planes(maps, grid, surface)
+    if box is not None:
+        grid = fit_grid(box[0], box[1], VOXELS**3)
+        surface = surface_nodes(maps, grid)
+    part = _part(maps, grid, surface, planes, box)
     if part.sum() < LEAST:
         return None
-    return [_shown(maps, view, grid, part) for view in range(len(cameras))]
+    grid = around(grid, part, VOXELS**3)  # again, finer
+    part = _part(maps, grid, surface_nodes(maps, grid), planes, box)
+    if part.sum() < LEAST:
+        return None
+    masks = [_shown(maps, view, grid, part) for view in range(len(cameras))]
+    if box is None:
+        return masks
+    return [mask * box_shown(cameras, view, box) for view, mask in enumerate(masks)]
 
 
 def surface_nodes(maps: DepthMaps, grid: GridShape) -> Tensor:
@@ -121,12 +142,27 @@ def fitted(points: Tensor) -> Plane:
     return Plane(normal, float(normal @ middle))
 
 
-def middle_part(maps: DepthMaps, grid: GridShape, surface: Tensor, planes: list[Plane]) -> Tensor:
-    """The nodes [X, Y, Z] of the surface before all planes that hang together around the middle."""
+def _part(
+    maps: DepthMaps, grid: GridShape, surface: Tensor, planes: list[Plane], box: Tensor | None
+) -> Tensor:
+    """The object's nodes [X, Y, Z] of the surface: those in a box, or else around the middle."""
+    if box is None:
+        return middle_part(maps, grid, surface, planes)
+    return before_planes(maps, grid, surface, planes) & (depth_in(grid, box) >= 0)
+
+
+def before_planes(maps: DepthMaps, grid: GridShape, surface: Tensor, planes: list[Plane]) -> Tensor:
+    """The nodes [X, Y, Z] of the surface before all planes."""
     nodes = grid.nodes()
     before = surface.clone()
     for plane in planes:
         before &= plane.height(nodes) > THICK * maps.step
+    return before
+
+
+def middle_part(maps: DepthMaps, grid: GridShape, surface: Tensor, planes: list[Plane]) -> Tensor:
+    """The nodes [X, Y, Z] of the surface before all planes that hang together around the middle."""
+    nodes, before = grid.nodes(), before_planes(maps, grid, surface, planes)
     parts = np.asarray(label(before.numpy(), connectivity=3))
     away = (nodes - looked_at(maps.cameras)).norm(dim=-1) / (NEAR * reach(maps.cameras))
     weight = np.bincount(parts.ravel(), (-away.square()).exp().numpy().ravel())
