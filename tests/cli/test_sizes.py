@@ -191,7 +191,9 @@ def test_the_timelapse_shows_the_first_view_in_its_size(runs, data):
 
 def test_photographs_are_cut_out_in_their_sizes(data, tmp_path, monkeypatch):
     before = load_photos(data, masks=False)
-    monkeypatch.setattr(task, "network", lambda: lambda photo: (photo.sum(-1) > 0).float())
+    monkeypatch.setattr(
+        task, "mask_network", lambda name: lambda photo: (photo.sum(-1) > 0).float()
+    )
     out = task.cutout(data, tmp_path / "out")
     after = load_photos(out)
     assert sizes(after.cameras) == sizes(before.cameras)
