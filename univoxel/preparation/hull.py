@@ -23,8 +23,9 @@ from univoxel.render.observations import Observations, observe, surface_points
 
 # The half of the first box over what the widest view shows at its distance
 FIRST_BOX = 1.2
-# Nodes of the grids that find the box, each around what the one before found, and so finer
-BOX_NODES = (32**3, 64**3)
+# Nodes of the grids that find the box, each around what the one before found, and so finer. With a
+# coarser first one the box is wider by a hundredth, and so are the voxels of all grids
+BOX_NODES = (64**3, 64**3)
 # Pixels of the longer side from which on distances to edges are found in pictures half as large: to
 # a quarter of a pixel, in a quarter of the time
 LARGE = 1000

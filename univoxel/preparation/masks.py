@@ -18,8 +18,9 @@ from univoxel.data import Photos
 from univoxel.data.photos import coverage_of
 from univoxel.preparation.hull import mask_distances
 
-# Pixels that are looked at, about, and photographs at least: the excess is a mean over them
-PIXELS, VIEWS = 8e6, 8
+# Photographs that are looked at, at most and at least, and pixels of them, about: the excess is a
+# mean over them
+MOST_VIEWS, VIEWS, PIXELS = 32, 8, 8e6
 # Share of a picture's larger side up to which an excess is looked for: wider masks stay as they
 # are
 REACH_SHARE = 0.015
@@ -64,7 +65,7 @@ def mask_excess(
     """
     longest = max(max(d.shape) for d in distance)
     reach = max(REACH_PIXELS, round(REACH_SHARE * longest))
-    views = max(VIEWS, int(PIXELS / distance[0].numel()))
+    views = min(MOST_VIEWS, max(VIEWS, int(PIXELS / distance[0].numel())))
     step = -(-len(color) // views)
     near, far = COMPARISON
     change = _change(color[::step], coverage[::step], distance[::step], reach + far)
