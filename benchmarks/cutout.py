@@ -161,7 +161,7 @@ def main() -> None:
                 overlap(masks.picture(masks.names.index(name))[1], mask)
                 for name, mask in zip(names, true, strict=True)
             ]
-            label = {REMBG: "a network", DEPTH: "the ground"}.get(source, source)
+            label = {REMBG: "a network", DEPTH: "depth alone"}.get(source, source)
             rows.append([room, label, sum(found) / len(found), min(found), used])
             print(rows[-1], flush=True)
     record = {

@@ -151,7 +151,7 @@ def test_few_masks_stay_as_they_are(tmp_path, caplog):
     masks = [photos.picture(view)[1] for view in range(4)]
     folder = write_masks(tmp_path / "masks", masks, photos.names)
     task.cutout(data, tmp_path / "cut", folder)
-    assert "a vote needs 12 photographs, there are 4" in caplog.text
+    assert "to check them needs 12 photographs, there are 4" in caplog.text
     masks[1][:] = 0
     write_masks(folder, masks, photos.names)
     with pytest.raises(DataError, match="the mask of r_1 shows nothing"):

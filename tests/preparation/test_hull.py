@@ -149,3 +149,19 @@ def test_where_masks_are_believed_one_view_is_enough():
     assert views_needed(100, 1) == 1
     assert views_needed(100, 7) == 25
     assert views_needed(2, 2) == 1
+
+
+def test_distances_of_large_pictures_are_those_of_smaller_ones():
+    """Of a disk, whose distance is known; half-covered pixels on its edge."""
+    side, radius = 1200, 350.0
+    place = torch.arange(side) + 0.5 - side / 2
+    true = (place[:, None].square() + place.square()).sqrt() - radius
+    found = mask_distances((0.5 - true).clamp(0, 1)[None])[0]
+    near = true.abs() < 5
+    off = (found - true).abs()
+    assert off[near].max() < 1  # half a pixel of the smaller picture, and its distance's own error
+    assert off[near].median() < 0.25
+    assert abs(float((found - true)[near].mean())) < 0.05
+    assert off.max() < 2  # of hundreds
+    kept = mask_distances((0.5 - true).clamp(0, 1)[None, 101:1100, 101:1100])[0]
+    assert (kept - true[101:1100, 101:1100]).abs().max() < 0.51  # of 999 pixels: not shrunk

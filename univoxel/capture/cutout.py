@@ -68,10 +68,10 @@ class MaskTile:
     """A photograph and its mask."""
 
     name: str
-    agreement: float | None  # IoU with the silhouette that the others vote for; None: no vote
+    agreement: float | None  # IoU with the object's silhouette; None: there was none
     fault: str  # what is wrong with the mask, or nothing
     before: Tensor  # [h, w, 3] in [0, 1], from `darkened`
-    after: Tensor | None  # the same with the mended mask
+    after: Tensor | None  # the same with the repaired mask
 
 
 def darkened(photograph: Tensor, mask: Tensor) -> Tensor:
@@ -118,7 +118,7 @@ def mask_sheet(tiles: Sequence[MaskTile]) -> np.ndarray:
         x, y = k % columns * width, k // columns * height
         after = picture is tile.after
         colour = "orange" if tile.fault and not after else "white"
-        words = "mended" if after else tile.fault
+        words = "repaired" if after else tile.fault
         draw.text((x + 2, y + 1), f"{tile.name}{_number(tile)}", colour, font)
         draw.text((x + 2, y + 16), words, colour, font)
         sheet.paste(Image.fromarray(_as_bytes(picture)), (x, y + LABEL))
@@ -136,8 +136,8 @@ def write_page(path: Path, tiles: Sequence[MaskTile], about: str) -> None:
         words = escape(f"{tile.name}{_number(tile)} {tile.fault}")
         images = [image(picture) for picture in (tile.before, tile.after) if picture is not None]
         kind = ' class="wrong"' if tile.fault else ""
-        mended = "" if tile.after is None else "; mended on the right"
-        caption = f"<figcaption>{words}{mended}</figcaption>"
+        repaired = "" if tile.after is None else "; repaired on the right"
+        caption = f"<figcaption>{words}{repaired}</figcaption>"
         figures.append(f"<figure{kind}>{''.join(images)}{caption}</figure>")
     main = "\n".join(["<main>", *figures, "</main>"])
     body = f"<h1>Masks</h1>\n{paragraph(about)}\n{main}"
@@ -158,11 +158,13 @@ def _as_bytes(picture: Tensor) -> np.ndarray:
 # Masks and depth tell the object in 3D, and masks that its silhouettes contradict are repaired.
 
 
-# Photographs at least, for a vote; fewer do not outvote one another
+# Photographs that masks are checked with, at least; fewer do not outvote one another
 PHOTOGRAPHS = 12
 # Voxels along a side of the grid whose silhouettes are masks themselves, and pixels that they are
 # wide at most
 FINE, WIDTH = 128, 500
+# Share of the object's surface that depth shows, below which depth alone has guessed its shape
+GUESSED = 0.15
 # Share of the object's surface that depth has to show for it to be believed against most masks
 SURE = 0.5
 
@@ -271,14 +273,14 @@ def _from_depth(
     small = masks_by_depth(maps, box, keep_table)
     if small is None and box is not None:
         raise nothing_inside(box, "depth shows next to no surface", maps.cameras)
-    if small is None:
+    shape = None if small is None else find_object(small, maps, FINE, box)
+    if shape is None or shape.surface < GUESSED:
         raise DataError(
             f"{splits['train'].folder}: no object that stands out in depth was found; it needs "
             f"texture, and cameras all around: expected source={REMBG} or a folder of masks, got "
             f"{DEPTH}",
             "source",
         )
-    shape = find_object(small, maps, FINE, box)
     _tell_evidence(shape, 0, box)
     log.info("masks: of the object that stands out in depth; look at masks.html")
     return {name: _silhouettes_of(shape, split) for name, split in splits.items()}
@@ -349,7 +351,7 @@ def _judged(
     people.
 
     Raises:
-        DataError: a mask shows nothing, and there are too few for a vote.
+        DataError: a mask shows nothing, and there are too few to check it.
         UserError: the masks have nothing in common, or nothing in the box.
     """
     train, count = splits["train"], len(splits["train"])
@@ -360,10 +362,10 @@ def _judged(
                     where = "" if box is None else " in the box"
                     raise DataError(f"{split.folder}: the mask of {stem} shows nothing{where}")
         log.warning(
-            "masks are taken as they are: a vote needs %d photographs, there are %d",
+            "masks are taken as they are: to check them needs %d photographs, there are %d",
             *(PHOTOGRAPHS, count),
         )
-        return _as_they_are(masks), "too few photographs for a vote: masks as they came"
+        return _as_they_are(masks), "too few photographs to check masks: they are as they came"
     coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
     shape = find_object(coverage["train"], depth_maps(train), box=box)
     _tell_evidence(shape, count, box)
@@ -444,14 +446,14 @@ def _write(
             before, verdict, stem = masks[name][view], verdicts[name][view], split.names[view]
             write_photo(partial / name / stem, split, view, verdict.mask.float() / 255)
             photograph = _encoded(split, view)
-            mended = not torch.equal(before, verdict.mask)
+            changed = not torch.equal(before, verdict.mask)
             tiles.append(
                 MaskTile(
                     name=f"{name}/{stem}",
                     agreement=verdict.agreement,
                     fault=verdict.fault,
                     before=darkened(photograph, before.float() / 255),
-                    after=darkened(photograph, verdict.mask.float() / 255) if mended else None,
+                    after=darkened(photograph, verdict.mask.float() / 255) if changed else None,
                 )
             )
         write_cameras(partial, name, split.cameras, split.names)

@@ -90,7 +90,7 @@ def _shown_in(cameras: Cameras, view: int, points: Tensor) -> tuple[Tensor, Tens
     return rows, columns
 
 
-def depth_maps(
+def depths_below_hull(
     pictures: Tensor,
     cameras: Cameras,
     hull_depths: list[Tensor],
@@ -236,7 +236,7 @@ def _agreed_nodes(
     nodes = grid.nodes()[solid]
     free_votes, votes, better_votes = torch.zeros(3, len(nodes))
     colors = torch.stack([log_colors(picture) for picture in pictures])
-    maps = depth_maps(colors, cameras, hull_depths, hull, grid)
+    maps = depths_below_hull(colors, cameras, hull_depths, hull, grid)
     for view, (depth, error, hull_error) in enumerate(maps):
         distance, pixel = _distance_and_pixel(nodes, cameras, view)
         clearance = depth.flatten()[pixel] - distance  # NaN: the view says nothing

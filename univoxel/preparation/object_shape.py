@@ -32,8 +32,7 @@ from univoxel.preparation.stereo import DepthMaps, pixels_of, reach
 # covers.
 
 
-# Gaps are what few masks see through, and a vote fills. Voxels, of the pixels in which they are
-# looked for
+# Voxels, of the pixels in which masks are compared with nodes: each then has one
 GAP_PIXEL = 1.5
 # Share of the silhouette's area that a gap has at least
 SMALLEST_GAP = 0.002
@@ -281,8 +280,7 @@ def evidence(
     """Values [X, Y, Z] above 0 inside, and the share of their surface that depth maps show."""
     share = in_box(share_of(found, len(masks)), grid, box)
     carve_gaps_(share, threshold, masks, maps.cameras, grid)
-    free = (found.free >= SURE) & (found.free > FREE * (found.free + found.near))
-    surface = (found.near >= SURE) & ~free
+    free, surface = free_and_surface(found)
     # Next to a surface its own views decide, blurred by a voxel
     votes_here = blurred(torch.where(surface, found.open, 0.0))
     whose = blurred(torch.where(surface, found.open_masks, 0.0)) / votes_here.clamp_min(1e-6)
@@ -333,6 +331,12 @@ def votes(masks: Sequence[Tensor], maps: DepthMaps, grid: GridShape) -> Votes:
     return Votes(*torch.cat(pieces, 1).view(-1, *grid.size))
 
 
+def free_and_surface(found: Votes) -> tuple[Tensor, Tensor]:
+    """Which nodes views see through, and which they see a surface at: [X, Y, Z] bool each."""
+    free = (found.free >= SURE) & (found.free > FREE * (found.free + found.near))
+    return free, (found.near >= SURE) & ~free
+
+
 def share_of(found: Votes, views: int) -> Tensor:
     """Mean of the masks of the views that show a node; 0 where few do: [X, Y, Z]."""
     enough = found.seen >= max(SEEN_BY * views, 1)
@@ -365,15 +369,13 @@ def overlaps(
     nodes: Tensor, values: Tensor, mask: Tensor, cameras: Cameras, view: int, grid: GridShape
 ) -> Tensor:
     """IoU of a mask [H, W] with the nodes [P, 3] whose values [P] reach each threshold: [K]; in
-    pixels as wide as a voxel. 1 where both are empty."""
-    eye = cameras.camera_to_world[view, :, 3]
-    depth = float((nodes.mean(0) - eye).norm())
-    wide = max(1.0, 1.5 * grid.voxel_size * float(cameras.focal[view].max()) / depth)
-    row, column, seen = pixels_of(cameras, view, nodes)
-    height, width = (max(1, round(n / wide)) for n in mask.shape)
-    at = (row * height // mask.shape[0]) * width + column * width // mask.shape[1]
-    highest = torch.zeros(height * width).scatter_reduce_(0, at[seen], values[seen], "amax")
-    shown = interpolate(mask[None, None], (height, width), mode="area").flatten() >= 0.5
+    the pixels of `_sight`. 1 where both are empty."""
+    sight = _sight(nodes, cameras, view, mask, grid)
+    pixel, shown = (
+        torch.from_numpy(sight.pixel.astype(np.int64)),
+        torch.from_numpy(sight.shown).flatten(),
+    )
+    highest = torch.zeros(len(shown) + 1).scatter_reduce_(0, pixel, values, "amax")[:-1]
     covered = highest >= THRESHOLDS[:, None]
     both, either = (covered & shown).sum(1), (covered | shown).sum(1)
     return torch.where(either > 0, both / either.clamp_min(1), 1.0)

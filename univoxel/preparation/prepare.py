@@ -223,7 +223,7 @@ def find_silhouettes(
     doubted, shape, edges_given = None, None, photos is given and belief.votes == 1
     if found is not None:
         doubted, shape = found.pixels, found.shape
-        distance, belief = found.distance, found.belief
+        belief = found.belief  # and `distance` is that of masks with all that is doubted
     believed = belief.box, belief.refined, belief.votes
     return Silhouettes(photos, distance, *believed, doubted, edges_given, shape)
 

@@ -39,7 +39,6 @@ class Doubted:
 
     shape: ObjectShape  # that photographs and masks agree on
     pixels: Tensor  # [V, H, W] bool: nothing is known there
-    distance: Tensor  # [V, H, W] pixels to silhouettes that hold what is doubted, negative inside
     belief: Belief  # one vote, where what is not doubted agrees
 
 
@@ -47,7 +46,8 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     """Which pixels of rough masks are not to be believed.
 
     Args:
-        distance: [V, H, W] from `hull.mask_distances`; it becomes that of the result.
+        distance: [V, H, W] from `hull.mask_distances`; it becomes that of masks with all that is
+            doubted.
         belief: of more than one vote.
 
     Raises:
@@ -76,7 +76,7 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     votes = 1 if off <= MAX_CONTRADICTION else belief.votes
     if votes != belief.votes:
         box = estimate_bounds(distance, cameras, votes)
-    return Doubted(shape, pixels, distance, replace(belief, box=box, votes=votes, off=off))
+    return Doubted(shape, pixels, replace(belief, box=box, votes=votes, off=off))
 
 
 def thick(differs: Tensor) -> Tensor:

@@ -18,13 +18,12 @@ from torch import Tensor
 from univoxel.camera import image_rays, looked_at
 from univoxel.fields.grid import GridShape, fit_grid
 from univoxel.preparation.object_shape import (
-    FREE,
     ROOM,
-    SURE,
     VOXELS,
     around,
     box_shown,
     depth_in,
+    free_and_surface,
     votes,
 )
 from univoxel.preparation.stereo import DepthMaps, reach
@@ -39,6 +38,9 @@ LARGE = 0.08
 BEFORE = 0.95
 # Distance of a plane from the middle, over `reach`, below which it may be a side of the object
 CLEAR = 0.1
+# Median distance of a plane's surface from the middle, over `reach`, at least: what is nearer is a
+# flat side of the object
+WIDE = 0.8
 # What counts as near the middle, over `reach`: standard deviation of the weight of surface
 NEAR = 0.5
 # Nodes of surface that an object has at least
@@ -101,8 +103,7 @@ def surface_nodes(maps: DepthMaps, grid: GridShape) -> Tensor:
     """Which nodes [X, Y, Z] depth maps have a surface at."""
     sizes = [maps.cameras.size(view) for view in range(len(maps.cameras))]
     found = votes([torch.ones(height, width) for width, height in sizes], maps, grid)
-    free = (found.free >= SURE) & (found.free > FREE * (found.free + found.near))
-    return (found.near >= SURE) & ~free
+    return free_and_surface(found)[1]
 
 
 def background_planes(maps: DepthMaps, grid: GridShape, surface: Tensor) -> list[Plane]:
@@ -114,7 +115,9 @@ def background_planes(maps: DepthMaps, grid: GridShape, surface: Tensor) -> list
     points = points[(points - centre).norm(dim=1) < ROOM * radius]
     count, generator = len(points), torch.Generator().manual_seed(0)
     planes: list[Plane] = []
-    while len(points) >= 3 and len(planes) < PLANES:
+    for _ in range(PLANES):
+        if len(points) < 3:
+            break
         a, b, c = points[torch.randint(len(points), (3, TRIALS), generator=generator)]
         normal = torch.linalg.cross(b - a, c - a)
         normal = normal / normal.norm(dim=1, keepdim=True).clamp_min(1e-9)
@@ -129,9 +132,14 @@ def background_planes(maps: DepthMaps, grid: GridShape, surface: Tensor) -> list
         best = int(torch.where(usable, near, -1.0).argmax())
         if not usable[best] or near[best] * len(points) < LARGE * count:
             break
-        plane = fitted(points[Plane(normal[best], float(offset[best])).near(points, maps.step)])
-        planes.append(plane if plane.normal @ normal[best] > 0 else plane.turned())
-        points = points[planes[-1].height(points) > THICK * maps.step]
+        found = Plane(normal[best], float(offset[best]))
+        within = found.near(points, maps.step)
+        if (points[within] - centre).norm(dim=1).median() > WIDE * radius:
+            plane = fitted(points[within])
+            planes.append(plane if plane.normal @ found.normal > 0 else plane.turned())
+            points = points[planes[-1].height(points) > THICK * maps.step]
+        else:
+            points = points[~within]
     return planes
 
 

@@ -4,7 +4,6 @@ check that neighbouring views see the same surface."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -176,26 +175,20 @@ def lowest(cost: Tensor) -> Tensor:
     return at[:, 0] + ((before - after) / (2 * bend)).clamp(-0.5, 0.5)
 
 
-def agreeing(maps: DepthMaps, view: int, others: Sequence[int] | Tensor) -> Tensor:
+def agreeing(maps: DepthMaps, view: int, others: Tensor) -> Tensor:
     """How many of other views see what a view's pixels see, where they see it: [H, W]."""
     cameras = maps.cameras
     width, height = cameras.size(view)
     rays, depth = image_rays(cameras, view), maps.distance[view, :height, :width].reshape(-1)
     points = rays.origin + depth.nan_to_num()[:, None] * rays.direction
     count = torch.zeros(maps.distance.shape[1:], dtype=torch.uint8)
-    for other in others:
-        there, seen = seen_distance(maps, int(other), points)
+    for other in others.tolist():
+        row, column, seen = pixels_of(cameras, other, points)
         away = (points - cameras.camera_to_world[other, :, 3]).norm(dim=1)
-        agrees = seen & ((there - away).abs() < AGREE * maps.step) & depth.isfinite()
+        apart = (maps.distance[other][row, column] - away).abs()
+        agrees = seen & (apart < AGREE * maps.step) & depth.isfinite()
         count[:height, :width] += agrees.view(height, width)
     return count
-
-
-def seen_distance(maps: DepthMaps, view: int, points: Tensor) -> tuple[Tensor, Tensor]:
-    """What a view's pixels that show points [P, 3] have in the depth map: [P], and whether the
-    picture shows them at all: [P] bool."""
-    row, column, seen = pixels_of(maps.cameras, view, points)
-    return maps.distance[view][row, column], seen
 
 
 def pixels_of(cameras: Cameras, view: int, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
