@@ -20,7 +20,7 @@ from layers import LAYERS, violations  # noqa: E402
 LIMITS = {
     "lines of the package": 37_020,
     "lines of the laboratory": 3_000,
-    "lines of tests": 36_730,
+    "lines of tests": 36_750,
     "modules of the package": 160,
     "loose modules at the top": 12,
     "configuration fields": 128,

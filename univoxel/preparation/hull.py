@@ -41,10 +41,8 @@ DOUBTED_VOTES = 0.07
 # in nearly all of their pictures
 DOUBTED_SEEN = 0.25
 
-
-PIECE = (
-    2**15
-)  # points that a thread works on at a time: what is computed of them stays in its cache
+# Points that a thread works on at a time: what is computed of them stays in its cache
+PIECE = 2**15
 
 
 def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
