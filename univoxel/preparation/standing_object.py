@@ -62,9 +62,6 @@ class Plane:
         """Which of points [..., 3] lie in it: bool."""
         return self.height(points).abs() < THICK * step
 
-    def turned(self) -> Plane:
-        return Plane(-self.normal, -self.offset)
-
 
 def masks_by_depth(
     maps: DepthMaps, box: Tensor | None = None, keep_table: bool = False
@@ -135,18 +132,18 @@ def background_planes(maps: DepthMaps, grid: GridShape, surface: Tensor) -> list
         found = Plane(normal[best], float(offset[best]))
         within = found.near(points, maps.step)
         if (points[within] - centre).norm(dim=1).median() > WIDE * radius:
-            plane = fitted(points[within])
-            planes.append(plane if plane.normal @ found.normal > 0 else plane.turned())
+            planes.append(fitted(points[within], found.normal))
             points = points[planes[-1].height(points) > THICK * maps.step]
         else:
             points = points[~within]
     return planes
 
 
-def fitted(points: Tensor) -> Plane:
-    """The plane nearest to points [N, 3], in least squares."""
+def fitted(points: Tensor, up: Tensor) -> Plane:
+    """The plane nearest to points [N, 3] in least squares, whose normal looks along up [3]."""
     middle = points.mean(0)
     normal = torch.linalg.svd(points - middle, full_matrices=False)[2][2]
+    normal = normal * (normal @ up).sign()
     return Plane(normal, float(normal @ middle))
 
 
