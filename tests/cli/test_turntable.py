@@ -19,7 +19,7 @@ from univoxel.core.records import Surface
 from univoxel.errors import ConfigError, DataError
 from univoxel.fields.grid import fit_grid
 from univoxel.lights import EnvmapConfig
-from univoxel.lights.views import Turntable, resampling
+from univoxel.lights.views import Table, Turntable, resampling, rotated
 from univoxel.preparation.hull import estimate_bounds, mask_distances, observe_hull, visual_hull
 from univoxel.preparation.turntable import explained, turntable_of
 from univoxel.render.observations import shade_observations, turned_maps
@@ -43,7 +43,7 @@ def turned_lamps() -> torch.Tensor:
     """What the lamps are in the world of each photograph: [V, D, 3]."""
     map = lamps(NODES)
     turn = TURNTABLE.turn(cameras_around(VIEWS).camera_to_world[:, :, 3])
-    return resampling(torch.nn.functional.normalize(sky_directions(), dim=1), TURNTABLE, turn) @ map
+    return resampling(torch.nn.functional.normalize(sky_directions(), dim=1), turn) @ map
 
 
 def sky_directions() -> torch.Tensor:
@@ -73,10 +73,12 @@ def test_which_light_it_was(photographs, light, caplog):
     turntable = turntable_of(photos, *hull_of(photos), "auto")
     if light == "still":
         assert found.by_still_light > 2 * found.by_turning_light
+        assert found.ahead < -3
         assert turntable is None
         assert not caplog.text
     else:
         assert found.by_turning_light > 2 * found.by_still_light
+        assert found.ahead > 3
         assert turntable == TURNTABLE
         assert "the light turns with the camera, as on a turntable" in caplog.text
 
@@ -149,7 +151,7 @@ def test_both_renders_follow_the_camera():
     turn = TURNTABLE.turn(eye)
     here = torch.nn.functional.normalize(torch.tensor([[0.5, 0.2, 0.6]]), dim=1).expand(VIEWS, 3)
     normal, wo = (
-        TURNTABLE.into_world(x, turn) for x in (here, here)
+        rotated(turn.transpose(1, 2), x) for x in (here, here)
     )  # as the first camera sees it
     depth = torch.full((VIEWS,), 2.0)
     surface = Surface(
@@ -170,10 +172,16 @@ def test_both_renders_follow_the_camera():
             assert (other - other[:1]).abs().max() > 1e-2
 
 
-def test_a_checkpoint_keeps_the_axis(tmp_path):
-    scene = turning(sphere_scene(NODES))
-    save_scene(scene, tmp_path, {})
-    assert load_scene(tmp_path).cfg.turntable == TURNTABLE
+@pytest.mark.parametrize("laid", [1, 2])
+def test_a_checkpoint_keeps_the_axes(laid, tmp_path):
+    """Those of before an object could be laid anew have neither eyes nor others."""
+    kept = TURNTABLE
+    if laid == 2:
+        one = TURNTABLE.point, TURNTABLE.axis, TURNTABLE.start
+        kept = Turntable(*one, ((1.0, 2.0, 3.0),), (Table(*one, ((0.0, 1.0, 0.5),)),))
+    scene = sphere_scene(NODES)
+    save_scene(Scene(replace(scene.cfg, turntable=kept), scene.field, scene.inv_s), tmp_path, {})
+    assert load_scene(tmp_path).cfg.turntable == kept
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from univoxel.camera import Cameras, circle_of
 from univoxel.errors import ConfigError
-from univoxel.lights.views import Turntable, resampling
+from univoxel.lights.views import Table, Turntable, resampling, rotated
 from univoxel.sphere import fibonacci_sphere
 
 TILTED = Rotation.from_rotvec([0.4, -0.3, 0.2])
@@ -44,13 +44,48 @@ def test_light_turns_as_the_camera_does():
     turntable = Turntable.of(cameras)
     eye, back = cameras.camera_to_world[:, :, 3], cameras.camera_to_world[:, :, 2]
     turn = turntable.turn(eye)
-    angle = torch.atan2(turn[1], turn[0]).remainder(2 * math.pi)
-    wanted = 2 * math.pi * torch.arange(len(cameras)) / len(cameras)
-    assert ((angle - wanted + math.pi).remainder(2 * math.pi) - math.pi).abs().max() < 1e-3
-    lit = turntable.into_light(back, turn)
+    lit = rotated(turn, back)
     torch.testing.assert_close(lit, back[:1].expand_as(lit), atol=2e-3, rtol=0)
-    torch.testing.assert_close(turntable.into_world(lit, turn), back)
-    torch.testing.assert_close(turntable.into_light(back[:1], (turn[0][:1], turn[1][:1])), back[:1])
+    torch.testing.assert_close(rotated(turn[:1], back[:1]), back[:1])
+    torch.testing.assert_close(turn @ turn.transpose(1, 2), torch.eye(3).expand_as(turn))
+    rounded = turntable.turn(eye[:1], 64) @ turn[:1].transpose(1, 2)
+    torch.testing.assert_close(rounded, torch.eye(3)[None], atol=1e-5, rtol=0)
+
+
+def laid_anew(roll: float) -> tuple[Cameras, Rotation]:
+    """A ring of cameras, and one around the object after it was rolled over, in its own world."""
+    first, second = ring(16), ring(12, height=0.8)
+    over = Rotation.from_rotvec([roll, 0.2, 0.0])
+    turned = torch.from_numpy(over.as_matrix()).float() @ second.camera_to_world
+    poses = torch.cat([first.camera_to_world, turned])
+    sizes = torch.full((28, 2), 30.0), torch.full((28, 2), 16.0)
+    return Cameras(poses, *sizes, 32, 32), over
+
+
+@pytest.mark.parametrize("roll", [math.pi, 2.3, math.pi / 2])
+def test_an_object_laid_anew_has_another_axis(roll):
+    """What hangs above the turntable stays above it, and the camera at its side of the room."""
+    cameras, over = laid_anew(roll)
+    turntable = Turntable.of(cameras)
+    assert [len(table.eyes) for table in turntable.tables] == [16, 12]
+    assert turntable.others[0].axis == pytest.approx(over.apply([0, 0, 1]).tolist(), abs=1e-4)
+    eye, back = cameras.camera_to_world[:, :, 3], cameras.camera_to_world[:, :, 2]
+    turn = turntable.turn(eye)
+    above = torch.tensor([[0.0, 0.0, 1.0]])
+    lamp = torch.cat([above.expand(16, 3), torch.tensor(over.apply(above)).expand(12, 3).float()])
+    torch.testing.assert_close(rotated(turn, lamp), above.expand(28, 3), atol=1e-3, rtol=0)
+    assert rotated(turn, back)[:, 1].abs().max() < 2e-3  # all in the plane of the first camera
+    assert (rotated(turn, back)[:, 0] > 0.7).all()  # at the first camera's side
+    assert turntable.laid(eye + 0.05).tolist() == 16 * [0] + 12 * [1]
+    # From a camera on, the light turns on about the axis of its own table
+    between = torch.nn.functional.normalize(eye[16] + eye[17], dim=0) * eye[16].norm()
+    step = turntable.turn(between) @ turn[16].T
+    assert Rotation.from_matrix(step.numpy()).magnitude() == pytest.approx(math.pi / 12, abs=0.02)
+
+
+def test_a_few_cameras_on_their_heads_are_no_table():
+    cameras, _ = laid_anew(math.pi)
+    assert not Turntable.of(cameras.of(torch.arange(20))).others
 
 
 def test_a_map_is_resampled_to_what_it_is_in_the_world():
@@ -62,9 +97,9 @@ def test_a_map_is_resampled_to_what_it_is_in_the_world():
     def light(w):  # in its own frame
         return 2 + w @ torch.tensor([0.8, -0.5, 0.6])
 
-    weights = resampling(direction, turntable, turn)
+    weights = resampling(direction, turn)
     found = weights @ light(direction)
-    wanted = light(turntable.into_light(direction[None], tuple(x[:, None] for x in turn)))
+    wanted = light(rotated(turn[:, None], direction))
     torch.testing.assert_close(weights.sum(2), torch.ones(12, 512))
     assert (found - wanted).abs().max() < 0.05  # the nodes' Gaussians blur it a little
 
@@ -74,7 +109,7 @@ def test_a_turned_map_has_no_weight_that_rounding_swallows():
     cameras = ring()
     turntable = Turntable.of(cameras)
     turn = turntable.turn(cameras.camera_to_world[:, :, 3])
-    weights = resampling(fibonacci_sphere(512), turntable, turn)
+    weights = resampling(fibonacci_sphere(512), turn)
     assert (weights == 0).double().mean() > 0.8
     assert weights[weights > 0].min() >= torch.finfo(torch.float32).eps
 
@@ -121,3 +156,6 @@ def test_axis_and_start_are_across():
         Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.6, 0.8))
     with pytest.raises(ConfigError, match="axis and start must be unit"):
         Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 2.0), (1.0, 0.0, 0.0))
+    one = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+    with pytest.raises(ConfigError, match="each of several tables needs the eyes of its cameras"):
+        Turntable(*one, others=(Table(*one, eyes=((1.0, 0.0, 0.0),)),))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -142,32 +143,34 @@ def _centred(values: Tensor) -> Tensor:
 Vec3 = tuple[float, float, float]
 LEVEL = 0.2  # spread of the cameras' right axes along their axis over that across it, at most
 UPRIGHT = 0.97  # cosine between that axis and the one of the circle they stand on, at least
+FEWEST = 8  # cameras that tell of a further way in which the object lay
+# Sine of the angle by which a level camera may be rolled, where others were not level with it
+ROLLED = 0.17
+PAIRS = 500  # of cameras, whose axes are tried
 
 
 @dataclass(frozen=True)
-class Turntable:
-    """The axis about which an object was turned, while camera and light stood still.
-
-    In the world, which is the object's, the light turns about the axis as the camera does. Its own
-    frame is the world as it was when the camera stood at `start`.
-    """
+class Table:
+    """The axis about which an object was turned, while camera and light stood still."""
 
     point: Vec3  # of the axis, world units
-    axis: Vec3  # unit
+    axis: Vec3  # unit, upwards
     start: Vec3  # unit, across the axis: from it to the camera
+    # Where its cameras stood; empty: all stood around this axis
+    eyes: tuple[Vec3, ...] = ()
 
     def __post_init__(self) -> None:
         axis, start = torch.tensor(self.axis), torch.tensor(self.start)
         lengths = float((axis.norm() - 1).abs().maximum((start.norm() - 1).abs()))
         if not max(lengths, float((axis @ start).abs())) < 1e-3:
             raise ConfigError(
-                "Turntable: axis and start must be unit vectors across each other, got "
-                f"{self.axis} and {self.start}"
+                f"{type(self).__name__}: axis and start must be unit vectors across each other, "
+                f"got {self.axis} and {self.start}"
             )
 
     @staticmethod
-    def of(cameras: Cameras) -> Turntable | None:
-        """The turntable that cameras stood around; None: they do not say where its axis is.
+    def of(cameras: Cameras) -> Table | None:
+        """The axis that cameras stood around; None: they do not say where it is.
 
         A camera that stands still is held level: what is to the right in the photographs lies
         across the axis. Turned all around, the cameras look at a point of it. Where they stand on
@@ -187,50 +190,150 @@ class Turntable:
         start = normalize(towards - (towards @ axis) * axis, dim=0)
         if not start.isfinite().all() or start.norm() < 0.5:  # the first stands on the axis
             return None
-        values = (tuple(x.tolist()) for x in (point, axis, start))
-        return Turntable(*values)
+        return Table(_vec3(point), _vec3(axis), _vec3(start))
 
-    def turn(self, eye: Tensor) -> tuple[Tensor, Tensor]:
-        """Cosine and sine [...] of how far the light has turned about the axis, seen from
-        [..., 3]."""
+    def turned(self, eye: Tensor, steps: int | None) -> Tensor:
+        """[..., 3, 3] rotations from the world to what it was when the camera stood at `start`."""
         point, axis, start = (eye.new_tensor(x) for x in (self.point, self.axis, self.start))
         beside = torch.linalg.cross(axis, start)
         towards = eye - point
         along, across = towards @ start, towards @ beside
+        if steps is not None:
+            step = 2 * math.pi / steps
+            angle = (torch.atan2(across, along) / step).round() % steps * step
+            along, across = angle.cos(), angle.sin()
         length = torch.hypot(along, across).clamp_min(1e-9)
-        return along / length, across / length
+        cosine, sine = ((x / length)[..., None, None] for x in (along, across))
+        parallel = axis[:, None] * axis
+        cross = torch.linalg.cross(torch.eye(3).to(axis), axis.expand(3, 3)).T  # times v: v x axis
+        return cosine * (torch.eye(3).to(axis) - parallel) + parallel + sine * cross
 
-    def into_light(self, direction: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
-        """World directions [..., 3] in the light's frame.
+    def frame(self) -> Tensor:
+        """[3, 3] rows: the start, beside it, the axis."""
+        axis, start = torch.tensor(self.axis), torch.tensor(self.start)
+        return torch.stack([start, torch.linalg.cross(axis, start), axis])
+
+
+@dataclass(frozen=True)
+class Turntable(Table):
+    """How an object was turned before a camera and a light that stood still.
+
+    In the world, which is the object's, the light turns about the axis as the camera does. Its own
+    frame is the world as it was when the camera stood at `start`. An object that was laid anew, to
+    show its underside, has another axis for the photographs since then.
+    """
+
+    others: tuple[Table, ...] = ()  # each with its own cameras' eyes
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.others and not all(table.eyes for table in (self, *self.others)):
+            raise ConfigError("Turntable: each of several tables needs the eyes of its cameras")
+
+    @staticmethod
+    def of(cameras: Cameras) -> Turntable | None:
+        """The turntable that cameras stood around; None: they do not say where its axes are."""
+        only, up = Table.of(cameras), cameras.camera_to_world[:, :, 1]
+        if only is not None and (up @ up.new_tensor(only.axis) < 0).sum() < FEWEST:
+            return Turntable(only.point, only.axis, only.start)
+        tables = []
+        for which in _laid(cameras):
+            table = Table.of(cameras.of(which))
+            if table is None:
+                return None
+            eyes = tuple(_vec3(eye) for eye in cameras.camera_to_world[which, :, 3])
+            tables.append(replace(table, eyes=eyes))
+        if not tables:
+            return None
+        first, *others = tables
+        return Turntable(first.point, first.axis, first.start, first.eyes, tuple(others))
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """All the ways in which the object lay."""
+        return (self, *self.others)
+
+    def laid(self, eye: Tensor) -> Tensor:
+        """Which of the tables places [..., 3] are seen over: that of the nearest camera."""
+        if not self.others:
+            return eye.new_zeros(eye.shape[:-1], dtype=torch.long)
+        apart = [
+            torch.cdist(eye.reshape(-1, 3), eye.new_tensor(table.eyes)).amin(1)
+            for table in self.tables
+        ]
+        return torch.stack(apart).argmin(0).reshape(eye.shape[:-1])
+
+    def turn(self, eye: Tensor, steps: int | None = None) -> Tensor:
+        """Rotations [..., 3, 3] from the world to the light's frame, seen from places [..., 3].
 
         Args:
-            turn: of where they are seen from, as of `turn`; [...] or broadcast to it.
+            steps: to so many positions of the turntable each is rounded; None: to none.
         """
-        return self._rotated(direction, turn[0], -turn[1])
-
-    def into_world(self, direction: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
-        """The inverse of `into_light`."""
-        return self._rotated(direction, *turn)
-
-    def _rotated(self, direction: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
-        """Turned about the axis (Rodrigues' formula)."""
-        axis = direction.new_tensor(self.axis)
-        along = (direction @ axis)[..., None] * axis
-        beside = torch.linalg.cross(axis.expand_as(direction), direction)
-        return along + cosine[..., None] * (direction - along) + sine[..., None] * beside
+        turn = self.turned(eye, steps)
+        laid = self.laid(eye)
+        for k, table in enumerate(self.others, 1):
+            into_first = (self.frame().T @ table.frame()).to(eye)
+            other = into_first @ table.turned(eye, steps)
+            turn = torch.where((laid == k)[..., None, None], other, turn)
+        return turn
 
 
-def resampling(direction: Tensor, turntable: Turntable, turn: tuple[Tensor, Tensor]) -> Tensor:
+def _vec3(vector: Tensor) -> Vec3:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def _laid(cameras: Cameras) -> list[Tensor]:
+    """Indices of the cameras of each way in which the object lay, in order; none: they do not say.
+
+    Cameras are level: all that saw it lying one way have their right axes across what was up then.
+    """
+    right, up = cameras.camera_to_world[:, :, 0], cameras.camera_to_world[:, :, 1]
+    generator = torch.Generator().manual_seed(0)
+    left = torch.ones(len(cameras), dtype=torch.bool)
+    found: list[Tensor] = []  # axes, upwards
+    while left.any():
+        tried = left.nonzero()[:, 0]
+        pair = tried[torch.randint(len(tried), (PAIRS, 2), generator=generator)]
+        axis = torch.linalg.cross(*right[pair].unbind(1))
+        axis = normalize(axis[axis.norm(dim=1) > 0.2], dim=1)  # others look the same way
+        axis = torch.cat([axis, -axis])
+        level = _off(axis, right, up).lt(ROLLED) & left
+        if not len(axis) or level.sum(1).max() < FEWEST:
+            return []
+        best = level.sum(1).argmax()
+        found.append(axis[best])
+        left = left & ~level[best]
+    axes = torch.stack(found)
+    for _ in range(3):  # of two that fit, the better
+        which = _off(axes, right, up).argmin(0)
+        if torch.bincount(which, minlength=len(axes)).min() < FEWEST:
+            return []
+        fitted = torch.stack([torch.linalg.svd(right[which == k])[2][2] for k in range(len(axes))])
+        axes = torch.where((fitted * axes).sum(1, keepdim=True) < 0, -fitted, fitted)
+    return [torch.nonzero(torch.eq(which, k))[:, 0] for k in range(len(axes))]
+
+
+def _off(axis: Tensor, right: Tensor, up: Tensor) -> Tensor:
+    """[K, V] sine by which cameras are not level about axes [K, 3]; 2: they stand on their head."""
+    return torch.where(axis @ up.T > 0, (axis @ right.T).abs(), 2.0)
+
+
+def rotated(turn: Tensor, direction: Tensor) -> Tensor:
+    """Directions [..., 3] turned by rotations [..., 3, 3], one broadcast to the other."""
+    return (turn @ direction[..., None])[..., 0]
+
+
+def resampling(direction: Tensor, turn: Tensor) -> Tensor:
     """Weights [V, D, D] that bring a map at D directions, in the light's frame, to what it is in
     the world along these directions, for V views.
 
     Args:
         direction: [D, 3] unit, evenly spread over the sphere.
-        turn: [V] of the views.
+        turn: [V, 3, 3] from the world to the light's frame, of the views.
     """
     sharpness = len(direction) / 5.0  # as wide as the nodes lie apart, as in `DistantLight`
-    cosine, sine = (x[:, None] for x in turn)
-    turned = turntable.into_light(direction.expand(len(cosine), -1, -1), (cosine, sine))
+    turned = direction @ turn.transpose(1, 2)
     weights = torch.softmax(sharpness * (turned @ direction.T), -1)
     # What rounding swallows is nothing: processors take a hundred times as long over the tiniest
     # numbers (denormals), of which half of the weights were, or became when multiplied

@@ -17,7 +17,7 @@ from univoxel.core.choices import LightFrameOrAuto
 from univoxel.data import Photos
 from univoxel.errors import DataError
 from univoxel.fields.grid import GridShape
-from univoxel.lights.views import Turntable
+from univoxel.lights.views import Turntable, rotated
 from univoxel.preparation.hull import observe_hull
 from univoxel.preparation.matches import neighbours
 from univoxel.render.observations import Observations
@@ -155,39 +155,32 @@ def say_strays(photos: Photos) -> None:
 # Before a camera that stands still an object is turned, and with it, in the object's world, the
 # light turns as the camera does. Then a point is bright where its normal faces the light as seen
 # from the camera. Under a light that stands still a point keeps its shade, and changes only by what
-# it mirrors. Each is a smooth function on the sphere, of the normal in the camera's frame or of the
-# mirrored direction in the world: the one that explains more of how points change from photograph
-# to photograph is believed.
+# it mirrors. Each is a smooth function on the sphere. It is fitted to half of the photographs, and
+# the other half says how well it foretells them: the light that does better there is believed.
 
 
 # Points of the surface whose colours are compared
-POINTS = 1500
+POINTS = 3000
 # sRGB; darker colours are left out: rounding to 8 bits is too large a part of them
 DARK = 0.05
 # Natural log; the scale of the Cauchy cost of a colour that is not explained
 CAUCHY = 0.1
 # Rounds of iteratively reweighted least squares
 ROUNDS = 6
-# How many times as much a light that turns has to explain as one that stands still. Of four
-# rendered scenes under a still light it was 0.1 to 0.2 times, of a bronze head on a turntable 1.8
-# times
-BETTER = 1.0
-# Share of the cost that it has to explain at least, over `better`
-LEAST = 0.03
-# `better` where the surroundings do not say whether they stood still. Of objects on rings of
-# cameras it was up to 3 under a still light, and 60 under one that turned; of a shiny ball, 3.2
-BETTER_ALONE = 3.0
-# `least` there: times `better_alone` it is above the 14 % of the cost that a light taken to turn
-# explained under a still one, and below the 30 and 70 % under one that turned
-LEAST_ALONE = 0.07
+# Standard errors by which photographs that were not used have to fit a turning light better than
+# a still one. Of four rendered scenes under a still light it was 4 to 8 times worse
+CERTAIN = 3.0
 
 
 @dataclass(frozen=True)
 class Explained:
-    """Shares, in [0, 1], of the robust cost of how points change that go away."""
+    """How well either light foretells photographs that it was not fitted to."""
 
+    # Shares of the robust cost of how points change that go away
     by_still_light: float
     by_turning_light: float
+    # By how many standard errors the turning one is ahead, over the photographs
+    ahead: float
 
 
 def turntable_of(
@@ -222,17 +215,15 @@ def turntable_of(
         return None
     found = explained(observations, turntable)
     log.debug("light frame: %s", found)
+    # Surroundings that stood still have said it already, if photographs do not contradict. That
+    # they moved says nothing: a cloth or a scale on the turntable does, too
     still_around = surroundings_stand_still(photos)
-    if still_around is False:  # the camera went around the object
-        return None
-    better, least = BETTER, LEAST
-    if still_around is None:
-        better, least = BETTER_ALONE, LEAST_ALONE
-    if found.by_turning_light < better * max(found.by_still_light, least):
+    if found.ahead < (-CERTAIN if still_around else CERTAIN):
         return None
     log.info(
-        "the light turns with the camera, as on a turntable: that explains %.0f %% of how points "
+        "the light turns with the camera, as on a turntable%s: that explains %.0f %% of how points "
         "change from photograph to photograph, a light that stands still %.0f %%; see light_frame",
+        f", on which the object lay in {len(turntable.tables)} ways" if turntable.others else "",
         100 * found.by_turning_light,
         100 * found.by_still_light,
         extra={"arguments": ("light_frame",)},
@@ -242,21 +233,38 @@ def turntable_of(
 
 @torch.no_grad()
 def explained(observations: Observations, turntable: Turntable) -> Explained:
-    """How much of the changes of points from photograph to photograph either light explains."""
+    """How well either light foretells how points change from photograph to photograph.
+
+    Of photographs in two random halves, each is foretold by what was fitted to the other.
+    """
     point = torch.repeat_interleave(observations.offsets.diff())
     encoded = linear_to_srgb(observations.color)
     usable = (encoded.mean(1) > DARK) & (encoded < CLIPPED).all(1)
     point, view, wo = point[usable], observations.view[usable], observations.wo[usable]
     log_color = observations.color[usable].mean(1).log()
     normal = observations.normal[point]
-    mirrored = 2 * (normal * wo).sum(1, keepdim=True) * normal - wo
-    cosine, sine = turntable.turn(observations.eye)
-    lit = turntable.into_light(normal, (cosine[view], sine[view]))
-    nothing = normal[:, :0]
-    none, still, turning = (
-        cost(log_color, basis, point) for basis in (nothing, smooth(mirrored), smooth(lit))
-    )
-    return Explained(1 - still / none, 1 - turning / none)
+    facing = (normal * wo).sum(1, keepdim=True)
+    mirrored = 2 * facing * normal - wo
+    turn = turntable.turn(observations.eye)[view]
+    # What dims towards the outline under any light: blurred edges, a surface that is off
+    slant = torch.cat([facing, facing.square(), facing**3], 1)
+    lights = {
+        "none": slant,
+        "still": torch.cat([slant, smooth(mirrored)], 1),
+        "turning": torch.cat(
+            [slant, smooth(rotated(turn, normal)), smooth(rotated(turn, mirrored))], 1
+        ),
+    }
+    views = len(observations.eye)
+    order = torch.randperm(views, generator=torch.Generator().manual_seed(0))
+    half = (order % 2).bool()[view]
+    costs = {name: foretold(log_color, basis, point, half) for name, basis in lights.items()}
+    none, still, turning = (float(cost.sum()) for cost in costs.values())
+    count = torch.bincount(view, minlength=views)
+    gain = costs["still"] - costs["turning"]
+    gain = gain.new_zeros(views).index_add_(0, view, gain)[count > 0] / count[count > 0]
+    error = float(gain.std()) / math.sqrt(len(gain))
+    return Explained(1 - still / none, 1 - turning / none, float(gain.mean()) / max(error, 1e-12))
 
 
 def smooth(direction: Tensor) -> Tensor:
@@ -264,13 +272,24 @@ def smooth(direction: Tensor) -> Tensor:
     return real_harmonics(2, direction)[:, 1:]
 
 
-def cost(log_color: Tensor, basis: Tensor, point: Tensor) -> float:
-    """Cauchy cost of log colours [N] of points [N], each of which has an albedo of its own, after
-    the best sum of the basis [N, K]."""
+def foretold(log_color: Tensor, basis: Tensor, point: Tensor, half: Tensor) -> Tensor:
+    """Cauchy cost [N] of log colours [N] of points [N], each of which has an albedo of its own,
+    after the sum of a basis [N, K] that is best for the other half, of [N] bool."""
     log_color, basis = log_color.double(), basis.double()
+    cost = torch.zeros_like(log_color)
+    for part in (half, ~half):
+        fitted = _robust(log_color[~part], basis[~part], point[~part])[0]
+        rest = log_color[part] - basis[part] @ fitted
+        cost[part] = _robust(rest, basis[part][:, :0], point[part])[1]
+    return cost
+
+
+def _robust(values: Tensor, basis: Tensor, point: Tensor) -> tuple[Tensor, Tensor]:
+    """Coefficients [K] of a basis [N, K] for values [N] but for a constant of each point, and the
+    Cauchy cost [N] of what is left."""
+    weight = torch.ones_like(values)
     count = int(point.max()) + 1 if len(point) else 0
-    weight = torch.ones_like(log_color)
-    rest = log_color
+    fitted, rest = basis.new_zeros(basis.shape[1]), values
     for _ in range(ROUNDS):
         total = weight.new_zeros(count).index_add_(0, point, weight).clamp_min(1e-9)
 
@@ -279,10 +298,10 @@ def cost(log_color: Tensor, basis: Tensor, point: Tensor) -> float:
             sums.index_add_(0, point, weight[:, None] * values)
             return values - (sums / total[:, None])[point]
 
-        shades = centred(basis)
-        rest = centred(log_color[:, None])
+        shades, rest = centred(basis), centred(values[:, None])
         weighted = weight[:, None] * shades
-        system = weighted.T @ shades + 1e-6 * torch.eye(shades.shape[1], dtype=torch.double)
-        rest = (rest - shades @ torch.linalg.solve(system, weighted.T @ rest))[:, 0]
+        system = weighted.T @ shades + 1e-6 * torch.eye(basis.shape[1], dtype=basis.dtype)
+        fitted = torch.linalg.solve(system, weighted.T @ rest)
+        rest = (rest - shades @ fitted)[:, 0]
         weight = 1 / (1 + (rest / CAUCHY).square())
-    return max(float(torch.log1p((rest / CAUCHY).square()).sum()), 1e-9)
+    return fitted.reshape(-1), torch.log1p((rest / CAUCHY).square())

@@ -275,12 +275,9 @@ def turned_maps(scene: Scene, observations: Observations) -> TurnedMaps | None:
     turntable = scene.cfg.turntable
     if turntable is None or scene.sky is None:
         return None
-    cosine, sine = turntable.turn(observations.eye)
-    step = 2 * math.pi / TURNS
-    rounded = (torch.atan2(sine, cosine) / step).round().long() % TURNS
-    used, position = rounded.unique(return_inverse=True)
-    turn = (used * step).cos(), (used * step).sin()
-    return TurnedMaps(resampling(scene.sky.direction, turntable, turn), position)
+    turns = turntable.turn(observations.eye, TURNS)
+    used, position = turns.flatten(1).unique(dim=0, return_inverse=True)
+    return TurnedMaps(resampling(scene.sky.direction, used.view(-1, 3, 3)), position)
 
 
 @torch.no_grad()

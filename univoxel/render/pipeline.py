@@ -13,6 +13,7 @@ from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb_unclipped, srgb_to_linear
 from univoxel.core.records import Mesh, Occlusion, Rays, Surface
 from univoxel.lights.quadrature import half_sphere, rotations
+from univoxel.lights.views import rotated
 from univoxel.ops import VisibilityScene
 from univoxel.scene import Scene
 
@@ -112,8 +113,7 @@ def in_light_frame(scene: Scene, surface: Surface, wo: Tensor) -> tuple[Surface,
     if turntable is None:
         return surface, wo
     turn = turntable.turn((surface.position + surface.depth[:, None] * wo).detach())
-    normal = turntable.into_light(surface.normal, turn)
-    return replace(surface, normal=normal), turntable.into_light(wo, turn)
+    return replace(surface, normal=rotated(turn, surface.normal)), rotated(turn, wo)
 
 
 def radiance_of(
