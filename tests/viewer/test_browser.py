@@ -87,6 +87,25 @@ def test_a_click_shows_the_light_at_a_point(tab):
     until(lambda: tab.run(shown) != [before])
 
 
+def test_a_box_is_shown_as_the_option_that_it_is(tab):
+    """A click on the object ends it there, and shows no light at a point."""
+    option = """[...document.querySelectorAll("code")].map((code) => code.textContent).find(
+        (text) => text.startsWith("--box") && text.split(" ").length == 7
+    )"""
+    tab.run("""[...document.querySelectorAll("label")].find(
+        (label) => label.textContent.trim() == "box"
+    ).click()""")
+    until(lambda: tab.run(option))
+    before = [float(value) for value in tab.run(option).split()[1:]]
+    assert all(low < high for low, high in zip(before[:3], before[3:], strict=True))
+    click(tab, 370, 250)
+    until(lambda: tab.run(option).split()[3] != f"{before[2]:.4g}")
+    after = [float(value) for value in tab.run(option).split()[1:]]
+    assert after[:2] == before[:2]
+    assert after[3:] == before[3:]
+    assert before[2] < after[2] < before[5]
+
+
 def click(tab, x, y):
     tab.mouse("mouseMoved", x, y)
     tab.mouse("mousePressed", x, y, button="left", clickCount=1)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import logging
 import math
 import tempfile
@@ -52,6 +53,7 @@ DARK = "no map"  # the light that leaves the sun alone
 PLAIN = 0.16  # sRGB, behind a transparent picture
 JPEG = 90  # quality of pictures that are sent
 MAPS = (".hdr", ".exr")
+BOX_COLOR = (255, 160, 60)
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -107,6 +109,7 @@ class Panel:
         self.viewer: Viewer = Viewer(self._show, self._complain)
         self._controls(client.gui)
         self._photographs(client.gui)
+        self._box(client.gui)
         studio.join(self.viewer)
         client.scene.on_click()(lambda event: self._pick(event.screen_pos))
         client.camera.on_update(lambda camera: self._ask())
@@ -178,6 +181,47 @@ class Panel:
             for handle in handles:
                 handle.visible = frusta.value
 
+    def _box(self, gui: Any) -> None:
+        """Handles at two corners of a box, and the option of `cutout` and `capture` that it is."""
+        low, high = _bounds(self._subject)
+        self._boxed = gui.add_checkbox(
+            "box", False, hint="drag its two corners; click on the object to end it there, below"
+        )
+        self._option = gui.add_markdown("", visible=False)
+        self._corners = [
+            self._client.scene.add_transform_controls(
+                f"/box/{name}",
+                scale=0.2 * float((high - low).norm()),
+                disable_rotations=True,
+                position=corner.numpy(),
+                visible=False,
+            )
+            for name, corner in (("low", low), ("high", high))
+        ]
+        for corner in self._corners:
+            corner.on_update(lambda event: self._draw_box())
+        self._boxed.on_update(lambda event: self._draw_box())
+
+    def _draw_box(self) -> None:
+        shown = self._boxed.value
+        corners = np.stack([corner.position for corner in self._corners])
+        low, high = corners.min(0), corners.max(0)
+        ends = np.array(list(itertools.product((0, 1), repeat=3)))
+        edges = [(a, b) for a, b in itertools.combinations(ends, 2) if np.abs(a - b).sum() == 1]
+        self._client.scene.add_line_segments(
+            "/box/edges",
+            low + (high - low) * np.array(edges),
+            BOX_COLOR,
+            thickness=2.0,
+            thickness_units="screen",
+            visible=shown,
+        )
+        for corner in self._corners:
+            corner.visible = shown
+        values = " ".join(f"{value:.4g}" for value in (*low, *high))
+        self._option.content = f"`--box {values}`"
+        self._option.visible = shown
+
     def _go_to(self, view: int) -> None:
         """Move the client's camera to where a photograph was taken."""
         cameras = self._subject.photos.cameras
@@ -220,6 +264,11 @@ class Panel:
         pixel = (torch.tensor(place, dtype=torch.float32) * size)[None]
         point = point_on_mesh(self._subject, pixel_rays(self._cameras, torch.tensor(0), pixel))
         if point is None:
+            return
+        if self._boxed.value:
+            low = min(self._corners, key=lambda corner: corner.position[2])
+            low.position = (*low.position[:2], float(point.position[2]))
+            self._draw_box()
             return
         extent = float((self._subject.traced.mesh.vertices.abs()).max())
         self._client.scene.add_icosphere(
@@ -312,6 +361,13 @@ class Panel:
     def _send_glb(self) -> None:
         mesh = bake(self._subject.scene, simplify(self._subject.traced.mesh, FACES), TEXTURE_SIZE)
         self._client.send_file_download(f"{self._title}.glb", glb(mesh, JPEG_QUALITY))
+
+
+def _bounds(subject: Subject) -> tuple[Tensor, Tensor]:
+    """The lower and the upper corner [3] of the mesh, with a little room."""
+    low, high = subject.traced.mesh.vertices.amin(0), subject.traced.mesh.vertices.amax(0)
+    room = 0.02 * (high - low).norm()
+    return low - room, high + room
 
 
 def _bytes(picture: Tensor) -> np.ndarray:
