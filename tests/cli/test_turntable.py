@@ -10,6 +10,8 @@ from observed_points import (
     RED,
     Steps,
     lamps,
+    no_metal,
+    photographed,
     photographs_under,
     problem_on_a_sphere,
 )
@@ -22,12 +24,12 @@ from univoxel.lights import EnvmapConfig
 from univoxel.lights.views import Table, Turntable, resampling, rotated
 from univoxel.preparation.hull import estimate_bounds, mask_distances, observe_hull, visual_hull
 from univoxel.preparation.turntable import explained, turntable_of
-from univoxel.render.observations import shade_observations, turned_maps
+from univoxel.render.observations import TurnedMaps, shade_observations, turned_maps
 from univoxel.render.pipeline import extract_mesh, radiance_of, shade
 from univoxel.scene import Scene, load_scene, save_scene
 from univoxel.training import joint_solve
 from univoxel.training.equations import channel_radiance
-from univoxel.training.newton import linear_transport
+from univoxel.training.newton import linear_transport, newton_round_
 
 NODES, VIEWS = 128, 16
 TURNTABLE = Turntable.of(cameras_around(VIEWS))
@@ -128,6 +130,30 @@ def test_the_equations_see_the_map_as_the_renders_do():
     flat = linear_transport(still, point, observation, rough, False)
     _, other = channel_radiance(flat, scene.sky.radiance, albedo.log(), 0, None)
     assert (other.flatten() - shaded[:, 0]).abs().max() > 0.1  # the frame matters
+
+
+def test_light_is_white_where_photographs_do_not_tell():
+    """Matte paint is as brown under white light as it is white under brown light."""
+
+    def tint_found(turned: bool) -> float:
+        torch.manual_seed(0)
+        scene = scene_of((0.5, 0.5, 0.5), 0.9, NODES)
+        problem = problem_on_a_sphere(300, 8, NODES, scene)
+        white = torch.full((NODES, 3), 0.7) * lamps(NODES).mean(1, keepdim=True)
+        paint, rough = torch.tensor([0.4, 0.25, 0.1]).expand(300, 3), torch.full((300,), 0.9)
+        problem = photographed(problem, white, paint, rough)
+        noisy = problem.target + 0.02 * torch.randn_like(problem.target)
+        still = TurnedMaps(torch.eye(NODES)[None], torch.zeros(8, dtype=torch.long))
+        problem = replace(problem, target=noisy, turned=still if turned else None)
+        with torch.no_grad():
+            scene.sky.log_radiance.copy_((white * torch.tensor([1.6, 1.0, 0.6])).log())
+        cfg = JointConfig(newton_points=300, newton_views=8, newton_steps=6)
+        assert newton_round_(scene, problem, no_metal(problem), cfg).costs
+        log_map = scene.sky.log_radiance.detach().mean(0)
+        return float(log_map.max() - log_map.min())
+
+    assert tint_found(True) < 0.1
+    assert tint_found(False) > 0.3
 
 
 def test_solve_finds_map_and_albedo_under_light_that_turns(photographs):

@@ -53,6 +53,9 @@ MAX_ROUGHNESS_CHANGE = 0.1
 MIN_LOG_ALBEDO = -7.0
 # Weight of the prior on changes of a view's own map, in units of newton_smooth
 VIEW_PRIOR = 10.0
+# Natural log by which a channel of the whole map may differ from the others, where the colours of
+# paint do not tell: the prior of a white light weighs as much as one observation of each point
+TINT = 1.0
 # Nearest nodes of the map that the smoothness ties a node to: as many as lie around one
 NODE_NEIGHBOURS = 6
 # Parts of the points that a step builds its equations from on a machine however slow
@@ -176,7 +179,8 @@ def newton_round_(
             if not views_step_(scene, points, differences, cfg.newton_smooth):
                 return NewtonRound(costs, [UNSOLVABLE])
             differences = view_differences(scene)
-        cost = map_step_(scene, points, differences, decisions.sun, laplacian, cfg.newton_smooth)
+        sun, damping = decisions.sun, cfg.newton_smooth
+        cost = map_step_(scene, points, differences, sun, laplacian, damping)
         if cost is None:
             return NewtonRound(costs, [UNSOLVABLE])
         costs.append(cost)
@@ -252,6 +256,12 @@ def map_step_(
         log_map = log_map - sun.T
     log_map = torch.nn.functional.pad(log_map, (0, unknowns - nodes))  # no gain is likelier than 1
     system, right_side = laplacian, -log_map @ laplacian
+    if points.problem.turned is not None:  # see `painted_points`
+        mean = (torch.arange(unknowns) < nodes) / nodes
+        prior = (NOISE / TINT) ** 2 * mean
+        tint = log_map @ mean
+        system = system + prior[:, None] * mean
+        right_side = right_side + (tint.mean() - tint)[:, None] * prior
     eliminated = []
     coupling = torch.zeros(())  # of the channels, by roughness
     for part in points.parts:  # added up at once: all would take much memory
