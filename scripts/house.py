@@ -18,9 +18,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 37_140,
+    "lines of the package": 37_260,
     "lines of the laboratory": 3_000,
-    "lines of tests": 36_800,
+    "lines of tests": 36_850,
     "modules of the package": 160,
     "loose modules at the top": 12,
     "configuration fields": 128,
