@@ -55,7 +55,7 @@ MIN_LOG_ALBEDO = -7.0
 VIEW_PRIOR = 10.0
 # Natural log by which a channel of the whole map may differ from the others, where the colours of
 # paint do not tell: the prior of a white light weighs as much as one observation of each point
-TINT = 1.0
+TINT = 0.5
 # Nearest nodes of the map that the smoothness ties a node to: as many as lie around one
 NODE_NEIGHBOURS = 6
 # Parts of the points that a step builds its equations from on a machine however slow
