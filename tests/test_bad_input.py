@@ -188,11 +188,11 @@ def nan(tensor):
         (meta(lambda m: m["scene"].update(channels=0)), "channels must be at least 1"),
         (
             meta(lambda m: m["scene"]["light"].update(layers=10**5)),
-            "layers must be at most 32",
+            r"layers must be in \[0, 32\]",
         ),
         (
             meta(lambda m: m["scene"]["light"].update(directions_eval=10**9)),
-            "directions_eval must be at most 65536",
+            r"directions_eval must be in \[1, 65536\]",
         ),
         (meta(lambda m: m.update(state=[1])), "its own description"),
         (meta(lambda m: m["state"].update(stage="last")), "stage must be int"),

@@ -29,6 +29,7 @@ from univoxel.core.choices import (
 )
 from univoxel.core.files import read_json, replacing
 from univoxel.core.progress_bar import duration
+from univoxel.core.validation import check_settings, setting
 from univoxel.errors import (
     DataError,
     ExistingFile,
@@ -106,9 +107,11 @@ def command(asked: CaptureOptions) -> int:
 class PicturesConfig:
     """The pictures of a capture."""
 
-    frames: int = 8  # of an orbit around the object, under each map
-    resolution: int = 512  # pixels of their sides
-    samples: int = SAMPLES  # of the light, per pixel
+    frames: int = setting(8, "of an orbit around the object, under each map", least=1)
+    resolution: int = setting(512, "of their sides", unit="pixels", least=1)
+    samples: int = setting(SAMPLES, "of the light, per pixel", least=1)
+
+    __post_init__ = check_settings
 
 
 PICTURES = PicturesConfig()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from univoxel.camera import Cameras, circle_of, looked_at
+from univoxel.core.validation import about
 from univoxel.errors import ConfigError, UserError
 from univoxel.sphere import real_harmonics
 
@@ -152,9 +153,9 @@ class Turntable:
     frame is the world as it was when the camera stood at `start`.
     """
 
-    point: Vec3  # of the axis, world units
-    axis: Vec3  # unit
-    start: Vec3  # unit, across the axis: from it to the camera
+    point: Vec3 = field(metadata=about("of the axis", unit="world units"))
+    axis: Vec3 = field(metadata=about("unit"))
+    start: Vec3 = field(metadata=about("unit, across the axis: from it to the camera"))
 
     def __post_init__(self) -> None:
         axis, start = torch.tensor(self.axis), torch.tensor(self.start)
