@@ -25,7 +25,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from univoxel import __version__
 from univoxel.core import guard
-from univoxel.core.files import read_json, replacing
+from univoxel.core.files import read_json, write_json
 from univoxel.core.machine import cores
 from univoxel.core.progress_bar import bar
 from univoxel.errors import DataError, ExistingFile, MissingExtra, ProcessFailed, UserError
@@ -93,8 +93,7 @@ class Job:
 
     def save(self, record: dict[str, dict[str, Any]]) -> None:
         """Write the record, whole or not at all."""
-        with replacing(self.file(".json")) as temporary:
-            temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        write_json(self.file(".json"), record)
 
     def check_same(self) -> None:
         """Refuse to go on with what other options began.

@@ -31,7 +31,8 @@ from univoxel.capture.masks import (
 )
 from univoxel.color import linear_to_srgb
 from univoxel.core.choices import DEPTH, NETWORK, REMBG, NetworkName
-from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph, write_html
+from univoxel.core.files import write_text
+from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph
 from univoxel.core.progress_bar import track
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
@@ -141,7 +142,7 @@ def write_page(path: Path, tiles: Sequence[MaskTile], about: str) -> None:
         figures.append(f"<figure{kind}>{''.join(images)}{caption}</figure>")
     main = "\n".join(["<main>", *figures, "</main>"])
     body = f"<h1>Masks</h1>\n{paragraph(about)}\n{main}"
-    write_html(path, document("masks", _STYLE, body))
+    write_text(path, document("masks", _STYLE, body))
 
 
 def _number(tile: MaskTile) -> str:

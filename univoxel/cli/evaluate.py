@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +18,7 @@ from univoxel.cli.parsing import (
     written,
 )
 from univoxel.core.choices import BOUNCES, SAMPLES, Behind
-from univoxel.core.files import replacing
+from univoxel.core.files import write_json
 from univoxel.errors import UserError
 
 if TYPE_CHECKING:
@@ -147,9 +146,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     }
     figures = views.say_trust(surveyed, report.get("troubles", []), save)
     if json:
-        with replacing(json) as temporary:
-            text = dumps(result | _verdict(run) | figures, indent=2)
-            temporary.write_text(text + "\n", encoding="utf-8")
+        write_json(json, result | _verdict(run) | figures)
     return result
 
 

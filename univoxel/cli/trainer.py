@@ -22,7 +22,7 @@ from univoxel.config import (
     save_config,
 )
 from univoxel.core import memmap
-from univoxel.core.files import replacing
+from univoxel.core.files import write_text
 from univoxel.core.progress_bar import duration
 from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import Cancelled, ExistingFile, UserError
@@ -351,6 +351,5 @@ def save_trust(
     text = verdict.sentence() + "."
     if surveyed is not None:
         text += " " + words(numbers(surveyed), troubles)
-    with replacing(cfg.out / "trust.txt") as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_text(cfg.out / "trust.txt", text + "\n")
     log.info(text)

@@ -3,7 +3,6 @@ camera paths without pictures."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import reprlib
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from univoxel.camera import Cameras
-from univoxel.core.files import read_json, replacing
+from univoxel.core.files import read_json, write_json
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
 from univoxel.data.load_images import (
@@ -373,8 +372,7 @@ def write_cameras(folder: Path, split: str, cameras: Cameras, names: Sequence[st
                 **{"fl_x": x, "fl_y": y, "cx": cx, "cy": cy},
             }
         )
-    with replacing(folder / f"transforms_{split}.json") as temporary:
-        temporary.write_text(json.dumps({"frames": frames}, indent=1), encoding="utf-8")
+    write_json(folder / f"transforms_{split}.json", {"frames": frames})
 
 
 def _mask(folder: Path, frame: dict[str, Any], where: str) -> Path | None:

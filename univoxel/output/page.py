@@ -18,7 +18,8 @@ from torch.nn.functional import adaptive_avg_pool2d
 from univoxel import __version__
 from univoxel.camera import Cameras, looked_at
 from univoxel.core.choices import MAP_ROWS, TEXTURE_SIZE
-from univoxel.core.html import VIEWPORT, base64_text, document, escape, paragraph, table, write_html
+from univoxel.core.files import write_text
+from univoxel.core.html import VIEWPORT, base64_text, document, escape, paragraph, table
 from univoxel.core.records import HALF_MAX
 from univoxel.envmap import read_map
 from univoxel.errors import UserError
@@ -319,7 +320,7 @@ def write_page(run: str | Path, path: str | Path, **options: Any) -> Path:
     scene, state = load_checkpoint(run)
     text = page_text(run, scene, PageOptions(**options), state.get("seconds"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_html(path, text)
+    write_text(path, text)
     return path
 
 
