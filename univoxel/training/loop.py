@@ -13,6 +13,7 @@ from univoxel.config import LossConfig, StageConfig, TrainConfig
 from univoxel.core import memmap
 from univoxel.core.records import Rays, Surface
 from univoxel.data import Photos
+from univoxel.data.photos import unpacked
 from univoxel.lights import base
 from univoxel.lights.base import Regularisation
 from univoxel.ops import sum_rows
@@ -31,7 +32,7 @@ from univoxel.training.descent import (
     smooth_sdf_gradient_,
     smooth_touched_,
 )
-from univoxel.training.pixels import TrainingPixels, unpacked
+from univoxel.training.pixels import TrainingPixels
 from univoxel.training.progress import Listener
 
 # Cadences: steps from one to the next. plateau.CHECK is a share of the schedule instead; reports
