@@ -13,6 +13,7 @@ from dataclasses import replace as replace_fields
 from pathlib import Path
 
 import pytest
+from plain import plain_stage, plain_training
 
 import univoxel
 from univoxel import cli, errors
@@ -148,11 +149,11 @@ def test_capture(calls, capsys):
 
 
 def test_train_as_another_run_was_trained(calls, tmp_path, capsys):
-    from univoxel.config import StageConfig, TrainConfig, save_config
+    from univoxel.config import save_config
 
     (tmp_path / "before").mkdir()
-    stages = (StageConfig(voxels=1.0, iterations=10, share=1.0),)
-    before = TrainConfig(Path("cup"), tmp_path / "before", stages, 1.0, downscale=2, seed=3)
+    stages = (plain_stage(voxels=1.0, iterations=10, share=1.0),)
+    before = plain_training(Path("cup"), tmp_path / "before", stages, 1.0, downscale=2, seed=3)
     save_config(before)
     file = str(tmp_path / "before/config.json")
     options = ["--config", file, "--seed", "7", "--minutes", "2", "--set", "loss.radiance=2"]

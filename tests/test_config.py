@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from plain import plain_stage, plain_training
 
 import univoxel
 from univoxel.config import (
@@ -24,8 +25,8 @@ from univoxel.presets import PRESETS, budget, chosen, preset, with_field, with_m
 from univoxel.scene import SceneConfig
 from univoxel.training.clock import expected_seconds
 
-STAGE = StageConfig(voxels=1.0, iterations=10, share=1.0)
-CONFIG = TrainConfig(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
+STAGE = plain_stage(voxels=1.0, iterations=10, share=1.0)
+CONFIG = plain_training(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
 
 
 @pytest.mark.parametrize("name", [*PRESETS])

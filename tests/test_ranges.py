@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from plain import plain_stage, plain_training
 
 from univoxel import config, scene
 from univoxel.capture.config import CaptureConfig
@@ -17,8 +18,8 @@ from univoxel.lights import BakedConfig, EnvmapConfig, EnvmapSGConfig
 from univoxel.lights.base import MOST_DIRECTIONS
 from univoxel.scene import LightConfig, SceneConfig
 
-STAGE = StageConfig(voxels=1.0, iterations=10, share=1.0)
-TRAIN = TrainConfig(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
+STAGE = plain_stage(voxels=1.0, iterations=10, share=1.0)
+TRAIN = plain_training(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
 NO_SKY = SceneConfig(sky_nodes=0)
 CLASSES = {
     *(CaptureConfig, AdviceConfig, *get_args(LightConfig)),

@@ -238,7 +238,7 @@ def test_a_slim_file_of_a_sparse_field_is_smaller(tmp_path):
 
 
 def test_lights_of_older_files_are_lobes():
-    assert read_config({"lobes": 4}) == SGConfig(lobes=4)
+    assert read_config({"lobes": 4}) == SGConfig(lobes=4, directions=128)
 
 
 def test_an_unknown_light():

@@ -16,8 +16,9 @@ from univoxel.core.choices import (
     LightFrameOrAuto,
     MasksFrom,
 )
-from univoxel.core.files import read_json, replacing
+from univoxel.core.files import read_json, write_json
 from univoxel.core.validation import (
+    EARLIER,
     about,
     check_fields,
     check_settings,
@@ -65,10 +66,10 @@ class StageConfig:
     )
     rays: int = setting(2048, "per step", least=1)
     sharpness: tuple[float, float] = setting(
-        (0.5, 0.5), "s of the NeuS density at begin and end", unit="voxels", above=0
+        (0.5, 0.3), "s of the NeuS density at begin and end", unit="voxels", above=0
     )
     lr_sdf: tuple[float, float] = setting(
-        (0.2, 0.02), "learning rate at begin and end", unit="voxels per step", above=0
+        (0.07, 0.005), "learning rate at begin and end", unit="voxels per step", above=0
     )
     lr_features: tuple[float, float] = setting(
         (0.1, 0.01),
@@ -76,7 +77,7 @@ class StageConfig:
         above=0,
     )
     lr_networks: tuple[float, float] = setting(
-        (3e-3, 3e-4),
+        (6e-3, 3e-4),
         "learning rate at begin and end: of the networks, the light, and what differs from view to "
         "view",
         above=0,
@@ -89,17 +90,17 @@ class StageConfig:
         0.01, "smoothing of touched feature nodes per step", least=0, most=0.25
     )
     physical_from: float = setting(
-        1.0, "progress at which the physically based render joins", least=0, most=1
+        0.3, "progress at which the physically based render joins", least=0, most=1
     )
     patches_from: float = setting(
-        1.0,
+        0.0,
         "progress at which patches of the surface are compared between photographs; 1: never",
         least=0,
         most=1,
     )
     refit: bool = setting(False, "materials stay; light, radiance and silhouettes follow them")
     field: FieldName = setting(
-        "dense",
+        "hash",
         "sparse: only bricks around the surface are stored; hash: features come from a hash table",
     )
 
@@ -178,12 +179,12 @@ class EntropyConfig:
 class JointConfig:
     """The stage that solves for one map, the materials and normals, see training/joint_solve.py."""
 
-    iterations: int = setting(700, "Adam steps in all rounds; fewer when time runs out", least=1)
-    share: float = setting(0.4, "of the time budget", above=0, most=1)
-    rays: int = setting(4096, "observations per step; at least views")
+    iterations: int = setting(675, "Adam steps in all rounds; fewer when time runs out", least=1)
+    share: float = setting(0.27, "of the time budget", above=0, most=1)
+    rays: int = setting(2048, "observations per step; at least views")
     views: int = setting(4, "observations of a point per step", least=1)
     rounds: int = setting(4, "of Newton steps on the map and then of Adam", least=1)
-    points: int = setting(20000, "on the surface", least=1)
+    points: int = setting(20400, "on the surface", least=1)
     tracing: int = setting(2, "visibility rays per point and direction", least=1)
     colors: bool = setting(True, "whether the light minimises the entropy of albedo, see entropy")
     only_metal: bool | None = setting(
@@ -200,7 +201,7 @@ class JointConfig:
         0.04, "learning rate of the surface; 0: it stays", unit="voxels per step", least=0
     )
     newton_steps: int = setting(3, "at the begin of a round", least=0)
-    newton_points: int = setting(4000, "of the points", least=1)
+    newton_points: int = setting(1900, "of the points", least=1)
     newton_views: int = setting(8, "observations of each", least=2)
     newton_roughness: float = setting(
         0.1, "standard deviation that roughness follows the map with; 0: none", least=0
@@ -256,16 +257,16 @@ class TrainConfig:
         "out does not depend on it",
     )
     masks: MasksFrom = setting(
-        "given",
+        "auto",
         "auto: masks that end outside of the object, as the photographs show it, are taken in",
     )
     cameras: CamerasFrom = setting(
-        "given",
+        "auto",
         "refined: the photographs' cameras are put right, before training and in it; auto: where "
         "their silhouettes contradict one another",
     )
     exposures: bool = setting(
-        False,
+        True,
         "whether photographs are looked at for exposures that differ; where they do, scene.varying "
         "becomes exposure, of none",
     )
@@ -273,13 +274,13 @@ class TrainConfig:
         False, "whether what the data set's files and links name may lie outside of its folder"
     )
     light_frame: LightFrameOrAuto = setting(
-        "world",
+        "auto",
         "what the light stands still in: the world of the cameras, or the room of a turntable, "
         "whose camera stood still too; auto: which of the two explains better how colours change "
         "from photograph to photograph. scene.turntable then holds the axis",
     )
     carving_seconds: float = setting(
-        0.0,
+        12.0,
         "that carving concavities before training may be expected to take on two cores, or they "
         "are left alone: those that no silhouette shows, where photographs agree on them. Never "
         "where their light varies, other than in exposure; 0: never",
@@ -293,7 +294,7 @@ class TrainConfig:
         least=0,
     )
     capacity: Capacity = setting(
-        "fixed", "adaptive: sizes above are limits, see training/compression.py"
+        "adaptive", "adaptive: sizes above are limits, see training/compression.py"
     )
     budget_mb: float | None = setting(
         None, "that the model's file may have; adaptive only", unit="1e6 bytes", above=0
@@ -358,9 +359,7 @@ def save_config(cfg: TrainConfig) -> None:
         OSError: it cannot be written.
     """
     values = {"version": __version__} | dataclasses.asdict(cfg)
-    text = json.dumps(values, indent=2, default=str)
-    with replacing(cfg.out / "config.json") as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_json(cfg.out / "config.json", values)
 
 
 def load_config(path: Path) -> TrainConfig:
@@ -400,13 +399,13 @@ def check_same(cfg: TrainConfig) -> None:
         raise UserError(f"{path}: expected an object with the configuration, got {before!r:.80}")
     began = _completed(before, cfg)
     # of configurations from before there were any
-    since = {"downscale": 1, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
-    since |= {"masks": "given", "cameras": "given", "exposures": False, "light_frame": "world"}
+    since = {"downscale": 1, "voxel_pixels": 0.0}
     began |= {name: value for name, value in since.items() if name not in before}
     now = _as_json(cfg)
     for one in (began, now):
         one["downscale"] = one["downscale"] or 1  # 0 was 1 before it was found
-    for name in ("stages", "scene", *since):
+    names = "stages scene downscale voxel_pixels capacity budget_mb masks cameras exposures"
+    for name in [*names.split(), "light_frame"]:
         if began.get(name) != now[name]:
             raise UserError(
                 f"{path}: the run began with other {name}: resume with the same "
@@ -426,10 +425,10 @@ def _completed(before: Any, now: Any) -> Any:
         return [_completed(b, n) for b, n in zip(before, now, strict=True)]
     if not dataclasses.is_dataclass(now) or not isinstance(before, dict):
         return before
-    result = without_retired(type(now), before)
+    result = without_retired(type(now), EARLIER.get(type(now).__name__, {}) | before)
     for known in dataclasses.fields(now):
-        if known.name in before:
-            result[known.name] = _completed(before[known.name], getattr(now, known.name))
+        if known.name in result:
+            result[known.name] = _completed(result[known.name], getattr(now, known.name))
         elif known.default is not dataclasses.MISSING:
             result[known.name] = _as_json(known.default)
         elif known.default_factory is not dataclasses.MISSING:

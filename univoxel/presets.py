@@ -217,25 +217,29 @@ def _configuration(
         share=0.15,
         rays=rays // 2,
         sharpness=(0.7, 0.35),
+        lr_sdf=(0.2, 0.02),
         lr_networks=lr_networks,
+        physical_from=1.0,
         patches_from=0.2 if compared else 1.0,  # before, there is no surface yet
-        field="hash",
     )
     fine = StageConfig(
         voxels=voxels,
         iterations=steps,
         share=0.85,
         rays=rays,
-        sharpness=(0.5, 0.3),
         lr_sdf=(work.lr_sdf, 0.005),
         lr_networks=lr_networks,
-        physical_from=0.3,
         patches_from=0.0 if compared else 1.0,
-        field="hash",
     )
     alone: dict[str, LightConfig] = {
         c.kind: c
-        for c in (SGConfig(), SHConfig(), MLPLightConfig(), EnvmapSGConfig(), EnvmapConfig())
+        for c in (
+            SGConfig(directions=128),
+            SHConfig(),
+            MLPLightConfig(),
+            EnvmapSGConfig(),
+            EnvmapConfig(),
+        )
     }
     match light:
         case "hybrid":
@@ -260,8 +264,6 @@ def _configuration(
         data,
         out,
         stages,
-        masks="auto",
-        cameras="auto",
         exposures=exposures,
         light_frame="auto"
         if isinstance(scene.light, LocalLightConfig) and known != "light"

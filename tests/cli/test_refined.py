@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 from analytic import LIGHTS, RADIUS, cameras_around, write_scene
+from plain import plain_stage, plain_training
 
 from lab.stress.damage import turned
 from univoxel.camera import project
 from univoxel.cli import trainer as task
 from univoxel.cli.trainer import train
-from univoxel.config import StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
 from univoxel.evaluation.confidence import survey
@@ -36,11 +37,11 @@ def data(tmp_path_factory):
 def config(data, out, cameras="auto") -> TrainConfig:
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
-        StageConfig(voxels=0.01, iterations=80, share=0.5, rays=256),
-        StageConfig(voxels=0.02, iterations=80, share=0.5, rays=256, physical_from=0.5),
+        plain_stage(voxels=0.01, iterations=80, share=0.5, rays=256),
+        plain_stage(voxels=0.02, iterations=80, share=0.5, rays=256, physical_from=0.5),
     )
     scene = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
-    return TrainConfig(
+    return plain_training(
         data, out, stages, minutes=2.0, cameras=cameras, scene=scene, voxel_pixels=0.0
     )
 

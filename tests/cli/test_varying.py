@@ -18,12 +18,13 @@ from observed_points import (
     problem_on_a_sphere,
     random_problem,
 )
+from plain import plain_stage, plain_training
 
 from univoxel.cli import main
 from univoxel.cli import trainer as task
 from univoxel.cli.trainer import train
 from univoxel.color import linear_to_srgb_unclipped
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import JointConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.lights import SGConfig
@@ -174,8 +175,8 @@ def test_training_explains_exposures(tmp_path):
     data = write_scene(tmp_path / "data", gain=2 ** stops(12, 1.5))
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
-        StageConfig(voxels=0.01, iterations=60, share=0.5, rays=256),
-        StageConfig(voxels=0.03, iterations=80, share=0.5, rays=256, physical_from=0.0),
+        plain_stage(voxels=0.01, iterations=60, share=0.5, rays=256),
+        plain_stage(voxels=0.03, iterations=80, share=0.5, rays=256, physical_from=0.0),
     )
     sizes = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
     photos = load_photos(data, "train")
@@ -185,7 +186,7 @@ def test_training_explains_exposures(tmp_path):
         auto = varying == "auto"
         scene = replace(sizes, varying="none" if auto else varying)
         run = tmp_path / varying
-        cfg = TrainConfig(data, run, stages, minutes=2.0, exposures=auto, scene=scene)
+        cfg = plain_training(data, run, stages, minutes=2.0, exposures=auto, scene=scene)
         learned = load_scene(train(cfg))
         assert learned.cfg.varying == ("exposure" if auto else varying)
         assert learned.cfg.views == (() if varying == "none" else tuple(photos.names))
@@ -197,8 +198,8 @@ def test_training_starts_from_the_exposures_that_were_seen(tmp_path, monkeypatch
     wanted = stops(12, 1.5).mean(1, keepdim=True).expand(-1, 3)
     data = write_scene(tmp_path / "data", gain=2**wanted)
     monkeypatch.setattr(task, "run_stage", lambda *_: None)
-    stages = (StageConfig(voxels=0.01, iterations=1, share=1.0),)
-    cfg = TrainConfig(data, tmp_path / "run", stages, minutes=1.0, exposures=True)
+    stages = (plain_stage(voxels=0.01, iterations=1, share=1.0),)
+    cfg = plain_training(data, tmp_path / "run", stages, minutes=1.0, exposures=True)
     found = load_scene(train(cfg)).views.log_gain.detach() / math.log(2)
     assert (found - wanted).square().mean().sqrt() < 0.1
 

@@ -15,11 +15,12 @@ from observed_points import (
     problem_on_a_sphere,
     random_problem,
 )
+from plain import plain_stage, plain_training
 from torch.nn.functional import normalize
 
 from univoxel import brdf
 from univoxel.cli import trainer as train_task
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import JointConfig
 from univoxel.lights.sg import SGConfig
 from univoxel.optim import RowAdam
 from univoxel.render.observations import MaterialLabels, Mirrors, prefiltered_roughness
@@ -378,11 +379,11 @@ def test_a_solve_that_was_killed_goes_on_in_its_round(tmp_path, monkeypatch):
     data = write_scene(tmp_path / "data", views=8, size=24)
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
-        StageConfig(voxels=0.01, iterations=10, share=0.4, rays=256, physical_from=0.5),
+        plain_stage(voxels=0.01, iterations=10, share=0.4, rays=256, physical_from=0.5),
         JointConfig(iterations=30, rounds=3, points=300, newton_points=100, rays=256, tracing=1),
     )
     sizes = SceneConfig(channels=4, material_channels=2, hidden=16, sky_nodes=32, light=light)
-    cfg = TrainConfig(data, tmp_path / "run", stages, minutes=5.0, scene=sizes)
+    cfg = plain_training(data, tmp_path / "run", stages, minutes=5.0, scene=sizes)
     started, newtons, steps = [], [], []
     initialise_, newton_round, objective = (
         joint_solve.initialise_,
@@ -425,7 +426,7 @@ def test_a_solve_that_was_killed_goes_on_in_its_round(tmp_path, monkeypatch):
 def test_a_refit_leaves_materials_bit_for_bit(tmp_path, monkeypatch):
     data = write_scene(tmp_path / "data", views=8, size=24)
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
-    stage = StageConfig(voxels=0.01, iterations=30, share=0.4, rays=256, physical_from=0.5)
+    stage = plain_stage(voxels=0.01, iterations=30, share=0.4, rays=256, physical_from=0.5)
     stages = (
         stage,
         JointConfig(iterations=20, points=300, newton_points=100, rays=256, tracing=1),
@@ -440,7 +441,7 @@ def test_a_refit_leaves_materials_bit_for_bit(tmp_path, monkeypatch):
         states.append({k: v.clone() for k, v in scene.state_dict().items()})
 
     monkeypatch.setattr(train_task, "run_stage", watched)
-    train_task.train(TrainConfig(data, tmp_path / "run", stages, minutes=2.0, scene=sizes))
+    train_task.train(plain_training(data, tmp_path / "run", stages, minutes=2.0, scene=sizes))
     start, formed, before, after = states
     kept = {k for k in after if torch.equal(before[k], after[k])}
     assert "sky.log_radiance" in kept

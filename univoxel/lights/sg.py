@@ -66,7 +66,7 @@ class SGConfig(LocalLightConfig):
     lobes: int = setting(16, "a point", least=1)
     hidden: int = setting(64, "width of the head", least=1)
     layers: int = setting(2, "hidden layers of the head", least=0, most=MOST_LAYERS)
-    directions: int = setting(128, "of the quadrature in training", least=1, most=MOST_DIRECTIONS)
+    directions: int = setting(64, "of the quadrature in training", least=1, most=MOST_DIRECTIONS)
     directions_eval: int = setting(
         256, "of the quadrature in evaluation", least=1, most=MOST_DIRECTIONS
     )
