@@ -221,12 +221,7 @@ def write_polycam(folder: Path, scene: Scene, place: str = "keyframes/corrected_
     return folder
 
 
-def write_metashape(
-    folder: Path,
-    scene: Scene,
-    calibration: str = "",
-    original: int = 1,
-) -> Path:
+def write_metashape(folder: Path, scene: Scene, calibration: str = "", original: int = 1) -> Path:
     """Labels without endings; a component that is turned, scaled and moved against the world."""
     write_pictures(folder, scene, "images", "masks", pad="_mask")
     height, width = (original * n for n in scene.pictures.shape[1:3])

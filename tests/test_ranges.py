@@ -14,9 +14,9 @@ from univoxel.capture.config import CaptureConfig
 from univoxel.config import JointConfig, MirrorConfig, StageConfig, TrainConfig
 from univoxel.errors import ConfigError
 from univoxel.evaluation.confidence import AdviceConfig
-from univoxel.lights import BakedConfig, EnvmapConfig, EnvmapSGConfig
+from univoxel.lights import BakedConfig, EnvmapConfig, EnvmapSGConfig, LightConfig
 from univoxel.lights.base import MOST_DIRECTIONS
-from univoxel.scene import LightConfig, SceneConfig
+from univoxel.scene import SceneConfig
 
 STAGE = plain_stage(voxels=1.0, iterations=10, share=1.0)
 TRAIN = plain_training(Path("photos"), Path("run"), (STAGE,), minutes=1.0)

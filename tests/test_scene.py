@@ -12,35 +12,24 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from univoxel import lights
 from univoxel.errors import ConfigError
 from univoxel.fields import field as fields
 from univoxel.fields.bricks import BrickDistances
 from univoxel.fields.features import Levels
 from univoxel.fields.field import dense_field, hash_field
 from univoxel.fields.grid import fit_grid
-from univoxel.lights import (
-    AbstractLocalLight,
-    BakedConfig,
-    EnvmapConfig,
-    EnvmapSGConfig,
-    MLPLightConfig,
-    SGConfig,
-    SHConfig,
-    build,
-    read_config,
-    scaled,
-)
 from univoxel.scene import FILE, SHELL, Scene, SceneConfig, load_checkpoint, load_scene, save_scene
 from univoxel.training.compression import drop_mirror_levels_
 from univoxel.training.loop import restore_surface_
 
 LIGHTS = [
-    SGConfig(lobes=3),
-    SHConfig(order=4),
-    MLPLightConfig(rank=5),
-    EnvmapSGConfig(lobes=7),
-    EnvmapConfig(rows=16),
-    BakedConfig(),
+    lights.SGConfig(lobes=3),
+    lights.SHConfig(order=4),
+    lights.MLPLightConfig(rank=5),
+    lights.EnvmapSGConfig(lobes=7),
+    lights.EnvmapConfig(rows=16),
+    lights.BakedConfig(),
 ]
 
 
@@ -50,7 +39,7 @@ def small_scene(light=None):
     field = dense_field(grid, 4, grid.nodes().norm(dim=-1) - 0.5)
     with torch.no_grad():
         field.features[3:6, 3:6, 3:6] = torch.randn(3, 3, 3, 4)
-    light = light or SGConfig()
+    light = light or lights.SGConfig()
     cfg = SceneConfig(channels=4, material_channels=2, hidden=8, mirror_levels=2, light=light)
     scene = Scene(cfg, field, inv_s=20.0)
     with torch.no_grad():
@@ -238,18 +227,18 @@ def test_a_slim_file_of_a_sparse_field_is_smaller(tmp_path):
 
 
 def test_lights_of_older_files_are_lobes():
-    assert read_config({"lobes": 4}) == SGConfig(lobes=4, directions=128)
+    assert lights.read_config({"lobes": 4}) == lights.SGConfig(lobes=4, directions=128)
 
 
 def test_an_unknown_light():
     with pytest.raises(ValueError, match=r"light must be one of sg, sh, .*, got 'candle'"):
-        read_config({"kind": "candle"})
+        lights.read_config({"kind": "candle"})
 
 
 @pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.kind)
 def test_local_light_knows_how_large_the_object_is(light):
-    of_size = scaled(light, 3.0)
-    local = isinstance(build(4, light), AbstractLocalLight)
+    of_size = lights.scaled(light, 3.0)
+    local = isinstance(lights.build(4, light), lights.AbstractLocalLight)
     assert getattr(of_size, "scale", None) == (3.0 if local else None)
 
 

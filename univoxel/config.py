@@ -9,13 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from univoxel import __version__
-from univoxel.core.choices import (
-    CamerasFrom,
-    Capacity,
-    FieldName,
-    LightFrameOrAuto,
-    MasksFrom,
-)
+from univoxel.core.choices import CamerasFrom, Capacity, FieldName, LightFrameOrAuto, MasksFrom
 from univoxel.core.files import read_json, write_json
 from univoxel.core.validation import (
     EARLIER,

@@ -6,19 +6,10 @@ import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+from univoxel import lights
 from univoxel.config import PREPARATION, JointConfig, LossConfig, StageConfig, TrainConfig
 from univoxel.core.choices import LIGHTS, Differing, FieldName, LightName, Metal
 from univoxel.errors import UserError
-from univoxel.lights import (
-    BakedConfig,
-    EnvmapConfig,
-    EnvmapSGConfig,
-    LightConfig,
-    LocalLightConfig,
-    MLPLightConfig,
-    SGConfig,
-    SHConfig,
-)
 from univoxel.scene import SceneConfig
 
 
@@ -231,25 +222,29 @@ def _configuration(
         lr_networks=lr_networks,
         patches_from=0.0 if compared else 1.0,
     )
-    alone: dict[str, LightConfig] = {
+    alone: dict[str, lights.LightConfig] = {
         c.kind: c
         for c in (
-            SGConfig(directions=128),
-            SHConfig(),
-            MLPLightConfig(),
-            EnvmapSGConfig(),
-            EnvmapConfig(),
+            lights.SGConfig(directions=128),
+            lights.SHConfig(),
+            lights.MLPLightConfig(),
+            lights.EnvmapSGConfig(),
+            lights.EnvmapConfig(),
         )
     }
     match light:
         case "hybrid":
             coarse, fine, joint, refit = _hybrid_stages(work, coarse, fine)
-            lobes = SGConfig(directions=round(work.directions))
+            lobes = lights.SGConfig(directions=round(work.directions))
             scene, loss = SceneConfig(light=lobes, varying=known), LossConfig()
             stages, capacity = (coarse, fine, joint, refit), "adaptive"
         case "baked":
             scene = SceneConfig(
-                sky_nodes=0, mirrored=False, light=BakedConfig(), varying=known, roughness=0.5
+                sky_nodes=0,
+                mirrored=False,
+                light=lights.BakedConfig(),
+                varying=known,
+                roughness=0.5,
             )
             stages, capacity, loss = (coarse, fine), "fixed", LossConfig()
         case _ if light in alone:
@@ -266,7 +261,7 @@ def _configuration(
         stages,
         exposures=exposures,
         light_frame="auto"
-        if isinstance(scene.light, LocalLightConfig) and known != "light"
+        if isinstance(scene.light, lights.LocalLightConfig) and known != "light"
         else "world",
         carving_seconds=CARVING * 60 * work.minutes,
         capacity=capacity,

@@ -16,6 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from univoxel import lights
 from univoxel.camera import PoseSteps
 from univoxel.core.choices import FieldName, Varying
 from univoxel.core.records import HALF_MAX, Bricks
@@ -27,17 +28,6 @@ from univoxel.fields.distances import PACKED, DenseDistances, SurfaceVersion, pa
 from univoxel.fields.features import HashFeatures, Levels, NodeFeatures
 from univoxel.fields.field import Field, MaterialHead, RadianceHead
 from univoxel.fields.grid import GridShape
-from univoxel.lights import (
-    AbstractLight,
-    AbstractLocalLight,
-    EnvmapLight,
-    EnvmapSGLight,
-    LightConfig,
-    LocalLightConfig,
-    SGConfig,
-    build,
-    read_config,
-)
 from univoxel.lights.base import MOST_ROWS, MirroredLight
 from univoxel.lights.latlong import DistantLight
 from univoxel.lights.views import Turntable, ViewLights
@@ -70,8 +60,8 @@ class SceneConfig:
     mirrored: bool = setting(
         True, "whether a local light gets a network for what is mirrored sharply"
     )
-    light: LightConfig = setting(
-        SGConfig(), "the light that photographs are rendered with, and its own sizes"
+    light: lights.LightConfig = setting(
+        lights.SGConfig(), "the light that photographs are rendered with, and its own sizes"
     )
     roughness: float | None = setting(
         None,
@@ -98,7 +88,7 @@ class SceneConfig:
         check_settings(self)
         most = f"at most channels ({self.channels})"
         check_fields(self, most, lambda x: x <= self.channels, "material_channels")
-        if self.turntable is not None and not isinstance(self.light, LocalLightConfig):
+        if self.turntable is not None and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
                 "SceneConfig: light that turns with the camera needs hybrid or a local light, sg, "
                 f"sh or mlp, got {self.light.kind}",
@@ -112,7 +102,7 @@ class SceneConfig:
                 "light_frame",
                 "varying",
             )
-        if self.varying == "light" and not isinstance(self.light, LocalLightConfig):
+        if self.varying == "light" and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
                 "SceneConfig: varying light needs hybrid or a local light, sg, sh or mlp, got "
                 f"{self.light.kind}; varying exposure goes with every light"
@@ -131,12 +121,12 @@ class Scene(nn.Module):
         codes = cfg.codes if cfg.varying == "light" else 0
         inputs = cfg.channels + codes  # of what draws photographs: features and the view's code
         self.radiance: RadianceHead = RadianceHead(inputs, cfg.hidden, cfg.mirror_levels)
-        self.light: AbstractLight = build(inputs, cfg.light)
+        self.light: lights.AbstractLight = lights.build(inputs, cfg.light)
         self.sky: DistantLight | None = None
         if cfg.sky_nodes:
             self.sky = DistantLight(cfg.sky_nodes, rows=cfg.sky_rows)
         self.mirrored = None
-        if cfg.mirrored and isinstance(cfg.light, LocalLightConfig):
+        if cfg.mirrored and isinstance(cfg.light, lights.LocalLightConfig):
             known = self.radiance.directions.channels
             self.mirrored: MirroredLight | None = MirroredLight(
                 inputs, cfg.hidden, cfg.light.scale, known
@@ -147,7 +137,7 @@ class Scene(nn.Module):
             self.views: ViewLights | None = ViewLights(cfg.views, codes, directions)
         self.poses: PoseSteps | None = PoseSteps(len(cfg.views)) if cfg.refined else None
         if codes:  # at first they change nothing
-            assert isinstance(self.light, AbstractLocalLight)
+            assert isinstance(self.light, lights.AbstractLocalLight)
             nets = [self.radiance.net, self.light.head]
             nets += [self.mirrored.net] if self.mirrored else []
             for net in nets:
@@ -237,9 +227,9 @@ class Scene(nn.Module):
         """For copies: what traces rays cannot be copied, and is made again."""
         return self.__dict__ | {"_traced": None, "_held": False}
 
-    def environment(self) -> DistantLight | EnvmapLight | EnvmapSGLight | None:
+    def environment(self) -> DistantLight | lights.EnvmapLight | lights.EnvmapSGLight | None:
         """The one distant map that the scene stood in, where it has one; without gains."""
-        if isinstance(self.light, EnvmapLight | EnvmapSGLight):
+        if isinstance(self.light, lights.EnvmapLight | lights.EnvmapSGLight):
             return self.light
         change = self.views.sky_change() if self.views else None
         if self.sky is None or self.views is None or self.views.chosen is None or change is None:
@@ -462,7 +452,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 def _description(meta: dict[str, Any], tensors: dict[str, Tensor]) -> Description:
     """The description, also of files from before there were all of its parts, which get them."""
     scene = dict(meta["scene"])
-    scene["light"] = read_config(scene["light"])
+    scene["light"] = lights.read_config(scene["light"])
     if "mirror_levels" not in scene:
         scene["mirror_levels"] = 0
         none = torch.zeros(0, dtype=torch.int32), torch.zeros(0, DirectionTable.per_level)

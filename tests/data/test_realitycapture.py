@@ -101,10 +101,7 @@ def only_a_head(folder):
             lambda f: (f / "cameras.csv").write_bytes(SHORT.encode() + b"\n\xff"),
             "cameras.csv: expected text in UTF-8",
         ),
-        (
-            lambda f: (f / "images").rename(f / "photos"),
-            "cameras.csv: no picture p_000.png, p_001.png, .*looked in .*images and",
-        ),
+        (lambda f: (f / "images").rename(f / "photos"), "cameras.csv: no picture p_000.png,"),
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, damage, message):

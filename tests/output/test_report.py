@@ -203,7 +203,7 @@ def test_what_time_cut_is_told(tmp_path):
     state |= {"took": [10.0, 20.0, 15.0], "stage_took": 5.0, "seconds": 57.0, "troubles": ["a"]}
     facts = report.stages(cfg, state)
     assert [f.fate for f in facts] == [
-        *("whole", "cut by the time limit", "ended early: nothing was left to gain", "not ended"),
+        *("whole", "cut by the time limit", "ended early: nothing was left to gain", "not ended")
     ]
     assert [f.seconds for f in facts] == [10.0, 20.0, 15.0, None]
     assert [f.name for f in facts][2:] == ["materials and light", "polish"]
@@ -254,7 +254,7 @@ def test_a_run_whose_photographs_are_gone_shows_what_is_left(run, data, tmp_path
     assert "The photographs cannot be read, so this is left out: " in said
     assert "gone" in said
     assert re.findall(r"<h2>(.*?)</h2>", text) == [
-        *("Result", "What to photograph next", "Materials", "Light", "Training"),
+        *("Result", "What to photograph next", "Materials", "Light", "Training")
     ]
     assert "no log of this training" in text
     # Where they are now
@@ -312,10 +312,7 @@ def test_by_the_command_line(run, capfd, tmp_path):
     for arguments, message in (
         ([str(tmp_path)], f"no checkpoint in {tmp_path}"),
         ([str(run.path), "--views", "-1"], "--views must be at least 0, got -1"),
-        (
-            [str(run.path), "--html", "a.pdf"],
-            "--html: expected a file that ends in .html, got a.pdf",
-        ),
+        ([str(run.path), "--html", "a.pdf"], "--html: expected a file that ends in .html, got"),
         ([str(run.path), "--data", str(tmp_path / "none")], "none"),
     ):
         assert main(["report", *arguments]) == 2

@@ -293,7 +293,7 @@ def test_a_system_is_damped_only_as_it_needs():
 def test_a_newton_round_without_a_solution_leaves_the_map(monkeypatch):
     scene = sphere_scene(32)
     problem = problem_on_a_sphere(100, 12, 32, scene)
-    monkeypatch.setattr(newton, "solve_damped", lambda *_: None)
+    monkeypatch.setattr(newton.equations, "solve_damped", lambda *_: None)
     solved = newton.newton_round_(scene, problem, no_metal(problem), JOINT)
     assert solved == newton.NewtonRound([], [newton.UNSOLVABLE])
     assert (scene.sky.log_radiance == 0).all()

@@ -117,10 +117,7 @@ def recorded(folder: Path, step: str) -> Any:
 
 
 def done(
-    folder: Path,
-    step: str,
-    fingerprint: Any,
-    refusal: Callable[[Any], ExistingFile] | None = None,
+    folder: Path, step: str, fingerprint: Any, refusal: Callable[[Any], ExistingFile] | None = None
 ) -> bool:
     """Whether a step is done.
 

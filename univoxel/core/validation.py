@@ -46,30 +46,12 @@ RETIRED: dict[str, frozenset[str]] = {
 # By class. Values of fields that a file may lack, where the class has another default by now: what
 # the field had when versions up to 0.2 wrote files
 EARLIER: dict[str, dict[str, Any]] = {
-    "TrainConfig": {
-        "scene": {},
-        "masks": "given",
-        "cameras": "given",
-        "exposures": False,
-        "light_frame": "world",
-        "carving_seconds": 0.0,
-        "capacity": "fixed",
-    },
-    "StageConfig": {
-        "sharpness": [0.5, 0.5],
-        "lr_sdf": [0.2, 0.02],
-        "lr_networks": [3e-3, 3e-4],
-        "physical_from": 1.0,
-        "patches_from": 1.0,
-        "field": "dense",
-    },
-    "JointConfig": {
-        "iterations": 700,
-        "share": 0.4,
-        "rays": 4096,
-        "points": 20000,
-        "newton_points": 4000,
-    },
+    "TrainConfig": {"scene": {}, "masks": "given", "cameras": "given", "exposures": False}
+    | {"light_frame": "world", "carving_seconds": 0.0, "capacity": "fixed"},
+    "StageConfig": {"sharpness": [0.5, 0.5], "lr_sdf": [0.2, 0.02], "lr_networks": [3e-3, 3e-4]}
+    | {"physical_from": 1.0, "patches_from": 1.0, "field": "dense"},
+    "JointConfig": {"iterations": 700, "share": 0.4, "rays": 4096, "points": 20000}
+    | {"newton_points": 4000},
     "SceneConfig": {"light": {}},
     "SGConfig": {"directions": 128},
 }

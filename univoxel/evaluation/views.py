@@ -55,12 +55,7 @@ class ViewMeasures:
 
 
 def relighting_of(
-    scene: Scene,
-    mesh: Mesh | None,
-    truth: SceneTruth,
-    scales: Scales,
-    samples: int,
-    bounces: int,
+    scene: Scene, mesh: Mesh | None, truth: SceneTruth, scales: Scales, samples: int, bounces: int
 ) -> Relighting | None:
     """What test views are relit with, where there are maps to relight them under."""
     if not truth.maps or mesh is None:

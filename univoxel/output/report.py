@@ -223,10 +223,7 @@ def write_report(run: str | Path, path: str | Path, **options: Any) -> Path:
 
 @torch.no_grad()
 def report_text(
-    run: Path,
-    scene: Scene,
-    state: dict[str, Any],
-    options: ReportOptions = ReportOptions(),
+    run: Path, scene: Scene, state: dict[str, Any], options: ReportOptions = ReportOptions()
 ) -> str:
     """The report of a scene as HTML; errors as of `write_report`.
 

@@ -86,11 +86,7 @@ def orbit(
 
 
 def views_of(
-    run: Path,
-    cameras: str | Path | Cameras,
-    resolution: int | None,
-    elevation: float,
-    mesh: Mesh,
+    run: Path, cameras: str | Path | Cameras, resolution: int | None, elevation: float, mesh: Mesh
 ) -> tuple[list[str], Cameras]:
     """Names of the views, and their cameras; arguments as of `cli.relight.RelightOptions`.
 
