@@ -36,12 +36,6 @@ def test_distortion_is_taken_out(tmp_path):
     assert "lens distortion taken out" in photos.about
 
 
-def test_sensors_of_larger_originals(tmp_path):
-    cameras = load_photos(write_metashape(tmp_path, scene(), original=4)).cameras
-    assert cameras.focal.unique().tolist() == [FOCAL]
-    assert cameras.centre[0].tolist() == [6, 4]
-
-
 def edited(*changes):
     def apply(folder):
         path = folder / "cameras.xml"
@@ -97,12 +91,6 @@ def test_a_chunk_without_components(tmp_path):
     found = load_photos(tmp_path).cameras.camera_to_world[:, :, 3]
     wanted = written.poses[written.split("train"), :3, 3]
     np.testing.assert_allclose(found, wanted, atol=1e-5)
-
-
-def test_pictures_that_are_not_there(tmp_path):
-    write_metashape(tmp_path, scene())
-    (tmp_path / "images" / "p_001.png").unlink()
-    assert "1 of 10 listed left out" in load_photos(tmp_path).about
 
 
 SENSOR = '<sensor id="3" label="unknown" type="frame">'

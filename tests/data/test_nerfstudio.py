@@ -71,10 +71,6 @@ def other_size(folder):
     write_png(folder / "images" / "p_008.png", np.ones((HEIGHT, 9, 3), np.uint8))
 
 
-def other_mask(folder):
-    write_png(folder / "masks" / "p_001.png", np.ones((WIDTH, HEIGHT), np.uint8))
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -91,7 +87,3 @@ def other_mask(folder):
 )
 def test_broken_files(data, change, message):
     refused(data, change, message, "test")
-
-
-def test_a_mask_of_another_size(data):
-    refused(data, other_mask, r"masks/p_001\.png: expected 12x8 pixels, got 8x12")
