@@ -21,7 +21,7 @@ from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.lights import SGConfig
 from univoxel.preparation import prepare as preparation
-from univoxel.presets import preset, with_field
+from univoxel.presets import with_field
 from univoxel.render.pipeline import extract_mesh
 from univoxel.run import load_verdict
 from univoxel.run import photos_of as photos_of_run
@@ -364,13 +364,6 @@ def test_pixels_are_those_in_and_near_silhouettes():
     assert found.dtype == torch.int32  # photographs have many
     wanted = (distance < pixels_module.MARGIN).nonzero().tolist()
     assert sorted(found.tolist()) == wanted
-
-
-def test_unknown_preset(tmp_path):
-    with pytest.raises(
-        ValueError, match="preset must be one of draft, fast, full, best, got 'quick'"
-    ):
-        preset("quick", tmp_path, tmp_path)
 
 
 def test_a_training_says_how_it_came_out(data, tmp_path, caplog):
