@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -296,6 +297,30 @@ def write_tensoir(folder: Path, scene: Scene) -> Path:
             }
             (view / "metadata.json").write_text(json.dumps(meta))
     return folder
+
+
+def replaced(file: str, *changes: tuple[str, str]) -> Callable[[Path], None]:
+    """Damage to a text file of a folder: pieces, each by another."""
+
+    def apply(folder: Path) -> None:
+        text = (folder / file).read_text()
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        (folder / file).write_text(text)
+
+    return apply
+
+
+def edited(file: str, change: Callable[[Any], object]) -> Callable[[Path], None]:
+    """Damage to a JSON file of a folder."""
+
+    def apply(folder: Path) -> None:
+        root = json.loads((folder / file).read_text())
+        change(root)
+        (folder / file).write_text(json.dumps(root))
+
+    return apply
 
 
 def refused(folder: Path, damage: Callable[[Path], object], message: str, split="train") -> None:

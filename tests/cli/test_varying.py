@@ -19,6 +19,7 @@ from observed_points import (
     random_problem,
 )
 from plain import plain_stage, plain_training
+from tiny import OPTIONS
 
 from univoxel.cli import main
 from univoxel.cli import trainer as task
@@ -206,15 +207,8 @@ def test_training_starts_from_the_exposures_that_were_seen(tmp_path, monkeypatch
 
 def test_the_light_of_a_view_from_the_command_line(tmp_path, capsys):
     data = write_scene(tmp_path / "data", views=6, size=16)
-    small = [
-        *(f"--set=stages.{i}.{name}" for i in (0, 1, 3) for name in ("voxels=0.004", "rays=64")),
-        *(f"--set=stages.{i}.iterations=2" for i in (0, 2, 3)),
-        *("--set=stages.1.iterations=20", "--set=stages.1.physical_from=0.0"),
-        *("--set=stages.2.rays=64", "--set=stages.2.points=64", "--set=stages.2.newton_points=8"),
-        *("--set=scene.sky_nodes=32", "--set=scene.light.directions=8"),
-    ]
     run = tmp_path / "run"
-    assert main(["train", str(data), "--out", str(run), "--varying", "light", *small]) == 0
+    assert main(["train", str(data), "--out", str(run), "--varying", "light", *OPTIONS]) == 0
     with torch.no_grad():  # 20 steps make no difference to see
         scene, state = load_checkpoint(run)
         scene.views.sky_weights.normal_()

@@ -1,14 +1,18 @@
 """Metashape's XML: lenses, components and errors. Axes are checked by test_layouts."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
-from layouts import FOCAL, HEIGHT, WIDTH, refused, scene, write_metashape
+from layouts import FOCAL, HEIGHT, WIDTH, refused, replaced, scene, write_metashape
 
 from univoxel.data import load_photos, photogrammetry
 
 TERMS = {"k1": 0.03, "k2": -0.02, "k3": 0.01, "k4": 0.05, "p1": 0.004, "p2": -0.007}
 OFFSETS = {"cx": 0.75, "cy": -0.5, "b1": 0.4}
+
+edited = partial(replaced, "cameras.xml")
 
 
 def calibration(**terms):
@@ -34,18 +38,6 @@ def test_lenses_bend_as_the_manual_says(tmp_path):
 def test_distortion_is_taken_out(tmp_path):
     photos = load_photos(write_metashape(tmp_path, scene(), calibration(k1=0.01)))
     assert "lens distortion taken out" in photos.about
-
-
-def edited(*changes):
-    def apply(folder):
-        path = folder / "cameras.xml"
-        text = path.read_text()
-        for old, new in changes:
-            assert old in text
-            text = text.replace(old, new)
-        path.write_text(text)
-
-    return apply
 
 
 def test_coordinates_of_the_earth_are_moved_to_the_origin(tmp_path):

@@ -1,22 +1,15 @@
 """sfm_scene.json: what it may say, and errors. Axes are checked by test_layouts."""
 
-import json
+from functools import partial
 
+import layouts
 import numpy as np
 import pytest
 from layouts import refused, scene, write_neilf
 
 from univoxel.data import load_photos
 
-
-def edited(change):
-    def apply(folder):
-        path = folder / "inputs" / "sfm_scene.json"
-        root = json.loads(path.read_text())
-        change(root)
-        path.write_text(json.dumps(root))
-
-    return apply
+edited = partial(layouts.edited, "inputs/sfm_scene.json")
 
 
 def image(change):

@@ -1,20 +1,15 @@
 """transforms.json of nerfstudio and instant-ngp: what it may say, and errors."""
 
-import json
-
 import numpy as np
 import pytest
-from layouts import FOCAL, HEIGHT, WIDTH, angle, refused, scene, write_nerfstudio
+from layouts import FOCAL, HEIGHT, WIDTH, angle, edited, refused, scene, write_nerfstudio
 
 from univoxel.data import load_photos
 from univoxel.data.images import write_png
 
 
 def edit(folder, change):
-    path = folder / "transforms.json"
-    root = json.loads(path.read_text())
-    change(root)
-    path.write_text(json.dumps(root))
+    edited("transforms.json", change)(folder)
 
 
 @pytest.fixture

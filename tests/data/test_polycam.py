@@ -1,7 +1,6 @@
 """Polycam's raw data: where it lies, and errors. Axes are checked by test_layouts."""
 
-import json
-
+import layouts
 import pytest
 from layouts import FOCAL, refused, scene, write_polycam
 
@@ -9,11 +8,8 @@ from univoxel.data import load_photos
 
 
 def edited(**values):
-    def apply(folder):
-        path = folder / "keyframes" / "corrected_cameras" / "p_003.json"
-        path.write_text(json.dumps(json.loads(path.read_text()) | values))
-
-    return apply
+    name = "keyframes/corrected_cameras/p_003.json"
+    return layouts.edited(name, lambda camera: camera.update(values))
 
 
 @pytest.mark.parametrize("place", ["keyframes/corrected_", "keyframes/", "corrected_"])

@@ -1,11 +1,12 @@
 """RealityCapture's CSV: lenses, columns and errors. Angles are checked by test_layouts."""
 
 import re
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from layouts import FOCAL, refused, scene, write_realitycapture
+from layouts import FOCAL, refused, replaced, scene, write_realitycapture
 
 from univoxel.data import load_photos, photogrammetry
 from univoxel.errors import DataError
@@ -22,6 +23,9 @@ def test_columns(tmp_path, head, lens):
     assert len(photos) == 8
     assert photos.cameras.focal.unique().tolist() == pytest.approx([FOCAL])
     assert photos.cameras.centre[0].tolist() == [6, 4]
+
+
+edited = partial(replaced, "cameras.csv")
 
 
 def test_lenses_bend_as_the_vendor_says(tmp_path):
@@ -46,18 +50,6 @@ def test_coordinates_of_the_earth_are_moved_to_the_origin(tmp_path):
     place = photos.cameras.camera_to_world[:, :, 3]
     wanted = torch.from_numpy(written.poses[written.split("train"), :3, 3]).float()
     torch.testing.assert_close(torch.cdist(place, place), torch.cdist(wanted, wanted))
-
-
-def edited(*changes):
-    def apply(folder):
-        path = folder / "cameras.csv"
-        text = path.read_text()
-        for old, new in changes:
-            assert old in text
-            text = text.replace(old, new)
-        path.write_text(text)
-
-    return apply
 
 
 def test_pictures_that_are_not_there_and_names_with_folders(tmp_path):
