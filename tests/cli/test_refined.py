@@ -18,6 +18,7 @@ from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
 from univoxel.evaluation.confidence import survey
 from univoxel.lights import SGConfig
+from univoxel.preparation import pose_refinement
 from univoxel.preparation.prepare import find_silhouettes
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig, load_scene
@@ -98,7 +99,8 @@ def test_given_cameras_are_only_complained_about(data, tmp_path, caplog):
 
 def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):
     """From a checkpoint after the first stage: the box and the cameras are as they were."""
-    cfg = config(data, tmp_path / "run")
+    monkeypatch.setattr(pose_refinement, "STEPS", 10)
+    cfg = config(data, tmp_path / "run", cameras="refined")
     original, stages = task.run_stage, []
 
     def killed(scene, cfg, stage, *rest):
@@ -120,9 +122,10 @@ def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.kind)
-def test_cameras_are_refined_under_every_light(data, tmp_path, light):
+def test_cameras_are_refined_under_every_light(data, tmp_path, monkeypatch, light):
     """The directions to them have gradients, then, and what is drawn under the light takes some."""
-    cfg = config(data, tmp_path / "run")
+    monkeypatch.setattr(pose_refinement, "STEPS", 10)
+    cfg = config(data, tmp_path / "run", cameras="refined")
     stage = replace(cfg.stages[1], iterations=5, physical_from=0.0)
     cfg = replace(cfg, stages=(stage,), scene=replace(cfg.scene, light=light, sky_nodes=0))
     scene = load_scene(train(cfg))

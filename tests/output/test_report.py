@@ -32,6 +32,9 @@ from univoxel.scene import load_checkpoint, save_scene
 from univoxel.sphere import latlong_directions
 
 SIZE, VIEWS, SECTOR = 24, 24, 90.0  # pixels, photographs, azimuth that none is taken from
+# Nothing is found out before training
+GIVEN = {"carving_seconds": 0.0, "masks": "given", "cameras": "given"}
+GIVEN |= {"exposures": False, "light_frame": "world"}
 STAGES = tuple(
     f"stages.{i}.{field}"
     for i in (0, 1)
@@ -61,8 +64,7 @@ def data(tmp_path_factory):
 def run(data, tmp_path_factory):
     """A run with local light alone, and no map."""
     out = tmp_path_factory.mktemp("sphere") / "run"
-    changes = [*STAGES, "voxel_pixels=0", "carving_seconds=0", "masks=given", "cameras=given"]
-    changes += ["exposures=False", "light_frame=world"]
+    changes = [*STAGES, "voxel_pixels=0", *(f"{name}={value}" for name, value in GIVEN.items())]
     return univoxel.train(data, out, light="sg", minutes=2, changes=changes)
 
 
@@ -293,7 +295,7 @@ def test_a_training_that_was_cancelled_is_shown_too(data, tmp_path, monkeypatch)
     small = [replace(s, voxels=0.01, rays=64, iterations=5) for s in cfg.stages]
     with pytest.raises(univoxel.Cancelled):
         train(
-            replace(cfg, stages=tuple(small), carving_seconds=0.0, voxel_pixels=0.0),
+            replace(cfg, stages=tuple(small), voxel_pixels=0.0, **GIVEN),
             on_progress=cancel,
         )
     text = univoxel.open_run(tmp_path / "run").report(size=SIZE, views=0).read_text()
