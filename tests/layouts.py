@@ -263,7 +263,6 @@ def write_realitycapture(
     scene: Scene,
     head: str = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
     lens: str = "0,0,0,0,0,0,0,0",
-    shift: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> Path:
     """Angles by the vendor's matrix from the world to the camera, y = pitch, x = roll, z = heading:
 
@@ -276,7 +275,7 @@ def write_realitycapture(
         m = to_camera(pose)
         pitch = math.asin(-m[1, 2])
         heading, roll = math.atan2(-m[1, 0], -m[1, 1]), math.atan2(-m[0, 2], -m[2, 2])
-        values = [*(pose[:3, 3] + shift), *map(math.degrees, (heading, pitch, roll))]
+        values = [*pose[:3, 3], *map(math.degrees, (heading, pitch, roll))]
         values.append(FOCAL / side * 36)
         lines.append(",".join([f"{name}.png", *(repr(float(x)) for x in values), lens]).rstrip(","))
     (folder / "cameras.csv").write_text("\n".join(lines) + "\n")

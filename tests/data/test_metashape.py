@@ -4,7 +4,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch
 from layouts import FOCAL, HEIGHT, WIDTH, refused, replaced, scene, write_metashape
 
 from univoxel.data import load_photos, photogrammetry
@@ -38,18 +37,6 @@ def test_lenses_bend_as_the_manual_says(tmp_path):
 def test_distortion_is_taken_out(tmp_path):
     photos = load_photos(write_metashape(tmp_path, scene(), calibration(k1=0.01)))
     assert "lens distortion taken out" in photos.about
-
-
-def test_coordinates_of_the_earth_are_moved_to_the_origin(tmp_path):
-    """Distances between cameras stay as exact as float32 has them."""
-    written = scene()
-    write_metashape(tmp_path, written)
-    edited(("<translation>0.5 -1.0 0.25", "<translation>4100000.5 899999.0 4800000.25"))(tmp_path)
-    photos = load_photos(tmp_path)
-    assert "world moved by -4100000 -900000 -480000" in photos.about
-    place = photos.cameras.camera_to_world[:, :, 3]
-    wanted = torch.from_numpy(written.poses[written.split("train"), :3, 3]).float()
-    torch.testing.assert_close(torch.cdist(place, place), torch.cdist(wanted, wanted))
 
 
 def test_the_largest_component_is_read(tmp_path):

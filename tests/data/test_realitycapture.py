@@ -1,11 +1,9 @@
 """RealityCapture's CSV: lenses, columns and errors. Angles are checked by test_layouts."""
 
-import re
 from functools import partial
 
 import numpy as np
 import pytest
-import torch
 from layouts import FOCAL, refused, replaced, scene, write_realitycapture
 
 from univoxel.data import load_photos, photogrammetry
@@ -41,15 +39,6 @@ def test_lenses_bend_as_the_vendor_says(tmp_path):
     bent_y = y * radial - 0.007 * (rr + 2 * y * y) + 2 * 0.004 * x * y
     np.testing.assert_allclose(u, 6 + 12 * 0.05 + bent_x * FOCAL, rtol=1e-12)
     np.testing.assert_allclose(v, 4 - 12 * 0.025 + bent_y * FOCAL, rtol=1e-12)
-
-
-def test_coordinates_of_the_earth_are_moved_to_the_origin(tmp_path):
-    written = scene()
-    photos = load_photos(write_realitycapture(tmp_path, written, shift=(391234.5, 5.82e6, 34.0)))
-    assert re.search(r"world moved by -39123\d -5820000 -3\d", photos.about)
-    place = photos.cameras.camera_to_world[:, :, 3]
-    wanted = torch.from_numpy(written.poses[written.split("train"), :3, 3]).float()
-    torch.testing.assert_close(torch.cdist(place, place), torch.cdist(wanted, wanted))
 
 
 def test_pictures_that_are_not_there_and_names_with_folders(tmp_path):
