@@ -19,9 +19,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 37_020,
-    "lines of the laboratory": 3_000,
-    "lines of tests": 36_750,
+    "lines of the package": 36_925,
+    "lines of the laboratory": 2_980,
+    "lines of tests": 36_345,
     "modules of the package": 160,
     "loose modules at the top": 12,
     "configuration fields": 128,
