@@ -423,6 +423,8 @@ def _completed(before: Any, now: Any) -> Any:
     for known in dataclasses.fields(now):
         if known.name in result:
             result[known.name] = _completed(result[known.name], getattr(now, known.name))
+        elif known.name == "kind":  # of a light: files from before there were others do not say
+            result["kind"] = "sg"
         elif known.default is not dataclasses.MISSING:
             result[known.name] = _as_json(known.default)
         elif known.default_factory is not dataclasses.MISSING:

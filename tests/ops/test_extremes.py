@@ -312,6 +312,3 @@ def test_rays_at_the_edge_meet_what_they_should(seed, n):
     assert hit.face[n] == 0
     # Rounding: where there is no AVX-512, Embree divides by a refined estimate
     torch.testing.assert_close(hit.t[n], torch.tensor(1.0))
-
-
-# --- strides
