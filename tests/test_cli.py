@@ -10,6 +10,7 @@ import sys
 import types
 from dataclasses import fields
 from dataclasses import replace as replace_fields
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,6 @@ import univoxel
 from univoxel import cli, errors
 from univoxel.cli import COMMANDS, LABORATORY, SPINS, laboratory, main
 from univoxel.cli.parsing import meanings, takes
-from univoxel.config import JointConfig
 from univoxel.errors import ExistingFile, MissingExtra, MissingFile, ProcessFailed, UserError
 from univoxel.presets import chosen
 
@@ -225,25 +225,26 @@ def test_downscale_out_of_range(calls, tmp_path, capsys, command, factor):
     assert not calls.noted
 
 
-def test_train_is_told_what_is_metal(calls, tmp_path):
-    assert main(["train", "photos", "--out", str(tmp_path / "run"), "--metal", "all"]) == 0
-    (joint,) = (s for s in calls.noted[0][1][0].stages if isinstance(s, JointConfig))
-    assert joint.only_metal is True
+def of_stage(number, name):
+    return lambda config: getattr(config.stages[number], name)
 
 
 @pytest.mark.parametrize(
-    ("options", "expected"),
+    ("options", "of", "expected"),
     [
-        ([], ("adaptive", None)),
-        (["--capacity", "adaptive"], ("adaptive", None)),
-        (["--capacity", "fixed"], ("fixed", None)),
-        (["--budget-mb", "2.5"], ("adaptive", 2.5)),
+        ([], attrgetter("capacity", "budget_mb"), ("adaptive", None)),
+        (["--capacity", "adaptive"], attrgetter("capacity", "budget_mb"), ("adaptive", None)),
+        (["--capacity", "fixed"], attrgetter("capacity", "budget_mb"), ("fixed", None)),
+        (["--budget-mb", "2.5"], attrgetter("capacity", "budget_mb"), ("adaptive", 2.5)),
+        (["--metal", "all"], of_stage(2, "only_metal"), True),
+        (["--field", "sparse"], attrgetter("capacity"), "fixed"),
+        (["--field", "sparse", "--set=stages.1.voxels=30"], of_stage(1, "field"), "sparse"),
+        (["--field", "sparse", "--set=stages.1.voxels=30"], of_stage(1, "voxels"), 30.0),
     ],
 )
-def test_train_fits_the_model_to_the_scene(calls, tmp_path, options, expected):
+def test_what_options_make_of_the_configuration(calls, tmp_path, options, of, expected):
     assert main(["train", "photos", "--out", str(tmp_path / "run"), *options]) == 0
-    config = calls.noted[0][1][0]
-    assert (config.capacity, config.budget_mb) == expected
+    assert of(calls.noted[0][1][0]) == expected
 
 
 def test_info(calls, capsys):
@@ -251,14 +252,6 @@ def test_info(calls, capsys):
     expected = {"json": Path("a.json"), "picture": Path("b.png")}
     assert calls.noted == [("info", (Path("run"),), expected)]
     assert capsys.readouterr().out == "parts\nsizes\nlobes 24 -> 12\n"
-
-
-def test_train_takes_a_sparse_field_before_changes(calls, tmp_path):
-    options = ["--field", "sparse", "--set", "stages.1.voxels=30"]
-    assert main(["train", "photos", "--out", str(tmp_path / "run"), *options]) == 0
-    config = calls.noted[0][1][0]
-    assert (config.stages[1].field, config.stages[1].voxels) == ("sparse", 30.0)
-    assert config.capacity == "fixed"
 
 
 def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
