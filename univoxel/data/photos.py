@@ -25,7 +25,7 @@ class Photos:
     cameras: Cameras
     about: str = ""  # what was read and how, for people
     downscale: int = 1  # pixels of the files along a side of one of these
-    origin: str = ""  # of pixels that are not those of the files, as of `kept.origin_of`
+    origin: str = ""  # of pixels that are not those of the files, as of `image_cache.origin_of`
 
     def __len__(self) -> int:
         return len(self.names)

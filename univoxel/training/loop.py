@@ -26,7 +26,7 @@ from univoxel.training import descent, patches
 from univoxel.training.pixels import TrainingPixels
 from univoxel.training.progress import Listener
 
-# Cadences: steps from one to the next. plateau.CHECK is a share of the schedule instead; reports
+# Cadences: steps from one to the next. CHECK of descent.py is a share of the schedule; reports
 # and checkpoints come by time, REPORT_SECONDS and CHECKPOINT_SECONDS in progress.py
 REFRESH = 16  # looks at which bricks are empty
 RETRACE = 100  # traces of light through the surface as it has become
