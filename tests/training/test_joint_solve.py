@@ -101,7 +101,7 @@ def test_solve_recovers_albedo_and_map():
     scene = sphere_scene(nodes)
     before = {k: v.clone() for k, v in scene.state_dict().items()}
     cfg = JointConfig(points=1500, newton_points=1000, rays=1024, tracing=1, rounds=3, lr_sdf=0.0)
-    joint_solve.solve(scene, photos, cfg, 0, Steps(450))
+    joint_solve.solve(scene, photos, cfg, 0, Steps(300))
     after = scene.state_dict()
     changed = {k.split(".")[0] for k in after if not torch.equal(after[k], before[k])}
     assert changed == {"field", "material", "sky"}
@@ -138,7 +138,7 @@ def test_bumps_that_shading_contradicts_are_smoothed():
     before = off()
     occluder = scene.occluder()
     cfg = JointConfig(points=1500, newton_points=500, rays=1024, tracing=1, rounds=2)
-    joint_solve.solve(scene, photos, cfg, 0, Steps(300))
+    joint_solve.solve(scene, photos, cfg, 0, Steps(200))
     assert off() < 0.75 * before  # some is left: pixels are three quarters of a voxel wide
     moved = scene.field.sample(at).sdf.abs().mean()
     assert moved < 0.3 * scene.field.voxel_size  # it turns, and stays where it is
