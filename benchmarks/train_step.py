@@ -55,7 +55,7 @@ STAGES = {
         *((base, name) for name in ("smoothness", "chroma", "total_variation")),
     ],
     "optimiser": [(RowAdam, "step")],
-    "smoothing": [(loop, "smooth_touched_"), (loop, "smooth_sdf_gradient_")],
+    "smoothing": [(loop.descent, "smooth_touched_"), (loop.descent, "smooth_sdf_gradient_")],
     "refresh": [(Field, "refresh")],
 }
 BACKWARD = "backward"

@@ -12,7 +12,7 @@ from lab.plots import Measure
 from lab.record import Outcome, Setting, result_text
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.core.choices import LIGHTS, LightName
-from univoxel.core.files import replacing
+from univoxel.core.files import write_text
 from univoxel.errors import ProcessFailed, UserError
 
 BETWEEN = (3, 6)  # minutes, where the curve is looked at between the presets
@@ -101,8 +101,7 @@ def chart(
         "fronts": fronts(outcomes),
         "published": [asdict(point) for point in PUBLISHED],
     }
-    with replacing(out / "chart.json") as temporary:
-        temporary.write_text(result_text(record), encoding="utf-8")
+    write_text(out / "chart.json", result_text(record))
     if any(not outcome.error for outcome in outcomes):
         plot(outcomes, out / "chart")
     if failed := runner.failures(outcomes):

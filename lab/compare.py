@@ -10,7 +10,7 @@ from lab import plots, runner
 from lab.plots import Measure
 from lab.record import Outcome, Setting, result_text
 from univoxel.core.choices import LIGHTS, LightName
-from univoxel.core.files import replacing
+from univoxel.core.files import write_text
 from univoxel.errors import ProcessFailed, UserError
 
 COLUMNS = (
@@ -71,10 +71,8 @@ def compare(
         "machine": plots.machine(),
         "rows": [outcome.summary() for outcome in outcomes],
     }
-    with replacing(out / "compare.json") as temporary:
-        temporary.write_text(result_text(record), encoding="utf-8")
-    with replacing(out / "compare.md") as temporary:
-        temporary.write_text(markdown(outcomes), encoding="utf-8")
+    write_text(out / "compare.json", result_text(record))
+    write_text(out / "compare.md", markdown(outcomes))
     if any(not outcome.error for outcome in outcomes):
         plot(outcomes, out / "compare")
     if failed := runner.failures(outcomes):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from univoxel import __version__
-from univoxel.core.files import replacing
+from univoxel.core.files import write_bytes
 from univoxel.core.machine import processor
 from univoxel.errors import MissingExtra
 
@@ -73,8 +73,7 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
     for path in paths:
         encoded = io.BytesIO()
         figure.savefig(encoded, format=path.suffix[1:], dpi=110, bbox_inches="tight")
-        with replacing(path) as temporary:
-            temporary.write_bytes(encoded.getvalue())
+        write_bytes(path, encoded.getvalue())
     return paths
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from univoxel.config import TrainConfig
 from univoxel.core.choices import LightName
-from univoxel.core.files import read_json, replacing
+from univoxel.core.files import read_json, write_json
 from univoxel.core.validation import changed, check_fields
 from univoxel.errors import DataError
 from univoxel.presets import chosen
@@ -74,9 +74,7 @@ class Outcome:
         Raises:
             OSError: it cannot be written.
         """
-        with replacing(folder / RESULT) as temporary:
-            text = json.dumps(dataclasses.asdict(self), indent=1)
-            temporary.write_text(text + "\n", encoding="utf-8")
+        write_json(folder / RESULT, dataclasses.asdict(self))
 
     def summary(self) -> dict[str, Any]:
         """All but the identity, which result.json keeps."""

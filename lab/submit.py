@@ -20,7 +20,6 @@ orb/utils/env_map.py.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import torch
@@ -29,7 +28,7 @@ from torch import Tensor
 from univoxel.camera import Cameras, resize
 from univoxel.cli.export import export
 from univoxel.core.choices import BOUNCES, SAMPLES
-from univoxel.core.files import replacing
+from univoxel.core.files import write_json
 from univoxel.core.progress_bar import track
 from univoxel.core.records import Mesh
 from univoxel.data import Photos
@@ -90,9 +89,7 @@ def submit(
     export(run, out / "mesh.obj")
     target = truth / "mesh_blender" / "mesh.obj"
     info["shape"] = {"output_mesh": _text(out / "mesh.obj"), "target_mesh": _text(target)}
-    with replacing(out / FILE) as temporary:
-        text = json.dumps({"info": {folder.name: info}}, indent=1)
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_json(out / FILE, {"info": {folder.name: info}})
     return out / FILE
 
 

@@ -7,30 +7,22 @@ from pathlib import Path
 import torch
 from PIL import Image
 
+from univoxel import lights
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.fields.field import dense_field
 from univoxel.fields.grid import GridShape
-from univoxel.lights import (
-    BakedConfig,
-    EnvmapConfig,
-    EnvmapSGConfig,
-    LightConfig,
-    MLPLightConfig,
-    SGConfig,
-    SHConfig,
-)
 from univoxel.scene import Scene, SceneConfig
 
 RADIUS = 0.5
 # Every model of light beside lobes, small
 LIGHTS = (
-    SHConfig(hidden=16, directions=64, directions_eval=64),
-    MLPLightConfig(rank=4, hidden=16, directions=64, directions_eval=64),
-    EnvmapSGConfig(lobes=16, rows=16, directions=16, directions_eval=32),
-    EnvmapConfig(rows=16, directions=16, directions_eval=32),
-    BakedConfig(),
+    lights.SHConfig(hidden=16, directions=64, directions_eval=64),
+    lights.MLPLightConfig(rank=4, hidden=16, directions=64, directions_eval=64),
+    lights.EnvmapSGConfig(lobes=16, rows=16, directions=16, directions_eval=32),
+    lights.EnvmapConfig(rows=16, directions=16, directions_eval=32),
+    lights.BakedConfig(),
 )
 
 
@@ -105,7 +97,7 @@ def write_scene(
 
 
 def sphere_scene(
-    sky_nodes: int, voxel_size: float = 0.05, seed: int = 0, light: LightConfig | None = None
+    sky_nodes: int, voxel_size: float = 0.05, seed: int = 0, light: lights.LightConfig | None = None
 ) -> Scene:
     """A scene whose surface is the sphere, exactly but for the grid; its heads are untrained."""
     torch.manual_seed(seed)
@@ -113,7 +105,7 @@ def sphere_scene(
     axis = (torch.arange(size) - size // 2) * voxel_size
     node = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
     grid = GridShape((float(axis[0]),) * 3, voxel_size, (size,) * 3)
-    light = light or SGConfig(lobes=2, hidden=4, directions=8, directions_eval=8)
+    light = light or lights.SGConfig(lobes=2, hidden=4, directions=8, directions_eval=8)
     cfg = SceneConfig(4, material_channels=2, hidden=8, sky_nodes=sky_nodes, light=light)
     return Scene(cfg, dense_field(grid, cfg.channels, node.norm(dim=-1) - RADIUS))
 

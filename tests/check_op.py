@@ -14,6 +14,17 @@ RTOL = {torch.float32: 1e-5, torch.float64: 1e-12}
 Op = Callable[..., Tensor | tuple[Tensor, ...]]
 
 
+def grads_of(op: Op, arguments: Sequence, seed: int = 0, **options) -> tuple[Tensor, ...]:
+    """Gradients of a random projection of the outputs, to all leaves."""
+    g = torch.Generator().manual_seed(seed)
+    outputs = op(*arguments, **options)
+    outputs = (outputs,) if isinstance(outputs, Tensor) else outputs
+    pulls = [torch.randn(o.shape, generator=g, dtype=torch.float64).to(o.dtype) for o in outputs]
+    leaves = [a for a in arguments if isinstance(a, Tensor) and a.requires_grad]
+    pulled = [(o * p).sum() for o, p in zip(outputs, pulls, strict=True) if o.requires_grad]
+    return torch.autograd.grad(sum(pulled), leaves)
+
+
 def check_op(
     op: Op,
     reference: Op,

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -221,12 +222,7 @@ def write_polycam(folder: Path, scene: Scene, place: str = "keyframes/corrected_
     return folder
 
 
-def write_metashape(
-    folder: Path,
-    scene: Scene,
-    calibration: str = "",
-    original: int = 1,
-) -> Path:
+def write_metashape(folder: Path, scene: Scene, calibration: str = "", original: int = 1) -> Path:
     """Labels without endings; a component that is turned, scaled and moved against the world."""
     write_pictures(folder, scene, "images", "masks", pad="_mask")
     height, width = (original * n for n in scene.pictures.shape[1:3])
@@ -267,7 +263,6 @@ def write_realitycapture(
     scene: Scene,
     head: str = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
     lens: str = "0,0,0,0,0,0,0,0",
-    shift: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> Path:
     """Angles by the vendor's matrix from the world to the camera, y = pitch, x = roll, z = heading:
 
@@ -280,7 +275,7 @@ def write_realitycapture(
         m = to_camera(pose)
         pitch = math.asin(-m[1, 2])
         heading, roll = math.atan2(-m[1, 0], -m[1, 1]), math.atan2(-m[0, 2], -m[2, 2])
-        values = [*(pose[:3, 3] + shift), *map(math.degrees, (heading, pitch, roll))]
+        values = [*pose[:3, 3], *map(math.degrees, (heading, pitch, roll))]
         values.append(FOCAL / side * 36)
         lines.append(",".join([f"{name}.png", *(repr(float(x)) for x in values), lens]).rstrip(","))
     (folder / "cameras.csv").write_text("\n".join(lines) + "\n")
@@ -301,6 +296,30 @@ def write_tensoir(folder: Path, scene: Scene) -> Path:
             }
             (view / "metadata.json").write_text(json.dumps(meta))
     return folder
+
+
+def replaced(file: str, *changes: tuple[str, str]) -> Callable[[Path], None]:
+    """Damage to a text file of a folder: pieces, each by another."""
+
+    def apply(folder: Path) -> None:
+        text = (folder / file).read_text()
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        (folder / file).write_text(text)
+
+    return apply
+
+
+def edited(file: str, change: Callable[[Any], object]) -> Callable[[Path], None]:
+    """Damage to a JSON file of a folder."""
+
+    def apply(folder: Path) -> None:
+        root = json.loads((folder / file).read_text())
+        change(root)
+        (folder / file).write_text(json.dumps(root))
+
+    return apply
 
 
 def refused(folder: Path, damage: Callable[[Path], object], message: str, split="train") -> None:

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from analytic import cameras_around, write_scene
+from analytic import cameras_around
 
 import univoxel
 from univoxel import api
@@ -21,20 +21,19 @@ SMALL = (
 )
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("ball") / "data")
+@pytest.fixture
+def data(tiny):
+    return tiny / "data"
 
 
-@pytest.fixture(scope="module")
-def run(data, tmp_path_factory):
-    out = tmp_path_factory.mktemp("ball") / "run"
-    return univoxel.train(str(data), str(out), minutes=2, changes=SMALL)
+@pytest.fixture
+def run(tiny):
+    return univoxel.open_run(tiny / "run")
 
 
 def test_a_run_and_what_it_can_do(run, tmp_path, capfd):
     rendered = run.render()
-    assert rendered.shape == (2, 32, 32, 4)
+    assert rendered.shape == (2, 16, 16, 4)
     assert rendered[..., 3].max() > 0.9
     relit = run.relight(EnvMap(torch.ones(4, 8, 3)), cameras="orbit 2", resolution=16, samples=4)
     assert relit.shape == (2, 16, 16, 4)

@@ -70,16 +70,9 @@ def test_data_that_cannot_be_used(data, tmp_path, refused, change, message):
     ("options", "message"),
     [
         (["--minutes", "0"], "--minutes must be above 0, got 0"),
-        (["--minutes", "-3"], "--minutes must be above 0, got -3"),
         (["--set=stages.0.share=1.5"], r"StageConfig: share must be in \(0, 1\], got 1.5"),
-        (["--set=scene.light.lobes=0"], "SGConfig: lobes must be at least 1, got 0"),
-        (
-            ["--varying", "light", "--light", "envmap"],
-            "varying light needs hybrid or a local light",
-        ),
+        (["--varying", "light", "--light", "envmap"], "varying light needs hybrid or a local"),
         (["--varying", "weather"], "'weather' for argument '--varying'"),
-        (["--preset", "quick"], "'quick' for argument '--preset'"),
-        (["--minuts", "3"], "Unrecognized options: --minuts, 3"),
     ],
 )
 def test_settings_out_of_range(data, tmp_path, refused, options, message):
@@ -166,16 +159,10 @@ def nan(tensor):
         (meta(lambda m: m.update(inv_s=np.nan)), "inv_s must be above 0, got nan"),
         (meta(lambda m: m.update(levels=7)), "its own description"),
         (meta(lambda m: m["levels"][2].append("fine")), "voxel_sizes must be tuple"),
-        (
-            meta(lambda m: m["levels"].__setitem__(3, 3)),
-            "rows must be a power of two",
-        ),
+        (meta(lambda m: m["levels"].__setitem__(3, 3)), "rows must be a power of two"),
         (meta(lambda m: m["levels"].__setitem__(3, 2**40)), "is expected with"),
         (meta(lambda m: m["grid"].update(origin=None)), "origin must be tuple"),
-        (
-            meta(lambda m: m["grid"].update(size=[10**5] * 3)),
-            "size must be 2 or more",
-        ),
+        (meta(lambda m: m["grid"].update(size=[10**5] * 3)), "size must be 2 or more"),
         (meta(lambda m: m["grid"].update(size=[1200] * 3)), "field.sdf is expected"),
         (meta(lambda m: m.update(scene=[])), "its own description"),
         (meta(lambda m: m["scene"].update(hidden=10**5)), "is expected as"),
@@ -186,20 +173,14 @@ def nan(tensor):
         (meta(lambda m: m["scene"].update(light={"kind": "candle"})), "light must be one of"),
         (meta(lambda m: m["scene"]["light"].update(rank=1)), "SGConfig: no field 'rank'"),
         (meta(lambda m: m["scene"].update(channels=0)), "channels must be at least 1"),
-        (
-            meta(lambda m: m["scene"]["light"].update(layers=10**5)),
-            "layers must be at most 32",
-        ),
+        (meta(lambda m: m["scene"]["light"].update(layers=10**5)), r"layers must be in \[0, 32\]"),
         (
             meta(lambda m: m["scene"]["light"].update(directions_eval=10**9)),
-            "directions_eval must be at most 65536",
+            r"directions_eval must be in \[1, 65536\]",
         ),
         (meta(lambda m: m.update(state=[1])), "its own description"),
         (meta(lambda m: m["state"].update(stage="last")), "stage must be int"),
-        (
-            meta(lambda m: m["state"].update(progress=2)),
-            r"progress must be in \[0, 1\]",
-        ),
+        (meta(lambda m: m["state"].update(progress=2)), r"progress must be in \[0, 1\]"),
         (meta(lambda m: m["state"].update(chosen=[{"what": 1}])), "what must be str"),
         (edited_tensor("material.net.0.weight", nan), "NaN or infinity in material.net.0.weight"),
         (

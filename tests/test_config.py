@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from plain import plain_stage, plain_training
 
 import univoxel
 from univoxel.config import (
@@ -19,13 +20,13 @@ from univoxel.config import (
 )
 from univoxel.core.choices import LIGHTS
 from univoxel.errors import MissingFile, UserError
-from univoxel.lights.sg import SGConfig
+from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.presets import PRESETS, budget, chosen, preset, with_field, with_metal, work_in
 from univoxel.scene import SceneConfig
 from univoxel.training.clock import expected_seconds
 
-STAGE = StageConfig(voxels=1.0, iterations=10, share=1.0)
-CONFIG = TrainConfig(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
+STAGE = plain_stage(voxels=1.0, iterations=10, share=1.0)
+CONFIG = plain_training(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
 
 
 @pytest.mark.parametrize("name", [*PRESETS])
@@ -244,6 +245,22 @@ def test_retired_fields_of_a_file_are_passed_over(tmp_path):
     )
     check_same(cfg)
     assert load_config(tmp_path / "config.json") == cfg
+
+
+def test_a_file_that_lacks_fields_has_the_defaults_of_version_0_2(tmp_path):
+    text = {
+        "data": "a",
+        "out": str(tmp_path),
+        "stages": [{"voxels": 1, "iterations": 9, "share": 1}],
+    }
+    (tmp_path / "config.json").write_text(json.dumps(text))
+    found = load_config(tmp_path / "config.json")
+    assert found.scene.light == SGConfig(directions=128)
+    assert found.stages == (plain_stage(1.0, 9, 1.0),)
+    assert found == plain_training(Path("a"), tmp_path, found.stages, scene=found.scene)
+    check_same(replace(found, downscale=1, voxel_pixels=0.0))
+    with pytest.raises(UserError, match="began with other scene"):
+        check_same(replace(found, scene=SceneConfig(light=EnvmapConfig())))
 
 
 @pytest.mark.parametrize("light", LIGHTS)

@@ -10,24 +10,16 @@ import pytest
 import torch
 from analytic import cameras_around, sphere_normals, write_scene
 from PIL import Image
+from tiny import CHANGES
 
 from univoxel.cli import main
 from univoxel.scene import load_scene
 from univoxel.training import progress
 
 SIZE, VIEWS = 16, 6
-SMALL = [
-    f"--set={change}"
-    for change in (
-        *(f"stages.{i}.{name}" for i in (0, 1, 3) for name in ("voxels=0.004", "rays=64")),
-        *("stages.0.iterations=3", "stages.2.iterations=3", "stages.3.iterations=2"),
-        *("stages.1.iterations=6", "stages.1.physical_from=0.0"),
-        *("stages.2.rays=64", "stages.2.points=64", "stages.2.newton_points=32"),
-        *("scene.sky_nodes=32", "stages.2.newton_steps=1", "stages.2.rounds=2"),
-        *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
-        *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
-    )
-]
+MORE = ("stages.0.iterations=3", "stages.1.iterations=6", "stages.2.iterations=3")
+MORE += ("stages.2.newton_points=32", "stages.2.rounds=2")
+SMALL = [f"--set={change}" for change in (*CHANGES, *MORE)]
 
 
 @pytest.fixture(scope="module")

@@ -159,11 +159,7 @@ def test_a_link_to_markdown_outside_of_docs_is_found():
             (partial(doc_names.unknown, ROOT), f"A page with `{code}`.", 1)
             for code in ("StageConfig.none", "NoneConfig.rays", "NO_SUCH_ONE", "joint/none.py")
         ),
-        (
-            partial(doc_names.unknown, ROOT),
-            "`StageConfig.rays`, `output/timelapse.py`, `DATA`",
-            0,
-        ),
+        (partial(doc_names.unknown, ROOT), "`StageConfig.rays`, `output/timelapse.py`, `DATA`", 0),
     ],
 )
 def test_names_that_are_not_there_are_found(check, page, count):

@@ -30,10 +30,7 @@ def test_whole_files_are_not_broken(run):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        *("scene.safetensors", "log.jsonl", "config.json", "preview.png", "index.html"),
-        "mesh.glb",
-    ],
+    [*("scene.safetensors", "log.jsonl", "config.json", "preview.png", "index.html"), "mesh.glb"],
 )
 def test_files_that_are_cut_short_are_broken(run, name):
     path = run / name

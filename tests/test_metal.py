@@ -17,15 +17,8 @@ from univoxel.cli import export as task
 from univoxel.core.records import Mesh, Surface
 from univoxel.envmap import EnvMap, lookup, tables
 from univoxel.ops import VisibilityScene
+from univoxel.render import relight
 from univoxel.render.pipeline import at_rays, extract_mesh, surface_of_view
-from univoxel.render.relight import (
-    Lighting,
-    Quality,
-    TracedMesh,
-    channels,
-    relight_surface,
-    render_picture,
-)
 from univoxel.sphere import fibonacci_sphere
 
 BASE = torch.tensor([0.95, 0.6, 0.3])  # copper, about
@@ -90,8 +83,10 @@ def test_what_no_picture_would_show_is_no_metal():
 def test_a_metal_sphere_equals_quadrature(metallic, roughness):
     surface, wo = a_sphere(8, torch.full((8,), metallic), roughness)
     lights, directions = smooth_map(), fibonacci_sphere(100_000)
-    traced = TracedMesh(*octahedron(), 0.01)
-    got = relight_surface(surface, wo, traced, Lighting(tables(lights)), samples=16384, bounces=0)
+    traced = relight.TracedMesh(*octahedron(), 0.01)
+    got = relight.relight_surface(
+        surface, wo, traced, relight.Lighting(tables(lights)), samples=16384, bounces=0
+    )
     diffuse, f0 = brdf.split(surface.albedo, surface.metallic)
     assert isinstance(f0, torch.Tensor)
     light = lookup(lights, directions) * (4 * math.pi / len(directions))
@@ -115,12 +110,12 @@ def test_metal_that_light_bounces_off():
     surface, _ = a_sphere(1, None, 1.0)
     up = torch.tensor([[0.0, 0.0, 1.0]])
     surface = replace(surface, position=0 * up, normal=up, albedo=torch.ones(1, 3))
-    traced = TracedMesh(mesh, VisibilityScene(corner, faces), 0.0)
-    light = Lighting(tables(WHITE))
+    traced = relight.TracedMesh(mesh, VisibilityScene(corner, faces), 0.0)
+    light = relight.Lighting(tables(WHITE))
 
     def lit(mesh):
         here = replace(traced, mesh=mesh)
-        return relight_surface(surface, up, here, light, samples=4096, bounces=1)[0]
+        return relight.relight_surface(surface, up, here, light, samples=4096, bounces=1)[0]
 
     metal = lit(mesh)
     plastic = lit(replace(mesh, metallic=torch.zeros(4)))
@@ -145,16 +140,16 @@ def test_views_and_pictures_carry_it(scene):
     assert torch.equal(surface.metallic[there], expected[there])
     assert torch.equal(at_rays(surface, there).metallic, surface.metallic[there])
     mesh = extract_mesh(scene)
-    traced = TracedMesh(mesh, VisibilityScene(mesh.vertices, mesh.faces), 0.02)
-    light = Lighting(tables(smooth_map()))
-    quality = Quality(samples=16, bounces=1)
-    with_metal = render_picture(surface, wo, cameras, 0, traced, light, quality)
-    without = render_picture(
+    traced = relight.TracedMesh(mesh, VisibilityScene(mesh.vertices, mesh.faces), 0.02)
+    light = relight.Lighting(tables(smooth_map()))
+    quality = relight.Quality(samples=16, bounces=1)
+    with_metal = relight.render_picture(surface, wo, cameras, 0, traced, light, quality)
+    without = relight.render_picture(
         replace(surface, metallic=None), wo, cameras, 0, traced, light, quality
     )
-    shown = channels(with_metal)["metallic"].flatten()
+    shown = relight.channels(with_metal)["metallic"].flatten()
     torch.testing.assert_close(shown[there], expected[there] * surface.opacity[there])
-    assert "metallic" not in channels(without)
+    assert "metallic" not in relight.channels(without)
     metal = there & (expected > 0)
     differ = (with_metal.rgb - without.rgb).flatten(0, 1).abs().amax(1)
     assert (differ[metal] > 1e-3).float().mean() > 0.95

@@ -1,7 +1,5 @@
-"""Configurations refuse what is out of range, as the comments of their fields tell the range."""
+"""Configurations refuse what is out of range, as the metadata of their fields tells the range."""
 
-import ast
-import inspect
 import math
 import re
 from dataclasses import fields, is_dataclass, replace
@@ -9,18 +7,19 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from plain import plain_stage, plain_training
 
 from univoxel import config, scene
 from univoxel.capture.config import CaptureConfig
 from univoxel.config import JointConfig, MirrorConfig, StageConfig, TrainConfig
 from univoxel.errors import ConfigError
 from univoxel.evaluation.confidence import AdviceConfig
-from univoxel.lights import BakedConfig, EnvmapConfig, EnvmapSGConfig
+from univoxel.lights import BakedConfig, EnvmapConfig, EnvmapSGConfig, LightConfig
 from univoxel.lights.base import MOST_DIRECTIONS
-from univoxel.scene import LightConfig, SceneConfig
+from univoxel.scene import SceneConfig
 
-STAGE = StageConfig(voxels=1.0, iterations=10, share=1.0)
-TRAIN = TrainConfig(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
+STAGE = plain_stage(voxels=1.0, iterations=10, share=1.0)
+TRAIN = plain_training(Path("photos"), Path("run"), (STAGE,), minutes=1.0)
 NO_SKY = SceneConfig(sky_nodes=0)
 CLASSES = {
     *(CaptureConfig, AdviceConfig, *get_args(LightConfig)),
@@ -31,68 +30,33 @@ CONFIGS = {
     for kind in sorted(CLASSES, key=lambda kind: kind.__name__)
     if kind.__name__.endswith("Config")
 }
-RANGE = re.compile(r"(>=?) (-?[\d.]+)|([\[(])([\d.]+), ([\d.]+)]")
-
-
-def comments(kind: type) -> dict[str, str]:
-    """What is said of each field, beside it and above."""
-    lines, found = inspect.getsource(kind).splitlines(), {}
-    for node in ast.parse("\n".join(lines)).body[0].body:
-        if isinstance(node, ast.AnnAssign):
-            first = node.lineno - 1
-            while lines[first - 1].strip().startswith("#"):
-                first -= 1
-            found[node.target.id] = " ".join(
-                re.findall("#(.*)", "\n".join(lines[first : node.end_lineno]))
-            )
-    return found
-
-
-def range_of(text: str) -> tuple[float, bool, float] | None:
-    """Lower end, whether it is within, and upper end of the range that a text tells of."""
-    found = RANGE.search(text)
-    if not found:
-        return None
-    sign, least, bracket, low, high = found.groups()
-    low = float(low or least)
-    if re.search("; 0: ", text):  # has a meaning of its own
-        low = min(low, 0.0)
-    return low, sign == ">=" or bracket == "[", float(high or math.inf)
-
-
-def ranges() -> list[tuple]:
-    """Class, field and its range, where its comment, its class or its group of fields has one."""
-    found = []
-    for name, example in CONFIGS.items():
-        texts = comments(type(example))
-        rates = "> 0" if "all rates > 0" in " ".join(texts.values()) else ""
-        for field in fields(example):
-            several = rates if field.name.startswith("lr_") else (type(example).__doc__ or "")
-            range = range_of(texts.get(field.name, "")) or range_of(several)
-            if range and field.name != "stages":
-                found.append((name, field.name, *range))
-    return found
+RANGES = [
+    (name, field.name, said)
+    for name, config in CONFIGS.items()
+    for field in fields(config)
+    if (said := field.metadata["setting"]).range
+]
 
 
 def changed(name: str, field: str, value: float) -> object:
-    """The class's example with a value there; where there are several, as the first of them."""
+    """The class's example with a value there; where there are several, as the last of them."""
     before = getattr(CONFIGS[name], field)
     if isinstance(before, tuple):
-        value = (value, *before[1:])
-    elif isinstance(before, int) and not math.isnan(value) and value % 1 == 0:
-        value = int(value)
+        value = (*before[1:], value)
     return replace(CONFIGS[name], **{field: value})
 
 
-@pytest.mark.parametrize(("name", "field", "low", "within", "high"), ranges())
-def test_a_number_is_held_to_its_range(name, field, low, within, high):
-    above = [] if math.isinf(high) else [high + 0.125]
-    for value in (math.nan, low - 1 if within else low, *above):
-        with pytest.raises(ConfigError, match=f"^{name}: {field} must be "):
+@pytest.mark.parametrize(("name", "field", "said"), RANGES)
+def test_a_number_is_held_to_its_range(name, field, said):
+    low = said.least if said.above is None else said.above
+    below = low - 1 if said.above is None else low
+    for value in (math.nan, math.inf, below, said.most + 0.125):
+        with pytest.raises(
+            ConfigError, match=f"^{name}: {field} must be .*{re.escape(said.range)}"
+        ):
             changed(name, field, value)
-    for value in (low if within else low + 0.125, *[high] * len(above)):
-        said = refusal(name, field, value)  # maybe by a rule that another field has a part in
-        assert not re.search(rf"{field} must be (at least -?\d|above|in)", said)
+    for value in (low if said.above is None else low + 0.125, min(said.most, 1024)):
+        assert said.range not in refusal(name, field, value)  # maybe by a rule of two fields
 
 
 def refusal(name: str, field: str, value: float) -> str:
@@ -103,8 +67,10 @@ def refusal(name: str, field: str, value: float) -> str:
     return ""
 
 
-def test_there_are_ranges():
-    assert len(ranges()) > 80
+def test_every_field_is_explained():
+    for one in CONFIGS.values():
+        assert all(field.metadata["setting"].meaning for field in fields(one))
+    assert len(RANGES) > 80
 
 
 @pytest.mark.parametrize(
@@ -134,13 +100,13 @@ def test_there_are_ranges():
         (MirrorConfig(), {"rows": 100}, r"rows must be a multiple of 32 in \[0, 1024\], got 100"),
         (MirrorConfig(), {"rows": math.nan}, r"rows must be a multiple of 32 in \[0, 1024\], got"),
         *(
-            (kind(), {name: MOST_DIRECTIONS + 1}, f"{name} must be at most {MOST_DIRECTIONS}")
+            (kind(), {name: MOST_DIRECTIONS + 1}, rf"{name} must be in \[1, {MOST_DIRECTIONS}\]")
             for kind in get_args(LightConfig)
             for name in ("directions", "directions_eval")
             if kind is not BakedConfig
         ),
         *(
-            (kind(), {"rows": 8193}, "rows must be at most 8192")
+            (kind(), {"rows": 8193}, r"rows must be in \[1, 8192\]")
             for kind in (EnvmapConfig, EnvmapSGConfig)
         ),
     ],

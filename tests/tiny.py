@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import pytest
 from analytic import write_scene
+from plain import plain_stage, plain_training
 
 from univoxel.cli import main
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import JointConfig, TrainConfig
 from univoxel.lights import SGConfig
 from univoxel.scene import SceneConfig
 
@@ -27,12 +28,12 @@ OPTIONS = ["--no-page", *(f"--set={change}" for change in CHANGES)]
 def three_stages(data, out, iterations=12, light=None, **sizes) -> TrainConfig:
     """Training of a moment: 12 steps, 6 of the joint stage, 4 that refit."""
     light = light or SGConfig(lobes=2, hidden=8, directions=16, directions_eval=16)
-    stage = StageConfig(voxels=0.008, iterations=iterations, share=0.4, rays=128, physical_from=0.5)
+    stage = plain_stage(voxels=0.008, iterations=iterations, share=0.4, rays=128, physical_from=0.5)
     joint = JointConfig(iterations=6, rounds=2, points=100, newton_points=50, rays=64, tracing=1)
     refit = replace(stage, iterations=4, refit=True, physical_from=0.0)
     options = {"channels": 4, "material_channels": 2, "hidden": 8, "sky_nodes": 16} | sizes
     scene = SceneConfig(light=light, **options)
-    return TrainConfig(data, out, (stage, joint, refit), minutes=60.0, scene=scene)
+    return plain_training(data, out, (stage, joint, refit), minutes=60.0, scene=scene)
 
 
 @pytest.fixture(scope="session")

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from univoxel import __version__
-from univoxel.core.choices import (
-    FIELDS,
-    CamerasFrom,
-    Capacity,
-    FieldName,
-    LightFrameOrAuto,
-    MasksFrom,
+from univoxel.core.choices import CamerasFrom, Capacity, FieldName, LightFrameOrAuto, MasksFrom
+from univoxel.core.files import read_json, write_json
+from univoxel.core.validation import (
+    EARLIER,
+    about,
+    check_fields,
+    check_settings,
+    record,
+    setting,
+    without_retired,
 )
-from univoxel.core.files import read_json, replacing
-from univoxel.core.validation import check_fields, record, without_retired
 from univoxel.errors import ConfigError, MissingFile, UserError
 from univoxel.fields.features import PER_LEVEL
 from univoxel.lights import read_config
@@ -45,194 +45,259 @@ CHOICES = (
 
 # Most of a limit of time that reading and preparation may take; stages share the rest
 PREPARATION = 0.25
-_WHOLE = ("at least 1", lambda x: x >= 1)
-_ABOVE = ("above 0", lambda x: 0 < x < math.inf)
-_NOT_BELOW = ("at least 0", lambda x: 0 <= x < math.inf)
-_SHARE = ("in (0, 1]", lambda x: 0 < x <= 1)
 
 
 @dataclass(frozen=True)
 class StageConfig:
     """One stage of training, on a grid of its own resolution."""
 
-    voxels: float  # millions in the object's box at most, > 0; see TrainConfig.voxel_pixels
-    iterations: int  # optimisation steps, >= 1; fewer when time runs out
-    share: float  # of the time that is left for stages under a limit, (0, 1]
-    rays: int = 2048  # per step, >= 1
-    sharpness: tuple[float, float] = (0.5, 0.5)  # s of the NeuS density at begin and end, voxels
-    lr_sdf: tuple[float, float] = (0.2, 0.02)  # at begin and end, voxels per step; all rates > 0
-    # at begin and end: of features, and of the table of mirrored directions
-    lr_features: tuple[float, float] = (0.1, 0.01)
-    # at begin and end: of the networks, the light, and what differs from view to view
-    lr_networks: tuple[float, float] = (3e-3, 3e-4)
-    plate: float = 0.003  # thin-plate smoothing of touched sdf nodes per step, [0, 0.125]
-    spread: int = 4  # passes that smooth the sdf's gradient before the optimiser, >= 0
-    diffusion: float = 0.01  # smoothing of touched feature nodes per step, [0, 0.25]
-    physical_from: float = 1.0  # progress in [0, 1] at which the physically based render joins
-    # progress in [0, 1] at which patches of the surface are compared between photographs; 1: never
-    patches_from: float = 1.0
-    refit: bool = False  # materials stay; light, radiance and silhouettes follow them
-    # sparse: only bricks around the surface are stored; hash: features come from a hash table
-    field: FieldName = "dense"
+    voxels: float = field(
+        metadata=about("in the object's box at most; see voxel_pixels", unit="millions", above=0)
+    )
+    iterations: int = field(metadata=about("optimisation steps; fewer when time runs out", least=1))
+    share: float = field(
+        metadata=about("of the time that is left for stages under a limit", above=0, most=1)
+    )
+    rays: int = setting(2048, "per step", least=1)
+    sharpness: tuple[float, float] = setting(
+        (0.5, 0.3), "s of the NeuS density at begin and end", unit="voxels", above=0
+    )
+    lr_sdf: tuple[float, float] = setting(
+        (0.07, 0.005), "learning rate at begin and end", unit="voxels per step", above=0
+    )
+    lr_features: tuple[float, float] = setting(
+        (0.1, 0.01),
+        "learning rate at begin and end: of features, and of the table of mirrored directions",
+        above=0,
+    )
+    lr_networks: tuple[float, float] = setting(
+        (6e-3, 3e-4),
+        "learning rate at begin and end: of the networks, the light, and what differs from view to "
+        "view",
+        above=0,
+    )
+    plate: float = setting(
+        0.003, "thin-plate smoothing of touched sdf nodes per step", least=0, most=0.125
+    )
+    spread: int = setting(4, "passes that smooth the sdf's gradient before the optimiser", least=0)
+    diffusion: float = setting(
+        0.01, "smoothing of touched feature nodes per step", least=0, most=0.25
+    )
+    physical_from: float = setting(
+        0.3, "progress at which the physically based render joins", least=0, most=1
+    )
+    patches_from: float = setting(
+        0.0,
+        "progress at which patches of the surface are compared between photographs; 1: never",
+        least=0,
+        most=1,
+    )
+    refit: bool = setting(False, "materials stay; light, radiance and silhouettes follow them")
+    field: FieldName = setting(
+        "hash",
+        "sparse: only bricks around the surface are stored; hash: features come from a hash table",
+    )
 
-    def __post_init__(self) -> None:
-        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "voxels")
-        check_fields(self, "at least 1", lambda x: x >= 1, "iterations", "rays")
-        check_fields(self, "in (0, 1]", lambda x: 0 < x <= 1, "share")
-        check_fields(
-            self,
-            "two numbers above 0",
-            lambda x: len(x) == 2 and all(0 < v < math.inf for v in x),
-            *("sharpness", "lr_sdf", "lr_features", "lr_networks"),
-        )
-        check_fields(self, "at least 0", lambda x: x >= 0, "spread")
-        check_fields(self, "in [0, 0.125]", lambda x: 0 <= x <= 0.125, "plate")
-        check_fields(self, "in [0, 0.25]", lambda x: 0 <= x <= 0.25, "diffusion")
-        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "physical_from", "patches_from")
-        check_fields(self, "dense, sparse or hash", lambda x: x in FIELDS, "field")
+    __post_init__ = check_settings
 
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights >= 0 of the losses; the photometric loss of the physically based render has 1."""
+    """Weights of the losses; the photometric loss of the physically based render has 1."""
 
-    radiance: float = 1.0  # photometric loss of what the radiance head shows
-    silhouette: float = 0.1  # rays' opacity against the masks
-    metallic: float = 0.01  # what the mean metallic costs: metal is for where nothing else serves
-    light_smoothness: float = 0.1  # change of a local light over about a voxel, L1
-    # distance of the light from grey on the whole, as a share of it: photographs fix albedo and
-    # light up to a colour only
-    white_light: float = 0.01
-    map_smoothness: float = 1e-3  # total variation of the log map
-    # what patches of the surface lack in correlation between photographs, in every second step
-    patches: float = 0.4
+    radiance: float = setting(1.0, "photometric loss of what the radiance head shows", least=0)
+    silhouette: float = setting(0.1, "rays' opacity against the masks", least=0)
+    metallic: float = setting(
+        0.01, "what the mean metallic costs: metal is for where nothing else serves", least=0
+    )
+    light_smoothness: float = setting(
+        0.1, "change of a local light over about a voxel, L1", least=0
+    )
+    white_light: float = setting(
+        0.01,
+        "distance of the light from grey on the whole, as a share of it: photographs fix albedo "
+        "and light up to a colour only",
+        least=0,
+    )
+    map_smoothness: float = setting(1e-3, "total variation of the log map", least=0)
+    patches: float = setting(
+        0.4,
+        "what patches of the surface lack in correlation between photographs, in every second step",
+        least=0,
+    )
 
-    def __post_init__(self) -> None:
-        names = [f.name for f in fields(self)]
-        check_fields(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
+    __post_init__ = check_settings
 
 
 @dataclass(frozen=True)
 class MetalConfig:
     """Which points are metal, see training/metals.py."""
 
-    # brightest channel of a metal at least, [0, 1]: metals in use reflect 0.4 and more
-    min_reflectance: float = 0.25
+    min_reflectance: float = setting(
+        0.25,
+        "brightest channel of a metal at least: metals in use reflect 0.4 and more",
+        least=0,
+        most=1,
+    )
 
-    def __post_init__(self) -> None:
-        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "min_reflectance")
+    __post_init__ = check_settings
 
 
 @dataclass(frozen=True)
 class MirrorConfig:
     """The map that mirrors show, see training/mirrors.py."""
 
-    # rows of the map as sharp points show it, a multiple of 32; 0: it is not kept
-    rows: int = 128
+    rows: int = setting(
+        128,
+        "of the map as sharp points show it; 0: it is not kept",
+        least=0,
+        most=1024,
+        multiple=32,
+    )
 
-    def __post_init__(self) -> None:
-        rows = range(0, 1025, 32)
-        check_fields(self, "a multiple of 32 in [0, 1024]", lambda x: x in rows, "rows")
+    __post_init__ = check_settings
 
 
 @dataclass(frozen=True)
 class EntropyConfig:
     """The prior that paint comes in few colours, see training/albedo_entropy.py."""
 
-    # steps, >= 1, in which the materials learn the albedos under a map that was changed
-    teaching_steps: int = 60
+    teaching_steps: int = setting(
+        60, "steps in which the materials learn the albedos under a map that was changed", least=1
+    )
 
-    def __post_init__(self) -> None:
-        check_fields(self, *_WHOLE, "teaching_steps")
+    __post_init__ = check_settings
 
 
 @dataclass(frozen=True)
 class JointConfig:
     """The stage that solves for one map, the materials and normals, see training/joint_solve.py."""
 
-    iterations: int = 700  # Adam steps in all rounds, >= 1; fewer when time runs out
-    share: float = 0.4  # of the time budget, (0, 1]
-    rays: int = 4096  # observations per step, >= views
-    views: int = 4  # observations of a point per step, >= 1
-    rounds: int = 4  # of Newton steps on the map and then of Adam, >= 1
-    points: int = 20000  # on the surface, >= 1
-    tracing: int = 2  # visibility rays per point and direction, >= 1
-    colors: bool = True  # whether the light minimises the entropy of albedo, see entropy
-    # whether all is metal, as dark as it looks, and the map neutral; None: trials decide
-    only_metal: bool | None = None
-    lr_features: float = 0.03  # at the begin of a round; all rates > 0
-    # at the begin of a round: of the materials' head and the views' gains
-    lr_networks: float = 3e-3
-    lr_map: float = 0.05  # of the log map
-    lr_sdf: float = 0.04  # of the surface, voxels per step, >= 0; 0: it stays
-    newton_steps: int = 3  # at the begin of a round, >= 0
-    newton_points: int = 4000  # of the points, >= 1
-    newton_views: int = 8  # observations of each, >= 2
-    newton_roughness: float = 0.1  # standard deviation that roughness follows the map with; 0: none
-    newton_smooth: float = 1e-7  # Laplacian on the log map against the mean squared residual, > 0
-    # how points are decided to be metal
-    metal: MetalConfig = field(default_factory=MetalConfig)
-    # the map that mirrors show
-    mirror: MirrorConfig = field(default_factory=MirrorConfig)
-    # the prior on few colours, where colors is set
-    entropy: EntropyConfig = field(default_factory=EntropyConfig)
+    iterations: int = setting(675, "Adam steps in all rounds; fewer when time runs out", least=1)
+    share: float = setting(0.27, "of the time budget", above=0, most=1)
+    rays: int = setting(2048, "observations per step; at least views")
+    views: int = setting(4, "observations of a point per step", least=1)
+    rounds: int = setting(4, "of Newton steps on the map and then of Adam", least=1)
+    points: int = setting(20400, "on the surface", least=1)
+    tracing: int = setting(2, "visibility rays per point and direction", least=1)
+    colors: bool = setting(True, "whether the light minimises the entropy of albedo, see entropy")
+    only_metal: bool | None = setting(
+        None, "whether all is metal, as dark as it looks, and the map neutral; None: trials decide"
+    )
+    lr_features: float = setting(0.03, "learning rate at the begin of a round", above=0)
+    lr_networks: float = setting(
+        3e-3,
+        "learning rate at the begin of a round: of the materials' head and the views' gains",
+        above=0,
+    )
+    lr_map: float = setting(0.05, "learning rate of the log map", above=0)
+    lr_sdf: float = setting(
+        0.04, "learning rate of the surface; 0: it stays", unit="voxels per step", least=0
+    )
+    newton_steps: int = setting(3, "at the begin of a round", least=0)
+    newton_points: int = setting(1900, "of the points", least=1)
+    newton_views: int = setting(8, "observations of each", least=2)
+    newton_roughness: float = setting(
+        0.1, "standard deviation that roughness follows the map with; 0: none", least=0
+    )
+    newton_smooth: float = setting(
+        1e-7, "Laplacian on the log map against the mean squared residual", above=0
+    )
+    metal: MetalConfig = setting(MetalConfig(), "how points are decided to be metal")
+    mirror: MirrorConfig = setting(MirrorConfig(), "the map that mirrors show")
+    entropy: EntropyConfig = setting(
+        EntropyConfig(), "the prior on few colours, where colors is set"
+    )
 
     def __post_init__(self) -> None:
-        counts = ("iterations", "views", "rounds", "points", "tracing", "newton_points")
-        check_fields(self, *_WHOLE, *counts)
-        check_fields(self, *_SHARE, "share")
+        check_settings(self)
         check_fields(self, "at least views", lambda x: x >= self.views, "rays")
-        check_fields(self, *_ABOVE, "lr_features", "lr_networks", "lr_map", "newton_smooth")
-        check_fields(self, *_NOT_BELOW, "lr_sdf", "newton_steps", "newton_roughness")
-        check_fields(self, "at least 2", lambda x: x >= 2, "newton_views")
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    data: Path  # folder of the data set
-    out: Path  # folder of the run
-    # in the order in which they are trained, >= 1: a StageConfig first, which makes the grid
-    stages: tuple[StageConfig | JointConfig, ...]
-    # wall-clock limit from the first photograph read to the end, > 0: what does not fit is cut, in
-    # all stages alike; None: all steps are made, however long they take
-    minutes: float | None = None
-    # pixels of the photographs along a side of one that is trained on, >= 1; 0: as many as leave
-    # what grids can use, 1 for photographs of 1499 pixels and fewer. A run's config.json has the
-    # number that was found
-    downscale: int = 0
-    # pixels of the photographs, where the object is, that a voxel is at least as wide as, >= 0: a
-    # finer grid would only learn their noise
-    voxel_pixels: float = 1.0
-    # of the random numbers of training: first parameters, rays, points. Which rays are held out
-    # does not depend on it
-    seed: int = 0
-    # auto: masks that end outside of the object, as the photographs show it, are taken in
-    masks: MasksFrom = "given"
-    # refined: the photographs' cameras are put right, before training and in it; auto: where their
-    # silhouettes contradict one another
-    cameras: CamerasFrom = "given"
-    # whether photographs are looked at for exposures that differ; where they do, scene.varying
-    # becomes exposure, of none
-    exposures: bool = False
-    # whether what the data set's files and links name may lie outside of its folder
-    allow_outside: bool = False
-    # what the light stands still in: the world of the cameras, or the room of a turntable, whose
-    # camera stood still too; auto: which of the two explains better how colours change from
-    # photograph to photograph. scene.turntable then holds the axis
-    light_frame: LightFrameOrAuto = "world"
-    # seconds, >= 0, that carving concavities before training may be expected to take on two cores,
-    # or they are left alone: those that no silhouette shows, where photographs agree on them. Never
-    # where their light varies, other than in exposure; 0: never
-    carving_seconds: float = 0.0
-    # dB that held-out rays must gain in 15 % of a stage, or it is shortened, >= 0; 0: never
-    patience: float = 0.0
-    capacity: Capacity = "fixed"  # adaptive: sizes above are limits, see training/compression.py
-    budget_mb: float | None = None  # 1e6 bytes that the model's file may have, > 0; adaptive only
-    # sizes of the model, and what light it has
-    scene: SceneConfig = field(default_factory=SceneConfig)
-    loss: LossConfig = field(default_factory=LossConfig)  # weights in each StageConfig
+    """A training."""
+
+    data: Path = field(metadata=about("folder of the data set"))
+    out: Path = field(metadata=about("folder of the run"))
+    stages: tuple[StageConfig | JointConfig, ...] = field(
+        metadata=about(
+            "in the order in which they are trained, one at least: a StageConfig first, which "
+            "makes the grid"
+        )
+    )
+    minutes: float | None = setting(
+        None,
+        "wall-clock limit from the first photograph read to the end: what does not fit is cut, in "
+        "all stages alike; None: all steps are made, however long they take",
+        above=0,
+    )
+    downscale: int = setting(
+        0,
+        "pixels of the photographs along a side of one that is trained on; 0: as many as leave "
+        "what grids can use, 1 for photographs of 1499 pixels and fewer. A run's config.json has "
+        "the number that was found",
+        least=0,
+    )
+    voxel_pixels: float = setting(
+        1.0,
+        "pixels of the photographs, where the object is, that a voxel is at least as wide as: a "
+        "finer grid would only learn their noise",
+        least=0,
+    )
+    seed: int = setting(
+        0,
+        "of the random numbers of training: first parameters, rays, points. Which rays are held "
+        "out does not depend on it",
+    )
+    masks: MasksFrom = setting(
+        "auto",
+        "auto: masks that end outside of the object, as the photographs show it, are taken in",
+    )
+    cameras: CamerasFrom = setting(
+        "auto",
+        "refined: the photographs' cameras are put right, before training and in it; auto: where "
+        "their silhouettes contradict one another",
+    )
+    exposures: bool = setting(
+        True,
+        "whether photographs are looked at for exposures that differ; where they do, scene.varying "
+        "becomes exposure, of none",
+    )
+    allow_outside: bool = setting(
+        False, "whether what the data set's files and links name may lie outside of its folder"
+    )
+    light_frame: LightFrameOrAuto = setting(
+        "auto",
+        "what the light stands still in: the world of the cameras, or the room of a turntable, "
+        "whose camera stood still too; auto: which of the two explains better how colours change "
+        "from photograph to photograph. scene.turntable then holds the axis",
+    )
+    carving_seconds: float = setting(
+        12.0,
+        "that carving concavities before training may be expected to take on two cores, or they "
+        "are left alone: those that no silhouette shows, where photographs agree on them. Never "
+        "where their light varies, other than in exposure; 0: never",
+        unit="seconds",
+        least=0,
+    )
+    patience: float = setting(
+        0.0,
+        "that held-out rays must gain in 15 % of a stage, or it is shortened; 0: never",
+        unit="dB",
+        least=0,
+    )
+    capacity: Capacity = setting(
+        "adaptive", "adaptive: sizes above are limits, see training/compression.py"
+    )
+    budget_mb: float | None = setting(
+        None, "that the model's file may have; adaptive only", unit="1e6 bytes", above=0
+    )
+    scene: SceneConfig = setting(SceneConfig(), "sizes of the model, and what light it has")
+    loss: LossConfig = setting(LossConfig(), "weights in each StageConfig")
 
     def __post_init__(self) -> None:
+        check_settings(self)
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")
         check_fields(self, "a path in UTF-8", _is_utf8, "data", "out")
         check_fields(
@@ -265,17 +330,6 @@ class TrainConfig:
             raise ConfigError(
                 "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
             )
-        check_fields(self, "above 0 or None", lambda x: x is None or x > 0, "minutes")
-        names = ("patience", "downscale", "voxel_pixels", "carving_seconds")
-        check_fields(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
-        check_fields(self, "fixed or adaptive", lambda x: x in get_args(Capacity), "capacity")
-        frames = get_args(LightFrameOrAuto)
-        check_fields(self, "auto, world or turntable", lambda x: x in frames, "light_frame")
-        check_fields(self, "auto or given", lambda x: x in get_args(MasksFrom), "masks")
-        check_fields(
-            self, "auto, given or refined", lambda x: x in get_args(CamerasFrom), "cameras"
-        )
-        check_fields(self, "above 0 or None", lambda x: x is None or 0 < x < math.inf, "budget_mb")
         if self.budget_mb is not None and self.capacity == "fixed":
             raise ConfigError(
                 f"TrainConfig: budget_mb {self.budget_mb:g} needs adaptive capacity, got fixed"
@@ -299,9 +353,7 @@ def save_config(cfg: TrainConfig) -> None:
         OSError: it cannot be written.
     """
     values = {"version": __version__} | dataclasses.asdict(cfg)
-    text = json.dumps(values, indent=2, default=str)
-    with replacing(cfg.out / "config.json") as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_json(cfg.out / "config.json", values)
 
 
 def load_config(path: Path) -> TrainConfig:
@@ -341,13 +393,13 @@ def check_same(cfg: TrainConfig) -> None:
         raise UserError(f"{path}: expected an object with the configuration, got {before!r:.80}")
     began = _completed(before, cfg)
     # of configurations from before there were any
-    since = {"downscale": 1, "voxel_pixels": 0.0, "capacity": "fixed", "budget_mb": None}
-    since |= {"masks": "given", "cameras": "given", "exposures": False, "light_frame": "world"}
+    since = {"downscale": 1, "voxel_pixels": 0.0}
     began |= {name: value for name, value in since.items() if name not in before}
     now = _as_json(cfg)
     for one in (began, now):
         one["downscale"] = one["downscale"] or 1  # 0 was 1 before it was found
-    for name in ("stages", "scene", *since):
+    names = "stages scene downscale voxel_pixels capacity budget_mb masks cameras exposures"
+    for name in [*names.split(), "light_frame"]:
         if began.get(name) != now[name]:
             raise UserError(
                 f"{path}: the run began with other {name}: resume with the same "
@@ -367,10 +419,12 @@ def _completed(before: Any, now: Any) -> Any:
         return [_completed(b, n) for b, n in zip(before, now, strict=True)]
     if not dataclasses.is_dataclass(now) or not isinstance(before, dict):
         return before
-    result = without_retired(type(now), before)
+    result = without_retired(type(now), EARLIER.get(type(now).__name__, {}) | before)
     for known in dataclasses.fields(now):
-        if known.name in before:
-            result[known.name] = _completed(before[known.name], getattr(now, known.name))
+        if known.name in result:
+            result[known.name] = _completed(result[known.name], getattr(now, known.name))
+        elif known.name == "kind":  # of a light: files from before there were others do not say
+            result["kind"] = "sg"
         elif known.default is not dataclasses.MISSING:
             result[known.name] = _as_json(known.default)
         elif known.default_factory is not dataclasses.MISSING:

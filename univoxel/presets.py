@@ -6,19 +6,10 @@ import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+from univoxel import lights
 from univoxel.config import PREPARATION, JointConfig, LossConfig, StageConfig, TrainConfig
 from univoxel.core.choices import LIGHTS, Differing, FieldName, LightName, Metal
 from univoxel.errors import UserError
-from univoxel.lights import (
-    BakedConfig,
-    EnvmapConfig,
-    EnvmapSGConfig,
-    LightConfig,
-    LocalLightConfig,
-    MLPLightConfig,
-    SGConfig,
-    SHConfig,
-)
 from univoxel.scene import SceneConfig
 
 
@@ -217,35 +208,43 @@ def _configuration(
         share=0.15,
         rays=rays // 2,
         sharpness=(0.7, 0.35),
+        lr_sdf=(0.2, 0.02),
         lr_networks=lr_networks,
+        physical_from=1.0,
         patches_from=0.2 if compared else 1.0,  # before, there is no surface yet
-        field="hash",
     )
     fine = StageConfig(
         voxels=voxels,
         iterations=steps,
         share=0.85,
         rays=rays,
-        sharpness=(0.5, 0.3),
         lr_sdf=(work.lr_sdf, 0.005),
         lr_networks=lr_networks,
-        physical_from=0.3,
         patches_from=0.0 if compared else 1.0,
-        field="hash",
     )
-    alone: dict[str, LightConfig] = {
+    alone: dict[str, lights.LightConfig] = {
         c.kind: c
-        for c in (SGConfig(), SHConfig(), MLPLightConfig(), EnvmapSGConfig(), EnvmapConfig())
+        for c in (
+            lights.SGConfig(directions=128),
+            lights.SHConfig(),
+            lights.MLPLightConfig(),
+            lights.EnvmapSGConfig(),
+            lights.EnvmapConfig(),
+        )
     }
     match light:
         case "hybrid":
             coarse, fine, joint, refit = _hybrid_stages(work, coarse, fine)
-            lobes = SGConfig(directions=round(work.directions))
+            lobes = lights.SGConfig(directions=round(work.directions))
             scene, loss = SceneConfig(light=lobes, varying=known), LossConfig()
             stages, capacity = (coarse, fine, joint, refit), "adaptive"
         case "baked":
             scene = SceneConfig(
-                sky_nodes=0, mirrored=False, light=BakedConfig(), varying=known, roughness=0.5
+                sky_nodes=0,
+                mirrored=False,
+                light=lights.BakedConfig(),
+                varying=known,
+                roughness=0.5,
             )
             stages, capacity, loss = (coarse, fine), "fixed", LossConfig()
         case _ if light in alone:
@@ -260,11 +259,9 @@ def _configuration(
         data,
         out,
         stages,
-        masks="auto",
-        cameras="auto",
         exposures=exposures,
         light_frame="auto"
-        if isinstance(scene.light, LocalLightConfig) and known != "light"
+        if isinstance(scene.light, lights.LocalLightConfig) and known != "light"
         else "world",
         carving_seconds=CARVING * 60 * work.minutes,
         capacity=capacity,

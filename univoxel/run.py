@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from univoxel.core.files import read_json, replacing
+from univoxel.core.files import read_json, write_json
 from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import DataError, UserError
 
@@ -199,8 +199,7 @@ def save_verdict(verdict: Verdict, run: Path) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    with replacing(run / FILE) as temporary:
-        temporary.write_text(json.dumps(as_json(verdict), indent=1) + "\n", encoding="utf-8")
+    write_json(run / FILE, as_json(verdict))
 
 
 def as_json(verdict: Verdict) -> dict[str, Any]:

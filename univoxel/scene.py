@@ -7,19 +7,20 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, astuple, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from univoxel import lights
 from univoxel.camera import PoseSteps
 from univoxel.core.choices import FieldName, Varying
 from univoxel.core.records import HALF_MAX, Bricks
-from univoxel.core.validation import check_fields, record
+from univoxel.core.validation import check_fields, check_settings, record, setting
 from univoxel.data import Photos
 from univoxel.errors import ConfigError, DataError, FileError, MissingFile, UserError
 from univoxel.fields.bricks import BrickDistances, pack_bricks, unpack_bricks
@@ -27,17 +28,6 @@ from univoxel.fields.distances import PACKED, DenseDistances, SurfaceVersion, pa
 from univoxel.fields.features import HashFeatures, Levels, NodeFeatures
 from univoxel.fields.field import Field, MaterialHead, RadianceHead
 from univoxel.fields.grid import GridShape
-from univoxel.lights import (
-    AbstractLight,
-    AbstractLocalLight,
-    EnvmapLight,
-    EnvmapSGLight,
-    LightConfig,
-    LocalLightConfig,
-    SGConfig,
-    build,
-    read_config,
-)
 from univoxel.lights.base import MOST_ROWS, MirroredLight
 from univoxel.lights.latlong import DistantLight
 from univoxel.lights.views import Turntable, ViewLights
@@ -49,39 +39,56 @@ from univoxel.ops.networks import DirectionTable
 class SceneConfig:
     """Sizes of the model."""
 
-    channels: int = 16  # features per voxel, >= 1
-    material_channels: int = 8  # of them, that albedo and roughness are decoded from, >= 1
-    hidden: int = 64  # width of the material and radiance heads, >= 1
-    mirror_levels: int = 5  # of the table of mirrored directions, 29 degrees and finer, [0, 8]
-    sky_nodes: int = 512  # directions of the environment map, >= 0; 0: the scene has none
-    # rows of the map's texels, >= 0, where polished things show it more sharply than its nodes do;
-    # training fills them in
-    sky_rows: int = 0
-    mirrored: bool = True  # whether a local light gets a network for what is mirrored sharply
-    # the light that photographs are rendered with, and its own sizes
-    light: LightConfig = field(default_factory=SGConfig)
-    # Of everything, in (0, 1], where it is known and nothing is metal; None: both are learned
-    roughness: float | None = None
-    # about which the light turns with the camera; None: it stands still
-    turntable: Turntable | None = None
-    varying: Varying = "none"  # what differs from photograph to photograph, see ViewLights
-    codes: int = 8  # numbers that tell the light of a view, where that varies, >= 1
-    # whether the photographs' cameras are learned too, see PoseSteps; training fills it in
-    refined: bool = False
-    # names of the photographs, where something differs from one to another; training fills them in
-    views: tuple[str, ...] = ()
+    channels: int = setting(16, "features per voxel", least=1)
+    material_channels: int = setting(
+        8, "of them, that albedo and roughness are decoded from", least=1
+    )
+    hidden: int = setting(64, "width of the material and radiance heads", least=1)
+    mirror_levels: int = setting(
+        5, "of the table of mirrored directions, 29 degrees and finer", least=0, most=8
+    )
+    sky_nodes: int = setting(
+        512, "directions of the environment map; 0: the scene has none", least=0
+    )
+    sky_rows: int = setting(
+        0,
+        "rows of the map's texels, where polished things show it more sharply than its nodes do; "
+        "training fills them in",
+        least=0,
+        most=MOST_ROWS,
+    )
+    mirrored: bool = setting(
+        True, "whether a local light gets a network for what is mirrored sharply"
+    )
+    light: lights.LightConfig = setting(
+        lights.SGConfig(), "the light that photographs are rendered with, and its own sizes"
+    )
+    roughness: float | None = setting(
+        None,
+        "of everything, where it is known and nothing is metal; None: both are learned",
+        above=0,
+        most=1,
+    )
+    turntable: Turntable | None = setting(
+        None, "about which the light turns with the camera; None: it stands still"
+    )
+    varying: Varying = setting("none", "what differs from photograph to photograph, see ViewLights")
+    codes: int = setting(8, "numbers that tell the light of a view, where that varies", least=1)
+    refined: bool = setting(
+        False,
+        "whether the photographs' cameras are learned too, see PoseSteps; training fills it in",
+    )
+    views: tuple[str, ...] = setting(
+        (),
+        "names of the photographs, where something differs from one to another; training fills "
+        "them in",
+    )
 
     def __post_init__(self) -> None:
-        counts = ("channels", "material_channels", "hidden", "codes")
-        check_fields(self, "at least 1", lambda x: x >= 1, *counts)
-        check_fields(self, "at least 0", lambda x: x >= 0, "sky_nodes")
-        check_fields(self, "in [0, 8]", lambda x: 0 <= x <= 8, "mirror_levels")
-        check_fields(self, f"in [0, {MOST_ROWS}]", lambda x: 0 <= x <= MOST_ROWS, "sky_rows")
+        check_settings(self)
         most = f"at most channels ({self.channels})"
         check_fields(self, most, lambda x: x <= self.channels, "material_channels")
-        check_fields(self, "None or in (0, 1]", lambda x: x is None or 0 < x <= 1, "roughness")
-        check_fields(self, "none, exposure or light", lambda x: x in get_args(Varying), "varying")
-        if self.turntable is not None and not isinstance(self.light, LocalLightConfig):
+        if self.turntable is not None and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
                 "SceneConfig: light that turns with the camera needs hybrid or a local light, sg, "
                 f"sh or mlp, got {self.light.kind}",
@@ -95,7 +102,7 @@ class SceneConfig:
                 "light_frame",
                 "varying",
             )
-        if self.varying == "light" and not isinstance(self.light, LocalLightConfig):
+        if self.varying == "light" and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
                 "SceneConfig: varying light needs hybrid or a local light, sg, sh or mlp, got "
                 f"{self.light.kind}; varying exposure goes with every light"
@@ -114,12 +121,12 @@ class Scene(nn.Module):
         codes = cfg.codes if cfg.varying == "light" else 0
         inputs = cfg.channels + codes  # of what draws photographs: features and the view's code
         self.radiance: RadianceHead = RadianceHead(inputs, cfg.hidden, cfg.mirror_levels)
-        self.light: AbstractLight = build(inputs, cfg.light)
+        self.light: lights.AbstractLight = lights.build(inputs, cfg.light)
         self.sky: DistantLight | None = None
         if cfg.sky_nodes:
             self.sky = DistantLight(cfg.sky_nodes, rows=cfg.sky_rows)
         self.mirrored = None
-        if cfg.mirrored and isinstance(cfg.light, LocalLightConfig):
+        if cfg.mirrored and isinstance(cfg.light, lights.LocalLightConfig):
             known = self.radiance.directions.channels
             self.mirrored: MirroredLight | None = MirroredLight(
                 inputs, cfg.hidden, cfg.light.scale, known
@@ -130,7 +137,7 @@ class Scene(nn.Module):
             self.views: ViewLights | None = ViewLights(cfg.views, codes, directions)
         self.poses: PoseSteps | None = PoseSteps(len(cfg.views)) if cfg.refined else None
         if codes:  # at first they change nothing
-            assert isinstance(self.light, AbstractLocalLight)
+            assert isinstance(self.light, lights.AbstractLocalLight)
             nets = [self.radiance.net, self.light.head]
             nets += [self.mirrored.net] if self.mirrored else []
             for net in nets:
@@ -220,9 +227,9 @@ class Scene(nn.Module):
         """For copies: what traces rays cannot be copied, and is made again."""
         return self.__dict__ | {"_traced": None, "_held": False}
 
-    def environment(self) -> DistantLight | EnvmapLight | EnvmapSGLight | None:
+    def environment(self) -> DistantLight | lights.EnvmapLight | lights.EnvmapSGLight | None:
         """The one distant map that the scene stood in, where it has one; without gains."""
-        if isinstance(self.light, EnvmapLight | EnvmapSGLight):
+        if isinstance(self.light, lights.EnvmapLight | lights.EnvmapSGLight):
             return self.light
         change = self.views.sky_change() if self.views else None
         if self.sky is None or self.views is None or self.views.chosen is None or change is None:
@@ -445,7 +452,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 def _description(meta: dict[str, Any], tensors: dict[str, Tensor]) -> Description:
     """The description, also of files from before there were all of its parts, which get them."""
     scene = dict(meta["scene"])
-    scene["light"] = read_config(scene["light"])
+    scene["light"] = lights.read_config(scene["light"])
     if "mirror_levels" not in scene:
         scene["mirror_levels"] = 0
         none = torch.zeros(0, dtype=torch.int32), torch.zeros(0, DirectionTable.per_level)

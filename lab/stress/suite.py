@@ -18,7 +18,7 @@ from lab.stress.damage import Damage, clipped, damaged
 from lab.stress.report import Cell
 from lab.stress.scenes import Spec
 from univoxel.core.choices import LIGHTS, LightName
-from univoxel.core.files import replacing
+from univoxel.core.files import write_text
 from univoxel.errors import UserError
 
 log: logging.Logger = logging.getLogger("univoxel")
@@ -83,10 +83,8 @@ def stress(
     train = partial(runner.run_pairs, at_once=jobs, scheduler=scheduler)
     cells = _train(found, lights, seeds, prepared, out / "runs", tuple(changes), train)
     clipping = {path.name: clipped(path) for path in dict.fromkeys(prepared.values())}
-    with replacing(out / "stress.json") as temporary:
-        temporary.write_text(result_text(_record(cells, clipping, changes)), encoding="utf-8")
-    with replacing(out / "stress.md") as temporary:
-        temporary.write_text(report.markdown(cells), encoding="utf-8")
+    write_text(out / "stress.json", result_text(_record(cells, clipping, changes)))
+    write_text(out / "stress.md", report.markdown(cells))
     plots.save_figure(report.plot(cells), out / "stress")
     return out / "stress.md"
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
-import io
 import re
 import textwrap
-import tokenize
 import types
 import typing
 from collections.abc import Callable, Iterator
@@ -162,21 +160,24 @@ def _places(root: type) -> dict[type, list[str]]:
 
 def _fields(cls: Any, paths: list[str]) -> str:
     hints = typing.get_type_hints(cls)
-    notes = _comments(cls)
     rows = []
     for field in dataclasses.fields(cls):
-        default = field.default
-        if field.default_factory is not dataclasses.MISSING:
-            made = field.default_factory()
-            default = type(made).__name__ if dataclasses.is_dataclass(made) else made
+        default, said = field.default, field.metadata["setting"]
+        if dataclasses.is_dataclass(default):
+            default = type(default).__name__
         shown = "required" if default is dataclasses.MISSING else f"`{default}`"
         kind = _cell(_type(hints[field.name]))
-        rows.append(f"| `{field.name}` | {kind} | {shown} | {_cell(notes.get(field.name, ''))} |")
+        row = [f"`{field.name}`", kind, shown, said.range, said.unit, _cell(said.meaning)]
+        rows.append(f"| {' | '.join(row)} |")
     where = ", ".join(f"`{path}`" for path in paths if path) or "the root"
     summary = (inspect.getdoc(cls) or "").strip()
     if summary.startswith(f"{cls.__name__}("):  # dataclass writes one where there is none
         summary = ""
-    table = ["| field | type | default | meaning |", "|---|---|---|---|", *rows]
+    table = [
+        "| field | type | default | range | unit | meaning |",
+        "|---|---|---|---|---|---|",
+        *rows,
+    ]
     parts = [f"## {cls.__name__}", f"At {where}.", summary, "\n".join(table) if rows else ""]
     return "\n\n".join(part for part in parts if part)
 
@@ -199,33 +200,6 @@ def _type(hint: Any) -> str:
     )
     name = getattr(typing.get_origin(hint), "__name__", str(hint).replace("typing.", ""))
     return f"`{name}[{inner}]`" if inner else f"`{name}`"
-
-
-def _comments(cls: type) -> dict[str, str]:
-    """Comment of each field: the lines above it, and what stands behind it."""
-    source = textwrap.dedent(inspect.getsource(cls))
-    notes = {}
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            alone = not token.line[: token.start[1]].strip()
-            notes[token.start[0]] = (token.string.lstrip("# "), alone)
-    found = {}
-    body = ast.parse(source).body[0]
-    assert isinstance(body, ast.ClassDef)
-    for node in body.body:
-        if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
-            continue
-        above = []
-        line = node.lineno - 1
-        while line in notes and notes[line][1]:
-            above.insert(0, notes[line][0])
-            line -= 1
-        lines = range(node.lineno, (node.end_lineno or node.lineno) + 1)
-        behind = [notes[n][0] for n in lines if n in notes]
-        text = " ".join(above)
-        joint = "; " if text and behind else ""
-        found[node.target.id] = f"{text}{joint}{' '.join(behind)}"
-    return found
 
 
 # Ops

@@ -244,8 +244,7 @@ def test_left_out_images_leave_no_trace():
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"size": 10}, {"first_octave": -2}, {"exhaustive": 1}, {"partners": 0}, {"seed": -1}],
+    "wrong", [{"size": 10}, {"first_octave": -2}, {"exhaustive": 1}, {"partners": 0}, {"seed": -1}]
 )
 def test_a_configuration_out_of_range_is_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from analytic import write_scene
-from clusters import scheduler, wait_for, worker
+from clusters import wait_for
 
 from univoxel.batch.scenes import (
     PER_PIXEL,
@@ -29,7 +29,7 @@ from univoxel.cli import main
 from univoxel.cli.batch import BatchOptions, job_of
 from univoxel.config import save_config
 from univoxel.core.machine import Memory
-from univoxel.errors import ExistingFile, MissingExtra, ProcessFailed, UserError
+from univoxel.errors import MissingExtra, ProcessFailed, UserError
 from univoxel.scene import FILE, load_checkpoint
 from univoxel.training.pixels import PER_PIXEL as FURTHER
 
@@ -224,42 +224,6 @@ def test_a_training_that_is_killed_goes_on(scenes, tmp_path):
     assert trainings(tmp_path, "ball") == 2
 
 
-def test_workers_and_schedulers_that_are_killed(scenes, tmp_path):
-    """Another worker goes on; with another scheduler the same command does."""
-    out = tmp_path / "night"
-
-    options = {"jobs": None}
-    with scheduler(tmp_path) as (running, address), worker(address), worker(address):
-
-        def both() -> None:
-            wait_for(lambda: in_mid_training(out, "ball"), 240)
-            os.kill(parent(training_process(out, "ball")), signal.SIGKILL)  # either worker has it
-            wait_for(lambda: trainings(out, "ball") == 2, 240)
-            running.kill()
-
-        changing = threading.Thread(target=both)
-        changing.start()
-        with pytest.raises(ProcessFailed, match="scheduler is gone: the same command goes on"):
-            run_batch(scenes[:1], out, SLOW, scheduler=address, **options)
-        changing.join()
-        wait_for(lambda: not training_process(out, "ball"))
-    with scheduler(tmp_path) as (_, address), worker(address):
-        (result,) = run_batch(scenes[:1], out, SLOW, scheduler=address, **options)
-    assert result.state == "done"
-    assert went_on(out, "ball")
-    assert whole(out, "ball")
-
-
-def test_two_batches_on_one_folder_train_each_scene_once(scenes, tmp_path):
-    results = []
-    second = threading.Thread(target=lambda: results.extend(run_batch(scenes, tmp_path)))
-    second.start()
-    results += run_batch(scenes, tmp_path)
-    second.join()
-    assert [result.state for result in results] == ["done"] * 4
-    assert [trainings(tmp_path, name) for name in ("ball", "cup")] == [1, 1]
-
-
 def test_masks_that_photographs_bring_are_taken(scenes, tmp_path):
     """Then nothing is cut out; what made no file is looked at again only until it was trained."""
     options = dataclasses.replace(OPTIONS, steps=("masks", "train"))
@@ -361,14 +325,6 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
     refused(UserError, "expected jobs or scheduler, got both", scheduler="tcp://x:1")
     monkeypatch.setitem(sys.modules, "distributed", None)
     refused(MissingExtra, r"univoxel\[cluster\]")
-
-
-def test_records_of_other_options_are_refused(scenes, tmp_path):
-    job = job_of("ball", scenes[0], dataclasses.replace(OPTIONS, out=tmp_path), 1)
-    job.files.parent.mkdir()
-    job.save({"identity": job.identity | {"data": "/elsewhere"}})
-    with pytest.raises(ExistingFile, match=r"ball\.json is of another data: choose another out"):
-        run_batch(scenes[:1], tmp_path)
 
 
 def test_a_video_is_a_scene(tmp_path):

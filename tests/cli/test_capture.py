@@ -275,15 +275,17 @@ def pictures(tmp_path) -> Path:
     return folder
 
 
-def test_without_a_network_or_masks_depth_tells_the_object(
-    steps, pictures, tmp_path, monkeypatch, caplog
+@pytest.mark.parametrize("there", [False, True])
+def test_masks_come_from_a_network_or_else_from_depth(
+    steps, pictures, tmp_path, monkeypatch, caplog, there
 ):
-    out = tmp_path / "mug"
     monkeypatch.setattr("univoxel.data.load_photos", without_masks)
+    if there:
+        monkeypatch.setattr("univoxel.capture.masks.mask_network", red_is_the_object)
     with caplog.at_level("INFO"):
-        task.capture(pictures, out)
-    assert ("cutout", out / "scene", "none") in steps
-    assert "depth alone tells the object" in caplog.text
+        task.capture(pictures, tmp_path / "mug")
+    assert steps[1] == ("cutout", tmp_path / "mug/scene", "rembg" if there else "none")
+    assert ("depth alone tells the object" in caplog.text) != there
 
 
 def test_masks_of_ones_own_go_on(steps, pictures, tmp_path):
@@ -341,13 +343,6 @@ def test_a_network_that_was_named_is_not_passed_over(steps, pictures, tmp_path, 
     monkeypatch.setattr("univoxel.data.load_photos", without_masks)
     with pytest.raises(MissingExtra, match="need rembg"):
         task.capture(pictures, tmp_path / "mug", network="silueta")
-
-
-def test_with_a_network_masks_come_from_it(steps, pictures, tmp_path, monkeypatch):
-    monkeypatch.setattr("univoxel.data.load_photos", without_masks)
-    monkeypatch.setattr("univoxel.capture.masks.mask_network", red_is_the_object)
-    task.capture(pictures, tmp_path / "mug")
-    assert steps[1] == ("cutout", tmp_path / "mug/scene", "rembg")
 
 
 def test_photographs_with_cameras_and_masks_are_trained_on_as_they_lie(

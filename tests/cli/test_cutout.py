@@ -21,6 +21,7 @@ from univoxel.data.load_images import read_photo
 from univoxel.data.transforms import write_cameras
 from univoxel.errors import DataError, MissingExtra
 
+ROOM = 20  # photographs of the furnished room
 VIEWS, SIZE = 16, 40
 
 
@@ -186,7 +187,7 @@ def test_without_a_network_there_is_one_line(tmp_path, with_masks, monkeypatch, 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     """An object on a patterned floor in a furnished room: its folder, and its true masks."""
-    folder, views = tmp_path_factory.mktemp("room"), textured_room.orbit(30, 200, 150)
+    folder, views = tmp_path_factory.mktemp("room"), textured_room.orbit(ROOM, 200, 150)
     (folder / "train").mkdir()
     true = []
     for view, seen in enumerate(views):
@@ -210,7 +211,7 @@ def test_what_stands_out_in_depth(tmp_path, room, caplog):
 
 def within(view, cameras, lower, upper):
     """The pixels whose surface lies in a box, by formula."""
-    seen = textured_room.orbit(30, 200, 150)[view]
+    seen = textured_room.orbit(ROOM, 200, 150)[view]
     rays, away = image_rays(cameras, view), torch.from_numpy(textured_room.distance(seen))
     place = rays.origin + rays.direction * away.view(-1, 1)
     inside = (place > torch.tensor(lower)) & (place < torch.tensor(upper))
@@ -225,7 +226,7 @@ def test_a_box_takes_the_table_out_of_all_masks(tmp_path, room, caplog):
     folder, box = write_masks(tmp_path / "masks", masks, photos.names), (-0.5, -0.5, 0.03)
     caplog.set_level("INFO", "univoxel")
     cut = load_photos(task.cutout(data, tmp_path / "cut", folder, box=(*box, 0.6, 0.5, 1.2)))
-    assert "the object is told by masks of 30 photographs, depth of " in caplog.text
+    assert "the object is told by masks of 20 photographs, depth of " in caplog.text
     assert "% of the surface, the box; it lies between " in caplog.text
     agreed = [iou(cut.picture(view)[1], mask) for view, mask in enumerate(true)]
     assert np.mean(agreed) > 0.9

@@ -289,14 +289,8 @@ def broken_relit(folders):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            lambda f: (f.run / "config.json").unlink(),
-            r"expected the folder of a run, got no config",
-        ),
-        (
-            lambda f: (f.run / "config.json").write_text("{}"),
-            "config.json: expected data, a folder",
-        ),
+        (lambda f: (f.run / "config.json").unlink(), r"expected the folder of a run, got no"),
+        (lambda f: (f.run / "config.json").write_text("{}"), "config.json: expected data, a"),
         (lambda f: (f.run / "config.json").write_text("{"), "config.json: .* JSON"),
         (
             lambda f: (f.data / "envmaps" / "dim.hdr").write_bytes(b"#?"),

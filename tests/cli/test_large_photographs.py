@@ -5,10 +5,10 @@ import json
 
 import pytest
 from analytic import write_scene
+from plain import plain_stage, plain_training
 
 from univoxel.cli.evaluate import evaluate
 from univoxel.cli.trainer import train
-from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import image_cache, load_images, load_photos
 from univoxel.errors import UserError
 from univoxel.lights import SGConfig
@@ -35,12 +35,14 @@ def read(monkeypatch):
 
 def config(tmp_path, **changes):
     light = SGConfig(lobes=2, hidden=8, directions=16, directions_eval=16)
-    stage = StageConfig(voxels=0.008, iterations=10, share=1.0, rays=64, physical_from=0.5)
+    stage = plain_stage(voxels=0.008, iterations=10, share=1.0, rays=64, physical_from=0.5)
     sizes = SceneConfig(4, material_channels=2, hidden=8, sky_nodes=16, light=light)
     data = tmp_path / "data"
     if not data.exists():
         write_scene(data, 6)
-    cfg = TrainConfig(data, tmp_path / "run", (stage,), minutes=2.0, scene=sizes, voxel_pixels=0.0)
+    cfg = plain_training(
+        data, tmp_path / "run", (stage,), minutes=2.0, scene=sizes, voxel_pixels=0.0
+    )
     return dataclasses.replace(cfg, **changes)
 
 

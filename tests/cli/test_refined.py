@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 import torch
 from analytic import LIGHTS, RADIUS, cameras_around, write_scene
+from plain import plain_stage, plain_training
 
 from lab.stress.damage import turned
 from univoxel.camera import project
 from univoxel.cli import trainer as task
 from univoxel.cli.trainer import train
-from univoxel.config import StageConfig, TrainConfig
+from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
 from univoxel.evaluation.confidence import survey
 from univoxel.lights import SGConfig
+from univoxel.preparation import pose_refinement
 from univoxel.preparation.prepare import find_silhouettes
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig, load_scene
@@ -36,11 +38,11 @@ def data(tmp_path_factory):
 def config(data, out, cameras="auto") -> TrainConfig:
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
-        StageConfig(voxels=0.01, iterations=80, share=0.5, rays=256),
-        StageConfig(voxels=0.02, iterations=80, share=0.5, rays=256, physical_from=0.5),
+        plain_stage(voxels=0.01, iterations=80, share=0.5, rays=256),
+        plain_stage(voxels=0.02, iterations=80, share=0.5, rays=256, physical_from=0.5),
     )
     scene = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
-    return TrainConfig(
+    return plain_training(
         data, out, stages, minutes=2.0, cameras=cameras, scene=scene, voxel_pixels=0.0
     )
 
@@ -97,7 +99,8 @@ def test_given_cameras_are_only_complained_about(data, tmp_path, caplog):
 
 def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):
     """From a checkpoint after the first stage: the box and the cameras are as they were."""
-    cfg = config(data, tmp_path / "run")
+    monkeypatch.setattr(pose_refinement, "STEPS", 10)
+    cfg = config(data, tmp_path / "run", cameras="refined")
     original, stages = task.run_stage, []
 
     def killed(scene, cfg, stage, *rest):
@@ -119,9 +122,10 @@ def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("light", LIGHTS, ids=lambda light: light.kind)
-def test_cameras_are_refined_under_every_light(data, tmp_path, light):
+def test_cameras_are_refined_under_every_light(data, tmp_path, monkeypatch, light):
     """The directions to them have gradients, then, and what is drawn under the light takes some."""
-    cfg = config(data, tmp_path / "run")
+    monkeypatch.setattr(pose_refinement, "STEPS", 10)
+    cfg = config(data, tmp_path / "run", cameras="refined")
     stage = replace(cfg.stages[1], iterations=5, physical_from=0.0)
     cfg = replace(cfg, stages=(stage,), scene=replace(cfg.scene, light=light, sky_nodes=0))
     scene = load_scene(train(cfg))

@@ -9,13 +9,13 @@ import torch
 from analytic import write_scene
 from cropped import windows, write_cropped
 from PIL import Image
+from plain import plain_stage, plain_training
 
 from univoxel.capture import cutout as task
 from univoxel.cli.evaluate import evaluate
 from univoxel.cli.inspect import inspect
 from univoxel.cli.relight import relight_images, relight_to_files
 from univoxel.cli.trainer import train
-from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import load_photos, load_truth
 from univoxel.data.images import image_size, read_exr, read_image, write_exr, write_png
 from univoxel.errors import DataError, UserError
@@ -48,14 +48,14 @@ def runs(data, whole, tmp_path_factory):
     """Trained on the cut and on the whole photographs."""
     out = tmp_path_factory.mktemp("runs")
     light = SGConfig(lobes=2, hidden=8, directions=16, directions_eval=16)
-    stage = StageConfig(voxels=0.02, iterations=60, share=1.0, rays=256, physical_from=0.5)
+    stage = plain_stage(voxels=0.02, iterations=60, share=1.0, rays=256, physical_from=0.5)
     sizes = SceneConfig(4, material_channels=2, hidden=8, sky_nodes=16, light=light)
     film = timelapse.FRAMES
     timelapse.FRAMES = 1e9
     try:
         return [
             train(
-                TrainConfig(
+                plain_training(
                     folder, out / name, (stage,), minutes=2.0, scene=sizes, voxel_pixels=0.0
                 ),
                 timelapse=out / f"{name}.gif",

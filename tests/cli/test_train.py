@@ -7,6 +7,7 @@ import pytest
 import torch
 from analytic import LIGHTS, RADIUS, photos_of, sphere_scene, write_scene
 from layouts import Scene, write_colmap
+from plain import plain_stage, plain_training
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
@@ -15,12 +16,12 @@ from univoxel.cli import trainer as task
 from univoxel.cli.info import info
 from univoxel.cli.trainer import train
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.config import JointConfig, StageConfig, TrainConfig, save_config
+from univoxel.config import JointConfig, TrainConfig, save_config
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.lights import SGConfig
 from univoxel.preparation import prepare as preparation
-from univoxel.presets import preset, with_field
+from univoxel.presets import with_field
 from univoxel.render.pipeline import extract_mesh
 from univoxel.run import load_verdict
 from univoxel.run import photos_of as photos_of_run
@@ -39,10 +40,10 @@ def data(tmp_path_factory):
 def config(data, out, **changes) -> TrainConfig:
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
-        StageConfig(voxels=0.01, iterations=60, share=0.5, rays=256),
-        StageConfig(voxels=0.03, iterations=80, share=0.5, rays=256, physical_from=0.0),
+        plain_stage(voxels=0.01, iterations=60, share=0.5, rays=256),
+        plain_stage(voxels=0.03, iterations=80, share=0.5, rays=256, physical_from=0.0),
     )
-    cfg = TrainConfig(
+    cfg = plain_training(
         data,
         out,
         stages,
@@ -209,7 +210,7 @@ def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, caplog):
     written = Scene(poses.numpy(), pictures.numpy()).turned(turn)
     focal = float(photos.cameras.focal[0, 0])
     data = write_colmap(tmp_path / "data", written, parameters=(focal, 32.0, 32.0))
-    stages = (StageConfig(voxels=0.01, iterations=40, share=1.0, rays=256),)
+    stages = (plain_stage(voxels=0.01, iterations=40, share=1.0, rays=256),)
     out = train(config(data, tmp_path / "run", stages=stages, downscale=2))
     said = "COLMAP model, 14 photographs of 32x32 pixels in train, shrunk to 1/2, world turned to"
     assert said in caplog.text
@@ -363,13 +364,6 @@ def test_pixels_are_those_in_and_near_silhouettes():
     assert found.dtype == torch.int32  # photographs have many
     wanted = (distance < pixels_module.MARGIN).nonzero().tolist()
     assert sorted(found.tolist()) == wanted
-
-
-def test_unknown_preset(tmp_path):
-    with pytest.raises(
-        ValueError, match="preset must be one of draft, fast, full, best, got 'quick'"
-    ):
-        preset("quick", tmp_path, tmp_path)
 
 
 def test_a_training_says_how_it_came_out(data, tmp_path, caplog):

@@ -18,12 +18,14 @@ from observed_points import (
     problem_on_a_sphere,
     random_problem,
 )
+from plain import plain_stage, plain_training
+from tiny import OPTIONS
 
 from univoxel.cli import main
 from univoxel.cli import trainer as task
 from univoxel.cli.trainer import train
 from univoxel.color import linear_to_srgb_unclipped
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import JointConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.lights import SGConfig
@@ -159,7 +161,7 @@ def test_solve_finds_gains_and_the_albedo_under_them():
     with torch.no_grad():
         scene.views.gain_steps.zero_()
     cfg = JointConfig(points=800, newton_points=800, rays=512, tracing=1, rounds=3)
-    joint_solve.solve(scene, photos, cfg, 0, Steps(600))
+    joint_solve.solve(scene, photos, cfg, 0, Steps(400))
     error = scene.views.log_gain.detach() / math.log(2) - wanted
     mesh = extract_mesh(scene)
     x = mesh.vertices[:, 0]
@@ -174,20 +176,17 @@ def test_training_explains_exposures(tmp_path):
     data = write_scene(tmp_path / "data", gain=2 ** stops(12, 1.5))
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
-        StageConfig(voxels=0.01, iterations=60, share=0.5, rays=256),
-        StageConfig(voxels=0.03, iterations=80, share=0.5, rays=256, physical_from=0.0),
+        plain_stage(voxels=0.01, iterations=40, share=0.5, rays=256),
+        plain_stage(voxels=0.03, iterations=60, share=0.5, rays=256, physical_from=0.0),
     )
     sizes = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
     photos = load_photos(data, "train")
     pixels = torch.cartesian_prod(torch.arange(12), torch.arange(32), torch.arange(32))
     found = {}
-    for varying in ("none", "auto", "exposure", "light"):
-        auto = varying == "auto"
-        scene = replace(sizes, varying="none" if auto else varying)
-        run = tmp_path / varying
-        cfg = TrainConfig(data, run, stages, minutes=2.0, exposures=auto, scene=scene)
-        learned = load_scene(train(cfg))
-        assert learned.cfg.varying == ("exposure" if auto else varying)
+    for varying in ("none", "exposure", "light"):
+        scene, run = replace(sizes, varying=varying), tmp_path / varying
+        learned = load_scene(train(plain_training(data, run, stages, minutes=2.0, scene=scene)))
+        assert learned.cfg.varying == varying
         assert learned.cfg.views == (() if varying == "none" else tuple(photos.names))
         found[varying] = held_out_psnr(learned, photos, pixels, physical=True)
     assert min(v for k, v in found.items() if k != "none") > found["none"] + 1
@@ -197,23 +196,18 @@ def test_training_starts_from_the_exposures_that_were_seen(tmp_path, monkeypatch
     wanted = stops(12, 1.5).mean(1, keepdim=True).expand(-1, 3)
     data = write_scene(tmp_path / "data", gain=2**wanted)
     monkeypatch.setattr(task, "run_stage", lambda *_: None)
-    stages = (StageConfig(voxels=0.01, iterations=1, share=1.0),)
-    cfg = TrainConfig(data, tmp_path / "run", stages, minutes=1.0, exposures=True)
-    found = load_scene(train(cfg)).views.log_gain.detach() / math.log(2)
+    stages = (plain_stage(voxels=0.01, iterations=1, share=1.0),)
+    cfg = plain_training(data, tmp_path / "run", stages, minutes=1.0, exposures=True)
+    learned = load_scene(train(cfg))
+    assert learned.cfg.varying == "exposure"
+    found = learned.views.log_gain.detach() / math.log(2)
     assert (found - wanted).square().mean().sqrt() < 0.1
 
 
 def test_the_light_of_a_view_from_the_command_line(tmp_path, capsys):
     data = write_scene(tmp_path / "data", views=6, size=16)
-    small = [
-        *(f"--set=stages.{i}.{name}" for i in (0, 1, 3) for name in ("voxels=0.004", "rays=64")),
-        *(f"--set=stages.{i}.iterations=2" for i in (0, 2, 3)),
-        *("--set=stages.1.iterations=20", "--set=stages.1.physical_from=0.0"),
-        *("--set=stages.2.rays=64", "--set=stages.2.points=64", "--set=stages.2.newton_points=8"),
-        *("--set=scene.sky_nodes=32", "--set=scene.light.directions=8"),
-    ]
     run = tmp_path / "run"
-    assert main(["train", str(data), "--out", str(run), "--varying", "light", *small]) == 0
+    assert main(["train", str(data), "--out", str(run), "--varying", "light", *OPTIONS]) == 0
     with torch.no_grad():  # 20 steps make no difference to see
         scene, state = load_checkpoint(run)
         scene.views.sky_weights.normal_()

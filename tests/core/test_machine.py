@@ -58,12 +58,7 @@ def test_memory_of_this_machine():
             1,
         ),
         # In a container the path is one of the host: the mounted root is the group
-        (
-            "0::/../host\n",
-            {"memory.max": f"{2 * GIB}\n", "memory.current": f"{GIB}\n"},
-            2,
-            1,
-        ),
+        ("0::/../host\n", {"memory.max": f"{2 * GIB}\n", "memory.current": f"{GIB}\n"}, 2, 1),
         (
             "5:cpu,cpuacct:/x\n4:memory:/docker/1\n",
             {

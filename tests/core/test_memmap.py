@@ -14,11 +14,12 @@ from PIL import Image
 
 from univoxel.core import memmap
 from univoxel.data import image_cache, load_images, load_photos
+from univoxel.data.photos import packed, unpacked
 from univoxel.errors import DataError
 from univoxel.preparation.hull import mask_distances
 from univoxel.training import pixels as training_pixels
 from univoxel.training.loop import batch_at
-from univoxel.training.pixels import packed, split_pixels, unpacked
+from univoxel.training.pixels import split_pixels
 
 pytestmark = pytest.mark.skipif(not memmap.MAPS, reason="arrays on disk are of Linux")
 

@@ -180,7 +180,10 @@ def test_pictures_of_one_name_in_two_folders(tmp_path):
     assert view_names(["a/0.png", "b/1.png"]) == ["0", "1"]
 
 
-@pytest.mark.parametrize("writer", [write_nerfstudio, write_llff, write_colmap])
+@pytest.mark.parametrize(
+    "writer",
+    [write_nerfstudio, write_llff, write_colmap, write_metashape, write_realitycapture],
+)
 def test_coordinates_of_the_earth(tmp_path, writer):
     """Distances between cameras stay as exact as float32 has them, in every layout."""
     written = scene()

@@ -14,16 +14,6 @@ from PIL import Image, ImageCms
 
 from univoxel.core.files import replacing
 from univoxel.data import images
-from univoxel.data.images import (
-    OF_RADIANCE,
-    REC_709,
-    image_size,
-    read_exr,
-    read_image,
-    write_exr,
-    write_png,
-    write_radiance,
-)
 from univoxel.data.load_images import read_photo
 from univoxel.envmap import read_map
 from univoxel.errors import DataError
@@ -39,22 +29,22 @@ def noise(*shape, dtype=np.float32):
 @pytest.mark.parametrize("shape", [(5, 7), (5, 7, 3), (5, 7, 4)])
 def test_png_bytes_survive_a_round_trip(tmp_path, shape):
     image = (255 * noise(*shape)).astype(np.uint8)
-    write_png(tmp_path / "a.png", torch.from_numpy(image))
-    back = read_image(tmp_path / "a.png")
+    images.write_png(tmp_path / "a.png", torch.from_numpy(image))
+    back = images.read_image(tmp_path / "a.png")
     assert back.dtype == torch.uint8
     assert np.array_equal(back.numpy().reshape(shape), image)
     assert back.shape == (5, 7, shape[2] if len(shape) == 3 else 1)
 
 
 def test_png_of_floats_rounds_and_clips(tmp_path):
-    write_png(tmp_path / "a.png", np.array([[-1.0, 0.2, 0.5, 2.0]]))
-    assert read_image(tmp_path / "a.png").flatten().tolist() == [0, 51, 128, 255]
+    images.write_png(tmp_path / "a.png", np.array([[-1.0, 0.2, 0.5, 2.0]]))
+    assert images.read_image(tmp_path / "a.png").flatten().tolist() == [0, 51, 128, 255]
 
 
 def test_png_of_16_bits_is_not_cut(tmp_path):
     image = np.array([[0, 257, 32768, 65535]], np.uint16)
     Image.fromarray(image).save(tmp_path / "a.png")
-    back = read_image(tmp_path / "a.png")
+    back = images.read_image(tmp_path / "a.png")
     torch.testing.assert_close(back[0, :, 0], torch.tensor([0, 257, 32768, 65535]) / 65535)
 
 
@@ -63,7 +53,7 @@ def test_palette_with_transparency_becomes_rgba(tmp_path):
     image.putpalette([255, 0, 0, 0, 0, 255])
     image.putdata([0, 1])
     image.save(tmp_path / "a.png", transparency=1)
-    assert read_image(tmp_path / "a.png").tolist() == [[[255, 0, 0, 255], [0, 0, 255, 0]]]
+    assert images.read_image(tmp_path / "a.png").tolist() == [[[255, 0, 0, 255], [0, 0, 255, 0]]]
 
 
 def swapped_profile() -> bytes:
@@ -79,36 +69,38 @@ def test_colours_of_a_profile(tmp_path, name):
     picture = Image.new("RGBA" if name in ("a.png", "a.webp") else "RGB", (2, 2), (250, 10, 20))
     options = {"quality": 100} | ({"lossless": True} if name == "a.webp" else {})
     picture.save(tmp_path / name, icc_profile=swapped_profile(), **options)
-    stored, seen = (read_image(tmp_path / name, s)[0, 0, :3].tolist() for s in (False, True))
+    stored, seen = (images.read_image(tmp_path / name, s)[0, 0, :3].tolist() for s in (False, True))
     assert stored == pytest.approx([250, 10, 20], abs=3)
     assert seen == pytest.approx([10, 250, 20], abs=6)
     assert read_photo(tmp_path / name, masks=False)[0][0, 0].tolist() == seen
     for profile in (b"none", ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()):
         picture.save(tmp_path / name, icc_profile=profile, **options)
-        assert read_image(tmp_path / name, in_srgb=True)[0, 0, 0] == pytest.approx(250, abs=3)
+        assert images.read_image(tmp_path / name, in_srgb=True)[0, 0, 0] == pytest.approx(
+            250, abs=3
+        )
 
 
 def test_other_kinds_under_the_name_of_jpeg(tmp_path):
     path = tmp_path / "a.jpg"
     for kind in ("WEBP", "TIFF", "PNG"):
         Image.new("RGB", (5, 3), (9, 8, 7)).save(path, format=kind, lossless=True)
-        assert read_image(path)[0, 0].tolist() == [9, 8, 7]
-        assert image_size(path) == (5, 3)
+        assert images.read_image(path)[0, 0].tolist() == [9, 8, 7]
+        assert images.image_size(path) == (5, 3)
     path.write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
-    for read in (read_image, image_size):
+    for read in (images.read_image, images.image_size):
         with pytest.raises(DataError, match=r"a\.jpg: .*got HEIC or AVIF under that name: convert"):
             read(path)
     Image.fromarray(np.zeros((3, 5), np.float32)).save(tmp_path / "a.tif")
     with pytest.raises(DataError, match="expected a picture of 8 or 16 bits, got one of 32"):
-        read_image(tmp_path / "a.tif")
+        images.read_image(tmp_path / "a.tif")
     (tmp_path / "a.tif").write_bytes(b"II*\0" + bytes(40))
     with pytest.raises(DataError, match=r"could not read this TIFF: .*: convert it to"):
-        read_image(tmp_path / "a.tif")
+        images.read_image(tmp_path / "a.tif")
 
 
 def test_jpeg(tmp_path):
     Image.new("RGB", (8, 4), (200, 100, 50)).save(tmp_path / "a.JPG", quality=100)
-    image = read_image(tmp_path / "a.JPG")
+    image = images.read_image(tmp_path / "a.JPG")
     assert image.shape == (4, 8, 3)
     # JPEG rounds its colour transform
     torch.testing.assert_close(image[0, 0].float(), torch.tensor([200.0, 100, 50]), atol=2, rtol=0)
@@ -119,8 +111,8 @@ def test_jpeg(tmp_path):
 
 def test_half_exr_survives_a_round_trip(tmp_path):
     channels = {name: noise(6, 9, dtype=np.float16) for name in ("R", "rgb.G", "depth")}
-    write_exr(tmp_path / "a.exr", channels)
-    back = read_exr(tmp_path / "a.exr")
+    images.write_exr(tmp_path / "a.exr", channels)
+    back = images.read_exr(tmp_path / "a.exr")
     assert back.keys() == channels.keys()
     for name, value in channels.items():
         assert back[name].dtype == np.float32
@@ -129,37 +121,37 @@ def test_half_exr_survives_a_round_trip(tmp_path):
 
 def test_float_exr_survives_a_round_trip(tmp_path):
     value = torch.from_numpy(1e6 * noise(6, 9))
-    write_exr(tmp_path / "a.exr", {"Y": value}, half=False)
-    assert torch.equal(read_image(tmp_path / "a.exr")[..., 0], value)
+    images.write_exr(tmp_path / "a.exr", {"Y": value}, half=False)
+    assert torch.equal(images.read_image(tmp_path / "a.exr")[..., 0], value)
 
 
 def test_half_exr_holds_no_infinity(tmp_path):
-    write_exr(tmp_path / "a.exr", {"Y": np.array([[1e6, -1e6, 1.0]])})
-    assert read_exr(tmp_path / "a.exr")["Y"].tolist() == [[65504.0, -65504.0, 1.0]]
+    images.write_exr(tmp_path / "a.exr", {"Y": np.array([[1e6, -1e6, 1.0]])})
+    assert images.read_exr(tmp_path / "a.exr")["Y"].tolist() == [[65504.0, -65504.0, 1.0]]
 
 
 def test_image_takes_rgba_in_order(tmp_path):
     channels = {name: np.full((2, 3), k) for k, name in enumerate("ABGR")}
-    write_exr(tmp_path / "a.exr", channels | {"Z": np.zeros((2, 3))})
-    assert read_image(tmp_path / "a.exr")[0, 0].tolist() == [3, 2, 1, 0]
+    images.write_exr(tmp_path / "a.exr", channels | {"Z": np.zeros((2, 3))})
+    assert images.read_image(tmp_path / "a.exr")[0, 0].tolist() == [3, 2, 1, 0]
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_exr_with_nan_is_no_picture(tmp_path, bad):
     value = np.zeros((4, 5), np.float32)
     value[2, 3] = bad
-    write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", value), half=False)
+    images.write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", value), half=False)
     with pytest.raises(DataError, match=r"a\.exr: NaN or infinity at row 2, column 3"):
-        read_image(tmp_path / "a.exr")
+        images.read_image(tmp_path / "a.exr")
 
 
 def test_exr_without_colours_is_no_picture(tmp_path):
-    write_exr(tmp_path / "a.exr", {"depth": np.zeros((2, 2))})
+    images.write_exr(tmp_path / "a.exr", {"depth": np.zeros((2, 2))})
     with pytest.raises(DataError, match="expected channels R, G, B or Y, got depth"):
-        read_image(tmp_path / "a.exr")
-    write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 2)), "G": np.zeros((2, 2))})
+        images.read_image(tmp_path / "a.exr")
+    images.write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 2)), "G": np.zeros((2, 2))})
     with pytest.raises(DataError, match="expected channels R, G, B or Y, got G, R"):
-        read_image(tmp_path / "a.exr")
+        images.read_image(tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize("corner", [(0, 0), (2, 3), (-1, -2), (8, 6), (20, 0), (-9, 0)])
@@ -173,8 +165,8 @@ def test_cropped_exr(tmp_path, corner):
     OpenEXR.File(header, {"Y": data}).write(str(tmp_path / "a.exr"))
     whole = np.zeros((40, 40), np.float32)  # of which pixel 0, 0 is at 10, 10
     whole[10 + y : 14 + y, 10 + x : 15 + x] = data
-    assert np.array_equal(read_exr(tmp_path / "a.exr")["Y"], whole[11:19, 11:21])
-    assert image_size(tmp_path / "a.exr") == (10, 8)
+    assert np.array_equal(images.read_exr(tmp_path / "a.exr")["Y"], whole[11:19, 11:21])
+    assert images.image_size(tmp_path / "a.exr") == (10, 8)
 
 
 def test_an_exr_of_several_parts(tmp_path):
@@ -185,10 +177,10 @@ def test_an_exr_of_several_parts(tmp_path):
         for name, channels in (("depth", "Z"), ("beauty", "RGB"), ("diffuse", "RGB"))
     ]
     OpenEXR.File(parts[:2]).write(str(tmp_path / "a.exr"))
-    assert sorted(read_exr(tmp_path / "a.exr")) == ["B", "G", "R"]
+    assert sorted(images.read_exr(tmp_path / "a.exr")) == ["B", "G", "R"]
     OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
     with pytest.raises(DataError, match="got parts with colours: depth, beauty, diffuse: write th"):
-        read_image(tmp_path / "a.exr")
+        images.read_image(tmp_path / "a.exr")
 
 
 DISPLAY_P3 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329)
@@ -201,8 +193,8 @@ ACES_CG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
         # Colours as published with the spaces, white adapted as of Bradford
         (DISPLAY_P3, [1.22494, -0.04206, -0.01964]),
         (ACES_CG, [1.70505, -0.13026, -0.02400]),
-        (REC_709, [1, 0, 0]),
-        (OF_RADIANCE, [1, 0, 0]),
+        (images.REC_709, [1, 0, 0]),
+        (images.OF_RADIANCE, [1, 0, 0]),
         ((0,) * 8, [1, 0, 0]),
     ],
 )
@@ -218,7 +210,7 @@ def test_colours_of_stated_primaries(tmp_path, stated, red):
     lines = f"PRIMARIES= {' '.join(map(str, stated))}\n".encode()
     (tmp_path / "a.hdr").write_bytes(head.replace(b"FORMAT", lines + b"FORMAT"))
     for path in tmp_path.iterdir():
-        white, found = read_image(path)[0].tolist()
+        white, found = images.read_image(path)[0].tolist()
         assert white == pytest.approx([0.5] * 3, abs=1e-3)
         assert found == pytest.approx([max(x / 2, 0) for x in red], abs=1e-3)
 
@@ -227,9 +219,9 @@ def test_maps_that_are_nearly_right(tmp_path):
     """Filters leave texels slightly below 0; a JPEG says nothing of the sun."""
     value = np.full((4, 8), 2.0)
     value[1, 2] = -0.01
-    write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", value))
+    images.write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", value))
     assert float(read_map(tmp_path / "a.exr").radiance.min()) == 0
-    write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", 4 * value - 7.9))
+    images.write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", 4 * value - 7.9))
     with pytest.raises(DataError, match="expected finite radiance of at least 0"):
         read_map(tmp_path / "a.exr")
     Image.new("RGB", (8, 4)).save(tmp_path / "a.jpg")
@@ -244,12 +236,12 @@ def test_the_largest_photographs(tmp_path, monkeypatch):
     monkeypatch.setattr(images, "LARGEST", 40)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
     Image.new("RGB", (8, 5)).save(tmp_path / "a.png")
-    assert read_image(tmp_path / "a.png").shape == (5, 8, 3)
-    assert image_size(tmp_path / "a.png") == (8, 5)
+    assert images.read_image(tmp_path / "a.png").shape == (5, 8, 3)
+    assert images.image_size(tmp_path / "a.png") == (8, 5)
     assert Image.MAX_IMAGE_PIXELS == 10
     Image.new("RGB", (9, 5)).save(tmp_path / "a.png")
     with pytest.raises(DataError, match="exceeds limit of 40 pixels"):
-        read_image(tmp_path / "a.png")
+        images.read_image(tmp_path / "a.png")
 
 
 # Radiance
@@ -269,7 +261,7 @@ def test_flat_radiance_is_exact(tmp_path):
     pixels[..., 3] = g.integers(100, 160, (2, 8))
     pixels[1, 2] = (9, 9, 9, 0)  # exponent 0 is black
     (tmp_path / "a.hdr").write_bytes(radiance(pixels.tobytes()))
-    image = read_image(tmp_path / "a.hdr")
+    image = images.read_image(tmp_path / "a.hdr")
     for row in range(2):
         for column in range(8):
             expected = rgbe_value(*map(int, pixels[row, column]))
@@ -288,7 +280,7 @@ def test_written_radiance_decodes_by_hand(tmp_path):
     picture[0, 4] = (1e39, 1.0, 0.0)  # above the largest number
     picture[0, 5] = 1e-40  # below the smallest
     picture[1] = np.exp(np.random.default_rng(0).normal(0, 8, (8, 3)))
-    write_radiance(tmp_path / "a.hdr", picture)
+    images.write_radiance(tmp_path / "a.hdr", picture)
     body = (tmp_path / "a.hdr").read_bytes()[-64:]
     back = np.array([rgbe_value(*body[i : i + 4]) for i in range(0, 64, 4)]).reshape(2, 8, 3)
     assert np.array_equal(back[0, :2], picture[0, :2])
@@ -297,7 +289,7 @@ def test_written_radiance_decodes_by_hand(tmp_path):
     fair = np.delete(np.arange(16), [4, 5])
     error = np.abs(back - picture).reshape(16, 3)[fair]
     assert (error <= picture.reshape(16, 3)[fair].max(1, keepdims=True) / 256).all()
-    assert np.array_equal(read_image(tmp_path / "a.hdr").numpy(), back.astype(np.float32))
+    assert np.array_equal(images.read_image(tmp_path / "a.hdr").numpy(), back.astype(np.float32))
 
 
 def test_run_lengths_are_decoded(tmp_path):
@@ -308,7 +300,7 @@ def test_run_lengths_are_decoded(tmp_path):
     exponent = [128 + 7, 136, 1, 137]
     row = head + red + green + blue + exponent
     (tmp_path / "a.hdr").write_bytes(radiance(row + row))
-    image = read_image(tmp_path / "a.hdr")
+    image = images.read_image(tmp_path / "a.hdr")
     expected = [[200, g, b] for g, b in zip([10, 20, 30] + [40] * 5, range(1, 9), strict=True)]
     expected[-1] = [2 * v for v in expected[-1]]
     assert image.tolist() == [expected, expected]
@@ -319,10 +311,7 @@ def test_run_lengths_are_decoded(tmp_path):
     [
         (b"P6 8 2 255", r"expected a Radiance picture .* got b'P6 8 2 2'"),
         (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n", "expected a header and pixels"),
-        (
-            radiance(bytes(64), form="32-bit_rle_xyze"),
-            "expected FORMAT=32-bit_rle_rgbe, got .*xyze",
-        ),
+        (radiance(bytes(64), form="32-bit_rle_xyze"), "expected FORMAT=32-bit_rle_rgbe, got"),
         (radiance(bytes(64), size="+Y 2 +X 8"), r"expected the size .* got b'\+Y 2"),
         (radiance(b"", size="-Y 0 +X 8"), "expected the size"),
         (radiance(bytes(63)), "expected 64 bytes of 8x2 flat pixels .* got 63"),
@@ -335,7 +324,7 @@ def test_run_lengths_are_decoded(tmp_path):
 def test_broken_radiance(tmp_path, content, message):
     (tmp_path / "a.hdr").write_bytes(content)
     with pytest.raises(DataError, match=rf"a\.hdr: {message}"):
-        read_image(tmp_path / "a.hdr")
+        images.read_image(tmp_path / "a.hdr")
 
 
 # Broken files of all kinds
@@ -344,11 +333,11 @@ def test_broken_radiance(tmp_path, content, message):
 def written(path):
     match path.suffix:
         case ".png":
-            write_png(path, (255 * noise(40, 40, 3)).astype(np.uint8))
+            images.write_png(path, (255 * noise(40, 40, 3)).astype(np.uint8))
         case ".jpg":
             Image.fromarray((255 * noise(40, 40, 3)).astype(np.uint8)).save(path)
         case ".exr":
-            write_exr(path, dict.fromkeys("RGB", noise(40, 40)))
+            images.write_exr(path, dict.fromkeys("RGB", noise(40, 40)))
         case ".hdr":
             path.write_bytes(radiance(bytes(64)))
     return path.read_bytes()
@@ -361,41 +350,41 @@ def test_truncated_files(tmp_path, suffix, keep):
     content = written(path)
     path.write_bytes(content[: int(keep * len(content))])
     with pytest.raises(DataError, match=rf"a\{suffix}: "):
-        read_image(path)
+        images.read_image(path)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".exr", ".hdr"])
 def test_empty_missing_and_foreign_files(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     with pytest.raises(DataError, match="expected a file, got nothing there"):
-        read_image(path)
+        images.read_image(path)
     path.write_bytes(b"")
     with pytest.raises(DataError, match="the file is empty"):
-        read_image(path)
+        images.read_image(path)
     path.write_bytes(b"this is no picture, whatever its name says" * 20)
     with pytest.raises(DataError, match=rf"a\{suffix}: expected"):
-        read_image(path)
+        images.read_image(path)
     path.unlink()
     path.mkdir()
     with pytest.raises(DataError, match="expected a file, got a folder"):
-        read_image(path)
+        images.read_image(path)
 
 
 def test_png_that_declares_a_huge_size(tmp_path):
-    write_png(tmp_path / "a.png", np.zeros((4, 4), np.uint8))
+    images.write_png(tmp_path / "a.png", np.zeros((4, 4), np.uint8))
     content = bytearray((tmp_path / "a.png").read_bytes())
     content[16:24] = struct.pack(">II", 1 << 30, 1 << 30)
     (tmp_path / "a.png").write_bytes(content)
     with pytest.raises(DataError, match=r"a\.png: expected a PNG or JPEG"):
-        read_image(tmp_path / "a.png")
+        images.read_image(tmp_path / "a.png")
 
 
 def test_unknown_suffix(tmp_path):
     with pytest.raises(DataError, match=r"expected a picture \(\.png .* got '\.bmp'"):
-        read_image(tmp_path / "a.bmp")
+        images.read_image(tmp_path / "a.bmp")
 
 
-@pytest.mark.parametrize("read", [read_image, image_size])
+@pytest.mark.parametrize("read", [images.read_image, images.image_size])
 @pytest.mark.parametrize("name", ["IMG_1.HEIC", "a.heif", "a.avif"])
 def test_pictures_of_telephones(tmp_path, read, name):
     (tmp_path / name).write_bytes(b"ftypheic")
@@ -417,7 +406,7 @@ def test_pictures_of_telephones(tmp_path, read, name):
 )
 def test_what_is_no_png(tmp_path, image, message):
     with pytest.raises(ValueError, match=message):
-        write_png(tmp_path / "a.png", image)
+        images.write_png(tmp_path / "a.png", image)
     assert not list(tmp_path.iterdir())
 
 
@@ -426,22 +415,22 @@ def test_what_is_no_png(tmp_path, image, message):
 )
 def test_what_is_no_exr(tmp_path, channels):
     with pytest.raises(ValueError, match=r"channels must be \[H, W\] of one size"):
-        write_exr(tmp_path / "a.exr", channels)
+        images.write_exr(tmp_path / "a.exr", channels)
     assert not list(tmp_path.iterdir())
 
 
 def write(path, value):
     if path.suffix == ".png":
-        write_png(path, np.full((2, 2), value, np.uint8))
+        images.write_png(path, np.full((2, 2), value, np.uint8))
     else:
-        write_exr(path, {"Y": np.full((2, 2), value)})
+        images.write_exr(path, {"Y": np.full((2, 2), value)})
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.exr"])
 def test_a_file_is_replaced(tmp_path, name):
     write(tmp_path / name, 1)
     write(tmp_path / name, 2)
-    assert float(read_image(tmp_path / name)[0, 0, 0]) == 2
+    assert float(images.read_image(tmp_path / name)[0, 0, 0]) == 2
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
@@ -472,7 +461,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, name):
     temporary.symlink_to("/dev/full")
     with pytest.raises(OSError, match=rf"cannot write: .*No space left on device.*{name}"):
         write(path, 2)
-    assert float(read_image(path)[0, 0, 0]) == 1
+    assert float(images.read_image(path)[0, 0, 0]) == 1
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
@@ -494,13 +483,13 @@ def test_size_without_reading(tmp_path, name):
         images.write_exr(path, dict.fromkeys("RGB", np.zeros((3, 5), np.float32)))
     else:
         Image.fromarray(np.zeros((3, 5, 3), np.uint8)).save(path)
-    assert image_size(path) == (5, 3)
+    assert images.image_size(path) == (5, 3)
     path.write_bytes(path.read_bytes()[:20])
     with pytest.raises(DataError, match=rf"{name}: expected .* could not read it"):
-        image_size(path)
+        images.image_size(path)
     path.write_bytes(b"")
     with pytest.raises(DataError, match=rf"{name}: the file is empty"):
-        image_size(path)
+        images.image_size(path)
     with pytest.raises(DataError, match="none: expected a file, got nothing there"):
         images.image_size(tmp_path / "none")
 
@@ -508,7 +497,9 @@ def test_size_without_reading(tmp_path, name):
 def test_what_openexr_says_of_damage_stays_away(tmp_path, capfd):
     """One line is promised: the library's own lines go to no one, from any thread."""
     path = tmp_path / "a.exr"
-    write_exr(path, {c: np.random.default_rng(0).random((64, 64)) for c in "RGB"}, half=False)
+    images.write_exr(
+        path, {c: np.random.default_rng(0).random((64, 64)) for c in "RGB"}, half=False
+    )
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     capfd.readouterr()
@@ -521,6 +512,6 @@ def test_what_openexr_says_of_damage_stays_away(tmp_path, capfd):
 
 def failure_of(path):
     try:
-        read_image(path)
+        images.read_image(path)
     except DataError as error:
         return error

@@ -99,6 +99,13 @@ def test_a_world_in_any_direction_is_turned_upright(tmp_path, writer):
         np.testing.assert_allclose(pixel[0], wanted, atol=1e-4)
 
 
+@pytest.mark.parametrize("writer", [write_llff, write_neilf, write_metashape])
+def test_sizes_may_be_those_of_larger_originals(tmp_path, writer):
+    cameras = load_photos(writer(tmp_path, scene(), original=4)).cameras
+    assert cameras.focal.unique().tolist() == [FOCAL]
+    assert cameras.centre[0].tolist() == [WIDTH / 2, HEIGHT / 2]
+
+
 def test_train_and_test_share_the_turn(tmp_path):
     """The turn comes from all cameras, not from those of the split."""
     written = scene()

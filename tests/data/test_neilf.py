@@ -1,22 +1,15 @@
 """sfm_scene.json: what it may say, and errors. Axes are checked by test_layouts."""
 
-import json
+from functools import partial
 
+import layouts
 import numpy as np
 import pytest
-from layouts import FOCAL, refused, scene, write_neilf
+from layouts import refused, scene, write_neilf
 
 from univoxel.data import load_photos
 
-
-def edited(change):
-    def apply(folder):
-        path = folder / "inputs" / "sfm_scene.json"
-        root = json.loads(path.read_text())
-        change(root)
-        path.write_text(json.dumps(root))
-
-    return apply
+edited = partial(layouts.edited, "inputs/sfm_scene.json")
 
 
 def image(change):
@@ -28,12 +21,6 @@ def text(content):
     return lambda folder: (folder / "inputs" / "sfm_scene.json").write_text(content)
 
 
-def test_sizes_may_be_those_of_larger_originals(tmp_path):
-    cameras = load_photos(write_neilf(tmp_path, scene(), original=4)).cameras
-    assert cameras.focal.unique().tolist() == [FOCAL]
-    assert cameras.centre[0].tolist() == [6, 4]
-
-
 def test_images_that_were_not_placed(tmp_path):
     write_neilf(tmp_path, scene())
     image(lambda i: i.update(flg=1))(tmp_path)
@@ -42,14 +29,6 @@ def test_images_that_were_not_placed(tmp_path):
     photos = load_photos(tmp_path)
     assert photos.names == ["p_001", "p_004", "p_006", "p_007", "p_008", "p_009"]
     assert "1 of 8 listed left out: no such pictures, 2 without a camera left out" in photos.about
-
-
-@pytest.mark.parametrize("place", ["inputs/pmasks", "masks"])
-def test_places_of_masks(tmp_path, place):
-    written = scene()
-    write_neilf(tmp_path, written)
-    (tmp_path / "inputs" / "masks").rename(tmp_path / place)
-    assert np.array_equal(load_photos(tmp_path, "test").alpha[0], written.pictures[0, ..., 3])
 
 
 def test_names_as_the_readme_has_them(tmp_path):
@@ -89,14 +68,8 @@ def test_names_as_the_readme_has_them(tmp_path):
             "image 3: expected fl_x between 0 and inf, got -1.0",
         ),
         (image(lambda i: i.update(size=[-12, 8])), "image 3: expected w between 0 and inf, got -1"),
-        (
-            image(lambda i: i.update(size=[12, 12])),
-            r"p_003.png: expected a picture of the shape 12x12 as in .*image 3, got 12x8",
-        ),
-        (
-            lambda f: (f / "inputs" / "images").rename(f / "photos"),
-            "json: no picture p_000.exr, .*: 10 of 10 are missing.*looked in .*inputs/images",
-        ),
+        (image(lambda i: i.update(size=[12, 12])), r"p_003.png: expected a picture of the shape"),
+        (lambda f: (f / "inputs" / "images").rename(f / "photos"), "json: no picture p_000.exr,"),
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, damage, message):

@@ -1,8 +1,6 @@
 """Polycam's raw data: where it lies, and errors. Axes are checked by test_layouts."""
 
-import json
-
-import numpy as np
+import layouts
 import pytest
 from layouts import FOCAL, refused, scene, write_polycam
 
@@ -10,11 +8,8 @@ from univoxel.data import load_photos
 
 
 def edited(**values):
-    def apply(folder):
-        path = folder / "keyframes" / "corrected_cameras" / "p_003.json"
-        path.write_text(json.dumps(json.loads(path.read_text()) | values))
-
-    return apply
+    name = "keyframes/corrected_cameras/p_003.json"
+    return layouts.edited(name, lambda camera: camera.update(values))
 
 
 @pytest.mark.parametrize("place", ["keyframes/corrected_", "keyframes/", "corrected_"])
@@ -30,25 +25,12 @@ def test_what_loops_were_closed_in_comes_first(tmp_path):
     assert len(load_photos(tmp_path)) == 8
 
 
-def test_masks_beside_the_keyframes(tmp_path):
-    written = scene()
-    write_polycam(tmp_path, written)
-    (tmp_path / "keyframes" / "masks").rename(tmp_path / "masks")
-    assert np.array_equal(load_photos(tmp_path, "test").alpha[0], written.pictures[0, ..., 3])
-
-
 def test_cameras_of_larger_pictures(tmp_path):
     write_polycam(tmp_path, scene())
     edited(width=48, height=32, fx=4 * FOCAL, fy=4 * FOCAL, cx=24, cy=16)(tmp_path)
     cameras = load_photos(tmp_path).cameras
     assert cameras.focal.unique().tolist() == [FOCAL]
     assert cameras.centre.unique(dim=0).tolist() == [[6, 4]]
-
-
-def test_pictures_that_are_not_there(tmp_path):
-    write_polycam(tmp_path, scene())
-    (tmp_path / "keyframes" / "corrected_images" / "p_001.png").unlink()
-    assert "1 of 10 listed left out" in load_photos(tmp_path).about
 
 
 @pytest.mark.parametrize(

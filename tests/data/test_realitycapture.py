@@ -1,11 +1,10 @@
 """RealityCapture's CSV: lenses, columns and errors. Angles are checked by test_layouts."""
 
-import re
+from functools import partial
 
 import numpy as np
 import pytest
-import torch
-from layouts import FOCAL, refused, scene, write_realitycapture
+from layouts import FOCAL, refused, replaced, scene, write_realitycapture
 
 from univoxel.data import load_photos, photogrammetry
 from univoxel.errors import DataError
@@ -24,6 +23,9 @@ def test_columns(tmp_path, head, lens):
     assert photos.cameras.centre[0].tolist() == [6, 4]
 
 
+edited = partial(replaced, "cameras.csv")
+
+
 def test_lenses_bend_as_the_vendor_says(tmp_path):
     """px and py in longer sides; t1 along x, as OpenCV's p2."""
     lens = "0.05,-0.025,0.03,-0.02,0.01,0.05,0.004,-0.007"
@@ -37,27 +39,6 @@ def test_lenses_bend_as_the_vendor_says(tmp_path):
     bent_y = y * radial - 0.007 * (rr + 2 * y * y) + 2 * 0.004 * x * y
     np.testing.assert_allclose(u, 6 + 12 * 0.05 + bent_x * FOCAL, rtol=1e-12)
     np.testing.assert_allclose(v, 4 - 12 * 0.025 + bent_y * FOCAL, rtol=1e-12)
-
-
-def test_coordinates_of_the_earth_are_moved_to_the_origin(tmp_path):
-    written = scene()
-    photos = load_photos(write_realitycapture(tmp_path, written, shift=(391234.5, 5.82e6, 34.0)))
-    assert re.search(r"world moved by -39123\d -5820000 -3\d", photos.about)
-    place = photos.cameras.camera_to_world[:, :, 3]
-    wanted = torch.from_numpy(written.poses[written.split("train"), :3, 3]).float()
-    torch.testing.assert_close(torch.cdist(place, place), torch.cdist(wanted, wanted))
-
-
-def edited(*changes):
-    def apply(folder):
-        path = folder / "cameras.csv"
-        text = path.read_text()
-        for old, new in changes:
-            assert old in text
-            text = text.replace(old, new)
-        path.write_text(text)
-
-    return apply
 
 
 def test_pictures_that_are_not_there_and_names_with_folders(tmp_path):
@@ -101,10 +82,7 @@ def only_a_head(folder):
             lambda f: (f / "cameras.csv").write_bytes(SHORT.encode() + b"\n\xff"),
             "cameras.csv: expected text in UTF-8",
         ),
-        (
-            lambda f: (f / "images").rename(f / "photos"),
-            "cameras.csv: no picture p_000.png, p_001.png, .*looked in .*images and",
-        ),
+        (lambda f: (f / "images").rename(f / "photos"), "cameras.csv: no picture p_000.png,"),
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, damage, message):

@@ -8,21 +8,12 @@ from analytic import scene_of
 from observed_points import RED, lamps, photographs_under
 from torch.nn.functional import normalize
 
+from univoxel.evaluation import confidence
 from univoxel.evaluation import confidence as task
-from univoxel.evaluation.confidence import (
-    ADVICE,
-    advise,
-    azimuths,
-    elevations,
-    in_words,
-    missing,
-    place,
-    survey,
-)
 from univoxel.ops import VisibilityScene
 
 NODES, VIEWS = 64, 40
-EVERY = replace(ADVICE, least=0.0)
+EVERY = replace(confidence.ADVICE, least=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +35,12 @@ def taken_from(photos):
 
 def off(direction, azimuth):
     """Degrees [N] of azimuths from one."""
-    return ((azimuths(direction) - azimuth + 180) % 360 - 180).abs()
+    return ((confidence.azimuths(direction) - azimuth + 180) % 360 - 180).abs()
 
 
 def advice_of(scene, photos, cfg=EVERY):
-    surveyed = survey(scene, photos, 1000)
-    return advise(surveyed, photos.cameras, photos.names, scene.occluder(), cfg)
+    surveyed = confidence.survey(scene, photos, 1000)
+    return confidence.advise(surveyed, photos.cameras, photos.names, scene.occluder(), cfg)
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 90.0, -150.0])
@@ -68,17 +59,17 @@ def test_it_sends_into_the_sector_that_was_not_photographed(scene, photos, azimu
     assert len(middle) > 10
     assert off(middle, azimuth).mean() < 25
     assert whole.gap.sum() <= 2  # the spiral leaves the poles
-    (said,) = missing(advice, 60.0)
-    assert said.startswith(f"no photograph from {place(advice, middle.mean(0))}"[:21])
+    (said,) = confidence.missing(advice, 60.0)
+    assert said.startswith(f"no photograph from {confidence.place(advice, middle.mean(0))}"[:21])
 
 
 def test_photographs_all_around_need_no_others(scene, photos):
     """Under a model that agrees with them: its own is red on the blue side too."""
-    surveyed = survey(scene, photos, 1000)
+    surveyed = confidence.survey(scene, photos, 1000)
     agreeing = replace(surveyed, disagreement=0 * surveyed.disagreement)
-    advice = advise(agreeing, photos.cameras, photos.names, scene.occluder())
+    advice = confidence.advise(agreeing, photos.cameras, photos.names, scene.occluder())
     assert len(advice.chosen) == len(advice.gains) == 0
-    assert in_words(advice) == []
+    assert confidence.in_words(advice) == []
 
 
 def test_what_stands_in_the_way_counts(scene, photos):
@@ -91,24 +82,24 @@ def test_what_stands_in_the_way_counts(scene, photos):
     vertices = torch.cat([ball.vertices, wall])
     more = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32) + len(ball.vertices)
     walled = VisibilityScene(vertices, torch.cat([ball.faces, more]))
-    surveyed = survey(scene, kept, 1000)
-    found = advise(surveyed, kept.cameras, kept.names, walled, EVERY)
+    surveyed = confidence.survey(scene, kept, 1000)
+    found = confidence.advise(surveyed, kept.cameras, kept.names, walled, EVERY)
     assert (found.chosen[:, 0] * 2.0 < 0.8).all()  # on this side of the wall
     behind = found.weighed[:, 0] > 0.5
     assert (found.worth[behind] == 0).all()
 
 
 def test_nobody_is_sent_under_the_table(scene, photos, monkeypatch):
-    high = elevations(taken_from(photos)) > 10
+    high = confidence.elevations(taken_from(photos)) > 10
     kept = photos.of(high.nonzero()[:, 0])
     advice = advice_of(scene, kept)
-    assert (elevations(advice.weighed) >= 0).all()
+    assert (confidence.elevations(advice.weighed) >= 0).all()
     assert advice.hidden > 0.03  # the underside: a cap below the horizon's cameras
     # Where a photograph was taken, others may be
-    assert elevations(advice_of(scene, photos).weighed).min() < -50
+    assert confidence.elevations(advice_of(scene, photos).weighed).min() < -50
     monkeypatch.setattr(task, "LOWEST", -90.0)
     under = advice_of(scene, kept)
-    assert elevations(under.chosen).min() < -30
+    assert confidence.elevations(under.chosen).min() < -30
     assert under.hidden == 0
 
 
@@ -121,7 +112,7 @@ def test_in_words(scene, photos):
         direction.append(torch.stack([u.cos() * a.cos(), u.cos() * a.sin(), u.sin()]))
     gains = torch.linspace(0.02, 0.01, len(degrees))
     advice = replace(advice, chosen=torch.stack(direction), gains=gains, front=30.0)
-    assert in_words(advice) == [
+    assert confidence.in_words(advice) == [
         "Three photographs from the right, 20 to 40 degrees above the horizon",
         "Two photographs from the back, from 10 degrees below to 10 degrees above the horizon",
         "One photograph from the left, 0 to 10 degrees above the horizon",
@@ -135,8 +126,8 @@ def test_the_front_is_where_the_first_photograph_was_taken(scene, photos):
     for first in (20, 11):
         advice = advice_of(scene, photos.of(torch.tensor([first, 1, 2, 30, 39])))
         assert advice.front_name == photos.names[first]
-        assert place(advice, taken_from(photos)[first]) == "the front"
+        assert confidence.place(advice, taken_from(photos)[first]) == "the front"
     # One from above has no side
     advice = advice_of(scene, photos.of(torch.tensor([0, 25, 30])))
-    assert elevations(taken_from(photos))[0] > 60
+    assert confidence.elevations(taken_from(photos))[0] > 60
     assert advice.front_name in (photos.names[0], photos.names[25])

@@ -34,10 +34,6 @@ def surveyed(scene, photos):
     return survey(scene, photos, 1000)
 
 
-def trust_text(run) -> str:
-    return (run / "trust.txt").read_text()
-
-
 def some_views(photos: Photos, keep) -> Photos:
     cameras = replace(
         photos.cameras,

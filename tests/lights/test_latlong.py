@@ -8,16 +8,8 @@ import torch
 from balls import ball, fit, views
 from torch.nn.functional import normalize
 
-from univoxel import sphere
+from univoxel import lights, sphere
 from univoxel.core.records import Occlusion
-from univoxel.lights import (
-    EnvmapConfig,
-    EnvmapLight,
-    EnvmapSGConfig,
-    EnvmapSGLight,
-    latlong,
-    quadrature,
-)
 from univoxel.sphere import latlong_directions
 
 LAMP = normalize(torch.tensor([0.5, -0.3, 0.8]), dim=0)
@@ -29,14 +21,14 @@ def lit(wi):
 
 
 def of_texels(rows=32, **changes):
-    light = EnvmapLight(EnvmapConfig(rows=rows, **changes))
+    light = lights.EnvmapLight(lights.EnvmapConfig(rows=rows, **changes))
     with torch.no_grad():
         light.levels[0] += (lit(latlong_directions(rows)).log() - light.log_radiance) / 30.0
     return light
 
 
 def of_lobes(**changes):
-    light = EnvmapSGLight(EnvmapSGConfig(**changes))
+    light = lights.EnvmapSGLight(lights.EnvmapSGConfig(**changes))
     with torch.no_grad():
         light.raw += 0.05 * torch.randn(light.raw.shape, generator=torch.manual_seed(0))
     return light
@@ -45,7 +37,7 @@ def of_lobes(**changes):
 def with_room(light, surface, half_open):
     """The occlusion of points that see no light from below z = 0, but a red floor."""
     rotation = torch.zeros(len(surface.normal))
-    wi = quadrature.half_sphere(surface, light.directions, rotation)
+    wi = lights.quadrature.half_sphere(surface, light.directions, rotation)
     above = (wi[..., 2] > 0).float() if half_open else torch.ones(wi.shape[:2])
     floor = torch.tensor([0.3, 0.1, 0.1])
     return Occlusion(rotation, above, (1 - above)[..., None] * floor)
@@ -59,7 +51,7 @@ def test_reflected_equals_the_quadrature_of_its_incident(make):
         assert light.directions == directions
         for seen in (None, with_room(light, surface, True)):
             got = light.reflected(surface, wo, seen).detach()
-            wanted = quadrature.reflected(light, surface, wo, directions, seen).detach()
+            wanted = lights.quadrature.reflected(light, surface, wo, directions, seen).detach()
             torch.testing.assert_close(got, wanted)
         light.eval()
 
@@ -80,7 +72,7 @@ def test_texels_are_where_the_conventions_say():
 
 def test_levels_add_up():
     """A step of the coarsest level lifts the whole map, also across the border."""
-    light = EnvmapLight(EnvmapConfig(rows=64))
+    light = lights.EnvmapLight(lights.EnvmapConfig(rows=64))
     assert [len(level) for level in light.levels] == [64, 16, 4]
     torch.testing.assert_close(light.log_radiance.exp(), torch.full((64, 128, 3), 0.5))
     with torch.no_grad():
@@ -110,14 +102,14 @@ def test_lobes_are_on_the_map_what_their_formula_says():
 def test_starts_are_even():
     wi = sphere.fibonacci_sphere(100)[None]
     # lobes are as wide as 0.4 of what they lie apart
-    texels = EnvmapLight().incident(ball(1), wi).detach()
+    texels = lights.EnvmapLight().incident(ball(1), wi).detach()
     torch.testing.assert_close(texels, torch.full((1, 100, 3), 0.5))
-    lobes = EnvmapSGLight().incident(ball(1), wi).detach()
+    lobes = lights.EnvmapSGLight().incident(ball(1), wi).detach()
     torch.testing.assert_close(lobes, torch.full((1, 100, 3), 0.5), atol=0.12, rtol=0)
 
 
 def test_no_gradient_to_normals_and_one_to_map_and_materials():
-    for light in (EnvmapLight(EnvmapConfig(rows=16)), EnvmapSGLight()):
+    for light in (lights.EnvmapLight(lights.EnvmapConfig(rows=16)), lights.EnvmapSGLight()):
         surface = ball(20)
         leaves = [
             t.clone().requires_grad_() for t in (surface.normal, surface.albedo, surface.roughness)
@@ -149,9 +141,9 @@ def test_recovers_a_known_light_behind_an_occluder(kind):
     wi = wi[wi[:, 2] > 0.1][None]
     for known in (True, False):
         if kind == "texels":
-            light = EnvmapLight(EnvmapConfig(rows=32, directions=128))
+            light = lights.EnvmapLight(lights.EnvmapConfig(rows=32, directions=128))
         else:
-            light = EnvmapSGLight(EnvmapSGConfig(lobes=32, rows=32, directions=128))
+            light = lights.EnvmapSGLight(lights.EnvmapSGConfig(lobes=32, rows=32, directions=128))
         seen = with_room(light, surface, known)
         light.reflected, reflect = (
             lambda s, w, generator=None, r=light.reflected, o=seen: r(s, w, o),
@@ -169,7 +161,7 @@ def test_recovers_a_known_light_behind_an_occluder(kind):
 
 @torch.no_grad()
 def test_regularisation_sees_noise_and_colour():
-    light, s = EnvmapLight(EnvmapConfig(rows=16)), ball(1)
+    light, s = lights.EnvmapLight(lights.EnvmapConfig(rows=16)), ball(1)
     even = light.regularisation(s, s)
     assert even.map_smoothness == pytest.approx(0.0, abs=1e-6)
     light.levels[0][..., 0] += 0.02 * torch.rand(16, 32)
@@ -179,6 +171,6 @@ def test_regularisation_sees_noise_and_colour():
     red = of_lobes()
     before = red.regularisation(s, s).white_light
     # in closed form, what the map sums up to
-    torch.testing.assert_close(before, latlong.chroma(red.latlong(64)), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(before, lights.latlong.chroma(red.latlong(64)), rtol=1e-3, atol=1e-4)
     red.raw[:, 4] += 0.1
     assert red.regularisation(s, s).white_light > before

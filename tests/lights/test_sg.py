@@ -14,7 +14,7 @@ from univoxel.render.pipeline import at_rays
 
 @pytest.mark.parametrize("generator", [False, True])
 def test_reflected_equals_the_quadrature_of_its_incident(generator):
-    surface, light = ball(), shaken(LocalSG(4))
+    surface, light = ball(), shaken(LocalSG(4, SGConfig(directions=128)))
     wo = views(surface)
 
     def turns():
@@ -29,7 +29,7 @@ def test_reflected_equals_the_quadrature_of_its_incident(generator):
 
 
 def test_an_occlusion_hides_the_light():
-    surface, light = ball(10), LocalSG(4)
+    surface, light = ball(10), LocalSG(4, SGConfig(directions=128))
     nothing = Occlusion(torch.zeros(10), torch.zeros(10, 128), torch.zeros(10, 128, 3))
     dark = light.reflected(surface, views(surface), nothing)
     assert float(dark.detach().abs().max()) == 0
@@ -37,7 +37,7 @@ def test_an_occlusion_hides_the_light():
 
 @pytest.mark.parametrize("lobes", [1, 12, 16, 128])
 def test_start_is_white_and_mid_grey(lobes):
-    surface, light = ball(), LocalSG(4, SGConfig(lobes=lobes))
+    surface, light = ball(), LocalSG(4, SGConfig(lobes=lobes, directions=128))
     rgb = light.reflected(surface, surface.normal).detach()
     torch.testing.assert_close(rgb[:, 0], rgb[:, 2])
     # albedo 0.5 under irradiance pi / 2 gives 0.25, and the layer adds about 0.01
@@ -46,7 +46,7 @@ def test_start_is_white_and_mid_grey(lobes):
 
 
 def test_lobes_are_in_range_and_finite():
-    light, surface = shaken(LocalSG(4)), ball()
+    light, surface = shaken(LocalSG(4, SGConfig(directions=128))), ball()
     axis, sharpness, amplitude = light.lobes(surface)
     torch.testing.assert_close(axis.norm(dim=-1), torch.ones(200, 16))
     assert bool(((sharpness >= 0.1) & (sharpness <= 30.1)).all())
@@ -68,7 +68,7 @@ def test_recovers_a_known_light():
         *truth, surface.normal, wo, surface.albedo, surface.roughness,
         sphere.fibonacci_hemisphere(128), torch.zeros(300),
     )  # fmt: skip
-    light = LocalSG(4, SGConfig(hidden=16), torch.Generator().manual_seed(0))
+    light = LocalSG(4, SGConfig(hidden=16, directions=128), torch.Generator().manual_seed(0))
     # No features: the light is the same everywhere, so a ball determines it.
     surface = dataclasses.replace(surface, features=torch.zeros(300, 4))
     optimizer = torch.optim.Adam([light.base], lr=0.05)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from check_op import check_op
+from check_op import check_op, grads_of
 
 from univoxel.ops import sample_dense, sample_dense_reference
 
@@ -21,16 +21,6 @@ def case(shape=(5, 6, 7), channels=3, m=40, seed=0, margin=0.2, needs=(True, Tru
     points = (points * extent + torch.tensor(ORIGIN)).float().double()
     leaves = [t.requires_grad_(n) for t, n in zip((sdf, features, points), needs, strict=True)]
     return (*leaves, ORIGIN, H)
-
-
-def grads_of(op, arguments, seed=0, **options):
-    """Gradients of a random projection of the outputs."""
-    g = torch.Generator().manual_seed(seed)
-    outputs = op(*arguments, **options)
-    pulls = [torch.randn(o.shape, generator=g, dtype=torch.float64).to(o.dtype) for o in outputs]
-    leaves = [a for a in arguments if isinstance(a, torch.Tensor) and a.requires_grad]
-    pulled = [(o * p).sum() for o, p in zip(outputs, pulls, strict=True) if o.requires_grad]
-    return torch.autograd.grad(sum(pulled), leaves)
 
 
 def test_native_equals_reference():

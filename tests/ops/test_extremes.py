@@ -30,8 +30,7 @@ VALUES = {
     "points": (*WILD, math.inf, -math.inf, 2.0, 3.0),
     # Sums on the way to a small result may leave float32, here as in torch: nothing above 1e7
     **dict.fromkeys(
-        ("x", "weights", "biases"),
-        (0.0, -0.0, 1e-45, -1e-40, 1.2e-38, 1e-7, 1.0, -1.0, 1e4, -1e7),
+        ("x", "weights", "biases"), (0.0, -0.0, 1e-45, -1e-40, 1.2e-38, 1e-7, 1.0, -1.0, 1e4, -1e7)
     ),
 }
 FIELDS = ["sample_dense", "sample_sparse", "encode_hash"]
@@ -313,6 +312,3 @@ def test_rays_at_the_edge_meet_what_they_should(seed, n):
     assert hit.face[n] == 0
     # Rounding: where there is no AVX-512, Embree divides by a refined estimate
     torch.testing.assert_close(hit.t[n], torch.tensor(1.0))
-
-
-# --- strides

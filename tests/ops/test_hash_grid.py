@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from check_op import check_op
+from check_op import check_op, grads_of
 
 from univoxel.ops import encode_hash, encode_hash_reference, use_backend
 from univoxel.ops.hash_grid import lattice_sizes, rows_read
@@ -19,14 +19,6 @@ def case(voxel_sizes=(0.5, 0.2), rows=32, features=2, m=30, seed=0, needs=(True,
     # On a float32 lattice, so that both precisions see the same points.
     leaves = [t.requires_grad_(n) for t, n in zip((table, points.double()), needs, strict=True)]
     return (*leaves, LOWER, UPPER, list(voxel_sizes))
-
-
-def grads_of(arguments, **options):
-    """Gradients of a random projection of the output."""
-    out = encode_hash(*arguments, **options)
-    pull = torch.randn(out.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    leaves = [a for a in arguments[:2] if a.requires_grad]
-    return torch.autograd.grad((out * pull.to(out.dtype)).sum(), leaves)
 
 
 def test_native_equals_reference():
@@ -49,13 +41,13 @@ def test_many_points_and_levels():
     arguments = case((0.5, 0.2, 0.1, 0.03), rows=256, m=5000)
     torch.testing.assert_close(encode_hash(*arguments), encode_hash_reference(*arguments))
     with use_backend("reference"):
-        wanted = grads_of(arguments)
+        wanted = grads_of(encode_hash, arguments)
     threads = torch.get_num_threads()
     for sparse in (False, True):
         got = []
         for n in (1, 2, 3):
             torch.set_num_threads(n)
-            got.append([g.to_dense() for g in grads_of(arguments, sparse_grad=sparse)])
+            got.append([g.to_dense() for g in grads_of(encode_hash, arguments, sparse_grad=sparse)])
         torch.set_num_threads(threads)
         for a, b, c, d in zip(*got, wanted, strict=True):
             torch.testing.assert_close(a, d)
@@ -95,8 +87,8 @@ def test_hash_of_a_node():
 def test_only_the_levels_that_are_felt_move_points(backend, felt):
     arguments = case((0.5, 0.2, 0.1))
     with use_backend(backend):
-        table, points = grads_of(arguments, felt=felt)
-        wanted = grads_of(arguments)
+        table, points = grads_of(encode_hash, arguments, felt=felt)
+        wanted = grads_of(encode_hash, arguments)
     assert torch.equal(table, wanted[0])
     # By parts: a level's own output, with the gradient that the whole has there
     pull = torch.randn(30, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

@@ -135,8 +135,7 @@ def test_exposure_and_even_shading_change_nothing():
     arguments = on_plane(known, pictures, matrix, 0.03)
     other = 0.1 + 0.5 * pictures
     torch.testing.assert_close(
-        patch_correlation(other, *arguments[1:], 1e-9)[0],
-        patch_correlation(*arguments, 1e-9)[0],
+        patch_correlation(other, *arguments[1:], 1e-9)[0], patch_correlation(*arguments, 1e-9)[0]
     )
 
 

@@ -86,12 +86,7 @@ def in_halves(op):
 
 
 def test_radiance_native_equals_reference():
-    cases = [
-        lit(3, 37),
-        lit(1, 1, f0=0.5),
-        lit(0, 16),
-        lit(4, 64, roughness=(0.05, 0.2), f0=0.0),
-    ]
+    cases = [lit(3, 37), lit(1, 1, f0=0.5), lit(0, 16), lit(4, 64, roughness=(0.05, 0.2), f0=0.0)]
     check_op(shade_radiance, shade_radiance_reference, cases, RTOL)
 
 

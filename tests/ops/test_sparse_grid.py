@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from bricks import cut
-from check_op import check_op
+from check_op import check_op, grads_of
 
 from univoxel.core.records import Bricks
 from univoxel.ops import sample_dense, sample_sparse, sample_sparse_reference
@@ -31,16 +31,6 @@ def case(shape=(9, 10, 11), channels=3, m=60, seed=0, margin=0.2, needs=(True, T
     points = (points * extent + torch.tensor(ORIGIN)).float().double()
     leaves = [t.requires_grad_(n) for t, n in zip((pool, features, points), needs, strict=True)]
     return (*leaves[:2], bricks, leaves[2], ORIGIN, H)
-
-
-def grads_of(op, arguments, seed=0, **options):
-    """Gradients of a random projection of the outputs."""
-    g = torch.Generator().manual_seed(seed)
-    outputs = op(*arguments, **options)
-    pulls = [torch.randn(o.shape, generator=g, dtype=torch.float64).to(o.dtype) for o in outputs]
-    leaves = [a for a in arguments if isinstance(a, torch.Tensor) and a.requires_grad]
-    pulled = [(o * p).sum() for o, p in zip(outputs, pulls, strict=True) if o.requires_grad]
-    return torch.autograd.grad(sum(pulled), leaves)
 
 
 def as_dense(pool, features, bricks, points, *place):

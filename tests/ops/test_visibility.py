@@ -5,13 +5,7 @@ import math
 import pytest
 import torch
 
-from univoxel.ops import (
-    VisibilityScene,
-    closest_hit_reference,
-    native,
-    occluded_reference,
-    use_backend,
-)
+from univoxel import ops
 
 TRIANGLE = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 FACE = torch.tensor([[0, 1, 2]], dtype=torch.int32)
@@ -33,10 +27,10 @@ def rays(n=2000, seed=1):
 
 @pytest.mark.parametrize("interval", [(0.0, math.inf), (0.1, 0.4)])
 def test_native_equals_brute_force(interval):
-    scene = VisibilityScene(*soup())
+    scene = ops.VisibilityScene(*soup())
     got, wanted = (
         scene.closest_hit(*rays(), *interval),
-        closest_hit_reference(*soup(), *rays(), *interval),
+        ops.closest_hit_reference(*soup(), *rays(), *interval),
     )
     assert 0.1 < (wanted.face >= 0).float().mean() < 0.95
     # Rays that graze an edge or the ends of the interval may fall on either side in float32.
@@ -53,7 +47,7 @@ def test_one_triangle_in_closed_form():
     """The ray from above (x, y) meets the triangle at (u, v) = (x, y)."""
     origin = torch.tensor([[0.2, 0.3, 2.0], [0.7, 0.7, 2.0], [0.2, 0.3, -1.0]])
     down = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
-    hit = VisibilityScene(TRIANGLE, FACE).closest_hit(origin, down)
+    hit = ops.VisibilityScene(TRIANGLE, FACE).closest_hit(origin, down)
     assert hit.face.tolist() == [0, -1, -1]
     assert hit.t.tolist() == pytest.approx([2.0, math.inf, math.inf])
     assert hit.barycentric[0].tolist() == pytest.approx([0.2, 0.3])
@@ -61,7 +55,7 @@ def test_one_triangle_in_closed_form():
 
 
 def test_t_counts_in_the_length_of_the_direction():
-    scene = VisibilityScene(TRIANGLE, FACE)
+    scene = ops.VisibilityScene(TRIANGLE, FACE)
     origin, down = torch.tensor([[0.2, 0.3, 2.0]]), torch.tensor([[0.0, 0.0, -4.0]])
     assert scene.closest_hit(origin, down).t.item() == pytest.approx(0.5)
     assert scene.occluded(origin, down, t_min=0.51).item() is False
@@ -81,12 +75,12 @@ def test_closed_mesh_lets_no_ray_through():
     a, b = vertices[edge[inner]].unbind(1)
     target = a + torch.rand(len(a), 1, generator=g) * (b - a)
     origin = torch.rand(len(a), 3, generator=g) + torch.tensor([3.5, 3.5, 2.0])
-    assert VisibilityScene(vertices, faces).occluded(origin, target - origin).all()
+    assert ops.VisibilityScene(vertices, faces).occluded(origin, target - origin).all()
 
 
 def test_strided_rays_and_wide_faces():
     vertices, faces = soup()
-    scene = VisibilityScene(vertices.repeat(1, 2)[:, :3], faces.long())
+    scene = ops.VisibilityScene(vertices.repeat(1, 2)[:, :3], faces.long())
     origin, direction = rays()
     strided = origin.repeat(1, 2)[:, :3], direction.t().contiguous().t()
     assert not strided[0].is_contiguous()
@@ -95,42 +89,42 @@ def test_strided_rays_and_wide_faces():
 
 def test_no_rays_and_no_triangles():
     none = torch.empty(0, 3)
-    scene = VisibilityScene(*soup())
+    scene = ops.VisibilityScene(*soup())
     assert scene.occluded(none, none).shape == (0,)
     assert scene.closest_hit(none, none).barycentric.shape == (0, 2)
     for empty in (
-        VisibilityScene(TRIANGLE, torch.empty(0, 3, dtype=torch.int32)),
-        VisibilityScene(none, torch.empty(0, 3, dtype=torch.int32)),
+        ops.VisibilityScene(TRIANGLE, torch.empty(0, 3, dtype=torch.int32)),
+        ops.VisibilityScene(none, torch.empty(0, 3, dtype=torch.int32)),
     ):
         assert not empty.occluded(*rays()).any()
         assert empty.closest_hit(*rays()).face.eq(-1).all()
-        with use_backend("reference"):
+        with ops.use_backend("reference"):
             assert not empty.occluded(*rays()).any()
 
 
 def test_rays_that_are_not_finite_meet_nothing():
     down = torch.tensor([[0.0, 0.0, -1.0]])
     above = torch.tensor([[0.2, 0.3, 2.0]])
-    scene = VisibilityScene(TRIANGLE, FACE)
+    scene = ops.VisibilityScene(TRIANGLE, FACE)
     assert scene.occluded(above, down).item()
     for bad in (math.nan, math.inf, 1e30):
         assert not scene.occluded(above.clone().fill_(bad), down).item()
         assert scene.closest_hit(above, down * bad).face.item() == -1
     assert not scene.occluded(above, torch.zeros(1, 3)).item()
-    assert not occluded_reference(TRIANGLE, FACE, above, down * math.nan).item()
+    assert not ops.occluded_reference(TRIANGLE, FACE, above, down * math.nan).item()
 
 
 def test_degenerate_triangles_are_passed_over():
     faces = torch.tensor([[0, 1, 2], [0, 0, 1], [2, 2, 2]], dtype=torch.int32)
     origin, down = torch.tensor([[0.2, 0.3, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])
-    assert VisibilityScene(TRIANGLE, faces).closest_hit(origin, down).face.item() == 0
-    with use_backend("reference"):
-        assert VisibilityScene(TRIANGLE, faces).closest_hit(origin, down).face.item() == 0
+    assert ops.VisibilityScene(TRIANGLE, faces).closest_hit(origin, down).face.item() == 0
+    with ops.use_backend("reference"):
+        assert ops.VisibilityScene(TRIANGLE, faces).closest_hit(origin, down).face.item() == 0
 
 
 def test_the_mesh_is_copied():
     vertices, faces = TRIANGLE.clone(), FACE.clone()
-    scene = VisibilityScene(vertices, faces)
+    scene = ops.VisibilityScene(vertices, faces)
     vertices += 100
     faces.zero_()
     assert scene.occluded(torch.tensor([[0.2, 0.3, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])).item()
@@ -142,11 +136,11 @@ def test_without_embree_the_error_says_how_to_get_it(monkeypatch):
         def embree_version():
             return 0
 
-    monkeypatch.setattr(native, "core", Core)
+    monkeypatch.setattr(ops.native, "core", Core)
     with pytest.raises(RuntimeError, match=r"built without Embree.*libembree-dev.*rebuild"):
-        VisibilityScene(*soup())
-    with use_backend("reference"):
-        scene = VisibilityScene(*soup())
+        ops.VisibilityScene(*soup())
+    with ops.use_backend("reference"):
+        scene = ops.VisibilityScene(*soup())
         assert scene.occluded(*rays(10)).any()
     with pytest.raises(RuntimeError, match="built without Embree"):
         scene.occluded(*rays(10))

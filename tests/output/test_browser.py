@@ -102,8 +102,7 @@ def psnr(a, b):
 
 
 @pytest.mark.parametrize(
-    ("azimuth", "elevation", "turn", "stops"),
-    [(25.0, 20.0, 0.0, 0.0), (140.0, -15.0, 70.0, -1.0)],
+    ("azimuth", "elevation", "turn", "stops"), [(25.0, 20.0, 0.0, 0.0), (140.0, -15.0, 70.0, -1.0)]
 )
 def test_it_looks_as_relit(fresh, scene, folder, monkeypatch, azimuth, elevation, turn, stops):
     camera = looking(azimuth, elevation)

@@ -239,7 +239,7 @@ def test_made_maps_light_a_white_ball_as_paper():
         if light.name in page.PHOTOGRAPHED:
             continue
         direction = latlong_directions(len(light.radiance)).flatten(0, 1)
-        area = page.texel_solid_angles(*light.radiance.shape[:2]).flatten()
+        area = page.sphere.texel_solid_angles(*light.radiance.shape[:2]).flatten()
         cosine = (fibonacci_sphere(200) @ direction.T).clamp_min(0)
         ball = cosine @ (area[:, None] * light.radiance.flatten(0, 1)) / math.pi
         assert 0.6 < ball.max() < 1.1, light.name

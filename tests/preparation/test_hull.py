@@ -6,35 +6,28 @@ from analytic import RADIUS, cameras_around, sphere_normals
 
 from univoxel.camera import Cameras
 from univoxel.fields.grid import GridShape, fit_grid, resample
-from univoxel.preparation.hull import (
-    estimate_bounds,
-    hull_sdf,
-    mask_distances,
-    views_needed,
-    visual_hull,
-    votes_needed,
-)
+from univoxel.preparation import hull
 
 
 @pytest.fixture(scope="module")
 def silhouettes():
     cameras = cameras_around(24, size=64)
     alpha = torch.stack([sphere_normals(cameras, v)[1] for v in range(24)]).float()
-    return mask_distances(alpha), cameras
+    return hull.mask_distances(alpha), cameras
 
 
 def test_mask_distance_is_signed_and_subpixel():
     alpha = torch.zeros(1, 9, 9)
     alpha[:, 2:7, 2:7] = 1
     alpha[:, 2:7, 7] = 0.25
-    d = mask_distances(alpha)[0]
+    d = hull.mask_distances(alpha)[0]
     assert d[4, 4] == -2.5  # the middle of a square of side 5
     assert d[4, 0] == 1.5  # two pixels left of the first covered one, whose edge is half nearer
     assert d[4, 7] == 0.25  # a quarter covered: the edge lies a quarter pixel inwards of its middle
 
 
 def test_an_empty_mask_is_far_outside_everywhere():
-    assert (mask_distances(torch.zeros(1, 4, 6)) == 6).all()
+    assert (hull.mask_distances(torch.zeros(1, 4, 6)) == 6).all()
 
 
 def test_the_edge_of_a_picture_is_no_silhouette():
@@ -42,7 +35,7 @@ def test_the_edge_of_a_picture_is_no_silhouette():
     alpha[0, 3:] = 1  # leaves the picture below, left and right
     alpha[1] = 1
     alpha[2, 2:6, 4:8] = 1
-    d = mask_distances(alpha)
+    d = hull.mask_distances(alpha)
     assert (d[0, 7] == -4.5).all()  # as deep as the one edge is far
     assert (d[1] == -12).all()
     assert (d[0].abs() < 1).sum() == 24  # the rows at that edge
@@ -54,24 +47,24 @@ def test_votes_keep_what_one_mask_lacks(silhouettes):
     bitten = distance.clone()
     bitten[5] = 64.0  # a view that shows nothing
     points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.5 * RADIUS]])
-    assert (hull_sdf(bitten, cameras, points) > 0).all()
-    inside, outside = hull_sdf(bitten, cameras, points, votes=2)
+    assert (hull.hull_sdf(bitten, cameras, points) > 0).all()
+    inside, outside = hull.hull_sdf(bitten, cameras, points, votes=2)
     assert inside < 0 < outside
     # The second largest of the views' values, by definition
     each = torch.stack(
-        [hull_sdf(bitten[v : v + 1], cameras.of(torch.tensor([v])), points) for v in range(24)]
+        [hull.hull_sdf(bitten[v : v + 1], cameras.of(torch.tensor([v])), points) for v in range(24)]
     )
     torch.testing.assert_close(
-        hull_sdf(bitten, cameras, points, votes=2), each.sort(0, descending=True).values[1]
+        hull.hull_sdf(bitten, cameras, points, votes=2), each.sort(0, descending=True).values[1]
     )
 
 
 def test_as_many_votes_are_needed_as_bad_masks_are_outvoted_by():
-    assert [votes_needed(n) for n in (1, 4, 6, 12, 40, 135)] == [1, 1, 2, 2, 3, 9]
+    assert [hull.votes_needed(n) for n in (1, 4, 6, 12, 40, 135)] == [1, 1, 2, 2, 3, 9]
 
 
 def test_bounds_enclose_the_sphere_with_little_to_spare(silhouettes):
-    lower, upper = estimate_bounds(*silhouettes)
+    lower, upper = hull.estimate_bounds(*silhouettes)
     assert (lower < -RADIUS).all()
     assert (upper > RADIUS).all()
     # margin: 3 % of the diagonal and a voxel, on top of a hull that is somewhat larger
@@ -80,7 +73,7 @@ def test_bounds_enclose_the_sphere_with_little_to_spare(silhouettes):
 
 def test_hull_is_the_sphere_up_to_its_facets(silhouettes):
     grid = fit_grid(torch.full((3,), -0.7), torch.full((3,), 0.7), 40**3)
-    sdf = visual_hull(*silhouettes, grid)
+    sdf = hull.visual_hull(*silhouettes, grid)
     true = grid.nodes().norm(dim=-1) - RADIUS
     near = true.abs() < 0.1
     # One pixel is 2 / (64 * 2 / 1.8) = 0.028 wide at the sphere; 24 facets bulge by about as much.
@@ -92,7 +85,7 @@ def test_hull_is_the_sphere_up_to_its_facets(silhouettes):
 
 def test_points_that_no_view_sees_are_outside(silhouettes):
     behind_everything = torch.tensor([[0.0, 0.0, 50.0], [0.0, 0.0, 0.0]])
-    sdf = hull_sdf(*silhouettes, behind_everything)
+    sdf = hull.hull_sdf(*silhouettes, behind_everything)
     assert sdf[0] > 0
     assert sdf[1] < 0
 
@@ -102,15 +95,15 @@ def test_a_silhouette_cut_by_the_border_says_nothing_beyond_it(silhouettes):
     pose, focal, centre = cameras.camera_to_world, cameras.focal, cameras.centre
     one = Cameras(pose[:1], focal[:1], centre[:1], 64, 64)
     beside = -1.5 * pose[:1, :, 0]  # left of the picture
-    assert hull_sdf(distance[:1], one, beside) > 0
-    assert hull_sdf(torch.full((1, 64, 64), -3.0), one, torch.zeros(1, 3)) < 0
-    assert hull_sdf(torch.full((1, 64, 64), -3.0), one, beside) == torch.inf  # nobody sees it
+    assert hull.hull_sdf(distance[:1], one, beside) > 0
+    assert hull.hull_sdf(torch.full((1, 64, 64), -3.0), one, torch.zeros(1, 3)) < 0
+    assert hull.hull_sdf(torch.full((1, 64, 64), -3.0), one, beside) == torch.inf  # nobody sees it
 
 
 def test_no_common_volume_is_an_error(silhouettes):
     distance, cameras = silhouettes
     with pytest.raises(ValueError, match="silhouettes of the photographs share no volume"):
-        estimate_bounds(torch.full_like(distance, 5.0), cameras)
+        hull.estimate_bounds(torch.full_like(distance, 5.0), cameras)
 
 
 def test_fit_grid_has_cubic_voxels_and_covers_the_box():
@@ -139,16 +132,16 @@ def test_what_few_views_see_is_carved_by_half_of_them_and_ends_where_too_few_do(
     few = cameras.of(torch.tensor([0, 1, 2]))
     above = torch.tensor([[0.0, 0.0, 1.5 * RADIUS]])  # in the pictures of all
     ball = torch.zeros(1, 3)
-    assert (hull_sdf(distance[:3], few, above, votes=8) > 0).all()  # eight there are not
-    assert (hull_sdf(distance[:3], few, ball, votes=8) < 0).all()
-    assert (hull_sdf(distance[:3], few, ball, votes=8, seen_by=3) < 0).all()
-    assert hull_sdf(distance[:3], few, ball, votes=8, seen_by=4).isposinf().all()
+    assert (hull.hull_sdf(distance[:3], few, above, votes=8) > 0).all()  # eight there are not
+    assert (hull.hull_sdf(distance[:3], few, ball, votes=8) < 0).all()
+    assert (hull.hull_sdf(distance[:3], few, ball, votes=8, seen_by=3) < 0).all()
+    assert hull.hull_sdf(distance[:3], few, ball, votes=8, seen_by=4).isposinf().all()
 
 
 def test_where_masks_are_believed_one_view_is_enough():
-    assert views_needed(100, 1) == 1
-    assert views_needed(100, 7) == 25
-    assert views_needed(2, 2) == 1
+    assert hull.views_needed(100, 1) == 1
+    assert hull.views_needed(100, 7) == 25
+    assert hull.views_needed(2, 2) == 1
 
 
 def test_distances_of_large_pictures_are_those_of_smaller_ones():
@@ -156,12 +149,12 @@ def test_distances_of_large_pictures_are_those_of_smaller_ones():
     side, radius = 1200, 350.0
     place = torch.arange(side) + 0.5 - side / 2
     true = (place[:, None].square() + place.square()).sqrt() - radius
-    found = mask_distances((0.5 - true).clamp(0, 1)[None])[0]
+    found = hull.mask_distances((0.5 - true).clamp(0, 1)[None])[0]
     near = true.abs() < 5
     off = (found - true).abs()
     assert off[near].max() < 1  # half a pixel of the smaller picture, and its distance's own error
     assert off[near].median() < 0.25
     assert abs(float((found - true)[near].mean())) < 0.05
     assert off.max() < 2  # of hundreds
-    kept = mask_distances((0.5 - true).clamp(0, 1)[None, 101:1100, 101:1100])[0]
+    kept = hull.mask_distances((0.5 - true).clamp(0, 1)[None, 101:1100, 101:1100])[0]
     assert (kept - true[101:1100, 101:1100]).abs().max() < 0.51  # of 999 pixels: not shrunk

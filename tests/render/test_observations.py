@@ -5,10 +5,7 @@ from dataclasses import replace
 
 import torch
 from analytic import photos_of, sphere_scene
-from observed_points import (
-    facing,
-    problem_on_a_sphere,
-)
+from observed_points import facing, problem_on_a_sphere
 from torch.nn.functional import normalize
 
 from univoxel.ops import shade_map

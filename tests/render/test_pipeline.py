@@ -7,14 +7,7 @@ from analytic import RADIUS, cameras_around, sphere_normals
 from univoxel.camera import image_rays
 from univoxel.fields.field import dense_field
 from univoxel.fields.grid import fit_grid
-from univoxel.render.pipeline import (
-    at_rays,
-    extract_mesh,
-    shade,
-    shade_hits,
-    surface_at,
-    surface_of_view,
-)
+from univoxel.render import pipeline
 from univoxel.scene import Scene, SceneConfig
 
 
@@ -32,7 +25,7 @@ def scene():
 def test_surface_is_the_sphere(scene):
     cameras = cameras_around(3, size=40)
     normal, hit = sphere_normals(cameras, 1)
-    surface, wo = surface_of_view(scene, cameras, 1)
+    surface, wo = pipeline.surface_of_view(scene, cameras, 1)
     # away from the silhouette, where the density's width lets rays through
     inner = ((normal.reshape(-1, 3) * wo).sum(1) > 0.6) & hit.reshape(-1)
     voxel = scene.field.voxel_size
@@ -50,9 +43,9 @@ def test_surface_is_the_sphere(scene):
 
 def test_gradients_reach_field_and_heads(scene):
     rays = image_rays(cameras_around(2, size=16), 0)
-    surface = surface_at(scene, rays, torch.rand(256))
+    surface = pipeline.surface_at(scene, rays, torch.rand(256))
     hit = (surface.opacity > 0.5).nonzero()[:, 0]
-    rgb = shade(scene, at_rays(surface, hit), -rays.direction[hit])
+    rgb = pipeline.shade(scene, pipeline.at_rays(surface, hit), -rays.direction[hit])
     radiance = scene.radiance(surface.features, surface.normal, -rays.direction)
     (rgb.square().sum() + radiance.square().sum() + surface.depth.sum()).backward()
     for name, p in scene.named_parameters():
@@ -68,14 +61,14 @@ def test_gradients_reach_field_and_heads(scene):
 
 def test_shading_a_picture_is_black_where_nothing_is(scene):
     cameras = cameras_around(2, size=24)
-    surface, wo = surface_of_view(scene, cameras, 0)
-    rgb = shade_hits(scene, surface, wo)
+    surface, wo = pipeline.surface_of_view(scene, cameras, 0)
+    rgb = pipeline.shade_hits(scene, surface, wo)
     assert (rgb[surface.opacity == 0] == 0).all()
     assert (rgb[surface.opacity > 0.9] > 0).all()
 
 
 def test_mesh_lies_on_the_surface_and_faces_outwards(scene):
-    mesh = extract_mesh(scene)
+    mesh = pipeline.extract_mesh(scene)
     assert (mesh.vertices.norm(dim=1) - RADIUS).abs().max() < 0.1 * scene.field.voxel_size
     a, b, c = mesh.vertices[mesh.faces.long()].unbind(1)
     outward = (torch.linalg.cross(b - a, c - a) * (a + b + c)).sum(1)
@@ -92,17 +85,17 @@ def test_a_field_without_surface_has_no_mesh(scene):
         dense_field(grid, 4, torch.ones(grid.size)),
     )
     with pytest.raises(ValueError, match="no surface: its sdf does not change sign"):
-        extract_mesh(empty)
+        pipeline.extract_mesh(empty)
 
 
 def test_resizing_keeps_what_is_seen(scene):
     cameras = cameras_around(2, size=24)
-    before, _ = surface_of_view(scene, cameras, 0)
+    before, _ = pipeline.surface_of_view(scene, cameras, 0)
     finer = Scene(scene.cfg, scene.field, scene.inv_s)
     finer.load_state_dict(scene.state_dict())
     lower, upper = scene.field.bounds()
     finer.field = scene.field.resized(fit_grid(lower, upper, 80**3))
-    after, _ = surface_of_view(finer, cameras, 0)
+    after, _ = pipeline.surface_of_view(finer, cameras, 0)
     inner = (before.opacity > 0.99) & (after.opacity > 0.99)
     assert inner.sum() > 50
     assert (before.depth - after.depth)[inner].abs().max() < 0.2 * scene.field.voxel_size

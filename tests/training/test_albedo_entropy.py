@@ -14,14 +14,6 @@ from univoxel.config import JointConfig
 from univoxel.lights.views import ViewLights
 from univoxel.render.observations import prefiltered_roughness
 from univoxel.training import albedo_entropy
-from univoxel.training.albedo_entropy import (
-    CELL,
-    diffuse_albedo,
-    fit_sun_,
-    minimise_entropy_,
-    painted_points,
-    palette_entropy,
-)
 from univoxel.training.newton import newton_round_
 
 NODES, POINTS = 128, 900
@@ -58,7 +50,7 @@ def in_colors(problem, color):
 
 def believed(scene, problem):
     """Albedo [P, 3] under the scene's map of matte paints, and which points."""
-    points = painted_points(scene, problem, no_metal(problem))
+    points = albedo_entropy.painted_points(scene, problem, no_metal(problem))
     return points.color / points.irradiance(scene.sky.radiance.detach()), points.point
 
 
@@ -75,7 +67,7 @@ def with_sun(share):
 def test_a_sun_is_found(share):
     map, node = with_sun(share)
     scene, problem, albedo = painted(map)
-    sun = fit_sun_(scene, problem, no_metal(problem))
+    sun = albedo_entropy.fit_sun_(scene, problem, no_metal(problem))
     assert sun is not None
     assert str(sun).startswith(f"a sun sends {share:.0%} of the light, from about azimuth ")
     azimuth, elevation = (math.radians(int(x)) for x in re.findall(r"-?\d+", str(sun))[1:])
@@ -97,7 +89,7 @@ def test_smoothness_leaves_the_sun():
     """Newton's equations, which diffuse points tell nothing, would take it down."""
     map, node = with_sun(0.8)
     scene, problem, _ = painted(map)
-    sun = fit_sun_(scene, problem, no_metal(problem))
+    sun = albedo_entropy.fit_sun_(scene, problem, no_metal(problem))
     before = scene.sky.log_radiance.detach()[node] - scene.sky.log_radiance.detach().mean(0)
     dark = replace(problem, target=torch.zeros_like(problem.target))
     cfg = JointConfig(newton_points=300, newton_steps=2, newton_views=4, newton_smooth=1e3)
@@ -113,7 +105,7 @@ def test_where_there_is_none_the_map_stays(light):
     if light == "known":
         scene.sky.log_radiance.data.copy_(map.log())
     before = scene.sky.log_radiance.detach().clone()
-    assert fit_sun_(scene, problem, no_metal(problem)) is None
+    assert albedo_entropy.fit_sun_(scene, problem, no_metal(problem)) is None
     assert torch.equal(scene.sky.log_radiance, before)
 
 
@@ -135,8 +127,8 @@ def test_what_tells_nothing_is_not_asked(why):
     elif why == "light varies":
         scene.views = ViewLights(("a", "b", "c", "d"), 2, scene.sky.direction)
     before = scene.sky.log_radiance.detach().clone()
-    assert fit_sun_(scene, problem, decisions) is None
-    assert not minimise_entropy_(scene, problem, decisions)
+    assert albedo_entropy.fit_sun_(scene, problem, decisions) is None
+    assert not albedo_entropy.minimise_entropy_(scene, problem, decisions)
     assert torch.equal(scene.sky.log_radiance, before)
 
 
@@ -148,7 +140,7 @@ def tilt(scene, problem, map, change):
     """How uneven the scene's map is over another, in log; and the mean log light on the points."""
     known(scene, map * change.exp())
     begin = believed(scene, problem)[0].log().mean(0)
-    assert minimise_entropy_(scene, problem, no_metal(problem))
+    assert albedo_entropy.minimise_entropy_(scene, problem, no_metal(problem))
     left = scene.sky.log_radiance.detach() - map.log()
     torch.testing.assert_close(believed(scene, problem)[0].log().mean(0), begin)
     return (left - left.mean(0)).abs().mean(0), (change - change.mean(0)).abs().mean(0)
@@ -171,7 +163,7 @@ def test_a_sun_of_the_wrong_brightness_is_put_right():
     change[node] = torch.tensor([0.7, 0.7, 0.3])
     known(scene, map * change.exp())
     decisions = replace(no_metal(problem), sun=10 * change)
-    minimise_entropy_(scene, problem, decisions)
+    albedo_entropy.minimise_entropy_(scene, problem, decisions)
     left = scene.sky.log_radiance.detach() - map.log()
     assert (left[node] - left.median(0).values).abs().max() < 0.1
 
@@ -181,18 +173,18 @@ def test_points_that_nothing_seems_to_reach_spoil_nothing():
     visibility = problem.transport.visibility.clone()
     visibility[:50] = 0  # and yet they are bright
     problem = replace(problem, transport=replace(problem.transport, visibility=visibility))
-    sun = fit_sun_(scene, problem, no_metal(problem))
+    sun = albedo_entropy.fit_sun_(scene, problem, no_metal(problem))
     assert sun is not None
-    minimise_entropy_(scene, problem, replace(no_metal(problem), sun=sun.log_excess))
+    albedo_entropy.minimise_entropy_(scene, problem, replace(no_metal(problem), sun=sun.log_excess))
     assert scene.sky.log_radiance.isfinite().all()
-    assert diffuse_albedo(scene, problem).isfinite().all()
+    assert albedo_entropy.diffuse_albedo(scene, problem).isfinite().all()
 
 
 def test_the_right_map_stays():
     scene, problem, albedo = painted(lamps(NODES))
     known(scene, lamps(NODES))
     before = scene.sky.log_radiance.detach().clone()
-    assert not minimise_entropy_(scene, problem, no_metal(problem))
+    assert not albedo_entropy.minimise_entropy_(scene, problem, no_metal(problem))
     torch.testing.assert_close(scene.sky.log_radiance.detach(), before)
     found, point = believed(scene, problem)
     torch.testing.assert_close(found, albedo[point], atol=1e-4, rtol=1e-3)
@@ -210,7 +202,7 @@ def test_paint_is_told_from_what_the_layer_mirrors():
         wo=problem.observations.wo[4:],
         view=problem.observations.view[4:],
     )
-    found = diffuse_albedo(scene, replace(problem, observations=seen))
+    found = albedo_entropy.diffuse_albedo(scene, replace(problem, observations=seen))
     assert found[0].isnan().all()
     mirrored = problem.observations.color.view(POINTS, 4, 3).std(1).mean()
     assert mirrored > 0.01
@@ -224,7 +216,7 @@ def test_of_gains_paint_knows_nothing():
     gains = torch.tensor([0.5, 0.2, -0.3, -0.4])[:, None].expand(4, 3)
     scene.views.add(gains)
     color = scene.exposed(problem.observations.color, problem.observations.view).detach()
-    found = diffuse_albedo(scene, in_colors(problem, color))
+    found = albedo_entropy.diffuse_albedo(scene, in_colors(problem, color))
     torch.testing.assert_close(found, albedo, atol=1e-3, rtol=1e-2)
 
 
@@ -235,15 +227,17 @@ def test_entropy_counts_the_colours():
     share = torch.bincount(few) / 2000
     wanted = -(share * share.log()).sum()
     mixed = torch.stack([colors[few], colors[few] + 7.3, 5 * torch.rand(2000, 3)], 1)
-    found = palette_entropy(mixed, CELL)
+    found = albedo_entropy.palette_entropy(mixed, albedo_entropy.CELL)
     torch.testing.assert_close(found[:2], wanted.expand(2), atol=1e-4, rtol=0)
     # Nearly as many cells as points; some share an entry of the table
     assert 0.9 * math.log(2000) < found[2] < math.log(2000)
-    assert (5 / CELL) ** 3 > 10 * 2000
+    assert (5 / albedo_entropy.CELL) ** 3 > 10 * 2000
 
 
 def test_albedos_come_in_parts(monkeypatch):
     scene, problem, albedo = painted(lamps(NODES), shiny=True)
     known(scene, lamps(NODES))
     monkeypatch.setattr(albedo_entropy, "POINTS_AT_ONCE", 70)
-    torch.testing.assert_close(diffuse_albedo(scene, problem), albedo, atol=1e-3, rtol=1e-2)
+    torch.testing.assert_close(
+        albedo_entropy.diffuse_albedo(scene, problem), albedo, atol=1e-3, rtol=1e-2
+    )

@@ -2,7 +2,8 @@
 
 import json
 
-from univoxel.config import StageConfig
+from plain import plain_stage
+
 from univoxel.training.compression import stage_voxels
 from univoxel.training.progress import CapacityChoice, chosen_reach, chosen_voxels
 
@@ -33,7 +34,7 @@ def test_choices_are_found_by_their_kind():
     assert chosen_reach(choices) == 1.5
     assert chosen_voxels(choices[1:]) is None
     assert chosen_reach(choices[2:3]) is None
-    stage = StageConfig(voxels=0.06, iterations=1, share=1.0)
+    stage = plain_stage(voxels=0.06, iterations=1, share=1.0)
     assert stage_voxels(stage, choices) == 50_000
     assert stage_voxels(stage, [choice("voxels", 70_000)]) == 60_000
     assert stage_voxels(stage, []) == 60_000

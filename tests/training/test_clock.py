@@ -5,8 +5,9 @@ import json
 from pathlib import Path
 
 import pytest
+from plain import plain_stage, plain_training
 
-from univoxel.config import PREPARATION, StageConfig, TrainConfig
+from univoxel.config import PREPARATION
 from univoxel.core.files import append_line
 from univoxel.training import clock as clock_module
 from univoxel.training.clock import HURRY, LEAST, RESERVE_SECONDS, REST, expected_seconds
@@ -31,8 +32,8 @@ def clock(monkeypatch):
 
 
 def config(out, *shares, iterations=10, minutes=1.0):
-    stages = tuple(StageConfig(voxels=1.0, iterations=iterations, share=s) for s in shares)
-    return TrainConfig(Path("photos"), out, stages, minutes)
+    stages = tuple(plain_stage(voxels=1.0, iterations=iterations, share=s) for s in shares)
+    return plain_training(Path("photos"), out, stages, minutes)
 
 
 def slower(cfg, seconds):

@@ -7,9 +7,10 @@ import pytest
 import torch
 from analytic import photos_of, sphere_scene, write_scene
 from observed_points import Steps, no_metal, problem_on_a_sphere
+from plain import plain_stage, plain_training
 
 from univoxel.cli import trainer as task
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import JointConfig
 from univoxel.lights import SGConfig
 from univoxel.optim import RowAdam
 from univoxel.scene import SceneConfig, load_scene
@@ -25,10 +26,10 @@ def data(tmp_path_factory):
 
 def small(data, out):
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=32)
-    stage = StageConfig(voxels=0.008, iterations=24, share=0.5, rays=256)
+    stage = plain_stage(voxels=0.008, iterations=24, share=0.5, rays=256)
     stages = (stage, dataclasses.replace(stage, physical_from=0.0))
     sizes = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
-    return TrainConfig(data, out, stages, minutes=2.0, scene=sizes)
+    return plain_training(data, out, stages, minutes=2.0, scene=sizes)
 
 
 def events(out):
@@ -292,7 +293,7 @@ def test_a_system_is_damped_only_as_it_needs():
 def test_a_newton_round_without_a_solution_leaves_the_map(monkeypatch):
     scene = sphere_scene(32)
     problem = problem_on_a_sphere(100, 12, 32, scene)
-    monkeypatch.setattr(newton, "solve_damped", lambda *_: None)
+    monkeypatch.setattr(newton.equations, "solve_damped", lambda *_: None)
     solved = newton.newton_round_(scene, problem, no_metal(problem), JOINT)
     assert solved == newton.NewtonRound([], [newton.UNSOLVABLE])
     assert (scene.sky.log_radiance == 0).all()

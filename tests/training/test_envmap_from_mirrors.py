@@ -18,16 +18,6 @@ from univoxel.envmap import EnvMap, lookup
 from univoxel.lights.latlong import DistantLight
 from univoxel.render.observations import Mirrors
 from univoxel.training import envmap_from_mirrors, mirrors
-from univoxel.training.envmap_from_mirrors import (
-    MirrorViews,
-    agreed_normals,
-    errors,
-    pooled,
-    sharp_map,
-    splat,
-    unit_of,
-    with_energy,
-)
 from univoxel.training.mirrors import NEIGHBOURS, reflect
 
 POINTS, VIEWS, NODES, ROWS = 1500, 16, 512, 64
@@ -58,7 +48,9 @@ def a_mirror(off=0.0, seed=0):
 def views_of(problem):
     seen = problem.observations
     point = torch.arange(POINTS).repeat_interleave(VIEWS)
-    return MirrorViews.of(point, seen.wo, seen.color, BASE.expand(POINTS, 3), seen.normal)
+    return envmap_from_mirrors.MirrorViews.of(
+        point, seen.wo, seen.color, BASE.expand(POINTS, 3), seen.normal
+    )
 
 
 def around(position, count=16):
@@ -76,19 +68,19 @@ def encoded_error(encoded):
 
 def test_what_is_seen_is_shared_among_four_texels_and_goes_around():
     direction = sphere.latlong_direction(torch.tensor([[0.0, 0.5], [0.25, 1e-4]]))
-    sums = splat(direction, torch.tensor([[1.0, 10.0], [2.0, 20.0]]), 8)
+    sums = envmap_from_mirrors.splat(direction, torch.tensor([[1.0, 10.0], [2.0, 20.0]]), 8)
     assert torch.allclose(sums.sum((0, 1)), torch.tensor([3.0, 30.0]))
     # u = 0 lies between the last column and the first, v = 1/2 between two rows
     for row in (3, 4):
         for column in (0, 15):
             assert torch.allclose(sums[row, column], torch.tensor([0.25, 2.5]), atol=1e-4)
     assert torch.allclose(sums[0, 3:5].sum(0), torch.tensor([2.0, 20.0]), rtol=1e-2)
-    assert torch.equal(pooled(sums, 4).sum((0, 1)), sums.sum((0, 1)))
+    assert torch.equal(envmap_from_mirrors.pooled(sums, 4).sum((0, 1)), sums.sum((0, 1)))
 
 
 def test_a_mirror_shows_the_map_finer_than_nodes():
     _, problem, normal = a_mirror()
-    found = sharp_map(views_of(problem), normal, ROWS)
+    found = envmap_from_mirrors.sharp_map(views_of(problem), normal, ROWS)
     nodes = DistantLight(NODES)
     with torch.no_grad():
         nodes.log_radiance.copy_(of_nodes(fine_map, nodes.direction).log())
@@ -105,7 +97,7 @@ def test_where_nothing_is_mirrored_texels_are_as_those_around():
     _, problem, normal = a_mirror()
     views = views_of(problem)
     there = views.mirrored(normal)[:, 2] > 0
-    found = sharp_map(views.at(there), normal, ROWS)
+    found = envmap_from_mirrors.sharp_map(views.at(there), normal, ROWS)
     below = slice(ROWS * 3 // 4, None)
     assert not found.count[below].any()
     assert found.encoded[below].isfinite().all()
@@ -119,11 +111,11 @@ def test_map_and_normals_find_each_other(monkeypatch):
     off = problem.observations.normal
     assert 3 < degrees(off, normal).mean() < 6
     nearest = around(problem.observations.position)
-    found = agreed_normals(views_of(problem), off, nearest)
+    found = envmap_from_mirrors.agreed_normals(views_of(problem), off, nearest)
     assert torch.allclose(found.norm(dim=1), torch.ones(POINTS), atol=1e-5)
     assert degrees(found, normal).mean() < 0.6 * degrees(off, normal).mean()
     monkeypatch.setattr(envmap_from_mirrors, "TURNS", ())
-    stay = agreed_normals(views_of(problem), off, nearest)
+    stay = envmap_from_mirrors.agreed_normals(views_of(problem), off, nearest)
     assert torch.equal(stay, off)
 
 
@@ -131,9 +123,9 @@ def test_what_is_far_off_counts_no_more_than_so_much():
     _, problem, normal = a_mirror()
     views = views_of(problem)
     black = torch.zeros(ROWS, 2 * ROWS, 3)
-    assert errors(black, views, normal).max() <= 0.3
+    assert envmap_from_mirrors.errors(black, views, normal).max() <= 0.3
     true = linear_to_srgb_unclipped(fine_map(sphere.latlong_directions(256)))
-    assert errors(true, views, normal).mean() < 0.01
+    assert envmap_from_mirrors.errors(true, views, normal).mean() < 0.01
 
 
 def test_at_grazing_angles_metal_reflects_more():
@@ -142,7 +134,9 @@ def test_at_grazing_angles_metal_reflects_more():
     cosine = torch.tensor([1.0, 0.3])
     wo = torch.stack([(1 - cosine**2).sqrt(), torch.zeros(2), cosine], 1)
     point = torch.zeros(2, dtype=torch.int64)
-    views = MirrorViews.of(point, wo, 0.4 * fresnel(cosine[:, None]), BASE[None], normal)
+    views = envmap_from_mirrors.MirrorViews.of(
+        point, wo, 0.4 * fresnel(cosine[:, None]), BASE[None], normal
+    )
     sent = linear_to_srgb_unclipped(torch.full((2, 3), 0.4))
     assert torch.allclose(views.incident, sent, rtol=1e-5)
 
@@ -161,10 +155,10 @@ def lit_by_a_lamp():
         nodes.log_radiance.copy_(of_nodes(sky, nodes.direction).log())
     views = sphere.fibonacci_sphere(60000)
     shown = sky(views).clamp_max(1.0)
-    seen = MirrorViews(
+    seen = envmap_from_mirrors.MirrorViews(
         torch.arange(len(views)), views, linear_to_srgb_unclipped(shown), shown[:, 0] > 0.97
     )
-    return true, lamp, nodes, sharp_map(seen, views, ROWS)
+    return true, lamp, nodes, envmap_from_mirrors.sharp_map(seen, views, ROWS)
 
 
 def irradiance(map):
@@ -176,7 +170,7 @@ def irradiance(map):
 def test_lamps_get_the_light_that_the_photographs_clip():
     true, lamp, nodes, shown = lit_by_a_lamp()
     assert (shown.clipped[lamp] > 0.5).float().mean() > 0.8
-    found = with_energy(shown, nodes)
+    found = envmap_from_mirrors.with_energy(shown, nodes)
     clipped = 0.2 + 0.1 * sphere.latlong_directions(ROWS)[..., 2:].expand(-1, -1, 3)
     clipped = torch.where(lamp[..., None], 1.0, clipped)
     wanted = irradiance(true)
@@ -188,23 +182,25 @@ def test_lamps_get_the_light_that_the_photographs_clip():
     far = far < math.cos(0.2 + 6 * math.pi / ROWS)
     assert (found[far] / true[far] - 1).abs().max() < 0.15
     nothing = replace(shown, count=0 * shown.count)
-    assert torch.allclose(with_energy(nothing, nodes), nodes.latlong(ROWS), rtol=0.02)
+    assert torch.allclose(
+        envmap_from_mirrors.with_energy(nothing, nodes), nodes.latlong(ROWS), rtol=0.02
+    )
 
 
 def test_a_map_of_less_light_and_brighter_paint_has_another_unit():
     true, lamp, nodes, shown = lit_by_a_lamp()
     with torch.no_grad():
         nodes.log_radiance += math.log(0.7)
-    found = with_energy(shown, nodes)
+    found = envmap_from_mirrors.with_energy(shown, nodes)
     assert ((irradiance(found) / irradiance(0.7 * true) - 1).abs()).max() < 0.05
     assert found[lamp].mean() > 0.7 * 15
     area = torch.full((NODES, 1), 4 * math.pi / NODES)
     sky = torch.rand(NODES, 3) * area
     place = sphere.fibonacci_sphere(NODES)
-    unit = unit_of(place, 0.7 * sky, sky, area, 0 * area)
+    unit = envmap_from_mirrors.unit_of(place, 0.7 * sky, sky, area, 0 * area)
     assert torch.allclose(unit, torch.full((3,), 0.7), rtol=1e-4)
-    assert unit_of(place, 0.7 * sky, sky, 0 * area, 0 * area) == 1.0
-    assert unit_of(place, 0.7 * sky, sky, area, area) == 1.0
+    assert envmap_from_mirrors.unit_of(place, 0.7 * sky, sky, 0 * area, 0 * area) == 1.0
+    assert envmap_from_mirrors.unit_of(place, 0.7 * sky, sky, area, area) == 1.0
 
 
 @pytest.fixture

@@ -4,11 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from observed_points import (
-    in_double,
-    photographed,
-    random_problem,
-)
+from observed_points import in_double, photographed, random_problem
 
 from univoxel import brdf
 from univoxel.color import linear_to_srgb_unclipped

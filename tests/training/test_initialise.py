@@ -56,8 +56,7 @@ def test_without_observations_nothing_is_decided():
 
 
 @pytest.mark.parametrize(
-    ("true", "begin", "wanted"),
-    [(0.25, 0.6, 0.25), (0.7, 0.3, 0.7), (0.45, 0.45, 0.45)],
+    ("true", "begin", "wanted"), [(0.25, 0.6, 0.25), (0.7, 0.3, 0.7), (0.45, 0.45, 0.45)]
 )
 def test_the_roughness_that_explains_the_photographs_is_chosen(true, begin, wanted):
     """From a wrong one the whole moves to a better; the right one stays, to the bit."""

@@ -11,9 +11,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 from analytic import write_scene
+from plain import plain_stage, plain_training
 
 from univoxel.cli.trainer import train
-from univoxel.config import LossConfig, StageConfig, TrainConfig
+from univoxel.config import LossConfig
 from univoxel.data import load_photos
 from univoxel.fields.features import Levels
 from univoxel.fields.field import dense_field, hash_field
@@ -28,7 +29,7 @@ from univoxel.training.loop import add_gradient_, batch_at, light_priors, losses
 from univoxel.training.pixels import TrainingPixels, split_pixels
 from univoxel.training.progress import Progress
 
-STAGE = StageConfig(voxels=0.004, iterations=3, share=1.0, rays=600, physical_from=0.0)
+STAGE = plain_stage(voxels=0.004, iterations=3, share=1.0, rays=600, physical_from=0.0)
 
 
 def test_every_term_of_a_light_has_its_own_weight():
@@ -81,7 +82,7 @@ def test_what_is_read_beside_the_surface_adds_its_gradient(scene, pixels):
 
 def test_bits_do_not_depend_on_threads(scene, pixels, tmp_path):
     stage = replace(STAGE, iterations=3)
-    cfg = TrainConfig(Path("data"), tmp_path, (stage,))
+    cfg = plain_training(Path("data"), tmp_path, (stage,))
     before, found = torch.get_num_threads(), []
     try:
         for threads in (1, 2):
@@ -132,8 +133,8 @@ def test_patches_are_compared_in_every_second_step_and_told_in_all(tmp_path, mon
     data = write_scene(tmp_path / "data", views=8, size=24)
     light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     sizes = SceneConfig(channels=4, material_channels=2, hidden=16, sky_nodes=0, light=light)
-    stage = StageConfig(voxels=0.01, iterations=20, share=1.0, rays=64, patches_from=0.42)
-    cfg = TrainConfig(data, tmp_path / "run", (stage,), minutes=2.0, scene=sizes)
+    stage = plain_stage(voxels=0.01, iterations=20, share=1.0, rays=64, patches_from=0.42)
+    cfg = plain_training(data, tmp_path / "run", (stage,), minutes=2.0, scene=sizes)
     train(cfg)
     assert len(compared) == 5
     lines = [json.loads(line) for line in (cfg.out / "log.jsonl").read_text().splitlines()]

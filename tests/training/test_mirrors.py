@@ -17,17 +17,6 @@ from univoxel.config import JointConfig
 from univoxel.lights.views import Turntable
 from univoxel.render.observations import Mirrors
 from univoxel.training import joint_solve, mirrors
-from univoxel.training.mirrors import (
-    ROWS,
-    MirrorObservations,
-    NodeMap,
-    find_mirrors,
-    neighbours,
-    reflect,
-    reflectance,
-    regions_of,
-    smoothed,
-)
 
 POINTS, VIEWS, NODES = 1500, 16, 512
 BASE = torch.tensor([0.9, 0.7, 0.5])
@@ -45,7 +34,7 @@ def under_fine_map(metal, paint, off=0.0):
     normal = problem.observations.normal
     painted = photographed(problem, nodes, *paint(normal)).observations.color
     wo = problem.observations.wo.view(POINTS, VIEWS, 3)
-    mirrored = BASE * fine_map(reflect(normal, wo)[0]).flatten(0, 1)
+    mirrored = BASE * fine_map(mirrors.reflect(normal, wo)[0]).flatten(0, 1)
     is_metal = metal(normal)
     color = torch.where(is_metal.repeat_interleave(VIEWS)[:, None], mirrored, painted)
     wave = math.radians(1.4 * off) * (3 * normal[:, [1, 2, 0]] + 1).sin()
@@ -68,7 +57,7 @@ def degrees(a, b):
 @pytest.mark.parametrize("paint", [white, black_and_glossy])
 def test_a_mirror_is_found_though_its_normals_are_off(paint):
     scene, problem = under_fine_map(lambda n: n[:, 2] > 0, paint, off=10)
-    found = find_mirrors(scene, problem)
+    found = mirrors.find_mirrors(scene, problem)
     true_normal = normalize(problem.observations.position, dim=1)
     above, below = true_normal[:, 2] > 0.25, true_normal[:, 2] < -0.25
     assert found.metal[above].float().mean() > 0.95
@@ -85,7 +74,7 @@ def test_where_nothing_mirrors_nothing_changes(paint):
     torch.manual_seed(3)
     expected = torch.rand(4)
     torch.manual_seed(3)
-    assert find_mirrors(scene, problem) is None
+    assert mirrors.find_mirrors(scene, problem) is None
     assert torch.equal(torch.rand(4), expected)
 
 
@@ -94,7 +83,7 @@ def test_how_much_a_point_changes_tells_and_not_what_it_mirrors():
     scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
     mixed = torch.randperm(POINTS * VIEWS)
     seen = replace(problem.observations, color=problem.observations.color[mixed])
-    found = find_mirrors(scene, replace(problem, observations=seen))
+    found = mirrors.find_mirrors(scene, replace(problem, observations=seen))
     assert found.metal.float().mean() > 0.97
     assert found.sharp.float().mean() > 0.97
 
@@ -103,27 +92,27 @@ def test_points_that_hardly_change_are_paint(monkeypatch):
     """However little the map changes: 8 bits are noisy."""
     scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
     monkeypatch.setattr(mirrors, "CHANGE", 0.5)
-    assert find_mirrors(scene, problem) is None
+    assert mirrors.find_mirrors(scene, problem) is None
 
 
 def test_lacquer_changes_less_than_what_it_mirrors(monkeypatch):
     scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
     lacquer = 0.3 + 0.35 * problem.observations.color
     problem = replace(problem, observations=replace(problem.observations, color=lacquer))
-    assert find_mirrors(scene, problem) is None
+    assert mirrors.find_mirrors(scene, problem) is None
     monkeypatch.setattr(mirrors, "REFLECTED", 0.2)
-    assert find_mirrors(scene, problem).metal.float().mean() > 0.9
+    assert mirrors.find_mirrors(scene, problem).metal.float().mean() > 0.9
 
 
 def test_what_changes_more_than_all_that_it_could_mirror_is_no_mirror(monkeypatch):
     """As paint under a sun does, beside which the map is dark; here the map is too dark."""
     scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
-    assert find_mirrors(scene, problem).metal.float().mean() > 0.9
+    assert mirrors.find_mirrors(scene, problem).metal.float().mean() > 0.9
     with torch.no_grad():
         scene.sky.log_radiance -= math.log(3)
-    assert find_mirrors(scene, problem) is None
+    assert mirrors.find_mirrors(scene, problem) is None
     monkeypatch.setattr(mirrors, "REFLECTED_AT_MOST", 9.0)
-    assert find_mirrors(scene, problem).metal.float().mean() > 0.9
+    assert mirrors.find_mirrors(scene, problem).metal.float().mean() > 0.9
 
 
 def test_points_that_see_no_sky_are_as_their_neighbours():
@@ -133,7 +122,7 @@ def test_points_that_see_no_sky_are_as_their_neighbours():
     blocked = (true_normal[:, 2] > 0.3) & (torch.arange(POINTS) % 2 == 0)
     visibility[blocked] = 0
     problem = replace(problem, transport=replace(problem.transport, visibility=visibility))
-    found = find_mirrors(scene, problem)
+    found = mirrors.find_mirrors(scene, problem)
     assert found.metal[blocked].float().mean() > 0.95
 
 
@@ -144,10 +133,10 @@ def test_fewer_than_half_of_the_voters_are_not_asked(monkeypatch):
 
     def counted(key, count):
         asked.append(count)
-        return neighbours(key, count)
+        return mirrors.neighbours(key, count)
 
     monkeypatch.setattr(mirrors, "neighbours", counted)
-    assert find_mirrors(scene, problem) is None
+    assert mirrors.find_mirrors(scene, problem) is None
     assert asked == [mirrors.NEIGHBOURS]
 
     def some(count):
@@ -161,19 +150,19 @@ def test_fewer_than_half_of_the_voters_are_not_asked(monkeypatch):
     for count, voted in ((5, False), (6, True)):
         asked.clear()
         monkeypatch.setattr(mirrors, "mirrors_among", some(count))
-        find_mirrors(scene, problem)
+        mirrors.find_mirrors(scene, problem)
         assert (10 in asked) == voted
 
 
 def test_light_that_turns_has_no_common_map():
     scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
-    assert find_mirrors(scene, replace(problem, turned=Turntable)) is None
+    assert mirrors.find_mirrors(scene, replace(problem, turned=Turntable)) is None
 
 
 def test_too_few_points_say_nothing(monkeypatch):
     scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
     monkeypatch.setattr(mirrors, "NEIGHBOURS", POINTS + 1)
-    assert find_mirrors(scene, problem) is None
+    assert mirrors.find_mirrors(scene, problem) is None
 
 
 def test_base_colours_are_read_from_where_it_is_dark():
@@ -185,10 +174,10 @@ def test_base_colours_are_read_from_where_it_is_dark():
         scene.sky.log_radiance.copy_(torch.where(direction[:, :1] > 0, 8.0, dark).log())
     point = torch.arange(POINTS).repeat_interleave(VIEWS)
     wo = seen.wo
-    mirrored = reflect(seen.normal[point], wo[:, None])[0][:, 0]
+    mirrored = mirrors.reflect(seen.normal[point], wo[:, None])[0][:, 0]
     shown = BASE * torch.where(mirrored[:, :1] > 0, 8.0, 0.3 + 0.2 * mirrored)
     problem = replace(problem, observations=replace(seen, color=shown.clamp_max(1.0)))
-    found = find_mirrors(scene, problem)
+    found = mirrors.find_mirrors(scene, problem)
     assert found.metal.float().mean() > 0.5  # points that mirror one side alone do not tell
     base = found.base[found.metal].median(0).values
     assert (base / BASE - 1).abs().max() < 0.03
@@ -200,16 +189,16 @@ def test_polished_surfaces_have_no_relief():
     bumpy = normalize(normal + 0.15 * torch.randn(2000, 3), dim=1)
     ball = 0.5 * normal
     everywhere = torch.ones(2000, dtype=torch.bool)
-    sharp, smooth = smoothed(ball, bumpy, everywhere)
+    sharp, smooth = mirrors.smoothed(ball, bumpy, everywhere)
     before, after = (degrees(n, normal).mean() for n in (bumpy, smooth))
     assert after < 0.4 * before
     assert sharp.all()
     half = everywhere & (normal[:, 2] > 0)
-    sharp, smooth = smoothed(ball, bumpy, half)
+    sharp, smooth = mirrors.smoothed(ball, bumpy, half)
     assert torch.equal(smooth[~half], bumpy[~half])
     assert torch.equal(sharp, half)
     few = torch.arange(2000) < mirrors.NEIGHBOURS - 1
-    sharp, smooth = smoothed(ball, bumpy, few)
+    sharp, smooth = mirrors.smoothed(ball, bumpy, few)
     assert torch.equal(smooth, bumpy)
     assert torch.equal(sharp, few)
 
@@ -221,7 +210,7 @@ def test_thin_surfaces_keep_their_normals_and_are_not_called_sharp():
     around = normalize(torch.randn(2000, 3) * torch.tensor([1.0, 1.0, 0.0]), dim=1)
     wire = 0.005 * around + torch.linspace(-0.5, 0.5, 2000)[:, None] * torch.tensor([0.0, 0, 1])
     everywhere = torch.ones(2000, dtype=torch.bool)
-    sharp, normal = smoothed(wire, around, everywhere)
+    sharp, normal = mirrors.smoothed(wire, around, everywhere)
     assert torch.equal(normal, around)
     assert not sharp.any()
 
@@ -230,8 +219,8 @@ def test_a_mirror_is_as_bright_where_it_mirrors_nothing_dark():
     """Two polished metals of two colours each, in parts that show a half more or less, under a map
     that is grey everywhere."""
     direction = sphere.fibonacci_sphere(NODES)
-    grey = torch.full((ROWS, 2 * ROWS, 3), 0.5)
-    map = NodeMap.of(direction, grey, torch.full((NODES, 3), 0.5))
+    grey = torch.full((mirrors.ROWS, 2 * mirrors.ROWS, 3), 0.5)
+    map = mirrors.NodeMap.of(direction, grey, torch.full((NODES, 3), 0.5))
     normal = torch.tensor([[0.0, 0.0, 1.0]]).repeat(8, 1)
     wo = torch.tensor([0.0, 0.0, 1.0]).expand(8, 4, 3)
     part = torch.tensor([0.4, 0.4, 0.8, 0.8, 0.3, 0.3, 0.5, 0.5])
@@ -239,28 +228,28 @@ def test_a_mirror_is_as_bright_where_it_mirrors_nothing_dark():
     color = part[:, None] * torch.where(torch.arange(8)[:, None] % 4 < 2, golden, red)
     is_open = torch.ones(8, 4, dtype=torch.bool)
     shown = (0.5 * color)[:, None].expand(8, 4, 3)
-    seen = MirrorObservations(torch.zeros(8, 6), normal, wo, shown, is_open)
+    seen = mirrors.MirrorObservations(torch.zeros(8, 6), normal, wo, shown, is_open)
     everywhere = torch.ones(8, dtype=torch.bool)
     # Each pair is of one colour; a link leads from the first pair of a metal to the second
     nearest = torch.tensor([[0, 1], [1, 0], [2, 3], [3, 2], [4, 5], [5, 4], [6, 7], [7, 6]])
-    apart = reflectance(seen, map, everywhere, everywhere, nearest)
+    apart = mirrors.reflectance(seen, map, everywhere, everywhere, nearest)
     assert torch.allclose(apart, color, rtol=1e-4)
     linked = nearest.clone()
     linked[1], linked[5] = torch.tensor([1, 2]), torch.tensor([5, 6])
-    base = reflectance(seen, map, everywhere, everywhere, linked)
+    base = mirrors.reflectance(seen, map, everywhere, everywhere, linked)
     assert torch.allclose(base.amax(1), torch.tensor([0.6] * 4 + [0.4] * 4), rtol=1e-4)
     own = color / color.amax(1, keepdim=True)
     alone = torch.tensor([0, 2, 3, 4, 6, 7])  # whose neighbours are all of their colour
     assert torch.allclose((base / base.amax(1, keepdim=True))[alone], own[alone], rtol=1e-4)
     rough = torch.zeros(8, dtype=torch.bool)
-    as_seen = reflectance(seen, map, everywhere, rough, nearest)
+    as_seen = mirrors.reflectance(seen, map, everywhere, rough, nearest)
     assert torch.allclose(as_seen, color, rtol=1e-4)
 
 
 def test_regions_are_what_neighbours_link():
     inside = torch.tensor([True, True, False, True, True])
     nearest = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4], [4, 3]])
-    region, count = regions_of(inside, nearest)
+    region, count = mirrors.regions_of(inside, nearest)
     assert count == 3
     assert region[0] == region[1]
     assert region[3] == region[4]
@@ -272,7 +261,7 @@ def test_what_is_rough_mirrors_but_is_not_sharp():
     scene, problem = under_fine_map(lambda n: n[:, 2] > 2, white)
     metal = torch.zeros(POINTS, 3), torch.full((POINTS,), 0.25), BASE.expand(POINTS, 3)
     problem = photographed(problem, scene.sky.radiance.detach(), *metal)
-    found = find_mirrors(scene, problem)
+    found = mirrors.find_mirrors(scene, problem)
     assert found.metal.float().mean() > 0.95
     assert not found.sharp.any()
 

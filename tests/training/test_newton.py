@@ -5,13 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from analytic import scene_of
-from observed_points import (
-    lamps,
-    no_metal,
-    photographed,
-    problem_on_a_sphere,
-    random_problem,
-)
+from observed_points import lamps, no_metal, photographed, problem_on_a_sphere, random_problem
 
 from univoxel import brdf
 from univoxel.config import JointConfig
@@ -77,13 +71,13 @@ def test_newton_learns_from_few_photographs(views):
 def test_newton_in_no_time_takes_few_points(monkeypatch):
     scene, counts = scene_of((0.5, 0.4, 0.3), 0.4, 32), []
     problem = problem_on_a_sphere(100, 12, 32, scene)
-    equations = newton.normal_equations
+    equations = newton.equations.normal_equations
 
     def counted(transport, *arguments):
         counts.append(len(transport.diffuse))
         return equations(transport, *arguments)
 
-    monkeypatch.setattr(newton, "normal_equations", counted)
+    monkeypatch.setattr(newton.equations, "normal_equations", counted)
     monkeypatch.setattr(newton, "NEWTON_CHUNK", 20)
     cfg = replace(CFG, newton_steps=2)
     newton_round_(scene, problem, no_metal(problem), cfg, seconds=0.0)

@@ -6,12 +6,13 @@ import json
 import pytest
 import torch
 from analytic import photos_of, write_scene
+from plain import plain_stage, plain_training
 from spare_scene import LIGHT
 
 from univoxel.cli import trainer as task
 from univoxel.cli.info import info
 from univoxel.cli.trainer import train
-from univoxel.config import JointConfig, StageConfig, TrainConfig
+from univoxel.config import JointConfig
 from univoxel.lights import EnvmapConfig
 from univoxel.scene import FILE, SceneConfig, load_checkpoint, load_scene
 from univoxel.training import compression, loop
@@ -19,7 +20,7 @@ from univoxel.training.compression import FEWEST_VOXELS
 
 
 def test_edges_stay_as_sharp_on_a_coarser_grid():
-    stage = StageConfig(voxels=0.064, iterations=1, share=1.0, sharpness=(0.6, 0.3))
+    stage = plain_stage(voxels=0.064, iterations=1, share=1.0, sharpness=(0.6, 0.3))
     box = torch.zeros(3), torch.ones(3)
     same = compression.on_grid(stage, box, compression.fit_grid(*box, 64_000).voxel_size)
     assert same.sharpness == pytest.approx(stage.sharpness)
@@ -30,8 +31,8 @@ def test_edges_stay_as_sharp_on_a_coarser_grid():
 def test_no_grid_is_finer_than_the_photographs(tmp_path):
     photos = photos_of(3, 48)
     pixel = 1.8 / 48  # a picture is 1.8 wide at the origin
-    grids = [StageConfig(voxels=v, iterations=1, share=0.5) for v in (5e-4, 1.0)]
-    cfg = TrainConfig(tmp_path, tmp_path, (grids[0], JointConfig(), grids[1]), minutes=1.0)
+    grids = [plain_stage(voxels=v, iterations=1, share=0.5) for v in (5e-4, 1.0)]
+    cfg = plain_training(tmp_path, tmp_path, (grids[0], JointConfig(), grids[1]), minutes=1.0)
     box = torch.tensor([-0.5, -0.5, -1.0]), torch.tensor([0.5, 0.5, 1.0])
     for wide in (1.0, 2.0):
         cut = compression.limited_to_pixels(
@@ -55,11 +56,11 @@ def data(tmp_path_factory):
 
 def config(data, out, light=LIGHT, **changes):
     stages = (
-        StageConfig(voxels=0.02, iterations=40, share=0.5, rays=256),
-        StageConfig(voxels=0.05, iterations=50, share=0.5, rays=256, physical_from=0.3),
+        plain_stage(voxels=0.02, iterations=40, share=0.5, rays=256),
+        plain_stage(voxels=0.05, iterations=50, share=0.5, rays=256, physical_from=0.3),
     )
     scene = SceneConfig(channels=4, material_channels=2, hidden=16, light=light, sky_nodes=0)
-    cfg = TrainConfig(data, out, stages, minutes=2.0, scene=scene, capacity="adaptive")
+    cfg = plain_training(data, out, stages, minutes=2.0, scene=scene, capacity="adaptive")
     return dataclasses.replace(cfg, voxel_pixels=0.0, **changes)  # pictures are 32 pixels wide
 
 

@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 from analytic import write_scene
+from plain import plain_stage, plain_training
 
 from univoxel.cli.trainer import train
-from univoxel.config import StageConfig, TrainConfig
 from univoxel.lights import SGConfig
 from univoxel.scene import SceneConfig, load_checkpoint
 from univoxel.training.descent import CHECK, WINDOW, Plateau
@@ -48,9 +48,9 @@ def test_without_patience_nothing_is_looked_at():
 def test_a_training_that_gains_too_little_is_shortened(tmp_path):
     data = write_scene(tmp_path / "data", views=8, size=24)
     light = SGConfig(lobes=2, hidden=8, directions=16, directions_eval=16)
-    stage = StageConfig(voxels=0.008, iterations=60, share=1.0, rays=128, physical_from=0.0)
+    stage = plain_stage(voxels=0.008, iterations=60, share=1.0, rays=128, physical_from=0.0)
     sizes = SceneConfig(4, material_channels=2, hidden=8, sky_nodes=16, light=light)
-    cfg = TrainConfig(data, tmp_path / "run", (stage,), minutes=2.0, scene=sizes, patience=50.0)
+    cfg = plain_training(data, tmp_path / "run", (stage,), minutes=2.0, scene=sizes, patience=50.0)
     state = load_checkpoint(train(cfg))[1]
     assert state["early"] == [0]
     assert state["made"][0] < 0.6

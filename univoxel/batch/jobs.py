@@ -25,7 +25,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from univoxel import __version__
 from univoxel.core import guard
-from univoxel.core.files import read_json, replacing
+from univoxel.core.files import read_json, write_json
 from univoxel.core.machine import cores
 from univoxel.core.progress_bar import bar
 from univoxel.errors import DataError, ExistingFile, MissingExtra, ProcessFailed, UserError
@@ -93,8 +93,7 @@ class Job:
 
     def save(self, record: dict[str, dict[str, Any]]) -> None:
         """Write the record, whole or not at all."""
-        with replacing(self.file(".json")) as temporary:
-            temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        write_json(self.file(".json"), record)
 
     def check_same(self) -> None:
         """Refuse to go on with what other options began.
@@ -166,29 +165,21 @@ def _steps(job: Job, watch: Callable[[Step], None]) -> tuple[Any, dict[str, str]
 
 def _run(job: Job, step: Step, watch: Callable[[Step], None]) -> tuple[int, str]:
     """Exit code of the process of a step, of a signal its number below 0; the last line it said."""
-    command = [sys.executable, *step.words()]
+    words = step.words()
     limits = {name: str(job.threads) for name in THREADS if job.threads is not None}
     with job.file(".txt").open("ab+") as output:
-        output.write(f"\n{time.strftime('%F %T')}: {' '.join(command)}\n".encode())
+        output.write(f"\n{time.strftime('%F %T')}: {' '.join([sys.executable, *words])}\n".encode())
         output.flush()
         place = output.tell()
-        process = subprocess.Popen(
-            [sys.executable, "-m", guard.__name__, str(os.getpid()), *command],
-            **{"stdin": subprocess.DEVNULL, "stdout": output, "stderr": subprocess.STDOUT},
-            env=os.environ | limits,
-            start_new_session=True,  # Ctrl-C is for who waits for it
-        )
-        try:
+        # In a session of its own: Ctrl-C is for who waits for it
+        options = {"env": os.environ | limits, "start_new_session": True}
+        with guard.guarded(words, output, **options) as process:
             while process.poll() is None:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(POLL_SECONDS)
                 watch(step)
-        finally:
-            process.kill()  # only where this was broken off is it still there
-            process.wait()
         output.seek(place)
-        said = output.read().decode("utf-8", "replace").strip().splitlines()
-    return process.returncode, said[-1].strip() if said else ""
+        return process.returncode, guard.last_words(output.read())
 
 
 def last_line(log: Path | None) -> dict[str, Any]:

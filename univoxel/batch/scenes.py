@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
-import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +16,8 @@ from PIL import Image
 from univoxel.batch.jobs import Job, Result
 from univoxel.capture.project import Project
 from univoxel.config import TrainConfig
-from univoxel.core.files import read_json, replacing
-from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph, table, write_html
+from univoxel.core.files import read_json, replacing, write_json, write_text
+from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph, table
 from univoxel.core.machine import Memory
 from univoxel.data.images import image_size
 from univoxel.data.load_images import LARGE
@@ -145,9 +144,7 @@ def write_results(
     """
     record = {"options": dict(options), "scenes": [dataclasses.asdict(r) for r in results]}
     for path in (out / "batch.json", *([other] if other else [])):
-        with replacing(path) as temporary:
-            text = json.dumps(record, indent=1, default=str)
-            temporary.write_text(text + "\n", encoding="utf-8")
+        write_json(path, record)
     steps = dict.fromkeys(step for result in results for step in result.seconds)
     head = ("name", "state", "verdict", "error", *(f"{step}_s" for step in steps))
     with replacing(out / "batch.csv") as temporary, temporary.open("w", encoding="utf-8") as file:
@@ -197,7 +194,7 @@ def write_sheet(results: Sequence[SceneResult], out: Path) -> Path:
     rows = table((_row(r, shown, out) for r in ordered), heads, [r.state for r in ordered])
     title, page = out.absolute().name, out / "index.html"
     body = f"<h1>{escape(title)}</h1>\n{paragraph(about)}\n{rows}"
-    write_html(page, document(title, _STYLE, body))
+    write_text(page, document(title, _STYLE, body))
     return page
 
 

@@ -31,24 +31,15 @@ from univoxel.capture.masks import (
 )
 from univoxel.color import linear_to_srgb
 from univoxel.core.choices import DEPTH, NETWORK, REMBG, NetworkName
-from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph, write_html
+from univoxel.core.files import write_text
+from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph
 from univoxel.core.progress_bar import track
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
 from univoxel.errors import DataError, ExistingFile, UserError
+from univoxel.preparation import object_shape
 from univoxel.preparation.hull import mask_distances
-from univoxel.preparation.object_shape import (
-    ObjectShape,
-    box_corners,
-    box_shown,
-    find_object,
-    inside_bounds,
-    nothing_inside,
-    shrunk,
-    silhouettes,
-    words_of,
-)
 from univoxel.preparation.standing_object import masks_by_depth
 from univoxel.preparation.stereo import DepthMaps, depth_maps, small_cameras
 
@@ -141,7 +132,7 @@ def write_page(path: Path, tiles: Sequence[MaskTile], about: str) -> None:
         figures.append(f"<figure{kind}>{''.join(images)}{caption}</figure>")
     main = "\n".join(["<main>", *figures, "</main>"])
     body = f"<h1>Masks</h1>\n{paragraph(about)}\n{main}"
-    write_html(path, document("masks", _STYLE, body))
+    write_text(path, document("masks", _STYLE, body))
 
 
 def _number(tile: MaskTile) -> str:
@@ -214,7 +205,7 @@ def cutout(
     if out.exists():
         raise ExistingFile(f"{out} is there already: choose another out", "out")
     check_masks(origin, network, box, keep_table)
-    corners = None if box is None else box_corners(box)
+    corners = None if box is None else object_shape.box_corners(box)
     masked = mask_network(network) if origin == REMBG else None
     load = functools.partial(load_photos, data, allow_outside=allow_outside)
     photos = load("train", downscale, masks=False)
@@ -256,7 +247,7 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
             "network",
         )
     if box is not None:
-        box_corners(box)
+        object_shape.box_corners(box)
     if keep_table and (box is None or origin != DEPTH):
         got = "no box" if box is None else f"masks from {origin}"
         raise UserError(
@@ -272,8 +263,8 @@ def _from_depth(
     """Masks of what stands out in depth."""
     small = masks_by_depth(maps, box, keep_table)
     if small is None and box is not None:
-        raise nothing_inside(box, "depth shows next to no surface", maps.cameras)
-    shape = None if small is None else find_object(small, maps, FINE, box)
+        raise object_shape.nothing_inside(box, "depth shows next to no surface", maps.cameras)
+    shape = None if small is None else object_shape.find_object(small, maps, FINE, box)
     if shape is None or shape.surface < GUESSED:
         raise DataError(
             f"{splits['train'].folder}: no object that stands out in depth was found; it needs "
@@ -290,7 +281,7 @@ def _within(splits: dict[str, Photos], masks: Masks, box: Tensor) -> Masks:
     """Masks that show nothing beside the box."""
 
     def cut(cameras: Cameras, view: int, mask: Tensor) -> Tensor:
-        shown = grown(box_shown(cameras, view, box)).float()[None, None]
+        shown = grown(object_shape.box_shown(cameras, view, box)).float()[None, None]
         return mask * interpolate(shown, (mask.shape[0], mask.shape[1]))[0, 0].byte()
 
     found = {}
@@ -300,20 +291,22 @@ def _within(splits: dict[str, Photos], masks: Masks, box: Tensor) -> Masks:
     return found
 
 
-def _tell_evidence(shape: ObjectShape, count: int, box: Tensor | None) -> None:
+def _tell_evidence(shape: object_shape.ObjectShape, count: int, box: Tensor | None) -> None:
     """Log what the object was told by, masks of so many photographs among it, and where it is."""
     by = [f"masks of {count} photographs"] if count else []
     by += [f"depth of {shape.surface:.0%} of the surface"]
     by += [] if box is None else ["the box"]
-    lower, upper = (words_of(corner.tolist()) for corner in inside_bounds(shape))
+    lower, upper = (
+        object_shape.words_of(corner.tolist()) for corner in object_shape.inside_bounds(shape)
+    )
     log.info(f"the object is told by {', '.join(by)}; it lies between {lower} and {upper}")
 
 
-def _silhouettes_of(shape: ObjectShape, photos: Photos) -> list[Tensor]:
+def _silhouettes_of(shape: object_shape.ObjectShape, photos: Photos) -> list[Tensor]:
     """The object's silhouettes as masks of photographs, their edges a pixel soft."""
     width = min(photos.cameras.width, WIDTH)
     found = []
-    for view, shown in enumerate(silhouettes(shape, resize(photos.cameras, width))):
+    for view, shown in enumerate(object_shape.silhouettes(shape, resize(photos.cameras, width))):
         size = photos.cameras.size(view)[::-1]
         away = mask_distances(shown.float()[None]) * (size[1] / shown.shape[1])
         fine = interpolate(away[None], size, mode="bilinear")[0, 0]
@@ -367,11 +360,14 @@ def _judged(
         )
         return _as_they_are(masks), "too few photographs to check masks: they are as they came"
     coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
-    shape = find_object(coverage["train"], depth_maps(train), box=box)
+    shape = object_shape.find_object(coverage["train"], depth_maps(train), box=box)
     _tell_evidence(shape, count, box)
-    shown = {n: list(silhouettes(shape, small_cameras(s.cameras))) for n, s in splits.items()}
+    shown = {
+        n: list(object_shape.silhouettes(shape, small_cameras(s.cameras)))
+        for n, s in splits.items()
+    }
     agreements = [
-        iou(shrunk(mask, one.shape[1], one.shape[0]) >= 0.5, one)
+        iou(object_shape.shrunk(mask, one.shape[1], one.shape[0]) >= 0.5, one)
         for mask, one in zip(coverage["train"], shown["train"], strict=True)
     ]
     usual = statistics.median(agreements)
@@ -392,7 +388,7 @@ def _judged(
         told += ": none is repaired, as it may be the object's shape that is wrong"
         log.warning(
             f"{told}. The masks keep or miss the same everywhere, or the cameras are wrong; "
-            "look at masks.html",
+            "look at masks.html"
         )
         for name, those in verdicts.items():
             kept = zip(those, masks[name], strict=True)

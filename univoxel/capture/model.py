@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from univoxel.core.files import replacing
+from univoxel.core.files import write_bytes
 from univoxel.data.colmap import read_cameras
 from univoxel.data.lens import Lens
 
@@ -198,8 +198,7 @@ def write_model(folder: Path, model: Model) -> None:
         ("images.bin", _images(model.images)),
         ("points3D.bin", _points(model.points)),
     ):
-        with replacing(folder / name) as temporary:
-            temporary.write_bytes(data)
+        write_bytes(folder / name, data)
 
 
 def without(model: Model, numbers: set[int]) -> Model:

@@ -44,7 +44,7 @@ def partners(
     """Those of each placed picture among the placed.
 
     Args:
-        pairs: verified ones, see `database.matches`.
+        pairs: verified ones, see `model.matches`.
         features: where they are in each picture [F, 2], pixels.
     """
     placed = {image.number: image for image in model.images}
@@ -149,7 +149,7 @@ def still(pairs: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]:
     """Pairs whose match is a shift alone, and pairs that match at all.
 
     Args:
-        pairs: as `database.verified_pairs` has them.
+        pairs: as `model.verified_pairs` has them.
     """
     matching = [kind for *_, inliers, kind in pairs if inliers > 0]
     return sum(kind == WATERMARK for kind in matching), len(matching)
@@ -211,7 +211,7 @@ def why_not(
     Args:
         number: its id in the database, None if it is not there.
         features: by id.
-        pairs: as `database.verified_pairs` has them.
+        pairs: as `model.verified_pairs` has them.
         elsewhere: of pictures that other models hold, the size of theirs.
     """
     if number is None or not features.get(number):

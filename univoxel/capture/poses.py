@@ -16,22 +16,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from univoxel import __version__
 from univoxel.capture import model as database
-from univoxel.capture import photographs, pose_validation, structure
+from univoxel.capture import photographs, pose_validation, scene, structure
 from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.capture.model import Model, without
 from univoxel.capture.photographs import find_photographs, require_readers
 from univoxel.capture.prepare import Capture, Folders, gather, in_words, write_pictures
-from univoxel.capture.scene import (
-    PARTIAL,
-    REPORT,
-    WRITTEN,
-    Report,
-    gauge_aligned,
-    own_sizes,
-    write_report,
-    write_scene,
-    written_name,
-)
 from univoxel.capture.sfm import require_pycolmap
 from univoxel.core import files as steps
 from univoxel.core.choices import KEEP_SIZE
@@ -68,7 +57,7 @@ class Found:
 
     model: Model  # the largest, as it is
     weak: dict[int, str]  # ids of pictures whose poses are not trusted, and why
-    reports: list[Report]  # of all photographs
+    reports: list[scene.Report]  # of all photographs
 
 
 def poses(
@@ -132,8 +121,8 @@ def poses(
         index = {name: i for i, name in enumerate(capture.pictures)}
         ordered = sorted(model.images, key=lambda i: index[i.name])
         wanted = [index[image.name] for image in ordered]
-        model = own_sizes(Model(model.cameras, ordered, model.points), capture, keep_size)
-        model, known = gauge_aligned(model)
+        model = scene.own_sizes(Model(model.cameras, ordered, model.points), capture, keep_size)
+        model, known = scene.gauge_aligned(model)
         if not known:
             log.warning("the cameras do not say what is up: the world may be askew")
         names = [image.name for image in model.images]
@@ -141,12 +130,12 @@ def poses(
         for gap in gaps(centres, names, GAP):
             log.info(gap)
         steps.forget(folders.work, SCENE)
-        written = write_scene(out, capture, model, wanted, keep_size)
+        written = scene.write_scene(out, capture, model, wanted, keep_size)
         _follow(progress, "writing", written, len(wanted))
     reports = list(found.reports)
     for i in wanted:
-        reports[i] = replace(reports[i], written=written_name(capture.photographs[i]))
-    write_report(out, {**settings, **used, "versions": _versions()}, model, reports)
+        reports[i] = replace(reports[i], written=scene.written_name(capture.photographs[i]))
+    scene.write_report(out, {**settings, **used, "versions": _versions()}, model, reports)
     steps.finish(folders.work, SCENE, used)
     return out
 
@@ -164,8 +153,8 @@ def folders_of(out: Path) -> Folders:
         marks = {PAIRS: "pairs.txt", MATCHES: "matched", MODELS: "models/done"}
         done = [step for step, name in marks.items() if (folders.work / name).exists()]
         noted |= dict.fromkeys((SEARCH, *done), settings)
-    if begun.exists() and (out / REPORT).exists():
-        report = read_json(out / REPORT)
+    if begun.exists() and (out / scene.REPORT).exists():
+        report = read_json(out / scene.REPORT)
         noted[SCENE] = {key: report.get(key) for key in ("keep_size", "keep_weak")}
     steps.adopt(folders.work, noted)
     return folders
@@ -173,11 +162,11 @@ def folders_of(out: Path) -> Folders:
 
 def _check_free(out: Path, folders: Folders) -> None:
     """Refuse a folder that holds what is not of a search for cameras."""
-    if not out.exists() or (out / REPORT).exists():
+    if not out.exists() or (out / scene.REPORT).exists():
         return
     # Written last, one after the other
-    begun = WRITTEN if steps.recorded(folders.work, SEARCH) else ()
-    foreign = [p.name for p in out.iterdir() if p.name not in (WORK, PARTIAL, *begun)]
+    begun = scene.WRITTEN if steps.recorded(folders.work, SEARCH) else ()
+    foreign = [p.name for p in out.iterdir() if p.name not in (WORK, scene.PARTIAL, *begun)]
     if foreign:
         raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
 
@@ -206,11 +195,7 @@ def photographs_of(
 
 
 def _settings(
-    source: Path,
-    masks: Path | None,
-    every: float | None,
-    config: CaptureConfig,
-    capture: Capture,
+    source: Path, masks: Path | None, every: float | None, config: CaptureConfig, capture: Capture
 ) -> dict:
     """What decides the cameras: the same settings go on with the same work."""
     files = [p.path for p in capture.photographs] + list(capture.masks or [])
@@ -226,7 +211,7 @@ def _settings(
 
 def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
     """Begin a search, or go on with it; whether all is done already."""
-    if (out / REPORT).exists():
+    if (out / scene.REPORT).exists():
         other = ExistingFile(f"{out} holds another scene: choose another out", "out")
         if not steps.done(folders.work, SEARCH, settings, lambda _: other):
             raise other
@@ -247,11 +232,7 @@ def _start_over(folders: Folders) -> None:
 
 
 def _search(
-    capture: Capture,
-    folders: Folders,
-    config: CaptureConfig,
-    settings: dict,
-    progress: Progress,
+    capture: Capture, folders: Folders, config: CaptureConfig, settings: dict, progress: Progress
 ) -> dict[int, str]:
     """All steps up to the models; returns why photographs could not be read, by index."""
     total = len(capture.photographs)
@@ -310,13 +291,13 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
             points = placed[number].points
             reason = weak.get(number, "")
             reports.append(
-                Report(photograph, True, points, errors[number], partners, reason=reason)
+                scene.Report(photograph, True, points, errors[number], partners, reason=reason)
             )
             continue
         reason = unreadable.get(index) or pose_validation.why_not(
             number, features, pairs, elsewhere
         )
-        reports.append(Report(photograph, False, partners=partners, reason=reason))
+        reports.append(scene.Report(photograph, False, partners=partners, reason=reason))
     if len(placed) < PLACED_SHARE * len(reports):
         missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
         raise DataError(
@@ -329,9 +310,7 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
 def _weak(model: Model, folders: Folders, errors: dict[int, float]) -> dict[int, str]:
     """Placed pictures whose poses are not trusted, and why."""
     partners = pose_validation.partners(
-        model,
-        database.matches(folders.database),
-        database.positions(folders.database),
+        model, database.matches(folders.database), database.positions(folders.database)
     )
     doubts = {i.number: pose_validation.doubt(model, i, errors[i.number]) for i in model.images}
     return pose_validation.weak({i.number: i.points for i in model.images}, partners, doubts)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from PIL import Image
 from univoxel.capture.model import Model, Placed, write_model
 from univoxel.capture.photographs import Photograph, fitted, read_upright
 from univoxel.capture.prepare import Capture, read_mask
-from univoxel.core.files import replacing
+from univoxel.core.files import write_json
 from univoxel.data.lens import Lens
 from univoxel.data.load_images import turn_to_z, up_direction
 
@@ -179,8 +178,7 @@ def write_report(out: Path, settings: dict[str, Any], model: Model, reports: lis
         "cameras": cameras,
         "photographs": [vars(r) for r in reports],
     }
-    with replacing(out / REPORT) as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_json(out / REPORT, record)
 
 
 def _write(picture: Image.Image, path: Path) -> None:

@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import re
-import subprocess
 import sys
 import time
 import zlib  # noqa: F401  before pycolmap
@@ -22,6 +20,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from univoxel.core import guard
 from univoxel.errors import MissingExtra, ProcessFailed
 
 MODEL = "SIMPLE_RADIAL"  # OPENCV begins with too much freedom: it placed 2 of 66 photographs
@@ -75,30 +74,19 @@ def run(request: Request, log: Path, done: Callable[[], int] | None = None) -> I
     asked.write_text(json.dumps(asdict(request)), encoding="utf-8")
     limit = request.seconds + (GRACE if request.step == "map" else 0.0)
     begin = time.monotonic()
-    with log.open("wb") as file:
-        process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "univoxel.core.guard", str(os.getpid())),
-                *(sys.executable, "-m", "univoxel.capture.sfm", str(asked)),
-            ],
-            **{"stdin": subprocess.DEVNULL, "stdout": file, "stderr": file},
-        )
-        try:
-            while process.poll() is None:
-                time.sleep(POLL)
-                yield count()
-                if time.monotonic() - begin > limit:
-                    raise ProcessFailed(
-                        f"{request.step}: pycolmap was stopped after {request.seconds:.0f} seconds"
-                    )
-        finally:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
+    arguments = "-m", "univoxel.capture.sfm", str(asked)
+    with log.open("wb") as file, guard.guarded(arguments, file) as process:
+        while process.poll() is None:
+            time.sleep(POLL)
+            yield count()
+            if time.monotonic() - begin > limit:
+                raise ProcessFailed(
+                    f"{request.step}: pycolmap was stopped after {request.seconds:.0f} seconds"
+                )
     if process.returncode:
-        said = log.read_text("utf-8", "replace").strip().splitlines() or ["it said nothing"]
+        said = guard.last_words(log.read_bytes()) or "it said nothing"
         raise ProcessFailed(
-            f"{request.step}: pycolmap ended with {process.returncode}: {said[-1]} (see {log})"
+            f"{request.step}: pycolmap ended with {process.returncode}: {said} (see {log})"
         )
     yield count()
 

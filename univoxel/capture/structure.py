@@ -16,7 +16,7 @@ from univoxel.capture.model import Model, read_models
 from univoxel.capture.photographs import fitted
 from univoxel.capture.prepare import Capture, Folders
 from univoxel.capture.sfm import Request, run
-from univoxel.core.files import replacing
+from univoxel.core.files import write_text
 
 COARSE_FEATURES = 512  # largest features that pairs are chosen by
 # Photographs up to which so many are compared: beyond, fewer of each, for the time of the
@@ -72,8 +72,7 @@ def select(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterato
             yield len(rows)
         chosen = choose(np.stack(rows), config.partners)
     lines = [f"{pictures[there[i]]} {pictures[there[j]]}\n" for i, j in chosen]
-    with replacing(folders.pairs) as temporary:
-        temporary.write_text("".join(lines), encoding="utf-8")
+    write_text(folders.pairs, "".join(lines))
 
 
 def features_each(photographs: int) -> int:

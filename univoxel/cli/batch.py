@@ -9,28 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from univoxel.cli.parsing import (
-    STDOUT,
-    Changes,
-    ConfigFile,
-    JsonFile,
-    Minutes,
-    Scenes,
-    Scheduler,
-    check_minutes,
-    json_file,
-    takes,
-    written,
-)
-from univoxel.core import machine
-from univoxel.core.choices import (
-    BATCH_STEPS,
-    SAMPLES,
-    USUAL_STEPS,
-    BatchStep,
-    LightName,
-    PresetOrAuto,
-)
+from univoxel.cli import parsing
+from univoxel.core import choices, machine
 from univoxel.core.files import read_json
 from univoxel.errors import ProcessFailed, UserError
 
@@ -50,35 +30,37 @@ EACH = ("steps", "masks", "preset", "light", "minutes", "config", "changes", "sa
 
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions:
-    scenes: Scenes
+    scenes: parsing.Scenes
     """folders of photographs, of different names"""
-    out: Annotated[Path, written("NIGHT")]
+    out: Annotated[Path, parsing.written("NIGHT")]
     """folder to write"""
-    steps: Annotated[tuple[BatchStep, ...], written("STEP [STEP ...]")] = USUAL_STEPS
+    steps: Annotated[tuple[choices.BatchStep, ...], parsing.written("STEP [STEP ...]")] = (
+        choices.USUAL_STEPS
+    )
     """of each scene: train eval export page; before them poses masks, for photographs without
     cameras or masks, as capture makes them"""
-    masks: Annotated[str, written("auto|rembg|FOLDER|none")] = "auto"
+    masks: Annotated[str, parsing.written("auto|rembg|FOLDER|none")] = "auto"
     """as of capture, for the step masks"""
-    preset: PresetOrAuto = "auto"
+    preset: choices.PresetOrAuto = "auto"
     """as of train"""
-    light: LightName = "hybrid"
+    light: choices.LightName = "hybrid"
     """as of train"""
-    minutes: Minutes = None
+    minutes: parsing.Minutes = None
     """wall-clock limit of each training, above 0"""
-    config: ConfigFile = None
+    config: parsing.ConfigFile = None
     """as of train"""
-    changes: Changes = ()
+    changes: parsing.Changes = ()
     """as of train"""
-    samples: int = SAMPLES
+    samples: int = choices.SAMPLES
     """of the light, per pixel of relit pictures that are measured"""
-    jobs: Annotated[int | None, written("N", "as cores and memory allow")] = None
+    jobs: Annotated[int | None, parsing.written("N", "as cores and memory allow")] = None
     """scenes at once; each runs on --threads, or its share of the cores"""
-    scheduler: Scheduler = None
+    scheduler: parsing.Scheduler = None
     """of a Dask cluster whose workers take the scenes, such as tcp://10.0.0.1:8786; they see the
     same folders. Whoever reaches a scheduler can run programs on its workers"""
-    tries: Annotated[int, written("N")] = 3
+    tries: Annotated[int, parsing.written("N")] = 3
     """how often a scene whose process is killed is tried before it counts as failed"""
-    json: JsonFile = None
+    json: parsing.JsonFile = None
     """another file for what batch.json holds; - prints it in place of the table"""
 
     def training(self) -> TrainConfig:
@@ -118,7 +100,7 @@ class BatchOptions:
         return [*words, *(f"--set={change}" for change in self.changes)]
 
 
-@takes(BatchOptions)
+@parsing.takes(BatchOptions)
 def command(asked: BatchOptions) -> None:
     """Take many scenes through training, measures, mesh and page, on one machine or a cluster.
 
@@ -130,10 +112,10 @@ def command(asked: BatchOptions) -> None:
     """
     import rich
 
-    check_minutes(asked.minutes)
-    with json_file(asked.json) as file:
+    parsing.check_minutes(asked.minutes)
+    with parsing.json_file(asked.json) as file:
         results = batch(replace(asked, json=file), machine.threads_asked())
-    if asked.json != STDOUT:
+    if asked.json != parsing.STDOUT:
         rich.print(table(results))
         print(asked.out / "index.html")
     check(results)
@@ -156,10 +138,10 @@ def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
     from univoxel.batch.jobs import connect, run_jobs
     from univoxel.batch.scenes import named, result_of, share, write_results, write_sheet
 
-    unknown = [step for step in asked.steps if step not in BATCH_STEPS]
+    unknown = [step for step in asked.steps if step not in choices.BATCH_STEPS]
     if unknown or not asked.steps:
         got = ", ".join(unknown) or "none"
-        raise UserError(f"steps must be of {', '.join(BATCH_STEPS)}, got {got}", "steps")
+        raise UserError(f"steps must be of {', '.join(choices.BATCH_STEPS)}, got {got}", "steps")
     numbers = {"jobs": asked.jobs, "threads": threads}
     numbers |= {"tries": asked.tries, "samples": asked.samples}
     for name, number in numbers.items():
@@ -224,10 +206,10 @@ def job_of(name: str, data: Path, asked: BatchOptions, threads: int | None) -> J
     page = ("view", run, "--html", str(project.page), "--title", name)
     export = ("export", run, "--mesh", str(project.mesh))
 
-    def step(name: BatchStep, *words: str | tuple[Path, ...], **fields: Any) -> Step:
+    def step(name: choices.BatchStep, *words: str | tuple[Path, ...], **fields: Any) -> Step:
         return Step(name, ("-m", "univoxel.cli", *words), **fields)
 
-    def aside(name: BatchStep, words: Sequence[str], makes: Path) -> Step:
+    def aside(name: choices.BatchStep, words: Sequence[str], makes: Path) -> Step:
         return step(name, *words, makes=makes, after=checkpoint, needed=False)
 
     every = (

@@ -15,20 +15,10 @@ from univoxel.cli.export import export
 from univoxel.cli.parsing import BoxOf, Changes, Minutes, check_minutes, takes, written
 from univoxel.cli.relight import relight_to_files
 from univoxel.cli.train import code_of
-from univoxel.core import files
-from univoxel.core.choices import (
-    DEPTH,
-    KEEP_SIZE,
-    NETWORK,
-    REMBG,
-    SAMPLES,
-    LightName,
-    NetworkName,
-    PresetOrAuto,
-    Until,
-)
+from univoxel.core import choices, files
 from univoxel.core.files import read_json, replacing
 from univoxel.core.progress_bar import duration
+from univoxel.core.validation import check_settings, setting
 from univoxel.errors import (
     DataError,
     ExistingFile,
@@ -59,21 +49,21 @@ class CaptureOptions:
     masks: Annotated[str, written("auto|rembg|FOLDER|none")] = AUTO
     """where masks come from: rembg, a network; a folder of masks; none, depth alone, as of cutout;
     auto takes those that the photographs bring, or else the network, or depth if there is none"""
-    network: NetworkName = NETWORK
+    network: choices.NetworkName = choices.NETWORK
     """which network it is; as of cutout"""
     box: BoxOf = None
     """as of cutout; the cameras are those of scene/, which --until cameras ends with"""
     keep_table: bool = False
     """as of cutout, with --masks none and a box"""
-    preset: PresetOrAuto = "auto"
+    preset: choices.PresetOrAuto = "auto"
     """as of train"""
-    light: LightName = "hybrid"
+    light: choices.LightName = "hybrid"
     """as of train"""
     minutes: Minutes = None
     """of training, above 0; as of train"""
     changes: Changes = ()
     """as of train"""
-    until: Until = "page"
+    until: choices.Until = "page"
     """the last step: page is all of them; cameras or masks end before training, and the folder to
     train on is printed"""
 
@@ -106,9 +96,11 @@ def command(asked: CaptureOptions) -> int:
 class PicturesConfig:
     """The pictures of a capture."""
 
-    frames: int = 8  # of an orbit around the object, under each map
-    resolution: int = 512  # pixels of their sides
-    samples: int = SAMPLES  # of the light, per pixel
+    frames: int = setting(8, "of an orbit around the object, under each map", least=1)
+    resolution: int = setting(512, "of their sides", unit="pixels", least=1)
+    samples: int = setting(choices.SAMPLES, "of the light, per pixel", least=1)
+
+    __post_init__ = check_settings
 
 
 PICTURES = PicturesConfig()
@@ -119,14 +111,16 @@ class MasksAsked:
     """Where masks come from, and how they are made."""
 
     source: str | Path
-    network: NetworkName = NETWORK
+    network: choices.NetworkName = choices.NETWORK
     box: Sequence[float] | None = None
     keep_table: bool = False
 
     @property
     def fingerprint(self) -> Any:
         """What steps.json has of them: a word, unless more was chosen."""
-        chosen: dict[str, Any] = {} if self.network == NETWORK else {"network": self.network}
+        chosen: dict[str, Any] = (
+            {} if self.network == choices.NETWORK else {"network": self.network}
+        )
         if self.box is not None:
             chosen["box"] = [float(value) for value in self.box]
         if self.keep_table:
@@ -148,11 +142,11 @@ def capture(
     out: str | Path,
     *,
     masks: str | Path = AUTO,
-    preset: PresetOrAuto = "auto",
+    preset: choices.PresetOrAuto = "auto",
     minutes: float | None = None,
-    light: LightName = "hybrid",
+    light: choices.LightName = "hybrid",
     changes: Sequence[str] = (),
-    network: NetworkName = NETWORK,
+    network: choices.NetworkName = choices.NETWORK,
     box: Sequence[float] | None = None,
     keep_table: bool = False,
     on_progress: Callable[[TrainingProgress], None] | None = None,
@@ -227,7 +221,7 @@ def find_data(
     out: str | Path,
     *,
     masks: str | Path = AUTO,
-    network: NetworkName = NETWORK,
+    network: choices.NetworkName = choices.NETWORK,
     box: Sequence[float] | None = None,
     keep_table: bool = False,
     until: Literal["cameras", "masks"] = "masks",
@@ -289,11 +283,12 @@ def _check_machine(given: Given, asked: MasksAsked) -> None:
         require_pycolmap()
     masks = asked.source
     check_masks(str(masks), asked.network, asked.box, asked.keep_table)
-    if str(masks) == REMBG:
+    if str(masks) == choices.REMBG:
         mask_network(asked.network)
-    elif str(masks) not in (AUTO, DEPTH) and not Path(masks).is_dir():
+    elif str(masks) not in (AUTO, choices.DEPTH) and not Path(masks).is_dir():
         raise DataError(
-            f"masks: expected {REMBG}, {DEPTH} or a folder of masks, got {masks}", "masks"
+            f"masks: expected {choices.REMBG}, {choices.DEPTH} or a folder of masks, got {masks}",
+            "masks",
         )
 
 
@@ -307,10 +302,10 @@ def _check_network(project: Project, asked: MasksAsked) -> None:
             *("network", "out"),
         )
 
-    if str(asked.source) not in (AUTO, REMBG):
+    if str(asked.source) not in (AUTO, choices.REMBG):
         return
     if not files.done(project.out, SINGLE, asked.network, other):
-        before = NETWORK  # which versions without a choice had, and did not note
+        before = choices.NETWORK  # which versions without a choice had, and did not note
         if project.masks.exists() and asked.network != before:
             raise other(before)
 
@@ -350,15 +345,15 @@ def _masks_before_cameras(project: Project, given: Given, asked: MasksAsked) -> 
     from univoxel.core.progress_bar import track
 
     masks = asked.source
-    if str(masks) not in (AUTO, REMBG, DEPTH):
+    if str(masks) not in (AUTO, choices.REMBG, choices.DEPTH):
         return Path(masks)
     if project.masks.exists():
         _skip("masks", project.masks)
         return project.masks
-    if str(masks) == DEPTH:
+    if str(masks) == choices.DEPTH:
         raise UserError(
             f"{given.path}: the object was turned before a still camera, so cameras need masks: "
-            f"expected masks={REMBG} or a folder, got {masks}",
+            f"expected masks={choices.REMBG} or a folder, got {masks}",
             "masks",
         )
     _say("masks", "of single photographs, from a network")
@@ -374,7 +369,7 @@ def _masks_before_cameras(project: Project, given: Given, asked: MasksAsked) -> 
     masked = timed(masked, asked.network, len(missing))
     for file in track(missing, "masks"):
         try:
-            picture = read_upright(file, KEEP_SIZE).convert("RGB")
+            picture = read_upright(file, choices.KEEP_SIZE).convert("RGB")
         except DataError:  # which `poses` counts and names
             continue
         mask = (255 * masked(torch.from_numpy(np.array(picture)))).round().byte()
@@ -410,7 +405,7 @@ def _find_masks(project: Project, scene: Path, asked: MasksAsked) -> Path:
         if asked.box is not None:
             raise UserError(
                 f"{scene} brings masks, which are trained on as they are: with a box expected "
-                f"masks={REMBG}, {DEPTH} or their folder, got {masks}",
+                f"masks={choices.REMBG}, {choices.DEPTH} or their folder, got {masks}",
                 "masks",
             )
         _skip("masks", scene)
@@ -420,28 +415,28 @@ def _find_masks(project: Project, scene: Path, asked: MasksAsked) -> Path:
         source = scene / "masks"  # those that the cameras were found with
     else:
         source = _network_or_depth(asked.network) if str(masks) == AUTO else masks
-    words = {REMBG: "from a network", DEPTH: "from depth alone"}
+    words = {choices.REMBG: "from a network", choices.DEPTH: "from depth alone"}
     _say("masks", words.get(str(source), f"from {source}"))
     return cutout(
         *(scene, project.cut, source),
-        network=asked.network if source == REMBG else NETWORK,
+        network=asked.network if source == choices.REMBG else choices.NETWORK,
         box=asked.box,
         keep_table=asked.keep_table,
     )
 
 
-def _network_or_depth(name: NetworkName) -> str:
+def _network_or_depth(name: choices.NetworkName) -> str:
     """Where masks come from that nobody has: a network, if one is installed."""
     from univoxel.capture.masks import mask_network
 
     try:
         mask_network(name)
     except MissingExtra as missing:
-        if name != NETWORK:  # which nobody names for nothing
+        if name != choices.NETWORK:  # which nobody names for nothing
             raise
         log.info(f"no network is installed, so depth alone tells the object ({missing})")
-        return DEPTH
-    return REMBG
+        return choices.DEPTH
+    return choices.REMBG
 
 
 def _have_masks(project: Project, scene: Path) -> bool:

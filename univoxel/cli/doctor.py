@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as jsonlib
 import os
 import platform
 import re
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 from univoxel import __version__
 from univoxel.cli.parsing import STDOUT, JsonFile, json_file, takes
 from univoxel.core import machine
-from univoxel.core.files import replacing
+from univoxel.core.files import write_json
 from univoxel.errors import MissingNative
 
 if TYPE_CHECKING:
@@ -61,9 +60,7 @@ def command(asked: DoctorOptions) -> None:
     findings = look()
     with json_file(asked.json) as file:
         if file is not None:
-            with replacing(Path(file)) as temporary:
-                text = jsonlib.dumps([asdict(f) for f in findings], indent=2)
-                temporary.write_text(text + "\n", encoding="utf-8")
+            write_json(file, [asdict(f) for f in findings])
     if asked.json != STDOUT:
         rich.print(table(findings))
     check(findings)

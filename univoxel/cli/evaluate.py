@@ -3,23 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from univoxel.cli.parsing import (
-    STDOUT,
-    DataOf,
-    File,
-    JsonFile,
-    LightOf,
-    Run,
-    json_file,
-    takes,
-    written,
-)
+from univoxel.cli import parsing
 from univoxel.core.choices import BOUNCES, SAMPLES, Behind
-from univoxel.core.files import replacing
+from univoxel.core.files import write_json
 from univoxel.errors import UserError
 
 if TYPE_CHECKING:
@@ -36,22 +25,22 @@ class EvaluateOptions:
         UserError: samples or bounces out of range; both light_of and fit_light.
     """
 
-    run: Run
+    run: parsing.Run
     """folder of a trained run"""
-    data: DataOf = None
+    data: parsing.DataOf = None
     """folder of the photographs"""
-    save: Annotated[File | None, written("DIR", "none are written")] = None
+    save: Annotated[parsing.File | None, parsing.written("DIR", "none are written")] = None
     """folder for the rendered pictures"""
-    json: JsonFile = None
+    json: parsing.JsonFile = None
     """file for the measures; - prints them in place of the table"""
     samples: int = SAMPLES
     """of the light, per pixel of relit pictures"""
     bounces: int = BOUNCES
     """reflections between parts of the object in relit pictures, 0 for none"""
-    light_of: LightOf = None
+    light_of: parsing.LightOf = None
     """training view, by name or number, in whose light novel views are rendered, where the run was
     trained with --varying"""
-    test_every: Annotated[int | None, written("N", "the test split")] = None
+    test_every: Annotated[int | None, parsing.written("N", "the test split")] = None
     """measure the first of every so many photographs, in order of all names; none of them may have
     been trained on"""
     background: Behind = "black"
@@ -72,18 +61,18 @@ class EvaluateOptions:
             raise UserError("light_of and fit_light exclude one another", "light_of", "fit_light")
 
 
-@takes(EvaluateOptions)
+@parsing.takes(EvaluateOptions)
 def command(asked: EvaluateOptions) -> None:
     """Measure a run on the test views and print the table."""
     import rich
 
-    with json_file(asked.json) as file:
+    with parsing.json_file(asked.json) as file:
         measures = evaluate(**vars(replace(asked, json=file)))
-    if asked.json != STDOUT:
+    if asked.json != parsing.STDOUT:
         rich.print(table(measures))
 
 
-@takes(EvaluateOptions, gradients=False)
+@parsing.takes(EvaluateOptions, gradients=False)
 def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     """Measures of a trained scene on its test views, by the keys of `MEASURES`.
 
@@ -147,9 +136,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     }
     figures = views.say_trust(surveyed, report.get("troubles", []), save)
     if json:
-        with replacing(json) as temporary:
-            text = dumps(result | _verdict(run) | figures, indent=2)
-            temporary.write_text(text + "\n", encoding="utf-8")
+        write_json(json, result | _verdict(run) | figures)
     return result
 
 

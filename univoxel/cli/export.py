@@ -8,14 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from univoxel.cli.parsing import File, Run, takes, written
-from univoxel.core.choices import (
-    ORIGINS,
-    TEXTURE_FORMATS,
-    TEXTURE_QUALITY,
-    TEXTURE_SIZE,
-    Origin,
-    TextureFormat,
-)
+from univoxel.core import choices
 from univoxel.errors import UserError
 
 if TYPE_CHECKING:
@@ -46,17 +39,17 @@ class ExportOptions:
     """the file to write: .glb, .usdz and .obj hold textures, .ply materials at the vertices"""
     faces: Annotated[int | None, written("N", "20000 with textures, all without")] = None
     """most triangles, at least 4"""
-    texture_size: Annotated[int, written("TEXELS")] = TEXTURE_SIZE
+    texture_size: Annotated[int, written("TEXELS")] = choices.TEXTURE_SIZE
     """width of the square textures, a power of 2 up to 4096"""
     watertight: bool = False
     """close holes, or fail"""
-    texture_format: TextureFormat = "png"
+    texture_format: choices.TextureFormat = "png"
     """png loses nothing, jpeg is smaller"""
-    quality: Annotated[int, written("1-95")] = TEXTURE_QUALITY
+    quality: Annotated[int, written("1-95")] = choices.TEXTURE_QUALITY
     """of textures as jpeg"""
     size: Annotated[float | None, written("METRES", "as photographed")] = None
     """what the longest side of the object becomes"""
-    origin: Origin = "world"
+    origin: choices.Origin = "world"
     """what lies at 0: the origin of the data set, the middle of the object's floor, or its
     centre"""
     lods: Annotated[int, written("N")] = 0
@@ -73,7 +66,10 @@ class ExportOptions:
                 f"export: texture_size must be a power of 2 from {low} to {high}, got {size}",
                 "texture_size",
             )
-        for name, known in (("texture_format", TEXTURE_FORMATS), ("origin", ORIGINS)):
+        for name, known in (
+            ("texture_format", choices.TEXTURE_FORMATS),
+            ("origin", choices.ORIGINS),
+        ):
             if (value := getattr(self, name)) not in known:
                 raise UserError(f"export: {name} must be {' or '.join(known)}, got {value}", name)
         for name, (low, high) in (("quality", QUALITIES), ("lods", LODS)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as jsonlib
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.cli.parsing import STDOUT, File, JsonFile, Run, json_file, takes, written
-from univoxel.core.files import replacing
+from univoxel.core.files import write_json
 from univoxel.errors import UserError
 
 if TYPE_CHECKING:
@@ -119,8 +118,7 @@ def info(asked: InfoOptions) -> dict[str, Any]:
         if path:
             path.parent.mkdir(parents=True, exist_ok=True)
     if json:
-        with replacing(json) as temporary:
-            temporary.write_text(jsonlib.dumps(found, indent=2) + "\n", encoding="utf-8")
+        write_json(json, found)
     if picture:
         write_png(picture, capacity_picture(scene, found))
     return found

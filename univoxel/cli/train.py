@@ -6,29 +6,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from univoxel.cli.parsing import (
-    Changes,
-    ConfigFile,
-    DownscaleBy,
-    File,
-    Minutes,
-    check_downscale,
-    check_minutes,
-    takes,
-    written,
-)
+from univoxel.cli import parsing
 from univoxel.cli.view import with_page
-from univoxel.core.choices import (
-    CamerasFrom,
-    CapacityOrAuto,
-    Differing,
-    FieldName,
-    LightFrameOrAuto,
-    LightName,
-    MasksFrom,
-    Metal,
-    PresetOrAuto,
-)
+from univoxel.core import choices
 from univoxel.errors import ExistingFile, UserError
 
 if TYPE_CHECKING:
@@ -43,55 +23,55 @@ OWN = ("data", "out", "config", "minutes", "downscale", "allow_outside", "seed",
 class TrainOptions:
     """What is trained, and how; `univoxel.train` takes them too."""
 
-    data: Annotated[File, written("DATA", positional=True)]
+    data: Annotated[parsing.File, parsing.written("DATA", positional=True)]
     """folder of the photographs and their cameras"""
-    out: Annotated[File, written("RUN")]
+    out: Annotated[parsing.File, parsing.written("RUN")]
     """folder that the run is written to"""
-    preset: PresetOrAuto = "auto"
+    preset: choices.PresetOrAuto = "auto"
     """how much work goes in: draft is a look, 1 minute on two cores, fast the usual, 2, full finer,
     5, best the finest, 8; auto is what fits into --minutes, or else fast"""
-    light: LightName = "hybrid"
+    light: choices.LightName = "hybrid"
     """sg, local lobes as published; hybrid, then one environment map with traced visibility, which
     cleans shadows from the albedo; others to compare with: sh and mlp, local too, envmap-sg and
     envmap, one map from the beginning, and baked, none: the photographs' colours are taken for
     albedo, as a photogrammetry mesh has them"""
-    varying: Differing = "auto"
+    varying: choices.Differing = "auto"
     """what differs from photograph to photograph: exposure, with the colour balance, or the light
     itself too; auto is exposure where it is seen to differ, else none"""
-    light_frame: LightFrameOrAuto = "auto"
+    light_frame: choices.LightFrameOrAuto = "auto"
     """world, where the light stood still, or turntable, where it turned with the camera; auto is
     what explains the photographs better"""
-    metal: Metal = "auto"
+    metal: choices.Metal = "auto"
     """all, if the whole object is metal, patina included; some, if not; auto decides it"""
-    masks: MasksFrom = "auto"
+    masks: choices.MasksFrom = "auto"
     """auto takes masks in that end outside of the object, as the photographs show it"""
-    cameras: CamerasFrom = "auto"
+    cameras: choices.CamerasFrom = "auto"
     """refined puts the photographs' cameras right, before training and in it; auto does so where
     their silhouettes contradict one another"""
-    field: FieldName = "hash"
+    field: choices.FieldName = "hash"
     """hash takes features from a small table of many resolutions; dense stores them at every node
     of the grid, sparse in bricks around the surface alone, for finer grids than the presets', such
     as --set stages.1.voxels=30"""
-    capacity: CapacityOrAuto = "auto"
+    capacity: choices.CapacityOrAuto = "auto"
     """adaptive makes no larger a model than the scene needs, as held-out pixels tell: fewer rows of
     features, fewer levels of mirrored directions, fewer nodes far from the surface. auto is that,
     but fixed for sparse fields and for lights other than hybrid"""
-    budget_mb: Annotated[float | None, written("MB", "no limit")] = None
+    budget_mb: Annotated[float | None, parsing.written("MB", "no limit")] = None
     """most megabytes of the model's file; implies --capacity adaptive"""
-    config: ConfigFile = None
+    config: parsing.ConfigFile = None
     """config.json of another run, to train these photographs alike: it says all that --preset,
     --light and such would; --minutes, --seed, --downscale and --set go before it"""
-    minutes: Minutes = None
+    minutes: parsing.Minutes = None
     """wall-clock limit, above 0, from the first photograph read to the end: what does not fit is
     cut, in all stages alike; without, all steps are made, however long they take"""
-    downscale: DownscaleBy = "auto"
+    downscale: parsing.DownscaleBy = "auto"
     """train on photographs of 1/N of their width and height; auto is as large as leaves what grids
     can use, 1 below 1500 pixels"""
     allow_outside: bool = False
     """read photographs outside of DATA too, where its files or links name such"""
-    seed: Annotated[int | None, written("N", "0, or that of --config")] = None
+    seed: Annotated[int | None, parsing.written("N", "0, or that of --config")] = None
     """of all random choices"""
-    changes: Changes = ()
+    changes: parsing.Changes = ()
     """for experts: one field of the configuration, such as loss.radiance=0.5 or stages.1.voxels=3;
     config.json in a run's folder holds them all"""
 
@@ -104,9 +84,9 @@ class TrainOptions:
         """
         from univoxel.core.validation import changed
 
-        check_minutes(self.minutes)
+        parsing.check_minutes(self.minutes)
         config = self._chosen() if self.config is None else self._loaded(Path(self.config))
-        downscale = check_downscale(self.downscale)
+        downscale = parsing.check_downscale(self.downscale)
         config = replace(config, downscale=downscale, allow_outside=self.allow_outside)
         return changed(
             config if self.seed is None else replace(config, seed=self.seed), self.changes
@@ -142,13 +122,13 @@ class TrainOptions:
 class Train(TrainOptions):
     resume: bool = False
     """go on with the run in --out; where nothing was saved yet, it begins"""
-    timelapse: Annotated[str | None, written("FILE.gif|FILE.mp4|DIR/", "none")] = None
+    timelapse: Annotated[str | None, parsing.written("FILE.gif|FILE.mp4|DIR/", "none")] = None
     """picture of a test view over training time, or a folder of its frames"""
     view: bool = False
     """look at the training in a browser while it goes, and end it early"""
-    host: Annotated[str | None, written("ADDRESS", "127.0.0.1")] = None
+    host: Annotated[str | None, parsing.written("ADDRESS", "127.0.0.1")] = None
     """address that --view listens on"""
-    port: Annotated[int | None, written("N", "8080")] = None
+    port: Annotated[int | None, parsing.written("N", "8080")] = None
     """port that --view listens on"""
     no_page: bool = False
     """write no RUN/index.html at the end"""
@@ -168,7 +148,7 @@ class Train(TrainOptions):
         return None
 
 
-@takes(Train)
+@parsing.takes(Train)
 def command(asked: Train) -> int:
     """Recover geometry, materials and light from posed photographs."""
     from univoxel.cli.trainer import train

@@ -12,17 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from univoxel import lights
-from univoxel.config import (
-    PREPARATION,
-    JointConfig,
-    StageConfig,
-    TrainConfig,
-    check_same,
-    save_config,
-)
+from univoxel import config, lights
 from univoxel.core import memmap
-from univoxel.core.files import replacing
+from univoxel.core.files import write_text
 from univoxel.core.progress_bar import duration
 from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import Cancelled, ExistingFile, UserError
@@ -57,7 +49,7 @@ PREPARATION_SECONDS = 1.0
 
 
 def train(
-    cfg: TrainConfig,
+    cfg: config.TrainConfig,
     resume: bool = False,
     timelapse: str | Path | None = None,
     on_progress: Callable[[TrainingProgress], None] | None = None,
@@ -93,7 +85,7 @@ def train(
 
 
 def _train(
-    cfg: TrainConfig,
+    cfg: config.TrainConfig,
     resume: bool,
     film: Timelapse | None,
     spectators: Spectators | None,
@@ -132,7 +124,7 @@ def _train(
         cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what fails
         if not state:  # of a run that was killed before anything was saved
             (cfg.out / LOG).unlink(missing_ok=True)
-        save_config(cfg)
+        config.save_config(cfg)
         keep_photos(photos, kept)
         if spectators:
             spectators.show(pixels.photos)
@@ -155,7 +147,7 @@ def _train(
     return cfg.out
 
 
-def build_scene(prepared: Prepared, cfg: TrainConfig) -> Scene:
+def build_scene(prepared: Prepared, cfg: config.TrainConfig) -> Scene:
     """A scene whose surface is the carved hull, with poses and gains as far as they are known.
 
     Draws the first weights from torch's generator.
@@ -186,10 +178,10 @@ def build_scene(prepared: Prepared, cfg: TrainConfig) -> Scene:
     return scene
 
 
-def build_field(prepared: Prepared, cfg: TrainConfig) -> Field:
+def build_field(prepared: Prepared, cfg: config.TrainConfig) -> Field:
     """The field of the first stage, its surface that of the carved hull."""
     grid, hull, box = prepared.grid, prepared.hull, prepared.silhouettes.box
-    stages = [s for s in cfg.stages if isinstance(s, StageConfig)]
+    stages = [s for s in cfg.stages if isinstance(s, config.StageConfig)]
     if stages[0].field != "hash":
         return dense_field(grid, cfg.scene.channels, hull)
     finest = min(fit_grid(*box, compression.stage_voxels(s, [])).voxel_size for s in stages)
@@ -198,7 +190,7 @@ def build_field(prepared: Prepared, cfg: TrainConfig) -> Field:
     return hash_field(grid, levels, hull)
 
 
-def resumed(cfg: TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
+def resumed(cfg: config.TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
     """The scene that a run goes on with, and its state; None where nothing was saved yet.
 
     Raises:
@@ -208,7 +200,7 @@ def resumed(cfg: TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
         log.info(f"nothing was saved in {cfg.out} yet: training begins")
         return None
     scene, state = load_checkpoint(cfg.out)
-    check_same(cfg)
+    config.check_same(cfg)
     return scene, state
 
 
@@ -220,7 +212,7 @@ def announce(progress: Progress, photos: Photos) -> None:
     whole = before + clock.planned + RESERVE_SECONDS
     size = photos.downscale**2 * pixels / len(photos)
     what = f"{len(photos)} photographs of {size:.2g} MP"
-    clock.preparation = min(before, PREPARATION * clock.limit)
+    clock.preparation = min(before, config.PREPARATION * clock.limit)
     if whole <= clock.limit:
         log.info(f"{what}: about {duration(whole)} on this machine")
         return
@@ -288,7 +280,7 @@ def _between_steps(
 
 def make_stage_(
     scene: Scene,
-    cfg: TrainConfig,
+    cfg: config.TrainConfig,
     index: int,
     box: tuple[torch.Tensor, torch.Tensor],
     pinned: PinnedHull | None,
@@ -302,11 +294,11 @@ def make_stage_(
         pinned: where the surface stays; None: nowhere.
     """
     stage, photos = cfg.stages[index], pixels.photos
-    if isinstance(stage, StageConfig):
+    if isinstance(stage, config.StageConfig):
         bring_to_grid_(scene, stage, box, progress)
     if pinned is not None:
         pinned.pin_(scene.field)
-    if isinstance(stage, JointConfig):
+    if isinstance(stage, config.JointConfig):
         rows = compression.sky_rows(stage.mirror.rows, cfg.budget_mb)
         stage = replace(stage, mirror=replace(stage.mirror, rows=rows))
         joint_stage.solve(scene, scene.registered(photos), stage, cfg.seed, progress)
@@ -325,7 +317,10 @@ def make_stage_(
 
 
 def bring_to_grid_(
-    scene: Scene, stage: StageConfig, box: tuple[torch.Tensor, torch.Tensor], progress: Progress
+    scene: Scene,
+    stage: config.StageConfig,
+    box: tuple[torch.Tensor, torch.Tensor],
+    progress: Progress,
 ) -> None:
     """Bring the scene's field to the grid of a stage."""
     grid = fit_grid(*box, compression.stage_voxels(stage, progress.chosen))
@@ -345,12 +340,11 @@ def trusted(scene: Scene, photos: Photos) -> Survey | None:
 
 
 def save_trust(
-    verdict: Verdict, surveyed: Survey | None, troubles: list[str], cfg: TrainConfig
+    verdict: Verdict, surveyed: Survey | None, troubles: list[str], cfg: config.TrainConfig
 ) -> None:
     """Write to the run's trust.txt, and log, how it came out and what photographs leave open."""
     text = verdict.sentence() + "."
     if surveyed is not None:
         text += " " + words(numbers(surveyed), troubles)
-    with replacing(cfg.out / "trust.txt") as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_text(cfg.out / "trust.txt", text + "\n")
     log.info(text)

@@ -27,12 +27,7 @@ Downscale: TypeAlias = Literal["auto"] | int  # side of the squares of pixels th
 Animation: TypeAlias = Literal["gif", "mp4"]
 # Of rembg's networks those that find what stands out, by its names
 NetworkName: TypeAlias = Literal[
-    "u2netp",
-    "silueta",
-    "u2net",
-    "isnet-general-use",
-    "birefnet-general-lite",
-    "birefnet-general",
+    "u2netp", "silueta", "u2net", "isnet-general-use", "birefnet-general-lite", "birefnet-general"
 ]
 # Lower and upper corner, x y z each
 Box: TypeAlias = tuple[float, float, float, float, float, float]

@@ -32,6 +32,26 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_bytes(path: str | Path, data: bytes | memoryview) -> None:
+    """Write a file, whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """The same of text."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """The same of JSON; paths become text."""
+    write_text(path, json.dumps(value, indent=1, default=str) + "\n")
+
+
 def append_line(path: Path, line: str) -> None:
     """Append a line to a file, whole or not at all.
 
@@ -97,10 +117,7 @@ def recorded(folder: Path, step: str) -> Any:
 
 
 def done(
-    folder: Path,
-    step: str,
-    fingerprint: Any,
-    refusal: Callable[[Any], ExistingFile] | None = None,
+    folder: Path, step: str, fingerprint: Any, refusal: Callable[[Any], ExistingFile] | None = None
 ) -> bool:
     """Whether a step is done.
 
@@ -139,5 +156,4 @@ def _read(folder: Path) -> dict[str, Any]:
 
 def _write(folder: Path, steps: dict[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    with replacing(folder / FILE) as temporary:
-        temporary.write_text(json.dumps(steps) + "\n", encoding="utf-8")
+    write_json(folder / FILE, steps)

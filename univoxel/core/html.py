@@ -8,14 +8,12 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
-from pathlib import Path
 
 import numpy as np
 from PIL import Image
 from torch import Tensor
 
 from univoxel import __version__
-from univoxel.core.files import replacing
 
 QUALITY = 85  # of JPEG
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"  # no scripts
@@ -47,16 +45,6 @@ def document(
 </body>
 </html>
 """
-
-
-def write_html(path: Path, text: str) -> None:
-    """Write a page, whole or not at all.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 def paragraph(text: str) -> str:

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import math
 import types
 from collections.abc import Callable, Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -41,16 +43,111 @@ RETIRED: dict[str, frozenset[str]] = {
 }
 
 
+# By class. Values of fields that a file may lack, where the class has another default by now: what
+# the field had when versions up to 0.2 wrote files
+EARLIER: dict[str, dict[str, Any]] = {
+    "TrainConfig": {"scene": {}, "masks": "given", "cameras": "given", "exposures": False}
+    | {"light_frame": "world", "carving_seconds": 0.0, "capacity": "fixed"},
+    "StageConfig": {"sharpness": [0.5, 0.5], "lr_sdf": [0.2, 0.02], "lr_networks": [3e-3, 3e-4]}
+    | {"physical_from": 1.0, "patches_from": 1.0, "field": "dense"},
+    "JointConfig": {"iterations": 700, "share": 0.4, "rays": 4096, "points": 20000}
+    | {"newton_points": 4000},
+    "SceneConfig": {"light": {}},
+    "SGConfig": {"directions": 128},
+}
+
+
 def without_retired(kind: Any, values: dict[str, Any]) -> dict[str, Any]:
     """What a file holds of a configuration, but for fields that its class no longer has."""
     gone = RETIRED.get(kind.__name__, frozenset())
     return {name: value for name, value in values.items() if name not in gone}
 
 
-# Checks of what configurations hold, in one form.
+# Meaning, unit and range of a field stand in its metadata, once: checks and the reference page are
+# derived from there.
 
 
 T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What a field of a configuration means, and which numbers it may be.
+
+    A range is of each number of a tuple; None is in it where the annotation allows that.
+    """
+
+    meaning: str
+    unit: str = ""
+    above: float | None = None  # the range is open there
+    least: float | None = None  # the range is closed there
+    most: float = math.inf  # and here; numbers are finite in any case
+    multiple: int = 0  # of what the numbers are multiples, if of anything
+
+    @property
+    def range(self) -> str:
+        """In words: above 0, at least 1, in [0, 1], a multiple of 32 in [0, 1024]; or nothing."""
+        low = self.least if self.above is None else self.above
+        if low is None:
+            return ""
+        if self.most == math.inf:
+            return f"{'at least' if self.above is None else 'above'} {low}"
+        many = f"a multiple of {self.multiple} " if self.multiple else ""
+        return f"{many}in {'[' if self.above is None else '('}{low}, {self.most}]"
+
+    def holds(self, value: Any) -> bool:
+        """Whether a number is in the range."""
+        low = value >= self.least if self.above is None else value > self.above
+        high = value <= self.most and value < math.inf
+        return low and high and not (self.multiple and value % self.multiple)
+
+
+def about(meaning: str, **rest: Any) -> dict[str, Setting]:
+    """Metadata of a field without default: the fields of Setting."""
+    return {"setting": Setting(meaning, **rest)}
+
+
+def setting(default: T, meaning: str, **rest: Any) -> T:
+    """A field with a default, which may be a frozen dataclass, and the fields of Setting."""
+    return dataclasses.field(default=default, metadata=about(meaning, **rest))
+
+
+def check_settings(config: Any) -> None:
+    """Refuse a configuration with a number out of its field's range, or a word that is no choice.
+
+    Raises:
+        ConfigError: names class and field, says what is wanted and what came.
+    """
+    hints = _hints(type(config))
+    for field in _fields(config):
+        said = field.metadata.get("setting", Setting(""))
+        if test := _test(hints[field.name], said):
+            check_fields(config, *test, field.name)
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _test(hint: Any, said: Setting) -> tuple[str, Callable[[Any], bool]] | None:
+    """What a field may be, in words and as a test; None: anything."""
+    inner = get_args(hint)
+    if get_origin(hint) is Literal:
+        *first, last = map(str, inner)
+        return f"{', '.join(first)} or {last}" if first else last, inner.__contains__
+    wanted = said.range
+    if not wanted:
+        return None
+    if get_origin(hint) is tuple:
+        count = {2: "two", 3: "three"}[len(inner)]
+        return (
+            f"{count} numbers {wanted}",
+            lambda x: len(x) == len(inner) and all(map(said.holds, x)),
+        )
+    if type(None) in inner:
+        return f"None or {wanted}", lambda x: x is None or said.holds(x)
+    return wanted, said.holds
 
 
 def check_fields(config: object, wanted: str, holds: Callable[[Any], bool], *names: str) -> None:
@@ -87,8 +184,8 @@ def record(kind: type[T], values: object) -> T:
     name = kind.__name__
     if not isinstance(values, dict):
         raise ConfigError(f"{name}: expected an object, got {values!r:.60}")
-    values = without_retired(kind, values)
-    hints, known = get_type_hints(kind), {f.name: f for f in _fields(kind) if f.init}
+    values = EARLIER.get(name, {}) | without_retired(kind, values)
+    hints, known = _hints(kind), {f.name: f for f in _fields(kind) if f.init}
     if unknown := values.keys() - known.keys():
         raise ConfigError(f"{name}: no field {min(map(str, unknown))!r:.60}")
     found = {}

@@ -2,28 +2,11 @@
 
 from pathlib import Path
 
+from univoxel.data import photogrammetry, research
 from univoxel.data.colmap import is_colmap, load_colmap
 from univoxel.data.image_cache import keep_photos, looking_in
 from univoxel.data.path_sandbox import staying_in
-from univoxel.data.photogrammetry import (
-    is_metashape,
-    is_polycam,
-    is_realitycapture,
-    load_metashape,
-    load_polycam,
-    load_realitycapture,
-)
 from univoxel.data.photos import Photos, Truth
-from univoxel.data.research import (
-    is_idr,
-    is_llff,
-    is_neilf,
-    is_tensoir,
-    load_idr,
-    load_llff,
-    load_neilf,
-    load_tensoir,
-)
 from univoxel.data.transforms import (
     is_blender,
     is_nerfstudio,
@@ -54,13 +37,13 @@ _LAYOUTS = (
     (is_blender, load_blender),
     (is_nerfstudio, load_nerfstudio),
     (is_colmap, load_colmap),
-    (is_llff, load_llff),
-    (is_idr, load_idr),
-    (is_neilf, load_neilf),
-    (is_polycam, load_polycam),
-    (is_metashape, load_metashape),
-    (is_realitycapture, load_realitycapture),
-    (is_tensoir, load_tensoir),
+    (research.is_llff, research.load_llff),
+    (research.is_idr, research.load_idr),
+    (research.is_neilf, research.load_neilf),
+    (photogrammetry.is_polycam, photogrammetry.load_polycam),
+    (photogrammetry.is_metashape, photogrammetry.load_metashape),
+    (photogrammetry.is_realitycapture, photogrammetry.load_realitycapture),
+    (research.is_tensoir, research.load_tensoir),
 )
 
 

@@ -18,7 +18,7 @@ import torch
 from PIL import ExifTags, Image, ImageCms
 from torch import Tensor
 
-from univoxel.core.files import replacing
+from univoxel.core.files import write_bytes
 from univoxel.core.records import HALF_MAX
 from univoxel.errors import DataError
 
@@ -124,8 +124,7 @@ def write_radiance(path: Path, radiance: np.ndarray) -> None:
     rgbe = np.concatenate([mantissa, exponent[..., None] + 128], 2)
     rgbe[largest < SMALLEST] = 0
     header = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n"
-    with replacing(path) as temporary:
-        temporary.write_bytes(header.encode("ascii") + rgbe.astype(np.uint8).tobytes())
+    write_bytes(path, header.encode("ascii") + rgbe.astype(np.uint8).tobytes())
 
 
 def _run_lengths(
@@ -360,8 +359,7 @@ def write_png(path: str | Path, image: Tensor | np.ndarray) -> None:
         raise ValueError(f"write_png: image must be uint8 or floating, got {array.dtype}")
     encoded = io.BytesIO()
     Image.fromarray(array).save(encoded, format="PNG")
-    with replacing(path) as temporary:
-        temporary.write_bytes(encoded.getbuffer())
+    write_bytes(path, encoded.getbuffer())
 
 
 def write_exr(
@@ -390,8 +388,7 @@ def write_exr(
     # Not straight to the file: when the disk fills up while OpenEXR closes a file, it says nothing.
     encoded = io.BytesIO()
     OpenEXR.File(header, pixels).write(encoded)
-    with replacing(path) as temporary:
-        temporary.write_bytes(encoded.getbuffer())
+    write_bytes(path, encoded.getbuffer())
 
 
 @contextmanager

@@ -56,10 +56,7 @@ class Lens:
         factor = 1 + rr * reduce(lambda inner, k: k + rr * inner, reversed(others), last)
         bent_x = x * factor + 2 * p1 * x * y + p2 * (rr + 2 * x * x)
         bent_y = y * factor + p1 * (rr + 2 * y * y) + 2 * p2 * x * y
-        return (
-            self.centre[0] + self.focal[0] * bent_x,
-            self.centre[1] + self.focal[1] * bent_y,
-        )
+        return (self.centre[0] + self.focal[0] * bent_x, self.centre[1] + self.focal[1] * bent_y)
 
 
 def checked(lens: Lens) -> Lens:

@@ -25,7 +25,7 @@ class Photos:
     cameras: Cameras
     about: str = ""  # what was read and how, for people
     downscale: int = 1  # pixels of the files along a side of one of these
-    origin: str = ""  # of pixels that are not those of the files, as of `kept.origin_of`
+    origin: str = ""  # of pixels that are not those of the files, as of `image_cache.origin_of`
 
     def __len__(self) -> int:
         return len(self.names)
@@ -63,6 +63,33 @@ def decode(color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
 def coverage_of(alpha: Tensor) -> Tensor:
     """Stored alpha as float32 in [0, 1]."""
     return alpha.float() / 255 if alpha.dtype == torch.uint8 else alpha
+
+
+def packed_width(photos: Photos) -> int:
+    """Numbers that `packed` makes of a pixel."""
+    return sum(-(-n * t.element_size() // 4) for n, t in ((3, photos.color), (1, photos.alpha)))
+
+
+def packed(photos: Photos, view: int, place: Tensor) -> Tensor:
+    """Stored colour and alpha of pixels [N, 2] (row, column) of a view, as int32 [N, 2] or, of
+    photographs in floating point, up to [N, 4]."""
+    row, column = place.unbind(1)
+    color, alpha = photos.color[view][row, column], photos.alpha[view][row, column, None]
+    return torch.cat([_as_int32(color), _as_int32(alpha)], 1)
+
+
+def unpacked(photos: Photos, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Linear straight colour [N, 3] and alpha [N] of what `packed` gave."""
+    split = packed_width(photos) - 1
+    color = rows[:, :split].contiguous().view(photos.color.dtype)[:, :3]
+    alpha = rows[:, split:].contiguous().view(photos.alpha.dtype)[:, 0]
+    return decode(color, alpha)
+
+
+def _as_int32(stored: Tensor) -> Tensor:
+    """The bytes of numbers [N, K], and zeros after them, as int32 [N, M]."""
+    raw = stored.contiguous().view(torch.uint8)
+    return torch.nn.functional.pad(raw, (0, -raw.shape[1] % 4)).view(torch.int32)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@ camera paths without pictures."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import reprlib
@@ -15,17 +14,10 @@ from typing import Any
 import numpy as np
 
 from univoxel.camera import Cameras
-from univoxel.core.files import read_json, replacing
+from univoxel.core.files import read_json, write_json
+from univoxel.data import load_images
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
-from univoxel.data.load_images import (
-    Shot,
-    cameras_of,
-    check_name,
-    every_eighth,
-    read_shots,
-    upright,
-)
 from univoxel.data.path_sandbox import inside, left_out
 from univoxel.data.photos import Photos
 from univoxel.errors import DataError, UserError
@@ -72,7 +64,7 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
     root, frames = read_transforms(path)
     names = view_names([str(f.get("file_path", f"{i:04d}")) for i, f in enumerate(frames)])
     for index, name in enumerate(names):
-        check_name(name, f"{path}: frame {index}")
+        load_images.check_name(name, f"{path}: frame {index}")
     if len(set(names)) != len(names):
         raise DataError(f"{path}: expected every frame under a name of its own")
     poses, lenses = [], []
@@ -85,7 +77,7 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
         if lens.bent:
             raise DataError(f"{where}: expected cameras without lens distortion, got some")
         lenses.append(lens)
-    return names, cameras_of(poses, lenses)
+    return names, load_images.cameras_of(poses, lenses)
 
 
 def read_transforms(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -108,7 +100,7 @@ def _without_nothing(values: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in values.items() if value is not None}
 
 
-def read_frames(path: Path) -> tuple[dict[str, Any], list[Shot], list[str]]:
+def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], list[str]]:
     """The root of the file, its frames with their pictures, which lie relative to it, and remarks.
 
     Frames without a picture are left out, as `left_out` says.
@@ -139,7 +131,7 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[Shot], list[str]]:
         lens = _lens(root | frame, where, image)
         scaled += lens.width < (root | frame).get("w", 0)
         pose, mask = pose_of(frame.get("transform_matrix"), where), _mask(path.parent, frame, where)
-        shots.append(Shot(names[index], where, image, mask, pose, lens))
+        shots.append(load_images.Shot(names[index], where, image, mask, pose, lens))
     lost = left_out(str(path), missing, len(frames), f" ({LOOKED_FOR}{_smaller(missing)})")
     lost += [f"cameras of {scaled} scaled to smaller pictures"] if scaled else []
     return root, shots, lost
@@ -373,8 +365,7 @@ def write_cameras(folder: Path, split: str, cameras: Cameras, names: Sequence[st
                 **{"fl_x": x, "fl_y": y, "cx": cx, "cy": cy},
             }
         )
-    with replacing(folder / f"transforms_{split}.json") as temporary:
-        temporary.write_text(json.dumps({"frames": frames}, indent=1), encoding="utf-8")
+    write_json(folder / f"transforms_{split}.json", {"frames": frames})
 
 
 def _mask(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
@@ -415,7 +406,7 @@ def load_blender(
     if not path.is_file():
         raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
     _, shots, remarks = read_frames(path)
-    return read_shots(folder, "NeRF layout", split, shots, downscale, remarks, masks)
+    return load_images.read_shots(folder, "NeRF layout", split, shots, downscale, remarks, masks)
 
 
 # The layout of nerfstudio and instant-ngp.
@@ -441,21 +432,21 @@ def load_nerfstudio(
     """
     path = folder / "transforms.json"
     root, shots, lost = read_frames(path)
-    shots, remarks = upright(shots)
+    shots, remarks = load_images.upright(shots)
     chosen = root.get(f"{split}_filenames")
     if chosen is None:
-        shots = every_eighth(folder, shots, split)
+        shots = load_images.every_eighth(folder, shots, split)
     else:
         listed = [frame["file_path"] for frame in root["frames"]]
         shots = _named(path, shots, listed, f"{split}_filenames", chosen)
-    return read_shots(
+    return load_images.read_shots(
         folder, "nerfstudio layout", split, shots, downscale, [*lost, *remarks], masks
     )
 
 
 def _named(
-    path: Path, shots: list[Shot], listed: list[str], key: str, chosen: object
-) -> list[Shot]:
+    path: Path, shots: list[load_images.Shot], listed: list[str], key: str, chosen: object
+) -> list[load_images.Shot]:
     """The shots of a split. What is listed and has no picture is left out of it, too."""
     if not isinstance(chosen, list) or not all(isinstance(name, str) for name in chosen):
         raise DataError(f"{path}: expected {key} as a list of file_paths, got {short(chosen)}")

@@ -17,7 +17,7 @@ from univoxel import brdf
 from univoxel.camera import Cameras
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped
 from univoxel.core.records import Surface
-from univoxel.core.validation import check_fields
+from univoxel.core.validation import check_settings, setting
 from univoxel.data import Photos
 from univoxel.ops import VisibilityScene
 from univoxel.render.observations import (
@@ -378,15 +378,19 @@ COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", 
 class AdviceConfig:
     """How directions for more photographs are chosen."""
 
-    most: int = 6  # directions that are advised, >= 1
-    # worth of a photograph, in [0, 1], from which on it is advised: the share of the surface, times
-    # its doubt, that it would show as well as many photographs
-    least: float = 0.006
-    share: float = 0.5  # of the best one's worth, in [0, 1]; less is not worth the walk
+    most: int = setting(6, "directions that are advised", least=1)
+    least: float = setting(
+        0.006,
+        "worth of a photograph from which on it is advised: the share of the surface, times its "
+        "doubt, that it would show as well as many photographs",
+        least=0,
+        most=1,
+    )
+    share: float = setting(
+        0.5, "of the best one's worth; less is not worth the walk", least=0, most=1
+    )
 
-    def __post_init__(self) -> None:
-        check_fields(self, "at least 1", lambda x: x >= 1, "most")
-        check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "least", "share")
+    __post_init__ = check_settings
 
 
 ADVICE = AdviceConfig()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from univoxel.color import linear_to_srgb
 from univoxel.core.choices import Behind
-from univoxel.core.files import replacing
+from univoxel.core.files import write_text
 from univoxel.core.progress_bar import track
 from univoxel.core.records import Mesh
 from univoxel.data import Photos
@@ -55,12 +55,7 @@ class ViewMeasures:
 
 
 def relighting_of(
-    scene: Scene,
-    mesh: Mesh | None,
-    truth: SceneTruth,
-    scales: Scales,
-    samples: int,
-    bounces: int,
+    scene: Scene, mesh: Mesh | None, truth: SceneTruth, scales: Scales, samples: int, bounces: int
 ) -> Relighting | None:
     """What test views are relit with, where there are maps to relight them under."""
     if not truth.maps or mesh is None:
@@ -185,6 +180,5 @@ def say_trust(
     paragraph = words(figures, troubles)
     log.info(paragraph)
     if save:
-        with replacing(save / "trust.txt") as temporary:
-            temporary.write_text(paragraph + "\n", encoding="utf-8")
+        write_text(save / "trust.txt", paragraph + "\n")
     return {"trust": figures}

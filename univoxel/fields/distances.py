@@ -12,18 +12,10 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
+from univoxel import ops
 from univoxel.core.records import Bricks, FieldSample, Rays, Samples
 from univoxel.errors import NoSurface
 from univoxel.fields.grid import GridShape, resample
-from univoxel.ops import (
-    brick_minimum,
-    composite_field,
-    diffuse_rows_,
-    march,
-    sample_dense,
-    sample_sparse,
-    smooth_rows_,
-)
 from univoxel.ops.compositing import FieldAlongRays, Lattices
 
 BAND = 4.0  # voxels from the surface beyond which density is nothing: 8 s at a sharpness of 0.5
@@ -89,7 +81,7 @@ class AbstractDistances(nn.Module, ABC):
             minimum, version = self._minimum
             if self.training or version.holds(self.sdf):
                 return minimum
-        minimum = brick_minimum(self.sdf.detach(), self.bricks)
+        minimum = ops.brick_minimum(self.sdf.detach(), self.bricks)
         self._minimum = minimum, SurfaceVersion.of(self.sdf)
         return minimum
 
@@ -109,12 +101,12 @@ class AbstractDistances(nn.Module, ABC):
     def _sample(self, sdf: Tensor, values: Tensor, points: Tensor) -> FieldSample:
         place = points, self.grid.origin, self.voxel_size
         if self.bricks is None:
-            return FieldSample(*sample_dense(sdf, values, *place, sparse_grad=True))
-        return FieldSample(*sample_sparse(sdf, values, self.bricks, *place, sparse_grad=True))
+            return FieldSample(*ops.sample_dense(sdf, values, *place, sparse_grad=True))
+        return FieldSample(*ops.sample_sparse(sdf, values, self.bricks, *place, sparse_grad=True))
 
     def march(self, rays: Rays, jitter: Tensor, inv_s: float) -> Samples:
         """The samples along rays that matter under density sharpness 1 / s; no gradients."""
-        return march(
+        return ops.march(
             self.sdf.detach(),
             self.brick_minimum(),
             rays.origin,
@@ -140,7 +132,7 @@ class AbstractDistances(nn.Module, ABC):
         Args:
             values: of nodes, as features; or a hash table with these levels.
         """
-        return composite_field(
+        return ops.composite_field(
             self.sdf,
             values,
             rays.origin,
@@ -174,11 +166,11 @@ class AbstractDistances(nn.Module, ABC):
     def smooth_rows_(self, values: Tensor, rows: Tensor, amount: float, order: int) -> None:
         """`ops.smooth_rows_` of values of nodes."""
         nodes = self.grid.size if self.bricks is None else (len(values),)
-        smooth_rows_(values.view(*nodes, -1), rows, amount, order, self.bricks)
+        ops.smooth_rows_(values.view(*nodes, -1), rows, amount, order, self.bricks)
 
     def diffuse_rows_(self, values: Tensor, rows: Tensor, amount: float, passes: int) -> None:
         """`ops.diffuse_rows_` of values [K] of nodes."""
-        diffuse_rows_(values, rows, self.grid.size, amount, passes, self.bricks)
+        ops.diffuse_rows_(values, rows, self.grid.size, amount, passes, self.bricks)
 
     @abstractmethod
     def on_grid(self, values: Tensor) -> Tensor:
@@ -244,7 +236,7 @@ class DenseDistances(AbstractDistances):
 
     def blocks(self, far: float) -> Tensor:
         sdf = self.sdf.detach()
-        return (brick_minimum(sdf) < far) & (brick_minimum(-sdf) < far)
+        return (ops.brick_minimum(sdf) < far) & (ops.brick_minimum(-sdf) < far)
 
     def isosurface(self, closed: bool = False) -> tuple[Tensor, Tensor]:
         sdf = self.sdf.detach().numpy()

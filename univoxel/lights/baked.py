@@ -9,15 +9,14 @@ import torch
 from torch import Tensor
 
 from univoxel.core.records import Occlusion, Surface
-from univoxel.lights.base import AbstractLight, Regularisation
+from univoxel.lights.base import KIND, AbstractLight, Regularisation
 
 
 @dataclass(frozen=True)
 class BakedConfig:
     """Shading stays in the albedo, as in a photogrammetry mesh with a texture."""
 
-    # name of this light, by which config.json tells it from the others
-    kind: Literal["baked"] = field(default="baked", init=False)
+    kind: Literal["baked"] = field(default="baked", init=False, metadata=KIND)
 
 
 class BakedLight(AbstractLight):

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from univoxel import brdf
 from univoxel.core.records import Occlusion, Surface
+from univoxel.core.validation import about
 from univoxel.ops.networks import MLP, DirectionTable, waves
 
 
@@ -56,6 +57,7 @@ def total_variation(log_map: Tensor) -> Tensor:
 MOST_DIRECTIONS = 1 << 16  # that light is summed up over: memory of a batch grows with them
 MOST_LAYERS = 32  # of a network: without shortcuts deeper ones do not learn
 MOST_ROWS = 1 << 13  # of a map
+KIND = about("name of this light, by which config.json tells it from the others")
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from univoxel.core.records import Surface
-from univoxel.core.validation import check_fields
+from univoxel.core.validation import check_settings, setting
 from univoxel.lights import base, latlong, sg
-from univoxel.lights.base import MOST_DIRECTIONS, MOST_ROWS, Regularisation
+from univoxel.lights.base import KIND, MOST_DIRECTIONS, MOST_ROWS, Regularisation
 from univoxel.lights.latlong import AbstractLatLongLight, LatLongConfig
 from univoxel.sphere import latlong_directions
 
@@ -26,17 +26,12 @@ COARSEST = 4  # rows of the coarsest level, at least
 class EnvmapConfig(LatLongConfig):
     """An environment map of texels, with traced visibility."""
 
-    # name of this light, by which config.json tells it from the others
-    kind: Literal["envmap"] = field(default="envmap", init=False)
-    rows: int = 256  # of the map, twice as wide, >= 1
-    directions: int = 64  # of the half-sphere, in training, >= 1
-    directions_eval: int = 256  # in evaluation, >= 1
+    kind: Literal["envmap"] = field(default="envmap", init=False, metadata=KIND)
+    rows: int = setting(256, "of the map, twice as wide", least=1, most=MOST_ROWS)
+    directions: int = setting(64, "of the half-sphere, in training", least=1, most=MOST_DIRECTIONS)
+    directions_eval: int = setting(256, "in evaluation", least=1, most=MOST_DIRECTIONS)
 
-    def __post_init__(self) -> None:
-        check_fields(self, "at least 1", lambda x: x >= 1, "rows", "directions", "directions_eval")
-        most = f"at most {MOST_DIRECTIONS}"
-        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
-        check_fields(self, f"at most {MOST_ROWS}", lambda x: x <= MOST_ROWS, "rows")
+    __post_init__ = check_settings
 
 
 class EnvmapLight(AbstractLatLongLight):
@@ -100,22 +95,18 @@ LOBE_GAIN = (
 class EnvmapSGConfig(LatLongConfig):
     """An environment map of spherical Gaussians, with traced visibility."""
 
-    # name of this light, by which config.json tells it from the others
-    kind: Literal["envmap-sg"] = field(default="envmap-sg", init=False)
-    lobes: int = 128  # of the map, >= 1
-    max_sharpness: float = 100.0  # of a lobe, > 0; its half width is about sqrt(2 / sharpness) rad
-    rows: int = 64  # of the lat-long map that the lobes are summed on, >= 1
-    directions: int = 64  # of the half-sphere, in training, >= 1
-    directions_eval: int = 256  # in evaluation, >= 1
+    kind: Literal["envmap-sg"] = field(default="envmap-sg", init=False, metadata=KIND)
+    lobes: int = setting(128, "of the map", least=1)
+    max_sharpness: float = setting(
+        100.0, "of a lobe; its half width is about sqrt(2 / sharpness) rad", above=0
+    )
+    rows: int = setting(
+        64, "of the lat-long map that the lobes are summed on", least=1, most=MOST_ROWS
+    )
+    directions: int = setting(64, "of the half-sphere, in training", least=1, most=MOST_DIRECTIONS)
+    directions_eval: int = setting(256, "in evaluation", least=1, most=MOST_DIRECTIONS)
 
-    def __post_init__(self) -> None:
-        check_fields(
-            self, "at least 1", lambda x: x >= 1, "lobes", "rows", "directions", "directions_eval"
-        )
-        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "max_sharpness")
-        most = f"at most {MOST_DIRECTIONS}"
-        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
-        check_fields(self, f"at most {MOST_ROWS}", lambda x: x <= MOST_ROWS, "rows")
+    __post_init__ = check_settings
 
 
 class EnvmapSGLight(AbstractLatLongLight):

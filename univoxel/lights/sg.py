@@ -11,9 +11,10 @@ from torch import Tensor, nn
 
 from univoxel import brdf, ops, sphere
 from univoxel.core.records import Occlusion, Surface
-from univoxel.core.validation import check_fields
+from univoxel.core.validation import check_settings, setting
 from univoxel.lights import base, quadrature
 from univoxel.lights.base import (
+    KIND,
     MOST_DIRECTIONS,
     MOST_LAYERS,
     AbstractLocalLight,
@@ -61,25 +62,20 @@ def white_light(count: int, max_sharpness: float) -> Tensor:
 class SGConfig(LocalLightConfig):
     """Local spherical Gaussian light."""
 
-    # name of this light, by which config.json tells it from the others
-    kind: Literal["sg"] = field(default="sg", init=False)
-    lobes: int = 16  # a point, >= 1
-    hidden: int = 64  # width of the head, >= 1
-    layers: int = 2  # hidden layers of the head, [0, 32]
-    directions: int = 128  # of the quadrature in training, >= 1
-    directions_eval: int = 256  # of the quadrature in evaluation, >= 1
-    max_sharpness: float = 30.0  # of a lobe, > 0; its half width is about sqrt(2 / sharpness) rad
-    scale: float = 1.0  # world units: half the extent of what is lit, > 0
+    kind: Literal["sg"] = field(default="sg", init=False, metadata=KIND)
+    lobes: int = setting(16, "a point", least=1)
+    hidden: int = setting(64, "width of the head", least=1)
+    layers: int = setting(2, "hidden layers of the head", least=0, most=MOST_LAYERS)
+    directions: int = setting(64, "of the quadrature in training", least=1, most=MOST_DIRECTIONS)
+    directions_eval: int = setting(
+        256, "of the quadrature in evaluation", least=1, most=MOST_DIRECTIONS
+    )
+    max_sharpness: float = setting(
+        30.0, "of a lobe; its half width is about sqrt(2 / sharpness) rad", above=0
+    )
+    scale: float = setting(1.0, "half the extent of what is lit", unit="world units", above=0)
 
-    def __post_init__(self) -> None:
-        check_fields(
-            self, "at least 1", lambda x: x >= 1, "lobes", "hidden", "directions", "directions_eval"
-        )
-        check_fields(self, "at least 0", lambda x: x >= 0, "layers")
-        most = f"at most {MOST_DIRECTIONS}"
-        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
-        check_fields(self, f"at most {MOST_LAYERS}", lambda x: x <= MOST_LAYERS, "layers")
-        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "max_sharpness", "scale")
+    __post_init__ = check_settings
 
 
 class LocalSG(AbstractLocalLight):

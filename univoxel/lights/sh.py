@@ -11,9 +11,10 @@ from torch import Tensor, nn
 
 from univoxel import sphere
 from univoxel.core.records import Occlusion, Surface
-from univoxel.core.validation import check_fields
+from univoxel.core.validation import check_settings, setting
 from univoxel.lights import base, quadrature
 from univoxel.lights.base import (
+    KIND,
     MOST_DIRECTIONS,
     MOST_LAYERS,
     AbstractLocalLight,
@@ -32,24 +33,17 @@ _START = 0.5  # radiance from everywhere
 class SHConfig(LocalLightConfig):
     """Local light in spherical harmonics."""
 
-    # name of this light, by which config.json tells it from the others
-    kind: Literal["sh"] = field(default="sh", init=False)
-    order: int = 3  # the highest degree, >= 0: 3 (order + 1)^2 numbers a point
-    hidden: int = 64  # width of the head, >= 1
-    layers: int = 2  # hidden layers of the head, [0, 32]
-    directions: int = 256  # over the whole sphere, in training, >= 1
-    directions_eval: int = 512  # in evaluation, >= 1
-    scale: float = 1.0  # world units: half the extent of what is lit, > 0
+    kind: Literal["sh"] = field(default="sh", init=False, metadata=KIND)
+    order: int = setting(3, "the highest degree: 3 (order + 1)^2 numbers a point", least=0)
+    hidden: int = setting(64, "width of the head", least=1)
+    layers: int = setting(2, "hidden layers of the head", least=0, most=MOST_LAYERS)
+    directions: int = setting(
+        256, "over the whole sphere, in training", least=1, most=MOST_DIRECTIONS
+    )
+    directions_eval: int = setting(512, "in evaluation", least=1, most=MOST_DIRECTIONS)
+    scale: float = setting(1.0, "half the extent of what is lit", unit="world units", above=0)
 
-    def __post_init__(self) -> None:
-        check_fields(
-            self, "at least 1", lambda x: x >= 1, "hidden", "directions", "directions_eval"
-        )
-        check_fields(self, "at least 0", lambda x: x >= 0, "order", "layers")
-        most = f"at most {MOST_DIRECTIONS}"
-        check_fields(self, most, lambda x: x <= MOST_DIRECTIONS, "directions", "directions_eval")
-        check_fields(self, f"at most {MOST_LAYERS}", lambda x: x <= MOST_LAYERS, "layers")
-        check_fields(self, "above 0", lambda x: 0 < x < math.inf, "scale")
+    __post_init__ = check_settings
 
 
 class LocalSH(AbstractLocalLight):

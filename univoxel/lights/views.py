@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from univoxel.camera import Cameras, circle_of, looked_at
+from univoxel.core.validation import about, setting
 from univoxel.errors import ConfigError, UserError
 from univoxel.sphere import real_harmonics
 
@@ -153,11 +154,12 @@ PAIRS = 500  # of cameras, whose axes are tried
 class Table:
     """The axis about which an object was turned, while camera and light stood still."""
 
-    point: Vec3  # of the axis, world units
-    axis: Vec3  # unit, upwards
-    start: Vec3  # unit, across the axis: from it to the camera
-    # Where its cameras stood; empty: all stood around this axis
-    eyes: tuple[Vec3, ...] = ()
+    point: Vec3 = field(metadata=about("of the axis", unit="world units"))
+    axis: Vec3 = field(metadata=about("unit, upwards"))
+    start: Vec3 = field(metadata=about("unit, across the axis: from it to the camera"))
+    eyes: tuple[Vec3, ...] = setting(
+        (), "where its cameras stood; none: all stood around this axis"
+    )
 
     def __post_init__(self) -> None:
         axis, start = torch.tensor(self.axis), torch.tensor(self.start)
@@ -223,7 +225,7 @@ class Turntable(Table):
     show its underside, has another axis for the photographs since then.
     """
 
-    others: tuple[Table, ...] = ()  # each with its own cameras' eyes
+    others: tuple[Table, ...] = setting((), "each with the eyes of its own cameras")
 
     def __post_init__(self) -> None:
         super().__post_init__()

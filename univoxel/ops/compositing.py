@@ -81,10 +81,7 @@ def composite(
     Mildenhall et al. 2020 (NeRF), eq. 3.
     """
     check(
-        "composite",
-        alpha=(alpha, "M"),
-        value=(value, "M C"),
-        offsets=(offsets, "N+1", torch.int64),
+        "composite", alpha=(alpha, "M"), value=(value, "M C"), offsets=(offsets, "N+1", torch.int64)
     )
     if not 0.0 <= early_stop <= 1.0:
         raise ValueError(f"composite: early_stop must be in [0, 1], got {early_stop}")

@@ -198,10 +198,7 @@ def sample_dense(
     voxels, interpolated.
     """
     sizes = check(
-        "sample_dense",
-        sdf=(sdf, "X Y Z"),
-        features=(features, "X Y Z C"),
-        points=(points, "M 3"),
+        "sample_dense", sdf=(sdf, "X Y Z"), features=(features, "X Y Z C"), points=(points, "M 3")
     )
     if not sdf.numel():
         raise ValueError(f"sample_dense: sdf must have nodes, got {list(sdf.shape)}")

@@ -77,11 +77,7 @@ def encode_hash(
 
 
 def check_levels(
-    op: str,
-    rows: int,
-    lower: Sequence[float],
-    upper: Sequence[float],
-    voxel_sizes: Sequence[float],
+    op: str, rows: int, lower: Sequence[float], upper: Sequence[float], voxel_sizes: Sequence[float]
 ) -> None:
     """Check where the lattices of a table of that many rows lie.
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from univoxel import __version__
 from univoxel.color import linear_to_srgb
-from univoxel.core.files import replacing
+from univoxel.core.files import write_bytes, write_text
 from univoxel.core.records import Mesh
 from univoxel.errors import MissingExtra, UserError
 from univoxel.output.mesh import (
@@ -41,8 +41,7 @@ def write_glb(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
         OSError: the file cannot be written; nothing is left behind.
     """
     data = glb(mesh, jpeg)
-    with replacing(path) as temporary:
-        temporary.write_bytes(data)
+    write_bytes(path, data)
 
 
 def glb(
@@ -205,8 +204,7 @@ def write_usdz(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
         _write_stage(usd, layer, mesh, pictures)
         package = folder / "object.usdz"
         _write_package(usd, package, [layer, *(folder / file for file in pictures.values())])
-        with replacing(path) as temporary:
-            temporary.write_bytes(package.read_bytes())
+        write_bytes(path, package.read_bytes())
 
 
 def _write_package(usd: Any, package: Path, files: list[Path]) -> None:
@@ -337,8 +335,7 @@ def write_obj(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
         pictures["metallic"] = metallic_picture(mesh)
         metal = f"Pm 1\nmap_Pm {name}_metallic.{suffix}"
     for kind, picture in pictures.items():
-        with replacing(path.with_name(f"{name}_{kind}.{suffix}")) as temporary:
-            temporary.write_bytes(encoded(picture, jpeg))
+        write_bytes(path.with_name(f"{name}_{kind}.{suffix}"), encoded(picture, jpeg))
     material = f"""newmtl object
 Kd 1 1 1
 Ks 0 0 0
@@ -350,7 +347,7 @@ map_Kd {name}_albedo.{suffix}
 map_Pr {name}_roughness.{suffix}
 norm {name}_normal.{suffix}
 """
-    _write_text(path.with_suffix(".mtl"), material)
+    write_text(path.with_suffix(".mtl"), material)
     corners = (mesh.faces + 1).tolist()  # v/vt/vn of each corner are the same
     parts = [f"# univoxel: +Z up\nmtllib {name}.mtl\no object\n"]
     for line, values in (
@@ -361,12 +358,7 @@ norm {name}_normal.{suffix}
         parts += [line % tuple(row) for row in values.tolist()]
     parts.append("usemtl object\ns 1\n")
     parts += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}\n" for a, b, c in corners]
-    _write_text(path, "".join(parts))
-
-
-def _write_text(path: Path, text: str) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(path, "".join(parts))
 
 
 # Meshes with materials at their vertices as PLY.
@@ -417,6 +409,5 @@ def write_ply(path: Path, mesh: Mesh) -> None:
         "property list uchar int vertex_indices",
         "end_header",
     ]
-    with replacing(path) as temporary:
-        text = "".join(line + "\n" for line in header).encode("ascii")
-        temporary.write_bytes(text + vertex.tobytes() + face.tobytes())
+    text = "".join(line + "\n" for line in header).encode("ascii")
+    write_bytes(path, text + vertex.tobytes() + face.tobytes())

@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
-from univoxel import __version__
+from univoxel import __version__, sphere
 from univoxel.camera import Cameras, looked_at
 from univoxel.core.choices import MAP_ROWS, TEXTURE_SIZE
-from univoxel.core.html import VIEWPORT, base64_text, document, escape, paragraph, table, write_html
+from univoxel.core.files import write_text
+from univoxel.core.html import VIEWPORT, base64_text, document, escape, paragraph, table
 from univoxel.core.records import HALF_MAX
 from univoxel.envmap import read_map
 from univoxel.errors import UserError
@@ -29,14 +30,6 @@ from univoxel.output.surface import cameras_of, surface_of
 from univoxel.output.topology import simplify
 from univoxel.run import load_verdict
 from univoxel.scene import Scene, load_checkpoint
-from univoxel.sphere import (
-    fibonacci_hemisphere,
-    latlong_direction,
-    latlong_directions,
-    real_harmonics,
-    texel_solid_angles,
-    to_world,
-)
 from univoxel.training.progress import LOG
 
 # How much of a distant light reaches each vertex past the object itself, and by way of it.
@@ -107,18 +100,18 @@ def _traced(
 ) -> tuple[Tensor, _Sightings]:
     """Harmonics [P, 25] of the open sky weighted by the cosine over pi, and what hides the rest."""
     visibility = VisibilityScene(places, faces)
-    local = fibonacci_hemisphere(RAYS)
+    local = sphere.fibonacci_hemisphere(RAYS)
     # Evenly over the disc below them: the cosine is in their density
     radius = (1 - local[:, 2]).sqrt() / (1 - local[:, 2] ** 2).clamp_min(1e-12).sqrt()
     local = torch.cat([local[:, :2] * radius[:, None], local[:, 2:].sqrt()], 1)
     direct, parts = [], []
     for start in range(0, len(places), VERTICES_AT_ONCE):
         some = slice(start, start + VERTICES_AT_ONCE)
-        direction = to_world(local, normals[some, None])
+        direction = sphere.to_world(local, normals[some, None])
         origin = (places[some] + offset * normals[some])[:, None].expand_as(direction)
         hit = visibility.closest_hit(origin.reshape(-1, 3), direction.reshape(-1, 3))
         open_sky = (hit.face < 0).reshape(len(direction), RAYS)
-        harmonics = real_harmonics(DEGREE, direction)
+        harmonics = sphere.real_harmonics(DEGREE, direction)
         direct.append(torch.einsum("pr,prk->pk", open_sky.float(), harmonics) / RAYS)
         met = (hit.face >= 0).nonzero()[:, 0]
         u, v = hit.barycentric[met].unbind(1)
@@ -192,7 +185,7 @@ def overcast() -> Tensor:
 
     Source of the sky: CIE standard overcast sky, Moon and Spencer 1942, (1 + 2 sin elevation) / 3.
     """
-    up = latlong_directions(ROWS)[..., 2:]
+    up = sphere.latlong_directions(ROWS)[..., 2:]
     sky = 1.1 * (1 + 2 * up.clamp_min(0)) / 3 * torch.tensor([0.93, 0.98, 1.07])
     ground = torch.tensor([0.22, 0.21, 0.20])
     share = torch.sigmoid(up / 0.02)  # the horizon as wide as a texel or two
@@ -203,7 +196,7 @@ def _fine_directions() -> Tensor:
     """Four directions a texel: [2 ROWS, 4 ROWS, 3]."""
     v = (torch.arange(2 * ROWS) + 0.5) / (2 * ROWS)
     u = (torch.arange(4 * ROWS) + 0.5) / (4 * ROWS)
-    return latlong_direction(torch.stack(torch.meshgrid(v, u, indexing="ij")[::-1], -1))
+    return sphere.latlong_direction(torch.stack(torch.meshgrid(v, u, indexing="ij")[::-1], -1))
 
 
 def _averaged(radiance: Tensor) -> Tensor:
@@ -238,8 +231,8 @@ def _box(
 def harmonics(radiance: Tensor) -> Tensor:
     """[25, 3]: integrals over the sphere of a map [H, 2 H, 3] times each real harmonic."""
     height, width, _ = radiance.shape
-    basis = real_harmonics(DEGREE, latlong_directions(height))
-    weighted = radiance * texel_solid_angles(height, width)[..., None]
+    basis = sphere.real_harmonics(DEGREE, sphere.latlong_directions(height))
+    weighted = radiance * sphere.texel_solid_angles(height, width)[..., None]
     return torch.einsum("hwk,hwc->kc", basis, weighted)
 
 
@@ -319,16 +312,13 @@ def write_page(run: str | Path, path: str | Path, **options: Any) -> Path:
     scene, state = load_checkpoint(run)
     text = page_text(run, scene, PageOptions(**options), state.get("seconds"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_html(path, text)
+    write_text(path, text)
     return path
 
 
 @torch.no_grad()
 def page_text(
-    run: Path,
-    scene: Scene,
-    options: PageOptions = PageOptions(),
-    seconds: float | None = None,
+    run: Path, scene: Scene, options: PageOptions = PageOptions(), seconds: float | None = None
 ) -> str:
     """The page of a scene as HTML; errors as of `write_page`.
 
@@ -339,10 +329,7 @@ def page_text(
     lights, cameras = lights_of(scene, options), cameras_of(scene, run)
     title = options.title or run.resolve().name or "univoxel"
     facts = facts_of(run, seconds)
-    described = {
-        "view": first_view(cameras),
-        "lights": [as_json(light) for light in lights],
-    }
+    described = {"view": first_view(cameras), "lights": [as_json(light) for light in lights]}
     parts = {
         "title": escape(title),
         "facts": escape(" \u00b7 ".join(facts)),

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from univoxel import __version__
 from univoxel.config import TrainConfig, load_config
-from univoxel.core.html import Curve, chart, document, escape, image, paragraph, table, write_html
+from univoxel.core.files import write_text
+from univoxel.core.html import Curve, chart, document, escape, image, paragraph, table
 from univoxel.core.records import Mesh
 from univoxel.errors import UserError
 from univoxel.evaluation.confidence import (
@@ -216,16 +217,13 @@ def write_report(run: str | Path, path: str | Path, **options: Any) -> Path:
     scene, state = load_checkpoint(run)
     text = report_text(run, scene, state, asked)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_html(path, text)
+    write_text(path, text)
     return path
 
 
 @torch.no_grad()
 def report_text(
-    run: Path,
-    scene: Scene,
-    state: dict[str, Any],
-    options: ReportOptions = ReportOptions(),
+    run: Path, scene: Scene, state: dict[str, Any], options: ReportOptions = ReportOptions()
 ) -> str:
     """The report of a scene as HTML; errors as of `write_report`.
 

@@ -18,16 +18,8 @@ from univoxel.data import load_cameras
 from univoxel.envmap import read_map
 from univoxel.errors import UserError
 from univoxel.ops import PointLight, Sun
+from univoxel.render import relight
 from univoxel.render.pipeline import extract_mesh, surface_of_view
-from univoxel.render.relight import (
-    Lighting,
-    Picture,
-    Quality,
-    TracedMesh,
-    render_picture,
-    rotated,
-    traced_mesh,
-)
 from univoxel.run import photos_of
 from univoxel.scene import Scene, load_scene
 
@@ -86,11 +78,7 @@ def orbit(
 
 
 def views_of(
-    run: Path,
-    cameras: str | Path | Cameras,
-    resolution: int | None,
-    elevation: float,
-    mesh: Mesh,
+    run: Path, cameras: str | Path | Cameras, resolution: int | None, elevation: float, mesh: Mesh
 ) -> tuple[list[str], Cameras]:
     """Names of the views, and their cameras; arguments as of `cli.relight.RelightOptions`.
 
@@ -133,7 +121,7 @@ def lighting(
     point_lights: Sequence[PointLight] = (),
     rotate: float = 0.0,
     exposure: float = 1.0,
-) -> Lighting:
+) -> relight.Lighting:
     """Light of a map, if any, suns and point lights.
 
     Args:
@@ -151,12 +139,12 @@ def lighting(
     elif not isinstance(envmap, env.EnvMap):
         envmap = read_map(Path(envmap))
     times = lambda power: tuple(exposure * x for x in power)  # noqa: E731
-    lights = Lighting(
+    lights = relight.Lighting(
         env.tables(replace(envmap, exposure=exposure * envmap.exposure)),
         tuple(replace(sun, irradiance=times(sun.irradiance)) for sun in suns),
         tuple(replace(light, intensity=times(light.intensity)) for light in point_lights),
     )
-    return rotated(lights, rotate)
+    return relight.rotated(lights, rotate)
 
 
 @dataclass(frozen=True)
@@ -164,7 +152,7 @@ class Studio:
     """What stays the same from frame to frame."""
 
     scene: Scene
-    traced: TracedMesh
+    traced: relight.TracedMesh
     names: list[str]  # of the views
     views: Cameras
 
@@ -176,16 +164,16 @@ def open_studio(
     scene = load_scene(run)
     mesh = extract_mesh(scene)
     names, views = views_of(run, cameras, resolution, elevation, mesh)
-    return Studio(scene, traced_mesh(mesh, scene.field.voxel_size), names, views)
+    return Studio(scene, relight.traced_mesh(mesh, scene.field.voxel_size), names, views)
 
 
 def pictures_of(
     studio: Studio,
     frames: Sequence[Frame],
-    lights: dict[str, Lighting],
-    quality: Quality,
+    lights: dict[str, relight.Lighting],
+    quality: relight.Quality,
     report: Callable[[float], None] = lambda done: None,
-) -> Iterator[tuple[Frame, Picture]]:
+) -> Iterator[tuple[Frame, relight.Picture]]:
     """Frames and their pictures; report is called with the number done, parts of one included."""
     seen: tuple[int, Surface, Tensor] | None = None
     for number, frame in enumerate(frames):
@@ -193,12 +181,12 @@ def pictures_of(
             seen = (frame.view, *surface_of_view(studio.scene, studio.views, frame.view))
         yield (
             frame,
-            render_picture(
+            relight.render_picture(
                 *seen[1:],
                 studio.views,
                 frame.view,
                 studio.traced,
-                rotated(lights[frame.light], frame.turn),
+                relight.rotated(lights[frame.light], frame.turn),
                 quality,
                 seed=frame.view,
                 report=lambda share, number=number: report(number + share),

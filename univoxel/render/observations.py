@@ -285,10 +285,7 @@ def first_labels(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mater
     """Decisions to start with: metal is what the stages before have made metallic, or all if that
     is known."""
     features = scene.field.features_at(problem.observations.position)
-    metal, only_metal = (
-        scene.material(features)[2] > METALLIC_BEFORE,
-        bool(cfg.only_metal),
-    )
+    metal, only_metal = (scene.material(features)[2] > METALLIC_BEFORE, bool(cfg.only_metal))
     return MaterialLabels(metal | only_metal, only_metal=only_metal)
 
 

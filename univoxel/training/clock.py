@@ -83,11 +83,7 @@ class Clock:
     """
 
     def __init__(
-        self,
-        cfg: TrainConfig,
-        begin: float,
-        state: dict[str, Any],
-        slower: float = 1.0,
+        self, cfg: TrainConfig, begin: float, state: dict[str, Any], slower: float = 1.0
     ) -> None:
         """
         Args:

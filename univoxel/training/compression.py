@@ -416,10 +416,7 @@ def storage_loss_db(
 
 
 def fit_budget_(
-    scene: Scene,
-    held_out: ReferenceRays,
-    reach: float | None,
-    budget_bytes: float,
+    scene: Scene, held_out: ReferenceRays, reach: float | None, budget_bytes: float
 ) -> list[CapacityChoice]:
     """Bring a finished scene into a file of that size, whatever it costs, and say what was chosen.
 

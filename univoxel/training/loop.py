@@ -13,6 +13,7 @@ from univoxel.config import LossConfig, StageConfig, TrainConfig
 from univoxel.core import memmap
 from univoxel.core.records import Rays, Surface
 from univoxel.data import Photos
+from univoxel.data.photos import unpacked
 from univoxel.lights import base
 from univoxel.lights.base import Regularisation
 from univoxel.ops import sum_rows
@@ -21,20 +22,11 @@ from univoxel.render import metrics
 from univoxel.render.metrics import psnr
 from univoxel.render.pipeline import at_rays, radiance_of, shade, surface_at
 from univoxel.scene import Scene, save_scene
-from univoxel.training import patches
-from univoxel.training.descent import (
-    EPS_FEATURES,
-    EPS_SDF,
-    MOMENTS,
-    Guard,
-    Plateau,
-    smooth_sdf_gradient_,
-    smooth_touched_,
-)
-from univoxel.training.pixels import TrainingPixels, unpacked
+from univoxel.training import descent, patches
+from univoxel.training.pixels import TrainingPixels
 from univoxel.training.progress import Listener
 
-# Cadences: steps from one to the next. plateau.CHECK is a share of the schedule instead; reports
+# Cadences: steps from one to the next. CHECK of descent.py is a share of the schedule; reports
 # and checkpoints come by time, REPORT_SECONDS and CHECKPOINT_SECONDS in progress.py
 REFRESH = 16  # looks at which bricks are empty
 RETRACE = 100  # traces of light through the surface as it has become
@@ -74,8 +66,8 @@ def run_stage(
     field, clock = scene.field, progress.clock
     scene.train()
     optimizer = build_optimizer(scene, stage.refit)
-    plateau = Plateau(cfg.patience)
-    guard = Guard(progress, restored=lambda: restore_surface_(scene))
+    plateau = descent.Plateau(cfg.patience)
+    guard = descent.Guard(progress, restored=lambda: restore_surface_(scene))
     guard.follow(optimizer)
     brightness = None  # of photographs whose patches are compared
     if cfg.loss.patches and stage.patches_from < 1 and not memmap.on_disk(pixels.photos.color):
@@ -129,10 +121,10 @@ def run_stage(
             if stage.refit:
                 field.encoding.hold_channels_(scene.material.channels)
             if stage.spread:
-                smooth_sdf_gradient_(field, stage.spread)
+                descent.smooth_sdf_gradient_(field, stage.spread)
             optimizer.step()
             if clock.step % SMOOTH_EVERY == 0 and not stage.refit:
-                smooth_touched_(field, stage, SMOOTH_EVERY)
+                descent.smooth_touched_(field, stage, SMOOTH_EVERY)
 
             # Held-out pixels, the report, a checkpoint
             if plateau.due(done):
@@ -195,12 +187,12 @@ def build_optimizer(scene: Scene, refit: bool) -> RowAdam:
         poses = [scene.poses.steps]
     return RowAdam(
         [
-            {"params": [field.sdf], "eps": EPS_SDF},
-            {"params": [field.features, table], "eps": EPS_FEATURES},
+            {"params": [field.sdf], "eps": descent.EPS_SDF},
+            {"params": [field.features, table], "eps": descent.EPS_FEATURES},
             {"params": [p for net in networks for p in net.parameters() if p is not table]},
             {"params": poses},
         ],
-        betas=MOMENTS,
+        betas=descent.MOMENTS,
     )
 
 

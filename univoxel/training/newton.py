@@ -21,18 +21,7 @@ from univoxel.render.observations import (
     prefiltered_roughness,
 )
 from univoxel.scene import Scene
-from univoxel.training.equations import (
-    EliminatedAlbedo,
-    LinearTransport,
-    RoughnessStep,
-    ViewDifferences,
-    graph_laplacian,
-    normal_equations,
-    roughness_terms,
-    solve_damped,
-    view_differences,
-    view_equations,
-)
+from univoxel.training import equations
 
 # Observations that a point needs: in a single one its colour explains everything
 MIN_VIEWS = 2
@@ -104,7 +93,7 @@ class NewtonPoints:
         for name in self.ARRAYS:
             setattr(self, name, getattr(self, name)[kept])
 
-    def transport(self, part: Tensor, roughness_step: float = 0.0) -> LinearTransport:
+    def transport(self, part: Tensor, roughness_step: float = 0.0) -> equations.LinearTransport:
         """Of a part, where its roughness is larger by the step."""
         roughness = self.roughness[part] + roughness_step
         roughness = prefiltered_roughness(roughness, self.problem.nodes)
@@ -113,19 +102,21 @@ class NewtonPoints:
         return linear_transport(self.problem, point, observation, roughness, metal)
 
     def equations(
-        self, part: Tensor, differences: ViewDifferences | None
-    ) -> tuple[Tensor, Tensor, EliminatedAlbedo]:
+        self, part: Tensor, differences: equations.ViewDifferences | None
+    ) -> tuple[Tensor, Tensor, equations.EliminatedAlbedo]:
         """Of a part under the present map, see `normal_equations`."""
         sky, cauchy = self.problem.sky.radiance, CAUCHY
         state = self.transport(part), sky, self.log_albedo[part], cauchy, differences
         if not self.prior_weight:
-            return normal_equations(*state)
+            return equations.normal_equations(*state)
         step = ROUGHNESS_STEP
         deviation = (self.roughness - self.prior_roughness)[part]
         rougher = self.transport(part, step)
-        return normal_equations(*state, RoughnessStep(rougher, step, self.prior_weight, deviation))
+        return equations.normal_equations(
+            *state, equations.RoughnessStep(rougher, step, self.prior_weight, deviation)
+        )
 
-    def step_(self, eliminated: list[EliminatedAlbedo], light_step: Tensor) -> None:
+    def step_(self, eliminated: list[equations.EliminatedAlbedo], light_step: Tensor) -> None:
         """Change albedo and roughness as it belongs to a step of the light [3, D + B]."""
         steps = zip(*(e.back_substituted(light_step) for e in eliminated), strict=True)
         to_albedo, to_roughness = (torch.cat(x) for x in steps)
@@ -171,14 +162,16 @@ def newton_round_(
         part_seconds = max(part_end - part_begin, 1e-6)
         parts_in_time = (seconds - (part_end - begin)) / (cfg.newton_steps * part_seconds)
         points.keep_(max(MIN_PARTS, int(parts_in_time)))
-    laplacian = cfg.newton_smooth * graph_laplacian(problem.sky.direction, NODE_NEIGHBOURS)
+    laplacian = cfg.newton_smooth * equations.graph_laplacian(
+        problem.sky.direction, NODE_NEIGHBOURS
+    )
     costs = []
     for _ in range(cfg.newton_steps):
-        differences = view_differences(scene)
+        differences = equations.view_differences(scene)
         if differences is not None and differences.basis is not None:
             if not views_step_(scene, points, differences, cfg.newton_smooth):
                 return NewtonRound(costs, [UNSOLVABLE])
-            differences = view_differences(scene)
+            differences = equations.view_differences(scene)
         sun, damping = decisions.sun, cfg.newton_smooth
         cost = map_step_(scene, points, differences, sun, laplacian, damping)
         if cost is None:
@@ -234,7 +227,7 @@ def in_parts(point: Tensor, metal: Tensor) -> tuple[Tensor, list[Tensor]]:
 def map_step_(
     scene: Scene,
     points: NewtonPoints,
-    differences: ViewDifferences | None,
+    differences: equations.ViewDifferences | None,
     sun: Tensor | None,
     laplacian: Tensor,
     damping: float,
@@ -267,14 +260,14 @@ def map_step_(
     for part in points.parts:  # added up at once: all would take much memory
         hessian, gradient, albedo = points.equations(part, differences)
         if albedo.roughness is not None:
-            hessian_part, gradient_part = roughness_terms(albedo.roughness)
+            hessian_part, gradient_part = equations.roughness_terms(albedo.roughness)
             coupling, gradient = coupling + hessian_part / count, gradient - gradient_part
         system, right_side = system + hessian / count, right_side + gradient / count
         eliminated.append(albedo)
     system.diagonal(dim1=1, dim2=2).add_(damping)
     if points.prior_weight:
         system, right_side = torch.block_diag(*system) - coupling, right_side.flatten()
-    step = solve_damped(system, right_side)
+    step = equations.solve_damped(system, right_side)
     if step is None:
         return None
     limit = MAX_MAP_CHANGE
@@ -288,7 +281,7 @@ def map_step_(
 
 
 def views_step_(
-    scene: Scene, points: NewtonPoints, differences: ViewDifferences, smooth: float
+    scene: Scene, points: NewtonPoints, differences: equations.ViewDifferences, smooth: float
 ) -> bool:
     """Change each view's gain and its change of the map by one step; return False if the equations
     have no solution and all stays.
@@ -302,13 +295,13 @@ def views_step_(
     hessian = gradient = torch.zeros(())
     for part in points.parts:
         state = points.transport(part), sky.radiance, points.log_albedo[part], CAUCHY
-        part_hessian, part_gradient = view_equations(*state, differences)
+        part_hessian, part_gradient = equations.view_equations(*state, differences)
         hessian, gradient = hessian + part_hessian / count, gradient + part_gradient / count
     weights = views.sky_weights - views.sky_weights.mean(0)  # [B, R, 3]
     weights = torch.nn.functional.pad(weights.permute(2, 0, 1), (0, 1))
     prior = VIEW_PRIOR * smooth
     hessian.diagonal(dim1=2, dim2=3).add_(prior)
-    step = solve_damped(hessian, gradient - prior * weights)
+    step = equations.solve_damped(hessian, gradient - prior * weights)
     if step is None:
         return False
     limit = MAX_MAP_CHANGE
@@ -319,7 +312,7 @@ def views_step_(
 
 def linear_transport(
     problem: JointProblem, point: Tensor, observation: Tensor, roughness: Tensor, metal: bool
-) -> LinearTransport:
+) -> equations.LinearTransport:
     """Of points [P], all of metal or none, in observations [P, V], with roughness [P]."""
     transport, observations = problem.transport, problem.observations
     count, views = observation.shape
@@ -342,7 +335,7 @@ def linear_transport(
         specular, by_base = specular_layer(brdf.F0), cosine
         factor = (1 - brdf.specular_albedo((normal * wo).sum(2), roughness[:, None])) / math.pi
     view = observations.view[observation]
-    return LinearTransport(
+    return equations.LinearTransport(
         from_map(problem, by_base * visibility, view),
         factor,
         from_map(problem, specular * visibility, view),

@@ -63,12 +63,7 @@ def comparable(photos: Photos) -> Tensor:
 
 
 def disagreement(
-    scene: Scene,
-    brightness: Tensor,
-    cameras: Cameras,
-    surface: Surface,
-    wo: Tensor,
-    pixels: Tensor,
+    scene: Scene, brightness: Tensor, cameras: Cameras, surface: Surface, wo: Tensor, pixels: Tensor
 ) -> Tensor:
     """How much the surface's patches differ between photographs: mean over rays, in [0, MOST].
 
@@ -134,12 +129,7 @@ def own_patches(
 
 
 def views_beside(
-    scene: Scene,
-    cameras: Cameras,
-    matrices: Tensor,
-    position: Tensor,
-    normal: Tensor,
-    view: Tensor,
+    scene: Scene, cameras: Cameras, matrices: Tensor, position: Tensor, normal: Tensor, view: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Views beside those that points [N, 3] are seen in: numbers [N, K], and whether they see the
     points too [N, K] bool; those that do come first.

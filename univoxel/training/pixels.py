@@ -13,7 +13,7 @@ from univoxel.config import StageConfig, TrainConfig
 from univoxel.core import memmap
 from univoxel.core.machine import Memory, memory
 from univoxel.data import Photos
-from univoxel.data.photos import decode
+from univoxel.data.photos import packed, packed_width
 from univoxel.errors import UserError
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
@@ -95,33 +95,6 @@ def _without(alpha: Tensor, doubted: Tensor) -> Tensor:
     for view in range(len(alpha)):
         result[view] = alpha[view].masked_fill(doubted[view], 0)
     return result
-
-
-def packed_width(photos: Photos) -> int:
-    """Numbers that `packed` makes of a pixel."""
-    return sum(-(-n * t.element_size() // 4) for n, t in ((3, photos.color), (1, photos.alpha)))
-
-
-def packed(photos: Photos, view: int, place: Tensor) -> Tensor:
-    """Stored colour and alpha of pixels [N, 2] (row, column) of a view, as int32 [N, 2] or, of
-    photographs in floating point, up to [N, 4]."""
-    row, column = place.unbind(1)
-    color, alpha = photos.color[view][row, column], photos.alpha[view][row, column, None]
-    return torch.cat([_as_int32(color), _as_int32(alpha)], 1)
-
-
-def unpacked(photos: Photos, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Linear straight colour [N, 3] and alpha [N] of what `packed` gave."""
-    split = packed_width(photos) - 1
-    color = rows[:, :split].contiguous().view(photos.color.dtype)[:, :3]
-    alpha = rows[:, split:].contiguous().view(photos.alpha.dtype)[:, 0]
-    return decode(color, alpha)
-
-
-def _as_int32(stored: Tensor) -> Tensor:
-    """The bytes of numbers [N, K], and zeros after them, as int32 [N, M]."""
-    raw = stored.contiguous().view(torch.uint8)
-    return torch.nn.functional.pad(raw, (0, -raw.shape[1] % 4)).view(torch.int32)
 
 
 # What a training will need, against what the machine leaves: said before the kernel says it.

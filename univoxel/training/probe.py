@@ -16,6 +16,7 @@ from univoxel.data import Photos
 from univoxel.fields.features import PER_LEVEL, Levels
 from univoxel.fields.field import hash_field
 from univoxel.fields.grid import fit_grid
+from univoxel.lights import SGConfig
 from univoxel.scene import Scene, SceneConfig
 from univoxel.training.clock import expected_seconds
 from univoxel.training.loop import run_stage
@@ -25,7 +26,7 @@ SECONDS = 1.0  # of steps that are measured
 WARM = 3  # steps before them, in which memory is allocated and tables are built
 # Trainings that are expected to take less are not worth a second of measuring
 WORTH = 20.0
-STAGE = StageConfig(voxels=0.25, iterations=1000, share=1.0, rays=1024, physical_from=0.0)
+STAGE = StageConfig(0.25, 1000, share=1.0, rays=1024, physical_from=0.0, patches_from=1.0)
 # Seconds of a step of it on the machine that `expected_seconds` is of
 REFERENCE = 0.0315
 VIEWS, SIZE, RADIUS = 8, 64, 0.5  # photographs, their sides in pixels, the sphere's radius
@@ -68,7 +69,7 @@ def _sphere() -> tuple[Photos, Scene]:
 
     side = torch.full((3,), 1.2 * RADIUS)
     grid = fit_grid(-side, side, round(1e6 * STAGE.voxels))
-    config = SceneConfig()
+    config = SceneConfig(light=SGConfig(directions=128))
     levels = Levels.of(grid.bounds(), grid.voxel_size, config.channels // PER_LEVEL)
     return photos, Scene(config, hash_field(grid, levels, grid.nodes().norm(dim=-1) - RADIUS))
 

@@ -187,10 +187,7 @@ class Progress:
         """Move the bar."""
         times = f"{_clock(self.clock.seconds)} gone, {_clock(self.clock.remaining)} left "
         self._bar.update(
-            self._task,
-            completed=self.clock.share_done,
-            description=what,
-            facts=facts + times,
+            self._task, completed=self.clock.share_done, description=what, facts=facts + times
         )
 
     def state(self) -> dict[str, Any]:

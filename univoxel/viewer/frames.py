@@ -254,13 +254,7 @@ def _at(rays: Rays, index: Tensor) -> Rays:
 
 
 def _shadow(
-    subject: Subject,
-    look: Look,
-    rays: Rays,
-    hidden: Tensor,
-    samples: int,
-    bounces: int,
-    seed: int,
+    subject: Subject, look: Look, rays: Rays, hidden: Tensor, samples: int, bounces: int, seed: int
 ) -> Tensor:
     """What a floor under the object loses of its light: [N]."""
     return ground_shadow(

@@ -60,10 +60,7 @@ log: logging.Logger = logging.getLogger("univoxel")
 
 @contextlib.contextmanager
 def serving(
-    subject: Subject,
-    options: PageOptions | None = None,
-    host: str = HOST,
-    port: int = PORT,
+    subject: Subject, options: PageOptions | None = None, host: str = HOST, port: int = PORT
 ) -> Iterator[str]:
     """A block in which a viewer answers; gives its address. Nothing of it is left afterwards.
 
