@@ -129,11 +129,11 @@ def test_points_that_see_no_sky_are_as_their_neighbours():
 def test_fewer_than_half_of_the_voters_are_not_asked(monkeypatch):
     """Nor what is near them looked for, which takes most of the time where nothing mirrors."""
     scene, problem = under_fine_map(lambda n: n[:, 2] > 2, white)
-    asked = []
+    asked, neighbours = [], mirrors.neighbours
 
     def counted(key, count):
         asked.append(count)
-        return mirrors.neighbours(key, count)
+        return neighbours(key, count)
 
     monkeypatch.setattr(mirrors, "neighbours", counted)
     assert mirrors.find_mirrors(scene, problem) is None
