@@ -252,7 +252,7 @@ def prepare(
     begins("exposures", needed=True)
     say_clipped(photos)
     varying, gains = varying_and_gains(photos, hull, grid, cfg.scene.varying, cfg.exposures)
-    turntable = turntable_of(photos, hull, grid, cfg.light_frame)
+    turntable = turntable_of(photos, hull, grid, cfg.light_frame, gains)
     pinned = None
     if varying == "none" and turntable is None and begins(PINNED):
         pinned = find_pinned(silhouettes, photos.cameras, hull, grid)
