@@ -14,6 +14,7 @@ from univoxel.core.choices import (
     FIELDS,
     CamerasFrom,
     Capacity,
+    Detailing,
     FieldName,
     LightFrameOrAuto,
     MasksFrom,
@@ -38,6 +39,7 @@ CHOICES = (
         "cameras",
         "downscale",
         "capacity",
+        "detail",
     ),
     *("budget_mb", "changes"),
 )
@@ -220,6 +222,9 @@ class TrainConfig:
     # camera stood still too; auto: which of the two explains better how colours change from
     # photograph to photograph. scene.turntable then holds the axis
     light_frame: LightFrameOrAuto = "world"
+    # texture: after training, albedo comes from the photographs at their own size, where they show
+    # more than the grid holds
+    detail: Detailing = "none"
     # seconds, >= 0, that carving concavities before training may be expected to take on two cores,
     # or they are left alone: those that no silhouette shows, where photographs agree on them. Never
     # where their light varies, other than in exposure; 0: never
@@ -269,6 +274,7 @@ class TrainConfig:
         names = ("patience", "downscale", "voxel_pixels", "carving_seconds")
         check_fields(self, "at least 0", lambda x: 0 <= x < math.inf, *names)
         check_fields(self, "fixed or adaptive", lambda x: x in get_args(Capacity), "capacity")
+        check_fields(self, "none or texture", lambda x: x in get_args(Detailing), "detail")
         frames = get_args(LightFrameOrAuto)
         check_fields(self, "auto, world or turntable", lambda x: x in frames, "light_frame")
         check_fields(self, "auto or given", lambda x: x in get_args(MasksFrom), "masks")

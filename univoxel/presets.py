@@ -268,6 +268,7 @@ def _configuration(
         else "world",
         carving_seconds=CARVING * 60 * work.minutes,
         capacity=capacity,
+        detail="texture" if compared and light != "baked" else "none",
         scene=scene,
         loss=loss,
     )

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 import torch
@@ -22,19 +24,24 @@ from torch.nn.functional import interpolate, normalize
 
 from univoxel.camera import Cameras, pixel_rays, pixel_width, project, resize
 from univoxel.color import linear_to_srgb
+from univoxel.core.progress_bar import track
 from univoxel.core.records import Mesh
 from univoxel.data import Photos
+from univoxel.data.images import write_exr
 from univoxel.detail.texture import (
     LINEAR,
     Detail,
     Vertices,
     between,
     corner_weights,
+    load_detail,
     sampled,
     seen_from,
     split,
     vertices_of,
 )
+from univoxel.evaluation.measures import render_layers
+from univoxel.render.metrics import ssim
 from univoxel.render.pipeline import at_rays
 from univoxel.scene import Scene
 
@@ -257,3 +264,66 @@ def coherence(found: list[Likeness]) -> list[float]:
     """Cosine between pictures and photographs, octave by octave, the finest first, over all."""
     dot, own, photo = (sum(getattr(x, name) for x in found) for name in ("dot", "own", "photo"))
     return (dot / np.sqrt(np.maximum(own * photo, 1e-12))).tolist()
+
+
+@torch.no_grad()
+def measure_full_size(
+    scene: Scene, run: Path, test: Photos, train: Photos | None, save: Path | None
+) -> dict[str, float | None]:
+    """Novel views at the size of their photographs' files against these, by `FULL_MEASURES`.
+
+    Without detail in the run, and without files of the photographs, views are enlarged.
+
+    Args:
+        train: the photographs that views are put right by; None: none are.
+        save: folder for NAME_full.exr, the view as half floats: rgb.*, linear on black, and alpha.
+    """
+    detail = load_detail(run)
+    views = None if detail is None else DetailedViews(scene, detail, train)
+    found: tuple[list[Likeness], list[Likeness]] = ([], [])
+    similar: list[float] = []
+    for view in track(range(len(test) if test.readers else 0), "full size"):
+        photo = test.readers[view](1)
+        photo = LINEAR[photo.int()] if photo.dtype == torch.uint8 else photo
+        cameras = resize(test.cameras.of(torch.tensor([view])), photo.shape[1])
+        layers = render_layers(scene, test.cameras, view)
+        height, width = photo.shape[:2]
+        cover = _enlarged(test.picture(view)[1][..., None], width, height)[..., 0]
+        alpha = _enlarged(layers.alpha[..., None], width, height)[..., 0]
+        if views is None:
+            aided = alone = _enlarged(layers.rgb, width, height)
+        else:
+            aided, alone = views.render(cameras, 0, layers.rgb, layers.alpha)
+        both = torch.minimum(cover, alpha)
+        for measured, picture in zip(found, (aided, alone), strict=True):
+            if (likeness_ := likeness(picture, photo, both)) is not None:
+                measured.append(likeness_)
+        similar.append(ssim(linear_to_srgb(aided), linear_to_srgb(photo * cover[..., None])))
+        if save:
+            channels = {f"rgb.{c}": aided[..., k] for k, c in enumerate("RGB")}
+            write_exr(save / f"{test.names[view]}_full.exr", channels | {"alpha": alpha})
+    result: dict[str, float | None] = dict.fromkeys(FULL_MEASURES)
+    if similar:
+        result["full_ssim"] = fmean(similar)
+    for prefix, measured in zip(("full", "full_model"), found, strict=True):
+        if measured:
+            result[f"{prefix}_psnr"] = fmean(x.psnr for x in measured)
+            for k, value in enumerate(coherence(measured)):
+                result[f"{prefix}_coherence_{k + 1}"] = value
+    return result
+
+
+# By key: what the table says of it
+FULL_MEASURES = {
+    "full_psnr": "at full size: novel views, PSNR of the object after a gain per channel, dB",
+    "full_ssim": "at full size: SSIM",
+    **{
+        f"full_coherence_{k + 1}": f"at full size: coherence, octave {k + 1}"
+        for k in range(OCTAVES)
+    },
+    "full_model_psnr": "at full size, without photographs nearby: PSNR, dB",
+    **{
+        f"full_model_coherence_{k + 1}": f"at full size, without photographs nearby: octave {k + 1}"
+        for k in range(OCTAVES)
+    },
+}
