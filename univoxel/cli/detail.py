@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,7 +58,12 @@ def make(asked: DetailOptions) -> Path | None:
 
     run = Path(asked.run)
     data = None if asked.data is None else Path(asked.data)
-    return write(load_scene(run), photos_of(run, data, "train"), run, asked.size)
+    made = write(load_scene(run), photos_of(run, data, "train"), run, asked.size)
+    if made is None:
+        logging.getLogger("univoxel").info(
+            "%s gets no detail: its photographs show no more than its grid holds", run
+        )
+    return made
 
 
 command = make
@@ -96,8 +102,6 @@ def made_after_training(
     Args:
         until: time of `time.monotonic` at which training must have ended; None: there is no limit.
     """
-    import logging
-
     if detail == "none":
         return None
     log = logging.getLogger("univoxel")

@@ -62,7 +62,7 @@ class EvaluateOptions:
     does where light differs from photograph to photograph"""
 
     full_size: bool = False
-    """measure novel views at the size of the photographs' files too, with the run's detail: PSNR and
+    """measure novel views at the full size of the photographs too, with the run's detail: PSNR,
     SSIM, and how much of the photographs' detail they show, octave by octave"""
 
     def __post_init__(self) -> None:

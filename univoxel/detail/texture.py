@@ -148,6 +148,11 @@ def corner_weights(barycentric: Tensor) -> Tensor:
     return torch.cat([1 - barycentric.sum(1, keepdim=True), barycentric], 1)
 
 
+def linear(picture: Tensor) -> Tensor:
+    """A stored picture [..., 3], uint8 sRGB or float32 linear, as the latter."""
+    return LINEAR[picture.int()] if picture.dtype == torch.uint8 else picture
+
+
 def sampled(picture: Tensor, place: Tensor) -> Tensor:
     """Linear colours [N, 3] of a picture at places, bilinear in linear light.
 
@@ -163,8 +168,7 @@ def sampled(picture: Tensor, place: Tensor) -> Tensor:
     high = (place.amax(0).ceil().int() + 1).tolist()
     x, y = (min(max(n, 0), size - 1) for n, size in zip(low, (width, height), strict=True))
     part = picture[y : max(high[1], y + 1), x : max(high[0], x + 1)]
-    if part.dtype == torch.uint8:
-        part = LINEAR[part.int()]
+    part = linear(part)
     size = torch.tensor([part.shape[1], part.shape[0]])
     at = 2 * (place - torch.tensor([x, y])) / size - 1
     planes = part.movedim(-1, 0)[None]
@@ -283,7 +287,7 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     voxel, middle = scene.field.voxel_size, torch.stack(scene.field.bounds()).mean(0)
     pixel = pixel_width(photos.cameras, middle) / photos.downscale
     if not photos.readers or voxel < PIXELS_OF_VOXEL * pixel:
-        log.info("detail: none is made, photographs show no more than the grid holds")
+        log.debug("detail: none is made, photographs show no more than the grid holds")
         return None
     mesh = surface_of(scene, photos.cameras)
     mesh = simplify(mesh, min(FACES, len(mesh.faces)))
@@ -433,7 +437,7 @@ class _Baking:
         low, high = ((factor * x).int() for x in (pixel.amin(0).floor(), pixel.amax(0).ceil()))
         left, top = low.sub(2).clamp_min(0).tolist()
         right, bottom = high.add(2).tolist()
-        picture = LINEAR[self.photos.readers[view](1)[top:bottom, left:right].int()]
+        picture = linear(self.photos.readers[view](1)[top:bottom, left:right])
         alpha = self.photos.stored(view)[1]
         alpha = (alpha.float() / (255 if alpha.dtype == torch.uint8 else 1))[None, None]
         size = torch.tensor(cameras.size(view))

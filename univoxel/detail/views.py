@@ -29,11 +29,11 @@ from univoxel.core.records import Mesh
 from univoxel.data import Photos
 from univoxel.data.images import write_exr
 from univoxel.detail.texture import (
-    LINEAR,
     Detail,
     Vertices,
     between,
     corner_weights,
+    linear,
     load_detail,
     sampled,
     seen_from,
@@ -198,9 +198,7 @@ class DetailedViews:
 
 def _shrunk(picture: Tensor, scale: float) -> Tensor:
     """A stored picture [H, W, 3] of `scale` times the size, < 1, linear where it was not."""
-    planes = picture.movedim(-1, 0)
-    if picture.dtype == torch.uint8:
-        planes = LINEAR[planes.int()]
+    planes = linear(picture).movedim(-1, 0)
     small = interpolate(planes[None], scale_factor=scale, mode="bilinear", antialias=True)
     return small[0].movedim(0, -1)
 
@@ -283,8 +281,7 @@ def measure_full_size(
     found: tuple[list[Likeness], list[Likeness]] = ([], [])
     similar: list[float] = []
     for view in track(range(len(test) if test.readers else 0), "full size"):
-        photo = test.readers[view](1)
-        photo = LINEAR[photo.int()] if photo.dtype == torch.uint8 else photo
+        photo = linear(test.readers[view](1))
         cameras = resize(test.cameras.of(torch.tensor([view])), photo.shape[1])
         layers = render_layers(scene, test.cameras, view)
         height, width = photo.shape[:2]
