@@ -236,7 +236,7 @@ def likeness(picture: Tensor, photo: Tensor, cover: Tensor) -> Likeness | None:
     about 2^(k+1) to 2^(k+2) pixels.
     """
     edge = max(2, round(EDGE * cover.shape[1]))
-    inside = binary_erosion((cover > 0.99).numpy(), iterations=edge)
+    inside = np.asarray(binary_erosion((cover > 0.99).numpy(), iterations=edge), bool)
     if inside.sum() < 1000:
         return None
     rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
@@ -260,7 +260,7 @@ def likeness(picture: Tensor, photo: Tensor, cover: Tensor) -> Likeness | None:
 
 def coherence(found: list[Likeness]) -> list[float]:
     """Cosine between pictures and photographs, octave by octave, the finest first, over all."""
-    dot, own, photo = (sum(getattr(x, name) for x in found) for name in ("dot", "own", "photo"))
+    dot, own, photo = np.sum([(x.dot, x.own, x.photo) for x in found], 0)
     return (dot / np.sqrt(np.maximum(own * photo, 1e-12))).tolist()
 
 
