@@ -249,7 +249,7 @@ def likeness(picture: Tensor, photo: Tensor, cover: Tensor) -> Likeness | None:
     made = made * gain.astype(np.float32)
     psnr = -10 * np.log10(max(float(((truth - made)[inside] ** 2).mean()), 1e-12))
     sums = np.zeros((3, OCTAVES))
-    before = grey = [x @ np.float32([0.299, 0.587, 0.114]) for x in (truth, made)]
+    before = grey = [x @ np.array([0.299, 0.587, 0.114], np.float32) for x in (truth, made)]
     for k in range(OCTAVES):
         after = [gaussian_filter(x, FINEST * 2**k) for x in grey]
         one, two = ((b - a)[inside].astype(np.float64) for b, a in zip(before, after, strict=True))
