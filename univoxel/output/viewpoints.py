@@ -173,9 +173,9 @@ class Studio:
     def surface(self, view: int) -> tuple[Surface, Tensor]:
         """What a view shows, as of `surface_of_view`."""
         surface, wo = surface_of_view(self.scene, self.views, view)
-        if self.albedo_near is None:
-            return surface, wo
         there = surface.opacity > 0
+        if self.albedo_near is None or not there.any():
+            return surface, wo
         footprint = float(surface.depth[there].median() / self.views.focal[view].mean())
         met = at_rays(surface, there)
         albedo = surface.albedo.clone()
