@@ -19,12 +19,12 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 37_130,
+    "lines of the package": 38_300,
     "lines of the laboratory": 5_300,
-    "lines of tests": 36_760,
-    "modules of the package": 160,
+    "lines of tests": 36_960,
+    "modules of the package": 164,
     "loose modules at the top": 12,
-    "configuration fields": 128,
+    "configuration fields": 129,
     "fields that nothing sets": 0,
     "layers": 10,
     "imports that go up": 0,

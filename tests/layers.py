@@ -19,7 +19,7 @@ LAYERS = [
     {"preparation"},
     {"capture", "evaluation", "training"},
     {"output"},
-    {"batch", "viewer"},
+    {"batch", "detail", "viewer"},
     {"api", "cli"},
 ]
 

@@ -267,7 +267,7 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
 
 def test_eval(calls, capsys):
     options = ["--samples", "8", "--bounces", "0", "--test-every", "16"]
-    options += ["--background", "white", "--fit-light"]
+    options += ["--background", "white", "--fit-light", "--full-size"]
     paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
     named = [str(part) for name, path in paths.items() for part in (f"--{name}", path)]
     assert main(["eval", "run", *named, *options]) == 0
@@ -275,7 +275,9 @@ def test_eval(calls, capsys):
     default = {"data": None, "save": None, "json": None, "samples": 64, "bounces": 2}
     run = {"run": Path("run")}
     protocol = {"test_every": 16, "background": "white", "fit_light": True}
+    protocol |= {"full_size": True}
     default |= {"light_of": None, "test_every": None, "background": "black", "fit_light": False}
+    default |= {"full_size": False}
     assert "table of {'psnr': 31.25, 'views': 5}" in capsys.readouterr().out
     assert calls.noted == [
         ("evaluate", (), run | paths | {"samples": 8, "bounces": 0, "light_of": None} | protocol),
@@ -291,7 +293,7 @@ def test_relight_export_view_and_demo(calls, capsys):
     assert main(["view", "run", "--html", "mug.html", "--envmap", "maps/hall.exr"]) == 0
     assert main(["demo", "--out", "demo"]) == 0
     paths = (Path("run"), Path("maps/hall.exr"), Path("run/relight/hall"))
-    options = {"faces": None, "texture_size": 1024, "watertight": False, "texture_format": "png"}
+    options = {"faces": None, "texture_size": None, "watertight": False, "texture_format": "png"}
     options |= {"quality": 90, "size": None, "origin": "world", "lods": 0}
     chosen_options = {"texture_format": "jpeg", "quality": 80}
     chosen_options |= {"size": 0.3, "origin": "bottom", "lods": 1}

@@ -85,7 +85,7 @@ def test_a_command_is_one_file():
     names = {path.stem for path in (ROOT / "univoxel" / "cli").glob("*.py")}
     names -= {"__init__", "__main__", "parsing", "trainer"}
     commands = {"poses", "cutout", "train", "eval", "relight", "export", "envmap", "inspect"}
-    commands |= {"batch", "capture", "info", "demo", "doctor", "view", "report"}
+    commands |= {"batch", "capture", "info", "demo", "doctor", "view", "report", "detail"}
     assert names - {"evaluate"} | {"eval"} == commands == set(COMMANDS) - {"completion"}
 
 

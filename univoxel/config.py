@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from univoxel import __version__
-from univoxel.core.choices import CamerasFrom, Capacity, FieldName, LightFrameOrAuto, MasksFrom
+from univoxel.core.choices import (
+    CamerasFrom,
+    Capacity,
+    Detailing,
+    FieldName,
+    LightFrameOrAuto,
+    MasksFrom,
+)
 from univoxel.core.files import read_json, write_json
 from univoxel.core.validation import (
     EARLIER,
@@ -38,6 +45,7 @@ CHOICES = (
         "cameras",
         "downscale",
         "capacity",
+        "detail",
     ),
     *("budget_mb", "changes"),
 )
@@ -272,6 +280,11 @@ class TrainConfig:
         "what the light stands still in: the world of the cameras, or the room of a turntable, "
         "whose camera stood still too; auto: which of the two explains better how colours change "
         "from photograph to photograph. scene.turntable then holds the axis",
+    )
+    detail: Detailing = setting(
+        "texture",
+        "texture: after training, albedo comes from the photographs at their own size, where they "
+        "show more than the grid holds",
     )
     carving_seconds: float = setting(
         12.0,

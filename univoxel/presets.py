@@ -265,6 +265,10 @@ def _configuration(
         else "world",
         carving_seconds=CARVING * 60 * work.minutes,
         capacity=capacity,
+        # Of a look nobody waits for it
+        detail="texture"
+        if work.minutes > PRESETS["draft"].minutes and light != "baked"
+        else "none",
         scene=scene,
         loss=loss,
     )

@@ -14,6 +14,7 @@ from univoxel.errors import UserError
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from univoxel.data import Photos
     from univoxel.scene import Scene
 
 
@@ -48,6 +49,10 @@ class EvaluateOptions:
     fit_light: bool = False
     """render each novel view in the light in which it looks most like its photograph, as the field
     does where light differs from photograph to photograph"""
+
+    full_size: bool = False
+    """measure novel views at the full size of the photographs too, with the run's detail: PSNR,
+    SSIM, and how much of the photographs' detail they show, octave by octave"""
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.bounces < 0:
@@ -85,7 +90,9 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     Into the folder `save` go <name>.exr of each view, contact_sheet.png, and trust.txt, what is
     weakly determined. The channels are half floats: rgb.*, albedo.* and relit_<map>.* linear,
     composited on black, with the albedo as it is; roughness, normal.* (world), doubt.albedo and
-    doubt.roughness in [0, 1], 0 where nothing is; alpha; depth along -Z, 0 where nothing is. The
+    doubt.roughness in [0, 1], 0 where nothing is; alpha; depth along -Z, 0 where nothing is. With
+    `full_size` NAME_full.exr comes beside it, rgb.* and alpha at the size of the photograph, and
+    the keys of `univoxel.detail.views.FULL_MEASURES` are in the result. The
     file `json` holds the measures; `complete` and `verdict`, how training came out, None where that
     is not known; and the figures of trust.txt under the key trust.
 
@@ -134,6 +141,8 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
         "trust_spearman_roughness": doubt_correlation(found.roughness_doubts),
         **_costs(run, scene, report),
     }
+    if asked.full_size:
+        result |= _at_full_size(scene, run, data, photos, save)
     figures = views.say_trust(surveyed, report.get("troubles", []), save)
     if json:
         write_json(json, result | _verdict(run) | figures)
@@ -148,11 +157,33 @@ def table(result: dict[str, float | int | None]) -> Table:
 
     rows = Table("measure", "meaning", "value", title="Test views")
     rows.columns[2].justify = "right"
-    for key, meaning in MEASURES.items():
+    known = MEASURES
+    if "full_psnr" in result:
+        from univoxel.detail.views import FULL_MEASURES
+
+        known = MEASURES | FULL_MEASURES
+    for key, meaning in known.items():
         value = result[key]
         text = "-" if value is None else f"{value:.4g}" if isinstance(value, float) else f"{value}"
         rows.add_row(key, meaning, text)
     return rows
+
+
+def _at_full_size(
+    scene: Scene, run: Path, data: Path | None, photos: Photos, save: Path | None
+) -> dict[str, float | int | None]:
+    """Measures at the size of the photographs' files."""
+    import logging
+
+    from univoxel.detail.views import measure_full_size
+    from univoxel.run import photos_of
+
+    try:
+        train = photos_of(run, data, "train")
+    except (UserError, OSError) as error:  # views are the model's alone
+        logging.getLogger("univoxel").info("full size: no photographs nearby: %s", error)
+        train = None
+    return dict(measure_full_size(scene, run, photos, train, save))
 
 
 def _costs(run: Path, scene: Scene, report: dict) -> dict[str, float | int | None]:

@@ -13,6 +13,7 @@ from univoxel.errors import UserError
 
 if TYPE_CHECKING:
     from univoxel.core.records import Mesh
+    from univoxel.detail.texture import Detail
     from univoxel.output.mesh import Placement
     from univoxel.scene import Scene
 
@@ -39,7 +40,9 @@ class ExportOptions:
     """the file to write: .glb, .usdz and .obj hold textures, .ply materials at the vertices"""
     faces: Annotated[int | None, written("N", "20000 with textures, all without")] = None
     """most triangles, at least 4"""
-    texture_size: Annotated[int, written("TEXELS")] = choices.TEXTURE_SIZE
+    texture_size: Annotated[
+        int | None, written("TEXELS", "what the photographs resolve, 1024 without detail")
+    ] = None
     """width of the square textures, a power of 2 up to 4096"""
     watertight: bool = False
     """close holes, or fail"""
@@ -61,7 +64,7 @@ class ExportOptions:
             raise UserError(f"export: faces must be at least 4, got {self.faces}", "faces")
         low, high = TEXTURE_SIZES
         size = self.texture_size
-        if not low <= size <= high or size & (size - 1):
+        if size is not None and (not low <= size <= high or size & (size - 1)):
             raise UserError(
                 f"export: texture_size must be a power of 2 from {low} to {high}, got {size}",
                 "texture_size",
@@ -119,6 +122,7 @@ def export(asked: ExportOptions) -> list[Path]:
         MissingExtra: .usdz without usd-core.
         OSError: a file cannot be written.
     """
+    from univoxel.detail.texture import load_detail
     from univoxel.output.mesh import placement_of
     from univoxel.output.mesh_files import require_usd
     from univoxel.output.surface import cameras_of, surface_of
@@ -134,7 +138,12 @@ def export(asked: ExportOptions) -> list[Path]:
     if suffix == ".usdz":
         require_usd()
     run = Path(asked.run)
-    scene = load_scene(run)
+    scene, detail = load_scene(run), load_detail(run)
+    widest = asked.texture_size
+    if widest is None:
+        widest = choices.TEXTURE_SIZE
+        if detail is not None:
+            widest = min(len(detail.albedo), TEXTURE_SIZES[1])
     surface = surface_of(scene, cameras_of(scene, run))
     if asked.watertight:
         surface = close(surface)
@@ -151,27 +160,36 @@ def export(asked: ExportOptions) -> list[Path]:
         if placement is None:  # all levels where the finest lies
             placement = placement_of(reduced.vertices, asked.size, asked.origin)
         written.append(level_path(mesh, level))
-        size = max(asked.texture_size >> level, TEXTURE_SIZES[0])
-        _write(written[-1], scene, reduced, placement, size, asked.jpeg)
+        size = max(widest >> level, TEXTURE_SIZES[0])
+        _write(written[-1], scene, reduced, placement, size, asked.jpeg, detail)
     return written
 
 
 def _write(
-    path: Path, scene: Scene, surface: Mesh, placement: Placement, size: int, jpeg: int | None
+    path: Path,
+    scene: Scene,
+    surface: Mesh,
+    placement: Placement,
+    size: int,
+    jpeg: int | None,
+    detail: Detail | None,
 ) -> None:
     """Write a surface, given in the scene's world, as its file's name says."""
     from univoxel.output.mesh import bake, placed, with_materials
     from univoxel.output.mesh_files import write_glb, write_obj, write_ply, write_usdz
 
+    if path.suffix.lower() == ".ply":
+        write_ply(path, placed(with_materials(scene, surface), placement))
+        return
+    albedo_near = None if detail is None else detail.near
+    mesh = placed(bake(scene, surface, size, albedo_near), placement)
     match path.suffix.lower():
         case ".glb":
-            write_glb(path, placed(bake(scene, surface, size), placement), jpeg)
+            write_glb(path, mesh, jpeg)
         case ".usdz":
-            write_usdz(path, placed(bake(scene, surface, size), placement), jpeg)
+            write_usdz(path, mesh, jpeg)
         case ".obj":
-            write_obj(path, placed(bake(scene, surface, size), placement), jpeg)
-        case ".ply":
-            write_ply(path, placed(with_materials(scene, surface), placement))
+            write_obj(path, mesh, jpeg)
 
 
 command = export

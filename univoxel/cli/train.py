@@ -43,6 +43,10 @@ class TrainOptions:
     what explains the photographs better"""
     metal: choices.Metal = "auto"
     """all, if the whole object is metal, patina included; some, if not; auto decides it"""
+    detail: choices.DetailingOrAuto = "auto"
+    """texture takes the albedo from the photographs at their own size, once the rest is trained,
+    where they show more than the grid holds; none leaves it to the grid; auto is texture, but none
+    for draft and for the light baked"""
     masks: choices.MasksFrom = "auto"
     """auto takes masks in that end outside of the object, as the photographs show it"""
     cameras: choices.CamerasFrom = "auto"
@@ -99,6 +103,8 @@ class TrainOptions:
         config = chosen(self.preset, self.minutes, *where, self.light, self.varying)
         config = replace(config, masks=self.masks, cameras=self.cameras)
         config = with_metal(with_field(config, self.field), self.metal)
+        if self.detail != "auto":
+            config = replace(config, detail=self.detail)
         if self.light_frame != "auto":
             config = replace(config, light_frame=self.light_frame)
         fits = self.budget_mb is not None and self.capacity == "auto"

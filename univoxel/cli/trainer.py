@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from univoxel import config, lights
+from univoxel.cli.detail import made_after_training, minutes_left
 from univoxel.core import memmap
 from univoxel.core.files import write_text
 from univoxel.core.progress_bar import duration
@@ -46,6 +48,7 @@ log: logging.Logger = logging.getLogger("univoxel")
 
 # Of preparation, a million pixels that are trained on, on two quiet cores of a Xeon
 PREPARATION_SECONDS = 1.0
+SLACK = 0.05  # of a limit that training may take of what detail was left
 
 
 def train(
@@ -106,10 +109,13 @@ def _train(
     begun = resumed(cfg) if resume else None
     state = begun[1] if begun else {}
     (cfg.out / VERDICT).unlink(missing_ok=True)  # of a run that goes on
+    shutil.rmtree(cfg.out / "detail", ignore_errors=True)  # as well
 
     begin -= state.get("seconds", 0.0)
     told = _told(spectators, on_progress)
-    with Progress(cfg, begin, state, told, slowdown(cfg)) as progress:
+    left = minutes_left(cfg.minutes, photos, cfg.detail, torch.get_num_threads())
+    timed = replace(cfg, minutes=left)
+    with Progress(timed, begin, state, told, slowdown(timed)) as progress:
         announce(progress, photos)
         silhouettes = find_silhouettes(photos, cfg, progress.preparing)
         pixels = split_pixels(silhouettes.photos, silhouettes.distance, silhouettes.doubted)
@@ -142,6 +148,10 @@ def _train(
     verdict = judge(evidence(scene, pixels, progress, surveyed))
     save_verdict(verdict, cfg.out)
     save_trust(verdict, surveyed, progress.troubles, cfg)
+    until = (
+        None if cfg.minutes is None or left is None else begin + 60 * (left + SLACK * cfg.minutes)
+    )
+    made_after_training(scene, pixels.photos, cfg.out, cfg.detail, until)
     for choice in progress.chosen:
         log.info(choice.sentence)
     return cfg.out

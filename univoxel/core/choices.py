@@ -17,6 +17,8 @@ Differing: TypeAlias = Literal["auto", "none", "exposure", "light"]
 LightFrame: TypeAlias = Literal["world", "turntable"]
 Metal: TypeAlias = Literal["auto", "all", "some"]
 LightFrameOrAuto: TypeAlias = Literal["auto", "world", "turntable"]
+Detailing: TypeAlias = Literal["none", "texture"]  # from photographs at their own size
+DetailingOrAuto: TypeAlias = Literal["auto", "none", "texture"]
 FIELDS: tuple[FieldName, ...] = get_args(FieldName)
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
 

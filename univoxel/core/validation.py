@@ -47,7 +47,7 @@ RETIRED: dict[str, frozenset[str]] = {
 # the field had when versions up to 0.2 wrote files
 EARLIER: dict[str, dict[str, Any]] = {
     "TrainConfig": {"scene": {}, "masks": "given", "cameras": "given", "exposures": False}
-    | {"light_frame": "world", "carving_seconds": 0.0, "capacity": "fixed"},
+    | {"light_frame": "world", "detail": "none", "carving_seconds": 0.0, "capacity": "fixed"},
     "StageConfig": {"sharpness": [0.5, 0.5], "lr_sdf": [0.2, 0.02], "lr_networks": [3e-3, 3e-4]}
     | {"physical_from": 1.0, "patches_from": 1.0, "field": "dense"},
     "JointConfig": {"iterations": 700, "share": 0.4, "rays": 4096, "points": 20000}

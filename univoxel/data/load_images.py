@@ -9,7 +9,7 @@ from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from statistics import median
 
@@ -131,7 +131,28 @@ def read_shots(
         about=f"{folder}: {kind}, {', '.join([*told, *remarks])}",
         downscale=factor,
         origin=origin,
+        readers=tuple(
+            partial(_reread, shot, pinhole) for shot, pinhole in zip(shots, pinholes, strict=True)
+        ),
     )
+
+
+def _reread(shot: Shot, pinhole: Lens, factor: int) -> Tensor:
+    """Stored colour [H // factor, W // factor, 3] of a photograph's file, without its mask.
+
+    Raises:
+        DataError: it cannot be read any more, or has another size.
+    """
+    color, alpha = read_photo(shot.image, masks=False)
+    if color.shape[:2] != (shot.lens.height, shot.lens.width):
+        raise DataError(
+            f"{shot.image}: expected {shot.lens.width}x{shot.lens.height} pixels as when it was "
+            f"first read, got {size_of(color)}"
+        )
+    if factor == 1 and not shot.lens.bent:
+        return color
+    grid = sources(shot.lens, pinhole) if shot.lens.bent else None
+    return resampled(color, alpha, factor, grid)[0]
 
 
 def fitting_downscale(shots: Sequence[Shot]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,6 +27,9 @@ class Photos:
     about: str = ""  # what was read and how, for people
     downscale: int = 1  # pixels of the files along a side of one of these
     origin: str = ""  # of pixels that are not those of the files, as of `image_cache.origin_of`
+    # Read the file of each photograph again, shrunk to 1/factor: stored colour [H, W, 3], as its
+    # pinhole sees it. Empty where photographs are from no files
+    readers: tuple[Callable[[int], Tensor], ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -37,8 +41,11 @@ class Photos:
     def of(self, views: Tensor) -> Photos:
         """Those of some views [K] int64."""
         names = [self.names[view] for view in views.tolist()]
-        color, alpha = self.color[views], self.alpha[views]
-        return replace(self, names=names, color=color, alpha=alpha, cameras=self.cameras.of(views))
+        color, alpha, cameras = self.color[views], self.alpha[views], self.cameras.of(views)
+        readers = tuple(self.readers[view] for view in views.tolist() if self.readers)
+        return replace(
+            self, names=names, color=color, alpha=alpha, cameras=cameras, readers=readers
+        )
 
     def coverage(self) -> Tensor:
         """Alpha of all pixels [V, H, W], float32 in [0, 1]; 0 beyond a picture."""

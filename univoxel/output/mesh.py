@@ -4,8 +4,9 @@ into it, and where it lies."""
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -22,6 +23,10 @@ from univoxel.core.records import FieldSample, Mesh
 from univoxel.errors import UserError
 from univoxel.fields.field import Field
 from univoxel.scene import Scene
+
+# Linear albedo [N, 3] of points of the surface [N, 3], of their unit normals [N, 3], the field's
+# albedo there [N, 3], and the width in world units of what is asked for
+AlbedoNear: TypeAlias = Callable[[Tensor, Tensor, Tensor, float], Tensor]
 
 # glTF and USD look along -Z with +Y up, our world has +Z up: (x, y, z) -> (x, z, -y), a quarter
 # turn.
@@ -303,13 +308,18 @@ def with_materials(scene: Scene, mesh: Mesh) -> Mesh:
 
 
 @torch.no_grad()
-def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
+def bake(
+    scene: Scene, mesh: Mesh, size: int, albedo_near: AlbedoNear | None = None
+) -> TexturedMesh:
     """Textures of size x size texels for a mesh near the scene's surface.
 
     Each texel's centre is a point of its triangle; the field at the surface beside it gives normal
     and materials. So relief that the triangles are too coarse for lies in the texture.
     Texels outside of the charts copy the nearest inside. Where the mesh is not seen it is smooth,
     and has no relief.
+
+    Args:
+        albedo_near: what gives the albedo, in place of the field.
 
     Raises:
         ValueError: no texel lies in a triangle.
@@ -321,6 +331,7 @@ def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
     if not len(texel):
         raise UserError(f"a texture of {size} x {size} is too small for {len(faces)} faces")
     seen = None if mesh.seen is None else mesh.seen[source]
+    footprint = _texel(mesh, len(texel))
     parts, known = [], surface_beside(scene.field, mesh)
     for some, w in zip(face.split(POINTS_AT_ONCE), weight.split(POINTS_AT_ONCE), strict=True):
         corner = faces[some].long()
@@ -328,15 +339,25 @@ def bake(scene: Scene, mesh: Mesh, size: int) -> TexturedMesh:
             torch.einsum("mk,mkc->mc", w, values[corner])
             for values in (vertices, normals, tangents)
         )
-        _, at = nearest_surface(scene.field, point, known)
+        place, at = nearest_surface(scene.field, point, known)
         relief = in_frame(at.gradient, n, t)
         if seen is not None:
             relief = _fading(relief, (w * seen[corner]).sum(1))
-        parts.append((relief, *scene.material(at.features)))
+        albedo, *others = scene.material(at.features)
+        if albedo_near is not None:
+            albedo = albedo_near(place, _unit(at.gradient), albedo, footprint)
+        parts.append((relief, albedo, *others))
     place = dilated(texel, size)
     *rest, metallic = (torch.cat(p)[place] for p in zip(*parts, strict=True))
     metal = metal_or_none(metallic)
     return TexturedMesh(vertices, faces, normals, tangents, uv, *rest, metallic=metal, seen=seen)
+
+
+def _texel(mesh: Mesh, texels: int) -> float:
+    """World units along a side of one of so many texels on a mesh."""
+    corner = mesh.vertices[mesh.faces.long()]
+    area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    return float((0.5 * area.norm(dim=1).sum() / texels).sqrt())
 
 
 def _fading(relief: Tensor, seen: Tensor) -> Tensor:

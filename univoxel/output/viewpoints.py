@@ -18,8 +18,9 @@ from univoxel.data import load_cameras
 from univoxel.envmap import read_map
 from univoxel.errors import UserError
 from univoxel.ops import PointLight, Sun
+from univoxel.output.mesh import AlbedoNear
 from univoxel.render import relight
-from univoxel.render.pipeline import extract_mesh, surface_of_view
+from univoxel.render.pipeline import at_rays, extract_mesh, surface_of_view
 from univoxel.run import photos_of
 from univoxel.scene import Scene, load_scene
 
@@ -155,6 +156,19 @@ class Studio:
     traced: relight.TracedMesh
     names: list[str]  # of the views
     views: Cameras
+    albedo_near: AlbedoNear | None = None  # what gives the albedo, in place of the field
+
+    def surface(self, view: int) -> tuple[Surface, Tensor]:
+        """What a view shows, as of `surface_of_view`."""
+        surface, wo = surface_of_view(self.scene, self.views, view)
+        there = surface.opacity > 0
+        if self.albedo_near is None or not there.any():
+            return surface, wo
+        footprint = float(surface.depth[there].median() / self.views.focal[view].mean())
+        met = at_rays(surface, there)
+        albedo = surface.albedo.clone()
+        albedo[there] = self.albedo_near(met.position, met.normal, met.albedo, footprint)
+        return replace(surface, albedo=albedo), wo
 
 
 def open_studio(
@@ -178,7 +192,7 @@ def pictures_of(
     seen: tuple[int, Surface, Tensor] | None = None
     for number, frame in enumerate(frames):
         if seen is None or seen[0] != frame.view:
-            seen = (frame.view, *surface_of_view(studio.scene, studio.views, frame.view))
+            seen = (frame.view, *studio.surface(frame.view))
         yield (
             frame,
             relight.render_picture(

@@ -1,0 +1,172 @@
+"""A print on a ball that is finer than the grid comes back from photographs, without light."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from analytic import cameras_around
+from asymmetric_scene import lopsided
+from torch.nn.functional import normalize
+
+from univoxel.camera import image_rays
+from univoxel.cli import main
+from univoxel.color import linear_to_srgb
+from univoxel.core.records import Surface
+from univoxel.data import Photos
+from univoxel.detail import texture
+from univoxel.detail.texture import load_detail, make_detail, save_detail
+from univoxel.detail.views import DetailedViews, coherence, likeness
+from univoxel.errors import DataError
+from univoxel.output.mesh import bake
+from univoxel.output.surface import surface_of
+from univoxel.render.pipeline import shade, shade_hits, surface_of_view
+from univoxel.scene import load_checkpoint, save_scene
+
+RADIUS, SIZE, VIEWS = 0.4, 240, 12
+EVEN = torch.tensor([0.4, 0.32, 0.2])  # what the model has for albedo
+
+
+def printed(points):
+    """Waves of 0.07, where the grid has voxels of 0.06: a period is 6 pixels."""
+    x, y, z = (90 * points).unbind(-1)
+    wave = (x + y).sin() * (y - z).sin()
+    return (0.4 + 0.25 * wave)[..., None] * torch.tensor([1.0, 0.8, 0.5])
+
+
+def photograph(scene, cameras, view, paint=printed):
+    """Linear colours [H, W, 3] of the painted ball in the scene's own light, and where it is."""
+    rays = image_rays(cameras, view)
+    along = -(rays.origin * rays.direction).sum(1)
+    nearest = rays.origin + along[:, None] * rays.direction
+    inside = RADIUS**2 - nearest.square().sum(1)
+    hit = inside > 0
+    depth = along - inside.clamp_min(0).sqrt()
+    place = (rays.origin + depth[:, None] * rays.direction)[hit]
+    at = scene.field.sample(place)
+    _, roughness, metallic = scene.material(at.features)
+    surface = Surface(
+        position=place,
+        normal=normalize(place, dim=1),
+        features=at.features,
+        albedo=paint(place),
+        roughness=roughness,
+        opacity=torch.ones(len(place)),
+        depth=depth[hit],
+        metallic=metallic,
+    )
+    rgb = torch.zeros(len(hit), 3)
+    rgb[hit] = shade(scene, surface, -rays.direction[hit])
+    return rgb.reshape(SIZE, SIZE, 3), hit.reshape(SIZE, SIZE)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A ball whose albedo is even: the grid holds none of the print. It shines."""
+    made = lopsided(16**3, change=lambda nodes, _: nodes.norm(dim=-1) - RADIUS)
+    with torch.no_grad():
+        made.field.features[..., :3] = EVEN
+        made.field.features[..., 3] = 0.35
+    return made
+
+
+@pytest.fixture(scope="module")
+@torch.no_grad()
+def photos(scene):
+    """In files they are as large as those that training had."""
+    cameras = cameras_around(VIEWS + 1, SIZE)
+    cameras = replace(cameras, focal=1.8 * cameras.focal)
+    pictures, masks = zip(*(photograph(scene, cameras, v) for v in range(VIEWS + 1)), strict=True)
+    color = (255 * linear_to_srgb(torch.stack(pictures))).round().to(torch.uint8)
+    alpha = 255 * torch.stack(masks).to(torch.uint8)
+    readers = tuple(lambda factor, v=v: color[v] for v in range(VIEWS + 1))
+    names = [str(v) for v in range(VIEWS + 1)]
+    return Photos(Path(), names, color, alpha, cameras, readers=readers)
+
+
+@pytest.fixture(scope="module")
+def detail(scene, photos):
+    made = make_detail(scene, photos.of(torch.arange(VIEWS)), 1024)
+    assert made is not None
+    return made
+
+
+def test_the_print_comes_back_without_light(scene, detail):
+    """The model has none of it; highlights, which the model has, are not painted on."""
+    generator = torch.Generator().manual_seed(0)
+    way = normalize(torch.randn(4000, 3, generator=generator), dim=1)
+    found = detail.near(RADIUS * way, way, EVEN.expand(4000, 3), 0.0)
+    true = printed(RADIUS * way)
+    one, two = (x[:, 0] - x[:, 0].mean() for x in (found, true))
+    assert (one * two).sum() / (one.norm() * two.norm()) > 0.97
+    # With the highlights left on it the ball would be brighter by 0.048, measured so
+    assert abs(float((found - true).mean())) < 0.01
+
+
+def test_novel_views_show_it(scene, photos, detail):
+    """The last photograph was not looked at; the model's own view of it has no detail at all."""
+    views = DetailedViews(scene, detail, photos.of(torch.arange(VIEWS)))
+    surface, wo = surface_of_view(scene, photos.cameras, VIEWS)
+    coarse = shade_hits(scene, surface, wo).reshape(SIZE, SIZE, 3)
+    opacity = surface.opacity.reshape(SIZE, SIZE)
+    aided, alone = views.render(photos.cameras, VIEWS, coarse, opacity)
+    photo, cover = photos.picture(VIEWS)
+    before, *after = (likeness(x, photo, cover) for x in (coarse, alone, aided))
+    assert before is not None
+    assert coherence([before])[1] < 0.3
+    for found in after:
+        assert found is not None
+        assert coherence([found])[1] > 0.85
+        assert found.psnr > before.psnr + 3
+
+
+def test_exported_textures_hold_it(scene, detail):
+    mesh = surface_of(scene)
+    size = 512
+    even, fine = bake(scene, mesh, size), bake(scene, mesh, size, detail.near)
+    assert even.albedo.std((0, 1)).max() < 1e-3
+    assert fine.albedo[..., 0].std() > 0.8 * printed(torch.randn(9999, 3))[:, 0].std()
+    assert torch.equal(even.relief, fine.relief)
+
+
+def test_none_is_made_where_photographs_show_no_more(scene, photos, monkeypatch):
+    monkeypatch.setattr(texture, "PIXELS_OF_VOXEL", 1000.0)
+    assert make_detail(scene, photos) is None
+
+
+def test_none_is_made_where_held_out_photographs_are_no_better(scene, photos):
+    """The ball as the model has it, under noise that differs from one photograph to the next."""
+    generator = torch.Generator().manual_seed(0)
+
+    def even(place):
+        return EVEN.expand(len(place), 3)
+
+    def noisy(view):
+        picture, _ = photograph(scene, photos.cameras, view, even)
+        return picture * (0.5 + torch.rand(picture.shape, generator=generator))
+
+    with torch.no_grad():
+        pictures = [noisy(view) for view in range(len(photos))]
+    readers = tuple(lambda factor, v=v: pictures[v] for v in range(len(photos)))
+    assert make_detail(scene, replace(photos, readers=readers), 256) is None
+
+
+def test_files_of_another_checkpoint_are_refused(tiny_copy, detail, capsys):
+    run = tiny_copy / "run"
+    assert load_detail(run) is None
+    save_detail(detail, run)
+    again = load_detail(run)
+    assert again is not None
+    for name in ("vertices", "faces", "corners", "uv", "albedo"):
+        assert torch.equal(getattr(again, name), getattr(detail, name))
+    mesh = tiny_copy / "mesh.glb"
+    (run / "detail" / "albedo.png").rename(run / "detail" / "other.png")
+    with pytest.raises(DataError, match="damaged"):
+        load_detail(run)
+    (run / "detail" / "other.png").rename(run / "detail" / "albedo.png")
+    scene, state = load_checkpoint(run)
+    scene.inv_s *= 1.01
+    save_scene(scene, run, state)
+    capsys.readouterr()
+    assert main(["export", str(run), "--mesh", str(mesh)]) == 2
+    assert "another checkpoint" in capsys.readouterr().err

@@ -1,0 +1,115 @@
+"""The albedo of a trained run again, from its photographs at their own size."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from univoxel.cli.parsing import DataOf, Run, takes, written
+from univoxel.core.choices import Detailing
+from univoxel.errors import UserError
+
+if TYPE_CHECKING:
+    from univoxel.data import Photos
+    from univoxel.scene import Scene
+
+DETAIL_SIZES = (256, 8192)
+# What it takes on two quiet cores of a Xeon: charts, and a million pixels of photographs
+CHARTS_SECONDS, MEGAPIXEL_SECONDS = 12.0, 0.06
+MOST_OF_LIMIT = 0.25  # of the minutes that a training has
+
+
+@dataclass(frozen=True)
+class DetailOptions:
+    """Where detail comes from, and how fine it becomes.
+
+    Raises:
+        UserError: size out of range.
+    """
+
+    run: Run
+    """folder of a trained run"""
+    data: DataOf = None
+    """folder of the photographs, where they were moved"""
+    size: Annotated[int | None, written("TEXELS", "what photographs resolve")] = None
+    """width of the square texture, a power of 2 from 256 to 8192"""
+
+    def __post_init__(self) -> None:
+        low, high = DETAIL_SIZES
+        if self.size is not None and (not low <= self.size <= high or self.size & (self.size - 1)):
+            raise UserError(
+                f"detail: size must be a power of 2 from {low} to {high}, got {self.size}", "size"
+            )
+
+
+@takes(DetailOptions)
+def make(asked: DetailOptions) -> Path | None:
+    """Make the detail of a run, in RUN/detail; None, with a line, where its photographs have none.
+
+    Raises:
+        UserError: the run or its photographs cannot be read, or there is no surface.
+        OSError: it cannot be written.
+    """
+    from univoxel.run import photos_of
+    from univoxel.scene import load_scene
+
+    run = Path(asked.run)
+    data = None if asked.data is None else Path(asked.data)
+    made = write(load_scene(run), photos_of(run, data, "train"), run, asked.size)
+    if made is None:
+        logging.getLogger("univoxel").info(
+            "%s gets no detail: its photographs show no more than its grid holds", run
+        )
+    return made
+
+
+command = make
+
+
+def write(scene: Scene, photos: Photos, run: Path, size: int | None = None) -> Path | None:
+    """Make the detail of a scene and write it beside its checkpoint; what was there goes."""
+    import shutil
+
+    from univoxel.detail.texture import FOLDER, make_detail, save_detail
+
+    shutil.rmtree(run / FOLDER, ignore_errors=True)
+    detail = make_detail(scene, photos, size)
+    if detail is None:
+        return None
+    save_detail(detail, run)
+    return run / FOLDER
+
+
+def minutes_left(
+    minutes: float | None, photos: Photos, detail: Detailing, threads: int
+) -> float | None:
+    """Of a training's limit in minutes, what is left beside detail; None: it has no limit."""
+    if minutes is None or detail == "none" or photos.downscale == 1:
+        return minutes
+    pixels = float(photos.cameras.size_of_each().double().prod(1).sum()) * photos.downscale**2
+    seconds = CHARTS_SECONDS + MEGAPIXEL_SECONDS * pixels / 1e6
+    return minutes - min(seconds * 2 / (60 * max(threads, 1)), MOST_OF_LIMIT * minutes)
+
+
+def made_after_training(
+    scene: Scene, photos: Photos, run: Path, detail: Detailing, until: float | None
+) -> Path | None:
+    """`write`, where a configuration asks for it.
+
+    Args:
+        until: time of `time.monotonic` at which training must have ended; None: there is no limit.
+    """
+    if detail == "none":
+        return None
+    log = logging.getLogger("univoxel")
+    if until is not None and time.monotonic() > until:
+        log.info("detail: no time is left for it; make it with `univoxel detail %s`", run)
+        return None
+    try:
+        return write(scene, photos, run)
+    except (UserError, OSError, ValueError) as error:  # a run without it is one, too
+        log.warning("detail: none is made: %s", error)
+        return None

@@ -1,0 +1,326 @@
+"""Novel views at any size: the model's light on the texture, and what it leaves of the photographs
+that were taken nearby; and how much of the photographs' own detail they show.
+
+A view is albedo * A + B, as of `univoxel.detail.texture`, with the texture for albedo. What the
+model of light cannot say, such as how single fibres glitter, the nearest photographs do: each pixel
+is multiplied by (photo / prediction) of those, by how near their directions are. With
+no photograph near, that is 1.
+
+Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering", for the weights.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_erosion, gaussian_filter
+from torch import Tensor
+from torch.nn.functional import interpolate, normalize
+
+from univoxel.camera import Cameras, pixel_rays, pixel_width, project, resize
+from univoxel.color import linear_to_srgb
+from univoxel.core.progress_bar import track
+from univoxel.core.records import Mesh
+from univoxel.data import Photos
+from univoxel.data.images import write_exr
+from univoxel.detail.texture import (
+    Detail,
+    Vertices,
+    between,
+    corner_weights,
+    linear,
+    load_detail,
+    sampled,
+    seen_from,
+    split,
+    vertices_of,
+)
+from univoxel.evaluation.measures import render_layers
+from univoxel.render.metrics import ssim
+from univoxel.render.pipeline import at_rays
+from univoxel.scene import Scene
+
+NEAREST = 6  # photographs that a view is put right by
+# Weights fall to 1/e within 7 degrees; on captures photographs are some 10 degrees apart
+NARROW = 120.0
+NONE_NEAR = 1e-3  # weight, of 1 for a photograph of the same direction, that nothing is changed
+DARK = 0.01  # linear, added to both sides of ratios
+MOST = 10.0  # times that a ratio makes a pixel brighter or darker
+AT_ONCE = 1 << 18  # pixels: bounds memory
+SAME = 0.1  # by which sizes of pixels may differ
+KEPT = 8  # photographs in memory, 36 MB each where they have 12 megapixels
+
+
+@dataclass(frozen=True)
+class _Photo:
+    """What one photograph says, at its own size."""
+
+    picture: Tensor  # [H, W, 3] as stored
+    values: Tensor  # [P, 7] A, B and weight at the vertices
+    shown: Tensor  # [F] bool: faces none of whose corners are hidden
+
+
+class DetailedViews:
+    """Renders a scene with its detail."""
+
+    def __init__(self, scene: Scene, detail: Detail, photos: Photos | None = None) -> None:
+        """With the photographs that were trained on, or None: views are the model's alone."""
+        self.scene, self.detail = scene, detail
+        self.at: Vertices = vertices_of(scene, Mesh(detail.vertices, detail.faces))
+        self.photos = scene.registered(photos) if photos is not None and photos.readers else None
+        self._kept: OrderedDict[int, _Photo] = OrderedDict()
+        if self.photos is not None:
+            width = self.photos.readers[0](1).shape[1]
+            self.full: Cameras = resize(self.photos.cameras, width)
+            self._scale = 1.0  # of the photographs that are kept
+
+    @torch.no_grad()
+    def render(
+        self, cameras: Cameras, view: int, coarse: Tensor, opacity: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """A view, premultiplied and linear [H, W, 3], and the same by the model alone.
+
+        Args:
+            cameras: with pictures of the size that is asked for.
+            coarse: [h, w, 3] render of the same view in any size, premultiplied; it shows where the
+                mesh is not met.
+            opacity: [h, w] of that.
+        """
+        width, height = cameras.size(view)
+        aided = _enlarged(torch.cat([coarse, opacity[..., None]], -1), width, height)
+        cover = aided[..., 3:].clamp(0, 1)
+        aided = aided[..., :3].clamp_min(0)
+        alone = aided.clone()
+        values = torch.cat(split(self.scene, self.at.surface, cameras, view, None), 1)
+        near = self._near(cameras.camera_to_world[view, :, 3])
+        if near:
+            self._shrink_to(cameras, view)
+        rows = max(1, AT_ONCE // width)
+        for top in range(0, height, rows):
+            band = slice(top, min(top + rows, height))
+            row, column = torch.meshgrid(
+                torch.arange(band.start, band.stop), torch.arange(width), indexing="ij"
+            )
+            there = (cover[band, :, 0] > 0).reshape(-1).nonzero()[:, 0]
+            pixel = torch.stack([column, row], -1).reshape(-1, 2)[there] + 0.5
+            rays = pixel_rays(cameras, torch.tensor(view), pixel)
+            hit = self.detail.tracer.closest_hit(rays.origin.contiguous(), rays.direction)
+            met = hit.face >= 0
+            there, face = there[met], hit.face[met]
+            if not len(face):
+                continue
+            weights = corner_weights(hit.barycentric[met])
+            depth = hit.t[met].median()
+            footprint = float(depth / cameras.focal[view].mean())
+            albedo = self.detail.at(face, weights, footprint)
+            corner = self.detail.faces[face]
+            light = between(values, corner, weights)
+            model = light[:, :3] * albedo + light[:, 3:]
+            place = between(self.detail.vertices, corner, weights)
+            change = self._change(near, face, weights, place, rays.direction[met], albedo)
+            over = cover[band].reshape(-1, 1)[there]
+            alone[band].view(-1, 3)[there] = model * over
+            put_right = (model + DARK) * change.exp() - DARK
+            aided[band].view(-1, 3)[there] = put_right.clamp_min(0) * over
+        return aided, alone
+
+    def _near(self, eye: Tensor) -> list[int]:
+        """The photographs whose directions from the object are nearest."""
+        if self.photos is None:
+            return []
+        middle = self.detail.vertices.mean(0)
+        away = normalize(self.photos.cameras.camera_to_world[:, :, 3] - middle, dim=1)
+        return (away @ normalize(eye - middle, dim=0)).argsort(descending=True)[:NEAREST].tolist()
+
+    def _shrink_to(self, cameras: Cameras, view: int) -> None:
+        """Keep photographs no finer than a view's pixels: they would alias."""
+        middle = self.detail.vertices.mean(0)
+        one = pixel_width(cameras.of(torch.tensor([view])), middle)
+        scale = min(1.0, pixel_width(self.full, middle) / one)
+        if abs(scale / self._scale - 1) > SAME:
+            self._kept.clear()
+            self._scale = scale
+
+    def _change(
+        self,
+        near: list[int],
+        face: Tensor,
+        weights: Tensor,
+        place: Tensor,
+        direction: Tensor,
+        albedo: Tensor,
+    ) -> Tensor:
+        """Logarithms [N, 3] of what pixels are multiplied by."""
+        corner = self.detail.faces[face]
+        total, whole = torch.zeros(len(place), 3), torch.full((len(place), 1), NONE_NEAR)
+        for view in near:
+            photo = self._photo(view)
+            at = between(photo.values, corner, weights)
+            seen = photo.shown[face].nonzero()[:, 0]
+            at, some = at[seen], place[seen]
+            towards = normalize(self.full.camera_to_world[view, :, 3] - some, dim=1)
+            cosine = -(towards * direction[seen]).sum(1)
+            weight = (at[:, 6] * (NARROW * (cosine - 1)).exp())[:, None]
+            size = torch.tensor([photo.picture.shape[1], photo.picture.shape[0]])
+            pixel = project(self.full, view, some)[0] * size / torch.tensor(self.full.size(view))
+            color = sampled(photo.picture, pixel)
+            ratio = (color + DARK) / (at[:, :3] * albedo[seen] + at[:, 3:6] + DARK)
+            total.index_add_(0, seen, weight * ratio.clamp(1 / MOST, MOST).log())
+            whole.index_add_(0, seen, weight)
+        return total / whole
+
+    def _photo(self, view: int) -> _Photo:
+        """A photograph, and A, B and weights of the vertices in it."""
+        assert self.photos is not None
+        if view not in self._kept:
+            while len(self._kept) >= KEPT:
+                self._kept.popitem(last=False)
+            cameras = self.photos.cameras
+            quality = seen_from(self.at, cameras, view, self.scene.field.voxel_size)
+            values = torch.zeros(len(quality), 7)
+            seen = quality > 0
+            part = at_rays(self.at.surface, seen)
+            values[seen, :6] = torch.cat(split(self.scene, part, cameras, view, view), 1)
+            values[:, 6] = quality / quality.max().clamp_min(1e-30)
+            picture = self.photos.readers[view](1)
+            if self._scale < 1 - SAME:
+                picture = _shrunk(picture, self._scale)
+            shown = seen[self.detail.faces.long()].all(1)
+            self._kept[view] = _Photo(picture, values, shown)
+        self._kept.move_to_end(view)
+        return self._kept[view]
+
+
+def _shrunk(picture: Tensor, scale: float) -> Tensor:
+    """A stored picture [H, W, 3] of `scale` times the size, < 1, linear where it was not."""
+    planes = linear(picture).movedim(-1, 0)
+    small = interpolate(planes[None], scale_factor=scale, mode="bilinear", antialias=True)
+    return small[0].movedim(0, -1)
+
+
+def _enlarged(picture: Tensor, width: int, height: int) -> Tensor:
+    """A picture [h, w, C] in another size, bilinear."""
+    planes = picture.movedim(-1, 0)[None]
+    return interpolate(planes, (height, width), mode="bilinear")[0].movedim(0, -1)
+
+
+# How much of the detail of photographs a picture has.
+
+
+OCTAVES = 6
+FINEST = 0.85  # sigma in pixels of the Gaussian that the finest octave is what is left of
+EDGE = 0.004  # of the width, that the silhouette is made smaller by
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """A picture beside its photograph, over the object."""
+
+    psnr: float  # dB, sRGB, after a gain per channel
+    dot: np.ndarray  # [OCTAVES] sums over pixels: of photograph times picture
+    own: np.ndarray  # of the picture's square
+    photo: np.ndarray  # of the photograph's square
+
+
+def likeness(picture: Tensor, photo: Tensor, cover: Tensor) -> Likeness | None:
+    """How like a picture [H, W, 3] is to a photograph, both linear, where `cover` [H, W] is the
+    object; None where too little of it is.
+
+    The object is made smaller by EDGE, so that its silhouette does not count. Octave k is the
+    difference of the grey values under Gaussians of 0.85 2^(k-1) and 0.85 2^k pixels: periods of
+    about 2^(k+1) to 2^(k+2) pixels.
+    """
+    edge = max(2, round(EDGE * cover.shape[1]))
+    inside = np.asarray(binary_erosion((cover > 0.99).numpy(), iterations=edge), bool)
+    if inside.sum() < 1000:
+        return None
+    rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
+    box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    inside = inside[box]
+    truth, made = (linear_to_srgb(x[box]).numpy() for x in (photo, picture))
+    made = np.where(inside[..., None], made, truth)
+    truth_in, made_in = truth[inside], made[inside]
+    gain = (truth_in * made_in).sum(0) / np.maximum((made_in**2).sum(0), 1e-9)
+    made = made * gain.astype(np.float32)
+    psnr = -10 * np.log10(max(float(((truth - made)[inside] ** 2).mean()), 1e-12))
+    sums = np.zeros((3, OCTAVES))
+    before = grey = [x @ np.array([0.299, 0.587, 0.114], np.float32) for x in (truth, made)]
+    for k in range(OCTAVES):
+        after = [gaussian_filter(x, FINEST * 2**k) for x in grey]
+        one, two = ((b - a)[inside].astype(np.float64) for b, a in zip(before, after, strict=True))
+        sums[:, k] = (one * two).sum(), (two * two).sum(), (one * one).sum()
+        before = after
+    return Likeness(float(psnr), *sums)
+
+
+def coherence(found: list[Likeness]) -> list[float]:
+    """Cosine between pictures and photographs, octave by octave, the finest first, over all."""
+    dot, own, photo = np.sum([(x.dot, x.own, x.photo) for x in found], 0)
+    return (dot / np.sqrt(np.maximum(own * photo, 1e-12))).tolist()
+
+
+@torch.no_grad()
+def measure_full_size(
+    scene: Scene, run: Path, test: Photos, train: Photos | None, save: Path | None
+) -> dict[str, float | None]:
+    """Novel views at the size of their photographs' files against these, by `FULL_MEASURES`.
+
+    Without detail in the run, and without files of the photographs, views are enlarged.
+
+    Args:
+        train: the photographs that views are put right by; None: none are.
+        save: folder for NAME_full.exr, the view as half floats: rgb.*, linear on black, and alpha.
+    """
+    detail = load_detail(run)
+    views = None if detail is None else DetailedViews(scene, detail, train)
+    found: tuple[list[Likeness], list[Likeness]] = ([], [])
+    similar: list[float] = []
+    for view in track(range(len(test) if test.readers else 0), "full size"):
+        photo = linear(test.readers[view](1))
+        cameras = resize(test.cameras.of(torch.tensor([view])), photo.shape[1])
+        layers = render_layers(scene, test.cameras, view)
+        height, width = photo.shape[:2]
+        cover = _enlarged(test.picture(view)[1][..., None], width, height)[..., 0]
+        alpha = _enlarged(layers.alpha[..., None], width, height)[..., 0]
+        if views is None:
+            aided = alone = _enlarged(layers.rgb, width, height)
+        else:
+            aided, alone = views.render(cameras, 0, layers.rgb, layers.alpha)
+        both = torch.minimum(cover, alpha)
+        for measured, picture in zip(found, (aided, alone), strict=True):
+            if (likeness_ := likeness(picture, photo, both)) is not None:
+                measured.append(likeness_)
+        similar.append(ssim(linear_to_srgb(aided), linear_to_srgb(photo * cover[..., None])))
+        if save:
+            channels = {f"rgb.{c}": aided[..., k] for k, c in enumerate("RGB")}
+            write_exr(save / f"{test.names[view]}_full.exr", channels | {"alpha": alpha})
+    result: dict[str, float | None] = dict.fromkeys(FULL_MEASURES)
+    if similar:
+        result["full_ssim"] = fmean(similar)
+    for prefix, measured in zip(("full", "full_model"), found, strict=True):
+        if measured:
+            result[f"{prefix}_psnr"] = fmean(x.psnr for x in measured)
+            for k, value in enumerate(coherence(measured)):
+                result[f"{prefix}_coherence_{k + 1}"] = value
+    return result
+
+
+# By key: what the table says of it
+FULL_MEASURES = {
+    "full_psnr": "at full size: novel views, PSNR of the object after a gain per channel, dB",
+    "full_ssim": "at full size: SSIM",
+    **{
+        f"full_coherence_{k + 1}": f"at full size: coherence, octave {k + 1}"
+        for k in range(OCTAVES)
+    },
+    "full_model_psnr": "at full size, without photographs nearby: PSNR, dB",
+    **{
+        f"full_model_coherence_{k + 1}": f"at full size, without photographs nearby: octave {k + 1}"
+        for k in range(OCTAVES)
+    },
+}
