@@ -20,7 +20,7 @@ from layers import LAYERS, violations  # noqa: E402
 LIMITS = {
     "lines of the package": 38_180,
     "lines of the laboratory": 3_000,
-    "lines of tests": 36_940,
+    "lines of tests": 36_960,
     "modules of the package": 164,
     "loose modules at the top": 12,
     "configuration fields": 129,
