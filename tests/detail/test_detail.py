@@ -1,5 +1,6 @@
 """A print on a ball that is finer than the grid comes back from photographs, without light."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from torch.nn.functional import normalize
 
 from univoxel.camera import image_rays
 from univoxel.cli import main
+from univoxel.cli.detail import made_after_training, minutes_left
 from univoxel.color import linear_to_srgb
 from univoxel.core.records import Surface
 from univoxel.data import Photos
@@ -170,3 +172,18 @@ def test_files_of_another_checkpoint_are_refused(tiny_copy, detail, capsys):
     capsys.readouterr()
     assert main(["export", str(run), "--mesh", str(mesh)]) == 2
     assert "another checkpoint" in capsys.readouterr().err
+
+
+def test_a_limit_of_time_leaves_room(photos, scene, tmp_path, caplog):
+    large = replace(photos, downscale=9)
+    assert minutes_left(None, large, "texture", 2) is None
+    assert minutes_left(2.0, large, "none", 2) == 2.0
+    assert minutes_left(2.0, photos, "texture", 2) == 2.0  # trained on as they are
+    left = minutes_left(2.0, large, "texture", 2)
+    assert left is not None
+    assert 1.5 <= left < 2.0
+    caplog.set_level("INFO", "univoxel")
+    over = time.monotonic() - 1
+    assert made_after_training(scene, photos, tmp_path, "texture", over) is None
+    assert "univoxel detail" in caplog.text
+    assert not any(tmp_path.iterdir())
