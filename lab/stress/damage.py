@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
@@ -37,7 +39,13 @@ class Damage:
 
 
 def damaged(
-    scene: Path, out: Path, damage: Damage, seed: int = 0, second: Path | None = None
+    scene: Path,
+    out: Path,
+    damage: Damage,
+    seed: int = 0,
+    second: Path | None = None,
+    jpeg: int | None = None,
+    behind: np.ndarray | None = None,
 ) -> Path:
     """Write a data set with other photographs than a rendered scene; what tests them stays.
 
@@ -45,6 +53,10 @@ def damaged(
         scene, second: folders of scenes of the same cameras, in two lights; `second` may be missing
             where damage.light is 0.
         out: folder to write; it is replaced.
+        jpeg: quality that photographs are stored with on the way, in [1, 95]; None: they are not.
+        behind: radians [V] that the light has turned by in each photograph of the scene, where what
+            stands behind the object is shown; None: it is where masks are too wide or rough, and
+            stands still.
 
     Raises:
         DataError: a scene cannot be read.
@@ -70,11 +82,13 @@ def damaged(
     write_cameras(out, "train", turned(photos.cameras, damage.pose, random), photos.names)
     pictures, alphas = [], []
     for view in range(len(photos)):
-        if damage.dilation or damage.rough:
-            shown, alpha = masked(photos, view, damage.dilation)
+        if damage.dilation or damage.rough or behind is not None:
+            turn = 0.0 if behind is None else float(behind[view])
+            shown, alpha = masked(photos, view, damage.dilation, turn)
         else:
             shown, alpha = photos.picture(view)
-        pictures.append(photographed(shown * gain[view], damage.noise, random))
+        picture = photographed(shown * gain[view], damage.noise, random)
+        pictures.append(picture if jpeg is None else compressed(picture, jpeg))
         alphas.append(alpha)
     if damage.rough:
         alphas = torch.from_numpy(rough_masks(torch.stack(alphas).numpy(), damage.rough, random))
@@ -104,15 +118,19 @@ def exposures(views: int, stops: float, random: np.random.Generator) -> Tensor:
     return torch.from_numpy(2.0 ** random.uniform(-stops, stops, views)).float()
 
 
-def masked(photos: Photos, view: int, dilation: float) -> tuple[Tensor, Tensor]:
+def masked(
+    photos: Photos, view: int, dilation: float, turn: float = 0.0
+) -> tuple[Tensor, Tensor]:
     """Linear colour [H, W, 3] before what stands behind the object, and a mask [H, W] too large.
 
-    The background is envmaps/train.exr, far away. A dilated pixel has the largest coverage within
-    so many pixels.
+    The background is envmaps/train.exr, far away, turned about +Z by so many radians. A dilated
+    pixel has the largest coverage within so many pixels.
     """
     color, alpha = photos.picture(view)
     rays = image_rays(photos.cameras, view)
-    behind = lookup(EnvMap(read_image(photos.folder / "envmaps" / "train.exr")), rays.direction)
+    c, s = np.cos(turn), np.sin(turn)
+    direction = rays.direction @ torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]]).float()
+    behind = lookup(EnvMap(read_image(photos.folder / "envmaps" / "train.exr")), direction)
     behind = behind.reshape(color.shape)
     shown = alpha[..., None] * color + (1 - alpha[..., None]) * behind
     reach = int(dilation)
@@ -128,6 +146,13 @@ def photographed(linear: Tensor, noise: float, random: np.random.Generator) -> T
     if noise:
         encoded = encoded + noise * torch.from_numpy(random.standard_normal(linear.shape)).float()
     return torch.round(255 * encoded.clamp(0, 1)).byte()
+
+
+def compressed(picture: Tensor, quality: int) -> Tensor:
+    """An 8-bit picture [H, W, 3] after it was stored as JPEG."""
+    stored = io.BytesIO()
+    Image.fromarray(picture.numpy()).save(stored, "JPEG", quality=quality)
+    return torch.from_numpy(np.array(Image.open(stored)))
 
 
 def clipped(folder: Path) -> float:

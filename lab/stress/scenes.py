@@ -90,7 +90,7 @@ def radiance(name: str, direction: np.ndarray, sun: float = 0.0) -> np.ndarray:
     if not sun:
         return found
     power = scale * (_soft_light(name, grid) * weight).sum((0, 1)).mean()
-    towards = _unit(60, 50)
+    towards = unit_direction(60, 50)
     peak = power * SUN_SHARPNESS / (2 * math.pi) * np.array([1.1, 1.0, 0.85])
     shape = np.exp(SUN_SHARPNESS * (direction @ towards - 1))[..., None]
     return (1 - sun) * found + sun * peak * shape
@@ -102,25 +102,29 @@ def environment(spec: Spec, name: str, poles: bool = False) -> np.ndarray:
     Args:
         poles: whether its first and last row lie on the poles.
     """
-    if not poles:
-        direction = latlong_directions(MAP_HEIGHT).double().numpy()
-    else:
-        theta = math.pi / 2 - math.pi * np.arange(MAP_HEIGHT) / (MAP_HEIGHT - 1)
-        phi = math.pi - math.pi * (np.arange(2 * MAP_HEIGHT) + 0.5) / MAP_HEIGHT
-        t, p = np.meshgrid(theta, phi, indexing="ij")
-        direction = np.stack([np.cos(t) * np.cos(p), np.cos(t) * np.sin(p), np.sin(t)], -1)
     sun = spec.sun if name == spec.light else 0.0
-    return radiance(name, direction, sun).astype(np.float32)
+    return radiance(name, directions_of_map(MAP_HEIGHT, poles), sun).astype(np.float32)
+
+
+def directions_of_map(height: int, poles: bool) -> np.ndarray:
+    """Unit directions [H, 2H, 3] of a map's texels; `poles` as of `environment`."""
+    if not poles:
+        return latlong_directions(height).double().numpy()
+    theta = math.pi / 2 - math.pi * np.arange(height) / (height - 1)
+    phi = math.pi - math.pi * (np.arange(2 * height) + 0.5) / height
+    t, p = np.meshgrid(theta, phi, indexing="ij")
+    return np.stack([np.cos(t) * np.cos(p), np.cos(t) * np.sin(p), np.sin(t)], -1)
 
 
 def truth_of_view(parts: Sequence[Part], cameras: Cameras, view: int) -> dict[str, np.ndarray]:
     """Means over the rays of each pixel, as test/gt/NAME.npz has them.
 
     Returns:
-        alpha uint8 [H, W]; albedo [H, W, 3] linear base colour; roughness [H, W]; normal [H, W, 3]
-        unit; depth [H, W] along -Z; float16, 0 where nothing is.
+        alpha uint8 [H, W]; albedo [H, W, 3] linear base colour; roughness and metallic [H, W];
+        normal [H, W, 3] unit; depth [H, W] along -Z; float16, 0 where nothing is; and part uint8
+        [H, W], the number of the one that the middle of the pixel shows, or 255.
     """
-    mesh, roughness = _joined(parts)
+    mesh = joined(parts)
     height, width = cameras.height, cameras.width
     y, x, j, i = torch.meshgrid(
         *(torch.arange(n) for n in (height, width, GRID, GRID)), indexing="ij"
@@ -136,7 +140,8 @@ def truth_of_view(parts: Sequence[Part], cameras: Cameras, view: int) -> dict[st
     values = {
         "albedo": (weight * mesh["base"][corner]).sum(1),
         "normal": (weight * mesh["normals"][corner]).sum(1),
-        "roughness": roughness[corner[:, 0], None],
+        "roughness": (weight * mesh["roughness"][corner]).sum(1),
+        "metallic": (weight * mesh["metallic"][corner]).sum(1),
         "depth": (hit.t * cosine)[:, None],
     }
     share = met.float().reshape(height, width, -1).mean(2)
@@ -150,12 +155,15 @@ def truth_of_view(parts: Sequence[Part], cameras: Cameras, view: int) -> dict[st
     found = {key: mean(value) for key, value in values.items()}
     found["normal"] = torch.nn.functional.normalize(found["normal"], dim=-1)
     arrays = {key: value.squeeze(-1).half().numpy() for key, value in found.items()}
-    return arrays | {"alpha": (255 * share).round().to(torch.uint8).numpy()}
+    part = torch.where(met, mesh["part"][corner[:, 0], 0], 255.0)
+    part = part.reshape(height, width, -1)[..., GRID * GRID // 2]
+    whole = {"alpha": (255 * share).round(), "part": part}
+    return arrays | {key: value.to(torch.uint8).numpy() for key, value in whole.items()}
 
 
 def surface_points(parts: Sequence[Part], count: int = POINTS) -> np.ndarray:
     """Points [P, 3] float32 on what can be seen of the surface from far away, by area."""
-    mesh, _ = _joined(parts)
+    mesh = joined(parts)
     corners = mesh["vertices"][mesh["faces"].long()]
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     generator = torch.Generator().manual_seed(0)
@@ -176,26 +184,41 @@ def surface_points(parts: Sequence[Part], count: int = POINTS) -> np.ndarray:
     return points[seen][:count].numpy()
 
 
-def _joined(parts: Sequence[Part]) -> tuple[dict[str, Tensor], Tensor]:
-    """All parts as one mesh, and the roughness of its vertices."""
+def joined(parts: Sequence[Part]) -> dict[str, Tensor]:
+    """All parts as one mesh: vertices, normals, base [P, 3], roughness, metallic, and part, the
+    index of each vertex's [P, 1], faces [F, 3]."""
     starts = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
     faces = np.concatenate([p.faces + s for p, s in zip(parts, starts, strict=True)])
+
+    def values(each: Sequence[float | np.ndarray]) -> np.ndarray:
+        full = [
+            np.broadcast_to(np.float32(v), len(p.vertices))
+            for p, v in zip(parts, each, strict=True)
+        ]
+        return np.concatenate(full)[:, None]
+
     arrays = {
-        key: torch.from_numpy(np.concatenate([getattr(p, key) for p in parts]))
+        key: np.concatenate([getattr(p, key) for p in parts])
         for key in ("vertices", "normals", "base")
     }
-    roughness = torch.cat([torch.full((len(p.vertices),), p.roughness) for p in parts])
-    return arrays | {"faces": torch.from_numpy(faces.astype(np.int32))}, roughness
+    arrays |= {key: values([getattr(p, key) for p in parts]) for key in ("roughness", "metallic")}
+    arrays |= {"part": values(range(len(parts))), "faces": faces.astype(np.int32)}
+    return {key: torch.from_numpy(value) for key, value in arrays.items()}
 
 
 def _cameras(spec: Spec, share: np.ndarray, phi: np.ndarray, target: np.ndarray) -> Cameras:
     low, high = RING_HEIGHTS if spec.rings else HEIGHTS.get(spec.shape, OTHER_HEIGHTS)
-    z, size = low + (high - low) * share, spec.size
+    z = low + (high - low) * share
     r = np.sqrt(1 - z**2)
     back = np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
+    return looking(back, target + DISTANCE * back, spec.size)
+
+
+def looking(back: np.ndarray, place: np.ndarray, size: int) -> Cameras:
+    """Cameras at places [V, 3] that look against unit directions back [V, 3], with +Z upwards."""
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    pose = np.stack([right, np.cross(back, right), back, target + DISTANCE * back], -1)
+    pose = np.stack([right, np.cross(back, right), back, place], -1)
     focal = size / 2 / math.tan(math.radians(VIEW_DEGREES / 2))
     return Cameras(
         torch.from_numpy(pose.astype(np.float32)),
@@ -227,7 +250,7 @@ def _soft_light(name: str, direction: np.ndarray) -> np.ndarray:
             windows = windows + window(200, 20, (12, 22), [5.0, 5.6, 6.4])
             return gradient([0.25, 0.21, 0.18], [0.55, 0.65, 0.8]) + windows
         case "dusk":
-            glow = np.exp(12 * (direction @ _unit(-70, 12) - 1))[..., None]
+            glow = np.exp(12 * (direction @ unit_direction(-70, 12) - 1))[..., None]
             return gradient([0.1, 0.08, 0.08], [0.2, 0.3, 0.5]) + glow * np.array([6.0, 3.4, 1.6])
         case "studio":
             boxes = window(120, 50, (25, 20), [8.0, 8.0, 8.0])
@@ -237,7 +260,7 @@ def _soft_light(name: str, direction: np.ndarray) -> np.ndarray:
             raise ValueError(f"light must be room, dusk or studio, got {name!r}")
 
 
-def _unit(azimuth: float, elevation: float) -> np.ndarray:
+def unit_direction(azimuth: float, elevation: float) -> np.ndarray:
     """Direction of degrees from +X and above the horizon."""
     a, e = math.radians(azimuth), math.radians(elevation)
     return np.array([math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)])

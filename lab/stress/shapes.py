@@ -22,14 +22,14 @@ HAIR_RADIUS = 0.006  # at the root, world units: half of a pixel
 
 @dataclass(frozen=True)
 class Part:
-    """A closed piece of one roughness."""
+    """A closed piece; what is one number is the same all over it."""
 
     vertices: np.ndarray  # [P, 3] float32, world units
     faces: np.ndarray  # [F, 3] int32, counter-clockwise seen from outside
     normals: np.ndarray  # [P, 3] float32 unit
     base: np.ndarray  # [P, 3] float32 linear base colour
-    roughness: float  # perceptual, in (0, 1]
-    metallic: float = 0.0
+    roughness: float | np.ndarray  # perceptual, in (0, 1]; or [P] float32
+    metallic: float | np.ndarray = 0.0  # in [0, 1]; or [P] float32
 
 
 def build(shape: str, amount: float, roughness: float, metals: int) -> list[Part]:
