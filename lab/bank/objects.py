@@ -64,8 +64,8 @@ def _placed(piece: Piece) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices [P, 3], faces [F, 3] and unit normals [P, 3] in the object's coordinates."""
     longest = 2 * max(piece.half)
     thin = 2 * min(piece.half)
-    spacing = [max(min(longest / piece.cells, thin / 12), longest / 260)] * 3
-    vertices, faces, normals = surface(piece.distance, piece.half, (spacing[0], spacing[1], spacing[2]))
+    spacing = max(min(longest / piece.cells, thin / 7), longest / 200)
+    vertices, faces, normals = surface(piece.distance, piece.half, (spacing, spacing, spacing))
     if piece.turn is not None:
         vertices, normals = vertices @ piece.turn.T, normals @ piece.turn.T
     return vertices + np.array(piece.centre), faces, normals

@@ -194,13 +194,7 @@ def expose(folder: Path, variant: str, parts: Sequence[Part], shots: Sequence[Sh
     meshes = {f"part{i}": mesh_of(mi, f"part{i}", part) for i, part in enumerate(parts)}
     for shot in shots:
         (folder / shot.place).mkdir(parents=True, exist_ok=True)
-        if shot.azimuths is None and not shot.flash:
-            found = _pictures(mi, meshes, shot, shot.cameras)
-        else:  # a light for each
-            azimuths = np.zeros(len(shot.cameras)) if shot.azimuths is None else shot.azimuths
-            each = [(shot.cameras.of(torch.tensor([v])), float(a)) for v, a in enumerate(azimuths)]
-            found = [_pictures(mi, meshes, shot, one, a)[0] for one, a in each]
-        for view, picture in enumerate(found):
+        for view, picture in enumerate(_pictures(mi, meshes, shot)):
             write_picture(folder / shot.place / f"{name_of(view)}.exr", picture)
 
 
@@ -257,19 +251,46 @@ def sensor_of(mi: Any, cameras: Cameras, view: int) -> dict[str, Any]:
     return {"type": "perspective", "fov": float(fov), "fov_axis": "x", "to_world": to_world}
 
 
-def _pictures(
-    mi: Any, meshes: dict[str, Any], shot: Shot, cameras: Cameras, azimuth: float = 0.0
-) -> np.ndarray:
-    """[V, H, W, 4] linear, premultiplied by alpha.
+def _pictures(mi: Any, meshes: dict[str, Any], shot: Shot) -> np.ndarray:
+    """[V, H, W, 4] linear, premultiplied by alpha."""
+    moves = shot.azimuths is not None or shot.flash
+    azimuths = np.zeros(len(shot.cameras)) if shot.azimuths is None else shot.azimuths
+    lamps: dict[str, Any] = {
+        "light": {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(shot.light),
+            "to_world": mi.ScalarTransform4f(_upright(azimuths[0]).tolist()),
+        }
+    }
+    if shot.flash:
+        intensity = {"type": "rgb", "value": [shot.flash] * 3}
+        lamps["flash"] = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": intensity}
+    integrator = {"type": "path", "max_depth": DEPTH, "hide_emitters": True}
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, **lamps, **meshes})
+    if not moves:
+        return _rendered(mi, scene, shot.cameras, shot.samples)
+    params, found = mi.traverse(scene), []
+    for view, azimuth in enumerate(azimuths):  # a light for each
+        if shot.azimuths is not None:
+            params["light.to_world"] = mi.Transform4f(_upright(azimuth).tolist())
+        if shot.flash:
+            pose = shot.cameras.camera_to_world[view].double().numpy()
+            params["flash.position"] = (pose[:, 3] + FLASH_ASIDE * pose[:, 0]).tolist()
+        params.update()
+        one = shot.cameras.of(torch.tensor([view]))
+        found.append(_rendered(mi, scene, one, shot.samples)[0])
+    return np.stack(found)
 
-    Args:
-        cameras: V of the shot's; 1 where it has a flash.
-        azimuth: radians that the light is turned by about +Z, counter-clockwise from above.
-    """
-    upright = [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]  # +Z up, see conventions
+
+def _upright(azimuth: float) -> np.ndarray:
+    """[4, 4] that brings a map upright, +Z up, see conventions, and turns it about +Z."""
     c, s = np.cos(azimuth), np.sin(azimuth)
     turn = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    to_world = (turn @ upright).tolist()
+    return turn @ [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
+
+
+def _rendered(mi: Any, scene: Any, cameras: Cameras, samples: int) -> np.ndarray:
+    """[V, H, W, 4] of a scene of Mitsuba's, by all cameras at once."""
     film = {
         "type": "hdrfilm",
         "width": len(cameras) * cameras.width,
@@ -278,36 +299,15 @@ def _pictures(
         "component_format": "float32",
         "rfilter": {"type": "box"},
     }
-    samples = shot.samples
     each = max(1, min(samples, BATCH // (len(cameras) * cameras.width * cameras.height)))
     passes = -(-samples // each)
     # Stratified samples: 6 dB less noise than independent ones
     sampler = {"type": "multijitter", "sample_count": each}
-    sensors: dict[str, Any] = {"type": "batch", "film": film, "sampler": sampler}
-    sensors |= {f"view{v}": sensor_of(mi, cameras, v) for v in range(len(cameras))}
-    lamps = {}
-    if shot.flash:
-        pose = cameras.camera_to_world[0].double().numpy()
-        lamps["flash"] = {
-            "type": "point",
-            "position": (pose[:, 3] + FLASH_ASIDE * pose[:, 0]).tolist(),
-            "intensity": {"type": "rgb", "value": [shot.flash] * 3},
-        }
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "light": {
-                "type": "envmap",
-                "bitmap": mi.Bitmap(shot.light),
-                "to_world": mi.ScalarTransform4f(to_world),
-            },
-            "sensor": sensors,
-            "integrator": {"type": "path", "max_depth": DEPTH, "hide_emitters": True},
-            **lamps,
-            **meshes,
-        }
+    views = {f"view{v}": sensor_of(mi, cameras, v) for v in range(len(cameras))}
+    sensor = mi.load_dict({"type": "batch", "film": film, "sampler": sampler, **views})
+    total = sum(
+        np.array(mi.render(scene, sensor=sensor, spp=each, seed=seed)) for seed in range(passes)
     )
-    total = sum(np.array(mi.render(scene, spp=each, seed=seed)) for seed in range(passes))
     found = np.asarray(total) / passes
     return found.reshape(cameras.height, len(cameras), cameras.width, 4).swapaxes(0, 1)
 
