@@ -1,9 +1,9 @@
-"""Commands of the laboratory: `univoxel lab compare`, `chart`, `stress`, `submit`."""
+"""Commands of the laboratory: `univoxel lab compare`, `chart`, `stress`, `bank`, `submit`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, TypeAlias
 
 from univoxel.cli.parsing import (
     AtOnce,
@@ -17,6 +17,8 @@ from univoxel.cli.parsing import (
     written,
 )
 from univoxel.core.choices import BOUNCES, LIGHTS, SAMPLES, LightName, PresetName, PresetOrAuto
+
+Half: TypeAlias = Literal["tuning", "judging"]
 
 
 def submit(
@@ -158,9 +160,47 @@ def stress(
     print(suite.stress(out, only, light, seeds, quick, set, **where))
 
 
+def bank(
+    out: Annotated[Path | None, written("DIR", "~/.cache/univoxel/bank")] = None,
+    render: bool = False,
+    judge: bool = False,
+    half: Half | None = None,
+    scenes: Annotated[int, written("N")] = 64,
+    seed: Annotated[int, written("N")] = 0,
+    label: Annotated[str, written("NAME")] = "draft",
+    preset: PresetName = "draft",
+    set: Changes = (),
+    jobs: AtOnce = 1,
+) -> None:
+    """Measure decisions, on random scenes of known truth.
+
+    Renders random objects, materials, light and captures with Mitsuba 3, trains on each, and says
+    how good results are in the mean, which share of decisions is right, and whether doubt foretells
+    errors. Half of the scenes are to tune with, half to judge with; the seed says which, for good.
+    Writes DIR/seed-N/judge-NAME.md and .json. What is done is kept: the same command goes on.
+
+    Args:
+        out: folder for scenes and trainings
+        render: only render what is missing
+        judge: only print what trainings so far say
+        half: of the scenes; both when left out
+        scenes: how many, of both halves together
+        seed: of the scenes
+        label: of the trainings, to keep those of several versions apart
+        preset: how much work goes into each training, as of train
+        set: one field of the configuration of all trainings, as of train
+        jobs: trainings at once
+    """
+    from lab.bank import suite
+
+    work = {"preset": preset, "changes": set, "jobs": jobs}
+    print(suite.bank(out, render, judge, half, scenes, seed, label, **work))
+
+
 COMMANDS: dict[str, Command] = {
     "compare": compare,
     "chart": chart,
     "stress": stress,
+    "bank": bank,
     "submit": submit,
 }

@@ -19,8 +19,8 @@ from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
     "lines of the package": 37_020,
-    "lines of the laboratory": 3_000,
-    "lines of tests": 36_750,
+    "lines of the laboratory": 5_300,
+    "lines of tests": 37_050,
     "modules of the package": 160,
     "loose modules at the top": 12,
     "configuration fields": 128,
@@ -78,7 +78,7 @@ def figures() -> dict[str, int]:
     files = [*ROOT.glob("univoxel/**/*.py")]
     return {
         "lines of the package": lines("univoxel/**/*.py"),
-        "lines of the laboratory": lines("lab/*.py", "lab/stress/*.py"),
+        "lines of the laboratory": lines("lab/*.py", "lab/stress/*.py", "lab/bank/*.py"),
         "lines of tests": lines("tests/**/*.py", "lab/tests/**/*.py"),
         "modules of the package": len(files),
         "loose modules at the top": sum(p.parent == ROOT / "univoxel" for p in files) - 1,

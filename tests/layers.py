@@ -29,6 +29,7 @@ LAB_LAYERS = [
     {"worker"},
     {"runner"},
     {"chart", "compare", "stress", "submit"},
+    {"bank"},
     {"commands"},
 ]
 

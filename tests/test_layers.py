@@ -12,7 +12,8 @@ from univoxel.cli import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 
-SOURCES = [*ROOT.glob("univoxel/**/*.py"), *ROOT.glob("lab/*.py"), *ROOT.glob("lab/stress/*.py")]
+LAB = ("lab/*.py", "lab/stress/*.py", "lab/bank/*.py")
+SOURCES = [path for pattern in ("univoxel/**/*.py", *LAB) for path in ROOT.glob(pattern)]
 
 # Extras: imported inside the function that needs one
 OPTIONAL = {"dask", "distributed", "drjit", "imageio_ffmpeg", "matplotlib", "mitsuba", "trimesh"}

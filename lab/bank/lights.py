@@ -174,7 +174,10 @@ def _sky(random: np.random.Generator, sun: float) -> Radiance:
         azimuth = np.arctan2(direction[..., 1:2], direction[..., :1])
         color = horizon + (zenith - horizon) * np.clip(z, 0, 1) ** 0.5
         color = color * (1 + 0.3 * np.maximum(direction @ towards, 0)[..., None] ** 4)
-        waves = [h * np.sin((k + 2) * azimuth + p) for k, (h, p) in enumerate(zip(tops, phase, strict=True))]
+        waves = [
+            h * np.sin((k + 2) * azimuth + p)
+            for k, (h, p) in enumerate(zip(tops, phase, strict=True))
+        ]
         skyline = 0.06 + np.abs(sum(waves))
         color = np.where((z > 0) & (z < skyline), side * (0.6 + 0.4 * z / skyline), color)
         color = np.where(z <= 0, ground * (1 + 0.2 * np.sin(9 * azimuth)), color)
@@ -212,7 +215,9 @@ def _studio(random: np.random.Generator) -> Radiance:
 
 
 def _pale(random: np.random.Generator) -> np.ndarray:
-    return random.uniform(0.45, 0.85) * np.array([1, random.uniform(0.85, 1), random.uniform(0.7, 1)])
+    return random.uniform(0.45, 0.85) * np.array(
+        [1, random.uniform(0.85, 1), random.uniform(0.7, 1)]
+    )
 
 
 def _wood(random: np.random.Generator) -> np.ndarray:

@@ -9,9 +9,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 # Points and unit normals [P, 3] to base colour [P, 3], roughness [P] and metallic [P]
-Material: TypeAlias = Callable[
-    [np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]
-]
+Material: TypeAlias = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 Share: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]  # to [P] in [0, 1]
 Class: TypeAlias = Literal["none", "some", "all"]
 
@@ -69,8 +67,8 @@ def dielectric(random: np.random.Generator) -> Material:
             return mixed(first, _uniform(two, 0.8, 0.0), _checks(count))
         case _:  # two paints in a pattern
             rough = random.uniform(0.15, 0.8, 2)
-            pair = [_plain(random, float(r), 0.0) for r in rough]
-            return mixed(*pair, pattern(random))
+            first, second = (_plain(random, float(r), 0.0) for r in rough)
+            return mixed(first, second, pattern(random))
 
 
 def metal(random: np.random.Generator) -> Material:

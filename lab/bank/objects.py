@@ -134,7 +134,9 @@ def capsule(start, end, first: float, second: float) -> Distance:
 
     def distance(p: np.ndarray) -> np.ndarray:
         t = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
-        return np.linalg.norm(p - a - t[..., None] * (b - a), axis=-1) - (first + (second - first) * t)
+        return np.linalg.norm(p - a - t[..., None] * (b - a), axis=-1) - (
+            first + (second - first) * t
+        )
 
     return distance
 
@@ -237,13 +239,23 @@ def pot(r: Random) -> list[Piece]:
     pieces = [Piece(body, box)]
     rim = float(radii[-1])
     if r.uniform() < 0.6:
-        pieces.append(Piece(ring(rim, 0.06), (rim + 0.06, rim + 0.06, 0.06), (0, 0, height), None, "rim"))
+        pieces.append(
+            Piece(ring(rim, 0.06), (rim + 0.06, rim + 0.06, 0.06), (0, 0, height), None, "rim")
+        )
     if r.uniform() < 0.5:
         for side in (-1, 1):
             pieces.append(_handle(side * (most * 0.95), r.uniform(-0.2, 0.3) * height, 0.25, "rim"))
     if closed:
         lid = lathe([0, 0.1, 0.2, 0.28, 0.4], [rim, 0.8 * rim, 0.1, 0.08, 0.12])
-        pieces.append(Piece(at(lid, (0, 0, -0.2)), (rim + 0.05, rim + 0.05, 0.25), (0, 0, height + 0.2), None, "lid"))
+        pieces.append(
+            Piece(
+                at(lid, (0, 0, -0.2)),
+                (rim + 0.05, rim + 0.05, 0.25),
+                (0, 0, height + 0.2),
+                None,
+                "lid",
+            )
+        )
     return pieces
 
 
@@ -287,7 +299,15 @@ def mug(r: Random) -> list[Piece]:
         box = (belly + 0.5, 0.16, height + 0.1)
         pieces.append(Piece(spout, box, role="body"))
         lid = lathe([0, 0.12, 0.2, 0.3], [top + 0.03, 0.5 * top, 0.05, 0.09])
-        pieces.append(Piece(at(lid, (0, 0, -0.15)), (top + 0.06, top + 0.06, 0.2), (0, 0, height + 0.13), None, "lid"))
+        pieces.append(
+            Piece(
+                at(lid, (0, 0, -0.15)),
+                (top + 0.06, top + 0.06, 0.2),
+                (0, 0, height + 0.13),
+                None,
+                "lid",
+            )
+        )
     return pieces
 
 
@@ -305,18 +325,20 @@ def animal(r: Random) -> list[Piece]:
     shapes.append(capsule((0.7 * length, 0, 0.05), head, 0.16, 0.12))
     size = r.uniform(0.17, 0.24)
     shapes.append(at(ball(size), (head[0], 0, head[2])))
-    shapes.append(capsule(head, head + [size + 0.12, 0, -0.06], 0.13, 0.08))
+    shapes.append(capsule(head, head + np.array([size + 0.12, 0, -0.06]), 0.13, 0.08))
     ear = r.uniform(0.15, 0.45)
     for y in (-1, 1):
-        start = head + [-0.03, 0.6 * y * size, 0.6 * size]
-        shapes.append(capsule(start, start + [-0.05, 0.1 * y, ear], 0.07, 0.045))
-    shapes.append(capsule((-length, 0, 0.05), (-length - 0.25, 0, r.uniform(-0.2, 0.3)), 0.06, 0.03))
+        start = head + np.array([-0.03, 0.6 * y * size, 0.6 * size])
+        shapes.append(capsule(start, start + np.array([-0.05, 0.1 * y, ear]), 0.07, 0.045))
+    shapes.append(
+        capsule((-length, 0, 0.05), (-length - 0.25, 0, r.uniform(-0.2, 0.3)), 0.06, 0.03)
+    )
     body = blended(shapes, 0.09)
     tall = float(head[2]) + size + ear + 0.1
     box = (length + 0.75, max(fat, 0.35) + 0.1, max(tall, fat + leg + 0.2))
     pieces = [Piece(body, box, cells=150)]
     for y in (-1, 1):
-        place = head + [0.8 * size, 0.5 * y * size, 0.35 * size]
+        place = head + size * np.array([0.8, 0.5 * y, 0.35])
         pieces.append(Piece(ball(0.05), (0.05, 0.05, 0.05), tuple(place), None, "eyes", 24))
     if r.uniform() < 0.6:
         turn = _along(head - np.array([0.7 * length, 0, 0.05]))
@@ -341,9 +363,13 @@ def car(r: Random) -> list[Piece]:
         hull = without(hull, at(turned(cylinder(wheel + 0.03, 0.14, 0.02), aside), place))
     pieces = [Piece(hull, (length + 0.05, wide + 0.05, low + 0.35), cells=140)]
     for place in places:
-        pieces.append(Piece(cylinder(wheel, 0.07, 0.03), (wheel, wheel, 0.07), place, aside, "tyres", 60))
+        pieces.append(
+            Piece(cylinder(wheel, 0.07, 0.03), (wheel, wheel, 0.07), place, aside, "tyres", 60)
+        )
         hub = 0.55 * wheel
-        pieces.append(Piece(cylinder(hub, 0.085, 0.02), (hub, hub, 0.085), place, aside, "hubs", 50))
+        pieces.append(
+            Piece(cylinder(hub, 0.085, 0.02), (hub, hub, 0.085), place, aside, "hubs", 50)
+        )
     return pieces
 
 
@@ -382,7 +408,9 @@ def lamp(r: Random) -> list[Piece]:
     hollow = without(cone, at(cylinder(shade - 0.06, 0.06, 0.01), (0, 0, -tall)))
     return [
         Piece(cylinder(foot, 0.05, 0.04), (foot, foot, 0.05), (0, 0, -0.72), None, "body"),
-        Piece(at(stem, (0, 0, 0.15)), (belly + 0.06, belly + 0.06, 0.6), (0, 0, -0.15), None, "stem"),
+        Piece(
+            at(stem, (0, 0, 0.15)), (belly + 0.06, belly + 0.06, 0.6), (0, 0, -0.15), None, "stem"
+        ),
         Piece(hollow, (shade + 0.03, shade + 0.03, tall + 0.05), (0, 0, 0.45), None, "shade"),
     ]
 
@@ -393,8 +421,30 @@ def emblem(r: Random) -> list[Piece]:
     if kind == "letter":
         cuts = {
             "L": [(-0.4, -0.6), (0.4, -0.6), (0.4, -0.3), (-0.1, -0.3), (-0.1, 0.6), (-0.4, 0.6)],
-            "T": [(-0.15, -0.6), (0.15, -0.6), (0.15, 0.3), (0.5, 0.3), (0.5, 0.6), (-0.5, 0.6), (-0.5, 0.3), (-0.15, 0.3)],
-            "E": [(-0.4, -0.6), (0.4, -0.6), (0.4, -0.36), (-0.1, -0.36), (-0.1, -0.12), (0.3, -0.12), (0.3, 0.12), (-0.1, 0.12), (-0.1, 0.36), (0.4, 0.36), (0.4, 0.6), (-0.4, 0.6)],
+            "T": [
+                (-0.15, -0.6),
+                (0.15, -0.6),
+                (0.15, 0.3),
+                (0.5, 0.3),
+                (0.5, 0.6),
+                (-0.5, 0.6),
+                (-0.5, 0.3),
+                (-0.15, 0.3),
+            ],
+            "E": [
+                (-0.4, -0.6),
+                (0.4, -0.6),
+                (0.4, -0.36),
+                (-0.1, -0.36),
+                (-0.1, -0.12),
+                (0.3, -0.12),
+                (0.3, 0.12),
+                (-0.1, 0.12),
+                (-0.1, 0.36),
+                (0.4, 0.36),
+                (0.4, 0.6),
+                (-0.4, 0.6),
+            ],
         }
         outline = np.array(cuts[str(r.choice(list(cuts)))], float)
     else:
@@ -525,5 +575,19 @@ def pebble(r: Random) -> list[Piece]:
 
 FAMILIES: dict[str, Callable[[Random], list[Piece]]] = {
     f.__name__: f
-    for f in (pot, bottle, mug, animal, car, chair, lamp, emblem, relief, plant, trophy, tool, pebble)
+    for f in (
+        pot,
+        bottle,
+        mug,
+        animal,
+        car,
+        chair,
+        lamp,
+        emblem,
+        relief,
+        plant,
+        trophy,
+        tool,
+        pebble,
+    )
 }

@@ -11,7 +11,7 @@ import math
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias, TypeVar
 
@@ -163,7 +163,7 @@ def _materials(kind: Class, count: int, random: np.random.Generator) -> list[Mat
         return [materials.metal(random) for _ in range(count)]
     if count == 1:
         return [materials.partly_metal(random)]
-    makers = [materials.dielectric, random.choice([materials.metal, materials.partly_metal])]
+    makers = [materials.dielectric, (materials.metal, materials.partly_metal)[random.integers(2)]]
     makers += [materials.metal, materials.dielectric, materials.dielectric]
     order = [makers[k] if k < 2 else makers[int(random.integers(5))] for k in range(count)]
     return [order[k](random) for k in random.permutation(count)]
@@ -212,7 +212,9 @@ def _places(
     return back, target + distance[:, None] * back
 
 
-def shots_of(scene: Drawn, train: Cameras, test: Cameras) -> tuple[list[Shot], dict[str, np.ndarray]]:
+def shots_of(
+    scene: Drawn, train: Cameras, test: Cameras
+) -> tuple[list[Shot], dict[str, np.ndarray]]:
     """What is rendered, and the maps of its lights by name."""
     random = _random(scene.seed, scene.index, "light")
     main = lights.light(scene.light, random)

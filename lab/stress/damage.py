@@ -118,9 +118,7 @@ def exposures(views: int, stops: float, random: np.random.Generator) -> Tensor:
     return torch.from_numpy(2.0 ** random.uniform(-stops, stops, views)).float()
 
 
-def masked(
-    photos: Photos, view: int, dilation: float, turn: float = 0.0
-) -> tuple[Tensor, Tensor]:
+def masked(photos: Photos, view: int, dilation: float, turn: float = 0.0) -> tuple[Tensor, Tensor]:
     """Linear colour [H, W, 3] before what stands behind the object, and a mask [H, W] too large.
 
     The background is envmaps/train.exr, far away, turned about +Z by so many radians. A dilated
