@@ -117,16 +117,27 @@ def errors(scene: Path, true: list[textured_room.View]) -> tuple[np.ndarray, np.
     found = {int(i.name[4:7]): i.pose for i in read_images(scene / "sparse/0/images.bin")}
     ours = np.stack([found[v] for v in sorted(found)])
     wanted = np.stack([true[v].pose for v in sorted(found)])
-    a = ours[:, :, 3] - ours[:, :, 3].mean(0)
-    b = wanted[:, :, 3] - wanted[:, :, 3].mean(0)
+    scale, turn, shift = similarity(ours, wanted)
+    left = np.einsum("vij,vkj->vik", turn @ ours[:, :, :3], wanted[:, :, :3])
+    cosine = (np.trace(left, axis1=1, axis2=2) - 1) / 2
+    away = scale * ours[:, :, 3] @ turn.T + shift - wanted[:, :, 3]
+    centres = np.linalg.norm(away, axis=1) / textured_room.RADIUS
+    return centres, np.degrees(np.arccos(cosine.clip(-1, 1)))
+
+
+def similarity(ours: np.ndarray, wanted: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, turn [3, 3] and shift [3] that bring our cameras' centres nearest to the true ones.
+
+    Args:
+        ours, wanted: camera-to-world [V, 3, 4].
+    """
+    middle, true_middle = ours[:, :, 3].mean(0), wanted[:, :, 3].mean(0)
+    a, b = ours[:, :, 3] - middle, wanted[:, :, 3] - true_middle
     u, s, v = np.linalg.svd(b.T @ a)
     mirror = np.array([1, 1, np.linalg.det(u @ v)])
     turn = u * mirror @ v
-    left = np.einsum("vij,vkj->vik", turn @ ours[:, :, :3], wanted[:, :, :3])
-    cosine = (np.trace(left, axis1=1, axis2=2) - 1) / 2
-    scale = (s * mirror).sum() / (a**2).sum()
-    centres = np.linalg.norm(scale * a @ turn.T - b, axis=1) / textured_room.RADIUS
-    return centres, np.degrees(np.arccos(cosine.clip(-1, 1)))
+    scale = float((s * mirror).sum() / (a**2).sum())
+    return scale, turn, true_middle - scale * turn @ middle
 
 
 def trained(variant: str, photos: Path, scene: Path, views: int, width: int) -> list[list[object]]:

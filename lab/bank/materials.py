@@ -56,7 +56,7 @@ def dielectric(random: np.random.Generator) -> Material:
         case "lacquer":  # a smooth coat over colour: one lobe, and what is below it is diffuse
             return _plain(random, random.uniform(0.04, 0.14), 0.0)
         case "wood":
-            return _wood(random)
+            return wood(random)
         case "stone":
             veins = noise(random, 1.5, 3)
             pair = _plain(random, random.uniform(0.2, 0.7), 0.0), _plain(random, 0.5, 0.0)
@@ -64,7 +64,7 @@ def dielectric(random: np.random.Generator) -> Material:
         case "weave":
             count, two = random.uniform(14, 28), _color(random)
             first = _plain(random, 0.85, 0.0)
-            return mixed(first, _uniform(two, 0.8, 0.0), _checks(count))
+            return mixed(first, uniform(two, 0.8, 0.0), _checks(count))
         case _:  # two paints in a pattern
             rough = random.uniform(0.15, 0.8, 2)
             first, second = (_plain(random, float(r), 0.0) for r in rough)
@@ -91,7 +91,7 @@ def partly_metal(random: np.random.Generator) -> Material:
     kind = random.choice(["patina", "worn", "inlay"])
     if kind == "patina":
         oxide = np.array(OXIDES[random.integers(len(OXIDES))])
-        other = _uniform(oxide * random.uniform(0.8, 1.2, 3), random.uniform(0.6, 0.9), 0.0)
+        other = uniform(oxide * random.uniform(0.8, 1.2, 3), random.uniform(0.6, 0.9), 0.0)
         return mixed(metal(random), other, _blotches(random))
     other = _plain(random, random.uniform(0.2, 0.7), 0.0)
     share = _blotches(random) if kind == "worn" else pattern(random)
@@ -158,7 +158,7 @@ def _plain(random: np.random.Generator, roughness: float, metallic: float) -> Ma
     return material
 
 
-def _uniform(base: np.ndarray, roughness: float, metallic: float) -> Material:
+def uniform(base: np.ndarray, roughness: float, metallic: float) -> Material:
     shown = np.clip(base, 0.01, 0.95)
     return lambda p, _: (
         np.broadcast_to(shown, p.shape),
@@ -167,11 +167,11 @@ def _uniform(base: np.ndarray, roughness: float, metallic: float) -> Material:
     )
 
 
-def _wood(random: np.random.Generator) -> Material:
+def wood(random: np.random.Generator) -> Material:
     light = random.uniform(0.25, 0.65) * np.array([1.0, random.uniform(0.6, 0.8), 0.35])
     bent, count = noise(random, 0.7, 2), random.uniform(4, 9)
     rough = random.uniform(0.15, 0.7)
-    first, second = _uniform(light, rough, 0.0), _uniform(0.55 * light, rough, 0.0)
+    first, second = uniform(light, rough, 0.0), uniform(0.55 * light, rough, 0.0)
 
     def grain(p: np.ndarray, _: np.ndarray) -> np.ndarray:
         rings = np.hypot(p[:, 0] + 0.3, p[:, 1]) + 0.06 * bent(p * [1, 1, 0.3])

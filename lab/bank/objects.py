@@ -30,15 +30,18 @@ class Piece:
     cells: int = CELLS
 
 
-def object_of(family: str, random: Random, materials: Callable[[str], Material]) -> list[Part]:
+def object_of(
+    family: str, random: Random, materials: Callable[[str], Material], detail: float = 1.0
+) -> list[Part]:
     """The parts of an object, within a ball of RADIUS about the origin, +Z up.
 
     Args:
         family: of FAMILIES.
         materials: the material of each role; asked once for each.
+        detail: times as many triangles along a side, for larger pictures.
     """
     pieces = FAMILIES[family](random)
-    found = [(piece, *_placed(piece)) for piece in pieces]
+    found = [(piece, *_placed(piece, detail)) for piece in pieces]
     everywhere = np.concatenate([vertices for _, vertices, _, _ in found])
     low, high = everywhere.min(0), everywhere.max(0)
     middle = (low + high) / 2
@@ -60,11 +63,11 @@ def roles(family: str, random: Random) -> list[str]:
     return list(dict.fromkeys(piece.role for piece in FAMILIES[family](random)))
 
 
-def _placed(piece: Piece) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _placed(piece: Piece, detail: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices [P, 3], faces [F, 3] and unit normals [P, 3] in the object's coordinates."""
     longest = 2 * max(piece.half)
     thin = 2 * min(piece.half)
-    spacing = max(min(longest / piece.cells, thin / 7), longest / 200)
+    spacing = max(min(longest / piece.cells, thin / 7), longest / 200) / detail
     vertices, faces, normals = surface(piece.distance, piece.half, (spacing, spacing, spacing))
     if piece.turn is not None:
         vertices, normals = vertices @ piece.turn.T, normals @ piece.turn.T

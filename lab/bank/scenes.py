@@ -151,12 +151,18 @@ def parts_of(scene: Drawn) -> list[Part]:
     shape = _random(scene.seed, scene.index, "shape")
     names = objects.roles(scene.family, _random(scene.seed, scene.index, "shape"))
     random = _random(scene.seed, scene.index, "materials")
-    found = dict(zip(names, _materials(scene.metal, len(names), random), strict=True))
+    found = materials_of_roles(scene.metal, names, random)
     return objects.object_of(scene.family, shape, found.__getitem__)
 
 
-def _materials(kind: Class, count: int, random: np.random.Generator) -> list[Material]:
+def materials_of_roles(
+    kind: Class, names: Sequence[str], random: np.random.Generator
+) -> dict[str, Material]:
     """A material for each role; where some is metal, at least one has some and one has other."""
+    return dict(zip(names, _materials(kind, len(names), random), strict=True))
+
+
+def _materials(kind: Class, count: int, random: np.random.Generator) -> list[Material]:
     if kind == "none":
         return [materials.dielectric(random) for _ in range(count)]
     if kind == "all":

@@ -268,7 +268,7 @@ def _pictures(mi: Any, meshes: dict[str, Any], shot: Shot) -> np.ndarray:
     integrator = {"type": "path", "max_depth": DEPTH, "hide_emitters": True}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, **lamps, **meshes})
     if not moves:
-        return _rendered(mi, scene, shot.cameras, shot.samples)
+        return seen_by(mi, scene, shot.cameras, shot.samples)
     params, found = mi.traverse(scene), []
     for view, azimuth in enumerate(azimuths):  # a light for each
         if shot.azimuths is not None:
@@ -278,7 +278,7 @@ def _pictures(mi: Any, meshes: dict[str, Any], shot: Shot) -> np.ndarray:
             params["flash.position"] = (pose[:, 3] + FLASH_ASIDE * pose[:, 0]).tolist()
         params.update()
         one = shot.cameras.of(torch.tensor([view]))
-        found.append(_rendered(mi, scene, one, shot.samples)[0])
+        found.append(seen_by(mi, scene, one, shot.samples)[0])
     return np.stack(found)
 
 
@@ -289,7 +289,7 @@ def _upright(azimuth: float) -> np.ndarray:
     return turn @ [[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
 
 
-def _rendered(mi: Any, scene: Any, cameras: Cameras, samples: int) -> np.ndarray:
+def seen_by(mi: Any, scene: Any, cameras: Cameras, samples: int) -> np.ndarray:
     """[V, H, W, 4] of a scene of Mitsuba's, by all cameras at once."""
     film = {
         "type": "hdrfilm",
