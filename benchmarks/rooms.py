@@ -382,7 +382,7 @@ def write_truth(
         if not path.exists():
             rays = image_rays(cameras, view)
             hit = scene.closest_hit(rays.origin, rays.direction).face >= 0
-            write_png(path, (255 * hit.reshape(SHORT_SIDE, LONG_SIDE, 1)).byte())
+            write_png(path, (255 * hit.reshape(SHORT_SIDE, LONG_SIDE)).byte())
 
 
 # What a capture made of it.
