@@ -82,7 +82,7 @@ ROOMS = (
 )
 VIEWS, LONG_SIDE, SHORT_SIDE = 40, 1600, 1200
 FOCAL_LENGTH = 0.8  # in widths of a picture: 28 mm
-SAMPLES = 10  # paths per pixel: few, as the lens smooths what they leave
+SAMPLES = 6  # paths per pixel: few, as the lens smooths what they leave
 SOFT = 0.9  # pixels that a lens and a phone's software blur by, a standard deviation
 BRIGHTEST = 1.5  # radiance of a pixel before the blur; 1 is white
 DEPTH = 5  # most segments of a path
