@@ -82,10 +82,10 @@ ROOMS = (
 )
 VIEWS, LONG_SIDE, SHORT_SIDE = 40, 1600, 1200
 FOCAL_LENGTH = 0.8  # in widths of a picture: 28 mm
-SAMPLES = 6  # paths per pixel: few, as the lens smooths what they leave
+SAMPLES = 4  # paths per pixel: few, as the lens smooths what they leave
 SOFT = 0.9  # pixels that a lens and a phone's software blur by, a standard deviation
 BRIGHTEST = 1.5  # radiance of a pixel before the blur; 1 is white
-DEPTH = 5  # most segments of a path
+DEPTH = 4  # most segments of a path
 NOISE, QUALITY, STOPS = 0.012, 92, 0.5
 DETAIL = 2.0  # of objects, against those of the bank
 TESTS, TEST_SIZE = 5, 320  # relit views
@@ -197,7 +197,7 @@ def furniture(room: Room, floor: float) -> Part:
 
     def worn(scale: float, material: Material, amount: float = 0.12) -> Material:
         """A material of another scale, with the small marks that all things have."""
-        marks = materials.noise(random, 2.0, 4)
+        marks = materials.noise(random, 6.0, 3)
 
         def found(p: np.ndarray, n: np.ndarray):
             base, roughness, metallic = material(p * scale, n)

@@ -89,7 +89,7 @@ COMMANDS: dict[str, Command] = {
 }
 
 # Written `univoxel lab NAME`; without the word, as they once were, they work too
-LABORATORY = ("compare", "chart", "stress", "submit")
+LABORATORY = ("compare", "chart", "stress", "bank", "submit")
 
 
 def has_laboratory() -> bool:

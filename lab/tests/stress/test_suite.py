@@ -226,6 +226,6 @@ def test_a_small_scene_from_end_to_end(tmp_path, monkeypatch, capfd):
     assert all(row["mean"]["relit_psnr"] > 5 for row in record["rows"])
     # The same command again renders and trains nothing
     monkeypatch.setattr(render, "require", lambda: pytest.fail("it rendered again"))
-    monkeypatch.setattr(suite.runner, "_train", lambda *_: pytest.fail("it trained again"))
+    monkeypatch.setattr(suite.runner, "run_jobs", lambda *_: pytest.fail("it trained again"))
     monkeypatch.setattr(suite.render, "require", lambda: None)
     assert main([*arguments, *OPTIONS[1:]]) == 0
