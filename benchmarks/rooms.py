@@ -2,6 +2,7 @@
 
     python benchmarks/rooms.py --render [--only table] [--work ~/.cache/univoxel/rooms]
     python benchmarks/rooms.py [--only table] [--out benchmarks/results/preparation/rooms.json]
+    python benchmarks/rooms.py --only table --width 640 --out FILE.json
 
 Six objects of lab/bank on six supports, rendered by Mitsuba: 40 photographs of 1600 x 1200 pixels
 from all around, as JPEG files with the EXIF of a phone, with noise, and exposures up to half a stop
@@ -80,14 +81,14 @@ ROOMS = (
     Room("cabinet", "pot", "all", (2.0, 1.2), 4.2, 5),
     Room("box", "trophy", "none", (1.4, 1.4), 2.0, 6),
 )
-VIEWS, LONG_SIDE, SHORT_SIDE = 40, 1600, 1200
+VIEWS, FULL = 40, 1600  # photographs, and pixels of their longer side
 FOCAL_LENGTH = 0.8  # in widths of a picture: 28 mm
 SAMPLES = 4  # paths per pixel: few, as the lens smooths what they leave
 SOFT = 0.9  # pixels that a lens and a phone's software blur by, a standard deviation
 BRIGHTEST = 1.5  # radiance of a pixel before the blur; 1 is white
 DEPTH = 4  # most segments of a path
 NOISE, QUALITY, STOPS = 0.012, 92, 0.5
-DETAIL = 2.0  # of objects, against those of the bank
+DETAIL = 2.0  # of objects in full photographs, against those of the bank
 TESTS, TEST_SIZE = 5, 320  # relit views
 POINTS = 20_000
 NEAR, WHOLE = 0.03, 0.95  # share of the extent, and of the true surface
@@ -106,15 +107,15 @@ COLUMNS = [
 ]
 
 
-def object_of(room: Room) -> list[Part]:
+def object_of(room: Room, width: int) -> list[Part]:
     """The parts of a room's object."""
     random = np.random.default_rng(room.seed)
     names = objects.roles(room.family, np.random.default_rng(room.seed))
     found = materials_of_roles(room.metal, names, np.random.default_rng([room.seed, 1]))
-    return objects.object_of(room.family, random, found.__getitem__, DETAIL)
+    return objects.object_of(room.family, random, found.__getitem__, DETAIL * width / FULL)
 
 
-def cameras_of(room: Room) -> Cameras:
+def cameras_of(room: Room, width: int) -> Cameras:
     """A walk around the object at three heights; the border cuts it in every third photograph."""
     random = np.random.default_rng([room.seed, 2])
     view = np.arange(VIEWS)
@@ -126,16 +127,17 @@ def cameras_of(room: Room) -> Cameras:
     cut = view % 3 == 2
     aside = np.where(cut, random.choice([-1, 1], VIEWS) * random.uniform(1.7, 2.0, VIEWS), 0.0)
     target = random.normal(0, 0.08, (VIEWS, 3)) + (aside * distance / 3.3)[:, None] * right
-    return _wide(scenes.looking(back, target + distance[:, None] * back, LONG_SIDE))
+    return _wide(scenes.looking(back, target + distance[:, None] * back, width))
 
 
 def _wide(cameras: Cameras) -> Cameras:
     """The same with a phone's picture."""
+    width, height = cameras.width, cameras.width * 3 // 4
     return replace(
         cameras,
-        focal=torch.full_like(cameras.focal, FOCAL_LENGTH * LONG_SIDE),
-        centre=torch.tensor([[LONG_SIDE / 2, SHORT_SIDE / 2]]).expand(len(cameras), 2).clone(),
-        height=SHORT_SIDE,
+        focal=torch.full_like(cameras.focal, FOCAL_LENGTH * width),
+        centre=torch.tensor([[width / 2, height / 2]]).expand(len(cameras), 2).clone(),
+        height=height,
     )
 
 
@@ -184,13 +186,14 @@ def half_of(room: Room) -> np.ndarray:
     return np.random.default_rng([room.seed, 7]).uniform(1.8, 2.4, 2) * METRE
 
 
-def furniture(room: Room, floor: float) -> Part:
+def furniture(room: Room, floor: float, width: int) -> Part:
     """Walls, floor, support and what else stands in the room.
 
     Args:
         floor: its z; the support's top is `room.height` above it.
+        width: of the photographs, pixels; vertices are as near as they need.
     """
-    random = np.random.default_rng([room.seed, 3])
+    random, coarser = np.random.default_rng([room.seed, 3]), FULL / width
     half, tall = half_of(room), 2.6 * METRE
     low, high = np.array([*-half, floor]), np.array([*half, floor + tall])
     x, y, z = np.diag(high - low)
@@ -216,42 +219,47 @@ def furniture(room: Room, floor: float) -> Part:
 
     pale = random.uniform(0.55, 0.75) * np.array([1.0, 0.97, 0.92])
     wall = worn(1, materials.uniform(pale, 0.8, 0.0), 0.05)
-    sheets = [sheet(low, x, y, 0.05, planks(0.3))]
-    sheets.append(sheet(low + z, y, x, 0.2, wall))
+    sheets = [sheet(low, x, y, 0.05 * coarser, planks(0.3))]
+    sheets.append(sheet(low + z, y, x, 0.2 * coarser, wall))
     for corner, along in ((low, y), (low + x, -x), (low + x + y, -y), (low + y, x)):
-        sheets.append(sheet(corner, along, z, 0.08, wall))
+        sheets.append(sheet(corner, along, z, 0.08 * coarser, wall))
         for _ in range(3):  # pictures on the walls
             size, place = random.uniform(0.3, 0.8, 2) * METRE, random.uniform(0.05, 0.75)
             inwards = np.cross(along, z)
             lower = corner + place * along + 0.45 * z + 0.05 * inwards / np.linalg.norm(inwards)
             wide = size[1] * along / np.linalg.norm(along)
-            sheets.append(sheet(lower, wide, size[0] * z / tall, 0.06, some()))
+            sheets.append(sheet(lower, wide, size[0] * z / tall, 0.06 * coarser, some()))
     for _ in range(9):  # along the walls
         size = random.uniform([0.3, 0.3, 0.4], [1.0, 0.6, 1.9]) * METRE
         corner = low + random.uniform(size=3) * (high - low - size)
         side = random.integers(2)
         corner[side] = (low, high - size)[random.integers(2)][side]
         corner[2] = floor
-        sheets += crate(corner, corner + size, 0.08, some())
+        sheets += crate(corner, corner + size, 0.08 * coarser, some())
         for _ in range(4):  # books and boxes on it
             small = random.uniform(0.05, 0.25, 3) * METRE
             spot = corner + random.uniform(size=3) * (size - small)
             spot[2] = corner[2] + size[2]
-            sheets += crate(spot, spot + small, 0.05, some(1.0))
+            sheets += crate(spot, spot + small, 0.05 * coarser, some(1.0))
     a, b = room.top
     top = floor + room.height
     thick = min(0.2, room.height)
     sheets += crate(
-        (-a, -b, top - thick), (a, b, top), 0.012, planks(0.5) if room.seed % 2 else some(0.6)
+        (-a, -b, top - thick),
+        (a, b, top),
+        0.012 * coarser,
+        planks(0.5) if room.seed % 2 else some(0.6),
     )
     if room.name in ("cabinet", "box", "counter"):
-        sheets += crate((-a, -b, floor), (a, b, top - thick), 0.04, some())
+        sheets += crate((-a, -b, floor), (a, b, top - thick), 0.04 * coarser, some())
     elif room.height > 1:  # legs
         wide = np.array([0.1, 0.1, 0])
         for sx in (-1, 1):
             for sy in (-1, 1):
                 leg = np.array([sx * (a - 0.2), sy * (b - 0.2), floor])
-                sheets += crate(leg - wide, leg + wide + [0, 0, room.height - thick], 0.05, some())
+                sheets += crate(
+                    leg - wide, leg + wide + [0, 0, room.height - thick], 0.05 * coarser, some()
+                )
     starts = np.cumsum([0, *(len(s[0]) for s in sheets[:-1])])
     faces = np.concatenate([s[1] + start for s, start in zip(sheets, starts, strict=True)])
     points, normals, base, roughness = (
@@ -285,10 +293,10 @@ def lamps(room: Room, floor: float) -> list[tuple[np.ndarray, np.ndarray, np.nda
     return found
 
 
-def render_room(room: Room, folder: Path, variant: str) -> None:
+def render_room(room: Room, folder: Path, width: int, variant: str) -> None:
     """Write photographs and truth, as far as they are not there."""
     mi = render.started(variant)
-    parts, cameras = object_of(room), cameras_of(room)
+    parts, cameras = object_of(room, width), cameras_of(room, width)
     whole = one_part(parts)
     floor = float(whole.vertices[:, 2].min()) - room.height
     write_truth(room, folder, parts, cameras, variant)
@@ -310,7 +318,7 @@ def render_room(room: Room, folder: Path, variant: str) -> None:
             "type": "scene",
             "integrator": {"type": "path", "max_depth": DEPTH},
             "object": render.mesh_of(mi, "object", whole),
-            "room": render.mesh_of(mi, "room", furniture(room, floor)),
+            "room": render.mesh_of(mi, "room", furniture(room, floor, width)),
             **emitters,
         }
     )
@@ -318,7 +326,8 @@ def render_room(room: Room, folder: Path, variant: str) -> None:
     for view in missing:
         one = cameras.of(torch.tensor([view]))
         if gain is None:  # of a first look, metered as a phone does: on the whole picture
-            small = replace(one, focal=one.focal / 16, centre=one.centre / 16, width=100, height=75)
+            by = width / 100
+            small = replace(one, focal=one.focal / by, centre=one.centre / by, width=100, height=75)
             look = render.seen_by(mi, scene, small, 64)[0, ..., :3]
             gain = 0.2 / float(np.median(look.max(-1)))
         picture = render.seen_by(mi, scene, one, SAMPLES)[0]
@@ -382,15 +391,15 @@ def write_truth(
         if not path.exists():
             rays = image_rays(cameras, view)
             hit = scene.closest_hit(rays.origin, rays.direction).face >= 0
-            write_png(path, (255 * hit.reshape(SHORT_SIDE, LONG_SIDE)).byte())
+            write_png(path, (255 * hit.reshape(cameras.height, cameras.width)).byte())
 
 
 # What a capture made of it.
 
 
-def true_data(room: Room, folder: Path) -> Path:
+def true_data(room: Room, folder: Path, width: int) -> Path:
     """The photographs with true masks and cameras, as a data set."""
-    out, cameras = folder / "true", cameras_of(room)
+    out, cameras = folder / "true", cameras_of(room, width)
     if not (out / "transforms_train.json").exists():
         (out / "train").mkdir(parents=True, exist_ok=True)
         names = [f"IMG_{v:03d}" for v in range(VIEWS)]
@@ -402,7 +411,7 @@ def true_data(room: Room, folder: Path) -> Path:
     return out
 
 
-def overlaps(room: Room, cut: Path, folder: Path) -> list[float]:
+def overlaps(cut: Path, folder: Path) -> list[float]:
     """Intersection over union with the true silhouettes, of each photograph that has a mask."""
     found = []
     photos = load_photos(cut, "train")
@@ -421,7 +430,7 @@ def aligned(room: Room, run: Path) -> tuple[float, np.ndarray, np.ndarray]:
     photos = scene.registered(photos_of(run, split="train"))
     ours = photos.cameras.camera_to_world.double().numpy()
     views = [int(Path(name).stem[4:7]) for name in photos.names]
-    wanted = cameras_of(room).camera_to_world.double().numpy()[views]
+    wanted = cameras_of(room, FULL).camera_to_world.double().numpy()[views]
     return similarity(ours, wanted)
 
 
@@ -475,12 +484,12 @@ def relit(
     return float(found)
 
 
-def row_of(room: Room, folder: Path, masks: str) -> list[object]:
+def row_of(room: Room, folder: Path, width: int, masks: str) -> list[object]:
     """A value for each of COLUMNS; None where capture failed."""
     points = torch.from_numpy(np.load(folder / "truth" / "points.npz")["points"])
     best = folder / "best"
     if not (best / "trust.txt").exists():
-        univoxel.train(true_data(room, folder), best, preset="draft", minutes=LONG)
+        univoxel.train(true_data(room, folder, width), best, preset="draft", minutes=LONG)
     same = (1.0, np.eye(3), np.zeros(3))
     wanted, _ = surface_errors(best, points, same)
     wanted_db = relit(room, best, folder, same, folder / "best-tests")
@@ -501,7 +510,7 @@ def row_of(room: Room, folder: Path, masks: str) -> list[object]:
         return [*row, *nothing, "no: failed"]
     run = out / "run"
     cut = out / "cut" if (out / "cut").exists() else out / "scene"
-    found, into = overlaps(room, cut, folder), aligned(room, run)
+    found, into = overlaps(cut, folder), aligned(room, run)
     chamfer, share = surface_errors(run, points, into)
     db = relit(room, run, folder, into, folder / f"capture-{masks}-tests")
     row += [f"{len(found)} of {VIEWS}", sum(found) / len(found), min(found)]
@@ -509,11 +518,19 @@ def row_of(room: Room, folder: Path, masks: str) -> list[object]:
     return [*row, "yes" if share > WHOLE else f"no: {share:.0%}"]
 
 
-def rendered(room: Room, folder: Path) -> None:
+def rendered(room: Room, folder: Path, width: int) -> None:
     """Render a room in a process of its own, with the first variant of Mitsuba that works."""
     folder.mkdir(parents=True, exist_ok=True)
     for variant in VARIANTS:
-        command = [sys.executable, __file__, "--process", room.name, str(folder), variant]
+        command = [
+            sys.executable,
+            __file__,
+            "--process",
+            room.name,
+            str(folder),
+            str(width),
+            variant,
+        ]
         if subprocess.run(command, check=False).returncode == 0:
             return
     raise SystemExit(f"{folder}: Mitsuba could not render it")
@@ -522,21 +539,24 @@ def rendered(room: Room, folder: Path) -> None:
 def main() -> None:
     """Render, or measure and write the table."""
     if sys.argv[1:2] == ["--process"]:
-        name, folder, variant = sys.argv[2:]
-        return render_room(next(r for r in ROOMS if r.name == name), Path(folder), variant)
+        name, folder, width, variant = sys.argv[2:]
+        room = next(r for r in ROOMS if r.name == name)
+        return render_room(room, Path(folder), int(width), variant)
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--render", action="store_true", help="only photographs and truth")
     names = [room.name for room in ROOMS]
     parser.add_argument("--only", nargs="+", choices=names, default=names)
+    parser.add_argument("--width", type=int, default=FULL, help="of the photographs, pixels")
     parser.add_argument("--masks", default="auto", help="as of capture")
     parser.add_argument("--work", type=Path, default=Path.home() / ".cache/univoxel/rooms")
     parser.add_argument("--out", type=Path, default=HERE / "results/preparation/rooms.json")
     args = parser.parse_args()
     rows = []
     for room in (r for r in ROOMS if r.name in args.only):
-        rendered(room, args.work / room.name)
+        folder = args.work / (room.name if args.width == FULL else f"{room.name}-{args.width}")
+        rendered(room, folder, args.width)
         if not args.render:
-            rows.append(row_of(room, args.work / room.name, args.masks))
+            rows.append(row_of(room, folder, args.width, args.masks))
             print(rows[-1], flush=True)
     if args.render:
         return None
