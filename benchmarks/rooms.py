@@ -74,7 +74,7 @@ class Room:
 
 METRE = 5.0  # world units; an object is a third of a metre large
 ROOMS = (
-    Room("table", "mug", "none", (3.5, 2.5), 3.7, 1),
+    Room("table", "mug", "none", (3.5, 2.5), 3.7, 11),
     Room("counter", "bottle", "some", (5.0, 1.6), 4.5, 2),
     Room("stool", "animal", "none", (0.9, 0.9), 2.4, 3),
     Room("rug", "car", "some", (4.0, 3.0), 0.05, 4),
