@@ -74,10 +74,6 @@ class Drawn:
     noise: float
     jpeg: int | None
 
-    @property
-    def name(self) -> str:
-        return name_of(self.index)
-
 
 def name_of(index: int) -> str:
     return f"scene-{index:03d}"
