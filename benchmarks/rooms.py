@@ -24,7 +24,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -83,7 +83,8 @@ ROOMS = (
 )
 VIEWS, FULL = 40, 1600  # photographs, and pixels of their longer side
 FOCAL_LENGTH = 0.8  # in widths of a picture: 28 mm
-SAMPLES = 4  # paths per pixel: few, as the lens smooths what they leave
+SAMPLES = 4  # paths per pixel: few, as what they leave is smoothed
+SMOOTH = 2.0  # pixels that light is smoothed by, a standard deviation
 SOFT = 0.9  # pixels that a lens and a phone's software blur by, a standard deviation
 BRIGHTEST = 1.5  # radiance of a pixel before the blur; 1 is white
 DEPTH = 4  # most segments of a path
@@ -316,7 +317,11 @@ def render_room(room: Room, folder: Path, width: int, variant: str) -> None:
     scene = mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "path", "max_depth": DEPTH},
+            "integrator": {
+                "type": "aov",
+                "aovs": "colour:albedo",
+                "image": {"type": "path", "max_depth": DEPTH},
+            },
             "object": render.mesh_of(mi, "object", whole),
             "room": render.mesh_of(mi, "room", furniture(room, floor, width)),
             **emitters,
@@ -328,11 +333,47 @@ def render_room(room: Room, folder: Path, width: int, variant: str) -> None:
         if gain is None:  # of a first look, metered as a phone does: on the whole picture
             by = width / 100
             small = replace(one, focal=one.focal / by, centre=one.centre / by, width=100, height=75)
-            look = render.seen_by(mi, scene, small, 64)[0, ..., :3]
+            look = pictured(mi, scene, small, 64)[..., :3]
             gain = 0.2 / float(np.median(look.max(-1)))
-        picture = render.seen_by(mi, scene, one, SAMPLES)[0]
-        save_photograph(photograph(folder, view), gain * despeckled(picture), room, view)
+        inside = np.array(Image.open(folder / "silhouettes" / f"IMG_{view:03d}.png")) > 127
+        picture = smoothed(pictured(mi, scene, one, SAMPLES), inside)
+        save_photograph(photograph(folder, view), gain * picture, room, view)
         print(room.name, view, flush=True)
+
+
+def pictured(mi: Any, scene: Any, camera: Cameras, samples: int) -> np.ndarray:
+    """[H, W, 7] of one camera: linear colour, alpha, and the colour of what is there."""
+    film = {
+        "type": "hdrfilm",
+        "width": camera.width,
+        "height": camera.height,
+        "component_format": "float32",
+        "pixel_format": "rgba",
+        "rfilter": {"type": "box"},
+    }
+    sensor = mi.load_dict(render.sensor_of(mi, camera, 0) | {"film": film})
+    return np.array(mi.render(scene, sensor=sensor, spp=samples))
+
+
+def smoothed(picture: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Linear colour [H, W, 3] with less noise: light is smoothed, and what it shines on is not.
+
+    Args:
+        picture: as of `pictured`.
+        inside: [H, W] the object's silhouette, across which nothing is smoothed.
+    """
+    shown, colour = despeckled(picture[..., :4])[..., :3], picture[..., 4:] + 0.02
+    light = shown / colour
+    found = np.zeros_like(light)
+    for region in (inside, ~inside):
+        weight = region[..., None].astype(np.float32)
+        total, share = (
+            np.asarray(ndimage.gaussian_filter(x, (SMOOTH, SMOOTH, 0)))
+            for x in (light * weight, weight)
+        )
+        found += weight * total / np.maximum(share, 1e-6)
+    window = picture[..., 4:].max(-1, keepdims=True) < 0.01  # and lamps, which have no colour
+    return np.where(window, shown, found * colour)
 
 
 def photograph(folder: Path, view: int) -> Path:
