@@ -83,8 +83,8 @@ ROOMS = (
 )
 VIEWS, FULL = 40, 1600  # photographs, and pixels of their longer side
 FOCAL_LENGTH = 0.8  # in widths of a picture: 28 mm
-SAMPLES = 4  # paths per pixel: few, as what they leave is smoothed
-SMOOTH = 2.0  # pixels that light is smoothed by, a standard deviation
+SAMPLES = 4  # paths per pixel of full photographs: few, as what they leave is smoothed
+SMOOTH = 6.0  # pixels of full photographs that light is smoothed by, a standard deviation
 SOFT = 0.9  # pixels that a lens and a phone's software blur by, a standard deviation
 BRIGHTEST = 1.5  # radiance of a pixel before the blur; 1 is white
 DEPTH = 4  # most segments of a path
@@ -117,11 +117,11 @@ def object_of(room: Room, width: int) -> list[Part]:
 
 
 def cameras_of(room: Room, width: int) -> Cameras:
-    """A walk around the object at three heights; the border cuts it in every third photograph."""
+    """A walk around the object, up and down; the border cuts it in every third photograph."""
     random = np.random.default_rng([room.seed, 2])
     view = np.arange(VIEWS)
     phi = 2 * math.pi * view / VIEWS + random.normal(0, 0.04, VIEWS)
-    up = np.radians(np.array([18.0, 34.0, 52.0])[(7 * view // 5) % 3] + random.normal(0, 2, VIEWS))
+    up = np.radians(31 + 14 * np.sin(3 * phi) + random.normal(0, 2, VIEWS))
     distance = random.uniform(3.0, 3.6, VIEWS)
     back = np.stack([np.cos(up) * np.cos(phi), np.cos(up) * np.sin(phi), np.sin(up)], -1)
     right = np.stack([-np.sin(phi), np.cos(phi), np.zeros(VIEWS)], -1)
@@ -199,7 +199,7 @@ def furniture(room: Room, floor: float, width: int) -> Part:
     low, high = np.array([*-half, floor]), np.array([*half, floor + tall])
     x, y, z = np.diag(high - low)
 
-    def worn(scale: float, material: Material, amount: float = 0.12) -> Material:
+    def worn(scale: float, material: Material, amount: float = 0.25) -> Material:
         """A material of another scale, with the small marks that all things have."""
         marks = materials.noise(random, 6.0, 3)
 
@@ -336,7 +336,7 @@ def render_room(room: Room, folder: Path, width: int, variant: str) -> None:
             look = pictured(mi, scene, small, 64)[..., :3]
             gain = 0.2 / float(np.median(look.max(-1)))
         inside = np.array(Image.open(folder / "silhouettes" / f"IMG_{view:03d}.png")) > 127
-        picture = smoothed(pictured(mi, scene, one, SAMPLES), inside)
+        picture = smoothed(pictured(mi, scene, one, round(SAMPLES * FULL / width)), inside)
         save_photograph(photograph(folder, view), gain * picture, room, view)
         print(room.name, view, flush=True)
 
@@ -363,12 +363,12 @@ def smoothed(picture: np.ndarray, inside: np.ndarray) -> np.ndarray:
         inside: [H, W] the object's silhouette, across which nothing is smoothed.
     """
     shown, colour = despeckled(picture[..., :4])[..., :3], picture[..., 4:] + 0.02
-    light = shown / colour
+    light, reach = shown / colour, SMOOTH * picture.shape[1] / FULL
     found = np.zeros_like(light)
     for region in (inside, ~inside):
         weight = region[..., None].astype(np.float32)
         total, share = (
-            np.asarray(ndimage.gaussian_filter(x, (SMOOTH, SMOOTH, 0)))
+            np.asarray(ndimage.gaussian_filter(x, (reach, reach, 0)))
             for x in (light * weight, weight)
         )
         found += weight * total / np.maximum(share, 1e-6)

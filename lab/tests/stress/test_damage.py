@@ -16,6 +16,7 @@ from univoxel.camera import image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data import load_photos, load_truth
 from univoxel.data.images import read_image, write_exr
+from univoxel.envmap import EnvMap, lookup
 
 SPEC = Spec(size=24, views=6, tests=2)
 MODES = ("train", "test", "relight/dusk", "relight/studio")
@@ -168,3 +169,22 @@ def test_test_cameras_stay_true(scene, tmp_path):
     assert cameras[0] == cameras[1]
     train = [load_photos(f, "train").cameras.camera_to_world for f in (scene, out)]
     assert (train[0][:3] - train[1]).abs().max() > 0.01
+
+
+def test_what_is_behind_turns_with_the_light(scene):
+    photos = load_photos(scene, "train")
+    shown, alpha = module.masked(photos, 0, 0.0, turn=0.7)
+    direction = image_rays(photos.cameras, 0).direction
+    azimuth = torch.atan2(direction[:, 1], direction[:, 0]) - 0.7  # where it was before
+    across = direction[:, :2].norm(dim=1)
+    before = torch.stack([across * azimuth.cos(), across * azimuth.sin(), direction[:, 2]], 1)
+    behind = lookup(EnvMap(read_image(scene / "envmaps" / "train.exr")), before)
+    empty = alpha.flatten() == 0
+    torch.testing.assert_close(shown.reshape(-1, 3)[empty], behind[empty], rtol=1e-3, atol=1e-3)
+
+
+def test_jpeg_changes_a_picture_a_little():
+    picture = torch.from_numpy(random().integers(90, 110, (32, 32, 3)).astype(np.uint8))
+    found = module.compressed(picture, 90)
+    assert found.shape == picture.shape
+    assert 0 < (found.float() - picture.float()).abs().mean() < 10
