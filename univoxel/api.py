@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -21,6 +22,7 @@ from univoxel.cli.trainer import train as train_config
 from univoxel.config import TrainConfig
 from univoxel.core.choices import ELEVATION, MAP_ROWS
 from univoxel.core.records import Mesh
+from univoxel.detail.texture import page_options
 from univoxel.envmap import EnvMap
 from univoxel.errors import UserError
 from univoxel.evaluation.recovered_map import recovered_map
@@ -60,7 +62,8 @@ class Run:
     def _repr_html_(self) -> str | None:
         """The page of `univoxel view` in a frame, for notebooks; None where there is no surface."""
         try:
-            text = page_text(self.path, self.scene, SMALL)
+            options = page_options(self.path) | {"texture_size": SMALL.texture_size}
+            text = page_text(self.path, self.scene, replace(SMALL, **options))
         except UserError:
             return None
         style = "width: 100%; height: 600px; border: 0"
@@ -131,7 +134,7 @@ class Run:
             UserError: a map cannot be used, or there is no surface.
             OSError: a file cannot be read or written.
         """
-        return write_page(self.path, path, **options)
+        return write_page(self.path, path, **page_options(self.path) | options)
 
     def report(self, path: str | Path | None = None, **options: Any) -> Path:
         """Write one web page that says how good it is and what to photograph next; return the file.

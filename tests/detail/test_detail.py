@@ -1,11 +1,14 @@
 """A print on a ball that is finer than the grid comes back from photographs, without light."""
 
+import io
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import trimesh
 from analytic import cameras_around
 from asymmetric_scene import lopsided
 from torch.nn.functional import normalize
@@ -17,10 +20,11 @@ from univoxel.color import linear_to_srgb
 from univoxel.core.records import Surface
 from univoxel.data import Photos
 from univoxel.detail import texture
-from univoxel.detail.texture import load_detail, make_detail, save_detail
+from univoxel.detail.texture import load_detail, make_detail, page_options, save_detail
 from univoxel.detail.views import DetailedViews, coherence, likeness
 from univoxel.errors import DataError
 from univoxel.output.mesh import bake
+from univoxel.output.page import PageOptions, model
 from univoxel.output.surface import surface_of
 from univoxel.render.pipeline import shade, shade_hits, surface_of_view
 from univoxel.scene import load_checkpoint, save_scene
@@ -129,6 +133,16 @@ def test_exported_textures_hold_it(scene, detail):
     assert even.albedo.std((0, 1)).max() < 1e-3
     assert fine.albedo[..., 0].std() > 0.8 * printed(torch.randn(9999, 3))[:, 0].std()
     assert torch.equal(even.relief, fine.relief)
+
+
+def test_pages_show_it(scene, tiny_copy, detail):
+    run = tiny_copy / "run"
+    assert page_options(run) == {}
+    save_detail(detail, run)
+    options = PageOptions(**page_options(run) | {"texture_size": 256, "faces": 2000})
+    mesh = trimesh.load(io.BytesIO(model(scene, options, None)), file_type="glb", force="mesh")
+    picture = np.asarray(mesh.visual.material.baseColorTexture)[..., 0]
+    assert picture.std() > 10  # of 255; the model's albedo is even
 
 
 def test_none_is_made_where_photographs_show_no_more(scene, photos, monkeypatch):

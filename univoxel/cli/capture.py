@@ -537,6 +537,7 @@ def _picture(project: Project, run: Path, config: PicturesConfig) -> None:
 
 def _write_page(project: Project, given: Given, run: Path) -> None:
     """Write the page of the object, which also says what lies beside it."""
+    from univoxel.detail.texture import page_options
     from univoxel.evaluation.measures import in_words
     from univoxel.output.page import write_page
 
@@ -559,4 +560,5 @@ def _write_page(project: Project, given: Given, run: Path) -> None:
         title=project.out.absolute().name,
         notes=f"Made of {given.words}. Beside this page lie {', '.join(named)}.",
         measures=in_words(known),
+        **page_options(run),
     )

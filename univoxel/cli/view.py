@@ -44,15 +44,17 @@ def command(asked: ViewOptions) -> Path | None:
         MissingExtra: viser is missing, which the server needs.
         OSError: a file cannot be read or written.
     """
+    from univoxel.detail.texture import page_options
     from univoxel.output.page import PageOptions, write_page
 
     if asked.html is not None:
-        return write_page(asked.run, asked.html, envmaps=asked.envmap, title=asked.title)
+        options = {"envmaps": asked.envmap, "title": asked.title} | page_options(asked.run)
+        return write_page(asked.run, asked.html, **options)
     from univoxel.viewer.server import serving
     from univoxel.viewer.viewer_scene import subject_of
 
-    options = PageOptions(title=asked.title, envmaps=asked.envmap)
-    with serving(subject_of(Path(asked.run)), options, asked.host, asked.port) as address:
+    page = PageOptions(asked.title, asked.envmap, **page_options(asked.run))
+    with serving(subject_of(Path(asked.run)), page, asked.host, asked.port) as address:
         log.info(f"to look at, in a browser: {address} (Ctrl-C ends it)")
         try:
             threading.Event().wait()
@@ -67,10 +69,11 @@ def with_page(run: Path) -> Path:
     Returns:
         The run.
     """
+    from univoxel.detail.texture import page_options
     from univoxel.output.page import write_page
 
     try:
-        page = write_page(run, run / PAGE)
+        page = write_page(run, run / PAGE, **page_options(run))
         log.info(f"to look at, in a browser: {page}")
     except (UserError, OSError) as error:  # the training is done and saved
         log.warning(f"no page was written: {error}")

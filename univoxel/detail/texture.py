@@ -24,6 +24,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -63,6 +64,7 @@ FORMAT = 1  # rises when older files cannot be read any more
 PIXELS_OF_VOXEL = 4.0
 FACES = 40_000  # of the mesh: within 0.04 voxels of the field, and charts are found in 7 s, not 50
 SIZES = 256, 8192  # texels along a side of the texture
+PAGE_SIZE = 2048  # the same of a page, which is sent as one file
 FILL = 0.6  # of it that charts cover
 GRAZING = 0.1  # cosine to a camera, below which it does not count
 # Of the weight of the view that sees a vertex best: what has less adds nothing
@@ -490,6 +492,13 @@ def save_detail(detail: Detail, run: Path) -> None:
     about["picture"] = _digest(folder / PICTURE)
     with replacing(folder / MESH) as temporary:
         save_file(tensors, temporary, {"univoxel": json.dumps(about)})
+
+
+def page_options(run: str | Path) -> dict[str, Any]:
+    """Fields of `univoxel.output.page.PageOptions` that show the detail of a run, if it has any;
+    errors as of `load_detail`."""
+    detail = load_detail(run)
+    return {} if detail is None else {"albedo_near": detail.near, "texture_size": PAGE_SIZE}
 
 
 def load_detail(run: str | Path) -> Detail | None:

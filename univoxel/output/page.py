@@ -24,7 +24,7 @@ from univoxel.core.records import HALF_MAX
 from univoxel.envmap import read_map
 from univoxel.errors import UserError
 from univoxel.ops import VisibilityScene
-from univoxel.output.mesh import TexturedMesh, bake
+from univoxel.output.mesh import AlbedoNear, TexturedMesh, bake
 from univoxel.output.mesh_files import glb
 from univoxel.output.surface import cameras_of, surface_of
 from univoxel.output.topology import simplify
@@ -284,6 +284,7 @@ class PageOptions:
     measures: Mapping[str, str] = field(default_factory=dict)  # what to tell, by what it is
     faces: int = FACES  # most triangles
     texture_size: int = TEXTURE_SIZE  # texels along a side, a power of 2
+    albedo_near: AlbedoNear | None = None  # what gives the albedo, in place of the field
 
     def __post_init__(self) -> None:
         names = [Path(path).stem for path in self.envmaps]
@@ -346,7 +347,8 @@ def page_text(
 def model(scene: Scene, options: PageOptions, cameras: Cameras | None) -> bytes:
     """The scene's surface as GLB with what light reaches its vertices; textures as JPEG."""
     surface = simplify(surface_of(scene, cameras), options.faces)
-    mesh = replace(bake(scene, surface, options.texture_size), seen=None)  # nothing reads it
+    textured = bake(scene, surface, options.texture_size, options.albedo_near)
+    mesh = replace(textured, seen=None)  # nothing reads it
     return glb(mesh, JPEG_QUALITY, attributes(transfer(mesh, OFFSET * scene.field.voxel_size)))
 
 

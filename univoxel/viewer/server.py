@@ -26,7 +26,6 @@ from torch import Tensor
 from univoxel import envmap as env
 from univoxel.camera import Cameras, image_rays, looked_at, pixel_rays, project, resize
 from univoxel.color import linear_to_srgb
-from univoxel.core.choices import TEXTURE_SIZE
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.ops import Sun
@@ -70,6 +69,7 @@ def serving(
     """
     options = options or PageOptions()
     title = options.title or (subject.run.resolve().name if subject.run else "univoxel")
+    options = replace(options, title=title)
     with hosted(host, port, title) as server:
         lights = lights_of(subject.scene, options)
         _start_camera(server, subject)
@@ -78,7 +78,7 @@ def serving(
 
         @server.on_client_connect
         def _(client: Any) -> None:
-            clients[client.client_id] = Panel(client, subject, studio, lights, title).viewer
+            clients[client.client_id] = Panel(client, subject, studio, lights, options).viewer
 
         @server.on_client_disconnect
         def _(client: Any) -> None:
@@ -95,10 +95,11 @@ class Panel:
     """A client's controls, and what they ask the studio for."""
 
     def __init__(
-        self, client: Any, subject: Subject, studio: Studio, lights: list[Light], title: str
+        self, client: Any, subject: Subject, studio: Studio, lights: list[Light], page: PageOptions
     ) -> None:
         self._client, self._subject, self._studio = client, subject, studio
-        self._lights, self._title = {light.name: light for light in lights}, title
+        self._lights, self._page = {light.name: light for light in lights}, page
+        self._title = page.title
         self._tables: dict[str, env.EnvTables] = {}
         self._lock = threading.Lock()
         self._last: Tensor | None = None
@@ -356,7 +357,9 @@ class Panel:
         self._client.send_file_download(f"{self._title}.png", held.getvalue())
 
     def _send_glb(self) -> None:
-        mesh = bake(self._subject.scene, simplify(self._subject.traced.mesh, FACES), TEXTURE_SIZE)
+        surface = simplify(self._subject.traced.mesh, FACES)
+        size, albedo_near = self._page.texture_size, self._page.albedo_near
+        mesh = bake(self._subject.scene, surface, size, albedo_near)
         self._client.send_file_download(f"{self._title}.glb", glb(mesh, JPEG_QUALITY))
 
 
