@@ -21,6 +21,7 @@ plain_training = partial(
     cameras="given",
     exposures=False,
     light_frame="world",
+    detail="none",
     carving_seconds=0.0,
     capacity="fixed",
 )

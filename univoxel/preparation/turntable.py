@@ -277,6 +277,8 @@ def explained(observations: Observations, turntable: Turntable) -> Explained:
     costs = {name: foretold(log_color, basis, point, half) for name, basis in lights.items()}
     none, still, turning = (float(cost.sum()) for cost in costs.values())
     count = torch.bincount(view, minlength=views)
+    if min(none, still) <= 0 or (count > 0).sum() < 2:  # too dark, or next to nothing is seen
+        return Explained(0.0, 0.0, -math.inf, 0.0)
     gain = costs["still"] - costs["turning"]
     gain = gain.new_zeros(views).index_add_(0, view, gain)[count > 0] / count[count > 0]
     error = float(gain.std()) / math.sqrt(len(gain))
