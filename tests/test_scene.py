@@ -65,6 +65,13 @@ def test_a_checkpoint_gives_the_same_scene(tmp_path, light):
         assert torch.equal(a, b), name
 
 
+def test_others_may_read_a_checkpoint(tmp_path):
+    """As they may any file of this user."""
+    (tmp_path / "any").write_text("")
+    save_scene(small_scene(), tmp_path, {})
+    assert (tmp_path / "scene.safetensors").stat().st_mode == (tmp_path / "any").stat().st_mode
+
+
 def test_a_checkpoint_keeps_a_map_that_is_sharper_than_its_nodes(tmp_path):
     scene = small_scene()
     sky = torch.rand(32, 64, 3)

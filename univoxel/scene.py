@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, astuple, dataclass, replace
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 from univoxel import lights
 from univoxel.camera import PoseSteps
 from univoxel.core.choices import FieldName, Varying
+from univoxel.core.files import replacing
 from univoxel.core.records import HALF_MAX, Bricks
 from univoxel.core.validation import check_fields, check_settings, record, setting
 from univoxel.data import Photos
@@ -317,12 +317,10 @@ def save_scene(
     if isinstance(scene.field.encoding, HashFeatures):
         meta["levels"] = astuple(scene.field.encoding.levels)
     path = run / FILE
-    temporary = path.with_suffix(".partial")
     try:
-        save_file(tensors, temporary, {"univoxel": json.dumps(meta)})
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            save_file(tensors, temporary, {"univoxel": json.dumps(meta)})
     except (OSError, SafetensorError) as error:
-        temporary.unlink(missing_ok=True)
         raise FileError(f"{path}: cannot write the checkpoint: {error}") from error
     return path
 

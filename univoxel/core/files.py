@@ -13,6 +13,10 @@ from typing import Any
 
 from univoxel.errors import DataError, ExistingFile
 
+_MASK = os.umask(0)
+os.umask(_MASK)
+_MODE = 0o666 & ~_MASK  # of new files
+
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
@@ -25,6 +29,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         yield temporary
+        if temporary.is_file():
+            temporary.chmod(_MODE)  # safetensors lets nobody else read what it writes
         os.replace(temporary, path)
     except OSError as error:
         raise OSError(error.errno, f"cannot write: {error.strerror}", str(path)) from error
