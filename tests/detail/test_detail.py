@@ -126,6 +126,21 @@ def test_novel_views_show_it(scene, photos, detail):
         assert found.psnr > before.psnr + 3
 
 
+def test_what_is_no_object_in_a_photograph_nearby_does_not_count(scene, photos, detail):
+    """Where the surface is off, they show what is behind it."""
+    white = tuple(lambda factor: torch.full((SIZE, SIZE, 3), 255, dtype=torch.uint8) for _ in "ab")
+    near = replace(photos.of(torch.arange(2)), readers=white)
+    nothing = replace(near, alpha=torch.zeros_like(near.alpha))
+    coarse, opacity = torch.zeros(SIZE, SIZE, 3), torch.ones(SIZE, SIZE)
+    changed = []
+    for shown in (near, nothing):
+        views = DetailedViews(scene, detail, shown)
+        aided, alone = views.render(photos.cameras, 0, coarse, opacity)
+        changed.append(float((aided - alone).abs().max()))
+    assert changed[0] > 0.1
+    assert changed[1] < 1e-6  # rounding
+
+
 def test_exported_textures_hold_it(scene, detail):
     mesh = surface_of(scene)
     size = 512

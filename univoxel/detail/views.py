@@ -28,6 +28,7 @@ from univoxel.core.progress_bar import track
 from univoxel.core.records import Mesh
 from univoxel.data import Photos
 from univoxel.data.images import write_exr
+from univoxel.data.photos import coverage_of
 from univoxel.detail.texture import (
     Detail,
     Vertices,
@@ -170,9 +171,20 @@ class DetailedViews:
             pixel = project(self.full, view, some)[0] * size / torch.tensor(self.full.size(view))
             color = sampled(photo.picture, pixel)
             ratio = (color + DARK) / (at[:, :3] * albedo[seen] + at[:, 3:6] + DARK)
+            # Where the surface is off, or a part was moved, it may show what is behind the object
+            weight = weight * self._shown(view, pixel / size)[:, None]
             total.index_add_(0, seen, weight * ratio.clamp(1 / MOST, MOST).log())
             whole.index_add_(0, seen, weight)
         return total / whole
+
+    def _shown(self, view: int, place: Tensor) -> Tensor:
+        """Whether a photograph's mask has the object at places [N, 2], each in [0, 1]: [N]."""
+        assert self.photos is not None
+        _, alpha = self.photos.stored(view)
+        height, width = alpha.shape
+        column, row = (place * torch.tensor([width, height])).long().unbind(1)
+        at = alpha[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+        return coverage_of(at)
 
     def _photo(self, view: int) -> _Photo:
         """A photograph, and A, B and weights of the vertices in it."""
