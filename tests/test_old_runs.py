@@ -2,8 +2,8 @@
 
 0.2 is a training of a few steps. 0.1 is what the last commit before 0.2 was begun saved of a sphere
 on a dense grid under lobes alone, with exposures and refined cameras, and nothing trained: version,
-configuration, model, log and trust.txt were written by its own `save_config`, `save_scene` and
-`confidence.words`.
+configuration, model and trust.txt were written by its own `save_config`, `save_scene` and
+`confidence.words`, the log by hand in its keys.
 """
 
 import json
