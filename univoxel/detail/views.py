@@ -71,9 +71,12 @@ class DetailedViews:
 
     def __init__(self, scene: Scene, detail: Detail, photos: Photos | None = None) -> None:
         """With the photographs that were trained on, or None: views are the model's alone."""
-        self.scene, self.detail = scene, detail
+        self.scene: Scene = scene
+        self.detail: Detail = detail
         self.at: Vertices = vertices_of(scene, Mesh(detail.vertices, detail.faces))
-        self.photos = scene.registered(photos) if photos is not None and photos.readers else None
+        self.photos: Photos | None = None
+        if photos is not None and photos.readers:
+            self.photos = scene.registered(photos)
         self._kept: OrderedDict[int, _Photo] = OrderedDict()
         if self.photos is not None:
             width = self.photos.readers[0](1).shape[1]
