@@ -194,22 +194,6 @@ class Table:
             return None
         return Table(_vec3(point), _vec3(axis), _vec3(start))
 
-    def turned(self, eye: Tensor, steps: int | None) -> Tensor:
-        """[..., 3, 3] rotations from the world to what it was when the camera stood at `start`."""
-        point, axis, start = (eye.new_tensor(x) for x in (self.point, self.axis, self.start))
-        beside = torch.linalg.cross(axis, start)
-        towards = eye - point
-        along, across = towards @ start, towards @ beside
-        if steps is not None:
-            step = 2 * math.pi / steps
-            angle = (torch.atan2(across, along) / step).round() % steps * step
-            along, across = angle.cos(), angle.sin()
-        length = torch.hypot(along, across).clamp_min(1e-9)
-        cosine, sine = ((x / length)[..., None, None] for x in (along, across))
-        parallel = axis[:, None] * axis
-        cross = torch.linalg.cross(torch.eye(3).to(axis), axis.expand(3, 3)).T  # times v: v x axis
-        return cosine * (torch.eye(3).to(axis) - parallel) + parallel + sine * cross
-
     def frame(self) -> Tensor:
         """[3, 3] rows: the start, beside it, the axis."""
         axis, start = torch.tensor(self.axis), torch.tensor(self.start)
@@ -259,11 +243,10 @@ class Turntable(Table):
         """Which of the tables places [..., 3] are seen over: that of the nearest camera."""
         if not self.others:
             return eye.new_zeros(eye.shape[:-1], dtype=torch.long)
-        apart = [
-            torch.cdist(eye.reshape(-1, 3), eye.new_tensor(table.eyes)).amin(1)
-            for table in self.tables
-        ]
-        return torch.stack(apart).argmin(0).reshape(eye.shape[:-1])
+        stood = eye.new_tensor([place for table in self.tables for place in table.eyes])
+        counts = torch.tensor([len(table.eyes) for table in self.tables])
+        nearest = (eye @ stood.T - 0.5 * stood.square().sum(1)).argmax(-1)
+        return torch.arange(len(counts)).repeat_interleave(counts)[nearest]
 
     def turn(self, eye: Tensor, steps: int | None = None) -> Tensor:
         """Rotations [..., 3, 3] from the world to the light's frame, seen from places [..., 3].
@@ -271,13 +254,17 @@ class Turntable(Table):
         Args:
             steps: to so many positions of the turntable each is rounded; None: to none.
         """
-        turn = self.turned(eye, steps)
+        frames = torch.stack([table.frame() for table in self.tables]).to(eye)
         laid = self.laid(eye)
-        for k, table in enumerate(self.others, 1):
-            into_first = (self.frame().T @ table.frame()).to(eye)
-            other = into_first @ table.turned(eye, steps)
-            turn = torch.where((laid == k)[..., None, None], other, turn)
-        return turn
+        towards = eye - eye.new_tensor([table.point for table in self.tables])[laid]
+        start, beside, axis = frames[laid].unbind(-2)
+        angle = torch.atan2((beside * towards).sum(-1), (start * towards).sum(-1))
+        if steps is not None:
+            step = 2 * math.pi / steps
+            angle = (angle / step).round() % steps * step
+        cosine, sine = angle.cos()[..., None], angle.sin()[..., None]
+        turned = [cosine * start + sine * beside, cosine * beside - sine * start, axis]
+        return frames[0].T @ torch.stack(turned, -2)
 
 
 def _vec3(vector: Tensor) -> Vec3:
