@@ -16,12 +16,14 @@ from observed_points import (
     problem_on_a_sphere,
 )
 
+from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.config import JointConfig
 from univoxel.core.records import Surface
 from univoxel.errors import ConfigError, DataError
 from univoxel.fields.grid import fit_grid
 from univoxel.lights import EnvmapConfig
 from univoxel.lights.views import Table, Turntable, resampling, rotated
+from univoxel.preparation import turntable
 from univoxel.preparation.hull import estimate_bounds, mask_distances, observe_hull, visual_hull
 from univoxel.preparation.turntable import explained, turntable_of
 from univoxel.render.observations import TurnedMaps, shade_observations, turned_maps
@@ -72,17 +74,50 @@ def test_which_light_it_was(photographs, light, caplog):
     caplog.set_level("INFO", "univoxel")
     photos = photographs[light]
     found = explained(observe_hull(photos, *hull_of(photos), 1500), TURNTABLE)
-    turntable = turntable_of(photos, *hull_of(photos), "auto")
+    told = turntable_of(photos, *hull_of(photos), "auto")
     if light == "still":
         assert found.by_still_light > 2 * found.by_turning_light
         assert found.ahead < -3
-        assert turntable is None
+        assert told is None
         assert not caplog.text
     else:
         assert found.by_turning_light > 2 * found.by_still_light
         assert found.ahead > 3
-        assert turntable == TURNTABLE
+        assert told == TURNTABLE
         assert "the light turns with the camera, as on a turntable" in caplog.text
+
+
+def test_exposures_are_no_light(photographs):
+    """Each photograph is as bright as another: what is left is how the light turned."""
+    photos, gains = photographs["turning"], torch.linspace(-1.0, 0.0, VIEWS)[torch.randperm(VIEWS)]
+    linear = srgb_to_linear(photos.color.float() / 255) * gains.exp()[:, None, None, None]
+    color = (255 * linear_to_srgb(linear)).round().to(torch.uint8)
+    observations = observe_hull(replace(photos, color=color), *hull_of(photos), 1500)
+    told, untold = (explained(observations, TURNTABLE, known) for known in (gains, None))
+    assert told.saved > 2 * untold.saved
+    assert told.ahead > 3
+
+
+@pytest.mark.parametrize(
+    ("still_around", "ahead", "saved", "turns"),
+    [
+        (None, 3, 0.1, True),
+        (None, 1, 0.1, False),  # might be chance
+        (None, 9, 0.01, False),  # sure, but next to nothing
+        (False, 3, 0.1, True),  # a scale on the turntable moves, too
+        (True, -1, 0.0, True),
+        (True, -3, 0.0, False),
+    ],
+)
+def test_what_decides(photographs, monkeypatch, caplog, still_around, ahead, saved, turns):
+    caplog.set_level("INFO", "univoxel")
+    found = turntable.Explained(-0.02, 0.3, ahead, saved)
+    monkeypatch.setattr(turntable, "explained", lambda *_: found)
+    monkeypatch.setattr(turntable, "surroundings_stand_still", lambda _: still_around)
+    photos = photographs["still"]
+    assert (turntable_of(photos, *hull_of(photos), "auto") is not None) == turns
+    if turns:
+        assert "a light that stands still 0 %" in caplog.text
 
 
 def test_what_is_known_is_not_looked_for(photographs):
