@@ -379,9 +379,15 @@ class _Baking:
             trusted = (
                 weight * luminance(a) * (color.amax(1) < CLIPPED).float().clamp_min(OF_CLIPPED)
             )
-            model = luminance(a * albedo)
-            trusted *= (model / (model + luminance(b)).clamp_min(1e-6)).square()
+            model = a * albedo
+            own = model / (model + b).clamp_min(1e-6)  # share that is no reflection
+            trusted *= (luminance(model) / luminance(model + b).clamp_min(1e-6)).square()
             value = ((color - b) / a.clamp_min(1e-3)).clamp(0, 1)
+            # What is left of a channel that reflections hide is a tint that nothing has: brightness
+            # is the photograph's then, and colour the model's
+            even = (own.amin(1) / own.amax(1).clamp_min(1e-6)).square()[:, None]
+            bright = luminance(value) / luminance(albedo).clamp_min(1e-4)
+            value = torch.lerp((albedo * bright[:, None]).clamp(0, 1), value, even)
             self.total.index_add_(0, some, trusted[:, None] * value)
             self.weights.index_add_(0, some, trusted)
 
