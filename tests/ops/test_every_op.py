@@ -26,6 +26,7 @@ from op_cases import (
     soup,
 )
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from univoxel import ops
 from univoxel.core.records import Bricks, Mesh
@@ -400,13 +401,42 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(case):
             assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("loss", [lambda o: o.square().sum(), Tensor.sum], ids=["square", "sum"])
 @pytest.mark.parametrize("case", DIFFERENTIABLE)
-def test_second_order_raises(case):
+def test_second_order_raises(case, loss):
+    """Whatever the loss, and whoever asks: a gradient that counts for nothing would be silent."""
     arguments, leaves = fresh(case, CASES[case](6))
-    out = [o.square() for o in flat(function(case)(**arguments)) if o.requires_grad]
-    first = torch.autograd.grad(projection(out), leaves, create_graph=True)
+    out = sum(loss(o) for o in flat(function(case)(**arguments)) if o.requires_grad)
+    first = torch.autograd.grad(out, leaves, create_graph=True)
+    for gradient in first:
+        with pytest.raises(RuntimeError, match="differentiate twice"):
+            torch.autograd.grad(gradient.square().sum() + 0 * out, leaves, retain_graph=True)
     with pytest.raises(RuntimeError, match="differentiate twice"):
         sum(g.square().sum() for g in first).backward()
+
+
+@pytest.mark.skipif(native.core is None, reason="the reference has them")
+@pytest.mark.parametrize("case", DIFFERENTIABLE)
+def test_forward_mode_raises(case):
+    """Where the library is asked it would be 0, and nothing said."""
+    arguments, _ = fresh(case, CASES[case](6))
+    name, value = next(
+        (k, v) for k, v in arguments.items() if any(t.requires_grad for t in flat(v))
+    )
+    given = [t.detach() for t in flat(value)]
+    tangents = [torch.ones_like(t) for t in given]
+
+    def op(*changed):
+        instead = list(changed) if isinstance(value, list) else changed[0]
+        return flat(function(case)(**arguments | {name: instead}))
+
+    def dual():
+        with forward_ad.dual_level():
+            op(*map(forward_ad.make_dual, given, tangents))
+
+    for ask in (lambda: torch.func.jvp(op, tuple(given), tuple(tangents)), dual):
+        with pytest.raises(NotImplementedError, match="no derivative in forward mode"):
+            ask()
 
 
 @pytest.mark.parametrize("case", DIFFERENTIABLE)

@@ -10,7 +10,6 @@ from typing import Any, List, TypeAlias, get_args  # noqa: UP035
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.autograd.function import once_differentiable
 
 from univoxel.core.records import Bricks
 from univoxel.ops import native
@@ -134,7 +133,8 @@ def differentiable(
                            grad_alpha, grad_value, early_stop, threads)
 
     torch knows them as `univoxel::composite` and `univoxel::composite_backward`: what they take and
-    return, the shapes of that without values, what is saved between them. Second order raises.
+    return, the shapes of that without values, what is saved between them. Second order raises, and
+    so do derivatives in forward mode.
 
     Args:
         to: names of the tensors that have gradients, in the order of the backward kernel.
@@ -146,7 +146,7 @@ def differentiable(
             and are saved after the tensors.
         optional: those of `to` whose gradient is an empty array where it is not needed. The kernel
             computes the others always.
-        traced: backward is made of torch's operations and is no op. Only what is held is saved.
+        traced: backward is made of torch's operations and is no op. It takes what is held alone.
     """
     return lambda allocate: Differentiable(
         name or allocate.__name__.removeprefix("_"),
@@ -210,13 +210,22 @@ class Differentiable(native.Operator):
             )
 
     def __call__(self, *arguments: Any) -> Any:
+        if forward_ad._current_level >= 0:
+            self._refuse_tangents(arguments)
         if native.goes_by_library(arguments):
             return self.defined(*arguments)
         if torch.is_grad_enabled() and torch._C._any_requires_grad(*arguments):
             return self._function(*arguments)
-        if forward_ad._current_level >= 0:  # the function tells that there is no such derivative
-            return self._function(*arguments)
         return self.kernel(*arguments)
+
+    def _refuse_tangents(self, arguments: Sequence) -> None:
+        """Raise where a derivative in forward mode is asked for, which torch would take for 0."""
+        given = [t for t in _flat(arguments) if isinstance(t, Tensor) and t.is_floating_point()]
+        if any(forward_ad.unpack_dual(t).tangent is not None for t in given):
+            raise NotImplementedError(
+                f"{self.name}: no derivative in forward mode (jvp, jacfwd, dual numbers): use "
+                "torch.autograd.grad"
+            )
 
     def _register(self) -> Callable:
         """Tell torch of the gradients; returns the short way, an autograd function."""
@@ -287,16 +296,30 @@ class Differentiable(native.Operator):
             return
         held = output[self._shown :]
         ctx.mark_non_differentiable(*held)
-        ctx.save_for_backward(*(() if self._traced else tensors), *held)
+        saved = [tensors[i] for i in self._to] if self._traced else tensors
+        ctx.save_for_backward(*saved, *held)
         if self._shown == 1:  # no zeros for what is held, which may be large
             ctx.set_materialize_grads(False)
 
     def _gradients(
         self, saved: Tensors, grads: Sequence[Any], options: Sequence, needs: list[bool]
     ) -> Sequence[Tensor | None]:
+        """What backward finds. Where a graph of it is asked for, going through that raises."""
+        if not torch.is_grad_enabled():
+            return self._found(saved, grads, options, needs)
+        with torch.no_grad():
+            found = self._found(saved, grads, options, needs)
+        there = [g for g in found if g is not None]
+        # Of constant gradients, too, such as those of a sum: they depend on what was saved
+        marked = iter(_Once.apply(self.name, len(there), *there, *_flat(saved), *grads))
+        return [None if g is None else next(marked) for g in found]
+
+    def _found(
+        self, saved: Tensors, grads: Sequence[Any], options: Sequence, needs: list[bool]
+    ) -> Sequence[Tensor | None]:
         """What backward finds, by the shortest way there is."""
         if self._traced:
-            return self._find(saved, grads, options, needs)
+            return self._find(saved[len(self._to) :], grads, options, needs)
         grads = [g.contiguous() for g in grads[: self._shown]]
         sparse = self._sparse is not None and options[self._sparse]
         if sparse or not native.goes_by_library((*saved, *grads)):
@@ -320,6 +343,22 @@ class Differentiable(native.Operator):
             torch.empty_like(x) if need else x.new_empty(0)
             for x, need in zip(tensors, arguments[-1], strict=True)
         ]
+
+
+class _Once(torch.autograd.Function):
+    """Gradients of an op as they are, which have none themselves."""
+
+    @staticmethod
+    def forward(ctx: Any, name: str, count: int, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.name = name
+        return tuple(t.detach() for t in tensors[:count])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        raise RuntimeError(
+            f"{ctx.name}: cannot differentiate twice: gradients of this op have none themselves, "
+            'those of its reference have: univoxel.ops.use_backend("reference")'
+        )
 
 
 def _forward_by_name(name: str) -> Forward:
@@ -350,8 +389,7 @@ def _backward_by_name(name: str, to: list[int], optional: list[bool]) -> Backwar
 
 
 def _autograd_function(name: str, forward: Callable, backward: Callable) -> Callable:
-    parts = {"forward": forward, "backward": once_differentiable(backward)}
-    methods = {part: staticmethod(method) for part, method in parts.items()}
+    methods = {"forward": staticmethod(forward), "backward": staticmethod(backward)}
     function = type(name, (torch.autograd.Function,), methods)
     # Its own `apply` looks for functorch's transforms first, as `goes_by_library` has done
     beyond: Any = super(torch.autograd.Function, function)
