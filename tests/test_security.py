@@ -1,6 +1,7 @@
 """What no module does: unpickle, unpack, run what data say, start a shell, open a connection."""
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 from analytic import write_scene
 
 import univoxel
+from univoxel.core.guard import guarded
 
 PACKAGE = Path(univoxel.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -139,3 +141,36 @@ def test_commands_open_no_connection(tmp_path):
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "a.ply").is_file()
     assert len(list((tmp_path / "lit").glob("*.png"))) == 2
+
+
+@pytest.mark.parametrize("places", ["{path}", "{path}:", ".:{path}", ":"], ids=repr)
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("-c", "import sys, random, torch, univoxel.cli; print(sys.argv, univoxel.__file__)", "a"),
+        ("-m", "univoxel.cli", "--version"),
+        ("-m", "univoxel.capture.sfm"),
+    ],
+    ids=["program", "command", "step"],
+)
+def test_processes_run_nothing_of_the_working_folder(arguments, places, tmp_path):
+    """Modules of a stranger's data, and a clone that is not built: none of them is imported."""
+    for name in ("random", "runpy", "torch", "importlib", "zlib", "univoxel", "usercustomize"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text(f"raise SystemExit('ran {name}')")
+        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('ran {name}.py')")
+    path = str(Path(univoxel.__file__).parent.parent)
+    env = os.environ | {"PYTHONPATH": places.format(path=path)}
+    with (tmp_path / "said").open("wb+") as said:
+        with guarded(arguments, said, cwd=tmp_path, env=env) as process:
+            code = process.wait()
+        said.seek(0)
+        text = said.read().decode()
+    assert "ran " not in text
+    match arguments[1]:
+        case "univoxel.cli":
+            assert (code, text.strip()) == (0, f"univoxel {univoxel.__version__}")
+        case "univoxel.capture.sfm":
+            assert "IndexError" in text.splitlines()[-1]  # of the argument that it was not given
+        case _:
+            assert (code, text.strip()) == (0, f"['-c', 'a'] {univoxel.__file__}")

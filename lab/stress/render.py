@@ -26,6 +26,7 @@ from lab.stress import scenes
 from lab.stress.scenes import RELIGHT, Spec
 from lab.stress.shapes import Part
 from univoxel.camera import Cameras
+from univoxel.core import guard
 from univoxel.core.machine import threads_asked
 from univoxel.data.images import write_exr
 from univoxel.data.transforms import write_cameras
@@ -95,8 +96,9 @@ def render_in(module: str, identity: str, folder: Path) -> Path:
             shutil.rmtree(begun, ignore_errors=True)
             begun.mkdir(parents=True)
             (begun / SPEC).write_text(identity, encoding="utf-8")
-            command = [sys.executable, "-m", module, str(begun), variant]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            command = guard.command(("-m", module, str(begun), variant))
+            options: dict[str, Any] = {"env": guard.environment(), "check": False}
+            done = subprocess.run(command, capture_output=True, text=True, **options)
             if done.returncode == 0:
                 os.replace(begun, folder)
                 return folder
