@@ -294,7 +294,7 @@ def test_relight_export_view_and_demo(calls, capsys):
     assert main(["demo", "--out", "demo"]) == 0
     paths = (Path("run"), Path("maps/hall.exr"), Path("run/relight/hall"))
     options = {"faces": None, "texture_size": None, "watertight": False, "texture_format": "png"}
-    options |= {"quality": 90, "size": None, "origin": "world", "lods": 0}
+    options |= {"quality": 90, "size": None, "origin": "upright", "lods": 0}
     chosen_options = {"texture_format": "jpeg", "quality": 80}
     chosen_options |= {"size": 0.3, "origin": "bottom", "lods": 1}
     served = {"title": None, "host": "127.0.0.1", "port": 8080}

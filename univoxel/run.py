@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from univoxel.core.files import read_json, write_json
 from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.errors import DataError, UserError
@@ -52,6 +54,38 @@ def photos_of(run: Path, data: Path | None = None, split: str = "test") -> Photo
     photos = load_photos(source.folder, split, size, kept=kept, allow_outside=outside)
     keep_photos(photos, kept)
     return photos
+
+
+WORLD = "world.json"  # in the folder of a run whose world is not that of its data's files
+
+
+def save_world(moved: np.ndarray | None, run: Path) -> None:
+    """Write how the world of the data's files was moved to that of the run, as of `Photos`.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    (run / WORLD).unlink(missing_ok=True)
+    if moved is not None:
+        write_json(run / WORLD, {"from_data": moved.tolist()})
+
+
+def load_world(run: Path) -> np.ndarray | None:
+    """[3, 4], as of `Photos.moved`; None also of runs of earlier versions, which kept none.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    path = run / WORLD
+    if not path.is_file():
+        return None
+    try:
+        moved = np.array(read_json(path)["from_data"], np.float64)
+    except (KeyError, TypeError, ValueError):
+        moved = np.empty(0)
+    if moved.shape != (3, 4) or not np.isfinite(moved).all():
+        raise DataError(f"{path}: expected from_data, a rotation and a translation, got none")
+    return moved
 
 
 def _source_of(run: Path) -> Source:

@@ -1,16 +1,19 @@
 """Size, origin, levels of detail and JPEG textures of exported meshes, read back by others."""
 
 import io
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from asymmetric_scene import lopsided
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from univoxel.cli import export as task
 from univoxel.errors import UserError
 from univoxel.ops import VisibilityScene
+from univoxel.run import save_world
 
 trimesh = pytest.importorskip("trimesh")
 pygltflib = pytest.importorskip("pygltflib")
@@ -27,8 +30,9 @@ def scene():
 def export(tmp_path, scene, monkeypatch):
     monkeypatch.setattr("univoxel.scene.load_scene", lambda run: scene)
 
-    def write(name, **options):
-        return task.export("run", tmp_path / name, **{"texture_size": 64, "faces": 500} | options)
+    def write(name, run="run", **options):
+        chosen: dict[str, Any] = {"texture_size": 64, "faces": 500} | options
+        return task.export(run, tmp_path / name, **chosen)
 
     return write
 
@@ -52,7 +56,7 @@ def pictures(path):
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
-@pytest.mark.parametrize("origin", ["world", "bottom", "centre"])
+@pytest.mark.parametrize("origin", ["upright", "world", "bottom", "centre"])
 def test_size_and_origin(export, suffix, origin):
     """True to 1e-6 of the size; PLY and GLB hold 24 bits, OBJ 7 digits."""
     (plain,) = export(f"plain.{suffix}")
@@ -61,7 +65,7 @@ def test_size_and_origin(export, suffix, origin):
     low, high = after.min(0), after.max(0)
     assert (high - low).max() == pytest.approx(0.3, abs=0.3e-6)
     scale = 0.3 / (before.max(0) - before.min(0)).max()
-    if origin == "world":
+    if origin in ("upright", "world"):
         expected = scale * before
     else:
         middle = (before.min(0) + before.max(0)) / 2
@@ -71,6 +75,38 @@ def test_size_and_origin(export, suffix, origin):
         at_zero = low[2] if origin == "bottom" else (low + high)[2] / 2
         assert at_zero == pytest.approx(0, abs=0.3e-6)
     np.testing.assert_allclose(after, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
+def test_the_data_set_s_own_world(export, suffix, tmp_path):
+    """Vertices, normals and the frame of the normal map are turned back, where it is asked for."""
+    turn = Rotation.from_rotvec([2.0, -0.5, 0.7])
+    save_world(np.column_stack([turn.as_matrix(), [0.5, -1.0, 2.0]]), tmp_path)
+    (plain,) = export(f"plain.{suffix}", run=tmp_path)
+    (world,) = export(f"world.{suffix}", run=tmp_path, origin="world")
+    before, after = vertices(plain), vertices(world)
+    expected = turn.inv().apply(before - [0.5, -1.0, 2.0])
+    np.testing.assert_allclose(after, expected, rtol=0, atol=2e-6)
+    if suffix == "glb":
+        places = [arrays(path) for path in (plain, world)]
+        for name in ("NORMAL", "TANGENT"):
+            old, new = (found[name][:, :3] @ UPRIGHT for found in places)
+            np.testing.assert_allclose(new, turn.inv().apply(old), atol=2e-6)
+    save_world(np.column_stack([np.eye(3), [0.0, -5.8e6, 0.0]]), tmp_path)
+    with pytest.raises(UserError, match="expected a data set whose origin is near, got an object"):
+        export(f"far.{suffix}", run=tmp_path, origin="world")
+
+
+def arrays(path):
+    """Attributes of the vertices of a GLB."""
+    file, found = pygltflib.GLTF2().load(str(path)), {}
+    for name, number in vars(file.meshes[0].primitives[0].attributes).items():
+        if number is not None and name in ("NORMAL", "TANGENT"):
+            accessor = file.accessors[number]
+            view = file.bufferViews[accessor.bufferView]
+            data = file.binary_blob()[view.byteOffset :][: view.byteLength]
+            found[name] = np.frombuffer(data, np.float32).reshape(accessor.count, -1)
+    return found
 
 
 def test_nothing_moves_unasked(export, scene):

@@ -22,8 +22,11 @@ from layouts import (
 from scipy.spatial.transform import Rotation
 
 from univoxel.camera import image_rays, project
+from univoxel.core.records import Mesh
 from univoxel.data import load_photos
 from univoxel.errors import DataError
+from univoxel.output.viewpoints import views_of
+from univoxel.run import load_world, save_world
 
 WRITERS = {
     "NeRF layout": write_nerf,
@@ -97,6 +100,44 @@ def test_a_world_in_any_direction_is_turned_upright(tmp_path, writer):
         local = np.linalg.inv(written.poses[v]) @ [0.1, -0.2, 0.3, 1]
         wanted = FOCAL * local[:2] / -local[2] * [1, -1] + [WIDTH / 2, HEIGHT / 2]
         np.testing.assert_allclose(pixel[0], wanted, atol=1e-4)
+
+
+@pytest.mark.parametrize("far", [(0.0, 0.0, 0.0), (391234.5, 5.82e6, 34.0)], ids=["near", "far"])
+@pytest.mark.parametrize("writer", [*TURNED, write_polycam])
+def test_how_the_world_was_moved_is_known(tmp_path, writer, far):
+    """A run keeps it, so that cameras in the data's own world fit."""
+    written = scene().turned(Rotation.from_rotvec([2.0, -0.5, 0.7]))
+    if writer is write_polycam:
+        written, far = scene(), (0.0, 0.0, 0.0)
+    written.poses[:, :3, :3] = Rotation.from_matrix(written.poses[:, :3, :3]).as_matrix()
+    written.poses[:, :3, 3] += far
+    photos = load_photos(writer(tmp_path / "data", written))
+    save_world(photos.moved, tmp_path)
+    moved = load_world(tmp_path)
+    assert moved is not None
+    undo = np.linalg.inv(np.concatenate([moved, [[0, 0, 0, 1]]]))
+    back = undo[:3, :3] @ photos.cameras.camera_to_world.double().numpy()
+    back[:, :, 3] += undo[:3, 3]
+    if writer is write_polycam:  # whose own world has +Y up
+        back = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) @ back
+    np.testing.assert_allclose(back, written.poses[written.split("train"), :3], atol=2e-6)
+
+
+@pytest.mark.parametrize("far", [0.0, 5.82e6])
+def test_cameras_in_the_data_s_own_world_fit(tmp_path, far):
+    """A path is given in it, to a run that was trained in one with +Z up."""
+    written = scene().turned(Rotation.from_rotvec([2.0, -0.5, 0.7]))
+    written.poses[:, 0, 3] += far
+    photos = load_photos(write_nerfstudio(tmp_path / "data", written))
+    save_world(photos.moved, tmp_path)
+    path, mesh = tmp_path / "data/transforms.json", Mesh(torch.zeros(3, 3), torch.zeros(1, 3).int())
+    names, cameras = views_of(tmp_path, path, None, 0.0, mesh)
+    chosen = cameras.camera_to_world[[names.index(name) for name in photos.names]]
+    torch.testing.assert_close(chosen, photos.cameras.camera_to_world, atol=1e-6, rtol=0)
+    save_world(None, tmp_path)  # a world that was not moved
+    names, cameras = views_of(tmp_path, path, None, 0.0, mesh)
+    wanted = torch.from_numpy(written.poses[[written.names.index(n) for n in names], :3]).float()
+    torch.testing.assert_close(cameras.camera_to_world, wanted)
 
 
 @pytest.mark.parametrize("writer", [write_llff, write_neilf, write_metashape])

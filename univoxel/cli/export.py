@@ -52,9 +52,9 @@ class ExportOptions:
     """of textures as jpeg"""
     size: Annotated[float | None, written("METRES", "as photographed")] = None
     """what the longest side of the object becomes"""
-    origin: choices.Origin = "world"
-    """what lies at 0: the origin of the data set, the middle of the object's floor, or its
-    centre"""
+    origin: choices.Origin = "upright"
+    """what lies at 0: the origin of the data set with +Z up, the same in the data set's own world,
+    as its cameras have it; the middle of the object's floor, or its centre"""
     lods: Annotated[int, written("N")] = 0
     """coarser levels of detail to write beside, FILE_lod1 and so on: each has a quarter of the
     triangles, and textures of half the width"""
@@ -127,6 +127,7 @@ def export(asked: ExportOptions) -> list[Path]:
     from univoxel.output.mesh_files import require_usd
     from univoxel.output.surface import cameras_of, surface_of
     from univoxel.output.topology import close, simplify
+    from univoxel.run import load_world
     from univoxel.scene import load_scene
 
     mesh = Path(asked.mesh)
@@ -158,7 +159,8 @@ def export(asked: ExportOptions) -> list[Path]:
         if asked.watertight:
             reduced = close(reduced)  # what decimation has torn
         if placement is None:  # all levels where the finest lies
-            placement = placement_of(reduced.vertices, asked.size, asked.origin)
+            moved = load_world(run) if asked.origin == "world" else None
+            placement = placement_of(reduced.vertices, asked.size, asked.origin, moved)
         written.append(level_path(mesh, level))
         size = max(widest >> level, TEXTURE_SIZES[0])
         _write(written[-1], scene, reduced, placement, size, asked.jpeg, detail)

@@ -31,7 +31,7 @@ from univoxel.preparation.prepare import Prepared, find_silhouettes, pinned_in, 
 from univoxel.render.pictures import preview
 from univoxel.render.pipeline import surface_at
 from univoxel.run import FILE as VERDICT
-from univoxel.run import Evidence, Verdict, judge, kept_photos, save_verdict
+from univoxel.run import Evidence, Verdict, judge, kept_photos, save_verdict, save_world
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
 from univoxel.training import compression
 from univoxel.training import joint_solve as joint_stage
@@ -131,6 +131,7 @@ def _train(
         if not state:  # of a run that was killed before anything was saved
             (cfg.out / LOG).unlink(missing_ok=True)
         config.save_config(cfg)
+        save_world(photos.moved, cfg.out)
         keep_photos(photos, kept)
         if spectators:
             spectators.show(pixels.photos)

@@ -39,7 +39,7 @@ BATCH_STEPS: tuple[BatchStep, ...] = get_args(BatchStep)
 USUAL_STEPS: tuple[BatchStep, ...] = ("train", "eval", "export", "page")
 ANIMATIONS: tuple[Animation, ...] = get_args(Animation)
 TextureFormat: TypeAlias = Literal["png", "jpeg"]
-Origin: TypeAlias = Literal["world", "bottom", "centre"]  # what of an exported mesh lies at 0
+Origin: TypeAlias = Literal["upright", "world", "bottom", "centre"]  # where a mesh is exported to
 TEXTURE_FORMATS: tuple[TextureFormat, ...] = get_args(TextureFormat)
 ORIGINS: tuple[Origin, ...] = get_args(Origin)
 

@@ -67,6 +67,9 @@ class Shot:
     pose: np.ndarray  # [3, 4] camera-to-world, axes as of `Cameras`
     lens: Lens
     beside: Path | None = None  # a mask that counts where the photograph has no alpha
+    moved: np.ndarray | None = (
+        None  # [3, 4] from the files' world to that of `pose`, as of `Photos`
+    )
 
 
 def read_shots(
@@ -134,6 +137,7 @@ def read_shots(
         readers=tuple(
             partial(_reread, shot, pinhole) for shot, pinhole in zip(shots, pinholes, strict=True)
         ),
+        moved=shots[0].moved,
     )
 
 
@@ -471,11 +475,27 @@ def _near_origin(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     middle = places.mean(0)
     if np.linalg.norm(middle) <= FAR * np.linalg.norm(places - middle, axis=1).mean():
         return list(shots), []
-    offset = np.round(middle)
-    moved = [
-        replace(s, pose=np.column_stack([s.pose[:, :3], s.pose[:, 3] - offset])) for s in shots
+    shift = -np.round(middle)
+    moved = in_moved_world(shots, np.column_stack([np.eye(3), shift]))
+    return moved, ["world moved by " + " ".join(f"{x:.0f}" for x in shift)]
+
+
+def in_moved_world(shots: Sequence[Shot], motion: np.ndarray) -> list[Shot]:
+    """The shots in a world that a rotation and a translation [3, 4] lead to."""
+    return [
+        replace(
+            shot,
+            pose=after(motion, shot.pose),
+            moved=motion if shot.moved is None else after(motion, shot.moved),
+        )
+        for shot in shots
     ]
-    return moved, ["world moved by " + " ".join(f"{-x:.0f}" for x in offset)]
+
+
+def after(motion: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """A pose or motion [3, 4], and then another motion."""
+    turned = motion[:, :3] @ pose
+    return np.column_stack([turned[:, :3], turned[:, 3] + motion[:, 3]])
 
 
 def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
@@ -493,8 +513,7 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
         return shots, [*moved, "world as in the files: its cameras do not say what is up"]
     if up[2] >= math.cos(LEAN):
         return shots, moved
-    turn = turn_to_z(up)
-    turned = [replace(shot, pose=turn @ shot.pose) for shot in shots]
+    turned = in_moved_world(shots, np.column_stack([turn_to_z(up), np.zeros(3)]))
     return turned, [*moved, "world turned to +Z up"]
 
 

@@ -17,7 +17,7 @@ from univoxel.core.files import read_json
 from univoxel.data.conventions import TO_OPENGL, check_skew, find_photo, parsed
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import Lens, fitted
-from univoxel.data.load_images import Shot, every_eighth, read_shots, upright
+from univoxel.data.load_images import Shot, every_eighth, in_moved_world, read_shots, upright
 from univoxel.data.path_sandbox import inside, left_out
 from univoxel.data.photos import Photos
 from univoxel.data.transforms import lens_of, listed_image, pose_of, read_number, short
@@ -334,7 +334,7 @@ def _row_pose(row: dict[str, str], where: str) -> np.ndarray:
 
 # Where cameras and images are; what loops were closed in comes first
 PLACES = ("keyframes/corrected_", "keyframes/", "corrected_")
-UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from +Y up to +Z up
+UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0]])  # from +Y up to +Z up
 
 
 def is_polycam(folder: Path, split: str) -> bool:
@@ -365,14 +365,14 @@ def load_polycam(
         values = _read(path)
         width, height = (int(values[key]) for key in ("width", "height"))
         lens = fitted(lens_of(values, str(path), width, height), picture, str(path))
-        pose = UPRIGHT @ pose_of(values["pose"], str(path))
+        pose = pose_of(values["pose"], str(path))
         shots.append(Shot(path.stem, str(path), picture, None, pose, lens))
     note = f" (looked in {pictures}"
     others = folder / f"{place.removesuffix('corrected_')}images"
     if others != pictures and others.is_dir():
         note += f"; those in {others} are of the cameras in {others.with_name('cameras')}"
     lost = left_out(str(cameras[0].parent), missing, len(cameras), f"{note})")
-    shots = every_eighth(folder, shots, split)
+    shots = every_eighth(folder, in_moved_world(shots, UPRIGHT), split)
     remarks = [*lost, "world turned from +Y to +Z up"]
     return read_shots(folder, "Polycam raw data", split, shots, downscale, remarks, masks)
 

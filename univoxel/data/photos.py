@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,6 +31,9 @@ class Photos:
     # Read the file of each photograph again, shrunk to 1/factor: stored colour [H, W, 3], as its
     # pinhole sees it. Empty where photographs are from no files
     readers: tuple[Callable[[int], Tensor], ...] = ()
+    # [3, 4] float64, rotation and translation from the world of the files to that of `cameras`;
+    # None: they are one
+    moved: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.names)

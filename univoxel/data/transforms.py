@@ -45,12 +45,15 @@ _SHORT.maxlist = _SHORT.maxdict = 20
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 200
 
 
-def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
+def load_cameras(
+    path: str | Path, size: int, moved: np.ndarray | None = None
+) -> tuple[list[str], Cameras]:
     """Names and cameras of a file in the form of transforms_<split>.json, without pictures.
 
     Args:
         size: pixels, width and height of the pictures to come where the file gives no w and h,
             for all or with a frame.
+        moved: from the file's world to that of the cameras, as of `Photos`.
 
     Returns:
         A name for each frame, from its file_path or its number, and the cameras.
@@ -70,7 +73,8 @@ def load_cameras(path: str | Path, size: int) -> tuple[list[str], Cameras]:
     poses, lenses = [], []
     for index, frame in enumerate(frames):
         where = f"{path}: frame {index}"
-        poses.append(pose_of(frame.get("transform_matrix"), where))
+        pose = pose_of(frame.get("transform_matrix"), where)
+        poses.append(pose if moved is None else load_images.after(moved, pose))
         values = {"w": size, "h": size} | root | frame
         width, height = (int(read_number(values, key, where, 0, WIDEST)) for key in ("w", "h"))
         lens = lens_of(values, where, width, height)

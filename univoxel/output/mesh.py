@@ -32,6 +32,8 @@ AlbedoNear: TypeAlias = Callable[[Tensor, Tensor, Tensor, float], Tensor]
 # turn.
 Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
+FARTHEST = 1000  # sides of an object that a data set's origin may be away: float32 has 7 digits
+
 
 @dataclass(frozen=True)
 class TexturedMesh:
@@ -395,19 +397,26 @@ AnyMesh = TypeVar("AnyMesh", Mesh, TexturedMesh)
 
 @dataclass(frozen=True)
 class Placement:
-    """x -> scale (x - origin), from the data set's world to an exported one."""
+    """x -> scale turn (x - origin), from the run's world to an exported one."""
 
     origin: Tensor  # [3] float64, the point of the world that comes to lie at 0
     scale: float
+    turn: Tensor | None = None  # [3, 3] float64, a rotation; None: none
 
 
-def placement_of(vertices: Tensor, size: float | None, origin: Origin) -> Placement:
+def placement_of(
+    vertices: Tensor, size: float | None, origin: Origin, moved: np.ndarray | None = None
+) -> Placement:
     """What brings the bounding box of vertices [P, 3] to a size and to an origin.
 
     Args:
         size: the longest side of the box afterwards; None: as it is.
-        origin: what comes to lie at 0: "world", the data set's origin; "bottom", the middle of the
-            box's floor; "centre", the middle of the box.
+        origin: what comes to lie at 0: "upright" and "world", the data set's origin; "bottom", the
+            middle of the box's floor; "centre", the middle of the box.
+        moved: how the data set's world was moved to the run's, as of `Photos`, which is undone.
+
+    Raises:
+        UserError: the data set's origin is so far away that float32 cannot hold the vertices.
     """
     low, high = vertices.double().amin(0), vertices.double().amax(0)
     middle = (low + high) / 2
@@ -418,10 +427,32 @@ def placement_of(vertices: Tensor, size: float | None, origin: Origin) -> Placem
             at = middle
         case _:
             at = torch.zeros_like(middle)
-    return Placement(at, 1.0 if size is None else size / float((high - low).max()))
+    side = float((high - low).max())
+    scale = 1.0 if size is None else size / side
+    if moved is None:
+        return Placement(at, scale)
+    turn, at = torch.from_numpy(moved[:, :3].T.copy()), torch.from_numpy(moved[:, 3].copy())
+    if (away := float((middle - at).norm())) > FARTHEST * side:
+        raise UserError(
+            f"export: expected a data set whose origin is near, got an object of {side:.4g} at a "
+            f"distance of {away:.6g}: mesh files hold too few digits. Take another origin",
+            "origin",
+        )
+    return Placement(at, scale, turn)
 
 
 def placed(mesh: AnyMesh, placement: Placement) -> AnyMesh:
-    """A mesh brought where a placement says; normals and textures stay."""
-    vertices = placement.scale * (mesh.vertices.double() - placement.origin)
-    return replace(mesh, vertices=vertices.float())
+    """A mesh brought where a placement says; textures stay."""
+
+    turn = placement.turn
+
+    def turned(vectors: Tensor) -> Tensor:
+        return (vectors if turn is None else vectors.double() @ turn.T).float()
+
+    changes = {"vertices": turned(placement.scale * (mesh.vertices.double() - placement.origin))}
+    if mesh.normals is not None:
+        changes["normals"] = turned(mesh.normals)
+    if isinstance(mesh, TexturedMesh):
+        along, side = mesh.tangents[:, :3], mesh.tangents[:, 3:]
+        changes["tangents"] = torch.cat([turned(along), side], 1)
+    return replace(mesh, **changes)

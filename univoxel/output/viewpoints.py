@@ -21,7 +21,7 @@ from univoxel.ops import PointLight, Sun
 from univoxel.output.mesh import AlbedoNear
 from univoxel.render import relight
 from univoxel.render.pipeline import at_rays, extract_mesh, surface_of_view
-from univoxel.run import photos_of
+from univoxel.run import load_world, photos_of
 from univoxel.scene import Scene, load_scene
 
 ORBIT_FRAMES = 60
@@ -109,7 +109,7 @@ def views_of(
         photos = photos_of(run)
         names, views = photos.names, photos.cameras
     else:
-        names, views = load_cameras(cameras, ORBIT_SIZE)
+        names, views = load_cameras(cameras, ORBIT_SIZE, load_world(run))
     return names, resize(views, resolution or views.width)
 
 
