@@ -100,12 +100,76 @@ def test_colours_are_those_of_the_video(tmp_path, matrix, full, tagged, height):
     np.testing.assert_allclose(middles, COLORS, atol=6)
 
 
-def test_hdr_is_told(film, tmp_path, caplog):
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(film), "-c", "copy"]
-    curve = "h264_metadata=transfer_characteristics=18:matrix_coefficients=9:colour_primaries=9"
-    subprocess.run([*command, "-bsf:v", curve, str(tmp_path / "a.mp4")], check=True)
-    write_frames(tmp_path / "a.mp4", tmp_path / "frames", every=1.0)
-    assert "a.mp4: colours of HLG (HDR) come out flat: record without HDR" in caplog.text
+# From linear Rec. 709 to other primaries of the same white, as standards print them
+TO_2020 = [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]]
+TO_P3 = [[0.8225, 0.1774, 0.0], [0.0332, 0.9669, 0.0], [0.0171, 0.0724, 0.9108]]
+
+
+def of_709(code):
+    return np.where(code < 0.081, code / 4.5, ((code + 0.099) / 1.099) ** (1 / 0.45))
+
+
+def in_709(light):
+    return np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
+
+
+def paper(srgb):
+    """Linear BT.2020 of numbers in sRGB, in cd/m2, paper as bright as BT.2408 has it."""
+    return (
+        203
+        * np.where(srgb < 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        @ np.array(TO_2020).T
+    )
+
+
+def hlg(srgb):
+    light = paper(srgb) / 1000
+    light *= (light @ [0.2627, 0.678, 0.0593])[:, None] ** (1 / 1.2 - 1)
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    return np.where(light < 1 / 12, np.sqrt(3 * light), a * np.log((12 * light - b).clip(1e-9)) + c)
+
+
+def pq(srgb):
+    power = (paper(srgb) / 10000) ** 0.1593017578125
+    return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+
+
+@pytest.mark.parametrize(
+    ("codes", "matrix", "primaries", "curve"),
+    [
+        (lambda srgb: in_709(of_709(srgb) @ np.array(TO_2020).T), "bt2020", "bt2020", "bt2020-10"),
+        (lambda srgb: in_709(of_709(srgb) @ np.array(TO_2020).T), "bt2020", "unknown", "unknown"),
+        (lambda srgb: in_709(of_709(srgb) @ np.array(TO_P3).T), "bt709", "smpte432", "bt709"),
+        (lambda srgb: srgb, "bt709", "bt709", "unknown"),
+        (hlg, "bt2020", "bt2020", "arib-std-b67"),
+        (pq, "bt2020", "bt2020", "smpte2084"),
+    ],
+)
+def test_wide_colours_and_hdr_become_those_of_709(
+    tmp_path, caplog, codes, matrix, primaries, curve
+):
+    """And pixels twice as wide as high become square."""
+    row = codes(np.repeat(np.array(COLORS) / 255, 20, 0))
+    frame = np.round(65535 * row).astype("<u2")[None].repeat(64, 0)
+    tags = f"setsar=2,setparams=color_primaries={primaries}:color_trc={curve}"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "rawvideo", "-r", "5"]
+    command += ["-pix_fmt", "rgb48le", "-s", "80x64", "-i", "-", "-vf"]
+    command += [f"scale=out_color_matrix={matrix}:out_range=tv,{tags}", "-c:v", "libx264"]
+    command += ["-pix_fmt", "yuv420p10le", "-crf", "2", str(tmp_path / "a.mp4")]
+    subprocess.run(command, check=True, input=5 * frame.tobytes())
+    assert write_frames(tmp_path / "a.mp4", tmp_path / "frames") == 1
+    found = np.asarray(Image.open(tmp_path / "frames/frame_00000.jpg"))
+    assert found.shape == (64, 160, 3)
+    np.testing.assert_allclose(found[32, 20::40], COLORS, atol=6 if curve == "smpte2084" else 4)
+    assert ("(HDR) were tone mapped" in caplog.text) == (codes in (hlg, pq))
+
+
+def test_frames_that_are_doubled_are_taken_once(film, tmp_path):
+    """As recorders of screens write them; noise of the encoder makes no picture of its own."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(film), "-vf"]
+    slow = "select='not(mod(n,10))',setpts=N/TB,fps=20,noise=alls=1:allf=t"
+    subprocess.run([*command, slow, "-crf", "30", str(tmp_path / "a.mp4")], check=True)
+    assert write_frames(tmp_path / "a.mp4", tmp_path / "frames", every=0.25) <= 4
 
 
 def test_a_recording_that_does_not_know_its_length(film, tmp_path):

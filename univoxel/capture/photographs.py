@@ -8,14 +8,17 @@ import logging
 import math
 import re
 import subprocess
+import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image, ImageOps
 
-from univoxel.data.images import is_heif, open_picture, srgb_of
+from univoxel.color import linear_to_srgb
+from univoxel.data.images import REC_709, in_rec709, is_heif, open_picture, srgb_of
 from univoxel.data.masks import without_masks
 from univoxel.errors import DataError, MissingExtra
 
@@ -276,6 +279,24 @@ LOOKED_AT = (640, 360)  # pixels, in which sharpness is compared
 JPEG_QUALITY = 2  # of ffmpeg: 1 to 31, lower is better
 HD = 720  # pixels of the shorter side from which colours are BT.709, where a video does not say
 HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}  # curves of colours that no JPEG has
+PAPER = 203.0  # cd/m2 of white paper in them
+# x and y of red, green, blue and white, by ffmpeg's names
+PRIMARIES = {
+    "bt2020": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
+    "smpte432": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
+    "smpte431": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3140, 0.3510),
+    "smpte170m": (0.630, 0.340, 0.310, 0.595, 0.155, 0.070, 0.3127, 0.3290),
+    "smpte240m": (0.630, 0.340, 0.310, 0.595, 0.155, 0.070, 0.3127, 0.3290),
+    "bt470bg": (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.3127, 0.3290),
+}
+# Of a video that states primaries alone
+MATRIX_OF = {"bt709": "bt709", "bt2020": "bt2020", "smpte432": "bt709"}
+MATRIX_OF |= dict.fromkeys(("smpte170m", "bt470bg"), "bt601")
+OTHER_MATRICES = ("bt2020c", "ictcp", "ipt-c2", "ycgco", "smpte2085")  # that ffmpeg does not undo
+FIELDS = ("progressive", "top first", "bottom first", "top coded first (swapped)")
+NODES = 65  # along a side of a table of colours
+TABLE = "colours.cube"
+STILL = 0.25  # of 255, by which frames of a picture that stands still may differ
 
 log: logging.Logger = logging.getLogger("univoxel")
 
@@ -312,33 +333,99 @@ def write_frames(video: Path, folder: Path, every: float | None = None) -> int:
     )
     pictures = np.frombuffer(looked, np.uint8).reshape(-1, height, width)
     chosen = sharpest([sharpness(picture) for picture in pictures], LOOKS)
-    again = [np.array_equal(pictures[a], pictures[b]) for a, b in pairwise(chosen)]
-    chosen = chosen[:1] + [n for n, same in zip(chosen[1:], again, strict=True) if not same]
-    if not chosen:
+    kept = chosen[:1]
+    for frame in chosen[1:]:
+        change = np.abs(pictures[frame].astype(np.int16) - pictures[kept[-1]])
+        kept += [frame] if change.mean() > STILL else []
+    if not kept:
         raise DataError(f"{video}: expected a video, got none of its frames")
     folder.mkdir(parents=True, exist_ok=True)
-    which = "+".join(f"eq(n\\,{n})" for n in chosen)
-    target = str(folder / "frame").replace("%", "%%") + "_%05d.jpg"
-    _ffmpeg(
-        video,
-        f"{rate},select='{which}',{_to_jpeg(video)}",
-        *("-fps_mode", "passthrough", "-q:v", str(JPEG_QUALITY), "-start_number", "0"),
-        target,
-    )
-    return len(chosen)
+    which = "+".join(f"eq(n\\,{n})" for n in kept)
+    target = str(folder.absolute() / "frame").replace("%", "%%") + "_%05d.jpg"
+    with tempfile.TemporaryDirectory() as place:
+        _ffmpeg(
+            video,
+            f"{rate},select='{which}',{_to_jpeg(video, Path(place))}",
+            *("-fps_mode", "passthrough", "-q:v", str(JPEG_QUALITY), "-start_number", "0"),
+            target,
+            place=place,
+        )
+    return len(kept)
 
 
-def _to_jpeg(video: Path) -> str:
-    """The filter that turns a video's colours into those that readers of JPEG expect: BT.601 in
-    full range. Without it ffmpeg writes the numbers of HD colours as they are."""
+def _to_jpeg(video: Path, folder: Path) -> str:
+    """The filter that makes of a video what readers of JPEG expect: square pixels of Rec. 709's
+    colours, in BT.601 of full range. Without it ffmpeg writes other colours' numbers as they are.
+
+    Args:
+        folder: for the table that the filter reads where colours are not those of Rec. 709.
+    """
     found = re.search(r"Video: .*?, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)", _about(video))
-    tags = re.split("[,/ ]+", found[1] or "") if found else []
-    if curve := next((HDR[tag] for tag in tags if tag in HDR), None):
-        log.warning("%s: colours of %s (HDR) come out flat: record without HDR", video.name, curve)
-    stated = any(tag.startswith(("bt", "smpte", "fcc", "gbr")) for tag in tags)
-    large = found is not None and min(int(found[2]), int(found[3])) >= HD
-    origin = "bt709" if large and not stated else "auto"
-    return f"scale=in_color_matrix={origin}:out_color_matrix=bt601:out_range=pc,format=yuvj420p"
+    words = re.split(", *", found[1] or "") if found else []
+    tags = next((w for w in words if w not in ("tv", "pc") and w not in FIELDS), "unknown")
+    matrix, primaries, curve = tags.split("/") if tags.count("/") == 2 else [tags] * 3
+    if matrix in OTHER_MATRICES:
+        log.warning("%s: colours of %s may come out wrong: record in BT.709", video.name, matrix)
+    if primaries == "unknown" and (curve in HDR or matrix.startswith("bt2020")):
+        primaries = "bt2020"
+    if matrix == "unknown":
+        large = found is not None and min(int(found[2]), int(found[3])) >= HD
+        matrix = MATRIX_OF.get(primaries, "bt709" if large else "auto")
+    else:
+        matrix = "auto"
+    table = ""
+    stated = PRIMARIES.get(primaries, REC_709)
+    if stated != REC_709 or curve in (*HDR, "linear"):
+        _write_table(folder / TABLE, stated, curve)
+        table = f",lut3d=file={TABLE}:interp=tetrahedral"
+    if curve in HDR:
+        said = "%s: colours of %s (HDR) were tone mapped: what is brighter than white paper is flat"
+        log.warning(said, video.name, HDR[curve])
+    exact = "flags=bicubic+accurate_rnd+full_chroma_int"
+    return (
+        f"scale=w='iw*max(sar,1)':h='ih/min(sar,1)':in_color_matrix={matrix}:{exact},setsar=1,"
+        f"format=gbrp16le{table},"
+        f"scale=out_color_matrix=bt601:out_range=pc:{exact},format=yuvj420p"
+    )
+
+
+def _write_table(path: Path, primaries: Sequence[float], curve: str) -> None:
+    """A cube of colours for ffmpeg: from numbers in a video to those in Rec. 709.
+
+    HDR is scaled so that paper is white, and goes over to white above three quarters of that, by
+    the largest channel: hues stay.
+
+    Source: ITU-R BT.2100, BT.2408 (paper has 203 cd/m2); BT.709's curve, also of BT.601 and 2020.
+    """
+    axis = np.linspace(0, 1, NODES)
+    code = np.stack(np.meshgrid(axis, axis, axis, indexing="ij")[::-1], -1).reshape(-1, 3)
+    match curve:
+        case "smpte2084":
+            power = code ** (32 / 2523)
+            light = (power - 0.8359375).clip(0) / (18.8515625 - 18.6875 * power)
+            light = light ** (16384 / 2610) * 10000 / PAPER
+        case "arib-std-b67":
+            a, b, c = 0.17883277, 0.28466892, 0.55991073
+            scene = np.where(code <= 0.5, code**2 / 3, (np.exp((code - c) / a) + b) / 12)
+            bright = (scene @ [0.2627, 0.6780, 0.0593])[:, None]
+            light = scene * bright.clip(1e-9) ** 0.2 * 1000 / PAPER
+        case "linear":
+            light = code
+        case "iec61966-2-1":
+            light = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+        case _:
+            light = np.where(code < 0.081, code / 4.5, ((code + 0.099) / 1.099) ** (1 / 0.45))
+    light = in_rec709(light, primaries)
+    if curve in HDR:
+        largest = light.max(1, keepdims=True).clip(1e-9)
+        light = light * np.where(largest < 0.75, 1, (1 - 0.25 * np.exp(3 - 4 * largest)) / largest)
+    if curve in (*HDR, "linear", "iec61966-2-1"):
+        shown = linear_to_srgb(torch.from_numpy(light)).numpy()
+    else:
+        shown = np.where(light < 0.018, 4.5 * light, 1.099 * light.clip(1e-9) ** 0.45 - 0.099)
+    with path.open("w", encoding="ascii") as file:
+        file.write(f"LUT_3D_SIZE {NODES}\n")
+        np.savetxt(file, shown.clip(0, 1), "%.6f")
 
 
 def sharpest(scores: list[float], looks: int) -> list[int]:
@@ -382,9 +469,9 @@ def _about(video: Path, *output: str) -> str:
     )
 
 
-def _ffmpeg(video: Path, filters: str, *output: str) -> bytes:
+def _ffmpeg(video: Path, filters: str, *output: str, place: str | None = None) -> bytes:
     command = [_program(), "-v", "error", "-nostdin", *_opened(video), "-vf", filters, *output]
-    done = subprocess.run(command, capture_output=True, check=False)
+    done = subprocess.run(command, capture_output=True, check=False, cwd=place)
     if done.returncode:
         said = done.stderr.decode("utf-8", "replace").strip().splitlines() or ["no reason given"]
         raise DataError(f"{video}: expected a video, could not read it: {said[-1]}")
@@ -394,7 +481,7 @@ def _ffmpeg(video: Path, filters: str, *output: str) -> bytes:
 def _opened(video: Path) -> list[str]:
     """Arguments that open a video alone: no file that it names, nothing over a network."""
     allowed = ["-protocol_whitelist", "file", "-format_whitelist", VIDEO_FORMATS]
-    return [*allowed, "-i", f"file:{video}"]
+    return [*allowed, "-i", f"file:{video.absolute()}"]
 
 
 def _program() -> str:
