@@ -4,13 +4,14 @@ import errno
 import os
 import stat
 import struct
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import OpenEXR
 import pytest
 import torch
-from PIL import Image, ImageCms
+from PIL import ExifTags, Image, ImageCms
 
 from univoxel.core.files import replacing
 from univoxel.data import images
@@ -78,6 +79,76 @@ def test_colours_of_a_profile(tmp_path, name):
         assert images.read_image(tmp_path / name, in_srgb=True)[0, 0, 0] == pytest.approx(
             250, abs=3
         )
+
+
+def linear_profile() -> bytes:
+    """Primaries of sRGB, and no curve: called sRGB all the same."""
+    data = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    start = data.index(b"para", 128)  # of all three channels: gamma 1 in place of the curve
+    return data[:start] + b"curv" + bytes(4 + 4) + data[start + 12 :]
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+P3_CHROMATICITIES = (31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000)
+# Of (250, 10, 20) stated in each way
+STATED = {
+    "linear": ([chunk(b"gAMA", struct.pack(">I", 100000))], (253, 55, 79)),
+    "gamma": ([chunk(b"gAMA", struct.pack(">I", 45455))], (250, 10, 20)),
+    "sRGB": ([chunk(b"sRGB", b"\0"), chunk(b"gAMA", struct.pack(">I", 100000))], (250, 10, 20)),
+    "P3": ([chunk(b"cHRM", struct.pack(">8I", *P3_CHROMATICITIES))], (255, 0, 0)),
+    "coded P3": ([chunk(b"cICP", bytes([12, 13, 0, 1]))], (255, 0, 0)),
+    "coded sRGB": ([chunk(b"cICP", bytes([1, 13, 0, 1]))], (250, 10, 20)),
+}
+
+
+@pytest.mark.parametrize("how", STATED)
+def test_colours_that_a_png_states(tmp_path, how):
+    said, expected = STATED[how]
+    Image.new("RGBA", (2, 2), (250, 10, 20, 77)).save(tmp_path / "a.png")
+    data = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(data[:33] + b"".join(said) + data[33:])
+    assert images.read_image(tmp_path / "a.png")[0, 0].tolist() == [250, 10, 20, 77]
+    seen = images.read_image(tmp_path / "a.png", in_srgb=True)[0, 0].tolist()
+    assert seen == pytest.approx([*expected, 77], abs=2)
+
+
+def test_hdr_in_a_png_is_refused(tmp_path):
+    Image.new("RGB", (2, 2)).save(tmp_path / "a.png")
+    data = (tmp_path / "a.png").read_bytes()
+    hlg = chunk(b"cICP", bytes([9, 18, 0, 1]))
+    (tmp_path / "a.png").write_bytes(data[:33] + hlg + data[33:])
+    with pytest.raises(DataError, match=r"a\.png: expected colours of sRGB, got HLG \(HDR\)"):
+        images.read_image(tmp_path / "a.png", in_srgb=True)
+
+
+def test_adobe_rgb_that_a_camera_states(tmp_path):
+    """In EXIF alone, as cameras do: DCF's index R03."""
+    light = np.array([0.5, 0.2, 0.1])  # linear Adobe RGB (1998), and the same in Rec. 709
+    turned = light @ np.array([[1.3982, -0.3982, 0], [0, 1, 0], [0, -0.0429, 1.0429]]).T
+    code = np.round(255 * light ** (256 / 563)).astype(np.uint8)
+    expected = 255 * (1.055 * turned ** (1 / 2.4) - 0.055)
+    for index, wanted in (("R03", expected), ("R98", code)):
+        exif = Image.Exif()
+        exif[ExifTags.IFD.Exif] = {0xA001: 65535, ExifTags.IFD.Interop: {1: index}}
+        picture = Image.new("RGB", (16, 16), tuple(code.tolist()))
+        picture.save(tmp_path / "a.jpg", quality=100, subsampling=0, exif=exif)
+        seen = images.read_image(tmp_path / "a.jpg", in_srgb=True)[0, 0]
+        assert seen.tolist() == pytest.approx(wanted.tolist(), abs=2)
+
+
+def test_the_name_of_a_profile_says_nothing(tmp_path):
+    Image.new("RGB", (2, 2), (250, 10, 20)).save(tmp_path / "a.png", icc_profile=linear_profile())
+    seen = images.read_image(tmp_path / "a.png", in_srgb=True)[0, 0].tolist()
+    assert seen == pytest.approx([253, 55, 79], abs=2)
+
+
+def test_primaries_that_are_none_change_nothing():
+    rgb = np.array([[0.5, 0.4, 0.3]], np.float32)
+    for wrong in ((0.3, 0.3) * 4, (0.0,) * 8, (np.nan,) * 8, (0.3, 0.4, 0.5)):
+        assert images.in_rec709(rgb, wrong) is rgb
 
 
 def test_other_kinds_under_the_name_of_jpeg(tmp_path):
@@ -184,6 +255,7 @@ def test_an_exr_of_several_parts(tmp_path):
 
 
 DISPLAY_P3 = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329)
+ACES_2065 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 ACES_CG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
 
 
@@ -193,6 +265,7 @@ ACES_CG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
         # Colours as published with the spaces, white adapted as of Bradford
         (DISPLAY_P3, [1.22494, -0.04206, -0.01964]),
         (ACES_CG, [1.70505, -0.13026, -0.02400]),
+        (ACES_2065, [2.52169, -0.27648, -0.01538]),  # whose blue has y below 0
         (images.REC_709, [1, 0, 0]),
         (images.OF_RADIANCE, [1, 0, 0]),
         ((0,) * 8, [1, 0, 0]),

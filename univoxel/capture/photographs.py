@@ -175,12 +175,10 @@ def read_upright(path: Path, longest: int = 0) -> Image.Image:
                 size = fitted(image.width, image.height, longest)
                 image.draft(None, size)
             image.load()
-            profile = image.info.get("icc_profile")
-            picture = shrunk_to(_eight_bits(image), longest)
+            picture = srgb_of(shrunk_to(_eight_bits(image), longest), image)
             orientation = image.getexif().get(ORIENTATION, 1)
     except BROKEN as error:
         raise DataError(f"{path}: expected a photograph, could not read it: {error}") from None
-    picture = srgb_of(picture, profile) if profile else picture
     picture.info.pop("icc_profile", None)
     picture.getexif()[ORIENTATION] = orientation
     return ImageOps.exif_transpose(picture)

@@ -34,7 +34,7 @@ from univoxel.data.photos import Photos, coverage_of
 UNFIT = (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError)
 HEADER = 4096  # bytes of the header of a file that is written while photographs are read
 FLUSHED = 16  # photographs after which what was read is safe on disk
-VERSION = 3  # of what is done to pixels: another one makes all files that are there unfit
+VERSION = 4  # of what is done to pixels: another one makes all files that are there unfit
 
 log: logging.Logger = logging.getLogger("univoxel")
 # Where photographs may have been kept. Layouts read photographs and need not know of it

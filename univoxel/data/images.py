@@ -15,9 +15,10 @@ from threading import Lock
 import numpy as np
 import OpenEXR
 import torch
-from PIL import ExifTags, Image, ImageCms
+from PIL import ExifTags, Image, ImageCms, ImageFilter
 from torch import Tensor
 
+from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.core.files import write_bytes
 from univoxel.core.records import HALF_MAX
 from univoxel.errors import DataError
@@ -26,7 +27,21 @@ SMALLEST = 2.0**-128  # what is darker has no exponent: black
 # x and y of red, green, blue and white: of Rec. 709, which colours here are of, and of Radiance,
 # whose writers state it whatever colours they have
 REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 OF_RADIANCE = (0.64, 0.33, 0.29, 0.60, 0.15, 0.06, 0.3333, 0.3333)
+# By their numbers in ITU-T H.273: primaries, and curves of light that sRGB does not hold
+CODED = {
+    9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
+    12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
+}
+HDR_CURVES = {16: "PQ", 18: "HLG"}
+HEAD = 4096  # bytes of a PNG that hold what is said of its colours
+SRGB_POWER = 2.2  # which sRGB's curve is near
+NODES = 33  # along a side of a table of colours
+# Colours all over sRGB: a profile that changes none of them by more than SAME of 255 is sRGB's
+PROBE: np.ndarray = np.stack(np.meshgrid(*3 * [np.arange(0, 256, 15)]), -1).reshape(18, -1, 3)
+PROBE = PROBE.astype(np.uint8)
+SAME = 2
 NEAR = 2e-3  # by which primaries may differ and are the same
 BRADFORD = np.array(
     [[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]]
@@ -76,7 +91,7 @@ def read_radiance(path: Path) -> np.ndarray:
     exponent = rgbe[..., 3:].astype(np.int32)
     value = np.ldexp(rgbe[..., :3].astype(np.float32), exponent - 136)
     value = np.where(exponent > 0, value, np.float32(0))
-    stated = re.search(rb"^PRIMARIES=\s*((?:[\d.]+\s+){7}[\d.]+)\s*$", head, re.MULTILINE)
+    stated = re.search(rb"^PRIMARIES=\s*((?:[-\d.]+\s+){7}[-\d.]+)\s*$", head, re.MULTILINE)
     return in_rec709(value, [float(x) for x in stated[1].split()]) if stated else value
 
 
@@ -87,11 +102,14 @@ def in_rec709(rgb: np.ndarray, stated: Sequence[float]) -> np.ndarray:
     Args:
         stated: x and y of red, green, blue and white. Numbers that are none change nothing.
     """
-    usual = any(np.allclose(stated, known, atol=NEAR) for known in (REC_709, OF_RADIANCE))
-    if len(stated) != 8 or usual or min(stated[1::2]) <= 0:
+    if len(stated) != 8 or not np.isfinite(stated).all() or 0 in stated[1::2]:
+        return rgb
+    if any(np.allclose(stated, known, atol=NEAR) for known in (REC_709, OF_RADIANCE)):
         return rgb
     (theirs, white), (ours, d65) = _to_xyz(stated), _to_xyz(REC_709)
     scale = np.diag((BRADFORD @ d65) / (BRADFORD @ white))
+    if not np.isfinite(theirs).all():  # of primaries on one line
+        return rgb
     matrix = np.linalg.inv(ours) @ np.linalg.inv(BRADFORD) @ scale @ BRADFORD @ theirs
     return np.maximum(rgb @ matrix.T, 0).astype(np.float32)
 
@@ -103,6 +121,8 @@ def _to_xyz(primaries: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         for x, y in zip(primaries[::2], primaries[1::2], strict=True)
     )
     matrix = np.stack(colors, 1)
+    if abs(np.linalg.det(matrix)) < 1e-9:
+        return np.full((3, 3), np.nan), white
     return matrix * np.linalg.solve(matrix, white), white
 
 
@@ -499,29 +519,78 @@ def as_array(image: Image.Image, path: Path, in_srgb: bool = False) -> np.ndarra
         raise DataError(f"{path}: expected a picture of 8 or 16 bits, got one of 32: write it as 8")
     grey = image.mode in ("1", "L")
     mode = "L" if grey else "RGBA" if image.has_transparency_data else "RGB"
-    profile = image.info.get("icc_profile") if in_srgb and not grey else None
+    source = image
     if image.mode not in (mode, "CMYK"):  # whose profile is of its own numbers
         image = image.convert(mode)
-    if profile:
-        image = srgb_of(image, profile)
+    if in_srgb and not grey:
+        image = srgb_of(image, source)
     array = np.array(image if image.mode == mode else image.convert(mode))
     return array[..., None] if grey else array
 
 
-def srgb_of(picture: Image.Image, profile: bytes) -> Image.Image:
-    """A picture RGB, RGBA or CMYK in the colours of a profile, as RGB or RGBA in sRGB.
+def srgb_of(picture: Image.Image, source: Image.Image) -> Image.Image:
+    """A picture RGB, RGBA or CMYK in the colours that its file states, as RGB or RGBA in sRGB.
 
-    Telephones store colours of a wider space. One in sRGB, or whose profile is broken or of
-    something else, stays as it is.
+    Telephones store colours of a wider space, with a profile; cameras set to Adobe RGB state it in
+    EXIF, and PNG may have a gamma and primaries. One that is sRGB already, or whose profile is
+    broken or of something else, stays as it is.
+
+    Args:
+        source: the picture as it was opened, which has what the file states.
     """
+    profile, info = source.info.get("icc_profile"), source.info
+    if profile:
+        return _by_profile(picture, profile)
+    if picture.mode == "CMYK":
+        return picture
+    gamma, primaries = 1 / SRGB_POWER, REC_709
+    if source.getexif().get_ifd(ExifTags.IFD.Interop).get(1) == "R03":
+        primaries = ADOBE_RGB
+    elif "srgb" not in info:
+        gamma = max(info.get("gamma") or gamma, 0.1)
+        white_x, white_y, *colors = info.get("chromaticity") or (*REC_709[6:], *REC_709[:6])
+        primaries = (*colors, white_x, white_y)
+    path = Path(getattr(source, "filename", ""))
+    if source.format == "PNG" and path.name and (code := _code_points(path)):
+        gamma, primaries = 1 / SRGB_POWER, CODED.get(code[0], REC_709)
+        if code[1] in HDR_CURVES:
+            said = f"{path}: expected colours of sRGB, got {HDR_CURVES[code[1]]} (HDR)"
+            raise DataError(f"{said}: write pictures without HDR")
+    if primaries is ADOBE_RGB or abs(gamma * SRGB_POWER - 1) > 0.05:
+        tone = 255 * linear_to_srgb((torch.arange(256) / 255) ** (1 / gamma))
+        table, alpha = 3 * tone.round().int().tolist(), [*range(256)]
+        picture = picture.point(table + (alpha if picture.mode == "RGBA" else []))
+    axis = torch.linspace(0, 1, NODES)
+    blue, green, red = torch.meshgrid(axis, axis, axis, indexing="ij")
+    light = srgb_to_linear(torch.stack([red, green, blue], -1)).numpy()
+    turned = in_rec709(light, primaries)
+    if turned is light:
+        return picture
+    cube = linear_to_srgb(torch.from_numpy(turned)).flatten().tolist()
+    return picture.filter(ImageFilter.Color3DLUT(NODES, cube))
+
+
+def _code_points(path: Path) -> bytes:
+    """Primaries and curve that a PNG states as videos do, by their numbers in ITU-T H.273."""
+    with path.open("rb") as file:
+        _, found, rest = file.read(HEAD).partition(b"\0\0\0\4cICP")
+    return rest[:2] if found else b""
+
+
+def _by_profile(picture: Image.Image, profile: bytes) -> Image.Image:
+    """A picture as of `srgb_of`, by an ICC profile. What it is called says nothing."""
+    alpha = picture.getchannel("A") if picture.mode == "RGBA" else None
+    flat = picture.convert("RGB") if alpha else picture
     try:
         own = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if "sRGB" in ImageCms.getProfileDescription(own):
-            return picture
-        alpha = picture.getchannel("A") if picture.mode == "RGBA" else None
-        flat = picture.convert("RGB") if alpha else picture
         srgb = ImageCms.createProfile("sRGB")
-        turned = ImageCms.profileToProfile(flat, own, srgb, outputMode="RGB")
+        turn = ImageCms.buildTransform(own, srgb, flat.mode, "RGB")
+        probe = Image.fromarray(PROBE)
+        if flat.mode == "RGB":
+            seen = np.asarray(ImageCms.applyTransform(probe, turn), np.int16)
+            if np.abs(seen - PROBE).max() <= SAME:
+                return picture
+        turned = ImageCms.applyTransform(flat, turn)
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
         return picture
     assert turned is not None  # as it is not converted in place
