@@ -27,6 +27,7 @@ from univoxel.data.images import (
     write_exr,
     write_png,
 )
+from univoxel.data.load_images import read_photo
 from univoxel.data.masks import coverage_in, find_masks, masks_beside, masks_in, read_mask
 from univoxel.errors import DataError, WithoutMasks
 
@@ -219,6 +220,44 @@ OBJECTS = {
     "8 bits in 16": Image.fromarray((255 * HALF).astype(np.uint16)),
     "0 and 1 in 16": Image.fromarray(HALF.astype(np.uint16)),
 }
+
+
+@pytest.mark.parametrize("top", [1, 2, 255, 65535])
+@pytest.mark.parametrize("kind", [np.int32, np.float32])
+def test_masks_of_32_bits(tmp_path, kind, top):
+    Image.fromarray((top * HALF).astype(kind)).save(tmp_path / "a.tif")
+    assert coverage_in(tmp_path / "a.tif").tolist() == HALF.tolist()
+    Image.fromarray((1e9 * HALF).astype(kind)).save(tmp_path / "a.tif")
+    with pytest.raises(DataError, match=r"a\.tif: expected a mask of numbers up to 65535, got"):
+        coverage_in(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("alpha", [0, 128, 254, 255])
+def test_an_alpha_that_is_the_same_all_over_says_nothing(tmp_path, alpha):
+    """Of a mask its brightness counts then; of a photograph, the mask beside it."""
+    mask = rgb(255, 255, 255)
+    mask.putalpha(alpha)
+    mask.save(tmp_path / "a_mask.png")
+    assert coverage_in(tmp_path / "a_mask.png").tolist() == (255 * HALF).tolist()
+    Image.new("RGBA", (2, 2), (9, 8, 7, alpha)).save(tmp_path / "a.png")
+    flat = {
+        name: np.full((2, 2), x) for name, x in {"R": 4, "G": 3, "B": 2, "A": alpha / 255}.items()
+    }
+    write_exr(tmp_path / "a.exr", flat)
+    for photograph, colors in (("a.png", [9, 8, 7]), ("a.exr", [4, 3, 2])):
+        color, found = read_photo(tmp_path / photograph, beside=tmp_path / "a_mask.png")
+        assert found.tolist() == (255 * HALF).tolist()
+        assert color[0, 0].tolist() == colors
+
+
+def test_photographs_of_nothing_or_nothing_else_are_named(tmp_path, caplog):
+    written = scene()
+    written.pictures[1:8, ..., 3], written.pictures[9, ..., 3] = 0, 255
+    written.pictures[1, 0, 0, 3] = 200
+    load_photos(write_nerfstudio(tmp_path, written))
+    names = ", ".join(written.names[v] for v in range(2, 7))
+    assert f"6 of 8 photographs show nothing of the object: {names}, ...\n" in caplog.text
+    assert f"1 of 8 photographs show nothing but the object: {written.names[9]}\n" in caplog.text
 
 
 @pytest.mark.parametrize("what", OBJECTS)

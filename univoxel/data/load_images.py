@@ -52,6 +52,7 @@ LEAN = math.radians(30)
 # Distance of cameras from the origin, in their distances from one another, beyond which float32
 # loses what they see: it has 7 digits, and pixels need 4
 FAR = 1000
+NAMED = 5  # photographs in a message, at most
 LOOKED_AT = 12  # photographs, at most, on which it is tried whether masks can be right
 HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/guide/masks.md"
 
@@ -251,7 +252,7 @@ def _read_all(
             if alpha.dtype != reading.alpha.dtype:
                 alpha, reading = coverage_of(alpha), reading.with_floating_alpha()
             reading.empty &= not alpha.any()
-            reading.opaque &= bool((alpha == (1 if alpha.is_floating_point() else 255)).all())
+            reading.opaque &= bool((alpha >= (0.98 if alpha.is_floating_point() else 250)).all())
             cameras.cut(view, reading.color[view]).copy_(color)
             cameras.cut(view, reading.alpha[view]).copy_(alpha)
             reading.done(view)
@@ -270,6 +271,7 @@ def _read_all(
         except DataError:
             reading.drop()
             raise
+        _tell_odd(folder, shots, [cameras.cut(v, a) for v, a in enumerate(reading.alpha)])
         if premultiplied(some):
             log.warning(
                 "%s: colours seem to be multiplied by alpha: they come out dark along the object's "
@@ -277,6 +279,24 @@ def _read_all(
                 folder,
             )
     return reading.finished()
+
+
+def _tell_odd(folder: Path, shots: Sequence[Shot], alphas: Sequence[Tensor]) -> None:
+    """Log which photographs show nothing of the object by their masks, and which nothing else."""
+    for what, odd in (
+        ("nothing of the object", [not bool(a.any()) for a in alphas]),
+        (
+            "nothing but the object",
+            [bool(a.min() > 0) and bool(a.min() == a.max()) for a in alphas],
+        ),
+    ):
+        names = [shot.name for shot, said in zip(shots, odd, strict=True) if said]
+        if names:
+            more = ", ..." if len(names) > NAMED else ""
+            log.warning(
+                "%s: by their masks %d of %d photographs show %s: %s%s",
+                *(folder, len(names), len(shots), what, ", ".join(names[:NAMED]), more),
+            )
 
 
 def _read_each(
@@ -335,7 +355,7 @@ def read_photo(
 ) -> tuple[Tensor, Tensor]:
     """Colour [H, W, 3] and alpha [H, W] of one photograph, stored as in `Photos`.
 
-    Without a mask: its alpha channel, or the mask beside it where that is opaque everywhere or not
+    Without a mask: its alpha channel, or the mask beside it where that is the same all over or not
     there. The colour of an EXR with alpha is premultiplied, as OpenEXR has it, and is divided;
     negative values, which denoisers and filters leave, become 0.
 
@@ -350,12 +370,13 @@ def read_photo(
     color, linear = image[..., :3], image.is_floating_point()
     alpha = image[..., 3] if channels == 4 else None
     opaque = 1 if linear else 255
-    if linear and alpha is not None:
+    tells = alpha is not None and bool((alpha < alpha.max()).any())
+    if linear and alpha is not None and (tells or (mask or beside) is None):
         alpha = alpha.clamp(0, 1)
         color = torch.where(alpha[..., None] > 0, color / alpha[..., None], 0.0)
     if not masks:
         alpha, mask = torch.full_like(color[..., 0], opaque), None
-    elif mask is None and (alpha is None or bool((alpha == opaque).all())):
+    elif mask is None and not tells:
         mask = beside
     if mask is not None:
         alpha = read_mask(mask, color.shape[1], color.shape[0], path, upright)

@@ -373,7 +373,7 @@ def _alike(shape: Sequence[int], width: int, height: int) -> bool:
 def coverage_in(path: Path) -> Tensor:
     """A mask as it is stored [H, W]: uint8, or float32 in [0, 1]; largest on the object.
 
-    That is its alpha, unless that is opaque everywhere; or its brightness. Where there are but two
+    That is its alpha, unless that is the same all over; or its brightness. Where there are but two
     values, or two colours of which one is black, the larger one is the object, whatever its number.
 
     Raises:
@@ -384,7 +384,17 @@ def coverage_in(path: Path) -> Tensor:
     with opened(path) as image:
         if image.mode == "P" and not image.has_transparency_data:
             return _of_palette(image, path)
+        if image.mode in ("I", "F"):
+            return _of_wide_numbers(np.asarray(image, np.float32), path)
         return _levels(torch.from_numpy(as_array(image, path)), path)
+
+
+def _of_wide_numbers(values: np.ndarray, path: Path) -> Tensor:
+    """Of a picture of 32 bits: of 0 and 1, or as much as 8 or 16 bits hold."""
+    top = float(values.max())
+    if not np.isfinite(values).all() or top > 65535:
+        raise DataError(f"{path}: expected a mask of numbers up to 65535, got up to {top:g}")
+    return _scaled(torch.from_numpy(values / (65535 if top > 255 else 1)), path)
 
 
 def _of_palette(image: Image.Image, path: Path) -> Tensor:
@@ -409,10 +419,10 @@ def _of_palette(image: Image.Image, path: Path) -> Tensor:
 
 def _levels(image: Tensor, path: Path) -> Tensor:
     """Coverage [H, W] in a picture [H, W, C]."""
-    opaque = 1 if image.is_floating_point() else 255
     if image.shape[-1] == 4:
-        if bool((image[..., 3] < opaque).any()):
-            return _scaled(image[..., 3], path)
+        alpha = image[..., 3]
+        if bool((alpha < alpha.max()).any()):
+            return _scaled(alpha, path)
         try:
             return _scaled(_brightness(image[..., :3], path), path)
         except DataError:  # a cut-out photograph whose object fills it
