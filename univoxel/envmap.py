@@ -3,6 +3,7 @@ light."""
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from univoxel.color import luminance
-from univoxel.data.images import read_image
+from univoxel.data.images import SUFFIXES, kind_of, read_image
 from univoxel.errors import DataError
 from univoxel.ops.integrator import EnvTables
 from univoxel.sphere import direction_to_latlong, rotate_z, texel_solid_angles
@@ -39,8 +40,9 @@ class EnvMap:
             )
         if r.dtype != torch.float32:
             raise ValueError(f"environment map: expected float32 radiance, got {r.dtype}")
-        bad = (~r.isfinite() | (r < 0)).nonzero()
-        if len(bad):
+        low, high = r.aminmax()  # NaN where there is one
+        if not (low >= 0 and high < math.inf):
+            bad = (~r.isfinite() | (r < 0)).nonzero()
             row, column, channel = bad[0].tolist()
             raise ValueError(
                 "environment map: expected finite radiance of at least 0, got "
@@ -157,6 +159,7 @@ def _invert(cdf: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
 # Environment maps from files.
 
 
+log: logging.Logger = logging.getLogger("univoxel")
 UNDERSHOOT = 0.01  # of the largest radiance: texels that are less below 0 are 0
 
 
@@ -167,15 +170,21 @@ def read_map(path: Path) -> EnvMap:
         DataError: it cannot be used as one; the message names it.
         OSError: it cannot be read.
     """
-    radiance = read_image(path)
-    if not radiance.is_floating_point():
+    if path.suffix.lower() in SUFFIXES and kind_of(path) not in (".exr", ".hdr"):
         raise DataError(
-            f"{path}: expected a map of light, .hdr or .exr, got a picture of 8 bits: the sun is "
-            "thousands of times as bright as they can say"
+            f"{path}: expected a map of light, .hdr or .exr, got a picture: the sun is thousands "
+            "of times as bright as 8 or 16 bits can say"
         )
+    radiance = read_image(path, infinite=True)
     if radiance.dim() == 3 and radiance.shape[2] == 4:
         radiance = radiance[..., :3]  # some writers add an alpha that says nothing
-    if radiance.min() >= -UNDERSHOOT * radiance.max():  # as filters and denoisers leave it
+    low, high = radiance.aminmax()
+    if high == math.inf:  # of a sun that half floats do not hold
+        largest = torch.where(radiance.isfinite(), radiance, 0).max()
+        log.warning("%s: infinite radiance is taken as the largest there is, %g", path, largest)
+        radiance = radiance.clamp_max(largest)
+        high = largest
+    if 0 > low >= -UNDERSHOOT * high:  # as filters and denoisers leave it
         radiance = radiance.clamp_min(0)
     try:
         return EnvMap(radiance.contiguous())

@@ -81,7 +81,7 @@ def load_world(run: Path) -> np.ndarray | None:
         return None
     try:
         moved = np.array(read_json(path)["from_data"], np.float64)
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         moved = np.empty(0)
     if moved.shape != (3, 4) or not np.isfinite(moved).all():
         raise DataError(f"{path}: expected from_data, a rotation and a translation, got none")

@@ -2,6 +2,7 @@
 
 import json
 import re
+import unicodedata
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from layouts import (
     write_idr,
     write_llff,
     write_metashape,
+    write_nerf,
     write_nerfstudio,
     write_polycam,
     write_realitycapture,
@@ -81,10 +83,27 @@ def groups(folder):
     text("cameras.xml", ("(?s)<cameras>.*</cameras>", f"<cameras>{inner}</cameras>"))(folder)
 
 
-def unpadded(folder):
-    for place in ("image", "mask"):
-        for path in sorted((folder / place).iterdir(), reverse=True):
-            path.rename(path.with_name(f"{int(path.stem[-3:]) + 5}.png"))
+def unpadded(name):
+    def apply(folder):
+        for place in ("image", "mask"):
+            for path in sorted((folder / place).iterdir(), reverse=True):
+                path.rename(path.with_name(name.format(int(path.stem[-3:]) + 5)))
+
+    return apply
+
+
+def with_accents(folder):
+    """Listed as most programs write them; in files, as Macs do."""
+    for path in (folder / "images").iterdir():
+        path.rename(path.with_name(unicodedata.normalize("NFD", f"\u00e9{path.name}")))
+    listed = folder / "transforms.json"
+    if not listed.exists():
+        listed = folder / "sparse/0/images.txt"
+    text(listed.relative_to(folder), ("(images/| )p_", "\\1\u00e9p_"))(folder)
+    for path in (folder / "masks").iterdir():
+        path.rename(path.with_name(f"\u00e9{path.name}"))
+    if listed.suffix == ".json":
+        text("transforms.json", ("masks/", "masks/\u00e9"))(folder)
 
 
 def more_pictures(folder):
@@ -103,11 +122,15 @@ OF_NERFSTUDIO = {
     "of Windows, with slashes": text("transforms.json", ('"images/', '"D:/a/images/')),
     "capitals": in_capitals,
     "null": text("transforms.json", ('"k1": 0.0', '"k1": null, "is_fisheye": null')),
+    "numbers as text": text("transforms.json", (r'"(w|h|fl_x|cx|k1)": ([\d.]+)', r'"\1": "\2"')),
+    "sizes with a point": text("transforms.json", (r'"(w|h)": (\d+)', r'"\1": \2.0')),
+    "accents": with_accents,
     "smaller": smaller,
 }
 OF_COLMAP = {
     "backslashes": text("sparse/0/images.txt", (" p_", r" .\\p_")),
     "capitals": in_capitals,
+    "accents": with_accents,
     "a mark and CR LF": text("sparse/0/cameras.txt", ("^", "\ufeff"), ("\n", "\r\n")),
     "FULL_OPENCV": text(
         "sparse/0/cameras.txt",
@@ -138,7 +161,8 @@ CASES = [
     ),
     (write_realitycapture, "tabs in UTF-16", text("cameras.csv", (",", "\t"), encoding="utf-16")),
     (write_metashape, "groups", groups),
-    (write_idr, "unpadded", unpadded),
+    (write_idr, "unpadded", unpadded("{}.png")),
+    (write_idr, "unpadded with a word", unpadded("view_{}_a.png")),
     (write_llff, "more pictures than rows", more_pictures),
 ]
 
@@ -197,6 +221,32 @@ def test_coordinates_of_the_earth(tmp_path, writer):
     torch.testing.assert_close(torch.cdist(place, place), torch.cdist(wanted, wanted))
 
 
+def test_splits_of_a_far_world_are_moved_as_one(tmp_path):
+    """In the layout of NeRF, too, whose splits are files of their own; one view tells nothing."""
+    written = scene()
+    written.poses[:, :3, :3] = Rotation.from_matrix(written.poses[:, :3, :3]).as_matrix()
+    plain = {s: load_photos(write_nerf(tmp_path / f"a{s}", written), s) for s in SPLITS}
+    written.poses[:, 0, 3] += 5.82e6
+    data = write_nerf(tmp_path / "data", written)
+    for split in SPLITS:
+        photos = load_photos(data, split)
+        assert "world moved by -5819999 0 -1" in photos.about
+        shift = (photos.cameras.camera_to_world - plain[split].cameras.camera_to_world)[:, :, 3]
+        torch.testing.assert_close(shift, shift.round(), atol=1e-5, rtol=0)
+        assert photos.moved is not None
+
+
+def test_a_lens_of_larger_pictures_is_told(tmp_path, caplog):
+    """Where no size says so: cx and cy would be those of a corner."""
+    data = write_nerfstudio(tmp_path, scene())
+    load_photos(data)
+    assert "at the border" not in caplog.text
+    text("transforms.json", ('"w": 12, ', ""), ('"h": 8, ', ""))(data)
+    text("transforms.json", (r'"cx": [\d.]+', '"cx": 12.0'), (r'"cy": [\d.]+', '"cy": 8.0'))(data)
+    load_photos(data)
+    assert "cx and cy are at the border of pictures of 12x8 pixels" in caplog.text
+
+
 def no_images(place, other):
     return lambda folder: (folder / place).rename(folder / other)
 
@@ -210,7 +260,11 @@ def two_fit(folder):
 @pytest.mark.parametrize(
     ("writer", "change", "message"),
     [
-        (write_nerfstudio, two_fit, "10 of 10 are missing"),
+        (
+            write_nerfstudio,
+            two_fit,
+            r"images/p_009\.png, got .*P_009\.png and .*p_009\.pNg: rename",
+        ),
         (
             write_nerfstudio,
             text("transforms.json", ("images/p", "/a/../images/p")),

@@ -4,6 +4,7 @@ import errno
 import os
 import stat
 import struct
+import time
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 
@@ -286,6 +287,60 @@ def test_colours_of_stated_primaries(tmp_path, stated, red):
         white, found = images.read_image(path)[0].tolist()
         assert white == pytest.approx([0.5] * 3, abs=1e-3)
         assert found == pytest.approx([max(x / 2, 0) for x in red], abs=1e-3)
+
+
+def test_old_run_lengths(tmp_path):
+    """1 1 1 N is the last pixel N times more; the next such counts N 256 times."""
+    pixels = [(9, 8, 7, 130), (1, 1, 1, 44), (1, 1, 1, 1), (5, 4, 3, 129), (1, 1, 1, 2)]
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 38\n"
+    (tmp_path / "a.hdr").write_bytes(head + bytes(np.ravel(pixels).tolist()))
+    found = images.read_image(tmp_path / "a.hdr").reshape(-1, 3)
+    assert (found[:301] == torch.tensor([9, 8, 7]) * 2.0**-6).all()
+    assert (found[301:] == torch.tensor([5, 4, 3]) * 2.0**-7).all()
+    for body in (pixels[:-1], pixels[1:], [*pixels, pixels[0]]):
+        (tmp_path / "a.hdr").write_bytes(head + bytes(np.ravel(body).tolist()))
+        with pytest.raises(DataError, match=r"a\.hdr: expected 1216 bytes of 38x8 flat pixels"):
+            images.read_image(tmp_path / "a.hdr")
+
+
+def test_a_large_map_takes_a_second_or_two(tmp_path):
+    row = np.tile(np.arange(64, dtype=np.uint8), 128)  # literals of 64 numbers, as of noise
+    line = bytes([2, 2, 32, 0]) + 4 * b"".join(
+        b"\x40" + part.tobytes() for part in row.reshape(-1, 64)
+    )
+    path = tmp_path / "a.hdr"
+    path.write_bytes(b"#?RADIANCE\n\n-Y 4096 +X 8192\n" + 4096 * line)
+    begin = time.process_time()
+    found = images.read_image(path)
+    assert found.shape == (4096, 8192, 3)
+    assert time.process_time() - begin < 6  # 2 s; 13 s where rows were read by NumPy
+
+
+def test_kinds_by_their_first_bytes(tmp_path):
+    value = np.full((4, 8), 2.0)
+    images.write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", value))
+    (tmp_path / "a.exr").rename(tmp_path / "a.hdr")
+    images.write_radiance(tmp_path / "b.exr", np.full((4, 8, 3), 3.0))
+    assert (read_map(tmp_path / "a.hdr").radiance == 2).all()
+    assert (read_map(tmp_path / "b.exr").radiance == 3).all()
+    assert images.image_size(tmp_path / "a.hdr") == (8, 4)
+
+
+def test_a_sun_that_half_floats_do_not_hold(tmp_path, caplog):
+    value = np.full((4, 8), 2.0, np.float32)
+    value[1, 2], value[2, 2] = np.inf, 900
+    channels = {c: value.astype(np.float16) for c in "RGB"}
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(tmp_path / "a.exr"))
+    assert read_map(tmp_path / "a.exr").radiance[1, 2].tolist() == [900] * 3
+    assert "infinite radiance is taken as the largest there is, 900" in caplog.text
+    with pytest.raises(DataError, match="NaN or infinity at row 1, column 2"):
+        images.read_image(tmp_path / "a.exr")
+    value[1, 2] = np.nan
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, dict.fromkeys("RGB", value)).write(
+        str(tmp_path / "a.exr")
+    )
+    with pytest.raises(DataError, match="NaN or infinity at row 1, column 2"):
+        read_map(tmp_path / "a.exr")
 
 
 def test_maps_that_are_nearly_right(tmp_path):

@@ -19,7 +19,8 @@ from univoxel.core import memmap
 from univoxel.core.files import write_text
 from univoxel.core.progress_bar import duration
 from univoxel.data import Photos, keep_photos, load_photos
-from univoxel.errors import Cancelled, ExistingFile, UserError
+from univoxel.data.path_sandbox import FEWEST
+from univoxel.errors import Cancelled, DataError, ExistingFile, UserError
 from univoxel.evaluation.confidence import REPORT_POINTS, Survey, numbers, survey, words
 from univoxel.fields.features import PER_LEVEL, Levels
 from univoxel.fields.field import Field, dense_field, hash_field
@@ -105,6 +106,8 @@ def _train(
     photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
     cfg = replace(cfg, downscale=photos.downscale)
     log.info(photos.about)
+    if len(photos) < FEWEST:
+        raise DataError(f"{cfg.data}: expected at least {FEWEST} photographs, got {len(photos)}")
     check_memory(photos, cfg)
     begun = resumed(cfg) if resume else None
     state = begun[1] if begun else {}

@@ -57,7 +57,7 @@ def read_radiance(path: Path) -> np.ndarray:
 
     Raises:
         DataError: not a Radiance RGBE picture, cut off, or of an orientation or encoding other than
-            -Y +X rows, flat or with run lengths per channel.
+            -Y +X rows, flat or with run lengths.
         OSError: the file cannot be read.
 
     Source: Ward 1991, "Real pixels" (Graphics Gems II), and the Radiance file format description.
@@ -77,20 +77,21 @@ def read_radiance(path: Path) -> np.ndarray:
         raise DataError(f"{path}: expected the size as '-Y height +X width', got {line[:40]!r}")
     height, width = int(size[1]), int(size[2])
 
+    if height * width > LARGEST:
+        raise DataError(f"{path}: expected up to {LARGEST} pixels, got {width}x{height}")
     # A flat file cannot start with the marker: its largest mantissa would be below 128.
     marker = bytes([2, 2, width >> 8 & 255, width & 255])
     if 8 <= width < 32768 and body.startswith(marker):
-        rgbe = _run_lengths(path, np.frombuffer(body, np.uint8), marker, height, width)
+        planes = _run_lengths(path, body, marker, height, width)
     elif len(body) == 4 * height * width:
-        rgbe = np.frombuffer(body, np.uint8).reshape(height, width, 4)
+        planes = np.frombuffer(body, np.uint8).reshape(height, width, 4).swapaxes(1, 2)
     else:
-        raise DataError(
-            f"{path}: expected {4 * height * width} bytes of {width}x{height} flat pixels or "
-            f"run-length encoded rows, got {len(body)} bytes"
-        )
-    exponent = rgbe[..., 3:].astype(np.int32)
-    value = np.ldexp(rgbe[..., :3].astype(np.float32), exponent - 136)
-    value = np.where(exponent > 0, value, np.float32(0))
+        planes = _old_run_lengths(path, body, height, width).swapaxes(1, 2)
+    scale = np.ldexp(np.ones(256, np.float32), np.arange(256) - 136)
+    scale[0] = 0
+    value, of_pixel = np.empty((height, width, 3), np.float32), scale[planes[:, 3]]
+    for channel in range(3):
+        np.multiply(planes[:, channel], of_pixel, out=value[..., channel], dtype=np.float32)
     stated = re.search(rb"^PRIMARIES=\s*((?:[-\d.]+\s+){7}[-\d.]+)\s*$", head, re.MULTILINE)
     return in_rec709(value, [float(x) for x in stated[1].split()]) if stated else value
 
@@ -147,31 +148,44 @@ def write_radiance(path: Path, radiance: np.ndarray) -> None:
     write_bytes(path, header.encode("ascii") + rgbe.astype(np.uint8).tobytes())
 
 
-def _run_lengths(
-    path: Path, body: np.ndarray, marker: bytes, height: int, width: int
-) -> np.ndarray:
-    """Rows that start with the marker and hold each channel as runs (> 128) and literals."""
-    shortest = 4 + 8 * -(-width // 127)  # bytes of a row: its marker, 4 channels of runs of 127
-    # Memory for as many rows as there may be, whatever the header says
-    out = np.empty((min(height, len(body) // shortest + 1), 4, width), np.uint8)
-    at = 0
+def _run_lengths(path: Path, body: bytes, marker: bytes, height: int, width: int) -> np.ndarray:
+    """Channels [H, 4, W] of rows that start with the marker and hold each channel as runs (> 128)
+    and literals."""
+    rows, at, size = bytearray(), 0, len(body)  # no memory for rows that a header alone promises
     for row in range(height):
-        if body[at : at + 4].tobytes() != marker:
+        if body[at : at + 4] != marker:
             raise DataError(f"{path}: row {row} of {height} is missing or broken")
         at += 4
-        for channel in out[row]:
-            x = 0
-            while x < width:
-                count = int(body[at]) if at < len(body) else 0
-                run = count > 128
-                count -= 128 if run else 0
-                needed = 1 if run else count
-                if not count or x + count > width or at + 1 + needed > len(body):
-                    raise DataError(f"{path}: row {row} of {height} is cut off or broken")
-                channel[x : x + count] = body[at + 1 : at + 1 + needed]
-                x += count
-                at += 1 + needed
-    return out.transpose(0, 2, 1)
+        for _ in range(4):
+            left = width
+            while left > 0 and at < size:
+                if (count := body[at]) > 128:
+                    rows += body[at + 1 : at + 2] * (count - 128)
+                    at, left = at + 2, left + 128 - count
+                elif count:
+                    rows += body[at + 1 : at + 1 + count]
+                    at, left = at + 1 + count, left - count
+                else:
+                    break
+            if left or at > size:
+                raise DataError(f"{path}: row {row} of {height} is cut off or broken")
+    return np.frombuffer(rows, np.uint8).reshape(height, 4, width)
+
+
+def _old_run_lengths(path: Path, body: bytes, height: int, width: int) -> np.ndarray:
+    """Pixels [H, W, 4] of which 1 1 1 N says that the last one comes N times more; of several such
+    in a row each counts 256 times the one before."""
+    pixels = np.frombuffer(body, np.uint8, len(body) // 4 * 4).reshape(-1, 4)
+    runs, place = (pixels[:, :3] == 1).all(1), np.arange(len(pixels))
+    last = np.maximum.accumulate(np.where(runs, -1, place))
+    power = 8 * (place - last - 1).clip(0, 3)
+    count = np.where(runs, pixels[:, 3].astype(np.int64) << power, 1)
+    if len(body) % 4 or not len(last) or last[0] < 0 or count.sum() != height * width:
+        raise DataError(
+            f"{path}: expected {4 * height * width} bytes of {width}x{height} flat pixels or "
+            f"run-length encoded rows, got {len(body)} bytes"
+        )
+    return np.repeat(pixels[last], count, 0).reshape(height, width, 4)
 
 
 # Pictures in files: PNG, JPEG, TIFF, WebP, OpenEXR and Radiance in; PNG and OpenEXR out.
@@ -179,6 +193,7 @@ def _run_lengths(
 
 _LIMIT = Lock()  # of Pillow, which is the process's
 _OPENING = Lock()  # of an OpenEXR file: what it prints to is the process's, not the thread's
+EXR_HEAD = b"v/1\x01"  # first bytes of an OpenEXR file
 EXR_TELLS = "Warning: "  # how its lines begin
 SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff", ".webp")
 # What Pillow may take a file for, whatever its name says
@@ -192,11 +207,12 @@ MOST_FRAMED = 1 << 29  # pixels of an EXR's display window, at most, where its d
 FOREIGN = (*HEIF, ".hif", ".bmp", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 
 
-def read_image(path: str | Path, in_srgb: bool = False) -> Tensor:
+def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) -> Tensor:
     """Read a picture, row 0 on top, channels in the order RGB(A) or grey.
 
     Args:
         in_srgb: turn colours of a profile that the file holds, as of telephones, into sRGB.
+        infinite: let an OpenEXR file hold infinity.
 
     Returns:
         [H, W, C]: uint8 as stored for files of 8 bits; float32 in [0, 1], still encoded as
@@ -209,12 +225,11 @@ def read_image(path: str | Path, in_srgb: bool = False) -> Tensor:
             kind, or holds NaN or infinity.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
     _refuse_heif(path)
-    if suffix not in SUFFIXES:
+    if path.suffix.lower() not in SUFFIXES:
         raise DataError(f"{path}: expected a picture ({' '.join(SUFFIXES)}), got '{path.suffix}'")
+    suffix = kind_of(path)
     if suffix == ".hdr":
-        _require_file(path)
         return torch.from_numpy(read_radiance(path))
     if suffix == ".exr":
         channels, stated = _read_exr(path)
@@ -222,14 +237,27 @@ def read_image(path: str | Path, in_srgb: bool = False) -> Tensor:
         if names not in (["R", "G", "B"], ["R", "G", "B", "A"], ["Y"]) or names[0] not in channels:
             raise DataError(f"{path}: expected channels R, G, B or Y, got {', '.join(channels)}")
         image = np.stack([channels[name] for name in names], -1)
-        if not np.isfinite(image).all():
-            row, column, _ = np.argwhere(~np.isfinite(image))[0]
+        bad = np.isnan(image) | (image == -np.inf) if infinite else ~np.isfinite(image)
+        if bad.any():
+            row, column, _ = np.argwhere(bad)[0]
             raise DataError(f"{path}: NaN or infinity at row {row}, column {column}")
         if stated and image.shape[2] > 1:
             image[..., :3] = in_rec709(image[..., :3], stated)
         return torch.from_numpy(image)
     with opened(path) as image:
         return torch.from_numpy(as_array(image, path, in_srgb))
+
+
+def kind_of(path: Path) -> str:
+    """.exr or .hdr where a file is of that kind by its first bytes, otherwise what its name says.
+
+    Raises:
+        DataError: there is no such file, or it is empty.
+    """
+    _require_file(path)
+    with path.open("rb") as file:
+        head = file.read(4)
+    return ".exr" if head == EXR_HEAD else ".hdr" if head[:2] == b"#?" else path.suffix.lower()
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
@@ -240,10 +268,9 @@ def image_size(path: str | Path) -> tuple[int, int]:
     """
     path = Path(path)
     _refuse_heif(path)
-    if path.suffix.lower() != ".exr":
+    if kind_of(path) != ".exr":
         with opened(path, whole=False) as image:
             return image.size
-    _require_file(path)
     try:
         with _exr(path, header_only=True) as file:
             low, high = file.header()["displayWindow"]

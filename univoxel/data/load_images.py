@@ -32,7 +32,7 @@ from univoxel.data.masks import (
     require_all,
     require_fit,
 )
-from univoxel.data.path_sandbox import inside
+from univoxel.data.path_sandbox import FEWEST, inside
 from univoxel.data.photos import Photos, coverage_of, decode
 from univoxel.errors import DataError, UserError, WithoutMasks
 
@@ -110,8 +110,9 @@ def read_shots(
         shots = [replace(shot, mask=mask) for shot, mask in zip(shots, found, strict=True)]
     masks = bool(masks)
     _check(folder, shots, downscale)
-    if split == "train" and len(shots) == 1:
-        log.warning("%s: one photograph shows no shape: at least 3 views are needed", folder)
+    if split == "train" and len(shots) < FEWEST:
+        count = "one photograph shows" if len(shots) == 1 else "two photographs show"
+        log.warning("%s: %s no shape: at least %d views are needed", folder, count, FEWEST)
     factor = downscale or fitting_downscale(shots)
     pinholes = _pinholes(shots)
     cameras = cameras_of([s.pose for s in shots], [shrunk(lens, factor) for lens in pinholes])
@@ -486,19 +487,22 @@ def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
     return chosen
 
 
-def _near_origin(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
+def near_origin(shots: Sequence[Shot], places: np.ndarray) -> tuple[list[Shot], list[str]]:
     """The shots in a world that float32 can hold, and what was done.
 
     Surveyed worlds have coordinates of the Earth, with cameras millions of metres from the origin.
     Such a world is moved by whole units, so that the cameras' mean is near its origin.
+
+    Args:
+        places: [N, 3] of the cameras that say so, of all splits or of one.
     """
-    places = np.stack([shot.pose[:, 3] for shot in shots])
     middle = places.mean(0)
-    if np.linalg.norm(middle) <= FAR * np.linalg.norm(places - middle, axis=1).mean():
+    apart = np.linalg.norm(places - middle, axis=1).mean()
+    if not apart or np.linalg.norm(middle) <= FAR * apart:
         return list(shots), []
     shift = -np.round(middle)
     moved = in_moved_world(shots, np.column_stack([np.eye(3), shift]))
-    return moved, ["world moved by " + " ".join(f"{x:.0f}" for x in shift)]
+    return moved, ["world moved by " + " ".join(str(int(x)) for x in shift)]
 
 
 def in_moved_world(shots: Sequence[Shot], motion: np.ndarray) -> list[Shot]:
@@ -527,7 +531,7 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     horizontal plane, and up is what is across to all of that. A world
     that is upright already, to within LEAN, stays as it is; and one whose cameras do not agree.
     """
-    shots, moved = _near_origin(shots)
+    shots, moved = near_origin(shots, np.stack([shot.pose[:, 3] for shot in shots]))
     held = np.stack([_right_and_up(shot) for shot in shots])
     up = up_direction(held)
     if up is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from univoxel.data.images import (
     turn_note,
     upright_from_stored,
 )
+from univoxel.data.path_sandbox import same_name
 from univoxel.errors import DataError
 
 PLACES = ("masks", "mask", "pmasks")  # folders of masks; the first that has one counts
@@ -170,9 +170,9 @@ def _named_masks(around: Path, inner: str) -> list[Path]:
     names = [f"{inner}_masks", f"{inner}_mask"] if inner else []
     if shrunk := re.fullmatch(r"images(_\d+)", inner):
         names += [f"{name}{shrunk[1]}" for name in PLACES]
-    order = {_key(name): place for place, name in enumerate([*names, *PLACES])}
-    folders = [p for p in _entries(around) if _key(p.name) in order and p.is_dir()]
-    return sorted(folders, key=lambda p: (order[_key(p.name)], p.name))
+    order = {same_name(name): place for place, name in enumerate([*names, *PLACES])}
+    folders = [p for p in _entries(around) if same_name(p.name) in order and p.is_dir()]
+    return sorted(folders, key=lambda p: (order[same_name(p.name)], p.name))
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -234,9 +234,9 @@ def _claims(masks: Sequence[Path], root: Path | None, photographs: Named) -> lis
     stems: dict[str, list[int]] = {}
     numbers: dict[int, list[int]] = {}
     for i, (name, image) in enumerate(photographs):
-        whole.setdefault(_key(image.name), []).append(i)
+        whole.setdefault(same_name(image.name), []).append(i)
         plain = re.sub("_rgba?$", "", image.stem)
-        for stem in {_key(s) for s in (image.stem, plain, name, Path(name).name)}:
+        for stem in {same_name(s) for s in (image.stem, plain, name, Path(name).name)}:
             stems.setdefault(stem, []).append(i)
         if image.stem.isdecimal():
             numbers.setdefault(int(image.stem), []).append(i)
@@ -272,7 +272,9 @@ def _claims(masks: Sequence[Path], root: Path | None, photographs: Named) -> lis
 
 def _common(inner: Sequence[str], parts: Sequence[str]) -> int:
     """How many of the last names of two paths are the same."""
-    same = [_key(a) == _key(b) for a, b in zip(reversed(inner), reversed(parts), strict=False)]
+    same = [
+        same_name(a) == same_name(b) for a, b in zip(reversed(inner), reversed(parts), strict=False)
+    ]
     return same.index(False) if False in same else len(same)
 
 
@@ -281,7 +283,7 @@ def _forms(name: str) -> Iterator[tuple[str, str | None]]:
 
     First without its own ending: IMG_1.jpg_mask.png yields img_1.jpg_mask, img_1.jpg, img_1.
     """
-    text, word = _key(name), None
+    text, word = same_name(name), None
     text = text[: -len(Path(text).suffix)]
     while True:
         yield text, word
@@ -293,11 +295,6 @@ def _forms(name: str) -> Iterator[tuple[str, str | None]]:
             word, text = found.groups()
         else:
             return
-
-
-def _key(name: str) -> str:
-    """A name as it is compared: Windows does not tell case apart, Macs take letters apart."""
-    return unicodedata.normalize("NFC", name).casefold()
 
 
 # What its numbers mean

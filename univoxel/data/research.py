@@ -221,18 +221,32 @@ def _idr_pictures(folder: Path, path: Path) -> list[Path]:
 
 
 def _ordered(pictures: list[Path]) -> list[Path]:
-    """9.png before 10.png, where all names are numbers."""
-    if all(path.stem.isdecimal() for path in pictures):
-        return sorted(pictures, key=lambda path: int(path.stem))
-    return pictures
+    """9.png before 10.png, where names are numbers or differ in one."""
+    numbers = _counted(pictures)
+    return (
+        pictures if numbers is None else [pictures[i] for i in np.argsort(numbers, kind="stable")]
+    )
+
+
+def _counted(pictures: list[Path]) -> list[int] | None:
+    """The number in each name, where that is all in which names differ: view_9.png, view_10.png."""
+    parts = [re.split("([0-9]+)", path.stem) for path in pictures]
+    if len({len(words) for words in parts}) != 1:
+        return None
+    differ = [words for words in zip(*parts, strict=True) if len({*words}) > 1]
+    if len(pictures) == 1:
+        differ = [words for words in zip(*parts, strict=True) if words[0].isdecimal()]
+    if len(differ) != 1 or not all(word.isdecimal() for word in differ[0]):
+        return None
+    return [int(word) for word in differ[0]]
 
 
 def _numbers(path: Path, known: list[int], pictures: list[Path]) -> list[int]:
     """The number of each picture's matrix."""
     if len(pictures) == len(known):
         return known
-    found = [int(p.stem) if p.stem.isdecimal() else -1 for p in pictures]
-    if set(found) <= set(known) and len(set(found)) == len(found):
+    found = _counted(pictures)
+    if found and set(found) <= set(known) and len(set(found)) == len(found):
         return found
     raise DataError(
         f"{path}: expected a world_mat for each of {len(pictures)} photographs in "

@@ -3,6 +3,7 @@ camera paths without pictures."""
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import reprlib
@@ -18,7 +19,7 @@ from univoxel.core.files import read_json, write_json
 from univoxel.data import load_images
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
-from univoxel.data.path_sandbox import inside, left_out
+from univoxel.data.path_sandbox import inside, left_out, same_name
 from univoxel.data.photos import Photos
 from univoxel.errors import DataError, UserError
 
@@ -37,9 +38,14 @@ RIGID_TOLERANCE = 1e-3
 CAPITAL = (".JPG", ".JPEG", ".PNG")
 ENDINGS = ("", ".png", "_rgba.png", "_rgb.exr", ".exr", ".jpg", ".jpeg", *CAPITAL)
 LOOKED_FOR = f"looked for the endings {', '.join(ending or 'none' for ending in ENDINGS)}"
+# That may be written as text
+NUMBERS = {"w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x"}
+NUMBERS |= {"k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"}
 WIDEST = 1 << 16  # pixels along a side of pictures to be made: what formats of files hold
+OFF = 0.9  # of a picture's sides: no lens is centred so far to the right and below
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
+log: logging.Logger = logging.getLogger("univoxel")
 _SHORT = reprlib.Repr()  # writes the beginning of values of any size and depth
 _SHORT.maxlist = _SHORT.maxdict = 20
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 200
@@ -95,13 +101,22 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise DataError(f"{path}: frame {index}: expected an object, got {short(frame)}")
-    frames = [_without_nothing(frame) for frame in frames]
-    return _without_nothing(root), frames
+    frames = [_understood(frame) for frame in frames]
+    return _understood(root), frames
 
 
-def _without_nothing(values: dict[str, Any]) -> dict[str, Any]:
-    """Without keys whose value is null: some write all that they know of."""
-    return {key: value for key, value in values.items() if value is not None}
+def _understood(values: dict[str, Any]) -> dict[str, Any]:
+    """Without keys whose value is null, as some write all that they know of; numbers that are
+    written as text are numbers, and whole ones of pixels are integers."""
+    values = {key: value for key, value in values.items() if value is not None}
+    for key in NUMBERS & values.keys():
+        if isinstance(value := values[key], str):
+            with suppress(ValueError):
+                value = float(value)
+        if key in ("w", "h") and isinstance(value, float) and value.is_integer():
+            value = int(value)
+        values[key] = value
+    return values
 
 
 def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], list[str]]:
@@ -137,6 +152,15 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], lis
         pose, mask = pose_of(frame.get("transform_matrix"), where), _mask(path.parent, frame, where)
         shots.append(load_images.Shot(names[index], where, image, mask, pose, lens))
     lost = left_out(str(path), missing, len(frames), f" ({LOOKED_FOR}{_smaller(missing)})")
+    first = shots[0].lens
+    if "w" not in root | frames[0] and all(
+        c > OFF * n for c, n in zip(first.centre, (first.width, first.height), strict=True)
+    ):
+        log.warning(
+            "%s: cx and cy are at the border of pictures of %dx%d pixels: if they are of larger "
+            "ones, state the size of those as w and h",
+            *(path, first.width, first.height),
+        )
     lost += [f"cameras of {scaled} scaled to smaller pictures"] if scaled else []
     return root, shots, lost
 
@@ -196,13 +220,18 @@ def listed_image(folder: Path, file_path: str, where: str) -> Path | None:
     if (named := Path(file_path)).suffix.lower() in (*SUFFIXES, *FOREIGN):
         names += [str(named.with_suffix(ending)) for ending in (*SUFFIXES, *CAPITAL)]
     found = next((path for name in names if _is_file(path := folder / name)), None)
-    found = found or _found_as_written_elsewhere(folder, names)
+    found = found or _found_as_written_elsewhere(folder, names, where)
     return None if found is None else inside(found, where)
 
 
-def _found_as_written_elsewhere(folder: Path, names: Sequence[str]) -> Path | None:
-    """A file that a list names as another machine has it: with backslashes, in capitals or not, or
-    by an absolute path, of which the end says which it is in the folder."""
+def _found_as_written_elsewhere(folder: Path, names: Sequence[str], where: str) -> Path | None:
+    """A file that a list names as another machine has it: with backslashes, in capitals or not,
+    accents apart from their letters or not, or by an absolute path, of which the end says which it
+    is in the folder.
+
+    Raises:
+        DataError: two files are called so.
+    """
     of_windows = "\\" in names[0] or re.match("[A-Za-z]:/", names[0])
     paths = [PureWindowsPath(name) if of_windows else PurePosixPath(name) for name in names]
     if any(".." in path.parts for path in paths):
@@ -211,15 +240,19 @@ def _found_as_written_elsewhere(folder: Path, names: Sequence[str]) -> Path | No
     for begin in range(len(paths[0].parts) if absolute else 1):
         for path in paths:
             parts = path.parts[begin + absolute :]
-            if parts and (found := _in_any_case(folder, parts, known)):
-                return found
+            found = _in_any_case(folder, parts, known) if parts else []
+            if len(found) > 1:
+                both = " and ".join(map(str, found[:2]))
+                raise DataError(f"{where}: expected one picture {path}, got {both}: rename one")
+            if found:
+                return found[0]
     return None
 
 
 def _in_any_case(
     folder: Path, parts: Sequence[str], known: dict[Path, dict[str, list[Path]]]
-) -> Path | None:
-    """The one file of a folder whose path is this, but for capitals.
+) -> list[Path]:
+    """The files of a folder whose path is this, but for capitals and how accents are written.
 
     Args:
         known: what is in folders, which is added to.
@@ -227,16 +260,16 @@ def _in_any_case(
     found = [folder]
     for part in parts:
         known |= {f: _entries(f) for f in found if f not in known}
-        found = [p for f in found for p in known[f].get(part.casefold(), [])]
-    return found[0] if len(found) == 1 and found[0].is_file() else None
+        found = [p for f in found for p in known[f].get(same_name(part), [])]
+    return [path for path in found if path.is_file()]
 
 
 def _entries(folder: Path) -> dict[str, list[Path]]:
-    """What is in a folder, by its name without regard to capitals."""
+    """What is in a folder, by its name as of `same_name`."""
     entries: dict[str, list[Path]] = {}
     with suppress(OSError):
         for path in sorted(folder.iterdir()):
-            entries.setdefault(path.name.casefold(), []).append(path)
+            entries.setdefault(same_name(path.name), []).append(path)
     return entries
 
 
@@ -410,6 +443,13 @@ def load_blender(
     if not path.is_file():
         raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
     _, shots, remarks = read_frames(path)
+    train = folder / "transforms_train.json"
+    if train.is_file():  # all splits in one world
+        frames = read_transforms(train)[1] if split != "train" else []
+        poses = [pose_of(f.get("transform_matrix"), str(train)) for f in frames]
+        places = [pose[:, 3] for pose in poses] or [shot.pose[:, 3] for shot in shots]
+        shots, moved = load_images.near_origin(shots, np.stack(places))
+        remarks = [*remarks, *moved]
     return load_images.read_shots(folder, "NeRF layout", split, shots, downscale, remarks, masks)
 
 
