@@ -1,9 +1,12 @@
 """COLMAP's models: where they lie, and errors."""
 
 import struct
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+import torch
 from layouts import HEIGHT, WIDTH, refused, scene, write_colmap
 
 from univoxel.data import load_photos
@@ -16,6 +19,27 @@ from univoxel.errors import DataError
 def test_places(tmp_path, place, text):
     photos = load_photos(write_colmap(tmp_path, scene(), place, text), "test")
     assert photos.names == ["p_000", "p_008"]
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_models_that_colmap_itself_writes(tmp_path, form):
+    """With rigs and frames beside, as it has them since 3.12; of one and the same model."""
+    pytest.importorskip("pycolmap")
+    data = write_colmap(tmp_path, scene(), text=True)
+    model, plain = data / "sparse/0", load_photos(data)
+    (model / "points3D.txt").touch()
+    program = (
+        "import sys, zlib, pycolmap; from pathlib import Path; model = Path(sys.argv[1])\n"
+        "read = pycolmap.Reconstruction(model)\n"
+        "for file in model.iterdir(): file.unlink()\n"
+        f"read.write_{form}(model)"
+    )
+    subprocess.run([sys.executable, "-c", program, model], check=True)  # never beside torch
+    assert len(list(model.glob({"binary": "*.bin", "text": "*.txt"}[form]))) >= 3
+    photos = load_photos(data)
+    assert photos.names == plain.names
+    torch.testing.assert_close(photos.cameras.camera_to_world, plain.cameras.camera_to_world)
+    torch.testing.assert_close(photos.cameras.focal, plain.cameras.focal)
 
 
 def test_binary_files_come_first(tmp_path):
