@@ -21,7 +21,7 @@ from layers import LAYERS, violations  # noqa: E402
 LIMITS = {
     "lines of the package": 38_765,
     "lines of the laboratory": 5_300,
-    "lines of tests": 37_381,
+    "lines of tests": 37_382,
     "modules of the package": 164,
     "loose modules at the top": 12,
     "configuration fields": 129,

@@ -111,8 +111,7 @@ def on_the_axis(data: Path):
 
 
 CASES = {
-    "one view": first_views(1),
-    "two views": first_views(2),
+    "three views": first_views(3),
     "white": colored(230),
     "black": colored(0),
     "clipped": colored(255),
@@ -155,7 +154,7 @@ def test_a_result_with_finite_numbers(template, tmp_path, capsys, case):
     data = Path(shutil.copytree(template, tmp_path / "data"))
     CASES[case](data)
     # No point is seen often enough to solve for materials and light: that stage makes no step
-    expected = 3 if case in ("one view", "one pixel") else 0
+    expected = 3 if case == "one pixel" else 0
     run(data, tmp_path, "hybrid", capsys, "--no-page", expected=expected)
 
 
@@ -169,6 +168,8 @@ def test_the_same_under_traced_light(template, tmp_path, capsys, case):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (first_views(1), "expected at least 3 photographs, got 1"),
+        (first_views(2), "expected at least 3 photographs, got 2"),
         (every_picture(lambda p, *_: 0 * p), "all 6 pictures are fully transparent"),
         (every_picture(opaque), "all 6 pictures are fully opaque"),
         (every_picture(one_pixel), "the silhouettes of the photographs share no volume"),
