@@ -1,6 +1,7 @@
 """The object in 3D: from masks of which some are wrong, with depth maps and without."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from univoxel.errors import UserError
 from univoxel.fields.grid import GridShape, fit_grid
 from univoxel.preparation import object_shape
 from univoxel.preparation.object_shape import ObjectShape, box_corners, find_object, silhouettes
+from univoxel.preparation.rough_masks import best_object
 from univoxel.preparation.stereo import depth_maps, pixels_of
 
 VIEWS, SIZE, VOXELS = 40, 64, 48
@@ -117,6 +119,17 @@ def test_depth_and_masks_find_the_object(room, spoilt):
     assert np.mean(agree) > 0.95
     assert min(agree) > 0.9
     assert shape.surface > 0.7
+
+
+def test_depth_that_contradicts_the_masks_is_not_believed(room):
+    """As of a mirror: depth lies behind the object's surface."""
+    _, masks, maps = room
+    behind = torch.stack([m >= 0.5 for m in masks]) * 0.8
+    for known, asked in ((maps, True), (replace(maps, distance=maps.distance + behind), False)):
+        shape, shown = best_object(masks, known)
+        assert (shape.surface > 0) == asked
+        agree = [iou(s, m) for s, m in zip(shown, masks, strict=True)]
+        assert np.mean(agree) > 0.95
 
 
 def test_depth_empties_the_air_that_masks_keep(room):

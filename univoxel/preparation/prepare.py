@@ -257,7 +257,8 @@ def prepare(
     if varying == "none" and turntable is None and begins(PINNED):
         pinned = find_pinned(silhouettes, photos.cameras, hull, grid)
     carves = cfg.carving_seconds and varying != "light" and turntable is None
-    carves = carves and silhouettes.shape is None  # which has its concavities
+    # A shape that depth was asked for has its concavities
+    carves = carves and (silhouettes.shape is None or silhouettes.shape.surface == 0)
     if carves and begins("concavities"):
         seconds = cfg.carving_seconds
         carved = carve_within_time(hull, grid, photos, gains, seconds)

@@ -8,6 +8,7 @@ as a lid, is doubted in those that disagree with the others.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,13 +25,15 @@ from univoxel.data.photos import coverage_of
 from univoxel.preparation.hull import estimate_bounds, mask_distances
 from univoxel.preparation.object_shape import ObjectShape, find_object, shrunk, silhouettes
 from univoxel.preparation.pose_refinement import MAX_CONTRADICTION, Belief, contradiction
-from univoxel.preparation.stereo import depth_maps
+from univoxel.preparation.stereo import DepthMaps, depth_maps
 
 log: logging.Logger = logging.getLogger("univoxel")
 
 # Half the width, in pixels of the depth maps, of what a mask lacks or shows too much before it is
 # doubted: narrower pieces are its jagged edge
 JAGGED = 2.0
+# How many times as many pixels of the masks as without depth an object may contradict with it
+CLEARLY = 1.2
 
 
 @dataclass(frozen=True)
@@ -55,8 +58,7 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     """
     cameras, maps = photos.cameras, depth_maps(photos)
     masks = parallel_map(lambda view: small_mask(photos, view, maps.cameras), range(len(photos)))
-    shape = find_object(masks, maps)
-    shown = list(silhouettes(shape, maps.cameras))
+    shape, shown = best_object(masks, maps)
     pixels = memmap.zeros(photos.alpha.shape, torch.bool)
 
     def doubt_(view: int) -> None:
@@ -77,6 +79,24 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     if votes != belief.votes:
         box = estimate_bounds(distance, cameras, votes)
     return Doubted(shape, pixels, replace(belief, box=box, votes=votes, off=off))
+
+
+def best_object(masks: Sequence[Tensor], maps: DepthMaps) -> tuple[ObjectShape, list[Tensor]]:
+    """The object with its depth or as masks alone show it, whichever fits the masks [H, W] better;
+    and its silhouettes [h, w] bool.
+
+    Depth tells of hollows, and of what most masks lack or show too much. But in a mirror it is that
+    of the reflection: then the object's silhouettes lose what all masks show.
+    """
+    found = []
+    for known in (maps.known, torch.zeros_like(maps.known)):
+        shape = find_object(masks, replace(maps, known=known))
+        shown = list(silhouettes(shape, maps.cameras))
+        differs = [(mask >= 0.5) != one for mask, one in zip(masks, shown, strict=True)]
+        found.append((shape, shown, sum(int(one.sum()) for one in differs)))
+    (with_depth, without) = found
+    best = with_depth if with_depth[2] <= CLEARLY * without[2] else without
+    return best[:2]
 
 
 def thick(differs: Tensor) -> Tensor:
