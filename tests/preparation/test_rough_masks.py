@@ -2,15 +2,21 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from analytic import RADIUS, photos_of
 
+from lab.stress.damage import turned
 from univoxel.data import Photos
 from univoxel.errors import DataError, UserError
-from univoxel.preparation import prepare
+from univoxel.preparation import pose_refinement, prepare
 from univoxel.preparation.hull import hull_sdf, mask_distances
-from univoxel.preparation.pose_refinement import MAX_CONTRADICTION, Belief
+from univoxel.preparation.pose_refinement import (
+    MAX_CONTRADICTION,
+    Belief,
+    choose_masks_or_poses,
+)
 from univoxel.preparation.rough_masks import doubt_masks, thick
 from univoxel.presets import preset
 
@@ -77,6 +83,29 @@ def test_ground_that_a_mask_keeps_is_doubted(photos):
 
 def test_what_all_masks_show_is_nowhere_doubted(photos):
     assert not doubt_masks(photos, mask_distances(photos.alpha), ROUGH).pixels.any()
+
+
+def test_of_plain_objects_silhouettes_alone_tell_masks_from_cameras(photos, caplog, monkeypatch):
+    """Cameras that are off can be put right; masks with holes and stains agree from nowhere."""
+    monkeypatch.setattr(pose_refinement, "STEPS", 60)
+    cameras = turned(photos.cameras, 2.0, np.random.default_rng(0))
+    distance = mask_distances(photos.alpha)
+    assert choose_masks_or_poses(replace(photos, cameras=cameras), distance, "auto", "auto").refined
+    alpha, pixel = photos.alpha.clone(), torch.arange(SIZE)
+    generator = torch.Generator().manual_seed(0)
+    for mask in alpha:
+        for shows in (0.0, 1.0, 0.0, 1.0):
+            row, column = torch.randint(10, SIZE - 10, (2,), generator=generator).tolist()
+            mask[((pixel[:, None] - row) ** 2 + (pixel - column) ** 2) < 6**2] = shows
+    spoilt, distance = replace(photos, alpha=alpha), mask_distances(alpha)
+    with caplog.at_level("INFO"):
+        found = choose_masks_or_poses(spoilt, distance, "auto", "auto")
+    assert not found.refined
+    assert found.votes > 1
+    assert "no better with other cameras: the masks are rough" in caplog.text
+    # What is told is believed
+    assert choose_masks_or_poses(spoilt, distance, "refined", "auto").refined
+    assert choose_masks_or_poses(spoilt, distance, "auto", "given").refined
 
 
 def test_jagged_edges_are_not_doubted():

@@ -212,17 +212,24 @@ def registered_poses(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tens
     Args:
         distance, box: see `Edges`.
     """
-    half = (box[1] - box[0]) / 2
-    poses = PoseSteps(len(cameras))
-    poses.about(cameras, box[0] + half, float(half.max()))
-    align_(poses, distance, cameras, box)
+    poses, rest = aligned_poses(distance, cameras, box)
     moved = poses.moved(cameras).square().mean().sqrt()
-    rest = contradiction(distance, poses.eval().corrected(cameras), box)
     result = "agree"
     if rest > MAX_CONTRADICTION:
         result = f"still contradict one another by {rest:.1f} pixels"
     log.info("cameras moved the object by %.1f pixels on average: silhouettes %s", moved, result)
     return poses
+
+
+def aligned_poses(
+    distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tensor]
+) -> tuple[PoseSteps, float]:
+    """Steps to cameras whose silhouettes agree, and what they still contradict one another by."""
+    half = (box[1] - box[0]) / 2
+    poses = PoseSteps(len(cameras))
+    poses.about(cameras, box[0] + half, float(half.max()))
+    align_(poses, distance, cameras, box)
+    return poses, contradiction(distance, poses.eval().corrected(cameras), box)
 
 
 # Cameras or masks: which are believed where silhouettes contradict one another.
@@ -234,6 +241,8 @@ MAX_DISTANCE = 1.0
 # How many times further silhouettes contradict one another where masks are to blame: cameras
 # that are off make both large, the contradiction up to twice as much as the distance
 DOUBT = 4.0
+# Share of the contradiction that cameras which are refined leave at most, if it was their fault
+MENDED = 0.25
 
 
 @dataclass(frozen=True)
@@ -256,7 +265,8 @@ def choose_masks_or_poses(
 
     Where silhouettes contradict one another, points matched between photographs are asked. If they
     lie much nearer to where the cameras put them than the contradiction is large, it is the masks
-    that are wrong.
+    that are wrong. Of plain objects no points are matched: then cameras are to blame if silhouettes
+    agree once they are refined.
 
     Args:
         distance: [V, H, W] from `hull.mask_distances`.
@@ -277,6 +287,9 @@ def choose_masks_or_poses(
         )
     seen = agreement(cameras, find_matches(photos, distance))
     believed = right(seen, off)
+    if seen is None and box is not None and (wanted, masks) == ("auto", "auto"):
+        wide = _widened(box, distance, cameras, off, True)
+        believed = aligned_poses(distance, cameras, wide)[1] > MENDED * off
     refined = wanted == "refined" or (wanted == "auto" and not believed)
     if believed or box is not None:
         _say(seen, off, believed, refined)
@@ -326,6 +339,8 @@ def _say(seen: Agreement | None, off: float, believed: bool, refined: bool) -> N
     contradicting = f"silhouettes contradict one another by {off:.1f} pixels"
     if math.isinf(off):
         contradicting = "silhouettes share no volume"
+    if seen is None and believed:
+        contradicting += ", and no better with other cameras"
     if seen is not None:
         lie = f"matched points lie {seen.median:.2f} pixels from where the cameras put them"
         contradicting = f"{lie}{': cameras are believed' if believed else ''}; {contradicting}"
