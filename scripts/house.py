@@ -19,12 +19,12 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 38_765,
+    "lines of the package": 39_050,
     "lines of the laboratory": 5_300,
-    "lines of tests": 37_382,
+    "lines of tests": 37_650,
     "modules of the package": 164,
     "loose modules at the top": 12,
-    "configuration fields": 129,
+    "configuration fields": 130,
     "fields that nothing sets": 0,
     "layers": 10,
     "imports that go up": 0,

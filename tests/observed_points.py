@@ -15,6 +15,7 @@ from univoxel import brdf
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.data import Photos
 from univoxel.lights.latlong import DistantLight
+from univoxel.lights.views import Flash
 from univoxel.ops import shade_map
 from univoxel.render.observations import (
     JointProblem,
@@ -87,7 +88,8 @@ def random_problem(
 
 def in_double(transport: LinearTransport) -> LinearTransport:
     values = {f.name: getattr(transport, f.name) for f in dataclasses.fields(transport)}
-    return LinearTransport(**{k: v.double() if k != "view" else v for k, v in values.items()})
+    whole = {k: values.pop(k) for k in ("view", "flash")}
+    return LinearTransport(**{k: v.double() for k, v in values.items()}, **whole)
 
 
 class Steps:
@@ -172,16 +174,22 @@ def sphere_of(base, metallic, roughness, views=12, noise=0.0):
 
 
 def photographs_under(
-    maps: torch.Tensor, roughness: float, views: int = 16, size: int = 48
+    maps: torch.Tensor,
+    roughness: float,
+    views: int = 16,
+    size: int = 48,
+    flash: Flash | None = None,
 ) -> Photos:
-    """The sphere, red on +X and blue on -X, under a map [D, 3], or one for each view [V, D, 3]."""
+    """The sphere, red on +X and blue on -X, under a map [D, 3], or one for each view [V, D, 3], and
+    a flash."""
     cameras = cameras_around(views, size)
     direction = fibonacci_sphere(maps.shape[-2])
     color, alpha = [], []
     for v, map in enumerate(maps.expand(views, -1, -1)):
         normal, hit = sphere_normals(cameras, v)
         n = normal[hit]
-        wo = normalize(cameras.camera_to_world[v, :, 3] - RADIUS * n, dim=1)
+        away = cameras.camera_to_world[v, :, 3] - RADIUS * n
+        wo = normalize(away, dim=1)
         count = len(n)
         albedo = torch.where(n[:, :1] > 0, RED, BLUE)
         shown = prefiltered_roughness(torch.full((count,), roughness), len(map))
@@ -190,6 +198,10 @@ def photographs_under(
             torch.zeros(count, len(map), 3).half(), torch.arange(count), n, wo, albedo,
             shown, direction, 4 * math.pi / len(map),
         )  # fmt: skip
+        if flash is not None:
+            f0 = torch.full_like(albedo, brdf.F0)
+            seen = n, wo, away.norm(dim=1)
+            rgb += flash.reflected(*seen, albedo, torch.full((count,), roughness), f0).detach()
         picture = torch.zeros(size, size, 3)
         picture[hit] = rgb
         color.append((255 * linear_to_srgb(picture)).round().to(torch.uint8))

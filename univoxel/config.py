@@ -277,9 +277,10 @@ class TrainConfig:
     )
     light_frame: LightFrameOrAuto = setting(
         "auto",
-        "what the light stands still in: the world of the cameras, or the room of a turntable, "
-        "whose camera stood still too; auto: which of the two explains better how colours change "
-        "from photograph to photograph. scene.turntable then holds the axis",
+        "what the light stands still in: the world of the cameras; the room of a turntable, whose "
+        "camera stood still too; or the camera, whose flash lights the object beside what stands "
+        "around it; auto: what explains best how colours change from photograph to photograph. "
+        "scene.turntable then holds the axis, scene.flash the distance",
     )
     detail: Detailing = setting(
         "texture",

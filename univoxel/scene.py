@@ -30,7 +30,7 @@ from univoxel.fields.field import Field, MaterialHead, RadianceHead
 from univoxel.fields.grid import GridShape
 from univoxel.lights.base import MOST_ROWS, MirroredLight
 from univoxel.lights.latlong import DistantLight
-from univoxel.lights.views import Turntable, ViewLights
+from univoxel.lights.views import Flash, Turntable, ViewLights
 from univoxel.ops import VisibilityScene
 from univoxel.ops.networks import DirectionTable
 
@@ -71,6 +71,12 @@ class SceneConfig:
     )
     turntable: Turntable | None = setting(
         None, "about which the light turns with the camera; None: it stands still"
+    )
+    flash: float | None = setting(
+        None,
+        "distance of the object from a flash at the camera's lens, see Flash; None: there is none",
+        unit="world units",
+        above=0,
     )
     varying: Varying = setting("none", "what differs from photograph to photograph, see ViewLights")
     codes: int = setting(8, "numbers that tell the light of a view, where that varies", least=1)
@@ -135,6 +141,7 @@ class Scene(nn.Module):
         if cfg.varying != "none":
             directions = self.sky.direction if codes and self.sky else None
             self.views: ViewLights | None = ViewLights(cfg.views, codes, directions)
+        self.flash: Flash | None = None if cfg.flash is None else Flash(cfg.flash)
         self.poses: PoseSteps | None = PoseSteps(len(cfg.views)) if cfg.refined else None
         if codes:  # at first they change nothing
             assert isinstance(self.light, lights.AbstractLocalLight)

@@ -97,7 +97,7 @@ def told_by(scene: Scene, truth: Mapping[str, Any]) -> dict[str, list[bool] | No
         else [truth["exposures_differ"], varying == "exposure"],
         "light": [truth["light_varies"], varying == "light"],
         "turntable": [truth["turntable"], scene.cfg.turntable is not None],
-        "flash": [truth["flash"], bool(getattr(scene.cfg, "flash", None))],  # of later versions
+        "flash": [truth["flash"], scene.cfg.flash is not None],
     }
 
 

@@ -23,9 +23,9 @@ from univoxel.errors import ConfigError, DataError
 from univoxel.fields.grid import fit_grid
 from univoxel.lights import EnvmapConfig
 from univoxel.lights.views import Table, Turntable, resampling, rotated
-from univoxel.preparation import turntable
+from univoxel.preparation import light_frame
 from univoxel.preparation.hull import estimate_bounds, mask_distances, observe_hull, visual_hull
-from univoxel.preparation.turntable import explained, turntable_of
+from univoxel.preparation.light_frame import LightFrame, explained, light_frame_of
 from univoxel.render.observations import TurnedMaps, shade_observations, turned_maps
 from univoxel.render.pipeline import extract_mesh, radiance_of, shade
 from univoxel.scene import Scene, load_scene, save_scene
@@ -74,16 +74,16 @@ def test_which_light_it_was(photographs, light, caplog):
     caplog.set_level("INFO", "univoxel")
     photos = photographs[light]
     found = explained(observe_hull(photos, *hull_of(photos), 1500), TURNTABLE)
-    told = turntable_of(photos, *hull_of(photos), "auto")
+    told = light_frame_of(photos, *hull_of(photos), "auto")
     if light == "still":
         assert found.by_still_light > 2 * found.by_turning_light
         assert found.ahead < -3
-        assert told is None
+        assert told == LightFrame()
         assert not caplog.text
     else:
         assert found.by_turning_light > 2 * found.by_still_light
         assert found.ahead > 3
-        assert told == TURNTABLE
+        assert told == LightFrame(TURNTABLE)
         assert "the light turns with the camera, as on a turntable" in caplog.text
 
 
@@ -111,19 +111,21 @@ def test_exposures_are_no_light(photographs):
 )
 def test_what_decides(photographs, monkeypatch, caplog, still_around, ahead, saved, turns):
     caplog.set_level("INFO", "univoxel")
-    found = turntable.Explained(-0.02, 0.3, ahead, saved)
-    monkeypatch.setattr(turntable, "explained", lambda *_: found)
-    monkeypatch.setattr(turntable, "surroundings_stand_still", lambda _: still_around)
+    found = light_frame.Explained(-0.02, 0.3, ahead, saved)
+    monkeypatch.setattr(light_frame, "explained", lambda *_: found)
+    monkeypatch.setattr(light_frame, "surroundings_stand_still", lambda _: still_around)
     photos = photographs["still"]
-    assert (turntable_of(photos, *hull_of(photos), "auto") is not None) == turns
+    found = light_frame_of(photos, *hull_of(photos), "auto")
+    assert (found.turntable is not None) == turns
+    assert found.flash is None
     if turns:
         assert "a light that stands still 0 %" in caplog.text
 
 
 def test_what_is_known_is_not_looked_for(photographs):
     photos = photographs["still"]
-    assert turntable_of(photos, *hull_of(photos), "turntable") == TURNTABLE
-    assert turntable_of(photographs["turning"], *hull_of(photos), "world") is None
+    assert light_frame_of(photos, *hull_of(photos), "turntable").turntable == TURNTABLE
+    assert light_frame_of(photographs["turning"], *hull_of(photos), "world") == LightFrame()
 
 
 def test_a_turntable_without_an_axis(photographs):
@@ -134,8 +136,8 @@ def test_a_turntable_without_an_axis(photographs):
     )  # every other on its side
     tumbled = replace(photos, cameras=replace(photos.cameras, camera_to_world=pose))
     with pytest.raises(DataError, match="light_frame turntable: the cameras do not stand around"):
-        turntable_of(tumbled, *hull_of(photos), "turntable")
-    assert turntable_of(tumbled, *hull_of(photos), "auto") is None
+        light_frame_of(tumbled, *hull_of(photos), "turntable")
+    assert light_frame_of(tumbled, *hull_of(photos), "auto") == LightFrame()
 
 
 def test_the_equations_see_the_map_as_the_renders_do():

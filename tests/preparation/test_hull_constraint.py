@@ -18,6 +18,7 @@ from univoxel.optim import rows_of
 from univoxel.preparation import hull_constraint as task
 from univoxel.preparation.hull import mask_distances, visual_hull
 from univoxel.preparation.hull_constraint import grown, open_observations, pinned_hull
+from univoxel.preparation.light_frame import LightFrame
 from univoxel.preparation.prepare import Silhouettes, pinned_in, prepare
 from univoxel.presets import preset
 from univoxel.render.observations import Observations
@@ -286,10 +287,16 @@ def test_photographs_that_differ_pin_nothing(tmp_path, varying):
     assert pinned_in(prepared.silhouettes, build_scene(prepared, cfg), cfg) is None
 
 
-def test_a_turntable_pins_nothing(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "frame",
+    [
+        LightFrame(Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))),
+        LightFrame(flash=2.0),
+    ],
+)
+def test_light_that_moves_with_the_camera_pins_nothing(tmp_path, monkeypatch, frame):
     silhouettes, cfg = silhouettes_of(half), draft(tmp_path)
-    turntable = Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
-    monkeypatch.setattr("univoxel.preparation.prepare.turntable_of", lambda *_: turntable)
+    monkeypatch.setattr("univoxel.preparation.prepare.light_frame_of", lambda *_: frame)
     prepared = prepare(silhouettes, cfg)
     assert prepared.pinned is None
     assert pinned_in(silhouettes, build_scene(prepared, cfg), cfg) is None

@@ -10,8 +10,8 @@ from analytic import look_at
 
 from univoxel.camera import Cameras, image_rays
 from univoxel.data import Photos
+from univoxel.preparation.light_frame import find_strays, say_strays
 from univoxel.preparation.prepare import find_silhouettes
-from univoxel.preparation.turntable import find_strays, say_strays
 from univoxel.presets import preset
 
 VIEWS, SIZE = 16, 64

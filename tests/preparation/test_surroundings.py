@@ -7,7 +7,7 @@ import torch
 
 from univoxel.camera import Cameras
 from univoxel.data import Photos
-from univoxel.preparation.turntable import surroundings_stand_still
+from univoxel.preparation.light_frame import surroundings_stand_still
 
 VIEWS, SIZE = 12, 128
 

@@ -39,8 +39,8 @@ class TrainOptions:
     """what differs from photograph to photograph: exposure, with the colour balance, or the light
     itself too; auto is exposure where it is seen to differ, else none"""
     light_frame: choices.LightFrameOrAuto = "auto"
-    """world, where the light stood still, or turntable, where it turned with the camera; auto is
-    what explains the photographs better"""
+    """world, where the light stood still; turntable, where it turned with the camera; camera, where
+    a flash at the lens lit the object; auto is what explains the photographs best"""
     metal: choices.Metal = "auto"
     """all, if the whole object is metal, patina included; some, if not; auto decides it"""
     detail: choices.DetailingOrAuto = "auto"

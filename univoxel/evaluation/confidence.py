@@ -234,6 +234,8 @@ def render(
         for k in torch.arange(len(point)).split(RAYS_AT_ONCE):
             at_points, o = at_rays(surface, point[k]), observation[k]
             view = observations.view[o]
+            away = (observations.eye[view] - at_points.position).norm(dim=1)
+            at_points = replace(at_points, depth=away)
             parts.append(shade(scene, at_points, observations.wo[o], view=view))
         return torch.cat(parts) if parts else torch.zeros(0, 3)
     assert surface.metallic is not None
@@ -241,7 +243,9 @@ def render(
     assert isinstance(f0, Tensor)
     color, voxel_size = observations.color, scene.field.voxel_size
     turned = turned_maps(scene, observations)
-    problem = JointProblem(observations, transport, color, voxel_size, scene.sky, turned)
+    problem = JointProblem(
+        observations, transport, color, voxel_size, scene.sky, turned, scene.flash
+    )
     roughness = prefiltered_roughness(surface.roughness, problem.nodes)
     shaded = observations.normal[point], diffuse[point], roughness[point], f0[point]
     return shade_observations(scene, problem, point, observation, *shaded)

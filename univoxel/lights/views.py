@@ -1,4 +1,5 @@
-"""What the light of each photograph has of its own, and light that turns with the camera."""
+"""What the light of each photograph has of its own: a gain, a flash, or where the whole light
+turns with the camera."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from univoxel import brdf
 from univoxel.camera import Cameras, circle_of, looked_at
 from univoxel.core.validation import about, setting
 from univoxel.errors import ConfigError, UserError
@@ -132,6 +134,52 @@ class ViewLights(nn.Module):
         if self.sky_weights is None or self.sky_basis is None:
             return None
         return torch.einsum("vrc,rd->vdc", _centred(self.sky_weights), self.sky_basis)
+
+
+NEAREST = 0.1  # of the usual distance from a flash, in which it does not become brighter any more
+
+
+class Flash(nn.Module):
+    """A lamp at the lens of the camera, which moves with it: a flash.
+
+    It is a point, so that what it sends falls with the squared distance, and it lights what the
+    camera sees without shadows. It is white: cameras balance their colours by it, so that it tells
+    the colour of paint from that of the room's light.
+    """
+
+    def __init__(self, distance: float) -> None:
+        """
+        Args:
+            distance: world units, > 0, for which `log_radiance` holds.
+        """
+        super().__init__()
+        self.distance = distance
+        # [1] of white matte paint that faces the camera at that distance
+        self.log_radiance: nn.Parameter = nn.Parameter(torch.full((1,), math.log(0.5)))
+
+    def reflected(
+        self,
+        normal: Tensor,
+        wo: Tensor,
+        away: Tensor,
+        albedo: Tensor,
+        roughness: Tensor,
+        f0: Tensor,
+    ) -> Tensor:
+        """Linear radiance [N, 3] that its light makes a surface send back to the camera.
+
+        Args:
+            normal, wo: [N, 3] unit; wo to the camera.
+            away: [N] world units from the camera.
+            albedo, f0: [N, 3] of the diffuse and of the specular part.
+            roughness: [N].
+        """
+        nearest = NEAREST * self.distance  # rays that meet nothing have a depth of 0
+        falloff = (self.distance / away.clamp_min(nearest)).square() * (normal * wo).sum(
+            -1
+        ).clamp_min(0)
+        shown = brdf.evaluate(normal, wo, wo, albedo, roughness, f0)
+        return math.pi * falloff[:, None] * shown * self.log_radiance.exp()
 
 
 def _centred(values: Tensor) -> Tensor:

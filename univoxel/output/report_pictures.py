@@ -206,6 +206,8 @@ def found_light(scene: Scene, mesh: Mesh) -> FoundLight | None:
     sky = scene.environment()
     if sky is not None:
         about = "The environment map that was recovered."
+        if scene.flash is not None:
+            about += " Beside it a flash at the camera lit the photographs."
         return FoundLight(scene.exposed(sky.latlong(ROWS)), about)
     if not isinstance(scene.light, AbstractLocalLight):
         return None

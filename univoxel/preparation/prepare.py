@@ -17,10 +17,10 @@ from univoxel.core.choices import Varying
 from univoxel.data import Photos
 from univoxel.errors import DataError, UserError
 from univoxel.fields.grid import GridShape, fit_grid
-from univoxel.lights.views import Turntable
 from univoxel.preparation.carving import carve_within_time
 from univoxel.preparation.hull import observe_hull, visual_hull
 from univoxel.preparation.hull_constraint import PinnedHull, pinned_hull
+from univoxel.preparation.light_frame import LightFrame, light_frame_of, say_strays
 from univoxel.preparation.masks import fitted_masks
 from univoxel.preparation.object_shape import ObjectShape, signed_distance
 from univoxel.preparation.pose_refinement import (
@@ -29,7 +29,6 @@ from univoxel.preparation.pose_refinement import (
     registered_poses,
 )
 from univoxel.preparation.rough_masks import doubt_masks
-from univoxel.preparation.turntable import say_strays, turntable_of
 from univoxel.scene import Scene
 
 # Points of the surface whose colours are compared
@@ -188,7 +187,7 @@ class Prepared:
     hull: Tensor  # [X, Y, Z] sdf of the carved visual hull on the grid, world units
     varying: Varying  # what differs from photograph to photograph
     gains: Tensor | None  # [V] log gains of the exposures; None: all are alike
-    turntable: Turntable | None  # about which the light turns; None: it stands still
+    frame: LightFrame  # what the light stands still in
     pinned: PinnedHull | None  # where training leaves the hull as it is; None: nowhere
 
 
@@ -252,18 +251,18 @@ def prepare(
     begins("exposures", needed=True)
     say_clipped(photos)
     varying, gains = varying_and_gains(photos, hull, grid, cfg.scene.varying, cfg.exposures)
-    turntable = turntable_of(photos, hull, grid, cfg.light_frame, gains)
-    pinned = None
-    if varying == "none" and turntable is None and begins(PINNED):
+    frame = light_frame_of(photos, hull, grid, cfg.light_frame, gains)
+    pinned, in_world = None, frame == LightFrame()
+    if varying == "none" and in_world and begins(PINNED):
         pinned = find_pinned(silhouettes, photos.cameras, hull, grid)
-    carves = cfg.carving_seconds and varying != "light" and turntable is None
+    carves = cfg.carving_seconds and varying != "light" and in_world
     # A shape that depth was asked for has its concavities
     carves = carves and (silhouettes.shape is None or silhouettes.shape.surface == 0)
     if carves and begins("concavities"):
         seconds = cfg.carving_seconds
         carved = carve_within_time(hull, grid, photos, gains, seconds)
         hull = carved if pinned is None else torch.where(pinned.nodes(hull, grid), hull, carved)
-    return Prepared(silhouettes, poses, grid, hull, varying, gains, turntable, pinned)
+    return Prepared(silhouettes, poses, grid, hull, varying, gains, frame, pinned)
 
 
 def pinned_in(
@@ -275,7 +274,8 @@ def pinned_in(
     """What `prepare` pinned, of a scene that goes on."""
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)
-    if scene.cfg.varying != "none" or scene.cfg.turntable is not None:
+    light = scene.cfg
+    if light.varying != "none" or light.turntable is not None or light.flash is not None:
         return None
     if not begins(PINNED):
         return None

@@ -18,8 +18,9 @@ from univoxel.core.records import HALF_MAX, Mesh
 from univoxel.data import Photos
 from univoxel.data.photos import coverage_of
 from univoxel.errors import NoSurface
+from univoxel.fields.field import MaterialHead
 from univoxel.lights.latlong import DistantLight
-from univoxel.lights.views import resampling
+from univoxel.lights.views import Flash, resampling
 from univoxel.ops import VisibilityScene, shade_map
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import Scene
@@ -210,6 +211,7 @@ class JointProblem:
     voxel_size: float  # world units
     sky: DistantLight  # the scene's own map: the solve changes it
     turned: TurnedMaps | None = None  # None: the light stands still
+    flash: Flash | None = None  # the scene's own
 
     @property
     def nodes(self) -> int:
@@ -267,7 +269,7 @@ def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> 
     )
     target = linear_to_srgb_unclipped(observations.color)
     turned = turned_maps(scene, observations)
-    return JointProblem(observations, transport, target, offset, scene.sky, turned)
+    return JointProblem(observations, transport, target, offset, scene.sky, turned, scene.flash)
 
 
 def turned_maps(scene: Scene, observations: Observations) -> TurnedMaps | None:
@@ -386,6 +388,11 @@ def shade_observations(
     )
     if order is not None:
         rgb = rgb[torch.argsort(order)]
+    if problem.flash is not None:
+        away = (observations.eye[view] - observations.position[point]).norm(dim=1)
+        sharp = unfiltered_roughness(roughness, problem.nodes)
+        seen = normal, observations.wo[observation], away
+        rgb = rgb + problem.flash.reflected(*seen, diffuse, sharp, f0)
     return scene.exposed(rgb, view)
 
 
@@ -397,3 +404,8 @@ def prefiltered_roughness(roughness: Tensor, nodes: int) -> Tensor:
     alpha^2, and variances add (Kaplanyan and Hill 2016 filter normals so).
     """
     return (roughness**4 + 1 / nodes) ** 0.25
+
+
+def unfiltered_roughness(filtered: Tensor, nodes: int) -> Tensor:
+    """The roughness of which `prefiltered_roughness` made this."""
+    return (filtered**4 - 1 / nodes).clamp_min(MaterialHead.min_roughness**4) ** 0.25

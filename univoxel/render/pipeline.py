@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from univoxel import brdf
 from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb_unclipped, srgb_to_linear
@@ -132,6 +133,16 @@ def radiance_of(
     return linear_to_srgb_unclipped(scene.exposed(srgb_to_linear(encoded), view))
 
 
+def flashed(scene: Scene, surface: Surface, wo: Tensor) -> Tensor | float:
+    """What the scene's flash adds to the radiance [N, 3] of a surface along wo [N, 3]."""
+    if scene.flash is None:
+        return 0.0
+    albedo, f0 = brdf.split(surface.albedo, surface.metallic)
+    f0 = f0 if isinstance(f0, Tensor) else torch.full_like(albedo, f0)
+    of_surface = albedo, surface.roughness, f0
+    return scene.flash.reflected(surface.normal, wo, surface.depth.detach(), *of_surface)
+
+
 def shade(
     scene: Scene,
     surface: Surface,
@@ -146,20 +157,21 @@ def shade(
         view: [N] photographs in whose light and exposure it stands, or one for all, where they
             differ; None: those that the scene shows.
     """
-    light = scene.light
+    light, from_flash = scene.light, flashed(scene, surface, wo)
     if not light.traced:
         surface, wo = in_light_frame(scene, surface, wo)
         surface = replace(surface, features=scene.coded(surface.features, view))
         rgb = light.reflected(surface, wo, generator=generator)
         if scene.mirrored is not None and not scene.mirrored.silent:
             rgb = (rgb + scene.mirrored(surface, wo, scene.radiance.directions)).clamp_min(0)
-        return scene.exposed(rgb, view)
+        return scene.exposed(rgb + from_flash, view)
     parts = []
     for index in torch.arange(len(wo)).split(max(1, TRACED_AT_ONCE // light.directions)):
         part = at_rays(surface, index)
         seen = occlusion(scene, part, light.directions, rotations(part, generator))
         parts.append(light.reflected(part, wo[index], seen))
-    return scene.exposed(torch.cat(parts) if parts else torch.zeros_like(wo), view)
+    rgb = torch.cat(parts) if parts else torch.zeros_like(wo)
+    return scene.exposed(rgb + from_flash, view)
 
 
 @torch.no_grad()

@@ -118,10 +118,10 @@ def painted_points(
 ) -> PaintedPoints | None:
     """Some points that are no metal, not dark and seen often.
 
-    None: there are too few, or most are metal, or each photograph has a light of its own, which
-    determines more.
+    None: there are too few, or most are metal, or each photograph has a light of its own, as a
+    flash is, which determines more.
     """
-    if problem.turned is not None:
+    if problem.turned is not None or scene.flash is not None:
         return None
     if scene.views is not None and scene.views.sky_change() is not None:
         return None

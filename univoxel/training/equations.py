@@ -48,13 +48,16 @@ class LinearTransport:
     specular_indirect: Tensor  # [P, V, 3]
     target: Tensor  # [P, V, 3] sRGB-encoded
     view: Tensor  # [P, V] int64: which photograph
+    # [2, P, V, 3] radiance from a flash, for base 1 and what does not depend on the base
+    flash: Tensor | None = None
 
 
 @dataclass(frozen=True)
 class EliminatedAlbedo:
     """What gives the albedo of P points back from a step of the light, and their cost.
 
-    The light is the log map of D nodes and, where views differ, their B log gains after it.
+    The light is the log map of D nodes and, after it, the B log gains of views that differ, and the
+    log radiance of a flash.
     """
 
     cross: Tensor  # [3, P, D + B] second derivatives by light and log albedo
@@ -103,6 +106,7 @@ class Linearisation:
     by_map: Tensor  # [P, V, D] slope by the log map
     by_albedo: Tensor  # [P, V] slope by log albedo
     by_gain: Tensor  # [P, V] slope by the log of a factor on everything
+    by_flash: Tensor | None  # [P, V] slope by the log of the flash; None: there is none
     by_radiance: Tensor  # [P, V] slope by linear radiance: root of the weight, and the encoding
     radiance: Tensor  # [P, V] linear
 
@@ -127,8 +131,11 @@ def linearise(
     slope = root * srgb_slope(radiance)
     by_map = (albedo * transport.diffuse_factor)[..., None] * diffuse + specular
     by_map = by_map * (slope * gain)[..., None] * sky[:, c]
-    by_albedo, by_gain = slope * diffuse_radiance, slope * radiance
-    return Linearisation(root * residual, by_map, by_albedo, by_gain, slope, radiance)
+    by_albedo, by_gain, by_flash = slope * diffuse_radiance, slope * radiance, None
+    if transport.flash is not None:
+        of_base, beside = transport.flash[..., c]
+        by_flash = slope * gain * (albedo * of_base + beside)
+    return Linearisation(root * residual, by_map, by_albedo, by_gain, by_flash, slope, radiance)
 
 
 def transport_in_views(
@@ -155,9 +162,11 @@ def channel_radiance(
     """Linear radiance [P, V] of channel c: the part that the base multiplies, and the whole."""
     diffuse, specular, gain = transport_in_views(transport, c, differences)
     from_sky = transport.diffuse_factor * (diffuse @ sky[:, c])
-    indirect = transport.diffuse_indirect[..., c]
-    diffuse_radiance = gain * log_albedo[:, c, None].exp() * (from_sky + indirect)
+    other = transport.diffuse_indirect[..., c]
     mirrored = specular @ sky[:, c] + transport.specular_indirect[..., c]
+    if transport.flash is not None:
+        other, mirrored = other + transport.flash[0, ..., c], mirrored + transport.flash[1, ..., c]
+    diffuse_radiance = gain * log_albedo[:, c, None].exp() * (from_sky + other)
     return diffuse_radiance, diffuse_radiance + gain * mirrored
 
 
@@ -188,6 +197,8 @@ def normal_equations(
         if differences is not None:
             of_view = torch.nn.functional.one_hot(transport.view, len(differences.gain))
             jacobian = torch.cat([jacobian, part.by_gain[..., None] * of_view], 2)
+        if part.by_flash is not None:
+            jacobian = torch.cat([jacobian, part.by_flash[..., None]], 2)
         # A point that shows no diffuse light keeps its albedo
         curvature = slope.square().sum(1) + 1e-6
         cross = torch.einsum("pvd,pv->pd", jacobian, slope)

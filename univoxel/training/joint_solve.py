@@ -329,6 +329,8 @@ def adam(scene: Scene, problem: JointProblem) -> RowAdam:
     views, light = scene.views, [problem.sky.log_radiance]
     if views is not None and views.sky_weights is not None:
         light += [views.sky_weights, views.sky_basis]
+    if scene.flash is not None:
+        light.append(scene.flash.log_radiance)
     groups = [
         {"params": [scene.field.features], "eps": EPS_FEATURES},
         {"params": list(scene.material.parameters())},

@@ -181,6 +181,9 @@ def build_optimizer(scene: Scene, refit: bool) -> RowAdam:
     if scene.views:
         scene.views.gain_steps.requires_grad_(not refit)
         networks.append(scene.views)
+    if scene.flash:
+        scene.flash.requires_grad_(not refit)
+        networks.append(scene.flash)
     table, poses = scene.radiance.directions.table, []
     if scene.poses is not None:
         scene.poses.requires_grad_(not refit)

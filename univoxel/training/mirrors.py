@@ -147,7 +147,11 @@ def find_mirrors(scene: Scene, problem: JointProblem) -> Mirrors | None:
 
     What is random comes from a generator of its own: where nothing mirrors, nothing changes.
     """
-    if problem.turned is not None or (scene.views and scene.views.sky_change() is not None):
+    if (
+        problem.turned is not None
+        or scene.flash is not None
+        or (scene.views and scene.views.sky_change() is not None)
+    ):
         return None
     sky, count = problem.sky, NEIGHBOURS
     map = NodeMap.of(sky.direction, sky.latlong(ROWS), sky.radiance)

@@ -19,6 +19,7 @@ from univoxel.render.observations import (
     MaterialLabels,
     observations_of,
     prefiltered_roughness,
+    unfiltered_roughness,
 )
 from univoxel.scene import Scene
 from univoxel.training import equations
@@ -241,8 +242,8 @@ def map_step_(
         damping: weight of the squared step.
     """
     sky, count = points.problem.sky, points.count
-    nodes = len(laplacian)
-    unknowns = nodes + (len(scene.views) if scene.views else 0)  # of a channel
+    nodes, gains = len(laplacian), len(scene.views) if scene.views else 0
+    unknowns = nodes + gains + (scene.flash is not None)  # of a channel
     laplacian = torch.nn.functional.pad(laplacian, 2 * (0, unknowns - nodes))
     log_map = sky.log_radiance.T  # [3, D]
     if sun is not None:
@@ -265,17 +266,28 @@ def map_step_(
         system, right_side = system + hessian / count, right_side + gradient / count
         eliminated.append(albedo)
     system.diagonal(dim1=1, dim2=2).add_(damping)
-    if points.prior_weight:
+    if points.prior_weight or scene.flash is not None:
         system, right_side = torch.block_diag(*system) - coupling, right_side.flatten()
+    tied = None
+    if scene.flash is not None:  # one for all channels
+        first, *others = (unknowns * torch.arange(1, 4) - 1).tolist()
+        tied = torch.eye(len(right_side))
+        tied[others, first] = 1.0
+        tied = tied[:, [k for k in range(len(right_side)) if k not in others]]
+        system, right_side = tied.T @ system @ tied, tied.T @ right_side
     step = equations.solve_damped(system, right_side)
     if step is None:
         return None
+    if tied is not None:
+        step = tied @ step
     limit = MAX_MAP_CHANGE
     step = step.view(3, unknowns).clamp(-limit, limit)
-    to_map, to_gain = step.split([nodes, unknowns - nodes], 1)
+    to_map, to_gain, to_flash = step.split([nodes, gains, unknowns - nodes - gains], 1)
     sky.log_radiance.add_(to_map.T)
     if scene.views is not None:
         sky.log_radiance.add_(scene.views.add(to_gain.T))
+    if scene.flash is not None:
+        scene.flash.log_radiance.add_(to_flash[0])
     points.step_(eliminated, step)
     return sum(albedo.cost for albedo in eliminated) / count
 
@@ -343,7 +355,32 @@ def linear_transport(
         specular @ indirect,
         problem.target[observation],
         view,
+        flash_transport(problem, point, observation, roughness, metal),
     )
+
+
+def flash_transport(
+    problem: JointProblem, point: Tensor, observation: Tensor, roughness: Tensor, metal: bool
+) -> Tensor | None:
+    """Radiance [2, P, V, 3] that the flash makes points send, for base 1 and what does not depend
+    on it; None: there is no flash. Arguments as of `linear_transport`."""
+    flash = problem.flash
+    if flash is None:
+        return None
+    observations, views = problem.observations, observation.shape[1]
+    index, flat = point.repeat_interleave(views), observation.flatten()
+    eye = observations.eye[observations.view[flat]]
+    away = (eye - observations.position[index]).norm(dim=1)
+    seen = observations.normal[index], observations.wo[flat], away
+    sharp = unfiltered_roughness(roughness, problem.nodes).repeat_interleave(views)
+
+    def of(diffuse: float, f0: float) -> Tensor:
+        white = torch.ones_like(seen[0])
+        shown = flash.reflected(*seen, diffuse * white, sharp, f0 * white)
+        return shown.view(*observation.shape, 3)
+
+    beside = of(0.0, 0.0 if metal else brdf.F0)
+    return torch.stack([(of(0.0, 1.0) if metal else of(1.0, brdf.F0)) - beside, beside])
 
 
 def from_map(problem: JointProblem, from_world: Tensor, view: Tensor) -> Tensor:

@@ -1,5 +1,7 @@
-"""Photographs of a turntable: a background that stood still, cameras off the circle of the
-others, light that turned."""
+"""What the light stood still in: the world, the room of a turntable, or, as a flash, the camera.
+
+Of a turntable also a background that stood still, and cameras off the circle of the others.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-from univoxel.camera import Circle, circle_of
+from univoxel.camera import Circle, circle_of, looked_at
 from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.core.choices import LightFrameOrAuto
 from univoxel.data import Photos
@@ -169,6 +171,16 @@ CAUCHY = 0.1
 ROUNDS = 6
 # Standard errors, over the photographs, by which a turning light has to be ahead of a still one
 CERTAIN = 2.0
+# Share of the shade of a flash that points show at least where there is one: paint does. Elsewhere
+# it was -0.4 to 0, for towards the outline surfaces do not become darker
+SHADE = 0.1
+# Natural log by which points that face the camera are brighter than others at least, if they do not
+# show that shade: metal does. Elsewhere it was -0.1 to 0.2
+GLINT = 0.5
+# Powers of the cosine to the camera that a highlight of its flash is made of
+SHININESS = 16, 64
+# Cosine to the camera below which a flash is not told by: there the surface is off most
+FACING = 0.15
 # Share of the cost under a still light that has to go away. Of 12 rendered scenes whose light did
 # not turn it was 1.4 % at most, of three under one that turned 15 to 32 %, of a wooden tankard 5 %
 LEAST = 0.03
@@ -185,14 +197,22 @@ class Explained:
     saved: float  # share of the cost under a still light that it takes away
 
 
-def turntable_of(
+@dataclass(frozen=True)
+class LightFrame:
+    """What the light stood still in: the world, if it is neither of these."""
+
+    turntable: Turntable | None = None  # on which the photographs were taken
+    flash: float | None = None  # world units between the object and a flash at the lens
+
+
+def light_frame_of(
     photos: Photos,
     hull: Tensor,
     grid: GridShape,
     frame: LightFrameOrAuto,
     gains: Tensor | None = None,
-) -> Turntable | None:
-    """The turntable that the photographs were taken on; None: the light stood still.
+) -> LightFrame:
+    """What the light of the photographs stood still in.
 
     Args:
         photos: their cameras where they are believed to be.
@@ -204,7 +224,11 @@ def turntable_of(
         DataError: a turntable is asked for, and the cameras do not say where its axis is.
     """
     if frame == "world":
-        return None
+        return LightFrame()
+    away = (photos.cameras.camera_to_world[:, :, 3] - looked_at(photos.cameras)).norm(dim=1)
+    flash = LightFrame(flash=float(away.median()))
+    if frame == "camera":
+        return flash
     turntable = Turntable.of(photos.cameras)
     if frame == "turntable":
         if turntable is None:
@@ -213,19 +237,31 @@ def turntable_of(
                 "upright axis, so where the turntable's is cannot be told",
                 "light_frame",
             )
-        return turntable
-    observations = None if turntable is None else observe_hull(photos, hull, grid, POINTS)
-    if turntable is None or observations is None:
-        return None
+        return LightFrame(turntable)
+    observations = observe_hull(photos, hull, grid, POINTS)
+    if observations is None:
+        return LightFrame()
+    flashed = explained_by_flash(observations, gains)
+    log.debug("flash: %s", flashed)
+    if (flashed.shade > SHADE or flashed.glint > GLINT) and flashed.ahead > CERTAIN:
+        log.info(
+            "a flash at the camera lit the object: that explains %.0f %% more of how points change "
+            "from photograph to photograph than a light that stands still; see light_frame",
+            100 * flashed.saved,
+            extra={"arguments": ("light_frame",)},
+        )
+        return flash
+    if turntable is None:
+        return LightFrame()
     found = explained(observations, turntable, gains)
     log.debug("light frame: %s", found)
     # Surroundings that stood still have said it already, if photographs do not contradict. That
     # they moved says nothing: a cloth or a scale on the turntable does, too
     still_around = surroundings_stand_still(photos)
     if found.ahead < (-CERTAIN if still_around else CERTAIN):
-        return None
+        return LightFrame()
     if not still_around and found.saved < LEAST:
-        return None
+        return LightFrame()
     log.info(
         "the light turns with the camera, as on a turntable%s: that explains %.0f %% of how points "
         "change from photograph to photograph, a light that stands still %.0f %%; see light_frame",
@@ -234,7 +270,45 @@ def turntable_of(
         100 * max(found.by_still_light, 0.0),  # none, where the other half contradicts it
         extra={"arguments": ("light_frame",)},
     )
-    return turntable
+    return LightFrame(turntable)
+
+
+@dataclass(frozen=True)
+class Flashed:
+    """How well a flash foretells photographs that it was not fitted to."""
+
+    shade: float  # share of the shade of a flash alone that points show
+    glint: float  # natural log by which points that face the camera are brighter than others
+    ahead: float  # standard errors over the photographs by which it is better than a still light
+    saved: float  # share of the cost under a still light that it takes away
+
+
+@torch.no_grad()
+def explained_by_flash(observations: Observations, gains: Tensor | None = None) -> Flashed:
+    """How well a flash foretells how points change from photograph to photograph.
+
+    It lights a point by the cosine to the camera over the squared distance. The surroundings light
+    it too, so that it shows only a share of that. What is glossy shows its highlight where it faces
+    the camera.
+
+    Args:
+        gains: as of `light_frame_of`.
+    """
+    log_color, point, view, normal, wo = comparable(observations, gains)
+    facing = (normal * wo).sum(1, keepdim=True).clamp_min(FACING)
+    away = (observations.eye[view] - observations.position[point]).norm(dim=1, keepdim=True)
+    still = smooth(2 * facing * normal - wo)
+    shade = facing.log() - 2 * (away / away.mean()).log()
+    flash = torch.cat([shade, *(facing**power for power in SHININESS), still], 1)
+    half = random_half(len(observations.eye), view)
+    without, with_flash = (foretold(log_color, basis, point, half) for basis in (still, flash))
+    ahead = ahead_by(without - with_flash, view)
+    if ahead is None:
+        return Flashed(0.0, 0.0, -math.inf, 0.0)
+    fitted = _robust(log_color.double(), flash.double(), point)[0].tolist()
+    glint = sum(fitted[1 : 1 + len(SHININESS)])
+    saved = 1 - float(with_flash.sum() / without.sum())
+    return Flashed(fitted[0], glint, ahead, saved)
 
 
 @torch.no_grad()
@@ -246,16 +320,9 @@ def explained(
     Of photographs in two random halves, each is foretold by what was fitted to the other.
 
     Args:
-        gains: as of `turntable_of`.
+        gains: as of `light_frame_of`.
     """
-    point = torch.repeat_interleave(observations.offsets.diff())
-    encoded = linear_to_srgb(observations.color)
-    usable = (encoded.mean(1) > DARK) & (encoded < CLIPPED).all(1)
-    point, view, wo = point[usable], observations.view[usable], observations.wo[usable]
-    log_color = observations.color[usable].mean(1).log()
-    if gains is not None:
-        log_color = log_color - gains[view]
-    normal = observations.normal[point]
+    log_color, point, view, normal, wo = comparable(observations, gains)
     facing = (normal * wo).sum(1, keepdim=True)
     mirrored = 2 * facing * normal - wo
     turn = turntable.turn(observations.eye)[view]
@@ -275,19 +342,46 @@ def explained(
         "still": torch.cat([any_light, smooth(mirrored)], 1),
         "turning": torch.cat([any_light, *turned], 1),
     }
-    views = len(observations.eye)
-    order = torch.randperm(views, generator=torch.Generator().manual_seed(0))
-    half = (order % 2).bool()[view]
+    half = random_half(len(observations.eye), view)
     costs = {name: foretold(log_color, basis, point, half) for name, basis in lights.items()}
     none, still, turning = (float(cost.sum()) for cost in costs.values())
-    count = torch.bincount(view, minlength=views)
-    if min(none, still) <= 0 or (count > 0).sum() < 2:  # too dark, or next to nothing is seen
+    ahead = ahead_by(costs["still"] - costs["turning"], view)
+    if min(none, still) <= 0 or ahead is None:
         return Explained(0.0, 0.0, -math.inf, 0.0)
-    gain = costs["still"] - costs["turning"]
-    gain = gain.new_zeros(views).index_add_(0, view, gain)[count > 0] / count[count > 0]
-    error = float(gain.std()) / math.sqrt(len(gain))
-    ahead = float(gain.mean()) / max(error, 1e-12)
     return Explained(1 - still / none, 1 - turning / none, ahead, 1 - turning / still)
+
+
+def comparable(
+    observations: Observations, gains: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Observations that are neither dark nor clipped: log brightness [N] without gains, point and
+    view [N] int64, normal and wo [N, 3]."""
+    point = torch.repeat_interleave(observations.offsets.diff())
+    encoded = linear_to_srgb(observations.color)
+    usable = (encoded.mean(1) > DARK) & (encoded < CLIPPED).all(1)
+    point, view, wo = point[usable], observations.view[usable], observations.wo[usable]
+    log_color = observations.color[usable].mean(1).log()
+    if gains is not None:
+        log_color = log_color - gains[view]
+    return log_color, point, view, observations.normal[point], wo
+
+
+def random_half(views: int, view: Tensor) -> Tensor:
+    """Which observations, of views [N], belong to one half of the photographs: [N] bool."""
+    order = torch.randperm(views, generator=torch.Generator().manual_seed(0))
+    return (order % 2).bool()[view]
+
+
+def ahead_by(gain: Tensor, view: Tensor) -> float | None:
+    """Standard errors, over the photographs, by which a gain [N] of observations of views [N] is
+    above 0; None: too few photographs show anything."""
+    count = torch.bincount(view)
+    total = gain.new_zeros(len(count)).index_add_(0, view, gain)
+    of_view = total[count > 0] / count[count > 0]
+    if len(of_view) < 2:
+        return None
+    error = float(of_view.std()) / math.sqrt(len(of_view))
+    return float(of_view.mean()) / max(error, 1e-12)
 
 
 def smooth(direction: Tensor) -> Tensor:
