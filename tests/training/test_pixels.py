@@ -7,7 +7,7 @@ import torch
 from univoxel.camera import Cameras
 from univoxel.data import Photos
 from univoxel.preparation.hull import mask_distances
-from univoxel.training.pixels import MARGIN, split_pixels
+from univoxel.training.pixels import EDGE, MARGIN, split_pixels
 
 SIZE = 40
 
@@ -44,3 +44,15 @@ def test_doubted_pixels_are_left_out_and_show_no_object():
     assert not doubted[view, row, column].any()
     assert not split.photos.alpha[doubted].any()
     assert torch.equal(split.photos.alpha[~doubted], photos.alpha[~doubted])
+
+
+def test_edges_of_rough_masks_are_not_held_out():
+    photos = photographs()
+    distance, nowhere = mask_distances(photos.coverage()), torch.zeros(2, SIZE, SIZE)
+    given, rough = (split_pixels(photos, distance, d) for d in (None, nowhere.bool()))
+    assert len(given.held_out) == len(rough.held_out)
+    least = [distance[s.held_out.long().unbind(1)].abs().min() for s in (given, rough)]
+    assert least[0] < 1
+    assert least[1] >= EDGE
+    both = torch.cat([rough.trained, rough.held_out])
+    assert len(both) == len(both.unique(dim=0))

@@ -20,6 +20,9 @@ MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones 
 MOST = (
     1 << 24
 )  # pixels that are trained on, at most; the longest preset draws about ten million rays
+EDGE = (
+    3.0  # pixels beside the silhouettes of rough masks, which say nothing of how good a render is
+)
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
 
 
@@ -44,8 +47,8 @@ def split_pixels(photos: Photos, distance: Tensor, doubted: Tensor | None = None
 
     Args:
         distance: [V, H, W] pixels to the silhouette, negative inside; infinite beyond a picture.
-        doubted: [V, H, W] bool, where masks are not believed: left out, here and, as if there were
-            no object, wherever the photographs are looked at later.
+        doubted: [V, H, W] bool, where rough masks are not believed: left out, here and, as if there
+            were no object, wherever the photographs are looked at later. None: masks are right.
     """
     if doubted is not None:
         photos = replace(photos, alpha=_without(photos.alpha, doubted))
@@ -66,6 +69,9 @@ def split_pixels(photos: Photos, distance: Tensor, doubted: Tensor | None = None
         if with_colors:
             part[:, 3:] = packed(photos, view, found)
     order = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))
+    if doubted is not None:  # no pixel at an edge is held out while there are others
+        at_edge = distance[pixels[:, :3].long().unbind(1)].abs() < EDGE
+        order = order[at_edge[order].long().argsort(stable=True)]
     held = min(HELD_OUT, len(pixels) // 10)
     if not held:  # so few that none can be spared
         return TrainingPixels(photos, pixels, pixels)
