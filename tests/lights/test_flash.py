@@ -30,8 +30,9 @@ from univoxel.render.observations import (
 )
 from univoxel.render.pipeline import shade, surface_of_view
 from univoxel.scene import Scene, load_scene, save_scene
+from univoxel.training import metals
 from univoxel.training.equations import channel_radiance
-from univoxel.training.newton import linear_transport, newton_round_
+from univoxel.training.newton import NewtonRound, linear_transport, newton_round_
 
 VIEWS = 16
 
@@ -194,3 +195,17 @@ def test_nothing_seen_tells_nothing(photographs):
     seen = observe_hull(photos, *hull_of(photos), 100)
     black = replace(seen, color=torch.zeros_like(seen.color))
     assert explained_by_flash(black).ahead < 0
+
+
+def test_trials_leave_the_flash_as_it_was(monkeypatch):
+    scene = with_flash(sphere_scene(32))
+    problem = replace(problem_on_a_sphere(100, 4, 32, scene), flash=scene.flash)
+
+    def brighten(scene, *_):
+        scene.flash.log_radiance.data += 1.0
+        return NewtonRound([math.inf])
+
+    monkeypatch.setattr(metals, "newton_round_", brighten)
+    before = scene.flash.log_radiance.clone()
+    metals.initialise_(scene, problem, no_metal(problem), JointConfig(), math.inf)
+    assert torch.equal(scene.flash.log_radiance, before)

@@ -241,7 +241,8 @@ def initialise_(
     Args:
         seconds: that the rounds of Newton may take together.
     """
-    parts = [part for part in (scene.material, problem.sky, scene.views) if part is not None]
+    changed = scene.material, problem.sky, scene.views, scene.flash
+    parts = [part for part in changed if part is not None]
     seed = int(torch.randint(2**31, ()))
     initial = [copy.deepcopy(part.state_dict()) for part in parts]
     round_seconds = seconds / TRIAL_ROUNDS
