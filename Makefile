@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 SETUP := .venv/.installed
-CXX_SOURCES := CMakeLists.txt $(wildcard cmake/*.cmake csrc/*.* csrc/*/*)
+CXX_SOURCES := CMakeLists.txt $(wildcard cmake/*.cmake csrc/*.* csrc/*/* third_party/*/*)
 # Tests run beside one another: a thread that waits should leave its core to them. Alone, a training
 # is faster as the command line has it.
 test page-test network-test fuzz kill-test asan tsan wheel-test: export OMP_WAIT_POLICY ?= passive

@@ -19,10 +19,10 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 38_330,
+    "lines of the package": 38_520,
     "lines of the laboratory": 5_300,
-    "lines of tests": 36_960,
-    "modules of the package": 164,
+    "lines of tests": 37_300,
+    "modules of the package": 166,
     "loose modules at the top": 12,
     "configuration fields": 129,
     "fields that nothing sets": 0,
