@@ -1,21 +1,20 @@
-"""Processes that end with the one that began them; as a program, PID COMMAND [ARGUMENT ...].
+"""Processes that end with the one that began them; as a program, PID ARGUMENT ... of Python.
 
 A process that is killed cannot end those that it began. They would go on alone, and write into
-files beside those that are begun again. Linux ends them.
+files beside those that are begun again.
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import IO, Any
 
-PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>; it stays through exec
+from univoxel.core import system
 
 
 @contextmanager
@@ -25,10 +24,11 @@ def guarded(
     """A process of Python, which ends with the block at the latest, and with this process.
 
     Args:
+        arguments: of Python: -m and a module, or a file, and what follows.
         output: takes all that it says.
         options: more of Popen's.
     """
-    command = [sys.executable, "-m", __name__, str(os.getpid()), sys.executable, *arguments]
+    command = [sys.executable, "-m", __name__, str(os.getpid()), *arguments]
     options |= {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": output}
     process: Any = subprocess.Popen(command, **options)
     try:
@@ -43,15 +43,17 @@ def last_words(said: bytes) -> str:
     return said.decode("utf-8", "replace").strip().rpartition("\n")[2].strip()
 
 
-def main(parent: int, command: list[str]) -> None:
-    """Replace this process by the command."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it was killed before it could be asked for
-            sys.exit(1)
-    if os.name == "nt":  # exec there begins another process, and ends this one at once
-        sys.exit(subprocess.call(command))
-    os.execvp(command[0], command)
+def main(parent: int, arguments: list[str]) -> None:
+    """Go on as Python with these arguments."""
+    if system.end_with(parent):
+        os.execv(sys.executable, [sys.executable, *arguments])
+    # What watches is a thread of this process, which therefore runs the program itself
+    module = arguments[0] == "-m"
+    sys.argv = arguments = arguments[module:]
+    if module:
+        runpy.run_module(arguments[0], run_name="__main__", alter_sys=True)
+    else:
+        runpy.run_path(arguments[0], run_name="__main__")
 
 
 if __name__ == "__main__":
