@@ -19,7 +19,7 @@ function(add_core_variants)
     add_library(univoxel_bindings OBJECT ${ARG_BINDINGS})
     target_include_directories(univoxel_bindings PRIVATE csrc)
     target_link_libraries(univoxel_bindings PRIVATE
-        pybind11::module univoxel_embree univoxel_warnings univoxel_sanitizers glm::glm)
+        pybind11::module univoxel_embree univoxel_warnings univoxel_sanitizers xatlas glm::glm)
     # Each file alone makes most of pybind11 anew: together they compile in a third of the time.
     set_target_properties(univoxel_bindings PROPERTIES UNITY_BUILD ON UNITY_BUILD_BATCH_SIZE 6)
     set(optimisation -O3)
@@ -40,7 +40,8 @@ function(add_core_variants)
         set_target_properties(core_${variant} PROPERTIES
             OUTPUT_NAME _core
             LIBRARY_OUTPUT_DIRECTORY ${CMAKE_CURRENT_BINARY_DIR}/_core/${variant})
-        target_link_libraries(core_${variant} PRIVATE kernels_${variant})
+        target_link_libraries(core_${variant} PRIVATE kernels_${variant} xatlas)
+        share_openmp(core_${variant})
         install(TARGETS core_${variant} LIBRARY DESTINATION univoxel/_core/${variant})
     endforeach()
 endfunction()

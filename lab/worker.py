@@ -21,7 +21,7 @@ from univoxel.cli.envmap import envmap
 from univoxel.cli.evaluate import evaluate
 from univoxel.cli.trainer import train
 from univoxel.config import TrainConfig, check_same
-from univoxel.core.machine import load
+from univoxel.core.system import load
 from univoxel.errors import UserError
 from univoxel.evaluation.recovered_map import Comparison
 from univoxel.scene import load_checkpoint

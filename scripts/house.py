@@ -19,10 +19,10 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 39_050,
+    "lines of the package": 39_300,
     "lines of the laboratory": 5_300,
-    "lines of tests": 37_650,
-    "modules of the package": 164,
+    "lines of tests": 38_050,
+    "modules of the package": 166,
     "loose modules at the top": 12,
     "configuration fields": 130,
     "fields that nothing sets": 0,

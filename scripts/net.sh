@@ -13,7 +13,7 @@ git worktree prune
 [ -d "$tree" ] || git worktree add -q --detach "$tree" "$base"
 trap 'git worktree remove -f "$tree"' EXIT
 
-if git diff --quiet "$base" -- csrc cmake CMakeLists.txt; then
+if git diff --quiet "$base" -- csrc third_party cmake CMakeLists.txt; then
     cp -r univoxel/_core "$tree/univoxel/"
 else
     for link in .venv .deps; do [ ! -e $link ] || ln -sfn "$here/$link" "$tree/$link"; done

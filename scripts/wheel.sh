@@ -1,7 +1,7 @@
 #!/bin/bash
 # Make the source distribution and, from it alone, one repaired wheel per Python, all into dist/.
 # Kernels are compiled once: of a second Python only the bindings. pybind11 knows no stable ABI.
-# Usage: scripts/wheel.sh [PYTHON ...]; without any: each CPython 3.10 to 3.13 that is here
+# Usage: scripts/wheel.sh [PYTHON ...]; without any: each CPython 3.10 to 3.14 that is here
 set -euo pipefail
 cd "$(dirname "$0")/.."
 work=$PWD/build/wheel
@@ -10,7 +10,7 @@ tools=$PWD/.venv/bin
 pythons=("$@")
 usable() { "$1" -c 'import sysconfig as s; open(s.get_path("include") + "/Python.h")' 2>/dev/null; }
 if [ ${#pythons[@]} = 0 ]; then
-    for version in 3.10 3.11 3.12 3.13; do
+    for version in 3.10 3.11 3.12 3.13 3.14; do
         for python in "python$version" "${PYENV_ROOT:-$HOME/.pyenv}/versions/$version".*/bin/python; do
             if usable "$python"; then pythons+=("$python"); break; fi
         done

@@ -1,5 +1,6 @@
 """What all tests run in."""
 
+import getpass
 import hashlib
 import os
 import tempfile
@@ -10,8 +11,9 @@ from tiny import tiny, tiny_copy  # noqa: F401
 
 # torch.compile has one cache for all processes of a user. It tells neither instruction sets apart,
 # whose kernels give wrong values on another, nor what the arguments of our backward ops are.
+_USER = getattr(os, "getuid", getpass.getuser)()
 _OPS = sorted((Path(__file__).parent.parent / "univoxel" / "ops").glob("*.py"))
 _SOURCES = hashlib.sha256(b"".join(path.read_bytes() for path in _OPS)).hexdigest()[:8]
 _KIND = f"{torch.__version__}-{torch.backends.cpu.get_cpu_capability()}-{_SOURCES}"
-_FOLDER = Path(tempfile.gettempdir()) / f"univoxel-tests-inductor-{os.getuid()}-{_KIND}"
+_FOLDER = Path(tempfile.gettempdir()) / f"univoxel-tests-inductor-{_USER}-{_KIND}"
 os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(_FOLDER))

@@ -141,6 +141,7 @@ void def_init(py::class_<C>& c, const char* names, F f, const Extra&... extra) {
 }
 
 /// Add the functions of one family to the module; each in a file of its own.
+void bind_chart_ops(py::module_& m);
 void bind_composite_ops(py::module_& m);
 void bind_composite_field_ops(py::module_& m);
 void bind_grid_ops(py::module_& m);

@@ -2,6 +2,7 @@
 
 PYBIND11_MODULE(_core, m) {
     m.doc() = "Native kernels of univoxel: plain functions over contiguous buffers.";
+    univoxel::bind_chart_ops(m);
     univoxel::bind_composite_ops(m);
     univoxel::bind_grid_ops(m);
     univoxel::bind_composite_field_ops(m);  // takes grids

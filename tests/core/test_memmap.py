@@ -12,7 +12,7 @@ import torch
 from analytic import write_scene
 from PIL import Image
 
-from univoxel.core import memmap
+from univoxel.core import memmap, system
 from univoxel.data import image_cache, load_images, load_photos
 from univoxel.data.photos import packed, unpacked
 from univoxel.errors import DataError
@@ -21,7 +21,7 @@ from univoxel.training import pixels as training_pixels
 from univoxel.training.loop import batch_at
 from univoxel.training.pixels import split_pixels
 
-pytestmark = pytest.mark.skipif(not memmap.MAPS, reason="arrays on disk are of Linux")
+pytestmark = pytest.mark.skipif(not system.can_map(), reason="Windows has no arrays on disk")
 
 
 def test_small_arrays_and_those_of_no_folder_are_memory(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from univoxel.ops import native
 
 pytestmark = pytest.mark.skipif(native.core is None, reason="without the extension")
 
-WITHOUT_ARRAYS = {"embree_version", "DenseGrid"}
+WITHOUT_ARRAYS = {"embree_version", "DenseGrid", "Charts.count"}
 WRONG = {
     "dtype": lambda array: array.astype(np.int16),
     "stride": lambda array: np.repeat(array, 2, 0)[::2],
@@ -72,6 +72,9 @@ def instances() -> dict[str, object]:
         "SparseGrid": sparse,
         "TouchedRows": core.touched_rows(dense, point, order, 8, True, False, 1)[0],
         "RowSet": core.touched_rows(sparse, point, order, 128, True, False, 1)[0],
+        "Charts": core.find_charts(
+            np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), 8, 1
+        ),
         "HashRows": rows,
         "Strategy": core.Strategy.mis,
     }

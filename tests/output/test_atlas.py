@@ -1,5 +1,6 @@
 """Charts, vertex frames and texels against constructions by hand."""
 
+import hashlib
 import math
 
 import pytest
@@ -7,7 +8,8 @@ import torch
 from asymmetric_scene import lopsided
 
 from univoxel.core.records import Mesh
-from univoxel.output.mesh import dilated, rasterise, unwrap, vertex_normals, vertex_tangents
+from univoxel.ops.charts import unwrap
+from univoxel.output.mesh import dilated, rasterise, vertex_normals, vertex_tangents
 from univoxel.output.topology import clean, simplify
 
 SQUARE = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
@@ -32,6 +34,27 @@ def test_charts_keep_the_triangles_and_do_not_overlap(mesh):
     # one per cent for borders.
     assert len(texel) == pytest.approx(float(area.sum()) * size * size, rel=0.01)
     assert area.sum() > 0.4  # padding takes much of so small a texture
+
+
+def test_charts_are_those_that_the_package_xatlas_makes():
+    """Of version 0.0.11, whose source is compiled in: on every processor the same."""
+    n = 24
+    i = torch.arange(n + 1).repeat_interleave(n + 1)
+    x, y = 2 * i / n - 1, 2 * (torch.arange((n + 1) ** 2) - (n + 1) * i) / n - 1
+    k = torch.arange(n).repeat_interleave(n) * (n + 1) + torch.arange(n).repeat(n)
+    faces = [torch.stack([k, k + n + 1, k + n + 2], 1), torch.stack([k, k + n + 2, k + 1], 1)]
+    saddle = Mesh(torch.stack([x, y, 2 * x**3 - y * y], 1), torch.cat(faces).int())
+    source, faces, uv = unwrap(saddle, 256)
+    digest = hashlib.sha256(source.numpy().tobytes() + faces.numpy().tobytes()).hexdigest()
+    assert digest == "46ca99708000f739301391fda1c223a28c0dcc37085f715cc178760167dfc7e1"
+    assert len(source) == 700
+    corners = [[0.7366594, 0.3600158], [0.0017031, 0.6864952], [0.1306851, 0.6725426]]
+    torch.testing.assert_close(uv[[0, 300, -1]], torch.tensor(corners), rtol=0, atol=1e-5)
+
+
+def test_charts_of_a_face_without_its_vertex_are_refused():
+    with pytest.raises(ValueError, match="charts: Index out of range"):
+        unwrap(Mesh(torch.eye(3), torch.tensor([[0, 1, 3]])), 64)
 
 
 def test_normals_of_a_cube_point_along_its_diagonals():

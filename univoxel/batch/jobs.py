@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -24,7 +23,7 @@ from filelock import FileLock, Timeout
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from univoxel import __version__
-from univoxel.core import guard
+from univoxel.core import guard, system
 from univoxel.core.files import read_json, write_json
 from univoxel.core.machine import cores
 from univoxel.core.progress_bar import bar
@@ -148,15 +147,14 @@ def _steps(job: Job, watch: Callable[[Step], None]) -> tuple[Any, dict[str, str]
         begin = time.monotonic()
         code, said = _run(job, step, watch)
         seconds[step.name] = seconds.get(step.name, 0.0) + time.monotonic() - begin
-        if code < 0:
-            name = signal.Signals(-code).name
-            errors[step.name] = f"ended by {name}, as the system does where memory is short"
+        if (cause := system.ended_by(code)) is not None:
+            errors[step.name] = f"ended by {cause}, as the system does where memory is short"
         elif code:
             errors[step.name] = said or f"ended with exit code {code}"
         elif step.makes is not None and not step.makes.exists():
             errors[step.name] = f"ended well and left no {step.makes}"
         job.save(record)
-        if code < 0:
+        if cause is not None:
             return "killed", errors
         if step.name in errors and step.needed:
             break
@@ -172,7 +170,7 @@ def _run(job: Job, step: Step, watch: Callable[[Step], None]) -> tuple[int, str]
         output.flush()
         place = output.tell()
         # In a session of its own: Ctrl-C is for who waits for it
-        options = {"env": os.environ | limits, "start_new_session": True}
+        options = {"env": os.environ | limits, **system.own_session()}
         with guard.guarded(words, output, **options) as process:
             while process.poll() is None:
                 with contextlib.suppress(subprocess.TimeoutExpired):

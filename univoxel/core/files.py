@@ -11,11 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from univoxel.core import system
 from univoxel.errors import DataError, ExistingFile
-
-_MASK = os.umask(0)
-os.umask(_MASK)
-_MODE = 0o666 & ~_MASK  # of new files
 
 
 @contextmanager
@@ -30,8 +27,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         if temporary.is_file():
-            temporary.chmod(_MODE)  # safetensors lets nobody else read what it writes
-        os.replace(temporary, path)
+            temporary.chmod(system.NEW_FILE)  # safetensors lets nobody else read what it writes
+        system.replace(temporary, path)
     except OSError as error:
         raise OSError(error.errno, f"cannot write: {error.strerror}", str(path)) from error
     finally:

@@ -1,7 +1,7 @@
 """Processes of Python that end with the one that began them, and run its package.
 
 A process that is killed cannot end those that it began. They would go on alone, and write into
-files beside those that are begun again. Linux ends them.
+files beside those that are begun again.
 
 Python looks for modules in the working folder first, which may be anybody's: a folder of
 photographs that holds a `random.py`, or a clone that is not built. These processes do not.
@@ -9,16 +9,13 @@ photographs that holds a `random.py`, or a clone that is not built. These proces
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import IO, Any
 
-PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
 # Takes the working folder, '', off the path before anything is imported, then packages from the
 # files that are named. `-P` does the first alone, since Python 3.11
 BEGINNING = """
@@ -31,8 +28,8 @@ for named in rest[:int(count)]:
     spec = importlib.util.spec_from_file_location(name, file)
     sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(sys.modules[name])
-from univoxel.core import guard
-guard.end_with(int(parent))
+from univoxel.core import system
+system.end_with(int(parent))
 sys.argv[1:] = rest[int(count):]
 """
 MODULE = """
@@ -71,6 +68,7 @@ def guarded(
     """A process of `command`, which ends with the block at the latest.
 
     Args:
+        arguments: of Python: -m and a module, or a file, and what follows.
         output: takes all that it says.
         options: more of Popen's.
     """
@@ -87,11 +85,3 @@ def guarded(
 def last_words(said: bytes) -> str:
     """The last line of what a process said; nothing where it said nothing."""
     return said.decode("utf-8", "replace").strip().rpartition("\n")[2].strip()
-
-
-def end_with(parent: int) -> None:
-    """Let this process end with the one that began it."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it was killed before it could be asked for
-            sys.exit(1)

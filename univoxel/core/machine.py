@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import platform
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from univoxel.core import system
 
 ROOT = Path("/")
 
@@ -32,11 +33,7 @@ def processor(root: Path = ROOT) -> str:
 
 def cores(root: Path = ROOT) -> float:
     """Cores that this process may use; a control group may grant parts of one."""
-    try:
-        count = len(os.sched_getaffinity(0))
-    except AttributeError:  # not everywhere
-        count = os.cpu_count() or 1
-    granted = [float(count)]
+    granted = [float(system.usable_cores())]
     for group in _groups("cpu", root):
         limit = _lines(group / "cpu.max") or [
             f"{quota} {period}"
@@ -64,10 +61,10 @@ def memory(root: Path = ROOT) -> Memory | None:
     if "MemTotal" in told:
         total, free = told["MemTotal"], told.get("MemAvailable")
     else:
-        try:
-            total, free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"), None
-        except (AttributeError, ValueError, OSError):
+        known = system.memory()
+        if known is None:
             return None
+        total, free = known
     machine = total
     for group in _groups("memory", root):
         limit = _number(group / "memory.max", group / "memory.limit_in_bytes")
@@ -80,21 +77,6 @@ def memory(root: Path = ROOT) -> Memory | None:
         left = max(limit - used + given_back, 0)
         total, free = min(total, limit), left if free is None else min(free, left)
     return Memory(total, free)
-
-
-def peak_memory_mb() -> float | None:
-    """Most memory that this process has had, MiB."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)  # macOS counts bytes
-
-
-def load() -> float | None:
-    """Processes that ran or waited for a core, the mean over a minute."""
-    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
 
 
 def _groups(controller: str, root: Path) -> Iterator[Path]:

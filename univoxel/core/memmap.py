@@ -4,9 +4,6 @@ side by side."""
 from __future__ import annotations
 
 import math
-import os
-import sys
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -17,6 +14,8 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from univoxel.core import system
+
 # Arrays of many photographs, in files where they are too large for memory.
 #
 # Inside of `large_arrays_in` an array of LARGE bytes or more is a file that is mapped into memory
@@ -25,7 +24,6 @@ from torch import Tensor
 
 
 LARGE = 1 << 28  # bytes of an array from which on it is a file
-MAPS = sys.platform == "linux"  # whether it can be one
 
 _folder: ContextVar[Path | None] = ContextVar("folder of large arrays", default=None)
 
@@ -42,7 +40,11 @@ def large_arrays_in(folder: Path) -> Iterator[None]:
 
 def is_large(shape: Sequence[int], dtype: torch.dtype) -> bool:
     """Whether an array is one for a file, and there is a place for it."""
-    return MAPS and _folder.get() is not None and math.prod(shape) * dtype.itemsize >= LARGE
+    return (
+        system.can_map()
+        and _folder.get() is not None
+        and math.prod(shape) * dtype.itemsize >= LARGE
+    )
 
 
 def zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
@@ -55,9 +57,9 @@ def zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     if folder is None or not is_large(shape, dtype):
         return torch.zeros(tuple(shape), dtype=dtype)
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=folder, prefix=".univoxel-") as file:
-        reserve(file.fileno(), math.prod(shape) * dtype.itemsize, folder)
-        return mapped(Path(f"/proc/self/fd/{file.fileno()}"), 0, shape, dtype)
+    with system.vanishing_file(folder) as (descriptor, path):
+        reserve(descriptor, math.prod(shape) * dtype.itemsize, folder)
+        return mapped(path, 0, shape, dtype)
 
 
 def reserve(descriptor: int, size: int, place: Path) -> None:
@@ -70,7 +72,7 @@ def reserve(descriptor: int, size: int, place: Path) -> None:
         OSError: there is no room.
     """
     try:
-        os.posix_fallocate(descriptor, 0, size)
+        system.reserve(descriptor, size)
     except OSError as error:
         raise OSError(
             error.errno, f"no room for {size / 1e9:.1f} GB: {error.strerror}", str(place)

@@ -26,7 +26,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from univoxel.core import memmap
+from univoxel.core import memmap, system
 from univoxel.core.files import replacing
 from univoxel.data.photos import Photos, coverage_of
 
@@ -131,7 +131,7 @@ class Reading:
         """Note that a photograph is whole."""
         self.read = view + 1
         if self.partial is not None and self.read % FLUSHED == 0:
-            _flush(self.partial)
+            system.flush(self.partial)
             _set_facts(self.partial, self._facts())
 
     def with_floating_alpha(self) -> Reading:
@@ -148,10 +148,10 @@ class Reading:
     def finished(self) -> tuple[Tensor, Tensor]:
         """Colour and alpha of all; the file has its name."""
         if self.partial is not None and (path := _place.get()) is not None:
-            _flush(self.partial)
+            system.flush(self.partial)
             checksum = _checksum(self.color, self.alpha)
             _set_facts(self.partial, {"origin": self.origin, "checksum": checksum})
-            os.replace(self.partial, path)
+            system.replace(self.partial, path)
         return self.color, self.alpha
 
     def _facts(self) -> dict[str, str]:
@@ -175,12 +175,6 @@ def _write_empty(path: Path, arrays: dict[str, tuple[Sequence[int], torch.dtype]
         file.write(_encoded(header))
         file.flush()
         memmap.reserve(file.fileno(), 8 + HEADER + end, path)
-
-
-def _flush(path: Path) -> None:
-    """Write what arrays in a file hold to the disk: a crash of the machine does not lose it."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
 
 
 def _encoded(header: dict[str, Any]) -> bytes:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from univoxel.camera import Cameras, sizes_of
 from univoxel.color import linear_to_srgb, srgb_to_linear
+from univoxel.core import system
 from univoxel.data.image_cache import Reading, kept_pixels, origin_of, to_be_kept
 from univoxel.data.images import orientation, read_image
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
@@ -588,7 +589,7 @@ def check_name(name: str, where: str) -> None:
     Raises:
         DataError: no name, or one that means another folder.
     """
-    if name in ("", "..") or Path(name).name != name:
+    if name in ("", "..") or Path(name).name != name or not system.can_be_a_name(name):
         raise DataError(f"{where}: expected names that files can have, got {name!r}")
 
 
@@ -597,9 +598,9 @@ def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
     names: set[str] = set()
     for shot in shots:
         check_name(shot.name, shot.where)
-        if shot.name in names:
+        if (key := system.file_key(shot.name)) in names:
             raise DataError(f"{shot.where}: the name {shot.name} of {shot.image} came before")
-        names.add(shot.name)
+        names.add(key)
         width, height = shot.lens.width, shot.lens.height
         if downscale > min(width, height):
             raise DataError(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from univoxel.camera import Cameras
+from univoxel.core import system
 from univoxel.core.files import read_json, write_json
 from univoxel.data import load_images
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
@@ -284,7 +285,7 @@ def _is_file(path: Path) -> bool:
 def view_names(file_paths: Sequence[str]) -> list[str]:
     """Names of views, with the folders in front where names alone come twice."""
     names = [view_name(file_path) for file_path in file_paths]
-    if len(set(names)) == len(names):
+    if len({system.file_key(name) for name in names}) == len(names):
         return names
     folders = [PurePosixPath(p.replace("\\", "/")).parts[:-1] for p in file_paths]
     differ = [len(set(level)) > 1 for level in zip(*folders, strict=False)]

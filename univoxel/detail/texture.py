@@ -47,7 +47,8 @@ from univoxel.core.records import Mesh, Surface
 from univoxel.data import Photos
 from univoxel.errors import DataError
 from univoxel.ops import VisibilityScene
-from univoxel.output.mesh import nearest_surface, surface_beside, unwrap, vertex_normals
+from univoxel.ops.charts import unwrap
+from univoxel.output.mesh import nearest_surface, surface_beside, vertex_normals
 from univoxel.output.surface import surface_of
 from univoxel.output.topology import simplify
 from univoxel.render.pipeline import RAYS_AT_ONCE, at_rays, shade

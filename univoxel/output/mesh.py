@@ -10,7 +10,6 @@ from typing import TypeAlias, TypeVar
 
 import numpy as np
 import torch
-import xatlas
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
@@ -22,6 +21,7 @@ from univoxel.core.choices import Origin
 from univoxel.core.records import FieldSample, Mesh
 from univoxel.errors import UserError
 from univoxel.fields.field import Field
+from univoxel.ops.charts import unwrap
 from univoxel.scene import Scene
 
 # Linear albedo [N, 3] of points of the surface [N, 3], of their unit normals [N, 3], the field's
@@ -93,33 +93,10 @@ def _bytes(values: Tensor) -> np.ndarray:
     return (values.clamp(0, 1) * 255).round().byte().numpy()
 
 
-# A texture over a mesh: charts, the frames of its vertices, and which texel lies where.
+# A texture over a mesh: the frames of its vertices, and which texel lies where.
 
 
-PADDING = 4  # texels between charts: two mip levels stay apart
 CANDIDATES = 1 << 22  # texels looked at together: bounds memory
-
-
-def unwrap(mesh: Mesh, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Cut a mesh into charts and pack them into a square of size x size texels (xatlas).
-
-    Returns:
-        source [Q] int64, the vertex of `mesh` that each new one copies; faces [F, 3] int32, in the
-        order of `mesh`; uv [Q, 2] float32 in [0, 1], v upwards.
-    """
-    atlas = xatlas.Atlas()
-    atlas.add_mesh(mesh.vertices.numpy(), mesh.faces.numpy().astype(np.uint32))
-    charts, pack = xatlas.ChartOptions(), xatlas.PackOptions()
-    # No mirrored charts, not every program can light them; the packer rotates by a transposition.
-    charts.fix_winding, pack.rotate_charts = True, False
-    pack.resolution, pack.padding, pack.bilinear = size, PADDING, True
-    atlas.generate(charts, pack)
-    source, faces, uv = atlas[0]
-    return (
-        torch.from_numpy(source.astype(np.int64)),
-        torch.from_numpy(faces.astype(np.int32)),
-        torch.from_numpy(uv.astype(np.float32)).clamp(0, 1),
-    )
 
 
 def vertex_normals(mesh: Mesh) -> Tensor:

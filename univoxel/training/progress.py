@@ -14,8 +14,8 @@ from rich.progress import BarColumn, TextColumn
 
 from univoxel.config import TrainConfig
 from univoxel.core.files import append_line
-from univoxel.core.machine import peak_memory_mb
 from univoxel.core.progress_bar import bar
+from univoxel.core.system import peak_memory_mb
 from univoxel.training.clock import Clock, StepClock, stage_name
 
 # Runs of version 0.2 and before may have channels, lobes and hidden units too
