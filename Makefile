@@ -14,7 +14,7 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # Tests in two processes of one thread each: most are too small for a second thread to help.
 TWO := -n 2 --dist loadfile
 
-.PHONY: help dev demo test net page-test network-test fuzz kill-test lint format bench profile docs docs-check docs-write asan tsan audit wheel wheel-test clean
+.PHONY: help dev demo test net page-test network-test fuzz kill-test lint format bench profile docs docs-check docs-write asan tsan audit wheel wheel-test index-test arm-test cross clean
 .DELETE_ON_ERROR:
 
 help:
@@ -36,6 +36,9 @@ help:
 	@echo "make audit   ask the package index for known holes of what is installed; needs its network"
 	@echo "make wheel   source distribution and wheels of each Python that is here, into dist/"
 	@echo "make wheel-test  install a wheel where there is nothing else, run demo and ops' tests"
+	@echo "make index-test  pip install univoxel[capture,masks,view] from dist/ as an index"
+	@echo "make arm-test  compile for 64-bit ARM, run tests and demo in emulation; root; hours"
+	@echo "make cross   compile and link for macOS on ARM and for Windows; root; half an hour"
 	@echo "make dev     set up only"
 
 dev: build/.installed
@@ -187,6 +190,20 @@ wheel: .venv/.wheel
 
 wheel-test: wheel
 	scripts/test_wheel.sh dist/univoxel-*-$$($(PYTHON) -c 'import sys; print("cp%d%d" % sys.version_info[:2])')-*.whl $(PYTHON)
+
+index-test:
+	scripts/index_test.sh $(PYTHON)
+
+# Emulated, one thread, some twenty times as slow: not for CI. ARM_TESTS= chooses.
+ARM_TESTS ?= tests/ops tests/output/test_atlas.py tests/test_net.py
+arm-test: dev
+	scripts/arm.sh setup
+	scripts/arm.sh run python3 -m pytest -q -p no:cacheprovider -o timeout=0 -k "not compile" $(ARM_TESTS)
+	scripts/arm.sh run python3 -m univoxel.cli demo --out build/arm/demo
+
+cross: dev
+	scripts/cross.sh macos
+	scripts/cross.sh windows
 
 clean:
 	rm -rf build build-asan build-tsan dist .deps .venv univoxel/_core

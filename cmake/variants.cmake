@@ -41,6 +41,7 @@ function(add_core_variants)
             OUTPUT_NAME _core
             LIBRARY_OUTPUT_DIRECTORY ${CMAKE_CURRENT_BINARY_DIR}/_core/${variant})
         target_link_libraries(core_${variant} PRIVATE kernels_${variant} xatlas)
+        share_openmp(core_${variant})
         install(TARGETS core_${variant} LIBRARY DESTINATION univoxel/_core/${variant})
     endforeach()
 endfunction()

@@ -41,6 +41,11 @@ void share_out(int64_t n, [[maybe_unused]] int team, F&& f) {
 /// write to disjoint places gives the same bits for any number of threads. Work of a single
 /// chunk runs serially: a thread team costs more than it brings there. The first exception
 /// leaves the parallel region and is thrown in the caller.
+///
+/// Memory order, for processors that reorder writes, as ARM does: chunks share nothing but
+/// `failed`, a hint that orders nothing, and `error`, which one thread writes and the caller reads
+/// behind the end of the region. Its barrier, or the join of each thread, releases all that the
+/// threads wrote.
 template <class F>
 void parallel_for(int64_t n, int64_t grain, int threads, F&& f) {
     DCHECK(n >= 0 && grain > 0);

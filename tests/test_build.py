@@ -2,6 +2,7 @@
 
 import ctypes
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -78,6 +79,23 @@ def test_version():
     assert f'\nversion = "{univoxel.__version__}"\n' in pyproject
     changes = (Path(__file__).parent.parent / "CHANGELOG.md").read_text()
     assert f"## [{univoxel.__version__}]" in changes
+
+
+def test_other_packagings_need_the_same():
+    """The recipe for conda has the dependencies and the version of pyproject.toml."""
+    root = Path(__file__).parent.parent
+    pyproject = (root / "pyproject.toml").read_text()
+    needed = pyproject.partition("dependencies = [")[2].partition("\n]")[0]
+    named = {
+        f"{name} >={version}".lower()
+        for name, version in re.findall(r'^    "([\w-]+)>=([\d.]+)', needed, re.MULTILINE)
+    }
+    other = {"torch": "pytorch", "openexr": "openexr-python"}
+    named = {" ".join([other.get(one.split()[0], one.split()[0]), one.split()[1]]) for one in named}
+    recipe = (root / "conda/meta.yaml").read_text()
+    run = recipe.partition("  run:")[2].partition("\ntest:")[0]
+    assert set(re.findall(r"- ([\w-]+ >=[\d.]+)", run)) == named
+    assert f'set version = "{univoxel.__version__}"' in recipe
 
 
 def test_import_is_cheap():

@@ -18,7 +18,7 @@ from plain import plain_stage, plain_training
 
 import univoxel
 from univoxel import cli, errors
-from univoxel.cli import COMMANDS, LABORATORY, SPINS, laboratory, main
+from univoxel.cli import COMMANDS, LABORATORY, SPINS, laboratory, main, take_threads
 from univoxel.cli.parsing import meanings, takes
 from univoxel.errors import ExistingFile, MissingExtra, MissingFile, ProcessFailed, UserError
 from univoxel.presets import chosen
@@ -580,6 +580,28 @@ def test_threads(calls, monkeypatch):
         assert main(["info", "run", "--threads", "1"]) == 0
         assert os.environ["OMP_NUM_THREADS"] == "1"
         assert torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("granted", "asked", "threads"),
+    [(0.5, None, 1), (1.9, None, 1), (2.5, None, 2), (8.0, None, None), (1.0, "3", "3")],
+)
+def test_a_container_of_few_cores_gets_few_threads(granted, asked, threads, monkeypatch):
+    """Of a machine of eight cores, of which a control group grants so many."""
+    import torch
+
+    monkeypatch.setattr("univoxel.core.system.usable_cores", lambda: 8)
+    monkeypatch.setattr("univoxel.core.machine.cores", lambda: granted)
+    monkeypatch.setenv("OMP_NUM_THREADS", asked or "")
+    if asked is None:
+        monkeypatch.delenv("OMP_NUM_THREADS")
+    before = torch.get_num_threads()
+    try:
+        take_threads(None)
+        assert os.environ.get("OMP_NUM_THREADS") == (None if threads is None else str(threads))
+        assert torch.get_num_threads() == (threads if isinstance(threads, int) else before)
     finally:
         torch.set_num_threads(before)
 

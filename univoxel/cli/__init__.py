@@ -39,6 +39,7 @@ from univoxel.cli import (
     view,
 )
 from univoxel.cli.parsing import LAB, STDOUT, Call, Command, Common, Shell, Usage
+from univoxel.core import machine, system
 from univoxel.errors import MissingExtra, UserError
 
 # What a command may raise for a mistake of its user, see `is_mistake`; all else is a bug and keeps
@@ -236,9 +237,16 @@ def lab() -> None:
 
 
 def take_threads(threads: int | None) -> None:
-    """Let kernels, torch and processes begun from here run on so many threads."""
+    """Let kernels, torch and processes begun from here run on so many threads.
+
+    None: as many as OMP_NUM_THREADS says, or else as there are cores. Where a control group grants
+    less of those, as of a container, OpenMP does not see it: a thread for each would wait.
+    """
     if threads is None:
-        return
+        granted = machine.cores()
+        if "OMP_NUM_THREADS" in os.environ or granted >= system.usable_cores():
+            return
+        threads = max(int(granted), 1)
     os.environ["OMP_NUM_THREADS"] = str(threads)  # read when a command imports torch
     if (torch := sys.modules.get("torch")) is not None:
         torch.set_num_threads(threads)
