@@ -81,7 +81,7 @@ def test_version():
     assert f"## [{univoxel.__version__}]" in changes
 
 
-def test_other_packagings_need_the_same():
+def test_other_packagings_need_the_same_versions():
     """The recipe for conda has the dependencies and the version of pyproject.toml."""
     root = Path(__file__).parent.parent
     pyproject = (root / "pyproject.toml").read_text()
