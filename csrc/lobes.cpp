@@ -68,7 +68,9 @@ void decode_lobes_forward(const RawLobes<T>& in, T* axis, T* sharpness, T* ampli
         for (int64_t first = begin; first < end; first += kBlock) {
             b.read(in.parameters + kNumbers * first, std::min(kBlock, end - first));
             const int64_t n = b.count;
-            auto& [x, y, z, s, red, green, blue] = b.column;
+            // By name: clang takes no structured binding into a loop of OpenMP
+            auto &x = b.column[0], &y = b.column[1], &z = b.column[2], &s = b.column[3];
+            auto &red = b.column[4], &green = b.column[5], &blue = b.column[6];
 #pragma omp simd
             for (int64_t i = 0; i < n; ++i) {
                 const T r = inverse_length(x[i], y[i], z[i]);
@@ -108,8 +110,10 @@ void decode_lobes_backward(const RawLobes<T>& in, const T* grad_axis, const T* g
                 }
                 g.column[3][i] = grad_sharpness[first + i];
             }
-            const auto& [x, y, z, s, red, green, blue] = b.column;
-            auto& [gx, gy, gz, gs, g_red, g_green, g_blue] = g.column;
+            const auto &x = b.column[0], &y = b.column[1], &z = b.column[2], &s = b.column[3];
+            const auto &red = b.column[4], &green = b.column[5], &blue = b.column[6];
+            auto &gx = g.column[0], &gy = g.column[1], &gz = g.column[2], &gs = g.column[3];
+            auto &g_red = g.column[4], &g_green = g.column[5], &g_blue = g.column[6];
 #pragma omp simd
             for (int64_t i = 0; i < n; ++i) {
                 const T r = inverse_length(x[i], y[i], z[i]), r2 = r * r;

@@ -52,9 +52,9 @@ for source in csrc/*.cpp csrc/bindings/*.cpp third_party/xatlas/xatlas.cpp; do
         done ;;
     esac
 done
-if [ "$target" = macos ]; then # Python's symbols and OpenMP's are found when it is loaded
+if [ "$target" = macos ]; then # the libraries of Python, OpenMP and C++ are found where it is loaded
     linked=$out/_core.cpython-311-darwin.so
-    "$python" -m ziglang c++ -target aarch64-macos -shared -undefined dynamic_lookup -o "$linked" "${objects[@]}"
+    "$python" -m ziglang cc -target aarch64-macos -shared -undefined dynamic_lookup -o "$linked" "${objects[@]}"
 else
     linked=$out/_core.cp311-win_amd64.pyd
     {
