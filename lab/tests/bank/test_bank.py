@@ -184,7 +184,7 @@ def test_a_small_bank_from_end_to_end(tmp_path, monkeypatch, capfd):
     worker = (
         "import sys; from pathlib import Path; from lab.bank import objects, scenes; "
         "scenes.SIZE, scenes.SAMPLES, scenes.TEST_SAMPLES = 24, 2, 2; objects.CELLS = 30; "
-        "scenes.VIEWS = (4, 5); scenes.work(Path(sys.argv[3]), sys.argv[4])"
+        "scenes.VIEWS = (4, 5); scenes.work(Path(sys.argv[-2]), sys.argv[-1])"
     )
     real = render.subprocess.run
     monkeypatch.setattr(scenes, "SIZE", 24)
