@@ -244,7 +244,11 @@ def test_what_the_box_cuts_is_closed(tmp_path, monkeypatch):
         ("a.glb", {"quality": 96}, "quality must be 1 to 95, got 96"),
         ("a.glb", {"size": 0.0}, "size must be above 0, got 0"),
         ("a.glb", {"size": float("nan")}, "size must be above 0, got nan"),
-        ("a.glb", {"origin": "top"}, "origin must be upright or world or bottom or centre, got top"),
+        (
+            "a.glb",
+            {"origin": "top"},
+            "origin must be upright or world or bottom or centre, got top",
+        ),
         ("a.glb", {"lods": -1}, "lods must be 0 to 8, got -1"),
         ("a.glb", {"lods": 9}, "lods must be 0 to 8, got 9"),
         ("a.glb", {"lods": 3, "faces": 2000}, "lods=3 of 2000 faces leave 31 in the coarsest"),
