@@ -17,8 +17,16 @@ import numpy as np
 import torch
 from PIL import Image, ImageOps
 
-from univoxel.color import linear_to_srgb
-from univoxel.data.images import REC_709, in_rec709, is_heif, open_picture, srgb_of
+from univoxel.color import linear_to_srgb, srgb_to_linear
+from univoxel.data.images import (
+    DISPLAY_P3,
+    REC_709,
+    REC_2020,
+    in_rec709,
+    is_heif,
+    open_picture,
+    srgb_of,
+)
 from univoxel.data.masks import without_masks
 from univoxel.errors import DataError, MissingExtra
 
@@ -280,8 +288,8 @@ HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}  # curves of colours that no JP
 PAPER = 203.0  # cd/m2 of white paper in them
 # x and y of red, green, blue and white, by ffmpeg's names
 PRIMARIES = {
-    "bt2020": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
-    "smpte432": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
+    "bt2020": REC_2020,
+    "smpte432": DISPLAY_P3,
     "smpte431": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3140, 0.3510),
     "smpte170m": (0.630, 0.340, 0.310, 0.595, 0.155, 0.070, 0.3127, 0.3290),
     "smpte240m": (0.630, 0.340, 0.310, 0.595, 0.155, 0.070, 0.3127, 0.3290),
@@ -410,7 +418,7 @@ def _write_table(path: Path, primaries: Sequence[float], curve: str) -> None:
         case "linear":
             light = code
         case "iec61966-2-1":
-            light = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+            light = srgb_to_linear(torch.from_numpy(code)).numpy()
         case _:
             light = np.where(code < 0.081, code / 4.5, ((code + 0.099) / 1.099) ** (1 / 0.45))
     light = in_rec709(light, primaries)

@@ -68,7 +68,7 @@ def guarded(
     """A process of `command`, which ends with the block at the latest.
 
     Args:
-        arguments: of Python: -m and a module, or a file, and what follows.
+        arguments: as of `command`.
         output: takes all that it says.
         options: more of Popen's.
     """

@@ -102,11 +102,15 @@ def vanishing_file(folder: Path) -> Iterator[tuple[int, Path]]:
             yield file.fileno(), Path(file.name)
 
 
-def file_key(name: str) -> str:
-    """A name of a file as the system compares it: equal of two names that are one file."""
-    if sys.platform == LINUX:
-        return name
+def folded(name: str) -> str:
+    """A name as any system may compare it: Windows does not tell case apart, Macs take letters
+    apart."""
     return unicodedata.normalize("NFC", name).casefold()
+
+
+def file_key(name: str) -> str:
+    """A name of a file as this system compares it: equal of two names that are one file."""
+    return name if sys.platform == LINUX else folded(name)
 
 
 def can_be_a_name(name: str) -> bool:

@@ -27,13 +27,12 @@ SMALLEST = 2.0**-128  # what is darker has no exponent: black
 # x and y of red, green, blue and white: of Rec. 709, which colours here are of, and of Radiance,
 # whose writers state it whatever colours they have
 REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+REC_2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+DISPLAY_P3 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 OF_RADIANCE = (0.64, 0.33, 0.29, 0.60, 0.15, 0.06, 0.3333, 0.3333)
 # By their numbers in ITU-T H.273: primaries, and curves of light that sRGB does not hold
-CODED = {
-    9: (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
-    12: (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
-}
+CODED = {9: REC_2020, 12: DISPLAY_P3}
 HDR_CURVES = {16: "PQ", 18: "HLG"}
 HEAD = 4096  # bytes of a PNG that hold what is said of its colours
 SRGB_POWER = 2.2  # which sRGB's curve is near

@@ -53,6 +53,7 @@ LEAN = math.radians(30)
 # Distance of cameras from the origin, in their distances from one another, beyond which float32
 # loses what they see: it has 7 digits, and pixels need 4
 FAR = 1000
+OPAQUE = 0.98  # of alpha: some programs write 254 where there is nothing but the object
 NAMED = 5  # photographs in a message, at most
 LOOKED_AT = 12  # photographs, at most, on which it is tried whether masks can be right
 HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/guide/masks.md"
@@ -254,7 +255,8 @@ def _read_all(
             if alpha.dtype != reading.alpha.dtype:
                 alpha, reading = coverage_of(alpha), reading.with_floating_alpha()
             reading.empty &= not alpha.any()
-            reading.opaque &= bool((alpha >= (0.98 if alpha.is_floating_point() else 250)).all())
+            most = OPAQUE * (1 if alpha.is_floating_point() else 255)
+            reading.opaque &= bool((alpha >= most).all())
             cameras.cut(view, reading.color[view]).copy_(color)
             cameras.cut(view, reading.alpha[view]).copy_(alpha)
             reading.done(view)

@@ -12,6 +12,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from univoxel.core.system import folded
 from univoxel.data.images import (
     FOREIGN,
     SUFFIXES,
@@ -24,7 +25,6 @@ from univoxel.data.images import (
     turn_note,
     upright_from_stored,
 )
-from univoxel.data.path_sandbox import same_name
 from univoxel.errors import DataError
 
 PLACES = ("masks", "mask", "pmasks")  # folders of masks; the first that has one counts
@@ -170,9 +170,9 @@ def _named_masks(around: Path, inner: str) -> list[Path]:
     names = [f"{inner}_masks", f"{inner}_mask"] if inner else []
     if shrunk := re.fullmatch(r"images(_\d+)", inner):
         names += [f"{name}{shrunk[1]}" for name in PLACES]
-    order = {same_name(name): place for place, name in enumerate([*names, *PLACES])}
-    folders = [p for p in _entries(around) if same_name(p.name) in order and p.is_dir()]
-    return sorted(folders, key=lambda p: (order[same_name(p.name)], p.name))
+    order = {folded(name): place for place, name in enumerate([*names, *PLACES])}
+    folders = [p for p in _entries(around) if folded(p.name) in order and p.is_dir()]
+    return sorted(folders, key=lambda p: (order[folded(p.name)], p.name))
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -234,9 +234,9 @@ def _claims(masks: Sequence[Path], root: Path | None, photographs: Named) -> lis
     stems: dict[str, list[int]] = {}
     numbers: dict[int, list[int]] = {}
     for i, (name, image) in enumerate(photographs):
-        whole.setdefault(same_name(image.name), []).append(i)
+        whole.setdefault(folded(image.name), []).append(i)
         plain = re.sub("_rgba?$", "", image.stem)
-        for stem in {same_name(s) for s in (image.stem, plain, name, Path(name).name)}:
+        for stem in {folded(s) for s in (image.stem, plain, name, Path(name).name)}:
             stems.setdefault(stem, []).append(i)
         if image.stem.isdecimal():
             numbers.setdefault(int(image.stem), []).append(i)
@@ -272,9 +272,7 @@ def _claims(masks: Sequence[Path], root: Path | None, photographs: Named) -> lis
 
 def _common(inner: Sequence[str], parts: Sequence[str]) -> int:
     """How many of the last names of two paths are the same."""
-    same = [
-        same_name(a) == same_name(b) for a, b in zip(reversed(inner), reversed(parts), strict=False)
-    ]
+    same = [folded(a) == folded(b) for a, b in zip(reversed(inner), reversed(parts), strict=False)]
     return same.index(False) if False in same else len(same)
 
 
@@ -283,7 +281,7 @@ def _forms(name: str) -> Iterator[tuple[str, str | None]]:
 
     First without its own ending: IMG_1.jpg_mask.png yields img_1.jpg_mask, img_1.jpg, img_1.
     """
-    text, word = same_name(name), None
+    text, word = folded(name), None
     text = text[: -len(Path(text).suffix)]
     while True:
         yield text, word

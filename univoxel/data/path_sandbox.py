@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 import tokenize
-import unicodedata
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -48,11 +47,6 @@ def inside(path: Path, where: str) -> Path:
             "allow_outside",
         )
     return path
-
-
-def same_name(name: str) -> str:
-    """A name as it is compared: Windows does not tell case apart, Macs take letters apart."""
-    return unicodedata.normalize("NFC", name).casefold()
 
 
 # Pictures that a data set lists and does not have: left out, as long as enough remain.

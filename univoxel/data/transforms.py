@@ -20,7 +20,7 @@ from univoxel.core.files import read_json, write_json
 from univoxel.data import load_images
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
-from univoxel.data.path_sandbox import inside, left_out, same_name
+from univoxel.data.path_sandbox import inside, left_out
 from univoxel.data.photos import Photos
 from univoxel.errors import DataError, UserError
 
@@ -261,16 +261,16 @@ def _in_any_case(
     found = [folder]
     for part in parts:
         known |= {f: _entries(f) for f in found if f not in known}
-        found = [p for f in found for p in known[f].get(same_name(part), [])]
+        found = [p for f in found for p in known[f].get(system.folded(part), [])]
     return [path for path in found if path.is_file()]
 
 
 def _entries(folder: Path) -> dict[str, list[Path]]:
-    """What is in a folder, by its name as of `same_name`."""
+    """What is in a folder, by its name as of `system.folded`."""
     entries: dict[str, list[Path]] = {}
     with suppress(OSError):
         for path in sorted(folder.iterdir()):
-            entries.setdefault(same_name(path.name), []).append(path)
+            entries.setdefault(system.folded(path.name), []).append(path)
     return entries
 
 

@@ -234,8 +234,7 @@ def render(
         for k in torch.arange(len(point)).split(RAYS_AT_ONCE):
             at_points, o = at_rays(surface, point[k]), observation[k]
             view = observations.view[o]
-            away = (observations.eye[view] - at_points.position).norm(dim=1)
-            at_points = replace(at_points, depth=away)
+            at_points = replace(at_points, depth=observations.away(point[k], o))
             parts.append(shade(scene, at_points, observations.wo[o], view=view))
         return torch.cat(parts) if parts else torch.zeros(0, 3)
     assert surface.metallic is not None

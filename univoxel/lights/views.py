@@ -143,8 +143,8 @@ class Flash(nn.Module):
     """A lamp at the lens of the camera, which moves with it: a flash.
 
     It is a point, so that what it sends falls with the squared distance, and it lights what the
-    camera sees without shadows. It is white: cameras balance their colours by it, so that it tells
-    the colour of paint from that of the room's light.
+    camera sees without shadows. It is taken for white, as flashes about are: so it tells the colour
+    of paint from that of the room's light.
     """
 
     def __init__(self, distance: float) -> None:
@@ -175,11 +175,10 @@ class Flash(nn.Module):
             roughness: [N].
         """
         nearest = NEAREST * self.distance  # rays that meet nothing have a depth of 0
-        falloff = (self.distance / away.clamp_min(nearest)).square() * (normal * wo).sum(
-            -1
-        ).clamp_min(0)
+        falloff = (self.distance / away.clamp_min(nearest)).square()
+        cosine = (normal * wo).sum(-1).clamp_min(0)
         shown = brdf.evaluate(normal, wo, wo, albedo, roughness, f0)
-        return math.pi * falloff[:, None] * shown * self.log_radiance.exp()
+        return math.pi * (falloff * cosine)[:, None] * shown * self.log_radiance.exp()
 
 
 def _centred(values: Tensor) -> Tensor:

@@ -179,8 +179,6 @@ SHADE = 0.1
 GLINT = 0.5
 # Powers of the cosine to the camera that a highlight of its flash is made of
 SHININESS = 16, 64
-# Cosine to the camera below which a flash is not told by: there the surface is off most
-FACING = 0.15
 # Share of the cost under a still light that has to go away. Of 12 rendered scenes whose light did
 # not turn it was 1.4 % at most, of three under one that turned 15 to 32 %, of a wooden tankard 5 %
 LEAST = 0.03
@@ -295,7 +293,7 @@ def explained_by_flash(observations: Observations, gains: Tensor | None = None) 
         gains: as of `light_frame_of`.
     """
     log_color, point, view, normal, wo = comparable(observations, gains)
-    facing = (normal * wo).sum(1, keepdim=True).clamp_min(FACING)
+    facing = (normal * wo).sum(1, keepdim=True)  # well above 0, as of `observe`
     away = (observations.eye[view] - observations.position[point]).norm(dim=1, keepdim=True)
     still = smooth(2 * facing * normal - wo)
     shade = facing.log() - 2 * (away / away.mean()).log()

@@ -32,7 +32,9 @@ log: logging.Logger = logging.getLogger("univoxel")
 # Half the width, in pixels of the depth maps, of what a mask lacks or shows too much before it is
 # doubted: narrower pieces are its jagged edge
 JAGGED = 2.0
-# How many times as many pixels of the masks as without depth an object may contradict with it
+# How many times as many pixels of the masks as without depth an object may contradict with it. Of
+# a tankard, whose depth is right, it was 1.1, of five scenes in which it made silhouettes worse 1.3
+# to 3.2
 CLEARLY = 1.2
 
 
@@ -70,10 +72,13 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     fill_(distance, photos, pixels)
     box = estimate_bounds(distance, cameras, belief.votes)
     off = contradiction(distance, cameras, box, pixels)
+    told = "what the others show; depth contradicts most masks, and is not asked"
+    if shape.surface:
+        told = "what the others and the depth of the photographs show; depth shows "
+        told += f"{shape.surface:.0%} of the surface"
     log.info(
-        "%.1f%% of the pixels are doubted, where a mask differs from what the others and the "
-        "depth of the photographs show; depth shows %.0f%% of the surface",
-        *(100 * float(pixels.float().mean()), 100 * shape.surface),
+        "%.1f%% of the pixels are doubted, where a mask differs from %s",
+        *(100 * float(pixels.float().mean()), told),
     )
     votes = 1 if off <= MAX_CONTRADICTION else belief.votes
     if votes != belief.votes:

@@ -42,6 +42,10 @@ class Observations:
     view: Tensor  # [S] int64: which photograph
     eye: Tensor  # [V, 3] where the photographs were taken from
 
+    def away(self, point: Tensor, observation: Tensor) -> Tensor:
+        """World units [N] between points [N] and the cameras of observations [N] of them."""
+        return (self.eye[self.view[observation]] - self.position[point]).norm(dim=1)
+
     def at(self, points: Tensor) -> Observations:
         """Those of some points, [N] int64, in their order."""
         counts = self.offsets.diff()[points]
@@ -272,6 +276,12 @@ def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> 
     return JointProblem(observations, transport, target, offset, scene.sky, turned, scene.flash)
 
 
+def has_one_light(scene: Scene, problem: JointProblem) -> bool:
+    """Whether the map lights all photographs alike, and nothing else does."""
+    varies = scene.views is not None and scene.views.sky_change() is not None
+    return problem.turned is None and problem.flash is None and not varies
+
+
 def turned_maps(scene: Scene, observations: Observations) -> TurnedMaps | None:
     """The scene's map in the world of each photograph; None where it is the same for all."""
     turntable = scene.cfg.turntable
@@ -389,9 +399,8 @@ def shade_observations(
     if order is not None:
         rgb = rgb[torch.argsort(order)]
     if problem.flash is not None:
-        away = (observations.eye[view] - observations.position[point]).norm(dim=1)
         sharp = unfiltered_roughness(roughness, problem.nodes)
-        seen = normal, observations.wo[observation], away
+        seen = normal, observations.wo[observation], observations.away(point, observation)
         rgb = rgb + problem.flash.reflected(*seen, diffuse, sharp, f0)
     return scene.exposed(rgb, view)
 

@@ -25,6 +25,7 @@ from univoxel.lights.latlong import DistantLight
 from univoxel.render.observations import (
     JointProblem,
     MaterialLabels,
+    has_one_light,
     mean_colors,
     observations_of,
     prefiltered_roughness,
@@ -121,9 +122,7 @@ def painted_points(
     None: there are too few, or most are metal, or each photograph has a light of its own, as a
     flash is, which determines more.
     """
-    if problem.turned is not None or scene.flash is not None:
-        return None
-    if scene.views is not None and scene.views.sky_change() is not None:
+    if not has_one_light(scene, problem):
         return None
     observations = without_exposure(scene, problem.observations)
     color = mean_colors(observations)

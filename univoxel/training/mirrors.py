@@ -22,6 +22,7 @@ from univoxel.render.observations import (
     JointProblem,
     Mirrors,
     Observations,
+    has_one_light,
     observations_of,
     observe,
     without_exposure,
@@ -147,11 +148,7 @@ def find_mirrors(scene: Scene, problem: JointProblem) -> Mirrors | None:
 
     What is random comes from a generator of its own: where nothing mirrors, nothing changes.
     """
-    if (
-        problem.turned is not None
-        or scene.flash is not None
-        or (scene.views and scene.views.sky_change() is not None)
-    ):
+    if not has_one_light(scene, problem):
         return None
     sky, count = problem.sky, NEIGHBOURS
     map = NodeMap.of(sky.direction, sky.latlong(ROWS), sky.radiance)

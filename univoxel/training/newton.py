@@ -369,8 +369,7 @@ def flash_transport(
         return None
     observations, views = problem.observations, observation.shape[1]
     index, flat = point.repeat_interleave(views), observation.flatten()
-    eye = observations.eye[observations.view[flat]]
-    away = (eye - observations.position[index]).norm(dim=1)
+    away = observations.away(index, flat)
     seen = observations.normal[index], observations.wo[flat], away
     sharp = unfiltered_roughness(roughness, problem.nodes).repeat_interleave(views)
 

@@ -20,9 +20,7 @@ MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones 
 MOST = (
     1 << 24
 )  # pixels that are trained on, at most; the longest preset draws about ten million rays
-EDGE = (
-    3.0  # pixels beside the silhouettes of rough masks, which say nothing of how good a render is
-)
+EDGE = 3.0  # pixels beside silhouettes of rough masks: they do not tell how good a render is
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
 
 
