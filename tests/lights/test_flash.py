@@ -18,20 +18,25 @@ from torch.nn.functional import normalize
 from univoxel import brdf
 from univoxel.color import linear_to_srgb_unclipped
 from univoxel.config import JointConfig
+from univoxel.core.records import Surface
+from univoxel.evaluation import confidence
 from univoxel.fields.grid import fit_grid
 from univoxel.lights.views import Flash
+from univoxel.optim import parameters_of
 from univoxel.preparation import light_frame
 from univoxel.preparation.hull import estimate_bounds, mask_distances, observe_hull, visual_hull
 from univoxel.preparation.light_frame import LightFrame, explained_by_flash, light_frame_of
 from univoxel.render.observations import (
+    has_one_light,
     prefiltered_roughness,
     shade_observations,
     unfiltered_roughness,
 )
 from univoxel.render.pipeline import shade, surface_of_view
 from univoxel.scene import Scene, load_scene, save_scene
-from univoxel.training import metals
+from univoxel.training import joint_solve, metals
 from univoxel.training.equations import channel_radiance
+from univoxel.training.loop import build_optimizer
 from univoxel.training.newton import NewtonRound, linear_transport, newton_round_
 
 VIEWS = 16
@@ -209,3 +214,42 @@ def test_trials_leave_the_flash_as_it_was(monkeypatch):
     before = scene.flash.log_radiance.clone()
     metals.initialise_(scene, problem, no_metal(problem), JointConfig(), math.inf)
     assert torch.equal(scene.flash.log_radiance, before)
+
+
+def test_every_stage_trains_it_but_the_polish():
+    scene = with_flash(sphere_scene(32))
+    problem = replace(problem_on_a_sphere(10, 2, 32, scene), flash=scene.flash)
+    intensity = scene.flash.log_radiance
+    assert any(p is intensity for p in parameters_of(joint_solve.adam(scene, problem)))
+    assert any(p is intensity for p in parameters_of(build_optimizer(scene, refit=False)))
+    assert intensity.requires_grad
+    build_optimizer(scene, refit=True)
+    assert not intensity.requires_grad
+
+
+def test_a_flash_is_a_light_beside_the_map():
+    scene = sphere_scene(32)
+    problem = problem_on_a_sphere(10, 2, 32, scene)
+    assert has_one_light(scene, problem)
+    assert not has_one_light(scene, replace(problem, flash=Flash(2.0)))
+
+
+def test_doubt_knows_how_far_each_camera_is_from_a_point():
+    """Of a scene without a map, which is shaded as rays are."""
+    plain = sphere_scene(0).eval()
+    lit = with_flash(plain)
+    seen = replace(random_problem().observations, eye=torch.randn(4, 3) * 3)
+    surface = Surface(
+        *(seen.position, seen.normal, torch.zeros(5, plain.cfg.channels), torch.rand(5, 3)),
+        *(torch.full((5,), 0.5), torch.ones(5), torch.ones(5)),
+        metallic=torch.zeros(5),
+    )
+    point, which = torch.tensor([0, 2, 4]), torch.tensor([3, 9, 18])
+    of = surface, seen, None, point, which
+    added = confidence.render(lit, *of) - confidence.render(plain, *of)
+    away = seen.away(point, which)
+    f0 = torch.full((3, 3), brdf.F0)
+    material = surface.albedo[point], surface.roughness[point], f0
+    shown = lit.flash.reflected(seen.normal[point], seen.wo[which], away, *material)
+    assert shown.max() > 1e-3
+    assert torch.allclose(added, shown, atol=1e-5)

@@ -145,3 +145,10 @@ def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(
     assert not found.edges_given
     hull = prepare.prepare(found, cfg).hull
     assert hull.min() < 0 < hull.max()
+    # Where depth was not asked, concavities are still to be found
+    carved = []
+    monkeypatch.setattr(prepare, "carve_within_time", lambda hull, *_: carved.append(1) or hull)
+    for surface in (0.5, 0.0):
+        asked = replace(found, shape=replace(found.shape, surface=surface))
+        prepare.prepare(asked, cfg)
+        assert len(carved) == (surface == 0)

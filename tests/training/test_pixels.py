@@ -7,7 +7,7 @@ import torch
 from univoxel.camera import Cameras
 from univoxel.data import Photos
 from univoxel.preparation.hull import mask_distances
-from univoxel.training.pixels import EDGE, MARGIN, split_pixels
+from univoxel.training.pixels import MARGIN, split_pixels
 
 SIZE = 40
 
@@ -53,6 +53,6 @@ def test_edges_of_rough_masks_are_not_held_out():
     assert len(given.held_out) == len(rough.held_out)
     least = [distance[s.held_out.long().unbind(1)].abs().min() for s in (given, rough)]
     assert least[0] < 1
-    assert least[1] >= EDGE
+    assert least[1] >= 3
     both = torch.cat([rough.trained, rough.held_out])
     assert len(both) == len(both.unique(dim=0))
