@@ -21,7 +21,7 @@ from layers import LAYERS, violations  # noqa: E402
 LIMITS = {
     "lines of the package": 39_300,
     "lines of the laboratory": 5_300,
-    "lines of tests": 38_085,
+    "lines of tests": 38_110,
     "modules of the package": 166,
     "loose modules at the top": 12,
     "configuration fields": 130,

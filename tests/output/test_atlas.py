@@ -2,6 +2,8 @@
 
 import hashlib
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -55,6 +57,28 @@ def test_charts_are_those_that_the_package_xatlas_makes():
 def test_charts_of_a_face_without_its_vertex_are_refused():
     with pytest.raises(ValueError, match="charts: Index out of range"):
         unwrap(Mesh(torch.eye(3), torch.tensor([[0, 1, 3]])), 64)
+
+
+# Many short searches; each begins threads and waits for them to end
+SEARCHES = """
+import torch
+from univoxel.core.records import Mesh
+from univoxel.ops.charts import unwrap
+faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+mesh = Mesh(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), faces)
+for _ in range(3000):
+    unwrap(mesh, 64)
+"""
+
+
+def test_every_search_for_charts_ends_on_a_busy_machine():
+    """Threads that missed that they should end kept 2 to 5 of 6 such processes forever."""
+    searches = [subprocess.Popen([sys.executable, "-c", SEARCHES]) for _ in range(6)]
+    try:
+        assert [search.wait(300) for search in searches] == [0] * 6
+    finally:
+        for search in searches:
+            search.kill()
 
 
 def test_normals_of_a_cube_point_along_its_diagonals():

@@ -3153,7 +3153,11 @@ public:
 		for (uint32_t i = 0; i < m_workers.size(); i++) {
 			Worker &worker = m_workers[i];
 			XA_DEBUG_ASSERT(worker.thread);
-			worker.wakeup = true;
+			{
+				// univoxel: without the lock a worker that is about to wait misses this, and join() never returns
+				std::lock_guard<std::mutex> lock(worker.mutex);
+				worker.wakeup = true;
+			}
 			worker.cv.notify_one();
 			if (worker.thread->joinable())
 				worker.thread->join();
