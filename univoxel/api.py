@@ -22,7 +22,7 @@ from univoxel.cli.trainer import train as train_config
 from univoxel.config import TrainConfig
 from univoxel.core.choices import ELEVATION, MAP_ROWS
 from univoxel.core.records import Mesh
-from univoxel.detail.texture import page_options
+from univoxel.detail.texture import albedo_near, page_options
 from univoxel.envmap import EnvMap
 from univoxel.errors import UserError
 from univoxel.evaluation.recovered_map import recovered_map
@@ -84,9 +84,9 @@ class Run:
             UserError: the cameras cannot be used.
         """
         _, views = views_of(self.path, cameras, resolution, ELEVATION, self.mesh())
-        pictures = []
+        near, pictures = albedo_near(self.path), []
         for view in range(len(views)):
-            surface, wo = surface_of_view(self.scene, views, view)
+            surface, wo = surface_of_view(self.scene, views, view, near)
             rgb = shade_hits(self.scene, surface, wo)
             width, height = views.size(view)
             rgba = torch.cat([rgb, surface.opacity[:, None]], 1)

@@ -88,7 +88,7 @@ def relit_calls(monkeypatch):
     scene.field.voxel_size = 0.125
     calls = []
 
-    def surface_of_view(scene, cameras, view):
+    def surface_of_view(scene, cameras, view, albedo_near=None):
         mask = inside().flatten()
         n = len(mask)
         angle = math.radians(TILT)

@@ -34,7 +34,7 @@ def sphere(n=40):
     return Mesh(RADIUS * normal, faces, normal, albedo, torch.full((len(normal),), 0.7))
 
 
-def surface_of_view(scene, cameras, view):
+def surface_of_view(scene, cameras, view, albedo_near=None):
     rays = image_rays(cameras, view)
     mesh = sphere()
     hit = VisibilityScene(mesh.vertices, mesh.faces).closest_hit(rays.origin, rays.direction)

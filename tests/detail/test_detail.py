@@ -13,9 +13,11 @@ from analytic import cameras_around
 from asymmetric_scene import lopsided
 from torch.nn.functional import normalize
 
+from univoxel import Run, api, evaluate
 from univoxel.camera import image_rays
 from univoxel.cli import main
 from univoxel.cli.detail import made_after_training, minutes_left
+from univoxel.cli.report import report
 from univoxel.color import linear_to_srgb
 from univoxel.core.records import Surface
 from univoxel.data import Photos
@@ -23,8 +25,10 @@ from univoxel.detail import texture
 from univoxel.detail.texture import load_detail, make_detail, page_options, save_detail
 from univoxel.detail.views import DetailedViews, coherence, likeness
 from univoxel.errors import DataError
+from univoxel.evaluation.measures import render_layers
 from univoxel.output.mesh import bake
 from univoxel.output.page import PageOptions, model
+from univoxel.output.report_pictures import Split, compared
 from univoxel.output.surface import surface_of
 from univoxel.render.pipeline import shade, shade_hits, surface_of_view
 from univoxel.scene import load_checkpoint, save_scene
@@ -158,6 +162,32 @@ def test_pages_show_it(scene, tiny_copy, detail):
     mesh = trimesh.load(io.BytesIO(model(scene, options, None)), file_type="glb", force="mesh")
     picture = np.asarray(mesh.visual.material.baseColorTexture)[..., 0]
     assert picture.std() > 10  # of 255; the model's albedo is even
+
+
+def test_measures_and_reports_show_it(scene, photos, detail):
+    even, fine = (
+        compared(scene, Split(photos, False), VIEWS, SIZE, near) for near in (None, detail.near)
+    )
+    assert fine.quality > even.quality + 2  # the rim, which counts too, is as it was
+    albedo = render_layers(scene, photos.cameras, VIEWS, albedo_near=detail.near).albedo
+    assert albedo[fine.inside][:, 0].std() > 0.8 * printed(torch.randn(9999, 3))[:, 0].std()
+
+
+def test_runs_are_measured_rendered_and_reported_with_it(tiny_copy, monkeypatch):
+    run, asked = tiny_copy / "run", []
+
+    def black(points, normals, albedo, footprint):
+        asked.append(footprint)
+        return torch.zeros_like(albedo)
+
+    before = evaluate(run)["nvs_psnr"], Run(run).render()[..., :3].mean()
+    for module in (texture, api):
+        monkeypatch.setattr(module, "albedo_near", lambda run: black)
+    assert evaluate(run)["nvs_psnr"] < before[0] - 1
+    assert Run(run).render()[..., :3].mean() < 0.5 * before[1]
+    asked.clear()
+    report(run, size=16)
+    assert len(asked) > 4  # four sides, and photographs
 
 
 def test_none_is_made_where_photographs_show_no_more(scene, photos, monkeypatch):

@@ -103,6 +103,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     """
     from statistics import fmean
 
+    from univoxel.detail.texture import albedo_near
     from univoxel.evaluation import views
     from univoxel.evaluation.measures import (
         albedo_scales,
@@ -130,9 +131,11 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
 
     surveyed = views.survey_of(scene, run, data)
     mesh = extract_mesh(scene) if truth.maps or truth.points is not None else None
-    scales = albedo_scales(scene, photos)
+    near = albedo_near(run)
+    scales = albedo_scales(scene, photos, near)
     relighting = views.relighting_of(scene, mesh, truth, scales, asked.samples, asked.bounces)
     how = {"background": asked.background, "fit_light": asked.fit_light, "save": save}
+    how |= {"albedo_near": near}
     found = views.measure_views(scene, photos, truth, scales, relighting, surveyed, **how)
     result = {key: fmean(values) if values else None for key, values in found.measures.items()}
     result |= {

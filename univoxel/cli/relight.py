@@ -114,13 +114,12 @@ class RelightOptions:
 
     def studio(self, run: Path) -> tuple[Studio, Quality]:
         """The scene of a run, ready for frames, and how they are rendered."""
-        from univoxel.detail.texture import load_detail
+        from univoxel.detail.texture import albedo_near
         from univoxel.output.viewpoints import open_studio
 
         quality = self.quality()
         studio = open_studio(run, self.cameras, self.resolution, self.elevation)
-        if detail := load_detail(run):
-            studio = replace(studio, albedo_near=detail.near)
+        studio = replace(studio, albedo_near=albedo_near(run))
         if self.ground == "lowest":
             quality = replace(quality, ground=float(studio.traced.mesh.vertices[:, 2].min()))
         return studio, quality

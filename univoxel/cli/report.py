@@ -41,6 +41,8 @@ def report(run: File, html: File | None = None, **options: Any) -> Path:
     Args:
         html: the page; in the run's folder when left out.
     """
+    from univoxel.detail.texture import albedo_near
     from univoxel.output.report import write_report
 
+    options |= {"albedo_near": albedo_near(run)}
     return write_report(run, Path(run) / REPORT if html is None else html, **options)

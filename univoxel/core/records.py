@@ -5,13 +5,17 @@ Sizes: N rays, M samples, C features, V views, P points.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import torch
 from torch import Tensor
 
 HALF_MAX = 65504.0  # the largest number of half precision
+# Linear albedo [N, 3] of points of the surface [N, 3], of their unit normals [N, 3], the field's
+# albedo there [N, 3], and the width in world units of what is asked for
+AlbedoNear: TypeAlias = Callable[[Tensor, Tensor, Tensor, float], Tensor]
 
 
 @dataclass(frozen=True)

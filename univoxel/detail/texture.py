@@ -43,7 +43,7 @@ from torch.nn.functional import (
 from univoxel.camera import Cameras, pixel_width, project
 from univoxel.color import linear_to_srgb, luminance, srgb_to_linear
 from univoxel.core.files import replacing
-from univoxel.core.records import Mesh, Surface
+from univoxel.core.records import AlbedoNear, Mesh, Surface
 from univoxel.data import Photos
 from univoxel.errors import DataError
 from univoxel.ops import VisibilityScene
@@ -501,11 +501,17 @@ def save_detail(detail: Detail, run: Path) -> None:
         save_file(tensors, temporary, {"univoxel": json.dumps(about)})
 
 
+def albedo_near(run: str | Path) -> AlbedoNear | None:
+    """What gives the albedo of a run where it has detail; errors as of `load_detail`."""
+    detail = load_detail(run)
+    return None if detail is None else detail.near
+
+
 def page_options(run: str | Path) -> dict[str, Any]:
     """Fields of `univoxel.output.page.PageOptions` that show the detail of a run, if it has any;
     errors as of `load_detail`."""
-    detail = load_detail(run)
-    return {} if detail is None else {"albedo_near": detail.near, "texture_size": PAGE_SIZE}
+    near = albedo_near(run)
+    return {} if near is None else {"albedo_near": near, "texture_size": PAGE_SIZE}
 
 
 def load_detail(run: str | Path) -> Detail | None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from univoxel.camera import Cameras
 from univoxel.color import linear_to_srgb, linear_to_srgb_unclipped
 from univoxel.core.choices import Behind
-from univoxel.core.records import Mesh, Surface
+from univoxel.core.records import AlbedoNear, Mesh, Surface
 from univoxel.data import Photos, Truth, load_points, load_relit, load_truth, relight_maps
 from univoxel.data.photos import decode
 from univoxel.envmap import EnvMap, read_map
@@ -60,9 +60,14 @@ def render_layers(
     view: int,
     relighting: Relighting | None = None,
     doubts: Doubts | None = None,
+    albedo_near: AlbedoNear | None = None,
 ) -> Layers:
-    """Render one view. Nothing is shaded where the opacity is 0."""
-    whole, wo = surface_of_view(scene, cameras, view)
+    """Render one view. Nothing is shaded where the opacity is 0.
+
+    Args:
+        albedo_near: what gives the albedo, in place of the field.
+    """
+    whole, wo = surface_of_view(scene, cameras, view, albedo_near)
     there = whole.opacity > 0
     width, height = cameras.size(view)
     surface, wo = at_rays(whole, there), wo[there]
@@ -386,16 +391,19 @@ def doubt_correlation(pairs: list[Pairs]) -> float | None:
     return metrics.spearman(doubt, error)
 
 
-def albedo_scales(scene: Scene, photos: Photos) -> Scales:
+def albedo_scales(scene: Scene, photos: Photos, albedo_near: AlbedoNear | None = None) -> Scales:
     """The scales over all test views, or 1 where there is no true albedo.
 
     This is a pass of its own, so that the pass that renders keeps one view in memory.
+
+    Args:
+        albedo_near: as of `render_layers`.
     """
     pairs = []
     for view in range(len(photos)):
         truth = view_truth(photos, view)
         if truth.albedo is not None and truth.mask is not None:
-            surface, _ = surface_of_view(scene, photos.cameras, view)
+            surface, _ = surface_of_view(scene, photos.cameras, view, albedo_near)
             pairs.append((truth.albedo[truth.mask], surface.albedo[truth.mask.flatten()]))
     if not pairs:
         return Scales(torch.ones(3), torch.ones(3))

@@ -13,7 +13,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.core.choices import Behind
 from univoxel.core.files import write_text
 from univoxel.core.progress_bar import track
-from univoxel.core.records import Mesh
+from univoxel.core.records import AlbedoNear, Mesh
 from univoxel.data import Photos
 from univoxel.data.images import write_exr, write_png
 from univoxel.envmap import tables
@@ -75,12 +75,14 @@ def measure_views(
     background: Behind,
     fit_light: bool,
     save: Path | None,
+    albedo_near: AlbedoNear | None = None,
 ) -> ViewMeasures:
     """Render and measure all test views; write their layers and the contact sheet into `save`.
 
     Args:
         background: what novel views are compared with photographs on.
         fit_light: each is rendered in the light that fits its photograph.
+        albedo_near: as of `render_layers`.
     """
     doubts = Doubts(surveyed) if surveyed else None
     found = ViewMeasures({key: [] for key in MEASURES}, [], [])
@@ -89,7 +91,7 @@ def measure_views(
     for view in track(range(len(photos)), "rendering test views"):
         if fit_light:
             fit_light_(scene, photos, view)
-        layers = render_layers(scene, photos.cameras, view, relighting, doubts)
+        layers = render_layers(scene, photos.cameras, view, relighting, doubts, albedo_near)
         expected = expected_view(photos, truth.relit, view, background)
         for key, value in score(layers, expected, scales):
             found.measures[key].append(value)

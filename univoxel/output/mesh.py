@@ -4,9 +4,8 @@ into it, and where it lies."""
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeAlias, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,15 +17,11 @@ from torch import Tensor
 from univoxel.brdf import metal_or_none
 from univoxel.color import linear_to_srgb
 from univoxel.core.choices import Origin
-from univoxel.core.records import FieldSample, Mesh
+from univoxel.core.records import AlbedoNear, FieldSample, Mesh
 from univoxel.errors import UserError
 from univoxel.fields.field import Field
 from univoxel.ops.charts import unwrap
 from univoxel.scene import Scene
-
-# Linear albedo [N, 3] of points of the surface [N, 3], of their unit normals [N, 3], the field's
-# albedo there [N, 3], and the width in world units of what is asked for
-AlbedoNear: TypeAlias = Callable[[Tensor, Tensor, Tensor, float], Tensor]
 
 # glTF and USD look along -Z with +Y up, our world has +Z up: (x, y, z) -> (x, z, -y), a quarter
 # turn.

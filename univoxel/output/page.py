@@ -20,11 +20,11 @@ from univoxel.camera import Cameras, looked_at
 from univoxel.core.choices import MAP_ROWS, TEXTURE_SIZE
 from univoxel.core.files import write_text
 from univoxel.core.html import VIEWPORT, base64_text, document, escape, paragraph, table
-from univoxel.core.records import HALF_MAX
+from univoxel.core.records import HALF_MAX, AlbedoNear
 from univoxel.envmap import read_map
 from univoxel.errors import UserError
 from univoxel.ops import VisibilityScene
-from univoxel.output.mesh import AlbedoNear, TexturedMesh, bake
+from univoxel.output.mesh import TexturedMesh, bake
 from univoxel.output.mesh_files import glb
 from univoxel.output.surface import cameras_of, surface_of
 from univoxel.output.topology import simplify

@@ -20,7 +20,7 @@ from univoxel import __version__
 from univoxel.config import TrainConfig, load_config
 from univoxel.core.files import write_text
 from univoxel.core.html import Curve, chart, document, escape, image, paragraph, table
-from univoxel.core.records import Mesh
+from univoxel.core.records import AlbedoNear, Mesh
 from univoxel.errors import UserError
 from univoxel.evaluation.confidence import (
     ADVICE,
@@ -180,6 +180,7 @@ class ReportOptions:
     views: int = 4  # photographs beside their render, the worst first; >= 0
     size: int = 256  # pixels along the longer side of pictures, >= 16
     advice: AdviceConfig = ADVICE  # how directions are chosen
+    albedo_near: AlbedoNear | None = None  # what gives the albedo, in place of the field
 
     def __post_init__(self) -> None:
         for name, least in (("views", 0), ("size", 16)):
@@ -243,7 +244,7 @@ def report_text(
     title = options.title or run.resolve().name or "univoxel"
     front = START[0] if known is None else known.advice.front
     doubts = None if known is None else Doubts(known.surveyed)
-    pictures = report_pictures.layers(scene, mesh, options.size, front, doubts)
+    pictures = report_pictures.layers(scene, mesh, options.size, front, doubts, options.albedo_near)
     verdict = load_verdict(run)
     sections = [
         ("Result", paragraph(verdict.sentence() + ".") if verdict else ""),
@@ -332,7 +333,9 @@ def doubt_section(known: Known, state: dict[str, Any], pictures: Sequence[Tensor
 
 def views_section(scene: Scene, known: Known, options: ReportOptions) -> str:
     """Photographs beside what the scene shows from there, the worst first."""
-    found, count = report_pictures.worst(scene, known.splits, options.views, options.size)
+    found, count = report_pictures.worst(
+        scene, known.splits, options.views, options.size, options.albedo_near
+    )
     if not found:
         return ""
     rows = "".join(

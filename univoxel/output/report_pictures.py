@@ -15,7 +15,7 @@ from univoxel.color import linear_to_srgb, luminance
 from univoxel.core.choices import ELEVATION
 from univoxel.core.html import escape
 from univoxel.core.progress_bar import track
-from univoxel.core.records import Mesh, Surface
+from univoxel.core.records import AlbedoNear, Mesh, Surface
 from univoxel.data import Photos
 from univoxel.evaluation.confidence import Advice, Doubts, azimuths, elevations
 from univoxel.lights import AbstractLocalLight
@@ -73,26 +73,35 @@ class Compared:
         return self.photograph, self.render, torch.from_numpy(heat(self.difference, LIMIT))
 
 
-def worst(scene: Scene, splits: list[Split], count: int, size: int) -> tuple[list[Compared], int]:
+def worst(
+    scene: Scene,
+    splits: list[Split],
+    count: int,
+    size: int,
+    albedo_near: AlbedoNear | None = None,
+) -> tuple[list[Compared], int]:
     """The views that differ most from their photographs, the worst first; how many were compared.
 
     Args:
         size: most pixels along the pictures that are returned.
+        albedo_near: what gives the albedo, in place of the field.
     """
     views = [(split, view) for split in splits for view in range(len(split.photos))]
     every = -(-len(views) // MOST)
     views = views[::every]
     errors = [
-        compared(scene, split, view, SCOUTED).error
+        compared(scene, split, view, SCOUTED, albedo_near).error
         for split, view in track(views, "comparing photographs")
     ]
     order = sorted(range(len(views)), key=lambda k: -errors[k])[:count]
-    found = [compared(scene, *views[k], size) for k in order]
+    found = [compared(scene, *views[k], size, albedo_near) for k in order]
     return sorted(found, key=lambda view: -view.error), len(views)
 
 
 @torch.no_grad()
-def compared(scene: Scene, split: Split, view: int, size: int) -> Compared:
+def compared(
+    scene: Scene, split: Split, view: int, size: int, albedo_near: AlbedoNear | None = None
+) -> Compared:
     """One view, at most `size` pixels along its longer side."""
     photos = split.photos
     longest = max(*photos.cameras.size(view))
@@ -100,7 +109,7 @@ def compared(scene: Scene, split: Split, view: int, size: int) -> Compared:
     cameras = resize(photos.cameras, max(1, round(share * photos.cameras.width)))
     width, height = cameras.size(view)
     small = shrunk(photos, view, width, height)
-    surface, wo = surface_of_view(scene, cameras, view)
+    surface, wo = surface_of_view(scene, cameras, view, albedo_near)
     rgb = shade_hits(scene, surface, wo, view if split.trained else None)
     opacity = surface.opacity.reshape(height, width)
     both = (small[..., :3], small[..., 3]), (rgb.reshape(height, width, 3), opacity)
@@ -131,7 +140,12 @@ SIDES = ("front", "right", "back", "left")
 
 @torch.no_grad()
 def layers(
-    scene: Scene, mesh: Mesh, size: int, front: float, doubts: Doubts | None
+    scene: Scene,
+    mesh: Mesh,
+    size: int,
+    front: float,
+    doubts: Doubts | None,
+    albedo_near: AlbedoNear | None = None,
 ) -> dict[str, list[Tensor]]:
     """Pictures [size, size, 3], sRGB, of each of SIDES, by layer: render, albedo, roughness, metal
     where there is any, normal, and doubt where it is known.
@@ -142,7 +156,7 @@ def layers(
     cameras = orbit(mesh, len(SIDES), size, ELEVATION, front)
     found: dict[str, list[Tensor]] = {}
     for view in track(range(len(SIDES)), "rendering layers"):
-        for name, picture in _of_view(scene, cameras, view, doubts):
+        for name, picture in _of_view(scene, cameras, view, doubts, albedo_near):
             found.setdefault(name, []).append(picture)
     if not any(bool((picture > BEHIND + 0.05).any()) for picture in found["metal"]):
         del found["metal"]
@@ -150,9 +164,13 @@ def layers(
 
 
 def _of_view(
-    scene: Scene, cameras: Cameras, view: int, doubts: Doubts | None
+    scene: Scene,
+    cameras: Cameras,
+    view: int,
+    doubts: Doubts | None,
+    albedo_near: AlbedoNear | None,
 ) -> Iterator[tuple[str, Tensor]]:
-    surface, wo = surface_of_view(scene, cameras, view)
+    surface, wo = surface_of_view(scene, cameras, view, albedo_near)
     width, height = cameras.size(view)
     alpha = surface.opacity.reshape(height, width)
 

@@ -13,14 +13,13 @@ from torch import Tensor
 from univoxel import envmap as env
 from univoxel.camera import Cameras, resize
 from univoxel.core.choices import ELEVATION
-from univoxel.core.records import Mesh, Surface
+from univoxel.core.records import AlbedoNear, Mesh, Surface
 from univoxel.data import load_cameras
 from univoxel.envmap import read_map
 from univoxel.errors import UserError
 from univoxel.ops import PointLight, Sun
-from univoxel.output.mesh import AlbedoNear
 from univoxel.render import relight
-from univoxel.render.pipeline import at_rays, extract_mesh, surface_of_view
+from univoxel.render.pipeline import extract_mesh, surface_of_view
 from univoxel.run import load_world, photos_of
 from univoxel.scene import Scene, load_scene
 
@@ -160,15 +159,7 @@ class Studio:
 
     def surface(self, view: int) -> tuple[Surface, Tensor]:
         """What a view shows, as of `surface_of_view`."""
-        surface, wo = surface_of_view(self.scene, self.views, view)
-        there = surface.opacity > 0
-        if self.albedo_near is None or not there.any():
-            return surface, wo
-        footprint = float(surface.depth[there].median() / self.views.focal[view].mean())
-        met = at_rays(surface, there)
-        albedo = surface.albedo.clone()
-        albedo[there] = self.albedo_near(met.position, met.normal, met.albedo, footprint)
-        return replace(surface, albedo=albedo), wo
+        return surface_of_view(self.scene, self.views, view, self.albedo_near)
 
 
 def open_studio(

@@ -12,7 +12,7 @@ from univoxel import brdf
 from univoxel.brdf import metal_or_none
 from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb_unclipped, srgb_to_linear
-from univoxel.core.records import Mesh, Occlusion, Rays, Surface
+from univoxel.core.records import AlbedoNear, Mesh, Occlusion, Rays, Surface
 from univoxel.lights.quadrature import half_sphere, rotations
 from univoxel.lights.views import rotated
 from univoxel.ops import VisibilityScene
@@ -185,8 +185,14 @@ def shade_hits(scene: Scene, surface: Surface, wo: Tensor, view: int | None = No
 
 
 @torch.no_grad()
-def surface_of_view(scene: Scene, cameras: Cameras, view: int) -> tuple[Surface, Tensor]:
-    """Surface at every pixel of a view, row by row [H * W], and wo [H * W, 3]."""
+def surface_of_view(
+    scene: Scene, cameras: Cameras, view: int, albedo_near: AlbedoNear | None = None
+) -> tuple[Surface, Tensor]:
+    """Surface at every pixel of a view, row by row [H * W], and wo [H * W, 3].
+
+    Args:
+        albedo_near: what gives the albedo, in place of the field.
+    """
     rays = image_rays(cameras, view)
     parts = [
         surface_at(scene, Rays(o, d))
@@ -195,8 +201,13 @@ def surface_of_view(scene: Scene, cameras: Cameras, view: int) -> tuple[Surface,
         )
     ]
     names = [name for name, x in vars(parts[0]).items() if x is not None]
-    whole = {name: torch.cat([vars(part)[name] for part in parts]) for name in names}
-    return Surface(**whole), -rays.direction
+    surface = Surface(**{name: torch.cat([vars(part)[name] for part in parts]) for name in names})
+    there = surface.opacity > 0
+    if albedo_near is not None and there.any():
+        footprint = float(surface.depth[there].median() / cameras.focal[view].mean())
+        met = at_rays(surface, there)
+        surface.albedo[there] = albedo_near(met.position, met.normal, met.albedo, footprint)
+    return surface, -rays.direction
 
 
 @torch.no_grad()
