@@ -19,9 +19,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 39_300,
+    "lines of the package": 39_340,
     "lines of the laboratory": 5_300,
-    "lines of tests": 38_110,
+    "lines of tests": 38_160,
     "modules of the package": 166,
     "loose modules at the top": 12,
     "configuration fields": 130,

@@ -5,14 +5,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from analytic import photos_of
+from analytic import RADIUS, photos_of
+from torch.nn.functional import normalize
 
+from univoxel.camera import image_rays
 from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.core.choices import Varying
 from univoxel.fields.grid import fit_grid
 from univoxel.preparation import prepare as task
 from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
-from univoxel.preparation.prepare import log_gains, varying_and_gains
+from univoxel.preparation.prepare import exposures_of, varying_and_gains
 
 VIEWS = 16
 
@@ -46,7 +48,7 @@ def rms(values: torch.Tensor) -> float:
 
 @pytest.mark.parametrize("most", [0.0, 0.5, 2.0])
 def test_gains_are_found(photos, hull, most):
-    found = log_gains(exposed(photos, stops(most)), *hull) / math.log(2)
+    found = exposures_of(exposed(photos, stops(most)), *hull).log_gain / math.log(2)
     assert float(found.sum()) == pytest.approx(0, abs=1e-4)
     # The hull of 16 views is larger than the ball: what is seen of a point is a little beside it
     assert rms(found - stops(most)) < 0.05
@@ -60,13 +62,13 @@ def test_what_is_no_surface_colour_counts_little(photos, hull):
     color[where < 0.05] = 1.0
     color[(where > 0.05) & (where < 0.1)] = 0.0
     color[(where > 0.1) & (where < 0.2)] *= 3.0
-    found = log_gains(replace(photos, color=color), *hull) / math.log(2)
+    found = exposures_of(replace(photos, color=color), *hull).log_gain / math.log(2)
     assert rms(found - stops(1.0)) < 0.1
 
 
 def test_eight_bits_will_do(photos, hull):
     color = (255 * linear_to_srgb(exposed(photos, stops(1.0)).color)).round().to(torch.uint8)
-    found = log_gains(replace(photos, color=color), *hull) / math.log(2)
+    found = exposures_of(replace(photos, color=color), *hull).log_gain / math.log(2)
     assert rms(found - stops(1.0)) < 0.1
 
 
@@ -75,7 +77,7 @@ def test_clipped_pixels_tell_no_gain(photos, hull):
     color = (5 * exposed(photos, stops(1.0)).color).clamp(max=1)
     shown = photos.alpha > 0.99
     assert ((color == 1).any(-1) & shown).sum() > 0.1 * shown.sum()
-    found = log_gains(replace(photos, color=color), *hull) / math.log(2)
+    found = exposures_of(replace(photos, color=color), *hull).log_gain / math.log(2)
     assert rms(found - stops(1.0)) < 0.04  # as if nothing were clipped 0.02
 
 
@@ -87,19 +89,19 @@ def test_photographs_that_share_few_points():
     wanted = torch.tensor([1.0, -0.5, 0.8, -1.2, -0.1])
     color = photos.color / 4 * 2 ** wanted[:, None, None, None]
     hull = visual_hull(distance, photos.cameras, grid)
-    found = log_gains(replace(photos, color=color), hull, grid) / math.log(2)
+    found = exposures_of(replace(photos, color=color), hull, grid).log_gain / math.log(2)
     assert rms(found - wanted) < 0.03  # 0.008 here
 
 
 def test_no_surface_says_nothing(photos, hull):
     sdf, grid = hull
-    assert not log_gains(photos, sdf.abs() + 1, grid).any()
+    assert not exposures_of(photos, sdf.abs() + 1, grid).log_gain.any()
 
 
 def test_a_black_photograph_says_nothing(photos, hull):
     dark = photos.color.clone()
     dark[3] = 0
-    found = log_gains(replace(photos, color=dark), *hull)
+    found = exposures_of(replace(photos, color=dark), *hull).log_gain
     assert found.isfinite().all()
     assert rms(found) < 0.05
 
@@ -109,7 +111,8 @@ def test_a_black_photograph_says_nothing(photos, hull):
     [
         (1.0, "none", True, "exposure", True),
         (1.0, "none", False, "none", False),
-        (0.25, "none", True, "none", False),
+        (0.25, "none", True, "exposure", True),
+        (0.0, "none", True, "none", False),
         (1.0, "exposure", True, "exposure", True),
         (0.0, "exposure", False, "exposure", True),
         (1.0, "light", True, "light", True),
@@ -124,13 +127,34 @@ def test_what_differs(
     assert (gains is not None) == told
     if gains is not None:
         assert rms(gains / math.log(2) - stops(most)) < 0.05
-    assert ("exposures differ by 0.6" in caplog.text) == (
-        varying != wanted
-    )  # of +-1 stop, evenly spread
+    # 0.61 and 0.15: of +-1 stop and +-0.25, evenly spread
+    said = f"exposures differ by {0.61 * most:.2f} stops"
+    assert (said in caplog.text) == (varying != wanted)
+
+
+def test_what_a_ball_mirrors_is_no_exposure(photos, hull):
+    """A room that is brighter above, with windows and dark corners."""
+    color = torch.zeros_like(photos.color)
+    for view in range(VIEWS):
+        rays = image_rays(photos.cameras, view)
+        along = -(rays.origin * rays.direction).sum(1)
+        inside = (rays.origin + along[:, None] * rays.direction).square().sum(1) < RADIUS**2
+        at = rays.origin + along[:, None] * rays.direction
+        depth = (RADIUS**2 - at.square().sum(1)).clamp_min(0).sqrt()
+        normal = normalize(at - depth[:, None] * rays.direction, dim=1)
+        cosine = (normal * rays.direction).sum(1, keepdim=True)
+        x, y, z = (rays.direction - 2 * cosine * normal).unbind(1)
+        sky = 0.1 * (0.5 * z + (6 * x).sin() * (5 * y + 4 * z).cos()).exp()
+        color[view] = (sky * inside).reshape(color.shape[1:3])[..., None]
+    mirror = replace(photos, color=color)
+    assert exposures_of(mirror, *hull).stops > 0.25
+    assert varying_and_gains(mirror, *hull, "none", look=True) == ("none", None)
+    differ = exposed(mirror, stops(1.0))
+    assert varying_and_gains(differ, *hull, "none", look=True)[0] == "exposure"
 
 
 def test_nothing_is_looked_for_that_was_not_asked_for(photos, hull, monkeypatch):
-    monkeypatch.setattr(task, "log_gains", None)
+    monkeypatch.setattr(task, "exposures_of", None)
     assert varying_and_gains(photos, *hull, "none", look=False) == ("none", None)
 
 

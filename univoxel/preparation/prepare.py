@@ -45,54 +45,104 @@ ROUNDS = 20
 PRIOR = 1e-3
 # Share of the object's pixels that are clipped, above which it is said
 MUCH_CLIPPED = 0.03
-# Stops, root mean square, above which exposures differ. Where they are alike, reflections and a
-# hull that is too large look like 0.01 to 0.16 stops. Metal or light that changes looks like
-# 0.25: gains do no harm there
-MIN_STOPS = 0.2
+# Share of the contradictions that gains leave at most where exposures differ, see `Exposures`: 0.4
+# to 0.91 of them. Where exposures are alike 0.97 to 1.25, metals and flashes among them; where the
+# light itself varies 0.86 to 1.01
+MOST_LEFT = 0.93
+# Stops, root mean square, below which exposures are alike: a hull that is too large looks like 0.03
+MIN_STOPS = 0.1
+# Points that both halves of the surface share with a photograph, at least, for it to count
+COMMON = 20
 
 
 log: logging.Logger = logging.getLogger("univoxel")
 
 
+@dataclass(frozen=True)
+class Exposures:
+    """How photographs were exposed, as a surface's points tell."""
+
+    log_gain: Tensor  # [V] of mean 0; 0 for all if the photographs show no surface
+    # Of what photographs of one half of the surface contradict each other by: the share that is
+    # left under gains that the other half told. 1 where there is nothing to compare
+    left: float
+
+    @property
+    def stops(self) -> float:
+        """Root mean square of the gains."""
+        return float(self.log_gain.square().mean().sqrt()) / math.log(2)
+
+
 @torch.no_grad()
-def log_gains(photos: Photos, sdf: Tensor, grid: GridShape) -> Tensor:
-    """The log gains of photographs that agree best on how bright a surface's points are.
+def exposures_of(photos: Photos, sdf: Tensor, grid: GridShape) -> Exposures:
+    """The gains of photographs that agree best on how bright a surface's points are.
 
     log brightness_pv = log gain_v + log albedo_p, in robust least squares: many sightings are of
-    something else, where the surface is off, and highlights move.
+    something else, where the surface is off, and highlights move. What metal mirrors changes from
+    photograph to photograph as exposures do, but on one side of the object in another way than on
+    the other. So the surface is cut in half, along each axis in turn, and the gains of each half
+    are held against what the photographs show of the other.
 
     Args:
         photos: V, their cameras where they are believed to be.
         sdf: [X, Y, Z] world units, such as of the visual hull.
         grid: of the sdf.
 
-    Returns:
-        [V], of mean 0; 0 for all if the photographs show no surface.
-
     Source: Brown and Lowe 2007, "Automatic panoramic image stitching using invariant features", for
     gains from overlaps; Cauchy's weights, iterated, as in robust statistics.
     """
-    gain = torch.zeros(len(photos))
     seen = observe_hull(photos, sdf, grid, POINTS)
     if seen is None:
-        return gain
+        return Exposures(torch.zeros(len(photos)), 1.0)
     encoded = linear_to_srgb(seen.color)
     usable = (encoded.mean(1) > DARK) & (encoded < CLIPPED).all(1)
     point_and_view = torch.repeat_interleave(seen.offsets.diff())[usable], seen.view[usable]
     log_color, observed = torch.zeros(2, POINTS, len(photos), dtype=torch.double)
     log_color[point_and_view] = seen.color[usable].mean(1).double().log()
     observed[point_and_view] = 1.0
+    gain, _ = _agreed(log_color, observed)
+    with_gains = without = 0.0
+    for place in seen.position.unbind(1):
+        half = place > place.median()
+        for told, asked in ((half, ~half), (~half, half)):
+            other, _ = _agreed(log_color[told], observed[told])
+            both = (observed[told].sum(0) >= COMMON) & (observed[asked].sum(0) >= COMMON)
+            for trial in (other, torch.zeros_like(other)):
+                _, cost = _agreed(log_color[asked], observed[asked], trial)
+                if trial is other:
+                    with_gains += float(cost[both].sum())
+                else:
+                    without += float(cost[both].sum())
+    return Exposures(gain.float(), with_gains / without if without else 1.0)
+
+
+def _agreed(
+    log_color: Tensor, observed: Tensor, gain: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Log gains [V] of mean 0 under which photographs agree best, and the mean Cauchy cost [V] of
+    each that is left.
+
+    Args:
+        log_color: [P, V] of points in photographs.
+        observed: [P, V] 1 where a photograph shows a point, 0 elsewhere.
+        gain: [V] log gains; None: they are looked for.
+    """
+    found = torch.zeros(len(observed.T), dtype=torch.double) if gain is None else gain
     weight = observed
     for _ in range(ROUNDS):
         share = weight / weight.sum(1, keepdim=True).clamp_min(1e-9)
-        # The albedos eliminated: a Laplacian of the photographs, tied by the points that they share
-        system = torch.diag(weight.sum(0) + PRIOR) - weight.T @ share
-        right_side = (weight * (log_color - (share * log_color).sum(1, keepdim=True))).sum(0)
-        gain = torch.linalg.solve(system, right_side)
-        gain = gain - gain.mean()
-        albedo = (share * (log_color - gain)).sum(1, keepdim=True)
-        weight = observed / (1 + ((log_color - gain - albedo) / CAUCHY).square())
-    return gain.float()
+        if gain is None:
+            # The albedos eliminated: a Laplacian of the photographs, tied by the points that they
+            # share
+            system = torch.diag(weight.sum(0) + PRIOR) - weight.T @ share
+            right_side = (weight * (log_color - (share * log_color).sum(1, keepdim=True))).sum(0)
+            found = torch.linalg.solve(system, right_side)
+            found = found - found.mean()
+        albedo = (share * (log_color - found)).sum(1, keepdim=True)
+        square = ((log_color - found - albedo) / CAUCHY).square()
+        weight = observed / (1 + square)
+    cost = (observed * square.log1p()).sum(0) / observed.sum(0).clamp_min(1)
+    return found, cost
 
 
 def clipped_share(photos: Photos) -> float:
@@ -140,19 +190,18 @@ def varying_and_gains(
     """
     if varying == "none" and not look:
         return varying, None
-    gains = log_gains(photos, hull, grid)
-    stops = float(gains.square().mean().sqrt()) / math.log(2)
+    found = exposures_of(photos, hull, grid)
     if varying == "none":
-        if stops < MIN_STOPS:
+        if found.left > MOST_LEFT or found.stops < MIN_STOPS:
             return varying, None
         varying = "exposure"
         log.info(
             "exposures differ by %.2f stops from photograph to photograph: a gain is learned for "
             "each, see varying",
-            stops,
+            found.stops,
             extra={"arguments": ("varying",)},
         )
-    return varying, gains
+    return varying, found.log_gain
 
 
 PINNED = "hull that stays"  # a step
