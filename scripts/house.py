@@ -19,12 +19,12 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 39_340,
+    "lines of the package": 38_970,
     "lines of the laboratory": 5_300,
-    "lines of tests": 38_160,
-    "modules of the package": 166,
+    "lines of tests": 37_860,
+    "modules of the package": 165,
     "loose modules at the top": 12,
-    "configuration fields": 130,
+    "configuration fields": 128,
     "fields that nothing sets": 0,
     "layers": 10,
     "imports that go up": 0,

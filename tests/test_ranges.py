@@ -11,7 +11,7 @@ from plain import plain_stage, plain_training
 
 from univoxel import config, scene
 from univoxel.capture.config import CaptureConfig
-from univoxel.config import JointConfig, MirrorConfig, StageConfig, TrainConfig
+from univoxel.config import JointConfig, StageConfig, TrainConfig
 from univoxel.errors import ConfigError
 from univoxel.evaluation.confidence import AdviceConfig
 from univoxel.lights import BakedConfig, EnvmapConfig, EnvmapSGConfig, LightConfig
@@ -97,8 +97,6 @@ def test_every_field_is_explained():
         (SceneConfig(), {"sky_rows": 8193}, r"sky_rows must be in \[0, 8192\], got 8193"),
         (SceneConfig(), {"roughness": "rough"}, r"roughness must be None or in \(0, 1\]"),
         (SceneConfig(), {"varying": "all"}, "varying must be none, exposure or light, got 'all'"),
-        (MirrorConfig(), {"rows": 100}, r"rows must be a multiple of 32 in \[0, 1024\], got 100"),
-        (MirrorConfig(), {"rows": math.nan}, r"rows must be a multiple of 32 in \[0, 1024\], got"),
         *(
             (kind(), {name: MOST_DIRECTIONS + 1}, rf"{name} must be in \[1, {MOST_DIRECTIONS}\]")
             for kind in get_args(LightConfig)

@@ -152,21 +152,6 @@ class MetalConfig:
 
 
 @dataclass(frozen=True)
-class MirrorConfig:
-    """The map that mirrors show, see training/mirrors.py."""
-
-    rows: int = setting(
-        128,
-        "of the map as sharp points show it; 0: it is not kept",
-        least=0,
-        most=1024,
-        multiple=32,
-    )
-
-    __post_init__ = check_settings
-
-
-@dataclass(frozen=True)
 class EntropyConfig:
     """The prior that paint comes in few colours, see training/albedo_entropy.py."""
 
@@ -212,7 +197,6 @@ class JointConfig:
         1e-7, "Laplacian on the log map against the mean squared residual", above=0
     )
     metal: MetalConfig = setting(MetalConfig(), "how points are decided to be metal")
-    mirror: MirrorConfig = setting(MirrorConfig(), "the map that mirrors show")
     entropy: EntropyConfig = setting(
         EntropyConfig(), "the prior on few colours, where colors is set"
     )

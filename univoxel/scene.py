@@ -52,8 +52,8 @@ class SceneConfig:
     )
     sky_rows: int = setting(
         0,
-        "rows of the map's texels, where polished things show it more sharply than its nodes do; "
-        "training fills them in",
+        "rows of the map's texels, in runs of version 0.2 where polished things showed it more "
+        "sharply than its nodes do",
         least=0,
         most=MOST_ROWS,
     )
@@ -192,12 +192,6 @@ class Scene(nn.Module):
                 "light_of",
                 "varying",
             )
-
-    def sharpen_sky(self, radiance: Tensor) -> None:
-        """Keep texels [R, 2 R, 3] of the map, linear, beside its nodes."""
-        assert self.sky is not None
-        self.sky.sharp = radiance
-        self.cfg = replace(self.cfg, sky_rows=len(radiance))
 
     def occluder(self) -> VisibilityScene:
         """The present surface, ready for rays; within `surface_held`, the one that is held.

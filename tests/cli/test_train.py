@@ -16,7 +16,7 @@ from univoxel.cli import trainer as task
 from univoxel.cli.info import info
 from univoxel.cli.trainer import train
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.config import JointConfig, TrainConfig, save_config
+from univoxel.config import TrainConfig, save_config
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
 from univoxel.lights import SGConfig
@@ -98,17 +98,6 @@ def test_every_light_learns_the_photographs(data, tmp_path, light):
     pixels = torch.cartesian_prod(torch.arange(2), torch.arange(32), torch.arange(32))
     psnr = loop.held_out_psnr(scene, photos, pixels, physical=True)
     assert psnr > 18  # black gives 9 dB, the right sphere in one mean colour 16
-
-
-@pytest.mark.parametrize(("megabytes", "rows"), [(None, 128), (1.0, 64)])
-def test_the_map_of_mirrors_keeps_to_the_budget(data, tmp_path, monkeypatch, megabytes, rows):
-    given = []
-    monkeypatch.setattr(task, "run_stage", lambda *_: None)
-    monkeypatch.setattr(task.joint_stage, "solve", lambda *args: given.append(args[2].mirror.rows))
-    monkeypatch.setattr(task.compression, "adapt_", lambda *_: [])
-    cfg = config(data, tmp_path / "run", budget_mb=megabytes, capacity="adaptive")
-    task.train(dataclasses.replace(cfg, stages=(*cfg.stages, JointConfig(share=0.1))))
-    assert given == [rows]
 
 
 def test_grids_of_a_training_are_no_finer_than_its_photographs(data, tmp_path, monkeypatch):

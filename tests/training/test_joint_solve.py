@@ -201,7 +201,7 @@ def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, 
 def events(monkeypatch):
     """What two rounds on a small problem do, in their order, where each part changes nothing."""
 
-    def solve(told, paint=False, whole=False, found=False, sharpens=False, **changes):
+    def solve(told, paint=False, whole=False, found=False, **changes):
         scene, told_of = scene_of((0.5, 0.5, 0.5), 0.4, 12), []
         sharp = torch.ones(5, dtype=torch.bool)
         mirrors = Mirrors(sharp, sharp, torch.eye(3)[[0] * 5], torch.full((5, 3), 0.8))
@@ -230,7 +230,6 @@ def events(monkeypatch):
             "teach_albedo_": does("albedos"),
             "teach_mirrors_": does("mirrors"),
             "neutralise_": does("neutral"),
-            "sharpen_sky_": lambda *_: sharpens,
             "newton_round_": newton,
             "objective": adam,
         }.items():
@@ -305,13 +304,6 @@ def test_training_says_and_keeps_that_there_is_nothing_but_metal(events, monkeyp
     told = Steps(4)
     events(told, only_metal=True)
     assert not told.said  # it was asked for
-
-
-def test_training_says_that_mirrors_made_the_map_sharper(events):
-    for told, sharpens in ((Steps(4), False), (Steps(4), True)):
-        events(told, found=True, sharpens=sharpens)
-        says = ["the map of the light is as sharp as what is polished shows it"]
-        assert told.said == says * sharpens
 
 
 def test_materials_follow_a_map_that_was_changed(monkeypatch):

@@ -48,15 +48,6 @@ def test_a_budget_leaves_room_for_some_mirror_levels(megabytes, levels):
     assert compression.mirror_levels(SceneConfig(mirror_levels=1), megabytes) == 1
 
 
-@pytest.mark.parametrize(
-    ("megabytes", "rows"), [(None, 128), (40.0, 128), (1.0, 64), (0.3, 32), (0.02, 0)]
-)
-def test_a_budget_leaves_room_for_some_rows_of_the_map(megabytes, rows):
-    assert compression.sky_rows(128, megabytes) == rows
-    assert compression.sky_rows(32, megabytes) == min(rows, 32)
-    assert compression.sky_rows(0, megabytes) == 0
-
-
 def test_a_budget_decides_on_the_rows_of_a_hash_table():
     scene = SceneConfig()  # 16 channels: 8 levels
     assert compression.table_rows(scene, None) == ROWS

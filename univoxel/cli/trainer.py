@@ -314,8 +314,6 @@ def make_stage_(
     if pinned is not None:
         pinned.pin_(scene.field)
     if isinstance(stage, config.JointConfig):
-        rows = compression.sky_rows(stage.mirror.rows, cfg.budget_mb)
-        stage = replace(stage, mirror=replace(stage.mirror, rows=rows))
         joint_stage.solve(scene, scene.registered(photos), stage, cfg.seed, progress)
     else:
         if cfg.capacity == "adaptive":

@@ -20,18 +20,12 @@ RETIRED: dict[str, frozenset[str]] = {
     "LossConfig": frozenset({"albedo_smoothness", "roughness_smoothness"}),
     "StageConfig": frozenset({"lr_poses"}),
     "JointConfig": frozenset(
-        "adam albedo_smoothness metallic newton roughness_smoothness surface trials".split()
+        "adam albedo_smoothness metallic mirror newton roughness_smoothness surface trials".split()
     ),
     "MetalConfig": frozenset(
         (
             "alike base max_evidence metallic_before near neighbours only_metal_albedo roughness "
             "steps threshold"
-        ).split()
-    ),
-    "MirrorConfig": frozenset(
-        (
-            "alike around change darkest flat min_cosine min_reflectance min_views neighbours "
-            "reflected reflected_at_most sharp turn turns views voters weight"
         ).split()
     ),
     "EntropyConfig": frozenset(
@@ -82,24 +76,22 @@ class Setting:
     above: float | None = None  # the range is open there
     least: float | None = None  # the range is closed there
     most: float = math.inf  # and here; numbers are finite in any case
-    multiple: int = 0  # of what the numbers are multiples, if of anything
 
     @property
     def range(self) -> str:
-        """In words: above 0, at least 1, in [0, 1], a multiple of 32 in [0, 1024]; or nothing."""
+        """In words: above 0, at least 1, in [0, 1] or in [0, 1024]; or nothing."""
         low = self.least if self.above is None else self.above
         if low is None:
             return ""
         if self.most == math.inf:
             return f"{'at least' if self.above is None else 'above'} {low}"
-        many = f"a multiple of {self.multiple} " if self.multiple else ""
-        return f"{many}in {'[' if self.above is None else '('}{low}, {self.most}]"
+        return f"in {'[' if self.above is None else '('}{low}, {self.most}]"
 
     def holds(self, value: Any) -> bool:
         """Whether a number is in the range."""
         low = value >= self.least if self.above is None else value > self.above
         high = value <= self.most and value < math.inf
-        return low and high and not (self.multiple and value % self.multiple)
+        return low and high
 
 
 def about(meaning: str, **rest: Any) -> dict[str, Setting]:

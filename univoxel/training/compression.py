@@ -284,7 +284,6 @@ BUDGET_STEP = 0.8
 TABLES = ("field.", "radiance.directions.")  # names of parameters that begin so are no network's
 # Of the file: format, not chosen
 ROW_BYTES = 4 + 2 * PER_LEVEL  # of a row of a hash table: its number, and features in halves
-SKY_ROW_BYTES = 2 * 3 * 2  # of a map's texels, over its rows squared: halves
 HEADER_BYTES = 8192  # of a file, that hold no numbers
 NAME_BYTES = 64  # of a view's name
 
@@ -342,15 +341,6 @@ def mirror_levels(scene: SceneConfig, budget_mb: float | None) -> int:
         return scene.mirror_levels
     levels = range(scene.mirror_levels + 1)
     return max(n for n in levels if _direction_bytes(n) <= MIRROR_SHARE * 1e6 * budget_mb)
-
-
-def sky_rows(rows: int, budget_mb: float | None) -> int:
-    """Rows of the map's texels: those, or as many as a share of the budget has room for; a multiple
-    of 32."""
-    if budget_mb is None:
-        return rows
-    room = math.isqrt(int(MIRROR_SHARE * 1e6 * budget_mb / SKY_ROW_BYTES))
-    return min(rows, room // 32 * 32)
 
 
 def _direction_bytes(levels: int) -> int:

@@ -47,7 +47,7 @@ from univoxel.training.metals import (
     initialise_,
     neutralise_,
 )
-from univoxel.training.mirrors import find_mirrors, sharpen_sky_
+from univoxel.training.mirrors import find_mirrors
 from univoxel.training.newton import newton_round_
 from univoxel.training.progress import Progress
 
@@ -146,10 +146,6 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             save_scene(scene, progress.cfg.out, progress.state())
     progress.within = None
     scene.field.refresh()
-    if decisions.mirrors is not None:
-        problem = with_present_normals(scene, problem)
-        if sharpen_sky_(scene, photos, problem, decisions.mirrors, cfg):
-            progress.say("the map of the light is as sharp as what is polished shows it")
 
 
 def traced_problem(

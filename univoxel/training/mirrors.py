@@ -1,5 +1,4 @@
-"""Metals that mirror their surroundings, found by how much they change from view to view, and
-the map as sharply as they show it."""
+"""Metals that mirror their surroundings, found by how much they change from view to view."""
 
 from __future__ import annotations
 
@@ -15,26 +14,15 @@ from torch.nn.functional import normalize
 
 from univoxel import sphere
 from univoxel.color import linear_to_srgb_unclipped
-from univoxel.config import JointConfig
-from univoxel.data import Photos
 from univoxel.envmap import EnvMap, lookup
 from univoxel.render.observations import (
     JointProblem,
     Mirrors,
-    Observations,
     has_one_light,
     observations_of,
-    observe,
     without_exposure,
 )
 from univoxel.scene import Scene
-from univoxel.training.envmap_from_mirrors import (
-    MirrorViews,
-    agreed_normals,
-    errors,
-    sharp_map,
-    with_energy,
-)
 from univoxel.training.metals import NEAR
 from univoxel.training.newton import NODE_NEIGHBOURS
 
@@ -172,31 +160,6 @@ def find_mirrors(scene: Scene, problem: JointProblem) -> Mirrors | None:
         return None
     sharp, normal = smoothed(problem.observations.position, seen.normal, sharp & metal)
     return Mirrors(metal, sharp, normal, torch.where(metal[:, None], base, 0.0))
-
-
-def open_views(
-    scene: Scene,
-    problem: JointProblem,
-    observations: Observations,
-    like: Tensor,
-    base: Tensor,
-    map: NodeMap,
-) -> tuple[MirrorViews, Tensor]:
-    """What photographs show of N points that mirror the sky, and which of the observations these
-    are: [S] int64.
-
-    Args:
-        like: [N] int64, points of the problem that see of the sky what these do.
-        base: [N, 3] what the points reflect.
-    """
-    observations = without_exposure(scene, observations)
-    point = torch.repeat_interleave(observations.offsets.diff())
-    mirrored, cosine = reflect(observations.normal[point], observations.wo[:, None])
-    is_open = sees_sky(problem, map, like[point], mirrored[:, 0])
-    index = (is_open & (cosine[:, 0] > MIN_COSINE)).nonzero()[:, 0]
-    wo, color = observations.wo[index], observations.color[index]
-    views = MirrorViews.of(point[index], wo, color, base, observations.normal)
-    return views, index
 
 
 def sees_sky(problem: JointProblem, map: NodeMap, point: Tensor, direction: Tensor) -> Tensor:
@@ -345,60 +308,3 @@ def smoothed(position: Tensor, normal: Tensor, sharp: Tensor) -> tuple[Tensor, T
         sharp.index_copy(0, index, flat[:, 0]),
         normal.index_copy(0, index, torch.where(flat, mean, own)),
     )
-
-
-# The scene's map as sharply as its mirrors show it.
-
-
-POINTS = 8000  # that are looked at, at least: closer together than those of the joint solve
-FORETOLD = 0.8  # of the error of one colour, at most
-PROJECTIONS = 2  # steps that bring them to the surface
-
-
-@torch.no_grad()
-def sharpen_sky_(
-    scene: Scene, photos: Photos, problem: JointProblem, mirrors: Mirrors, cfg: JointConfig
-) -> bool:
-    """Give the scene the map that its mirrors show; whether they show one.
-
-    They do if what half of the photographs show tells the other half better than the nodes do, and
-    much better than one colour.
-    """
-    parent = mirrors.sharp.nonzero()[:, 0]
-    if not cfg.mirror.rows or len(parent) < NEIGHBOURS:
-        return False
-    parent = parent.repeat(-(-POINTS // len(parent)))
-    observations = points_beside(scene, photos, problem, parent)
-    sky = problem.sky
-    nodes = NodeMap.of(sky.direction, sky.latlong(ROWS), sky.radiance)
-    base = mirrors.base[parent]
-    views, index = open_views(scene, problem, observations, parent, base, nodes)
-    first = observations.view[index] % 2 == 0
-    if not first.any() or first.all():  # too few to foretell others from
-        return False
-    nearest = neighbours(observations.position, NEIGHBOURS)
-    normal = agreed_normals(views, observations.normal, nearest)
-    seen, told = views.at(first), views.at(~first)
-    half = sharp_map(seen, normal, ROWS).encoded
-    of_nodes, of_half = (errors(map, told, normal).mean() for map in (nodes.encoded, half))
-    of_mean = (told.incident - seen.incident.mean(0)).abs().mean()
-    if not of_half < min(of_nodes, FORETOLD * of_mean):
-        return False
-    scene.sharpen_sky(with_energy(sharp_map(views, normal, cfg.mirror.rows), sky))
-    return True
-
-
-def points_beside(
-    scene: Scene, photos: Photos, problem: JointProblem, parent: Tensor
-) -> Observations:
-    """What photographs see of points of the surface, each a voxel or two beside such a one [N] of
-    the problem."""
-    generator = torch.Generator().manual_seed(0)
-    beside = torch.randn(len(parent), 3, generator=generator) * problem.voxel_size
-    position = problem.observations.position[parent] + beside
-    for _ in range(PROJECTIONS):
-        sample = scene.field.sample(position)
-        normal = normalize(sample.gradient, dim=1, eps=1e-6)
-        position = position - sample.sdf[:, None] * normal
-    normal = normalize(scene.field.sample(position).gradient, dim=1, eps=1e-6)
-    return observe(position, normal, photos, scene.occluder(), problem.voxel_size)
