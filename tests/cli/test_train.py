@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -366,6 +367,20 @@ def test_a_training_says_how_it_came_out(data, tmp_path, caplog):
     assert (run / "trust.txt").read_text().startswith(verdict.sentence() + ". ")
     assert any(message.startswith("Result: ") for message in caplog.messages)
     assert "12 photographs of 0.001 MP: about" in caplog.text
+
+
+def test_a_limit_may_be_enough_for_the_steps_alone(caplog):
+    """Then it does not promise more than all of them."""
+    caplog.set_level("INFO", "univoxel")
+    clock = SimpleNamespace(seconds=0.0, planned=20.0, limit=120.0, preparation=0.0)
+    progress = SimpleNamespace(clock=clock, cfg=SimpleNamespace(minutes=2.0), slower=1.0)
+    cameras = SimpleNamespace(width=4000, height=3000)
+    photos = type("", (), {"cameras": cameras, "downscale": 1, "__len__": lambda self: 60})()
+    task.announce(progress, photos)
+    assert caplog.messages[-1].endswith(
+        "minutes=2 are enough for all steps if cameras and masks take 30 s"
+    )
+    assert clock.preparation == 30.0
 
 
 def test_a_stage_without_a_step_is_said_and_ends_with_code_3(data, tmp_path, monkeypatch, capsys):

@@ -233,7 +233,10 @@ def announce(progress: Progress, photos: Photos) -> None:
         return
     fits = max(clock.limit - clock.preparation - RESERVE_SECONDS, 0.0) / clock.planned
     said = f"{what}: about {duration(whole)} on this machine; minutes={cfg.minutes:g} are enough "
-    said += f"for about {fits:.0%} of the steps"
+    if fits < 1:
+        said += f"for about {fits:.0%} of the steps"
+    else:
+        said += f"for all steps if cameras and masks take {duration(clock.preparation)}"
     if fits < LEAST:
         said += f", minutes={math.ceil(whole / 60)} for all of them"
     log.info(said, extra={"arguments": ("minutes",)})
