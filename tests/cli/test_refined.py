@@ -141,10 +141,3 @@ def test_trust_looks_from_where_the_cameras_are(data, run):
     there, before = survey(scene, moved, 200), survey(scene, photos, 200)
     torch.testing.assert_close(refined.disagreement, there.disagreement)
     assert (before.disagreement - there.disagreement).abs().mean() > 1e-3
-
-
-def test_other_photographs_are_refused(data, run):
-    photos = load_photos(data, "train")
-    fewer = replace(photos.cameras, camera_to_world=photos.cameras.camera_to_world[:5])
-    with pytest.raises(ValueError, match="trained on 12 photographs with refined cameras, got 5"):
-        load_scene(run).registered(replace(photos, cameras=fewer))

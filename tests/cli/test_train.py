@@ -27,8 +27,6 @@ from univoxel.run import load_verdict
 from univoxel.run import photos_of as photos_of_run
 from univoxel.scene import FILE, SceneConfig, load_scene
 from univoxel.training import clock, descent, loop
-from univoxel.training import pixels as pixels_module
-from univoxel.training.loop import batch_at
 from univoxel.training.pixels import split_pixels
 
 
@@ -325,16 +323,6 @@ def test_a_run_is_not_overwritten(run, data):
         train(config(data, run))
 
 
-def test_held_out_pixels_are_not_trained_on(data):
-    photos = load_photos(data, "train")
-    split = split_pixels(photos, torch.where(photos.coverage() > 0, -1.0, 99.0))
-    pixels, held = split.trained, split.held_out
-    both = torch.cat([pixels, held])
-    assert len(both.unique(dim=0)) == len(both)
-    batch = batch_at(photos, held)
-    assert (batch.alpha == 1).all()
-
-
 def test_so_few_pixels_that_none_is_spared():
     distance = torch.full((1, 30, 30), 99.0)
     distance[0, 3, 4:8] = -1.0
@@ -342,17 +330,6 @@ def test_so_few_pixels_that_none_is_spared():
     pixels, held = split.trained, split.held_out
     assert len(pixels) == 4
     assert torch.equal(pixels, held)
-
-
-def test_pixels_are_those_in_and_near_silhouettes():
-    """Each once, a view without any too."""
-    distance = 30 * torch.randn(4, 9, 9, generator=torch.Generator().manual_seed(0))
-    distance[1] = torch.inf
-    split = split_pixels(photos_of(4, 9), distance)
-    found = torch.cat([split.trained, split.held_out])
-    assert found.dtype == torch.int32  # photographs have many
-    wanted = (distance < pixels_module.MARGIN).nonzero().tolist()
-    assert sorted(found.tolist()) == wanted
 
 
 def test_a_training_says_how_it_came_out(data, tmp_path, caplog):

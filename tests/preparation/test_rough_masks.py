@@ -9,7 +9,7 @@ from analytic import RADIUS, photos_of
 
 from lab.stress.damage import turned
 from univoxel.data import Photos
-from univoxel.errors import DataError, UserError
+from univoxel.errors import DataError
 from univoxel.preparation import pose_refinement, prepare
 from univoxel.preparation.hull import hull_sdf, mask_distances
 from univoxel.preparation.pose_refinement import (
@@ -121,12 +121,6 @@ def test_silhouettes_in_which_nothing_lies(photos, tmp_path):
     cfg = preset("fast", tmp_path / "data", tmp_path / "run")
     with pytest.raises(DataError, match=r"data: .*(share no volume|nothing in common)"):
         prepare.find_silhouettes(replace(photos, alpha=torch.zeros_like(photos.alpha)), cfg)
-
-
-def test_masks_that_show_nothing(photos):
-    empty = torch.zeros_like(photos.alpha)
-    with pytest.raises(UserError, match="nothing in common"):
-        doubt_masks(replace(photos, alpha=empty), mask_distances(empty), ROUGH)
 
 
 def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(
