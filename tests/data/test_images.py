@@ -541,14 +541,6 @@ def write(path, value):
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.exr"])
-def test_a_file_is_replaced(tmp_path, name):
-    write(tmp_path / name, 1)
-    write(tmp_path / name, 2)
-    assert float(images.read_image(tmp_path / name)[0, 0, 0]) == 2
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-@pytest.mark.parametrize("name", ["a.png", "a.exr"])
 def test_new_files_get_usual_permissions(tmp_path, name):
     (tmp_path / "plain").write_bytes(b"")
     write(tmp_path / name, 1)
