@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from analytic import LIGHTS, RADIUS, cameras_around, write_scene
-from plain import plain_stage, plain_training
+from plain import interrupt_second_stage, plain_stage, plain_training
 
 from lab.stress.damage import turned
 from univoxel.camera import project
@@ -101,17 +101,7 @@ def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):
     """From a checkpoint after the first stage: the box and the cameras are as they were."""
     monkeypatch.setattr(pose_refinement, "STEPS", 10)
     cfg = config(data, tmp_path / "run", cameras="refined")
-    original, stages = task.run_stage, []
-
-    def killed(scene, cfg, stage, *rest):
-        if stages:
-            raise KeyboardInterrupt
-        stages.append(scene.field.grid)
-        original(scene, cfg, stage, *rest)
-
-    monkeypatch.setattr(task, "run_stage", killed)
-    with pytest.raises(KeyboardInterrupt):
-        train(cfg)
+    interrupt_second_stage(cfg)
     before = load_scene(cfg.out).poses.steps
     seen = []
     monkeypatch.setattr(task, "run_stage", lambda scene, *_: seen.append(scene.field.grid))

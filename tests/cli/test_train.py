@@ -7,7 +7,7 @@ import pytest
 import torch
 from analytic import LIGHTS, RADIUS, photos_of, sphere_scene, write_scene
 from layouts import Scene, write_colmap
-from plain import plain_stage, plain_training
+from plain import interrupt_second_stage, plain_stage, plain_training
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
@@ -184,8 +184,8 @@ def test_a_gradient_spreads_over_the_nodes_that_it_touches():
 
 
 def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, caplog):
-    caplog.set_level("INFO", "univoxel")
     """The sphere, 40 times as large, far away and upside down, from half of the pixels."""
+    caplog.set_level("INFO", "univoxel")
     scale, centre = 40.0, torch.tensor([100.0, -50.0, 30.0])
     photos = photos_of(16, 64)
     poses = torch.eye(4).repeat(16, 1, 1)
@@ -257,21 +257,11 @@ def test_time_ends_a_run_with_a_usable_result(data, tmp_path):
 
 def test_resume_goes_on_where_it_stopped(data, tmp_path, monkeypatch):
     cfg = config(data, tmp_path / "run")
-    original, seen = task.run_stage, []
-
-    def killed(scene, cfg, stage, *rest):
-        if len(seen):
-            raise KeyboardInterrupt
-        seen.append(stage)
-        original(scene, cfg, stage, *rest)
-
-    monkeypatch.setattr(task, "run_stage", killed)
-    with pytest.raises(KeyboardInterrupt):
-        train(cfg)
-    first = load_scene(cfg.out)
+    interrupt_second_stage(cfg)
+    first, seen = load_scene(cfg.out), []
     monkeypatch.setattr(task, "run_stage", lambda scene, cfg, stage, *rest: seen.append(stage))
     train(cfg, resume=True)
-    assert seen == list(cfg.stages)
+    assert seen == list(cfg.stages[1:])
     assert load_scene(cfg.out).field.grid != first.field.grid  # the second stage's resolution
 
 
@@ -288,19 +278,9 @@ def test_what_is_pinned_is_so_on_the_grid_of_every_stage_and_after_a_kill(
     first, second = Pinned(), Pinned()
     monkeypatch.setattr(preparation, "find_pinned", lambda *_: first)
     cfg = config(data, tmp_path / "run", carving_seconds=0.0)
-    original = task.run_stage
-
-    def killed(scene, cfg, stage, *rest):
-        if stage.physical_from == 0.0:
-            raise KeyboardInterrupt
-        original(scene, cfg, stage, *rest)
-
-    monkeypatch.setattr(task, "run_stage", killed)
-    with pytest.raises(KeyboardInterrupt):
-        train(cfg)
+    interrupt_second_stage(cfg)
     coarse, fine = first.grids
     assert coarse < fine
-    monkeypatch.setattr(task, "run_stage", original)
     monkeypatch.setattr(preparation, "find_pinned", lambda *_: second)
     train(cfg, resume=True)
     assert second.grids == [fine]
