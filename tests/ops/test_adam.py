@@ -29,10 +29,13 @@ def test_native_equals_reference(size, dtype):
         torch.testing.assert_close(a.double(), b, **tolerance)
 
 
-def test_first_step_in_closed_form():
+@pytest.mark.parametrize(("lr", "eps"), [(0.1, 1.0), (0.1, 0.0), (0.0, 1.0)])
+def test_first_step_in_closed_form(lr, eps):
     """From zero moments the corrected ones are g and g^2: the step is lr g / (|g| + eps)."""
     param, grad = torch.zeros(3, 1).double(), torch.tensor([[4.0], [-2.0]]).double()
     moments = torch.zeros(2, 3, 1).double()
     rows = torch.tensor([2, 0])
-    adam_rows_(param, *moments.unbind(), rows, grad, **(NUMBERS | {"eps": 1.0, "step": 1}))
-    assert param[:, 0].tolist() == pytest.approx([0.1 * 2 / 3, 0.0, -0.1 * 4 / 5])
+    adam_rows_(
+        param, *moments.unbind(), rows, grad, **(NUMBERS | {"lr": lr, "eps": eps, "step": 1})
+    )
+    assert param[:, 0].tolist() == pytest.approx([lr * 2 / (2 + eps), 0.0, -lr * 4 / (4 + eps)])
