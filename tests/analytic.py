@@ -12,7 +12,8 @@ from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.fields.field import dense_field
-from univoxel.fields.grid import GridShape
+from univoxel.fields.grid import GridShape, fit_grid
+from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
 from univoxel.scene import Scene, SceneConfig
 
 RADIUS = 0.5
@@ -116,6 +117,13 @@ def photos_of(views: int, size: int) -> Photos:
     color, alpha = zip(*(photograph(cameras, v) for v in range(views)), strict=True)
     names = [f"r_{v}" for v in range(views)]
     return Photos(Path("sphere"), names, torch.stack(color), torch.stack(alpha), cameras)
+
+
+def hull_of(photos: Photos) -> tuple[torch.Tensor, GridShape]:
+    """The visual hull of photographs, on a small grid around it."""
+    distance = mask_distances(photos.coverage())
+    grid = fit_grid(*estimate_bounds(distance, photos.cameras), 20000)
+    return visual_hull(distance, photos.cameras, grid), grid
 
 
 def scene_of(albedo, roughness: float, nodes: int):

@@ -8,8 +8,10 @@ from univoxel.envmap import EnvMap
 from univoxel.fields.field import dense_field
 from univoxel.fields.grid import fit_grid
 from univoxel.lights import SGConfig
+from univoxel.render.relight import traced_mesh
 from univoxel.scene import Scene, SceneConfig
 from univoxel.sphere import latlong_directions
+from univoxel.viewer.viewer_scene import Subject, mesh_of
 
 # Balls of these centres and radii, united.
 BALLS = torch.tensor([[0.0, 0, 0, 0.4], [0.35, 0.1, 0, 0.2], [0, 0.1, 0.4, 0.15]])
@@ -63,3 +65,15 @@ def lopsided(voxels: int = 48**3, change=None, light=None) -> Scene:
     scene = Scene(cfg, field, inv_s=100.0)
     scene.material = Identity()
     return scene.eval()
+
+
+def with_metal() -> Scene:
+    scene = lopsided()
+    scene.material = Metals()
+    scene.inv_s = 600.0  # silhouettes as sharp as after a training
+    return scene
+
+
+def subject_of(scene: Scene) -> Subject:
+    """What the viewer shows of a scene."""
+    return Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size))

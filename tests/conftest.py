@@ -6,8 +6,11 @@ import os
 import tempfile
 from pathlib import Path
 
+import pytest
 import torch
 from tiny import tiny, tiny_copy  # noqa: F401
+
+from univoxel.data import load_images
 
 # torch.compile has one cache for all processes of a user. It tells neither instruction sets apart,
 # whose kernels give wrong values on another, nor what the arguments of our backward ops are.
@@ -17,3 +20,17 @@ _SOURCES = hashlib.sha256(b"".join(path.read_bytes() for path in _OPS)).hexdiges
 _KIND = f"{torch.__version__}-{torch.backends.cpu.get_cpu_capability()}-{_SOURCES}"
 _FOLDER = Path(tempfile.gettempdir()) / f"univoxel-tests-inductor-{_USER}-{_KIND}"
 os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(_FOLDER))
+
+
+@pytest.fixture
+def read(monkeypatch):
+    """The names of photographs that were read from their files."""
+    names = []
+    original = load_images.read_photo
+
+    def noted(path, *rest):
+        names.append(path.name)
+        return original(path, *rest)
+
+    monkeypatch.setattr(load_images, "read_photo", noted)
+    return names

@@ -64,11 +64,11 @@ def field(n: int) -> dict:
     samples = Samples(t, connected, torch.arange(0, 8 * n + 1, 8))
     rays = {"origin": origin, "direction": direction, "samples": samples}
     place = {"grid_origin": ORIGIN, "voxel_size": H, "inv_s": 6.0}
-    return {"sdf": slanted(), "features": normal(*SHAPE, 3), **rays, **place}
+    return {"sdf": -slanted(), "features": normal(*SHAPE, 3), **rays, **place}  # they enter it
 
 
 def hashed_field_of_bricks(n: int) -> dict:
-    _, pool, bricks = cut(slanted(), far=0.8)
+    _, pool, bricks = cut(-slanted(), far=0.8)
     change = {"sdf": pool, "features": normal(2 * 64, 2), "bricks": bricks, "levels": LEVELS}
     return field(n) | change | {"min_share": 0.1}
 

@@ -2,7 +2,11 @@
 
 from functools import partial
 
+import pytest
+
+from univoxel.cli import trainer
 from univoxel.config import StageConfig, TrainConfig
+from univoxel.fields.grid import GridShape
 
 # On dense grids, with rates for few steps; no patches, and no physically based render unless asked
 plain_stage = partial(
@@ -25,3 +29,20 @@ plain_training = partial(
     carving_seconds=0.0,
     capacity="fixed",
 )
+
+
+def interrupt_second_stage(cfg: TrainConfig) -> list[GridShape]:
+    """Train by the first stage, and no further; the grids that it had."""
+    original, grids = trainer.run_stage, []
+
+    def run_stage(scene, *rest):
+        if grids:
+            raise KeyboardInterrupt
+        grids.append(scene.field.grid)
+        original(scene, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer, "run_stage", run_stage)
+        with pytest.raises(KeyboardInterrupt):
+            trainer.train(cfg)
+    return grids

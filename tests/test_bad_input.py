@@ -196,20 +196,6 @@ def test_checkpoints_that_contradict_themselves(run, refused, change, message):
     refused(rf"scene\.safetensors: .*{message}", "info", run)
 
 
-def test_an_environment_map_of_another_shape(run, data, tmp_path, refused):
-    square = tmp_path / "square.exr"
-    write_exr(square, {c: np.ones((8, 8), np.float32) for c in "RGB"})
-    refused(
-        r"square\.exr: .* twice as wide as high .* got \[8, 8, 3\]",
-        *("relight", run, "--envmap", square, "--out", tmp_path / "out"),
-    )
-    (data / "envmaps").mkdir()
-    square.rename(data / "envmaps" / "square.exr")
-    shutil.copytree(data / "test", data / "relight" / "square")
-    refused(r"square\.exr: .* twice as wide as high", "eval", run, "--save", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 @contextmanager
 def full_disk(room: int):
     """Files stop growing at `room` bytes: a write is cut there, the next one fails."""

@@ -713,11 +713,6 @@ def test_arguments_that_no_command_can_use(calls, capsys, argument, message):
     assert not calls.noted
 
 
-def test_version(capsys):
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out.startswith("univoxel 0.")
-
-
 @pytest.mark.parametrize("command", [*COMMANDS, *LABORATORY])
 def test_help_names_every_default(command, capsys):
     main([command, "--help"])

@@ -12,12 +12,6 @@ def test_all_bytes_survive_a_round_trip():
     assert torch.equal((back * 255).round().long(), byte)
 
 
-def test_linear_values_survive_a_round_trip():
-    x = torch.linspace(0, 1, 1001, dtype=torch.float64)
-    # The standard rounds its two thresholds, so the pieces miss each other by 3e-8.
-    torch.testing.assert_close(color.srgb_to_linear(color.linear_to_srgb(x)), x, atol=1e-7, rtol=0)
-
-
 def test_known_values():
     """IEC 61966-2-1: the linear piece, the middle grey of 8 bits, and white."""
     srgb = torch.tensor([0.02, 128 / 255, 1.0], dtype=torch.float64)

@@ -1,11 +1,7 @@
 """Lights and the ground as the command line writes them; the package's functions."""
 
-import subprocess
-import sys
-
 import pytest
 
-import univoxel
 from univoxel.cli.relight import parse_ground, point_light, sun_light
 
 
@@ -28,18 +24,3 @@ def test_ground():
     )
     with pytest.raises(ValueError, match="--ground: expected lowest or a height, got 'floor'"):
         parse_ground("floor")
-
-
-def test_the_package_has_the_work_and_stays_cheap():
-    code = "import sys, univoxel; dir(univoxel); assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
-    from univoxel import api
-    from univoxel.cli import evaluate, export, relight
-
-    assert univoxel.train is api.train
-    assert univoxel.evaluate is evaluate.evaluate
-    assert univoxel.export is export.export
-    assert univoxel.relight is relight.relight_images
-    assert "relight" in dir(univoxel)
-    with pytest.raises(AttributeError, match="no attribute 'relit'"):
-        univoxel.relit  # noqa: B018

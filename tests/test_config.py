@@ -19,7 +19,7 @@ from univoxel.config import (
     save_config,
 )
 from univoxel.core.choices import LIGHTS
-from univoxel.errors import MissingFile, UserError
+from univoxel.errors import UserError
 from univoxel.lights import EnvmapConfig, SGConfig
 from univoxel.presets import PRESETS, budget, chosen, preset, with_field, with_metal, work_in
 from univoxel.scene import SceneConfig
@@ -288,8 +288,3 @@ def test_a_file_that_is_no_configuration(tmp_path, text, message):
     with pytest.raises(UserError, match=f"config.json.*{re.escape(message)}|{message}") as caught:
         load_config(path)
     assert str(path) in str(caught.value)
-
-
-def test_a_configuration_that_is_not_there(tmp_path):
-    with pytest.raises(MissingFile, match="expected a configuration"):
-        load_config(tmp_path / "config.json")

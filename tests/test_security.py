@@ -143,15 +143,16 @@ def test_commands_open_no_connection(tmp_path):
     assert len(list((tmp_path / "lit").glob("*.png"))) == 2
 
 
-@pytest.mark.parametrize("places", ["{path}", "{path}:", ".:{path}", ":"], ids=repr)
+PROGRAM = "import sys, random, torch, univoxel.cli; print(sys.argv, univoxel.__file__)"
+
+
 @pytest.mark.parametrize(
-    "arguments",
+    ("arguments", "places"),
     [
-        ("-c", "import sys, random, torch, univoxel.cli; print(sys.argv, univoxel.__file__)", "a"),
-        ("-m", "univoxel.cli", "--version"),
-        ("-m", "univoxel.capture.sfm"),
+        *((("-c", PROGRAM, "a"), places) for places in ("{path}", "{path}:", ".:{path}", ":")),
+        (("-m", "univoxel.cli", "--version"), ".:{path}"),
+        (("-m", "univoxel.capture.sfm"), ":"),
     ],
-    ids=["program", "command", "step"],
 )
 def test_processes_run_nothing_of_the_working_folder(arguments, places, tmp_path):
     """Modules of a stranger's data, and a clone that is not built: none of them is imported."""

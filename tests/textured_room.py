@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image
 
 from univoxel.camera import Cameras
+from univoxel.data.photos import Photos
 
 RADIUS = 2.2  # of the orbit
 ROOM = 4.0  # half of its width; the floor is at z = 0
@@ -90,6 +92,15 @@ def photograph(
         Image.fromarray((255 * color + 0.5).astype(np.uint8)),
         Image.fromarray((255 * mask + 0.5).astype(np.uint8)),
     )
+
+
+def photos_of(views: list[View], folder: Path | None = None) -> Photos:
+    """Their photographs v0, v1, ... with the object's masks."""
+    color, masks = (
+        torch.from_numpy(np.stack(pictures))
+        for pictures in zip(*map(photograph, views), strict=True)
+    )
+    return Photos(folder, [f"v{i}" for i in range(len(views))], color, masks, cameras(views))
 
 
 def _band(

@@ -22,6 +22,13 @@ CHANGES = (
     *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
     *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
 )
+# The same of the two stages of a light of lobes
+OF_LOBES = (
+    *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),
+    *("stages.0.iterations=2", "stages.1.iterations=8", "stages.1.physical_from=0.0"),
+    *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
+    *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
+)
 OPTIONS = ["--no-page", *(f"--set={change}" for change in CHANGES)]
 
 

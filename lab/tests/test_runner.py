@@ -10,6 +10,7 @@ import threading
 import pytest
 from analytic import write_scene
 from filelock import FileLock
+from tiny import OF_LOBES as TINY
 
 from lab import runner, worker
 from lab.record import Setting, load_outcome
@@ -18,12 +19,6 @@ from univoxel.errors import DataError
 from univoxel.evaluation.measures import MEASURES
 from univoxel.scene import FILE
 
-TINY = (
-    *(f"stages.{i}.{field}" for i in (0, 1) for field in ("voxels=0.004", "rays=64")),
-    *("stages.0.iterations=2", "stages.1.iterations=8", "stages.1.physical_from=0.0"),
-    *("scene.material_channels=1", "scene.channels=2", "scene.hidden=4"),
-    *("scene.light.lobes=1", "scene.light.hidden=4", "scene.light.directions=8"),
-)
 # Its steps take seconds; draft's minute would cut them on a busy machine
 SMALL = Setting("small", "draft", "sg", minutes=30, changes=TINY)
 DIES = dataclasses.replace(SMALL, name="dies", changes=(*TINY, f"seed={10**30}"))

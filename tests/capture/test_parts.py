@@ -7,7 +7,6 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from univoxel.capture.config import CaptureConfig
 from univoxel.capture.model import (
     NO_POINT,
     TRACK,
@@ -25,7 +24,6 @@ from univoxel.capture.prepare import Capture, group, in_words, to_landscape
 from univoxel.capture.scene import gauge_aligned, own_sizes, points_back, to_camera_back
 from univoxel.capture.structure import choose, features_each, similarities
 from univoxel.data.lens import Lens
-from univoxel.errors import ConfigError
 
 
 def photo(name="a.jpg", width=40, height=30, camera="", focal=(0.0, 0.0)) -> Photograph:
@@ -241,11 +239,3 @@ def test_left_out_images_leave_no_trace():
     kept = set(two.points.number.tolist())
     for image in two.images:
         assert set(image.point.tolist()) <= kept | {NO_POINT}
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"size": 10}, {"first_octave": -2}, {"exhaustive": 1}, {"partners": 0}, {"seed": -1}]
-)
-def test_a_configuration_out_of_range_is_refused(wrong):
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
-        CaptureConfig(**wrong)

@@ -19,8 +19,8 @@ from PIL import Image
 
 import univoxel
 from univoxel.capture import model as database
-from univoxel.capture import pose_validation, sfm, structure
 from univoxel.capture import poses as poses_task
+from univoxel.capture import sfm, structure
 from univoxel.capture.config import CaptureConfig
 from univoxel.capture.photographs import find_photographs
 from univoxel.capture.poses import poses
@@ -433,28 +433,3 @@ def test_the_database_is_read_as_it_is_written(scene):
     for pair in pairs:
         for number, features in zip((pair.first, pair.second), pair.matches.T, strict=True):
             assert features.max() < len(places[number])
-
-
-def test_matches_of_right_places_fit_and_of_a_wrong_one_do_not(scene):
-    """The database's matches against the model as it was found, and with one picture turned."""
-    folders = Folders(scene[0] / "sfm")
-    model = structure.models(folders)[0]
-    features = database.positions(folders.database)
-
-    def shares(model):
-        found = pose_validation.partners(model, database.matches(folders.database), features)
-        return {
-            n: sum(p.fitting for p in those) / sum(p.matches for p in those)
-            for n, those in found.items()
-        }
-
-    assert min(shares(model).values()) > pose_validation.FITTING_SHARE
-    first = model.images[0]
-    angle = np.radians(3.0)
-    turn = np.array(
-        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    )
-    wrong = replace(first, to_camera=turn @ first.to_camera)
-    spoilt = shares(replace(model, images=[wrong, *model.images[1:]]))
-    assert spoilt[first.number] < pose_validation.CONTRADICTED_SHARE
-    assert min(share for n, share in spoilt.items() if n != first.number) > 0.8

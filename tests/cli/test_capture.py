@@ -501,10 +501,6 @@ def test_what_a_killed_writer_left_is_removed(steps, pictures, tmp_path, monkeyp
     assert not list(out.rglob("*.tmp"))
 
 
-def test_the_package_has_it():
-    assert univoxel.capture_object is task.capture
-
-
 def test_how_long_training_takes_is_said_before_cameras_are_found(
     tmp_path, photographs, monkeypatch, caplog
 ):

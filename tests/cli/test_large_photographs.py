@@ -22,17 +22,6 @@ def large(monkeypatch):
     monkeypatch.setattr(load_images, "FINE", 16)
 
 
-@pytest.fixture
-def read(monkeypatch):
-    """Counts the photographs that are read from their files."""
-    files = []
-    original = load_images.read_photo
-    monkeypatch.setattr(
-        load_images, "read_photo", lambda p, *rest: files.append(p) or original(p, *rest)
-    )
-    return files
-
-
 def config(tmp_path, **changes):
     light = SGConfig(lobes=2, hidden=8, directions=16, directions_eval=16)
     stage = plain_stage(voxels=0.008, iterations=10, share=1.0, rays=64, physical_from=0.5)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from analytic import LIGHTS, RADIUS, cameras_around, write_scene
-from plain import plain_stage, plain_training
+from plain import interrupt_second_stage, plain_stage, plain_training
 
 from lab.stress.damage import turned
 from univoxel.camera import project
@@ -101,17 +101,7 @@ def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):
     """From a checkpoint after the first stage: the box and the cameras are as they were."""
     monkeypatch.setattr(pose_refinement, "STEPS", 10)
     cfg = config(data, tmp_path / "run", cameras="refined")
-    original, stages = task.run_stage, []
-
-    def killed(scene, cfg, stage, *rest):
-        if stages:
-            raise KeyboardInterrupt
-        stages.append(scene.field.grid)
-        original(scene, cfg, stage, *rest)
-
-    monkeypatch.setattr(task, "run_stage", killed)
-    with pytest.raises(KeyboardInterrupt):
-        train(cfg)
+    interrupt_second_stage(cfg)
     before = load_scene(cfg.out).poses.steps
     seen = []
     monkeypatch.setattr(task, "run_stage", lambda scene, *_: seen.append(scene.field.grid))
@@ -141,10 +131,3 @@ def test_trust_looks_from_where_the_cameras_are(data, run):
     there, before = survey(scene, moved, 200), survey(scene, photos, 200)
     torch.testing.assert_close(refined.disagreement, there.disagreement)
     assert (before.disagreement - there.disagreement).abs().mean() > 1e-3
-
-
-def test_other_photographs_are_refused(data, run):
-    photos = load_photos(data, "train")
-    fewer = replace(photos.cameras, camera_to_world=photos.cameras.camera_to_world[:5])
-    with pytest.raises(ValueError, match="trained on 12 photographs with refined cameras, got 5"):
-        load_scene(run).registered(replace(photos, cameras=fewer))

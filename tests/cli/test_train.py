@@ -8,7 +8,7 @@ import pytest
 import torch
 from analytic import LIGHTS, RADIUS, photos_of, sphere_scene, write_scene
 from layouts import Scene, write_colmap
-from plain import plain_stage, plain_training
+from plain import interrupt_second_stage, plain_stage, plain_training
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
@@ -28,8 +28,6 @@ from univoxel.run import load_verdict
 from univoxel.run import photos_of as photos_of_run
 from univoxel.scene import FILE, SceneConfig, load_scene
 from univoxel.training import clock, descent, loop
-from univoxel.training import pixels as pixels_module
-from univoxel.training.loop import batch_at
 from univoxel.training.pixels import split_pixels
 
 
@@ -187,8 +185,8 @@ def test_a_gradient_spreads_over_the_nodes_that_it_touches():
 
 
 def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, caplog):
-    caplog.set_level("INFO", "univoxel")
     """The sphere, 40 times as large, far away and upside down, from half of the pixels."""
+    caplog.set_level("INFO", "univoxel")
     scale, centre = 40.0, torch.tensor([100.0, -50.0, 30.0])
     photos = photos_of(16, 64)
     poses = torch.eye(4).repeat(16, 1, 1)
@@ -260,21 +258,11 @@ def test_time_ends_a_run_with_a_usable_result(data, tmp_path):
 
 def test_resume_goes_on_where_it_stopped(data, tmp_path, monkeypatch):
     cfg = config(data, tmp_path / "run")
-    original, seen = task.run_stage, []
-
-    def killed(scene, cfg, stage, *rest):
-        if len(seen):
-            raise KeyboardInterrupt
-        seen.append(stage)
-        original(scene, cfg, stage, *rest)
-
-    monkeypatch.setattr(task, "run_stage", killed)
-    with pytest.raises(KeyboardInterrupt):
-        train(cfg)
-    first = load_scene(cfg.out)
+    interrupt_second_stage(cfg)
+    first, seen = load_scene(cfg.out), []
     monkeypatch.setattr(task, "run_stage", lambda scene, cfg, stage, *rest: seen.append(stage))
     train(cfg, resume=True)
-    assert seen == list(cfg.stages)
+    assert seen == list(cfg.stages[1:])
     assert load_scene(cfg.out).field.grid != first.field.grid  # the second stage's resolution
 
 
@@ -291,19 +279,9 @@ def test_what_is_pinned_is_so_on_the_grid_of_every_stage_and_after_a_kill(
     first, second = Pinned(), Pinned()
     monkeypatch.setattr(preparation, "find_pinned", lambda *_: first)
     cfg = config(data, tmp_path / "run", carving_seconds=0.0)
-    original = task.run_stage
-
-    def killed(scene, cfg, stage, *rest):
-        if stage.physical_from == 0.0:
-            raise KeyboardInterrupt
-        original(scene, cfg, stage, *rest)
-
-    monkeypatch.setattr(task, "run_stage", killed)
-    with pytest.raises(KeyboardInterrupt):
-        train(cfg)
+    interrupt_second_stage(cfg)
     coarse, fine = first.grids
     assert coarse < fine
-    monkeypatch.setattr(task, "run_stage", original)
     monkeypatch.setattr(preparation, "find_pinned", lambda *_: second)
     train(cfg, resume=True)
     assert second.grids == [fine]
@@ -326,16 +304,6 @@ def test_a_run_is_not_overwritten(run, data):
         train(config(data, run))
 
 
-def test_held_out_pixels_are_not_trained_on(data):
-    photos = load_photos(data, "train")
-    split = split_pixels(photos, torch.where(photos.coverage() > 0, -1.0, 99.0))
-    pixels, held = split.trained, split.held_out
-    both = torch.cat([pixels, held])
-    assert len(both.unique(dim=0)) == len(both)
-    batch = batch_at(photos, held)
-    assert (batch.alpha == 1).all()
-
-
 def test_so_few_pixels_that_none_is_spared():
     distance = torch.full((1, 30, 30), 99.0)
     distance[0, 3, 4:8] = -1.0
@@ -343,17 +311,6 @@ def test_so_few_pixels_that_none_is_spared():
     pixels, held = split.trained, split.held_out
     assert len(pixels) == 4
     assert torch.equal(pixels, held)
-
-
-def test_pixels_are_those_in_and_near_silhouettes():
-    """Each once, a view without any too."""
-    distance = 30 * torch.randn(4, 9, 9, generator=torch.Generator().manual_seed(0))
-    distance[1] = torch.inf
-    split = split_pixels(photos_of(4, 9), distance)
-    found = torch.cat([split.trained, split.held_out])
-    assert found.dtype == torch.int32  # photographs have many
-    wanted = (distance < pixels_module.MARGIN).nonzero().tolist()
-    assert sorted(found.tolist()) == wanted
 
 
 def test_a_training_says_how_it_came_out(data, tmp_path, caplog):

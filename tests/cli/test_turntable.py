@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from analytic import cameras_around, scene_of, sphere_scene
+from analytic import cameras_around, hull_of, scene_of, sphere_scene
 from observed_points import (
     BLUE,
     RED,
@@ -20,11 +20,10 @@ from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.config import JointConfig
 from univoxel.core.records import Surface
 from univoxel.errors import ConfigError, DataError
-from univoxel.fields.grid import fit_grid
 from univoxel.lights import EnvmapConfig
 from univoxel.lights.views import Table, Turntable, resampling, rotated
 from univoxel.preparation import light_frame
-from univoxel.preparation.hull import estimate_bounds, mask_distances, observe_hull, visual_hull
+from univoxel.preparation.hull import observe_hull
 from univoxel.preparation.light_frame import LightFrame, explained, light_frame_of
 from univoxel.render.observations import TurnedMaps, shade_observations, turned_maps
 from univoxel.render.pipeline import extract_mesh, radiance_of, shade
@@ -61,12 +60,6 @@ def photographs():
         "still": photographs_under(lamps(NODES), 0.3, VIEWS),
         "turning": photographs_under(turned_lamps(), 0.3, VIEWS),
     }
-
-
-def hull_of(photos):
-    distance = mask_distances(photos.coverage())
-    grid = fit_grid(*estimate_bounds(distance, photos.cameras), 20000)
-    return visual_hull(distance, photos.cameras, grid), grid
 
 
 @pytest.mark.parametrize("light", ["still", "turning"])

@@ -8,7 +8,6 @@ import torch
 from univoxel.camera import Cameras
 from univoxel.color import srgb_to_linear
 from univoxel.data import Photos
-from univoxel.data.photos import decode
 
 
 def photos(color, alpha):
@@ -41,12 +40,6 @@ def test_floats_are_linear_already(stored):
     assert torch.equal(linear.picture(0)[0], color[0])
     assert torch.equal(linear.picture(0)[1], alpha[0])
     assert torch.equal(linear.coverage(), alpha)
-
-
-def test_linear_colour_with_a_mask_of_bytes(stored):
-    color, alpha = decode(torch.rand(3, 4, 3), stored.alpha[0])
-    assert color.dtype == alpha.dtype == torch.float32
-    assert alpha.max() <= 1
 
 
 def test_single_pixels_are_those_of_the_picture(stored):

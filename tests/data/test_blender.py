@@ -69,14 +69,6 @@ def test_photos_and_cameras(scene):
     torch.testing.assert_close(cameras.camera_to_world[1], torch.tensor(pose(1))[:3])
 
 
-def test_pictures_are_decoded(scene):
-    color, alpha = load_photos(scene).picture(0)
-    stored = rgba(0)[1, 2] / 255
-    expected = [((v + 0.055) / 1.055) ** 2.4 if v > 0.04045 else v / 12.92 for v in stored[:3]]
-    assert color[1, 2].tolist() == pytest.approx(expected, rel=1e-5)
-    assert float(alpha[1, 2]) == pytest.approx(stored[3])
-
-
 def test_names_with_extension_and_with_dots(scene):
     (scene / "train" / "r_1.png").rename(scene / "train" / "r_1.5.png")
 
@@ -200,12 +192,6 @@ def text(content):
     return lambda folder: (folder / "transforms_train.json").write_bytes(content)
 
 
-def nan_exr(folder):
-    without(folder, "train/r_1.png")
-    plane = np.full((HEIGHT, WIDTH), np.nan, np.float32)
-    write_exr(folder / "train" / "r_1.exr", dict.fromkeys("RGBA", plane), half=False)
-
-
 def mixed(folder):
     without(folder, "train/r_1.png")
     plane = np.ones((HEIGHT, WIDTH), np.float32)
@@ -241,7 +227,6 @@ BROKEN = {
         r"expected photographs .*, got train \(looked for transforms_train\.json, ",
     ),
     "broken JSON": (text(b'{\n"frames": [,]\n}'), "broken JSON in line 2, column 12"),
-    "cut JSON": (text(b'{"frames": ['), "broken JSON in line 1"),
     "not UTF-8": (text(b'{"frames": "\xff\xfe"}'), "expected text in UTF-8"),
     "a list": (text(b"[1, 2]"), r"expected a JSON object, got \[1, 2\]"),
     "no frames": (root(frames=[]), r"expected a list of frames, got \[\]"),
@@ -272,23 +257,13 @@ BROKEN = {
     "no alpha": (opaque, r"r_1\.png: expected an alpha channel or a mask r_1_mask\.png"),
     "grey": (gray, r"r_1\.png: expected a picture with 3 or 4 channels, got 1"),
     "mask of another size": (small_mask, r"r_1_mask\.png: expected 6x4 pixels, got 2x2"),
-    "NaN": (nan_exr, r"r_1\.exr: NaN or infinity at row 0, column 0"),
     "formats mixed": (mixed, r"r_1\.exr: expected the format of r_0"),
-    "broken picture": (
-        lambda f: (f / "train" / "r_1.png").write_bytes(b"no picture"),
-        r"r_1\.png: expected a PNG or JPEG",
-    ),
-    "empty picture": (
-        lambda f: (f / "train" / "r_1.png").write_bytes(b""),
-        r"r_1\.png: the file is empty",
-    ),
     "no matrix": (
         matrix(lambda m: None),
         "frame 0: expected a finite 4x4 transform_matrix, got None",
     ),
     "small matrix": (matrix(lambda m: m[:2]), "frame 0: expected a finite 4x4"),
     "ragged matrix": (matrix(lambda m: [[1.0], [1.0, 2.0]]), "frame 0: expected a finite 4x4"),
-    "words in the matrix": (matrix(lambda m: [["a"] * 4] * 4), "frame 0: expected a finite 4x4"),
     "NaN in the matrix": (matrix(lambda m: m * np.nan), "frame 0: expected a finite 4x4"),
     "singular matrix": (
         matrix(lambda m: m * [0, 1, 1, 1]),
@@ -310,8 +285,6 @@ BROKEN = {
         "frame 0: expected camera_angle_x between 0 and 3.142, got nothing",
     ),
     "angle in degrees": (root(camera_angle_x=40.0), "camera_angle_x between 0 and 3.142, got 40.0"),
-    "angle of zero": (root(camera_angle_x=0), "camera_angle_x .* got 0"),
-    "angle in words": (root(camera_angle_x="wide"), "camera_angle_x .* got 'wide'"),
     "angle of NaN": (root(camera_angle_x=math.nan), "camera_angle_x .* got nan"),
     "angle of truth": (root(camera_angle_x=True), "camera_angle_x .* got True"),
     "focal length": (root(fl_x=-5.0), "expected fl_x between 0 and inf, got -5.0"),

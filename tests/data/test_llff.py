@@ -2,16 +2,10 @@
 
 import numpy as np
 import pytest
-from layouts import FOCAL, refused, scene, write_llff
+from layouts import refused, scene, write_llff
 
 from univoxel.data import load_photos
 from univoxel.data.images import write_png
-
-
-def test_rows_may_describe_larger_originals(tmp_path):
-    photos = load_photos(write_llff(tmp_path, scene(), original=4, place="images_4"))
-    assert photos.cameras.focal.unique().tolist() == [FOCAL]
-    assert (photos.cameras.width, photos.cameras.height) == (12, 8)
 
 
 def test_the_largest_photographs_are_read(tmp_path):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from layouts import FOCAL, HEIGHT, WIDTH, Scene, scene, write_colmap, write_nerf, write_nerfstudio
+from layouts import HEIGHT, WIDTH, Scene, scene, write_colmap, write_nerf, write_nerfstudio
 
 from univoxel.camera import project
 from univoxel.color import linear_to_srgb, srgb_to_linear
@@ -43,12 +43,6 @@ def test_downscale(tmp_path, writer):
         other, there = project(whole.cameras, view, point)
         torch.testing.assert_close(2 * pixel, other)
         torch.testing.assert_close(depth, there)
-
-
-def test_downscale_of_one_leaves_every_bit(tmp_path):
-    written = scene()
-    photos = load_photos(write_nerf(tmp_path, written), "test", downscale=1)
-    assert np.array_equal(photos.color.numpy(), written.pictures[[0, 8], ..., :3])
 
 
 def test_linear_photographs_stay_linear(tmp_path):
@@ -156,8 +150,3 @@ def test_splits(tmp_path, files, splits):
     for file in files:
         (tmp_path / file).write_text("{}")
     assert splits_of(tmp_path) == splits
-
-
-def test_focal_lengths_are_divided(tmp_path):
-    cameras = load_photos(write_nerf(tmp_path, scene()), downscale=4).cameras
-    torch.testing.assert_close(cameras.focal, torch.full((8, 2), FOCAL / 4))

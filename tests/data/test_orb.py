@@ -122,15 +122,6 @@ def test_one_line_for_what_is_broken(tmp_path, place, array, message):
         load_truth(load_photos(folder, "test"), 0)
 
 
-def test_an_array_that_is_none(tmp_path):
-    folder = write_orb(tmp_path)
-    save(folder, "z_depth/0000.npy", np.ones((8, 12)))
-    path = tmp_path / "ground_truth" / folder.name / "z_depth" / "0000.npy"
-    path.write_bytes(b"no array")
-    with pytest.raises(DataError, match=r"0000\.npy: expected an array of NumPy, could not read"):
-        load_truth(load_photos(folder, "test"), 0)
-
-
 def test_splits_of_the_colmap_layout(tmp_path):
     """llff_colmap_HDR: names in the model end in .png, the pictures in .exr."""
     write_colmap(tmp_path, scene())

@@ -127,20 +127,6 @@ def test_masks_of_16_bits_may_come_later(tmp_path):
     torch.testing.assert_close(after.alpha[3], torch.from_numpy(alpha), atol=2e-5, rtol=0)
 
 
-@pytest.fixture
-def read(monkeypatch):
-    """Counts the photographs that are read from their files."""
-    files = []
-    original = load_images.read_photo
-
-    def counted(path, *rest):
-        files.append(path.name)
-        return original(path, *rest)
-
-    monkeypatch.setattr(load_images, "read_photo", counted)
-    return files
-
-
 def load_kept(data, file, **options):
     photos = load_photos(data, kept=file, **options)
     keep_photos(photos, file)

@@ -80,15 +80,6 @@ def test_broken_truth(tmp_path, change, message):
         load_truth(photos(tmp_path), 0)
 
 
-@pytest.mark.parametrize("keep", [0.0, 0.1, 0.9])
-def test_truncated_truth(tmp_path, keep):
-    path = save_truth(tmp_path)
-    content = path.read_bytes()
-    path.write_bytes(content[: int(keep * len(content))])
-    with pytest.raises(DataError, match=r"r_0\.npz: expected an npz file"):
-        load_truth(photos(tmp_path), 0)
-
-
 def test_relit_views(tmp_path):
     assert relight_maps(tmp_path) == {}
     (tmp_path / "envmaps").mkdir()

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from analytic import cameras_around, sphere_scene
+from analytic import cameras_around, hull_of, sphere_scene
 from observed_points import (
     lamps,
     no_metal,
@@ -20,11 +20,10 @@ from univoxel.color import linear_to_srgb_unclipped
 from univoxel.config import JointConfig
 from univoxel.core.records import Surface
 from univoxel.evaluation import confidence
-from univoxel.fields.grid import fit_grid
 from univoxel.lights.views import Flash
 from univoxel.optim import parameters_of
 from univoxel.preparation import light_frame
-from univoxel.preparation.hull import estimate_bounds, mask_distances, observe_hull, visual_hull
+from univoxel.preparation.hull import observe_hull
 from univoxel.preparation.light_frame import LightFrame, explained_by_flash, light_frame_of
 from univoxel.render.observations import (
     has_one_light,
@@ -152,12 +151,6 @@ def photographs():
         name: photographs_under(0.5 * lamps(128), 0.3, VIEWS, flash=lamp)
         for name, lamp in (("room", None), ("flash", flash))
     }
-
-
-def hull_of(photos):
-    distance = mask_distances(photos.coverage())
-    grid = fit_grid(*estimate_bounds(distance, photos.cameras), 20000)
-    return visual_hull(distance, photos.cameras, grid), grid
 
 
 def test_photographs_tell_of_a_flash(photographs, caplog):

@@ -28,14 +28,6 @@ def test_native_equals_reference():
     check_op(composite, composite_reference, cases, custom_op=None)
 
 
-def test_many_rays_cross_the_chunks():
-    alpha, value, offsets = rays([3] * 1000)
-    out, weight = composite(alpha, value, offsets)
-    expected, expected_weight = composite_reference(alpha, value, offsets)
-    torch.testing.assert_close(out, expected)
-    torch.testing.assert_close(weight, expected_weight)
-
-
 def test_weights_and_transmittance_sum_to_one():
     alpha, value, offsets = rays([6, 4])
     _, weight = composite(alpha, value, offsets)

@@ -8,7 +8,7 @@ import math
 
 import pytest
 import torch
-from extremes import REACH, WILD, channels, few, pick, run, same, seeds
+from extremes import REACH, WILD, channels, few, pick, same, seeds
 from hypothesis import given
 from hypothesis import strategies as st
 from op_cases import CASES, LEAVES, doubled, flat, fresh, function
@@ -118,33 +118,6 @@ def test_what_is_no_number_stays_in_its_row(case, seed, row):
 
 
 # --- sample_dense
-
-
-def lattice(seed, shape, n_channels, n_points):
-    g = torch.Generator().manual_seed(seed)
-    sdf, features = pick(g, WILD, *shape), pick(g, WILD, *shape, n_channels)
-    points = pick(g, (*WILD, math.inf, -math.inf, 2.0, 3.0), n_points, 3)
-    return sdf.requires_grad_(), features.requires_grad_(), points.requires_grad_()
-
-
-@few
-@given(seeds, st.integers(0, 29), st.integers(0, 2), st.booleans())
-def test_sample_dense_keeps_nan_at_its_point(seed, lost, axis, sparse):
-    def op(sdf, features, points):
-        return ops.sample_dense(sdf, features, points, (0.0, 0.0, 0.0), 1.0, sparse_grad=sparse)
-
-    sdf, features, points = lattice(seed, (9, 3, 12), 3, 30)
-    kept = torch.arange(30) != lost
-    without = run(op, (sdf, features, points.detach()[kept].requires_grad_()))
-    with torch.no_grad():
-        points[lost, axis] = math.nan
-    found = run(op, (sdf, features, points))
-    for i in (0, 1, 2, 5):  # value, gradient, feature, gradient to the points
-        assert same(found[i][kept], without[i])
-    assert found[0][lost].isnan()
-    # Its gradient reaches no node: the grid's are what the other points alone give.
-    assert same(found[3], without[3])
-    assert same(found[4], without[4])
 
 
 @few

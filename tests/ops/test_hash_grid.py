@@ -36,25 +36,6 @@ def test_native_equals_reference():
     )
 
 
-def test_many_points_and_levels():
-    # Several chunks and a team of threads. Gradcheck would take minutes.
-    arguments = case((0.5, 0.2, 0.1, 0.03), rows=256, m=5000)
-    torch.testing.assert_close(encode_hash(*arguments), encode_hash_reference(*arguments))
-    with use_backend("reference"):
-        wanted = grads_of(encode_hash, arguments)
-    threads = torch.get_num_threads()
-    for sparse in (False, True):
-        got = []
-        for n in (1, 2, 3):
-            torch.set_num_threads(n)
-            got.append([g.to_dense() for g in grads_of(encode_hash, arguments, sparse_grad=sparse)])
-        torch.set_num_threads(threads)
-        for a, b, c, d in zip(*got, wanted, strict=True):
-            torch.testing.assert_close(a, d)
-            assert torch.equal(a, b)
-            assert torch.equal(a, c)
-
-
 def test_a_level_that_fits_is_a_dense_grid():
     """Its value is torch's own trilinear lookup, clamped to the border."""
     h, rows = 0.25, 512

@@ -135,10 +135,6 @@ def test_calls_that_go_on_make_one_sequence():
         (lambda: Sun((0, 0, 1), (1, 1, 1), 180.0), r"angle must be in \[0, 180\) degrees"),
         (lambda: PointLight((0, math.nan, 0), (1, 1, 1)), "point light: position must be finite"),
         (lambda: PointLight((0, 0, 0), (math.inf, 1, 1)), "point light: intensity must be finite"),
-        (lambda: lit(UP, UP, first=-1), "first must be at least 0, got -1"),
-        (lambda: lit(UP, UP, first=2**31), r"first \+ samples must be at most 2\^31"),
-        (lambda: lit(UP, UP, f0=torch.zeros(2, 3)), r"f0 must be \[N, 3\]"),
-        (lambda: lit(UP, UP, bounces=1, mesh_f0=torch.zeros(2, 3)), r"mesh_f0 must be \[P, 3\]"),
     ],
 )
 def test_bad_lights(make, message):

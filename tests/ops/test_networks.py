@@ -16,11 +16,6 @@ def test_layers_end_linear():
     assert net(torch.randn(3, 5)).shape == (3, 2)
 
 
-def test_one_layer_is_linear():
-    net, x = MLP([3, 2]), torch.randn(4, 3)
-    torch.testing.assert_close(net(x), net.linear[0](x))
-
-
 @pytest.mark.parametrize("rows", [0, 50, FEWEST_ROWS])
 @pytest.mark.parametrize("backend", ["auto", "reference"])
 def test_equals_its_layers_one_by_one(backend, rows):

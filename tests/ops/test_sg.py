@@ -2,11 +2,10 @@
 
 import math
 
-import pytest
 import torch
 from check_op import check_op
 
-from univoxel import brdf, sphere
+from univoxel import sphere
 from univoxel.ops import shade_sg, shade_sg_reference
 
 # Above check_op's common bound: a few hundred directions through exp of -60 .. 0, whose argument is
@@ -72,48 +71,6 @@ def test_metals_native_equals_reference():
     check_op(shade_sg, shade_sg_reference, [*cases, tuple(behind)], rtol=RTOL)
 
 
-def test_f0_of_equal_channels_is_a_number():
-    case = points(3, 4, 37, f0=0.3)
-    f0 = torch.full((3, 3), 0.3, dtype=torch.float64)
-    torch.testing.assert_close(shade_sg(*case[:9], f0), shade_sg(*case), rtol=1e-12, atol=0)
-
-
-def test_eye_behind_the_surface_and_light_below():
-    case = list(points(3, 2, 20))
-    case[4] = -case[4].detach()
-    case[4].requires_grad_()
-    case[7] = sphere.fibonacci_sphere(20, torch.float64)
-    check_op(shade_sg, shade_sg_reference, [tuple(case)], rtol=RTOL)
-
-
-def test_many_points_cross_the_chunks():
-    case = points(300, 3, 16)
-    torch.testing.assert_close(shade_sg(*case), shade_sg_reference(*case))
-
-
-def test_white_furnace():
-    """Sharpness 0 is the same light from everywhere: white under it shows its radiance."""
-    case = list(points(5, 1, 4096, roughness=(0.5, 1.0)))
-    case[1], case[2] = torch.zeros(5, 1).double(), torch.full((5, 1, 3), 0.7).double()
-    case[4] = case[3]  # seen from above, where 4096 directions resolve the highlight
-    case[5] = torch.ones(5, 3).double()
-    # 0.006: the fit of the layer's albedo is good to 0.005
-    torch.testing.assert_close(
-        shade_sg(*case), torch.full((5, 3), 0.7).double(), rtol=0.006, atol=0
-    )
-
-
-def test_white_metal_furnace():
-    """A white metal under the same light from everywhere shows E of F0 = 1, and no base."""
-    case = list(points(5, 1, 4096, roughness=(0.5, 1.0)))
-    case[1], case[2] = torch.zeros(5, 1).double(), torch.ones(5, 1, 3).double()
-    case[4] = case[3]  # seen from above, where 4096 directions resolve the highlight
-    case[5], case[9] = torch.zeros(5, 3).double(), torch.ones(5, 3).double()
-    wanted = brdf.specular_albedo(torch.ones(5).double(), case[6], 1.0)[:, None].expand(5, 3)
-    # 0.006: the fit of the layer's albedo is good to 0.005
-    torch.testing.assert_close(shade_sg(*case), wanted, rtol=0, atol=0.006)
-
-
 def test_diffuse_under_a_wide_lobe():
     """Without a layer, a lobe on the normal has a closed form: int exp(s (z - 1)) z 2 pi dz."""
     case = list(points(1, 1, 4096, f0=0.0))
@@ -142,20 +99,3 @@ def test_exponential_is_accurate():
     # 2 ulp for the power of two, half an ulp for each of the few products around it; and sharpness
     # times log2 e is rounded, which is as if sharpness were off by less than an ulp.
     assert bool((relative.abs() < 4 * 2**-23 + 2 * s.double() * 2**-23).all())
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_extremes_are_finite(dtype):
-    case = list(points(6, 4, 32, roughness=(0.0, 0.04)))
-    with torch.no_grad():
-        case[1][0], case[1][1], case[6][:2] = 0, 1e6, 0
-        case[3][2], case[4][3] = 0, -case[3][3]  # no normal; eye opposite the normal
-        case[0][4] = 0
-    case = [
-        t.detach().to(dtype).requires_grad_(t.requires_grad) if isinstance(t, torch.Tensor) else t
-        for t in case
-    ]
-    for op in (shade_sg, shade_sg_reference):
-        rgb = op(*case)
-        for t in (rgb, *torch.autograd.grad(rgb.sum(), case[:7])):
-            assert bool(t.isfinite().all())

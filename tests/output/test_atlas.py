@@ -66,7 +66,7 @@ from univoxel.core.records import Mesh
 from univoxel.ops.charts import unwrap
 faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 mesh = Mesh(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), faces)
-for _ in range(3000):
+for _ in range(2000):
     unwrap(mesh, 64)
 """
 

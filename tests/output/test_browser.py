@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from asymmetric_scene import Metals, lamp, lopsided
+from asymmetric_scene import lamp, with_metal
 from browser import browser, installed, pixels
 
 from univoxel.camera import Cameras
@@ -54,9 +54,7 @@ def seen_by(camera):
 
 @pytest.fixture(scope="module")
 def scene():
-    scene = lopsided()
-    scene.material = Metals()
-    scene.inv_s = 600.0  # silhouettes as sharp as after a training
+    scene = with_metal()
     scene.sky = None  # as with --light sg: a run without a map
     return scene
 

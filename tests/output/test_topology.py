@@ -95,13 +95,6 @@ def test_holes_are_closed():
     assert read(closed).volume == pytest.approx(ball.volume - 0.25, abs=0.05)
 
 
-def test_a_surface_cut_by_the_box_is_closed():
-    scene = lopsided(change=lambda nodes, sdf: nodes.norm(dim=-1) - 0.55)  # beyond -0.5
-    mesh = clean(Mesh(*scene.field.isosurface()))
-    assert open_edges(mesh) > 0
-    assert read(close(mesh)).is_watertight
-
-
 def test_what_cannot_be_closed_is_reported():
     wing = Mesh(torch.cat([CORNERS, CORNERS[1:2] + 1]), torch.tensor([[0, 1, 4]]).int())
     three = joined(Mesh(CORNERS, TETRAHEDRON), wing)

@@ -5,15 +5,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from analytic import RADIUS, photos_of
+from analytic import RADIUS, hull_of, photos_of
 from torch.nn.functional import normalize
 
 from univoxel.camera import image_rays
 from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.core.choices import Varying
-from univoxel.fields.grid import fit_grid
 from univoxel.preparation import prepare as task
-from univoxel.preparation.hull import estimate_bounds, mask_distances, visual_hull
 from univoxel.preparation.prepare import exposures_of, varying_and_gains
 
 VIEWS = 16
@@ -28,9 +26,7 @@ def photos():
 
 @pytest.fixture(scope="module")
 def hull(photos):
-    distance = mask_distances(photos.coverage())
-    grid = fit_grid(*estimate_bounds(distance, photos.cameras), 20000)
-    return visual_hull(distance, photos.cameras, grid), grid
+    return hull_of(photos)
 
 
 def stops(most: float) -> torch.Tensor:
@@ -84,12 +80,9 @@ def test_clipped_pixels_tell_no_gain(photos, hull):
 def test_photographs_that_share_few_points():
     """Five around a ball: each point is seen in one or two."""
     photos = photos_of(5, 32)
-    distance = mask_distances(photos.coverage())
-    grid = fit_grid(*estimate_bounds(distance, photos.cameras), 20000)
     wanted = torch.tensor([1.0, -0.5, 0.8, -1.2, -0.1])
     color = photos.color / 4 * 2 ** wanted[:, None, None, None]
-    hull = visual_hull(distance, photos.cameras, grid)
-    found = exposures_of(replace(photos, color=color), hull, grid).log_gain / math.log(2)
+    found = exposures_of(replace(photos, color=color), *hull_of(photos)).log_gain / math.log(2)
     assert rms(found - wanted) < 0.03  # 0.008 here
 
 

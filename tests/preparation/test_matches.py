@@ -25,7 +25,6 @@ from univoxel.preparation.matches import (
     neighbours,
 )
 from univoxel.preparation.pose_refinement import choose_masks_or_poses, right
-from univoxel.training.pixels import MARGIN, split_pixels
 
 VIEWS, SIZE = 8, 200
 
@@ -205,14 +204,3 @@ def test_one_empty_place_in_masks_is_outvoted_or_refused(photos):
     assert found.box[1].min() > 0.9 * RADIUS
     with pytest.raises(UserError, match="share no volume"):
         choose_masks_or_poses(spoilt, distance, "auto", "given")
-
-
-def test_doubted_pixels_are_not_trained_on(photos, distance):
-    doubted = torch.zeros_like(distance, dtype=torch.bool)
-    doubted[2, : SIZE // 2] = True
-    split = split_pixels(photos, distance, doubted)
-    for pixels in (split.trained, split.held_out):
-        assert not doubted[tuple(pixels.unbind(1))].any()
-    whole = split_pixels(photos, distance)
-    left_out = len(whole.trained) + len(whole.held_out) - len(split.trained) - len(split.held_out)
-    assert left_out == ((distance < MARGIN) & doubted).sum()

@@ -11,7 +11,6 @@ from analytic import cameras_around
 from spoilt_masks import BESIDE, MISSING, iou, kept_table, lost_part, true_mask, without_depth
 
 from univoxel.capture.masks import grown, judge, voxel_pixels
-from univoxel.data.photos import Photos
 from univoxel.errors import UserError
 from univoxel.fields.grid import GridShape, fit_grid
 from univoxel.preparation import object_shape
@@ -94,13 +93,7 @@ def test_masks_that_show_nothing():
 @pytest.fixture(scope="module")
 def room():
     """Photographs of an object on a patterned floor, its masks, and depth maps."""
-    views = textured_room.orbit(30, 160, 120)
-    made = [textured_room.photograph(view, samples=2) for view in views]
-    color, masks = (
-        torch.from_numpy(np.stack([np.array(x) for x in xs])) for xs in zip(*made, strict=True)
-    )
-    names = [f"v{i}" for i in range(len(views))]
-    photos = Photos(None, names, color, masks, textured_room.cameras(views))
+    photos = textured_room.photos_of(textured_room.orbit(30, 160, 120))
     return photos, list(photos.coverage()), depth_maps(photos)
 
 

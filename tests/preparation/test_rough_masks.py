@@ -9,7 +9,7 @@ from analytic import RADIUS, photos_of
 
 from lab.stress.damage import turned
 from univoxel.data import Photos
-from univoxel.errors import DataError, UserError
+from univoxel.errors import DataError
 from univoxel.preparation import pose_refinement, prepare
 from univoxel.preparation.hull import hull_sdf, mask_distances
 from univoxel.preparation.pose_refinement import (
@@ -44,15 +44,19 @@ def on_the_ball(radius: float) -> torch.Tensor:
     return radius * points / points.norm(dim=1, keepdim=True)
 
 
-def test_a_part_that_a_mask_lacks_is_doubted_and_no_more_carved(photos):
+def test_a_part_that_a_mask_lacks_and_ground_that_one_keeps_are_doubted(photos):
+    """And what is lacked is carved no more."""
     spoilt = without_a_part(photos, (3,))
+    spoilt.alpha[5, -30:, 20:60] = 1
     distance = mask_distances(spoilt.alpha)
     found = doubt_masks(spoilt, distance, ROUGH)
     assert found.belief.votes == 1
     assert found.belief.off <= MAX_CONTRADICTION
     lost = (photos.alpha > 0.5) & (spoilt.alpha < 0.5)
+    kept = (photos.alpha < 0.5) & (spoilt.alpha > 0.5)
     assert found.pixels[lost].float().mean() > 0.9
-    assert found.pixels[~lost].float().mean() < 2e-3
+    assert found.pixels[kept].float().mean() > 0.9
+    assert found.pixels[~lost & ~kept].float().mean() < 2e-3
     held = hull_sdf(distance, photos.cameras, on_the_ball(RADIUS))
     exact = hull_sdf(mask_distances(photos.alpha), photos.cameras, on_the_ball(RADIUS))
     assert (held - exact).abs().quantile(0.99) < PIXEL
@@ -71,14 +75,6 @@ def test_what_two_masks_lack_together_comes_back(photos):
     )
     assert bitten.max() > 0.1 * RADIUS
     assert whole.max() < 0
-
-
-def test_ground_that_a_mask_keeps_is_doubted(photos):
-    alpha = photos.alpha.clone()
-    alpha[5, -30:, 20:60] = 1
-    found = doubt_masks(replace(photos, alpha=alpha), mask_distances(alpha), ROUGH)
-    kept = (alpha > 0.5) & (photos.alpha < 0.5)
-    assert found.pixels[kept].float().mean() > 0.9
 
 
 def test_what_all_masks_show_is_nowhere_doubted(photos):
@@ -121,12 +117,6 @@ def test_silhouettes_in_which_nothing_lies(photos, tmp_path):
     cfg = preset("fast", tmp_path / "data", tmp_path / "run")
     with pytest.raises(DataError, match=r"data: .*(share no volume|nothing in common)"):
         prepare.find_silhouettes(replace(photos, alpha=torch.zeros_like(photos.alpha)), cfg)
-
-
-def test_masks_that_show_nothing(photos):
-    empty = torch.zeros_like(photos.alpha)
-    with pytest.raises(UserError, match="nothing in common"):
-        doubt_masks(replace(photos, alpha=empty), mask_distances(empty), ROUGH)
 
 
 def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(

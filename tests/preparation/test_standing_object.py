@@ -7,7 +7,6 @@ import torch
 from spoilt_masks import iou, without_depth
 
 from univoxel.camera import image_rays, looked_at
-from univoxel.data.photos import Photos
 from univoxel.fields.grid import fit_grid
 from univoxel.preparation.object_shape import ROOM, box_corners, shrunk
 from univoxel.preparation.standing_object import (
@@ -24,13 +23,7 @@ from univoxel.preparation.stereo import depth_maps, reach
 @pytest.fixture(scope="module")
 def room():
     """Photographs of an object on a floor, in a room with furniture, and their depth maps."""
-    views = textured_room.orbit(30, 200, 150)
-    made = [textured_room.photograph(view) for view in views]
-    color, masks = (
-        torch.from_numpy(np.stack([np.array(x) for x in xs])) for xs in zip(*made, strict=True)
-    )
-    names = [f"v{i}" for i in range(len(views))]
-    photos = Photos(None, names, color, masks, textured_room.cameras(views))
+    photos = textured_room.photos_of(textured_room.orbit(30, 200, 150))
     return photos, depth_maps(photos)
 
 

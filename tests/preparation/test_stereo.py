@@ -1,6 +1,5 @@
 """Depth maps of a textured room whose distances are known."""
 
-import numpy as np
 import pytest
 import textured_room
 import torch
@@ -15,13 +14,7 @@ VIEWS, WIDTH, HEIGHT = 24, 160, 120
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     views = textured_room.orbit(VIEWS, WIDTH, HEIGHT)
-    made = [textured_room.photograph(view, samples=2) for view in views]
-    color, masks = (
-        torch.from_numpy(np.stack([np.array(x) for x in xs])) for xs in zip(*made, strict=True)
-    )
-    names = [f"v{i}" for i in range(VIEWS)]
-    folder = tmp_path_factory.mktemp("room")
-    return Photos(folder, names, color, masks, textured_room.cameras(views))
+    return textured_room.photos_of(views, tmp_path_factory.mktemp("room"))
 
 
 @pytest.fixture(scope="module")

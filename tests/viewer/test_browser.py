@@ -7,14 +7,12 @@ import time
 
 import numpy as np
 import pytest
-from asymmetric_scene import lopsided
+from asymmetric_scene import lopsided, subject_of
 from browser import browser, installed
 
 from univoxel.output.page import PageOptions
-from univoxel.render.relight import traced_mesh
 from univoxel.viewer import render_queue
 from univoxel.viewer.server import serving
-from univoxel.viewer.viewer_scene import Subject, mesh_of
 
 pytest.importorskip("viser")
 pytestmark = pytest.mark.skipif(
@@ -27,8 +25,7 @@ LEFT = (slice(100, 400), slice(100, 330))  # of the window, where nothing lies o
 @pytest.fixture(scope="module")
 def address():
     """Pictures at rest are small, and so soon done."""
-    scene = lopsided(24**3)
-    subject = Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size))
+    subject = subject_of(lopsided(24**3))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(render_queue, "REST_WIDTH", 320)
         with serving(subject, PageOptions(title="Balls"), port=0) as address:

@@ -6,24 +6,21 @@ from itertools import pairwise
 
 import pytest
 import torch
-from asymmetric_scene import lopsided
+from asymmetric_scene import lopsided, subject_of
 from PIL import Image
 
 from univoxel.camera import project
 from univoxel.envmap import EnvMap
 from univoxel.errors import MissingExtra
 from univoxel.output.viewpoints import lighting, orbit
-from univoxel.render.relight import traced_mesh
 from univoxel.viewer import render_queue as module
 from univoxel.viewer.frames import Look
 from univoxel.viewer.render_queue import film, kind, turned_about
-from univoxel.viewer.viewer_scene import Subject, mesh_of
 
 
 @pytest.fixture(scope="module")
 def subject():
-    scene = lopsided(24**3)
-    return Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size))
+    return subject_of(lopsided(24**3))
 
 
 @pytest.fixture

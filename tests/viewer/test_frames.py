@@ -10,7 +10,7 @@ from itertools import islice
 import asymmetric_scene
 import pytest
 import torch
-from asymmetric_scene import Metals, lopsided
+from asymmetric_scene import subject_of, with_metal
 
 from univoxel.camera import Cameras
 from univoxel.cli.relight import RelightOptions, relight_images
@@ -20,25 +20,21 @@ from univoxel.ops import Sun
 from univoxel.output import viewpoints
 from univoxel.render.metrics import psnr
 from univoxel.render.pipeline import surface_of_view
-from univoxel.render.relight import traced_mesh
 from univoxel.viewer import frames
 from univoxel.viewer.frames import LAYERS, Look, quick_picture, refined_pictures
-from univoxel.viewer.viewer_scene import Subject, mesh_of
+from univoxel.viewer.viewer_scene import mesh_of
 
 SIZE = 40
 
 
 @pytest.fixture(scope="module")
 def scene():
-    scene = lopsided()
-    scene.material = Metals()
-    scene.inv_s = 600.0  # silhouettes as sharp as after a training
-    return scene
+    return with_metal()
 
 
 @pytest.fixture(scope="module")
 def subject(scene):
-    return Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size))
+    return subject_of(scene)
 
 
 @pytest.fixture(scope="module")

@@ -4,20 +4,18 @@ import math
 
 import pytest
 import torch
-from asymmetric_scene import BALLS, lopsided
+from asymmetric_scene import BALLS, lopsided, subject_of
 
 from univoxel.camera import Cameras, pixel_rays
 from univoxel.core.records import Rays
 from univoxel.envmap import EnvMap, lookup
 from univoxel.ops import Sun
 from univoxel.output.viewpoints import lighting
-from univoxel.render.relight import relight_surface, traced_mesh
+from univoxel.render.relight import relight_surface
 from univoxel.sphere import latlong_directions, texel_solid_angles
 from univoxel.viewer.viewer_scene import (
-    Subject,
     incident_light,
     incident_picture,
-    mesh_of,
     mesh_surface,
     point_on_mesh,
 )
@@ -27,8 +25,7 @@ ROWS = 32
 
 @pytest.fixture(scope="module")
 def subject():
-    scene = lopsided()
-    return Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size))
+    return subject_of(lopsided())
 
 
 @pytest.fixture(scope="module")

@@ -11,27 +11,24 @@ from pathlib import Path
 
 import pytest
 import torch
-from asymmetric_scene import lopsided
+from asymmetric_scene import lopsided, subject_of
 
 from univoxel.data import Photos
 from univoxel.data.images import write_exr
 from univoxel.envmap import EnvMap
 from univoxel.errors import UserError
 from univoxel.output.viewpoints import lighting, orbit
-from univoxel.render.relight import traced_mesh
 from univoxel.viewer.frames import Look
 from univoxel.viewer.render_queue import Studio, Viewer
 from univoxel.viewer.server import camera_of, laid_over, light_of_bytes, pose_for_viser, serving
 from univoxel.viewer.training import same_site
-from univoxel.viewer.viewer_scene import Subject, mesh_of
 
 PATIENCE = 120.0  # seconds, on a loaded machine
 
 
 @pytest.fixture(scope="module")
 def subject():
-    scene = lopsided(24**3)
-    return Subject(scene, traced_mesh(mesh_of(scene), scene.field.voxel_size))
+    return subject_of(lopsided(24**3))
 
 
 @pytest.fixture(scope="module")
@@ -219,15 +216,13 @@ def test_a_socket_of_another_site_is_closed(subject):
 
 SCRIPT = """
 import logging, sys
-from asymmetric_scene import lopsided
-from univoxel.render.relight import traced_mesh
+from asymmetric_scene import lopsided, subject_of
 from univoxel.cli.view import command
 from univoxel.viewer import viewer_scene
 
 logging.basicConfig(level=logging.INFO, stream=sys.stderr)
-scene = lopsided(24**3)
-traced = traced_mesh(viewer_scene.mesh_of(scene), scene.field.voxel_size)
-viewer_scene.subject_of = lambda run: viewer_scene.Subject(scene, traced)
+subject = subject_of(lopsided(24**3))
+viewer_scene.subject_of = lambda run: subject
 command("run", port=0)
 """
 
