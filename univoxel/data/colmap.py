@@ -16,12 +16,11 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from univoxel.data.conventions import TO_OPENGL, find_photo, listed_split
+from univoxel.data.conventions import TO_OPENGL, find_photo, listed_split, turned_up
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
-from univoxel.data.load_images import Shot, read_shots, upright
+from univoxel.data.load_images import Listed, Shot
 from univoxel.data.path_sandbox import inside, left_out
-from univoxel.data.photos import Photos
 from univoxel.errors import DataError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -49,16 +48,7 @@ def is_colmap(folder: Path, split: str) -> bool:
     return bool(_models(folder))
 
 
-def load_colmap(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split, as of `listed_split`.
-
-    The world keeps its scale and origin, and is turned so that +Z is up.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_colmap(folder: Path, split: str) -> Listed:
     models = _models(folder)
     if not models:
         raise DataError(f"{folder}: expected a COLMAP model in {', '.join(PLACES)}, got none")
@@ -108,11 +98,9 @@ def load_colmap(
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(images_file), missing, len(images), note)
     lost += [f"cameras of {scaled} scaled to smaller pictures"] if scaled else []
-    shots, remarks = upright(shots)
-    shots = listed_split(folder, shots, split)
     if len(models) > 1:
         lost = [f"{model.relative_to(folder)}, the largest of {len(models)} models", *lost]
-    return read_shots(folder, "COLMAP model", split, shots, downscale, [*lost, *remarks], masks)
+    return turned_up(folder, split, "COLMAP model", shots, lost, listed_split)
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:

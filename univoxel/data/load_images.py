@@ -75,14 +75,17 @@ class Shot:
     )
 
 
+@dataclass(frozen=True)
+class Listed:
+    """The photographs of one split that a data set lists."""
+
+    kind: str  # of the data set, for people
+    shots: Sequence[Shot]
+    remarks: Sequence[str] = ()  # on how the files were read, for people
+
+
 def read_shots(
-    folder: Path,
-    kind: str,
-    split: str,
-    shots: Sequence[Shot],
-    downscale: int = 0,
-    remarks: Sequence[str] = (),
-    masks: bool | Path = True,
+    folder: Path, split: str, listed: Listed, downscale: int = 0, masks: bool | Path = True
 ) -> Photos:
     """Photographs as pinholes see them, each in its own size.
 
@@ -90,9 +93,7 @@ def read_shots(
     Pixels are those of the file: an orientation in its EXIF is not looked at.
 
     Args:
-        kind: of the data set, for people.
         downscale: means over squares of so many pixels; 0: what `fitting_downscale` says.
-        remarks: on how the files were read, for people.
         masks: False for photographs as they are, the whole picture opaque; or a folder of masks,
             which takes the place of what the layout names.
 
@@ -101,6 +102,7 @@ def read_shots(
     """
     if downscale < 0:
         raise ValueError(f"downscale must be at least 1, got {downscale}")
+    shots = listed.shots
     named = masks if isinstance(masks, Path) else None
     if named is None and masks:
         shots = _with_masks(folder, shots)
@@ -135,7 +137,7 @@ def read_shots(
         color=color,
         alpha=alpha,
         cameras=cameras,
-        about=f"{folder}: {kind}, {', '.join([*told, *remarks])}",
+        about=f"{folder}: {listed.kind}, {', '.join([*told, *listed.remarks])}",
         downscale=factor,
         origin=origin,
         readers=tuple(

@@ -14,12 +14,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from univoxel.core.files import read_json
-from univoxel.data.conventions import TO_OPENGL, check_skew, find_photo, parsed
+from univoxel.data.conventions import TO_OPENGL, check_skew, find_photo, parsed, turned_up
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import Lens, fitted
-from univoxel.data.load_images import Shot, every_eighth, in_moved_world, read_shots, upright
+from univoxel.data.load_images import Listed, Shot, every_eighth, in_moved_world
 from univoxel.data.path_sandbox import inside, left_out
-from univoxel.data.photos import Photos
 from univoxel.data.transforms import lens_of, listed_image, pose_of, read_number, short
 from univoxel.errors import DataError
 
@@ -47,17 +46,8 @@ def is_metashape(folder: Path, split: str) -> bool:
     return _xml_file(folder) is not None
 
 
-def load_metashape(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
-
-    The world keeps its scale, and is turned so that +Z is up; it keeps its origin, too, unless that
-    is far away. Of several components the one with most cameras is read.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_metashape(folder: Path, split: str) -> Listed:
+    """Of several components the one with most cameras is read."""
     path = _xml_file(folder) or folder / "cameras.xml"
     chunk = _chunk(path)
     sensors = {s.get("id"): s for s in chunk.iterfind("sensors/sensor")}
@@ -97,10 +87,7 @@ def load_metashape(
         if rig := sum(c.get("master_id") is not None for c in every if c not in placed):
             told += f"; {rig} of a rig, whose place is that of a master camera"
         lost += [f"{len(every) - len(chosen)} of {len(every)} cameras left out: {told}"]
-    shots, remarks = upright(shots)
-    shots = every_eighth(folder, shots, split)
-    remarks = [*lost, *remarks]
-    return read_shots(folder, "Metashape cameras", split, shots, downscale, remarks, masks)
+    return turned_up(folder, split, "Metashape cameras", shots, lost)
 
 
 def _xml_file(folder: Path) -> Path | None:
@@ -217,17 +204,7 @@ def is_realitycapture(folder: Path, split: str) -> bool:
     return _csv_file(folder) is not None
 
 
-def load_realitycapture(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
-
-    The world keeps its scale, and is turned so that +Z is up, where it is not yet; it keeps its
-    origin, too, unless that is far away.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_realitycapture(folder: Path, split: str) -> Listed:
     path = _csv_file(folder) or folder / "cameras.csv"
     rows = _rows(path)
     shots, missing = [], []
@@ -242,10 +219,7 @@ def load_realitycapture(
         shots.append(Shot(picture.stem, where, picture, None, pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(path), missing, len(rows), note)
-    shots, remarks = upright(shots)
-    shots = every_eighth(folder, shots, split)
-    remarks = [*lost, *remarks]
-    return read_shots(folder, "RealityCapture cameras", split, shots, downscale, remarks, masks)
+    return turned_up(folder, split, "RealityCapture cameras", shots, lost)
 
 
 def _csv_file(folder: Path) -> Path | None:
@@ -341,16 +315,8 @@ def is_polycam(folder: Path, split: str) -> bool:
     return _place(folder) is not None
 
 
-def load_polycam(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
-
-    The world keeps its scale, metres, and its origin, and is turned from +Y up to +Z up.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_polycam(folder: Path, split: str) -> Listed:
+    """The world keeps its scale, metres, and its origin, and is turned from +Y up to +Z up."""
     place = _place(folder) or PLACES[0]
     cameras, pictures = (
         sorted((folder / f"{place}cameras").glob("*.json")),
@@ -373,8 +339,7 @@ def load_polycam(
         note += f"; those in {others} are of the cameras in {others.with_name('cameras')}"
     lost = left_out(str(cameras[0].parent), missing, len(cameras), f"{note})")
     shots = every_eighth(folder, in_moved_world(shots, UPRIGHT), split)
-    remarks = [*lost, "world turned from +Y to +Z up"]
-    return read_shots(folder, "Polycam raw data", split, shots, downscale, remarks, masks)
+    return Listed("Polycam raw data", shots, [*lost, "world turned from +Y to +Z up"])
 
 
 def _place(folder: Path) -> str | None:

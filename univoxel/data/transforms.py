@@ -21,7 +21,6 @@ from univoxel.data import load_images
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
 from univoxel.data.path_sandbox import inside, left_out
-from univoxel.data.photos import Photos
 from univoxel.errors import DataError, UserError
 
 # Cameras in the JSON of NeRF: what its layouts share, and camera paths without pictures.
@@ -432,14 +431,7 @@ def is_blender(folder: Path, split: str) -> bool:
     return any((folder / f"transforms_{s}.json").is_file() for s in ("train", split))
 
 
-def load_blender(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_blender(folder: Path, split: str) -> load_images.Listed:
     path = folder / f"transforms_{split}.json"
     if not path.is_file():
         raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
@@ -451,7 +443,7 @@ def load_blender(
         places = [pose[:, 3] for pose in poses] or [shot.pose[:, 3] for shot in shots]
         shots, moved = load_images.near_origin(shots, np.stack(places))
         remarks = [*remarks, *moved]
-    return load_images.read_shots(folder, "NeRF layout", split, shots, downscale, remarks, masks)
+    return load_images.Listed("NeRF layout", shots, remarks)
 
 
 # The layout of nerfstudio and instant-ngp.
@@ -467,14 +459,8 @@ def is_nerfstudio(folder: Path, split: str) -> bool:
     return (folder / "transforms.json").is_file()
 
 
-def load_nerfstudio(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split: without one in the file, every eighth is for tests.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_nerfstudio(folder: Path, split: str) -> load_images.Listed:
+    """Where the file has no splits, every eighth is for tests."""
     path = folder / "transforms.json"
     root, shots, lost = read_frames(path)
     shots, remarks = load_images.upright(shots)
@@ -484,9 +470,7 @@ def load_nerfstudio(
     else:
         listed = [frame["file_path"] for frame in root["frames"]]
         shots = _named(path, shots, listed, f"{split}_filenames", chosen)
-    return load_images.read_shots(
-        folder, "nerfstudio layout", split, shots, downscale, [*lost, *remarks], masks
-    )
+    return load_images.Listed("nerfstudio layout", shots, [*lost, *remarks])
 
 
 def _named(
