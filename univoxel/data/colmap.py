@@ -31,6 +31,8 @@ MODELS = (
 )
 SUPPORTED = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
 SUPPORTED |= {"FULL_OPENCV": 12}  # without its denominator, k4 to k6
+# A feature of a photograph in images.bin: its pixel, and the number of the point that it shows
+SEEN = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 # What reading a broken file may raise; OverflowError: of sizes of hundreds of digits
 BROKEN = (struct.error, IndexError, ValueError, OverflowError)
 
@@ -240,14 +242,24 @@ def _images_text(path: Path) -> Iterator[tuple[list[float], list[float], int, st
 
 
 def _images_binary(path: Path) -> Iterator[tuple[list[float], list[float], int, str]]:
-    data = path.read_bytes()
+    for _, pose, camera, name, _ in image_records(path.read_bytes()):
+        yield pose[:4], pose[4:], camera, name
+
+
+def image_records(data: bytes) -> Iterator[tuple[int, list[float], int, str, np.ndarray]]:
+    """Of each photograph in images.bin: number, quaternion and translation to the camera, number of
+    its camera, name, and its features as `SEEN`.
+
+    Raises:
+        ValueError, struct.error: a broken file.
+    """
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
-        _, *pose, camera = struct.unpack_from("<i7di", data, at)
+        number, *pose, camera = struct.unpack_from("<i7di", data, at)
         end = data.index(b"\0", at + 64)
         name = data[at + 64 : end].decode("utf-8")
-        (points,) = struct.unpack_from("<Q", data, end + 1)
-        at = end + 9 + 24 * points
+        (features,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9 + features * SEEN.itemsize
         if at > len(data):
             raise ValueError("the file is cut off")
-        yield pose[:4], pose[4:], camera, name
+        yield number, pose, camera, name, np.frombuffer(data, SEEN, features, end + 9)
