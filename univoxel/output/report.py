@@ -10,6 +10,7 @@ import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -116,13 +117,10 @@ def stages(cfg: TrainConfig, state: dict[str, Any]) -> list[StageFacts]:
 
 
 def stage_ends(state: dict[str, Any]) -> list[float]:
-    """Seconds at which stages ended, the last first counted from the end of training; empty where
-    that was not kept."""
-    took = list(state.get("took", ()))
-    if not took or "seconds" not in state:
+    """Seconds at which stages but the last ended; empty where that was not kept."""
+    if (begin := prepared(state)) is None:
         return []
-    begin = state["seconds"] - sum(took) - state.get("stage_took", 0.0)  # preparation
-    return [begin + sum(took[: k + 1]) for k in range(len(took) - 1)]
+    return [begin + end for end in accumulate(state["took"][:-1])]
 
 
 def prepared(state: dict[str, Any]) -> float | None:
@@ -145,10 +143,6 @@ def remarks(cfg: TrainConfig, state: dict[str, Any]) -> list[str]:
         told.append(f"Training met trouble {len(troubles)} times, the last in {troubles[-1]}.")
     chosen = [entry.get("said", "") for entry in state.get("chosen", ())]
     return told + [f"Size chosen: {said}." for said in chosen if said]
-
-
-# A run as a report: one page without scripts and without network, which says how good the run is,
-# where it is in doubt, and what to photograph next. No truth is read.
 
 
 FOLDER = Path(__file__).parent / "web"
@@ -184,8 +178,7 @@ class ReportOptions:
 
     def __post_init__(self) -> None:
         for name, least in (("views", 0), ("size", 16)):
-            if getattr(self, name) < least:
-                value = getattr(self, name)
+            if (value := getattr(self, name)) < least:
                 raise UserError(f"report: {name} must be at least {least}, got {value}", name)
 
 
@@ -275,8 +268,7 @@ def what_is_known(run: Path, scene: Scene, options: ReportOptions) -> Known:
     photos = photos_of(run, data, "train")
     surveyed = survey(scene, photos, POINTS)
     photos = scene.registered(photos)
-    occluder = scene.occluder()
-    advice = advise(surveyed, photos.cameras, photos.names, occluder, options.advice)
+    advice = advise(surveyed, photos.cameras, photos.names, scene.occluder(), options.advice)
     splits = [report_pictures.Split(photos, True)]
     try:
         splits.append(report_pictures.Split(photos_of(run, data, "test"), False))
@@ -288,8 +280,7 @@ def what_is_known(run: Path, scene: Scene, options: ReportOptions) -> Known:
 def next_section(advice: Advice) -> str:
     """Directions for more photographs, in words, as a list and on the sphere."""
     parts = []
-    told = in_words(advice)
-    if told:
+    if told := in_words(advice):
         text = "".join(f"<li>{escape(line)}" for line in told)
         parts.append(f'<ul class="advice">{text}</ul>')
         worth = enumerate(zip(advice.nearest, advice.gains.tolist(), strict=True))
@@ -325,8 +316,7 @@ def next_section(advice: Advice) -> str:
 
 def doubt_section(known: Known, state: dict[str, Any], pictures: Sequence[Tensor]) -> str:
     """What photographs leave open, in words and painted on the object."""
-    surveyed = known.surveyed
-    text = words(numbers(surveyed), list(state.get("troubles", [])))
+    text = words(numbers(known.surveyed), list(state.get("troubles", [])))
     legend = "Doubt of the albedo: black is well determined, white is a guess."
     return paragraph(text) + gallery(zip(report_pictures.SIDES, pictures, strict=True), legend)
 

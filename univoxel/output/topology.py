@@ -44,11 +44,7 @@ def clean(mesh: Mesh) -> Mesh:
 
 
 def cleaned(mesh: Mesh) -> tuple[Mesh, Dropped]:
-    """As `clean`, and what was dropped.
-
-    Raises:
-        ValueError: nothing is left.
-    """
+    """As `clean`, and what was dropped."""
     vertices, faces = mesh.vertices.double().numpy(), mesh.faces.long().numpy()
     dropped = Dropped(0, 0)
     if len(faces):

@@ -239,13 +239,12 @@ def film(
         OSError: there is no room for the pictures.
     """
     frames = frames or FRAMES
-    vertices = subject.traced.mesh.vertices
-    middle = (vertices.amin(0) + vertices.amax(0)) / 2
+    low, high = subject.bounds
     small = resize(cameras, min(cameras.width, WIDTH))
     with tempfile.TemporaryDirectory() as name:
         pictures = []
         for frame in range(frames):
-            stand = turned_about(small, middle, 2 * math.pi * frame / frames)
+            stand = turned_about(small, (low + high) / 2, 2 * math.pi * frame / frames)
             picture = None
             for better in refined_pictures(subject, stand, look, samples):
                 picture = picture if better is None else better

@@ -35,6 +35,7 @@ from univoxel.output.page import FACES, JPEG_QUALITY, Light, PageOptions, light_
 from univoxel.output.topology import simplify
 from univoxel.output.viewpoints import VIEW_ANGLE, orbit
 from univoxel.render.relight import Lighting, rotated
+from univoxel.sphere import direction_at
 from univoxel.viewer import frames
 from univoxel.viewer.frames import LAYERS, Look
 from univoxel.viewer.render_queue import Studio, Viewer, film, kind
@@ -152,7 +153,7 @@ class Panel:
             log.info("no photographs to show: %s", error)
             return
         self._overlay = gui.add_slider("photograph", 0.0, 1.0, 0.05, 0.0)
-        self._overlay.on_update(lambda event: self._again())
+        self._overlay.on_update(lambda event: self._last is not None and self._show(self._last))
         choice = gui.add_dropdown("go to", ["", *photos.names], initial_value="")
         choice.on_update(
             lambda event: choice.value and self._go_to(photos.names.index(choice.value))
@@ -181,7 +182,9 @@ class Panel:
 
     def _box(self, gui: Any) -> None:
         """Handles at two corners of a box, and the option of `cutout` and `capture` that it is."""
-        low, high = _bounds(self._subject)
+        low, high = self._subject.bounds
+        room = 0.02 * (high - low).norm()
+        low, high = low - room, high + room
         self._boxed = gui.add_checkbox(
             "box", False, hint="drag its two corners; click on the object to end it there, below"
         )
@@ -310,9 +313,7 @@ class Panel:
         turned = rotated(Lighting(self._tables[name]), self._turn.value)
         if not self._sun.value:
             return turned
-        phi, up = math.radians(self._azimuth.value), math.radians(self._elevation.value)
-        flat = math.cos(up)
-        direction = (flat * math.cos(phi), flat * math.sin(phi), math.sin(up))
+        direction = direction_at(self._azimuth.value, self._elevation.value)
         return replace(turned, suns=(Sun(direction, (self._sun.value,) * 3),))
 
     def _show(self, picture: Tensor) -> None:
@@ -323,10 +324,6 @@ class Panel:
             rgb = laid_over(rgb, self._subject.photos, self._shown, self._cameras, share)
         values = _bytes(rgb)
         self._client.scene.set_background_image(values, format="jpeg", jpeg_quality=JPEG)
-
-    def _again(self) -> None:
-        if self._last is not None:
-            self._show(self._last)
 
     def _complain(self, line: str) -> None:
         log.warning(line)
@@ -363,13 +360,6 @@ class Panel:
         self._client.send_file_download(f"{self._title}.glb", glb(mesh, JPEG_QUALITY))
 
 
-def _bounds(subject: Subject) -> tuple[Tensor, Tensor]:
-    """The lower and the upper corner [3] of the mesh, with a little room."""
-    low, high = subject.traced.mesh.vertices.amin(0), subject.traced.mesh.vertices.amax(0)
-    room = 0.02 * (high - low).norm()
-    return low - room, high + room
-
-
 def _bytes(picture: Tensor) -> np.ndarray:
     return (255 * picture + 0.5).clamp(0, 255).byte().numpy()
 
@@ -395,13 +385,7 @@ def light_of_bytes(name: str, content: bytes) -> Light:
 def camera_of(wxyz: Any, position: Any, angle: float, width: int, height: int) -> Cameras:
     """viser's camera (+X right, +Y down, +Z ahead; vertical angle in radians) as one of ours."""
     w, x, y, z = (float(v) for v in wxyz)
-    turn = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = torch.from_numpy(Rotation.from_quat([x, y, z, w]).as_matrix()).float()
     turn = turn * torch.tensor([1.0, -1.0, -1.0])
     place = torch.tensor([float(v) for v in position])
     focal = height / 2 / math.tan(angle / 2)
@@ -445,7 +429,6 @@ def laid_over(rgb: Tensor, photos: Photos, view: int, cameras: Cameras, share: f
 def _start_camera(server: Any, subject: Subject) -> None:
     cameras = orbit(subject.traced.mesh, 8, 512)
     pose = cameras.camera_to_world[1]
-    low, high = subject.traced.mesh.vertices.amin(0), subject.traced.mesh.vertices.amax(0)
     server.initial_camera.position = pose[:, 3].numpy()
-    server.initial_camera.look_at = ((low + high) / 2).numpy()
+    server.initial_camera.look_at = torch.stack(subject.bounds).mean(0).numpy()
     server.initial_camera.fov = math.radians(VIEW_ANGLE)
