@@ -34,20 +34,8 @@ from univoxel.scene import SceneConfig
 
 # Arguments that a configuration is made of
 CHOICES = (
-    *(
-        "preset",
-        "minutes",
-        "light",
-        "varying",
-        "light_frame",
-        "metal",
-        "masks",
-        "cameras",
-        "downscale",
-        "capacity",
-        "detail",
-    ),
-    *("budget_mb", "changes"),
+    *("preset", "minutes", "light", "varying", "light_frame", "metal", "masks", "cameras"),
+    *("downscale", "capacity", "detail", "budget_mb", "changes"),
 )
 
 

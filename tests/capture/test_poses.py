@@ -438,7 +438,7 @@ def test_the_database_is_read_as_it_is_written(scene):
 def test_matches_of_right_places_fit_and_of_a_wrong_one_do_not(scene):
     """The database's matches against the model as it was found, and with one picture turned."""
     folders = Folders(scene[0] / "sfm")
-    model = structure.models(folders)[0]
+    model = database.read_models(folders.models)[0]
     features = database.positions(folders.database)
 
     def shares(model):

@@ -95,11 +95,7 @@ class Job:
         write_json(self.file(".json"), record)
 
     def check_same(self) -> None:
-        """Refuse to go on with what other options began.
-
-        Raises:
-            ExistingFile: they are others.
-        """
+        """Refuse, by an ExistingFile, to go on with what other options began."""
         before = self.record()["identity"]
         other = [key for key, value in self.identity.items() if before and before.get(key) != value]
         if other:
@@ -335,11 +331,7 @@ class ProgressTable:
     """A bar of all jobs beside those at work; without a terminal a line now and then."""
 
     def __init__(self, before: int, total: int) -> None:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[facts]}"),
-        )
+        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[facts]}")
         self.progress: Progress = bar(*columns, TimeElapsedColumn())
         self._all = self.progress.add_task(f"{before}/{total}", total=total, facts="")
         self._begin, self._before, self._total = time.monotonic(), before, total
@@ -368,9 +360,7 @@ class ProgressTable:
             spent, left = time.monotonic() - self._begin, self._total - self._before - made
             facts.append(f"about {timedelta(seconds=round(spent * left / made))} left")
         separator = "\n" if self.progress.console.is_terminal else "  "
-        row = {
-            "completed": self._before + made,
-            "description": f"{self._before + ended}/{self._total}",
-        }
         shown = separator.join([*facts, *(text for _, text in told)])
-        self.progress.update(self._all, facts=shown, **row)
+        description = f"{self._before + ended}/{self._total}"
+        completed = self._before + made
+        self.progress.update(self._all, completed=completed, description=description, facts=shown)

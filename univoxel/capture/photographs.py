@@ -4,7 +4,6 @@ their camera, their pixels upright."""
 from __future__ import annotations
 
 import importlib.util
-import logging
 import math
 import re
 import subprocess
@@ -21,6 +20,7 @@ from PIL import Image, ImageOps
 from scipy.ndimage import laplace
 
 from univoxel.color import linear_to_srgb, srgb_to_linear
+from univoxel.core import log
 from univoxel.data.images import (
     DISPLAY_P3,
     REC_709,
@@ -124,11 +124,7 @@ def _pictures(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def require_readers(paths: list[Path]) -> None:
-    """Say before anything is read whether a package is missing for some of the files.
-
-    Raises:
-        MissingExtra: it is.
-    """
+    """Raise a MissingExtra, before anything is read, where a package lacks for some files."""
     for suffixes, module, package, kind in (
         (HEIF, "pillow_heif", "pillow-heif", "HEIC"),
         (RAW, "rawpy", "rawpy", "RAW"),
@@ -293,19 +289,13 @@ NODES = 65  # along a side of a table of colours
 TABLE = "colours.cube"
 STILL = 0.25  # of 255, by which frames of a picture that stands still may differ
 
-log: logging.Logger = logging.getLogger("univoxel")
-
 
 def is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in SUFFIXES
 
 
 def require_ffmpeg() -> None:
-    """Say before anything is read whether videos can be.
-
-    Raises:
-        MissingExtra: they cannot.
-    """
+    """Raise a MissingExtra, before anything is read, where videos cannot be."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise MissingExtra("a video needs imageio-ffmpeg: pip install 'univoxel[capture]'")
 

@@ -39,7 +39,7 @@ from univoxel.cli import (
     view,
 )
 from univoxel.cli.parsing import LAB, STDOUT, Call, Command, Common, Shell, Usage
-from univoxel.core import machine, system
+from univoxel.core import log, machine, system
 from univoxel.errors import MissingExtra, UserError
 
 # What a command may raise for a mistake of its user, see `is_mistake`; all else is a bug and keeps
@@ -322,16 +322,15 @@ def spoken(common: Common, results_alone: bool) -> Iterator[None]:
     Args:
         results_alone: on stdout; all else goes to stderr.
     """
-    logger, handler = logging.getLogger("univoxel"), _Plain(common, results_alone)
-    level = logger.level
-    logger.addHandler(handler)
+    handler, level = _Plain(common, results_alone), log.level
+    log.addHandler(handler)
     chosen = logging.WARNING if common.quiet else logging.DEBUG if common.verbose else logging.INFO
-    logger.setLevel(chosen)
+    log.setLevel(chosen)
     try:
         yield
     finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
+        log.removeHandler(handler)
+        log.setLevel(level)
 
 
 def _kept(call: Call) -> str:

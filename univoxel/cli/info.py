@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.cli.parsing import STDOUT, File, JsonFile, Run, json_file, takes, written
+from univoxel.core import log
 from univoxel.core.files import write_json
 from univoxel.errors import UserError
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from univoxel.scene import Scene
 
-log: logging.Logger = logging.getLogger("univoxel")
 
 # Beginning of a tensor's name in the file: the part it belongs to. The first that fits counts.
 PARTS = {

@@ -143,15 +143,12 @@ def _test(hint: Any, said: Setting) -> tuple[str, Callable[[Any], bool]] | None:
 
 
 def check_fields(config: object, wanted: str, holds: Callable[[Any], bool], *names: str) -> None:
-    """Refuse a configuration whose named fields are not as wanted.
+    """Refuse, as `check_settings` does, a configuration whose named fields are not as wanted.
 
     Args:
         config: a dataclass.
         wanted: the range in words, such as "at least 1".
         holds: whether a value is in it; a TypeError counts as no.
-
-    Raises:
-        ConfigError: names class and field, says what is wanted and what came.
     """
     for name in names:
         value = getattr(config, name)

@@ -9,7 +9,7 @@ from univoxel.data.path_sandbox import staying_in
 from univoxel.data.photos import Photos, Truth
 from univoxel.data.transforms import load_cameras
 from univoxel.data.truth import load_points, load_relit, load_truth, relight_maps
-from univoxel.errors import DataError
+from univoxel.errors import DataError, some
 
 __all__ = [
     "DataError",
@@ -75,9 +75,9 @@ def load_photos(
             with looking_in(kept), staying_in(None if allow_outside else folder):
                 return read_shots(folder, split, listed(folder, split), downscale, masks)
     files = sorted(path.name for path in folder.iterdir())
-    came = ", ".join(files[:5]) + (", ..." if len(files) > 5 else "") or "an empty folder"
     raise DataError(
-        f"{folder}: expected photographs with their cameras, got {came} (looked for "
+        f"{folder}: expected photographs with their cameras, got "
+        f"{some(files) or 'an empty folder'} (looked for "
         f"transforms_{split}.json, transforms.json, cameras and images (.bin or .txt) of COLMAP in "
         f"sparse/0, sparse, colmap/sparse/0 and here, poses_bounds.npy, cameras_sphere.npz, "
         f"inputs/sfm_scene.json, keyframes/corrected_cameras, XML of Metashape, CSV of "

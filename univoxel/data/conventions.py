@@ -74,11 +74,7 @@ def check_skew(skew: float, lens: Lens, where: str) -> None:
 
 
 def parsed(text: str | None, what: str, where: str) -> float:
-    """A finite number from text.
-
-    Raises:
-        DataError: it is missing or no such number.
-    """
+    """A finite number from text; a DataError where it is missing or another text."""
     try:
         value = float(text) if text is not None else math.nan
     except ValueError:

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import math
 import os
 import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +25,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from univoxel.core import memmap, system
+from univoxel.core import log, memmap, system
 from univoxel.core.files import replacing
 from univoxel.data.photos import Photos, coverage_of
 
@@ -36,19 +35,13 @@ HEADER = 4096  # bytes of the header of a file that is written while photographs
 FLUSHED = 16  # photographs after which what was read is safe on disk
 VERSION = 4  # of what is done to pixels: another one makes all files that are there unfit
 
-log: logging.Logger = logging.getLogger("univoxel")
 # Where photographs may have been kept. Layouts read photographs and need not know of it
 _place: ContextVar[Path | None] = ContextVar("kept photographs", default=None)
 
 
-@contextmanager
-def looking_in(path: Path | None) -> Iterator[None]:
+def looking_in(path: Path | None) -> AbstractContextManager[None]:
     """Let photographs that are read in the block come from this file, where they are in it."""
-    token = _place.set(path)
-    try:
-        yield
-    finally:
-        _place.reset(token)
+    return memmap.assigned(_place, path)
 
 
 def origin_of(files: Sequence[Path], *treatment: object) -> str:

@@ -3,7 +3,6 @@ camera paths without pictures."""
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 import reprlib
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from univoxel.camera import Cameras
-from univoxel.core import system
+from univoxel.core import log, system
 from univoxel.core.files import read_json, write_json
 from univoxel.data import load_images
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
@@ -23,7 +22,7 @@ from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
 from univoxel.data.path_sandbox import inside, left_out
 from univoxel.errors import DataError, UserError
 
-# Cameras in the JSON of NeRF: what its layouts share, and camera paths without pictures.
+# The JSON of NeRF:
 #
 # {"camera_angle_x" (or "fl_x", "fl_y", "cx", "cy"), "w", "h", "k1" .., "p1", "p2", "frames": [
 #     {"file_path": .., "transform_matrix": camera-to-world with OpenGL axes, "mask_path": ..}]}
@@ -45,7 +44,6 @@ WIDEST = 1 << 16  # pixels along a side of pictures to be made: what formats of 
 OFF = 0.9  # of a picture's sides: no lens is centred so far to the right and below
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
-log: logging.Logger = logging.getLogger("univoxel")
 _SHORT = reprlib.Repr()  # writes the beginning of values of any size and depth
 _SHORT.maxlist = _SHORT.maxdict = 20
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 200
@@ -203,11 +201,7 @@ def _folder(path: Path, frame: dict[str, Any], where: str) -> Path:
 
 
 def find_image(folder: Path, file_path: str, where: str) -> Path:
-    """The picture that a frame's file_path means, as of `listed_image`.
-
-    Raises:
-        DataError: there is none.
-    """
+    """The picture that a frame's file_path means, as of `listed_image`; a DataError without one."""
     found = listed_image(folder, file_path, where)
     if found is None:
         raise DataError(f"{where}: no picture {folder / file_path} ({LOOKED_FOR})")

@@ -7,7 +7,6 @@ No truth is read.
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from univoxel import __version__
 from univoxel.config import TrainConfig, load_config
+from univoxel.core import log
 from univoxel.core.files import write_text
 from univoxel.core.html import Curve, chart, document, escape, image, paragraph, table
 from univoxel.core.records import AlbedoNear, Mesh
@@ -45,8 +45,6 @@ from univoxel.run import load_verdict, photos_of
 from univoxel.scene import Scene, load_checkpoint
 from univoxel.training.clock import ALL, Clock, stage_name
 from univoxel.training.progress import LOG
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)
@@ -328,17 +326,19 @@ def views_section(scene: Scene, known: Known, options: ReportOptions) -> str:
     )
     if not found:
         return ""
-    rows = "".join(
-        f'<figure class="row">{"".join(image(tile, words) for tile in tiles)}'
-        f"<figcaption>{escape(words)}</figcaption></figure>"
-        for words, tiles in report_pictures.rows(found)
-    )
+    rows = []
+    for view in found:
+        kind = "" if view.trained else " (not trained on)"
+        words = f"{view.name}{kind}: {view.error:.3f} in sRGB on the mean, {view.quality:.1f} dB"
+        tiles = "".join(image(tile, words) for tile in view.tiles)
+        caption = f"<figcaption>{escape(words)}</figcaption>"
+        rows.append(f'<figure class="row">{tiles}{caption}</figure>')
     said = (
         f"The {len(found)} that differ most, of {count} compared: photograph, render, and their "
         f"difference, drawn brightest at {report_pictures.LIMIT} in sRGB. Numbers are over the "
         "object."
     )
-    return paragraph(said) + f'<div class="views">{rows}</div>'
+    return paragraph(said) + f'<div class="views">{"".join(rows)}</div>'
 
 
 def materials_section(pictures: dict[str, list[Tensor]]) -> str:

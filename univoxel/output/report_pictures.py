@@ -74,11 +74,7 @@ class Compared:
 
 
 def worst(
-    scene: Scene,
-    splits: list[Split],
-    count: int,
-    size: int,
-    albedo_near: AlbedoNear | None = None,
+    scene: Scene, splits: list[Split], count: int, size: int, albedo_near: AlbedoNear | None = None
 ) -> tuple[list[Compared], int]:
     """The views that differ most from their photographs, the worst first; how many were compared.
 
@@ -123,14 +119,6 @@ def on_grey(premultiplied: Tensor, alpha: Tensor) -> Tensor:
     return linear_to_srgb(straight) * alpha[..., None] + BEHIND * (1 - alpha[..., None])
 
 
-def rows(found: list[Compared]) -> Iterator[tuple[str, tuple[Tensor, Tensor, Tensor]]]:
-    """What stands under each view, and its pictures."""
-    for view in found:
-        kind = "" if view.trained else " (not trained on)"
-        words = f"{view.name}{kind}: {view.error:.3f} in sRGB on the mean, {view.quality:.1f} dB"
-        yield words, view.tiles
-
-
 # The object from four sides, as layers.
 
 
@@ -163,11 +151,7 @@ def layers(
 
 
 def _of_view(
-    scene: Scene,
-    cameras: Cameras,
-    view: int,
-    doubts: Doubts | None,
-    albedo_near: AlbedoNear | None,
+    scene: Scene, cameras: Cameras, view: int, doubts: Doubts | None, albedo_near: AlbedoNear | None
 ) -> Iterator[tuple[str, Tensor]]:
     surface, wo = surface_of_view(scene, cameras, view, albedo_near)
     width, height = cameras.size(view)

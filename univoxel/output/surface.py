@@ -3,7 +3,6 @@ smooth."""
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from univoxel.camera import Cameras, project
+from univoxel.core import log
 from univoxel.core.records import Mesh
 from univoxel.errors import UserError
 from univoxel.ops import VisibilityScene
@@ -22,8 +22,6 @@ from univoxel.output.topology import cleaned
 from univoxel.render.observations import MIN_COSINE
 from univoxel.run import photos_of
 from univoxel.scene import Scene
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 # Edges over which the border between what is seen and what is not is spread
 BORDER = 6

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
-import logging
 import math
 import tempfile
 import threading
@@ -26,6 +25,7 @@ from torch import Tensor
 from univoxel import envmap as env
 from univoxel.camera import Cameras, image_rays, looked_at, pixel_rays, project, resize
 from univoxel.color import linear_to_srgb
+from univoxel.core import log
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.ops import Sun
@@ -54,8 +54,6 @@ PLAIN = 0.16  # sRGB, behind a transparent picture
 JPEG = 90  # quality of pictures that are sent
 MAPS = (".hdr", ".exr")
 BOX_COLOR = (255, 160, 60)
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @contextlib.contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import html
 import io
-import logging
 import socket
 import threading
 import time
@@ -18,6 +17,7 @@ import torch
 
 from univoxel.camera import resize
 from univoxel.color import linear_to_srgb
+from univoxel.core import log
 from univoxel.core.html import Curve, chart
 from univoxel.data import Photos
 from univoxel.errors import MissingExtra, UserError
@@ -30,8 +30,6 @@ from univoxel.training.progress import TrainingProgress
 HOST = "127.0.0.1"
 PORT = 8080
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @contextlib.contextmanager
