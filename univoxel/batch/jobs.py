@@ -79,11 +79,8 @@ class Job:
         return self.files.with_name(self.files.name + suffix)
 
     def record(self) -> dict[str, dict[str, Any]]:
-        """What is known from all sittings: identity; seconds, and errors of the last, by step.
-
-        Raises:
-            DataError: the file is no record.
-        """
+        """What is known from all sittings: identity; seconds, and errors of the last, by step; a
+        DataError where the file is no record."""
         path = self.file(".json")
         found = read_json(path) if path.exists() else {}
         if not isinstance(found, dict) or any(type(found.get(k, {})) is not dict for k in RECORD):

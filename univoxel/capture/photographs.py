@@ -137,11 +137,7 @@ def require_readers(paths: list[Path]) -> None:
 
 
 def describe(path: Path) -> Photograph:
-    """Size and camera of a photograph, from its beginning alone.
-
-    Raises:
-        DataError: it cannot be read.
-    """
+    """Size and camera of a photograph, from its beginning alone; a DataError where it is none."""
     try:
         if path.suffix.lower() in RAW:
             return _describe_raw(path)
@@ -428,11 +424,7 @@ def sharpness(picture: np.ndarray) -> float:
 
 
 def seconds(video: Path) -> float:
-    """Length of a video.
-
-    Raises:
-        DataError: it does not say.
-    """
+    """Length of a video; a DataError where it does not say."""
     clock = r"(\d+):(\d+):(\d+\.?\d*)"
     found = re.findall(f"Duration: {clock}", _about(video))
     if not found:  # of recordings that were written as they came: the time of the last frame

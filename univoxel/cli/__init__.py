@@ -101,11 +101,7 @@ def has_laboratory() -> bool:
 
 
 def laboratory() -> dict[str, Command]:
-    """Commands of the laboratory by name.
-
-    Raises:
-        MissingExtra: there is none beside the package.
-    """
+    """Commands of the laboratory by name; a MissingExtra where there is none beside the package."""
     if not has_laboratory():
         raise MissingExtra(
             f"{', '.join(LABORATORY)} measure the method and are not part of the installed "
@@ -202,11 +198,8 @@ def understood(arguments: Sequence[str]) -> Call | None:
 
 
 def help_screen(arguments: Sequence[str]) -> str | None:
-    """The overview that arguments ask for; None: they ask for something else.
-
-    Raises:
-        MissingExtra: that of the laboratory, which is not there.
-    """
+    """The overview that arguments ask for; None: they ask for something else. Errors are those of
+    `laboratory`."""
     match arguments:
         case [] | ["-h" | "--help" | "help"]:
             title = f"univoxel {__version__}: from photographs to a relightable object, on any CPU"

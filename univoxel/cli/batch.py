@@ -61,11 +61,7 @@ class BatchOptions:
     """another file for what batch.json holds; - prints it in place of the table"""
 
     def training(self) -> TrainConfig:
-        """The configuration of a training.
-
-        Raises:
-            UserError: there is none of that kind.
-        """
+        """The configuration of a training; a UserError where there is none of that kind."""
         from univoxel.config import load_config
         from univoxel.core.validation import changed
         from univoxel.presets import chosen

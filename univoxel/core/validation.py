@@ -198,11 +198,8 @@ def _fields(kind: Any) -> tuple[dataclasses.Field[Any], ...]:
 
 
 def _typed(hint: Any, value: Any) -> Any:
-    """A value of JSON as the annotation has it.
-
-    Raises:
-        TypeError, OverflowError: it is of another type, or an integer that no float holds.
-    """
+    """A value of JSON as the annotation has it; a TypeError where it is of another type, and an
+    OverflowError for an integer that no float holds."""
     origin, inner = get_origin(hint), get_args(hint)
     if hasattr(value, "__dataclass_fields__") and isinstance(value, hint):  # read before
         return value

@@ -246,11 +246,8 @@ def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) 
 
 
 def kind_of(path: Path) -> str:
-    """.exr or .hdr where a file is of that kind by its first bytes, otherwise what its name says.
-
-    Raises:
-        DataError: there is no such file, or it is empty.
-    """
+    """.exr or .hdr where a file is of that kind by its first bytes, otherwise what its name says; a
+    DataError where there is no such file, or it is empty."""
     _require_file(path)
     with path.open("rb") as file:
         head = file.read(4)

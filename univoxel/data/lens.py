@@ -60,11 +60,7 @@ class Lens:
 
 
 def checked(lens: Lens) -> Lens:
-    """The lens, if float32 can hold what it does.
-
-    Raises:
-        UserError: a focal length, centre or distortion is out of range.
-    """
+    """The lens, if float32 can hold what it does, or else a UserError."""
     side = max(lens.width, lens.height)
     low, high = (share * side for share in FOCALS)
     if not all(low <= focal <= high for focal in lens.focal):

@@ -140,11 +140,8 @@ def read_shots(
 
 
 def _reread(shot: Shot, pinhole: Lens, factor: int) -> Tensor:
-    """Stored colour [H // factor, W // factor, 3] of a photograph's file, without its mask.
-
-    Raises:
-        DataError: it cannot be read any more, or has another size.
-    """
+    """Stored colour [H // factor, W // factor, 3] of a photograph's file, without its mask; a
+    DataError where it cannot be read any more, or has another size."""
     color, alpha = read_photo(shot.image, masks=False)
     if color.shape[:2] != (shot.lens.height, shot.lens.width):
         raise DataError(
@@ -182,11 +179,8 @@ def _pinholes(shots: Sequence[Shot]) -> list[Lens]:
 
 
 def _with_masks(folder: Path, shots: Sequence[Shot]) -> list[Shot]:
-    """The shots with the masks that lie in folders of masks and beside photographs.
-
-    Raises:
-        DataError: some photographs have a mask in such a folder, and others none at all.
-    """
+    """The shots with the masks that lie in folders of masks and beside photographs; a DataError
+    where some have one in such a folder, and others none at all."""
     photographs = [(shot.name, shot.image) for shot in shots]
     found, beside = find_masks(folder, photographs), masks_beside(photographs)
     masked = [

@@ -221,11 +221,7 @@ def listed_image(folder: Path, file_path: str, where: str) -> Path | None:
 def _found_as_written_elsewhere(folder: Path, names: Sequence[str], where: str) -> Path | None:
     """A file that a list names as another machine has it: with backslashes, in capitals or not,
     accents apart from their letters or not, or by an absolute path, of which the end says which it
-    is in the folder.
-
-    Raises:
-        DataError: two files are called so.
-    """
+    is in the folder. Two files that are called so are a DataError."""
     of_windows = "\\" in names[0] or re.match("[A-Za-z]:/", names[0])
     paths = [PureWindowsPath(name) if of_windows else PurePosixPath(name) for name in names]
     if any(".." in path.parts for path in paths):

@@ -144,11 +144,7 @@ def usual_lights() -> list[Light]:
 
 
 def light_of_file(path: Path) -> Light:
-    """A map from a file, averaged to at most MOST_ROWS rows.
-
-    Raises:
-        DataError: it cannot be used as a map; OSError: it cannot be read.
-    """
+    """A map from a file, averaged to at most MOST_ROWS rows; errors as of `read_map`."""
     radiance = read_map(path).radiance
     return Light(path.stem, _averaged(radiance, min(len(radiance), MOST_ROWS)))
 

@@ -257,11 +257,8 @@ def report_text(
 
 
 def what_is_known(run: Path, scene: Scene, options: ReportOptions) -> Known:
-    """Survey the surface by the photographs of a run, and weigh directions for more.
-
-    Raises:
-        UserError: they cannot be used; OSError: they cannot be read.
-    """
+    """Survey the surface by the photographs of a run, and weigh directions for more; errors as of
+    `photos_of`."""
     data = None if options.data is None else Path(options.data)
     photos = photos_of(run, data, "train")
     surveyed = survey(scene, photos, POINTS)

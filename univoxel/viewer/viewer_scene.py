@@ -68,11 +68,7 @@ class Subject:
 
 
 def subject_of(run: Path) -> Subject:
-    """The scene of a run's folder, and its mesh.
-
-    Raises:
-        UserError: the run cannot be used, or there is no surface.
-    """
+    """The scene of a run's folder, and its mesh; a UserError where there is none."""
     scene = load_scene(run)
     mesh = mesh_of(scene, cameras=cameras_of(scene, run))
     return Subject(scene, traced_mesh(mesh, scene.field.voxel_size), run)
@@ -141,13 +137,8 @@ class Point:
 
 def point_on_mesh(subject: Subject, ray: Rays) -> Point | None:
     """Where one ray first meets the mesh; None: nowhere."""
-    hit = subject.traced.visibility.closest_hit(ray.origin, ray.direction)
-    mesh = subject.traced.mesh
-    if hit.face[0] < 0:
-        return None
-    assert mesh.normals is not None
-    normal = torch.nn.functional.normalize(at_hits(mesh, hit, mesh.normals)[0], dim=0)
-    return Point(ray.origin[0] + hit.t[0] * ray.direction[0], normal)
+    surface, _, hit = surface_along(subject, ray)
+    return None if hit.face[0] < 0 else Point(surface.position[0], surface.normal[0])
 
 
 @torch.no_grad()
