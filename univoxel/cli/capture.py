@@ -468,10 +468,10 @@ def _check_trained(wanted: TrainConfig, done: bool) -> None:
 
 def _export(project: Project, run: Path) -> None:
     if _up_to_date(project.mesh, run):
-        return _skip("mesh", project.mesh)
-    _say("mesh", str(project.mesh))
-    export(run, project.mesh)
-    return None
+        _skip("mesh", project.mesh)
+    else:
+        _say("mesh", str(project.mesh))
+        export(run, project.mesh)
 
 
 def _up_to_date(file: Path, run: Path) -> bool:

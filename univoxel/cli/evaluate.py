@@ -206,6 +206,4 @@ def _verdict(run: Path) -> dict[str, Any]:
     from univoxel.run import load_verdict
 
     verdict = load_verdict(run)
-    if verdict is None:
-        return {"complete": None, "verdict": None}
-    return {"complete": verdict.complete, "verdict": verdict.word}
+    return {"complete": verdict and verdict.complete, "verdict": verdict and verdict.word}

@@ -195,7 +195,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff", ".webp")
 # What Pillow may take a file for, whatever its name says
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 KINDS = {".exr": "an OpenEXR file", ".tif": "a TIFF", ".tiff": "a TIFF", ".webp": "a WebP"}
-FLIPPED = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}  # axes, by EXIF orientation
+# Axes that are flipped, by orientation in EXIF
+FLIPPED: dict[int, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
 HEIF = (".heic", ".heif", ".avif")  # of telephones
 HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
 LARGEST = 1 << 29  # pixels of a file: panoramas and the largest telephones have 200 million

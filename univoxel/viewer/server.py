@@ -127,10 +127,8 @@ class Panel:
         self._denoise = gui.add_checkbox("denoise", frames.available(), visible=frames.available())
         for control in (self._layer, self._ground, self._backdrop, self._denoise):
             control.on_update(lambda event: self._ask())
-        for control in (
-            *(self._light, self._turn, self._exposure),
-            *(self._sun, self._azimuth, self._elevation),
-        ):
+        sun = self._sun, self._azimuth, self._elevation
+        for control in (self._light, self._turn, self._exposure, *sun):
             control.on_update(lambda event: self._relight())
         self._map.on_upload(lambda event: self._guarded(self._take_map))
         gui.add_button("PNG").on_click(lambda event: self._guarded(self._send_png))
@@ -241,15 +239,9 @@ class Panel:
         self._studio.ask(self.viewer, self._cameras, self._look())
 
     def _look(self) -> Look:
+        controls = self._layer, self._exposure, self._ground, self._backdrop, self._denoise
         with self._lock:
-            return Look(
-                self._lighting(),
-                self._layer.value,
-                self._exposure.value,
-                self._ground.value,
-                self._backdrop.value,
-                self._denoise.value,
-            )
+            return Look(self._lighting(), *(control.value for control in controls))
 
     def _relight(self) -> None:
         """The light has changed: the picture, and what arrives at the point."""
