@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from univoxel import lights
 from univoxel.config import PREPARATION, JointConfig, LossConfig, StageConfig, TrainConfig
@@ -185,16 +186,10 @@ def _configuration(
         lr_networks=lr_networks,
         patches_from=0.0 if compared else 1.0,
     )
-    alone: dict[str, lights.LightConfig] = {
-        c.kind: c
-        for c in (
-            lights.SGConfig(directions=128),
-            lights.SHConfig(),
-            lights.MLPLightConfig(),
-            lights.EnvmapSGConfig(),
-            lights.EnvmapConfig(),
-        )
-    }
+    local = lights.SGConfig(directions=128), lights.SHConfig(), lights.MLPLightConfig()
+    kinds: tuple[lights.LightConfig, ...] = *local, lights.EnvmapSGConfig(), lights.EnvmapConfig()
+    alone = {config.kind: config for config in kinds}
+    bare: dict[str, Any] = {"sky_nodes": 0, "mirrored": False, "varying": known}
     match light:
         case "hybrid":
             coarse, fine, joint, refit = _hybrid_stages(work, coarse, fine)
@@ -202,16 +197,10 @@ def _configuration(
             scene, loss = SceneConfig(light=lobes, varying=known), LossConfig()
             stages, capacity = (coarse, fine, joint, refit), "adaptive"
         case "baked":
-            scene = SceneConfig(
-                sky_nodes=0,
-                mirrored=False,
-                light=lights.BakedConfig(),
-                varying=known,
-                roughness=0.5,
-            )
+            scene = SceneConfig(**bare, light=lights.BakedConfig(), roughness=0.5)
             stages, capacity, loss = (coarse, fine), "fixed", LossConfig()
         case _ if light in alone:
-            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=known)
+            scene = SceneConfig(**bare, light=alone[light])
             # Lobes that light the materials to the end: what leaves least shading in the albedo
             loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
             stages, capacity = (coarse, fine), "fixed"

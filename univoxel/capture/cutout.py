@@ -412,16 +412,10 @@ def _write(
             before, verdict, stem = masks[name][view], verdicts[name][view], split.names[view]
             write_photo(partial / name / stem, split, view, verdict.mask.float() / 255)
             photograph = _encoded(split, view)
-            changed = not torch.equal(before, verdict.mask)
-            tiles.append(
-                MaskTile(
-                    name=f"{name}/{stem}",
-                    agreement=verdict.agreement,
-                    fault=verdict.fault,
-                    before=darkened(photograph, before.float() / 255),
-                    after=darkened(photograph, verdict.mask.float() / 255) if changed else None,
-                )
-            )
+            shown, after = darkened(photograph, before.float() / 255), None
+            if not torch.equal(before, verdict.mask):
+                after = darkened(photograph, verdict.mask.float() / 255)
+            tiles.append(MaskTile(f"{name}/{stem}", verdict.agreement, verdict.fault, shown, after))
         write_cameras(partial, name, split.cameras, split.names)
     tiles = worst_first(tiles)
     write_png(partial / "masks.png", mask_sheet(tiles))

@@ -316,15 +316,10 @@ def _words(cameras: Cameras) -> str:
 
 def cameras_of(poses: Sequence[np.ndarray], lenses: Sequence[Lens]) -> Cameras:
     """Pinholes, each with its picture's size."""
-    width, height, sizes = sizes_of([(lens.width, lens.height) for lens in lenses])
-    return Cameras(
-        camera_to_world=torch.from_numpy(np.stack(poses).astype(np.float32)),
-        focal=torch.tensor([lens.focal for lens in lenses], dtype=torch.float32),
-        centre=torch.tensor([lens.centre for lens in lenses], dtype=torch.float32),
-        width=width,
-        height=height,
-        sizes=sizes,
-    )
+    pose = torch.from_numpy(np.stack(poses).astype(np.float32))
+    focal = torch.tensor([lens.focal for lens in lenses], dtype=torch.float32)
+    centre = torch.tensor([lens.centre for lens in lenses], dtype=torch.float32)
+    return Cameras(pose, focal, centre, *sizes_of([(lens.width, lens.height) for lens in lenses]))
 
 
 def read_photo(

@@ -383,11 +383,6 @@ def _shot(view: Path, picture: str) -> Shot:
     angle = read_number(meta, "cam_angle_x", str(path), 0.0, math.pi)
     camera = {"camera_angle_x": angle}
     camera |= {to: meta[key] for to, key in (("w", "imw"), ("h", "imh")) if key in meta}
-    return Shot(
-        name=view.name,
-        where=str(path),
-        image=image,
-        mask=None,
-        pose=pose_of([values[i : i + 4] for i in range(0, 16, 4)], str(path)),
-        lens=lens_of(camera, str(path), *image_size(image)),
-    )
+    pose = pose_of(np.reshape(values, (4, 4)), str(path))
+    lens = lens_of(camera, str(path), *image_size(image))
+    return Shot(view.name, str(path), image, None, pose, lens)

@@ -385,13 +385,9 @@ def write_cameras(folder: Path, split: str, cameras: Cameras, names: Sequence[st
     frames = []
     for view, pose in enumerate(cameras.camera_to_world.tolist()):
         (x, y), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
-        frames.append(
-            {
-                "file_path": f"{split}/{names[view]}",
-                "transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]],
-                **{"fl_x": x, "fl_y": y, "cx": cx, "cy": cy},
-            }
-        )
+        lens = {"fl_x": x, "fl_y": y, "cx": cx, "cy": cy}
+        matrix = [*pose, [0.0, 0.0, 0.0, 1.0]]
+        frames.append({"file_path": f"{split}/{names[view]}", "transform_matrix": matrix, **lens})
     write_json(folder / f"transforms_{split}.json", {"frames": frames})
 
 

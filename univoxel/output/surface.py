@@ -125,11 +125,8 @@ def smoothed(mesh: Mesh, seen: Tensor, reach: float) -> Mesh:
         moved = vertices + STEP * free * (mean @ vertices - vertices) - start
         length = np.linalg.norm(moved, axis=1, keepdims=True)
         vertices = start + moved * (reach / np.maximum(length, reach))
-    return replace(
-        mesh,
-        vertices=torch.from_numpy(vertices.astype(np.float32)),
-        seen=torch.from_numpy(share.astype(np.float32)),
-    )
+    vertices, share = (torch.from_numpy(x.astype(np.float32)) for x in (vertices, share))
+    return replace(mesh, vertices=vertices, seen=share)
 
 
 def _mean_of_neighbours(mesh: Mesh) -> csr_matrix:
