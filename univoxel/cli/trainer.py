@@ -138,9 +138,9 @@ def _train(
         if spectators:
             spectators.show(pixels.photos)
         progress.prepared()
-        seers = film and film.take_frame, spectators and spectators.look
+        watchers = film and film.take_frame, spectators and spectators.look
         now = scene, progress.clock
-        progress.clock.watch = _each(*(seer and partial(seer, *now) for seer in seers))
+        progress.clock.watch = _each(*(look and partial(look, *now) for look in watchers))
         try:
             for index in range(progress.clock.stage, len(cfg.stages)):
                 make_stage_(scene, limited, index, silhouettes.box, pinned, pixels, progress)
