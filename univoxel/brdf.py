@@ -62,9 +62,9 @@ def split(base: Tensor, metallic: Tensor | None) -> tuple[Tensor, Tensor | float
     return base * (1 - m), F0 * (1 - m) + base * m
 
 
-def metal_or_none(metallic: Tensor) -> Tensor | None:
+def metal_or_none(metallic: Tensor | None) -> Tensor | None:
     """Metallic [...], or None where no value of it would show in 8 bits: a dielectric scene."""
-    return metallic if (metallic > 0.5 / 255).any() else None
+    return metallic if metallic is not None and (metallic > 0.5 / 255).any() else None
 
 
 def ggx_alpha(roughness: Tensor) -> Tensor:

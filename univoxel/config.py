@@ -34,20 +34,8 @@ from univoxel.scene import SceneConfig
 
 # Arguments that a configuration is made of
 CHOICES = (
-    *(
-        "preset",
-        "minutes",
-        "light",
-        "varying",
-        "light_frame",
-        "metal",
-        "masks",
-        "cameras",
-        "downscale",
-        "capacity",
-        "detail",
-    ),
-    *("budget_mb", "changes"),
+    *("preset", "minutes", "light", "varying", "light_frame", "metal", "masks", "cameras"),
+    *("downscale", "capacity", "detail", "budget_mb", "changes"),
 )
 
 
@@ -298,12 +286,8 @@ class TrainConfig:
         check_settings(self)
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")
         check_fields(self, "a path in UTF-8", _is_utf8, "data", "out")
-        check_fields(
-            self,
-            "a StageConfig first, which makes the grid",
-            lambda x: len(x) >= 1 and isinstance(x[0], StageConfig),
-            "stages",
-        )
+        first = "a StageConfig first, which makes the grid"
+        check_fields(self, first, lambda x: x and isinstance(x[0], StageConfig), "stages")
         kinds = [s.field for s in self.stages if isinstance(s, StageConfig)]
         if "hash" in kinds and set(kinds) != {"hash"}:
             raise ConfigError(

@@ -3,7 +3,6 @@ light."""
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from univoxel.color import luminance
+from univoxel.core import log
 from univoxel.data.images import SUFFIXES, kind_of, read_image
 from univoxel.errors import DataError
 from univoxel.ops.integrator import EnvTables
@@ -159,7 +159,6 @@ def _invert(cdf: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
 # Environment maps from files.
 
 
-log: logging.Logger = logging.getLogger("univoxel")
 UNDERSHOOT = 0.01  # of the largest radiance: texels that are less below 0 are 0
 
 

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+
+def some(names: Sequence[object], most: int = 5) -> str:
+    """The first of many names, for a message."""
+    return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
+
 
 class Cancelled(Exception):
     """Raised in on_progress by a caller of the package: ends a training, which can be resumed."""

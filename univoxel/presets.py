@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from univoxel import lights
 from univoxel.config import PREPARATION, JointConfig, LossConfig, StageConfig, TrainConfig
@@ -30,52 +31,15 @@ class Work:
     directions: float  # of the light at a point, per step; the hybrid light's turn at random
 
 
+# fmt: off
 PRESETS = {
-    "draft": Work(
-        minutes=1.0,
-        voxels=1.25,
-        steps=530,
-        rays=1280,
-        lr_networks=6e-3,
-        lr_sdf=0.07,
-        joint_steps=395,
-        observations=2048,
-        directions=64,
-    ),
-    "fast": Work(
-        minutes=2.0,
-        voxels=2.0,
-        steps=900,
-        rays=2048,
-        lr_networks=6e-3,
-        lr_sdf=0.07,
-        joint_steps=675,
-        observations=2048,
-        directions=64,
-    ),
-    "full": Work(
-        minutes=5.0,
-        voxels=3.3,
-        steps=2900,
-        rays=2048,
-        lr_networks=3.7e-3,
-        lr_sdf=0.056,
-        joint_steps=2500,
-        observations=3400,
-        directions=105,
-    ),
-    "best": Work(
-        minutes=8.0,
-        voxels=4.0,
-        steps=4200,
-        rays=2048,
-        lr_networks=3e-3,
-        lr_sdf=0.05,
-        joint_steps=4200,
-        observations=4096,
-        directions=128,
-    ),
+    #     minutes, voxels, steps, rays, lr_networks, lr_sdf, joint_steps, observations, directions
+    "draft": Work(1.0, 1.25,  530, 1280, 6e-3,   0.07,   395, 2048,  64),
+    "fast":  Work(2.0, 2.0,   900, 2048, 6e-3,   0.07,   675, 2048,  64),
+    "full":  Work(5.0, 3.3,  2900, 2048, 3.7e-3, 0.056, 2500, 3400, 105),
+    "best":  Work(8.0, 4.0,  4200, 2048, 3e-3,   0.05,  4200, 4096, 128),
 }
+# fmt: on
 
 
 SHORTEST = 1.0  # minutes; in fewer, patches and taught colours cost more than they bring
@@ -222,16 +186,10 @@ def _configuration(
         lr_networks=lr_networks,
         patches_from=0.0 if compared else 1.0,
     )
-    alone: dict[str, lights.LightConfig] = {
-        c.kind: c
-        for c in (
-            lights.SGConfig(directions=128),
-            lights.SHConfig(),
-            lights.MLPLightConfig(),
-            lights.EnvmapSGConfig(),
-            lights.EnvmapConfig(),
-        )
-    }
+    local = lights.SGConfig(directions=128), lights.SHConfig(), lights.MLPLightConfig()
+    kinds: tuple[lights.LightConfig, ...] = *local, lights.EnvmapSGConfig(), lights.EnvmapConfig()
+    alone = {config.kind: config for config in kinds}
+    bare: dict[str, Any] = {"sky_nodes": 0, "mirrored": False, "varying": known}
     match light:
         case "hybrid":
             coarse, fine, joint, refit = _hybrid_stages(work, coarse, fine)
@@ -239,36 +197,25 @@ def _configuration(
             scene, loss = SceneConfig(light=lobes, varying=known), LossConfig()
             stages, capacity = (coarse, fine, joint, refit), "adaptive"
         case "baked":
-            scene = SceneConfig(
-                sky_nodes=0,
-                mirrored=False,
-                light=lights.BakedConfig(),
-                varying=known,
-                roughness=0.5,
-            )
+            scene = SceneConfig(**bare, light=lights.BakedConfig(), roughness=0.5)
             stages, capacity, loss = (coarse, fine), "fixed", LossConfig()
         case _ if light in alone:
-            scene = SceneConfig(sky_nodes=0, mirrored=False, light=alone[light], varying=known)
+            scene = SceneConfig(**bare, light=alone[light])
             # Lobes that light the materials to the end: what leaves least shading in the albedo
             loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
             stages, capacity = (coarse, fine), "fixed"
         case _:
             names = ", ".join(LIGHTS)
             raise UserError(f"light must be one of {names}, got {light!r}", "light")
+    turns = isinstance(scene.light, lights.LocalLightConfig) and known != "light"
+    detailed = work.minutes > PRESETS["draft"].minutes and light != "baked"
     return TrainConfig(
-        data,
-        out,
-        stages,
+        *(data, out, stages),
         exposures=exposures,
-        light_frame="auto"
-        if isinstance(scene.light, lights.LocalLightConfig) and known != "light"
-        else "world",
+        light_frame="auto" if turns else "world",
         carving_seconds=CARVING * 60 * work.minutes,
         capacity=capacity,
-        # Of a look nobody waits for it
-        detail="texture"
-        if work.minutes > PRESETS["draft"].minutes and light != "baked"
-        else "none",
+        detail="texture" if detailed else "none",  # of a look nobody waits for it
         scene=scene,
         loss=loss,
     )

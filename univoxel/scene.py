@@ -281,12 +281,8 @@ def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict
         tensors[rows_name], tensors[values_name] = rows.int(), table[rows]
     if slim:
         # sdf next to the surface is a small number: half precision keeps it to 1e-3 voxels
-        halves = {
-            "field.sdf",
-            "field.sdf_values",
-            "sky.sharp",
-            *(values for _, values in TABLES.values()),
-        }
+        halves = {"field.sdf", "field.sdf_values", "sky.sharp"}
+        halves |= {values for _, values in TABLES.values()}
         for name in halves & tensors.keys():
             tensors[name] = tensors[name].clamp(-HALF_MAX, HALF_MAX).half()
     return tensors

@@ -99,6 +99,12 @@ def random_rotation(generator: torch.Generator) -> Tensor:
     )
 
 
+def direction_at(azimuth: float, elevation: float) -> tuple[float, float, float]:
+    """A unit vector, from degrees counter-clockwise from +X and degrees above the horizon."""
+    phi, up = math.radians(azimuth), math.radians(elevation)
+    return math.cos(up) * math.cos(phi), math.cos(up) * math.sin(phi), math.sin(up)
+
+
 def latlong_direction(uv: Tensor) -> Tensor:
     """Unit directions [..., 3] of places on an environment map.
 

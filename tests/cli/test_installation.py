@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from univoxel.cli import doctor
-from univoxel.cli.doctor import Extra
 
 
 def test_extras_and_what_is_missing_of_them(monkeypatch):
@@ -16,10 +15,7 @@ def test_extras_and_what_is_missing_of_them(monkeypatch):
         "neither_this (>=1) ; extra == 'many'",
     ]
     monkeypatch.setattr(doctor.metadata, "requires", lambda name: requirements)
-    assert doctor.extras() == [
-        Extra("many", ("no-such-package", "neither_this")),
-        Extra("sums", ()),
-    ]
+    assert doctor.extras() == {"many": ["no-such-package", "neither_this"], "sums": []}
 
 
 def test_extras_of_what_is_not_installed():

@@ -26,7 +26,6 @@ def test_the_fields_that_a_joint_stage_has_always_had(config):
     ("record", "name", "text", "value"),
     [
         ("metal", "min_reflectance", "0.3", 0.3),
-        ("mirror", "rows", "64", 64),
         ("entropy", "teaching_steps", "5", 5),
     ],
 )
@@ -61,4 +60,4 @@ def test_config_json_records_them(config, tmp_path):
     save_config(config)
     stages = json.loads((tmp_path / "config.json").read_text())["stages"]
     assert stages[1]["sharpness"] == [0.7, 0.2]
-    assert set(stages[2]) >= {"metal", "mirror", "entropy"}
+    assert set(stages[2]) >= {"metal", "entropy"}

@@ -6,7 +6,7 @@ import pytest
 import torch
 from asymmetric_scene import BALLS, lopsided, subject_of
 
-from univoxel.camera import Cameras, pixel_rays
+from univoxel.camera import Cameras, image_rays, pixel_rays
 from univoxel.core.records import Rays
 from univoxel.envmap import EnvMap, lookup
 from univoxel.ops import Sun
@@ -16,8 +16,8 @@ from univoxel.sphere import latlong_directions, texel_solid_angles
 from univoxel.viewer.viewer_scene import (
     incident_light,
     incident_picture,
-    mesh_surface,
     point_on_mesh,
+    surface_along,
 )
 
 ROWS = 32
@@ -79,7 +79,7 @@ def test_what_hides_the_sky_is_seen_as_a_camera_there_sees_it(subject, crease):
     pose = torch.stack([right, up, back, eye], 1)[None]
     focal = torch.full((1, 2), size / 2 / math.tan(math.radians(60)))
     camera = Cameras(pose, focal, torch.full((1, 2), size / 2), size, size)
-    surface, wo, hit = mesh_surface(subject, camera)
+    surface, wo, hit = surface_along(subject, image_rays(camera, 0))
     rgb = relight_surface(surface, wo, subject.traced, light_of, samples=512, bounces=1)
     above = -wo @ crease.normal > 0.1
     blocked = ((hit.face >= 0) & above).nonzero()[:, 0]

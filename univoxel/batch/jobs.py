@@ -79,11 +79,8 @@ class Job:
         return self.files.with_name(self.files.name + suffix)
 
     def record(self) -> dict[str, dict[str, Any]]:
-        """What is known from all sittings: identity; seconds, and errors of the last, by step.
-
-        Raises:
-            DataError: the file is no record.
-        """
+        """What is known from all sittings: identity; seconds, and errors of the last, by step; a
+        DataError where the file is no record."""
         path = self.file(".json")
         found = read_json(path) if path.exists() else {}
         if not isinstance(found, dict) or any(type(found.get(k, {})) is not dict for k in RECORD):
@@ -95,11 +92,7 @@ class Job:
         write_json(self.file(".json"), record)
 
     def check_same(self) -> None:
-        """Refuse to go on with what other options began.
-
-        Raises:
-            ExistingFile: they are others.
-        """
+        """Refuse, by an ExistingFile, to go on with what other options began."""
         before = self.record()["identity"]
         other = [key for key, value in self.identity.items() if before and before.get(key) != value]
         if other:
@@ -335,11 +328,7 @@ class ProgressTable:
     """A bar of all jobs beside those at work; without a terminal a line now and then."""
 
     def __init__(self, before: int, total: int) -> None:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[facts]}"),
-        )
+        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[facts]}")
         self.progress: Progress = bar(*columns, TimeElapsedColumn())
         self._all = self.progress.add_task(f"{before}/{total}", total=total, facts="")
         self._begin, self._before, self._total = time.monotonic(), before, total
@@ -368,9 +357,7 @@ class ProgressTable:
             spent, left = time.monotonic() - self._begin, self._total - self._before - made
             facts.append(f"about {timedelta(seconds=round(spent * left / made))} left")
         separator = "\n" if self.progress.console.is_terminal else "  "
-        row = {
-            "completed": self._before + made,
-            "description": f"{self._before + ended}/{self._total}",
-        }
         shown = separator.join([*facts, *(text for _, text in told)])
-        self.progress.update(self._all, facts=shown, **row)
+        description = f"{self._before + ended}/{self._total}"
+        completed = self._before + made
+        self.progress.update(self._all, completed=completed, description=description, facts=shown)

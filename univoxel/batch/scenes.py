@@ -180,11 +180,7 @@ a {{ color: #9cf }}
 
 
 def write_sheet(results: Sequence[SceneResult], out: Path) -> Path:
-    """Write out/index.html, which holds its pictures; return it. Failed scenes come first.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write out/index.html, which holds its pictures; return it. Failed scenes come first."""
     shown = [key for key in COLUMNS if any(r.measures.get(key) is not None for r in results)]
     heads = ["", "scene", "verdict", *(COLUMNS[key][0] for key in shown)]
     heads += ["doubt of albedo", "of roughness", "training", "all", ""]
@@ -205,7 +201,7 @@ def _row(result: SceneResult, shown: Sequence[str], out: Path) -> list[str]:
     cells += [_number(result.measures.get(key), COLUMNS[key][1]) for key in shown]
     cells += [_number(result.doubts.get(key), 2) for key in ("doubt_albedo", "doubt_roughness")]
     whole = sum(result.seconds.values()) if result.seconds else None
-    cells += [_seconds(result.seconds.get("train")), _seconds(whole)]
+    cells += [_number(spent, 0, " s") for spent in (result.seconds.get("train"), whole)]
     output = _link(out / LOGS / f"{result.name}.txt", "what it said", out)
     return [*cells, f"{escape(result.error)} {output}"]
 
@@ -218,12 +214,8 @@ def _link(path: Path, text: str, out: Path) -> str:
     return f'<a href="{quote(path.relative_to(out).as_posix())}">{said}</a>'
 
 
-def _number(value: float | int | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _seconds(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0f} s"
+def _number(value: float | int | None, digits: int, unit: str = "") -> str:
+    return "-" if value is None else f"{value:.{digits}f}{unit}"
 
 
 def _thumbnail(path: Path) -> str:

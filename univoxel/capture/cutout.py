@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import logging
 import shutil
 import statistics
 from collections.abc import Callable, Sequence
@@ -30,6 +29,7 @@ from univoxel.capture.masks import (
     voxel_pixels,
 )
 from univoxel.color import linear_to_srgb
+from univoxel.core import log
 from univoxel.core.choices import DEPTH, NETWORK, REMBG, NetworkName
 from univoxel.core.files import write_text
 from univoxel.core.html import DARK_STYLE, document, escape, image, paragraph
@@ -37,7 +37,7 @@ from univoxel.core.progress_bar import track
 from univoxel.data import Photos, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.transforms import write_cameras
-from univoxel.errors import DataError, ExistingFile, UserError
+from univoxel.errors import DataError, ExistingFile, UserError, some
 from univoxel.preparation import object_shape
 from univoxel.preparation.hull import mask_distances
 from univoxel.preparation.standing_object import masks_by_depth
@@ -85,19 +85,10 @@ def worst_first(tiles: Sequence[MaskTile]) -> list[MaskTile]:
 
 
 def mask_sheet(tiles: Sequence[MaskTile]) -> np.ndarray:
-    """All of them in rows, in their order, before and after beside each other: [H, W, 3] uint8.
-
-    Raises:
-        ValueError: there are none.
-    """
+    """All of them in rows, in their order, before and after beside each other: [H, W, 3] uint8."""
     if not tiles:
         raise ValueError("mask_sheet: expected photographs, got none")
-    pictures = [
-        (tile, picture)
-        for tile in tiles
-        for picture in (tile.before, tile.after)
-        if picture is not None
-    ]
+    pictures = [(tile, p) for tile in tiles for p in (tile.before, tile.after) if p is not None]
     columns = min(COLUMNS, len(pictures))
     width = max(picture.shape[1] for _, picture in pictures)
     width = max(width, TILE) + GAP  # the words need their room
@@ -112,7 +103,7 @@ def mask_sheet(tiles: Sequence[MaskTile]) -> np.ndarray:
         words = "repaired" if after else tile.fault
         draw.text((x + 2, y + 1), f"{tile.name}{_number(tile)}", colour, font)
         draw.text((x + 2, y + 16), words, colour, font)
-        sheet.paste(Image.fromarray(_as_bytes(picture)), (x, y + LABEL))
+        sheet.paste(Image.fromarray(_bytes(picture).numpy()), (x, y + LABEL))
     return np.asarray(sheet)
 
 
@@ -139,12 +130,6 @@ def _number(tile: MaskTile) -> str:
     return "" if tile.agreement is None else f"  {tile.agreement:.2f}"
 
 
-def _as_bytes(picture: Tensor) -> np.ndarray:
-    return (picture.numpy() * 255 + 0.5).astype(np.uint8)
-
-
-# Cut an object out of photographs without masks.
-#
 # Masks come from a network, from a folder, or from the depth that the photographs show, alone.
 # Masks and depth tell the object in 3D, and masks that its silhouettes contradict are repaired.
 
@@ -160,9 +145,6 @@ GUESSED = 0.15
 SURE = 0.5
 
 
-log: logging.Logger = logging.getLogger("univoxel")
-
-NAMED = 5  # photographs in a message, at most
 Masks = dict[str, list[Tensor]]  # [H, W] uint8 of each photograph of each split
 
 
@@ -215,8 +197,7 @@ def cutout(
     }
     log.info(photos.about)
     if masked:
-        count = sum(map(len, splits.values()))
-        masks = _from_network(splits, timed(masked, network, count))
+        masks = _from_network(splits, timed(masked, network, sum(map(len, splits.values()))))
     elif origin == DEPTH:
         masks = _from_depth(splits, depth_maps(photos), corners, keep_table)
     else:  # of shrunk photographs those with masks are black outside of them
@@ -231,13 +212,10 @@ def cutout(
 
 
 def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_table: bool) -> None:
-    """Refuse choices of masks that contradict one another.
+    """Refuse, by a UserError, choices of masks that contradict one another.
 
     Args:
         origin: where masks come from.
-
-    Raises:
-        UserError: they do.
     """
     check_network(network)
     if network != NETWORK and origin not in (REMBG, "auto"):
@@ -315,13 +293,8 @@ def _silhouettes_of(shape: object_shape.ObjectShape, photos: Photos) -> list[Ten
 
 
 def _from_network(splits: dict[str, Photos], masked: Callable[[Tensor], Tensor]) -> Masks:
-    return _of_all(splits, lambda split, view: masked(_encoded(split, view)))
-
-
-def _of_all(splits: dict[str, Photos], masked: Callable[[Photos, int], Tensor]) -> Masks:
-    """Masks of all photographs, of each by its split and number."""
     return {
-        name: [_bytes(masked(split, view)) for view in track(range(len(split)), "masks")]
+        name: [_bytes(masked(_encoded(split, v))) for v in track(range(len(split)), "masks")]
         for name, split in splits.items()
     }
 
@@ -414,13 +387,10 @@ def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: 
     if not wrong:
         return told
     parts = []
-    for stems, words in (
-        (faults[BESIDE], "keep something beside the object"),
-        (faults[MISSING], "miss a part"),
-    ):
-        if stems:
-            more = ", ..." if len(stems) > NAMED else ""
-            parts.append(f"{len(stems)} {words} ({', '.join(stems[:NAMED])}{more})")
+    said = {BESIDE: "keep something beside the object", MISSING: "miss a part"}
+    for fault, words in said.items():
+        if stems := faults[fault]:
+            parts.append(f"{len(stems)} {words} ({some(stems)})")
     return f"{told}; {wrong} do not: {', '.join(parts)}"
 
 
@@ -442,16 +412,10 @@ def _write(
             before, verdict, stem = masks[name][view], verdicts[name][view], split.names[view]
             write_photo(partial / name / stem, split, view, verdict.mask.float() / 255)
             photograph = _encoded(split, view)
-            changed = not torch.equal(before, verdict.mask)
-            tiles.append(
-                MaskTile(
-                    name=f"{name}/{stem}",
-                    agreement=verdict.agreement,
-                    fault=verdict.fault,
-                    before=darkened(photograph, before.float() / 255),
-                    after=darkened(photograph, verdict.mask.float() / 255) if changed else None,
-                )
-            )
+            shown, after = darkened(photograph, before.float() / 255), None
+            if not torch.equal(before, verdict.mask):
+                after = darkened(photograph, verdict.mask.float() / 255)
+            tiles.append(MaskTile(f"{name}/{stem}", verdict.agreement, verdict.fault, shown, after))
         write_cameras(partial, name, split.cameras, split.names)
     tiles = worst_first(tiles)
     write_png(partial / "masks.png", mask_sheet(tiles))

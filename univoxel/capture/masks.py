@@ -3,7 +3,6 @@ contradicts."""
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,14 +17,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 from univoxel.camera import Cameras, project
+from univoxel.core import log
 from univoxel.core.choices import NETWORK, NetworkName
 from univoxel.core.progress_bar import duration
 from univoxel.errors import DataError, MissingExtra, UserError
 from univoxel.fields.grid import GridShape
 from univoxel.preparation.hull import mask_distances
 from univoxel.preparation.object_shape import shrunk
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 Values = tuple[float, float, float]  # of red, green and blue
 IMAGENET: tuple[Values, Values] = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -57,11 +55,7 @@ NETWORKS: dict[str, Network] = {
 
 
 def check_network(name: str) -> Network:
-    """The network of a name.
-
-    Raises:
-        UserError: there is none.
-    """
+    """The network of a name; a UserError where there is none."""
     if name not in NETWORKS:
         raise UserError(f"network: expected one of {', '.join(NETWORKS)}, got {name}", "network")
     return NETWORKS[name]

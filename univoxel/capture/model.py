@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from univoxel.core.files import write_bytes
-from univoxel.data.colmap import read_cameras
+from univoxel.data.colmap import SEEN, image_records, read_cameras
 from univoxel.data.lens import Lens
 
 # COLMAP's database of features and matches, read in this process: it is SQLite.
@@ -122,7 +122,6 @@ def positions(path: Path) -> dict[int, np.ndarray]:
 
 SIMPLE_RADIAL = 2  # its number in the files
 NO_POINT = -1
-SEEN = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 TRACK = np.dtype([("image", "<i4"), ("index", "<i4")])
 
 
@@ -226,15 +225,8 @@ def without(model: Model, numbers: set[int]) -> Model:
 
 
 def _read_images(data: bytes) -> list[Placed]:
-    (count,), at = struct.unpack_from("<Q", data), 8
     found = []
-    for _ in range(count):
-        number, *pose, camera = struct.unpack_from("<i7di", data, at)
-        end = data.index(b"\0", at + 64)
-        name = data[at + 64 : end].decode("utf-8")
-        (features,) = struct.unpack_from("<Q", data, end + 1)
-        seen = np.frombuffer(data, SEEN, features, end + 9)
-        at = end + 9 + features * SEEN.itemsize
+    for number, pose, camera, name, seen in image_records(data):
         turn = Rotation.from_quat(pose[:4], scalar_first=True).as_matrix()
         to_camera = np.concatenate([turn, np.array(pose[4:])[:, None]], 1)
         found.append(Placed(number, camera, name, to_camera, seen["xy"], seen["point"]))

@@ -4,20 +4,23 @@ their camera, their pixels upright."""
 from __future__ import annotations
 
 import importlib.util
-import logging
 import math
 import re
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image, ImageOps
+from scipy.ndimage import laplace
 
 from univoxel.color import linear_to_srgb, srgb_to_linear
+from univoxel.core import log
 from univoxel.data.images import (
     DISPLAY_P3,
     REC_709,
@@ -30,9 +33,7 @@ from univoxel.data.images import (
 from univoxel.data.masks import without_masks
 from univoxel.errors import DataError, MissingExtra
 
-# Photographs of any format: which there are, what they say of their camera, their pixels upright.
-#
-# Formats: JPEG, PNG, TIFF, WebP, AVIF; HEIC with pillow-heif; RAW with rawpy.
+# Formats of photographs: JPEG, PNG, TIFF, WebP, AVIF; HEIC with pillow-heif; RAW with rawpy.
 
 
 PLAIN = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif")
@@ -48,9 +49,7 @@ ORDER = (".jpg", ".jpeg", *HEIF, ".png", ".tif", ".tiff", ".webp", ".avif", *RAW
 FEWEST = 3  # pictures that are a capture; fewer beside a folder of them are previews
 NAMED = 5  # folders in a message, at most
 DIAGONAL_35MM = math.hypot(36, 24)  # millimetres
-T = Image.Transpose
-TURNS = {5: T.TRANSPOSE, 6: T.ROTATE_270, 7: T.TRANSVERSE, 8: T.ROTATE_90}  # to upright, by EXIF
-SIDEWAYS = tuple(TURNS)  # orientations that swap width and height
+SIDEWAYS = (5, 6, 7, 8)  # orientations of EXIF that swap width and height
 MAKE, MODEL, ORIENTATION, DETAILS = 0x010F, 0x0110, 0x0112, 0x8769
 FOCAL, FOCAL_35MM, EXIF_WIDTH, EXIF_HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
 SRGB_GAMMA = (2.4, 12.92)  # of a RAW's development
@@ -125,11 +124,7 @@ def _pictures(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def require_readers(paths: list[Path]) -> None:
-    """Say before anything is read whether a package is missing for some of the files.
-
-    Raises:
-        MissingExtra: it is.
-    """
+    """Raise a MissingExtra, before anything is read, where a package lacks for some files."""
     for suffixes, module, package, kind in (
         (HEIF, "pillow_heif", "pillow-heif", "HEIC"),
         (RAW, "rawpy", "rawpy", "RAW"),
@@ -142,11 +137,7 @@ def require_readers(paths: list[Path]) -> None:
 
 
 def describe(path: Path) -> Photograph:
-    """Size and camera of a photograph, from its beginning alone.
-
-    Raises:
-        DataError: it cannot be read.
-    """
+    """Size and camera of a photograph, from its beginning alone; a DataError where it is none."""
     try:
         if path.suffix.lower() in RAW:
             return _describe_raw(path)
@@ -207,12 +198,9 @@ def shrunk_to(picture: Image.Image, longest: int) -> Image.Image:
     return picture.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
 
 
-def _can_read_heif() -> bool:
-    return importlib.util.find_spec("pillow_heif") is not None
-
-
 def _open(path: Path) -> Image.Image:
-    if path.suffix.lower() in HEIF or (_can_read_heif() and is_heif(path)):
+    readable = importlib.util.find_spec("pillow_heif") is not None
+    if path.suffix.lower() in HEIF or (readable and is_heif(path)):
         import pillow_heif  # pyright: ignore[reportMissingImports]  the extra `capture`
 
         pillow_heif.register_heif_opener()
@@ -229,38 +217,31 @@ def _eight_bits(image: Image.Image) -> Image.Image:
 
 
 def _describe_raw(path: Path) -> Photograph:
-    raw = _raw(path)
-    try:
-        sizes = raw.sizes
-    finally:
-        raw.close()
-    width, height = sizes.width, sizes.height
-    if sizes.flip in (5, 6):
-        width, height = height, width
+    with _raw(path) as raw:
+        width, height = raw.sizes.width, raw.sizes.height
+        if raw.sizes.flip in (5, 6):
+            width, height = height, width
     return Photograph(path, width, height)
 
 
 def _develop(path: Path, longest: int) -> Image.Image:
-    raw = _raw(path)
-    try:
+    with _raw(path) as raw:
         half = 0 < 2 * longest <= max(raw.sizes.width, raw.sizes.height)
         # The brightness as it was taken: otherwise each photograph has an exposure of its own
         array = raw.postprocess(
             use_camera_wb=True, no_auto_bright=True, gamma=SRGB_GAMMA, half_size=half
         )
-    except Exception as error:
-        raise OSError(str(error)) from None  # rawpy's errors have no common root but Exception
-    finally:
-        raw.close()
     return Image.fromarray(array)
 
 
-def _raw(path: Path):
+@contextmanager
+def _raw(path: Path) -> Iterator[Any]:
     import rawpy  # pyright: ignore[reportMissingImports]  the extra `capture`
 
     try:
-        return rawpy.imread(str(path))
-    except rawpy.LibRawError as error:  # pyright: ignore[reportAttributeAccessIssue]
+        with rawpy.imread(str(path)) as raw:
+            yield raw
+    except Exception as error:  # rawpy's errors have no common root but this
         raise OSError(str(error)) from None
 
 
@@ -304,19 +285,13 @@ NODES = 65  # along a side of a table of colours
 TABLE = "colours.cube"
 STILL = 0.25  # of 255, by which frames of a picture that stands still may differ
 
-log: logging.Logger = logging.getLogger("univoxel")
-
 
 def is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in SUFFIXES
 
 
 def require_ffmpeg() -> None:
-    """Say before anything is read whether videos can be.
-
-    Raises:
-        MissingExtra: they cannot.
-    """
+    """Raise a MissingExtra, before anything is read, where videos cannot be."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise MissingExtra("a video needs imageio-ffmpeg: pip install 'univoxel[capture]'")
 
@@ -445,18 +420,11 @@ def sharpness(picture: np.ndarray) -> float:
 
     It says nothing of frames that show something else: smooth sides have little of it.
     """
-    p = picture.astype(np.float32)
-    inner = p[1:-1, 1:-1]
-    laplacian = p[:-2, 1:-1] + p[2:, 1:-1] + p[1:-1, :-2] + p[1:-1, 2:] - 4 * inner
-    return float(laplacian.var())
+    return float(laplace(picture.astype(np.float32))[1:-1, 1:-1].var())
 
 
 def seconds(video: Path) -> float:
-    """Length of a video.
-
-    Raises:
-        DataError: it does not say.
-    """
+    """Length of a video; a DataError where it does not say."""
     clock = r"(\d+):(\d+):(\d+\.?\d*)"
     found = re.findall(f"Duration: {clock}", _about(video))
     if not found:  # of recordings that were written as they came: the time of the last frame

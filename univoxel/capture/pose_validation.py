@@ -49,16 +49,11 @@ def partners(
     """
     placed = {image.number: image for image in model.images}
     index = {number: i for i, number in enumerate(model.points.number.tolist())}
-    looks = {
-        n: _Look(
-            image,
-            model.cameras[image.camera],
-            features[n],
-            _rays(features[n], model.cameras[image.camera]),
-            np.array([index.get(p, -1) for p in image.point.tolist()]),
-        )
-        for n, image in placed.items()
-    }
+    looks = {}
+    for n, image in placed.items():
+        lens = model.cameras[image.camera]
+        point = np.array([index.get(p, -1) for p in image.point.tolist()])
+        looks[n] = _Look(image, lens, features[n], _rays(features[n], lens), point)
     found: dict[int, list[Partner]] = {number: [] for number in placed}
     for pair in pairs:
         if pair.first not in placed or pair.second not in placed or not len(pair.matches):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import platform
 import shutil
 from collections.abc import Callable, Iterable, Iterator
@@ -23,13 +22,12 @@ from univoxel.capture.photographs import find_photographs, require_readers
 from univoxel.capture.prepare import Capture, Folders, gather, in_words, write_pictures
 from univoxel.capture.sfm import require_pycolmap
 from univoxel.core import files as steps
+from univoxel.core import log
 from univoxel.core.choices import KEEP_SIZE
 from univoxel.core.files import read_json
 from univoxel.core.progress_bar import bar
 from univoxel.errors import DataError, ExistingFile, StillBackground
 from univoxel.sphere import gaps
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 WORK = "sfm"  # folder in the scene that the steps keep their results in
 # Steps that are noted in it: those of the search, with its settings, and what stands by itself
@@ -274,7 +272,7 @@ def _follow(progress: Progress, name: str, parts: Iterable[int], total: int) -> 
 
 def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Found:
     """The largest model, and what is known of each photograph."""
-    models = structure.models(folders)
+    models = database.read_models(folders.models)
     pairs = database.verified_pairs(folders.database)
     features = database.feature_counts(folders.database)
     numbers = database.images(folders.database)

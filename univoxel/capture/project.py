@@ -52,11 +52,7 @@ class Project:
 
 
 def look_at(path: Path) -> Given:
-    """What a capture can begin with there.
-
-    Raises:
-        DataError: nothing that it can begin with.
-    """
+    """What a capture can begin with there; a DataError where that is nothing."""
     if (path / FILE).is_file():
         return Given(path, "run", [(str(path.absolute()), 0)])
     if has_cameras(path):

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from univoxel.capture.model import Model, Placed, write_model
 from univoxel.capture.photographs import Photograph, fitted, read_upright
@@ -146,7 +145,11 @@ def write_scene(
         photograph = capture.photographs[index]
         picture = read_upright(photograph.path, longest)
         name = written_name(photograph)
-        _write(picture, partial / "images" / name)
+        if name.endswith(".png"):
+            picture.save(partial / "images" / name)  # without EXIF, as it is not asked for
+        else:
+            flat = picture.convert("RGB")
+            flat.save(partial / "images" / name, quality=QUALITY, subsampling=0)
         if capture.masks is not None:
             (partial / "masks").mkdir(exist_ok=True)
             mask = read_mask(capture, index).resize(picture.size)
@@ -179,10 +182,3 @@ def write_report(out: Path, settings: dict[str, Any], model: Model, reports: lis
         "photographs": [vars(r) for r in reports],
     }
     write_json(out / REPORT, record)
-
-
-def _write(picture: Image.Image, path: Path) -> None:
-    if path.suffix == ".png":
-        picture.save(path)  # without EXIF, as it is not asked for
-    else:
-        picture.convert("RGB").save(path, quality=QUALITY, subsampling=0)

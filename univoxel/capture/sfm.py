@@ -50,11 +50,7 @@ class Request:
 
 
 def require_pycolmap() -> None:
-    """Say before anything is read whether cameras can be found.
-
-    Raises:
-        MissingExtra: they cannot.
-    """
+    """Raise a MissingExtra, before anything is read, where cameras cannot be found."""
     if importlib.util.find_spec("pycolmap") is None:
         raise MissingExtra("finding cameras needs pycolmap: pip install 'univoxel[capture]'")
 

@@ -12,7 +12,6 @@ import torch
 
 from univoxel.capture import model
 from univoxel.capture.config import CaptureConfig
-from univoxel.capture.model import Model, read_models
 from univoxel.capture.photographs import fitted
 from univoxel.capture.prepare import Capture, Folders
 from univoxel.capture.sfm import Request, run
@@ -149,11 +148,6 @@ def place(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator
     shutil.rmtree(folders.models, ignore_errors=True)
     folders.models.mkdir(parents=True)
     yield from run(_request("map", capture, folders, config), folders.work / "map.log")
-
-
-def models(folders: Folders) -> list[Model]:
-    """What `place` found, the largest first."""
-    return read_models(folders.models)
 
 
 def _request(step, capture: Capture, folders: Folders, config: CaptureConfig, **more) -> Request:

@@ -39,7 +39,7 @@ from univoxel.cli import (
     view,
 )
 from univoxel.cli.parsing import LAB, STDOUT, Call, Command, Common, Shell, Usage
-from univoxel.core import machine, system
+from univoxel.core import log, machine, system
 from univoxel.errors import MissingExtra, UserError
 
 # What a command may raise for a mistake of its user, see `is_mistake`; all else is a bug and keeps
@@ -101,11 +101,7 @@ def has_laboratory() -> bool:
 
 
 def laboratory() -> dict[str, Command]:
-    """Commands of the laboratory by name.
-
-    Raises:
-        MissingExtra: there is none beside the package.
-    """
+    """Commands of the laboratory by name; a MissingExtra where there is none beside the package."""
     if not has_laboratory():
         raise MissingExtra(
             f"{', '.join(LABORATORY)} measure the method and are not part of the installed "
@@ -202,11 +198,8 @@ def understood(arguments: Sequence[str]) -> Call | None:
 
 
 def help_screen(arguments: Sequence[str]) -> str | None:
-    """The overview that arguments ask for; None: they ask for something else.
-
-    Raises:
-        MissingExtra: that of the laboratory, which is not there.
-    """
+    """The overview that arguments ask for; None: they ask for something else. Errors are those of
+    `laboratory`."""
     match arguments:
         case [] | ["-h" | "--help" | "help"]:
             title = f"univoxel {__version__}: from photographs to a relightable object, on any CPU"
@@ -322,16 +315,15 @@ def spoken(common: Common, results_alone: bool) -> Iterator[None]:
     Args:
         results_alone: on stdout; all else goes to stderr.
     """
-    logger, handler = logging.getLogger("univoxel"), _Plain(common, results_alone)
-    level = logger.level
-    logger.addHandler(handler)
+    handler, level = _Plain(common, results_alone), log.level
+    log.addHandler(handler)
     chosen = logging.WARNING if common.quiet else logging.DEBUG if common.verbose else logging.INFO
-    logger.setLevel(chosen)
+    log.setLevel(chosen)
     try:
         yield
     finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
+        log.removeHandler(handler)
+        log.setLevel(level)
 
 
 def _kept(call: Call) -> str:

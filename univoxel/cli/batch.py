@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.cli import parsing
-from univoxel.core import choices, machine
+from univoxel.core import choices, log, machine
 from univoxel.core.files import read_json
 from univoxel.errors import ProcessFailed, UserError
 
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from univoxel.batch.jobs import Job, Result, Step
     from univoxel.batch.scenes import SceneResult
     from univoxel.config import TrainConfig
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 # Options of what is done with each scene: those of a later sitting agree but for the steps
@@ -64,11 +61,7 @@ class BatchOptions:
     """another file for what batch.json holds; - prints it in place of the table"""
 
     def training(self) -> TrainConfig:
-        """The configuration of a training.
-
-        Raises:
-            UserError: there is none of that kind.
-        """
+        """The configuration of a training; a UserError where there is none of that kind."""
         from univoxel.config import load_config
         from univoxel.core.validation import changed
         from univoxel.presets import chosen
@@ -225,11 +218,7 @@ def job_of(name: str, data: Path, asked: BatchOptions, threads: int | None) -> J
 
 
 def check(results: Sequence[SceneResult]) -> None:
-    """Refuse a batch in which scenes failed.
-
-    Raises:
-        ProcessFailed: some did.
-    """
+    """Raise a ProcessFailed where scenes failed."""
     failed = [result.name for result in results if result.state != "done"]
     if failed:
         raise ProcessFailed(

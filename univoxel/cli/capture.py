@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.cli.demo import MAPS, SCENE
@@ -15,7 +14,7 @@ from univoxel.cli.export import export
 from univoxel.cli.parsing import BoxOf, Changes, Minutes, check_minutes, takes, written
 from univoxel.cli.relight import relight_to_files
 from univoxel.cli.train import code_of
-from univoxel.core import choices, files
+from univoxel.core import choices, files, log
 from univoxel.core.files import read_json, replacing
 from univoxel.core.progress_bar import duration
 from univoxel.core.validation import check_settings, setting
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
     from univoxel.config import TrainConfig
     from univoxel.training.progress import TrainingProgress
 
-log: logging.Logger = logging.getLogger("univoxel")
 
 AUTO = "auto"  # masks that the photographs have, or else of a network, or of depth alone
 STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
@@ -67,6 +65,18 @@ class CaptureOptions:
     """the last step: page is all of them; cameras or masks end before training, and the folder to
     train on is printed"""
 
+    @property
+    def fingerprint(self) -> Any:
+        """What steps.json has of the masks: a word, unless more was chosen."""
+        chosen: dict[str, Any] = {}
+        if self.network != choices.NETWORK:
+            chosen["network"] = self.network
+        if self.box is not None:
+            chosen["box"] = [float(value) for value in self.box]
+        if self.keep_table:
+            chosen["keep_table"] = True
+        return {"masks": str(self.masks), **chosen} if chosen else str(self.masks)
+
 
 @takes(CaptureOptions)
 def command(asked: CaptureOptions) -> int:
@@ -78,9 +88,8 @@ def command(asked: CaptureOptions) -> int:
     """
     check_minutes(asked.minutes)
     where, until = (asked.photographs, asked.out), asked.until
-    masks: dict[str, Any] = {"masks": asked.masks, "network": asked.network}
-    masks |= {"box": asked.box, "keep_table": asked.keep_table}
-    training = {"preset": asked.preset, "light": asked.light, "minutes": asked.minutes}
+    masks = {name: getattr(asked, name) for name in ("masks", "network", "box", "keep_table")}
+    training = {name: getattr(asked, name) for name in ("preset", "light", "minutes")}
     if until == "page":
         made = capture(*where, **masks, **training, changes=asked.changes)
         print(made.page)
@@ -107,28 +116,6 @@ PICTURES = PicturesConfig()
 
 
 @dataclass(frozen=True)
-class MasksAsked:
-    """Where masks come from, and how they are made."""
-
-    source: str | Path
-    network: choices.NetworkName = choices.NETWORK
-    box: Sequence[float] | None = None
-    keep_table: bool = False
-
-    @property
-    def fingerprint(self) -> Any:
-        """What steps.json has of them: a word, unless more was chosen."""
-        chosen: dict[str, Any] = (
-            {} if self.network == choices.NETWORK else {"network": self.network}
-        )
-        if self.box is not None:
-            chosen["box"] = [float(value) for value in self.box]
-        if self.keep_table:
-            chosen["keep_table"] = True
-        return {"masks": str(self.source), **chosen} if chosen else str(self.source)
-
-
-@dataclass(frozen=True)
 class Captured:
     """What a capture leaves: the pages and files to open."""
 
@@ -141,17 +128,10 @@ def capture(
     photographs: str | Path,
     out: str | Path,
     *,
-    masks: str | Path = AUTO,
-    preset: choices.PresetOrAuto = "auto",
-    minutes: float | None = None,
-    light: choices.LightName = "hybrid",
-    changes: Sequence[str] = (),
-    network: choices.NetworkName = choices.NETWORK,
-    box: Sequence[float] | None = None,
-    keep_table: bool = False,
     on_progress: Callable[[TrainingProgress], None] | None = None,
     config: CaptureConfig = DEFAULTS,
     pictures: PicturesConfig = PICTURES,
+    **options: Any,
 ) -> Captured:
     """Make an object that can be lit anew from photographs, in steps that are each kept.
 
@@ -164,12 +144,11 @@ def capture(
         photographs: a folder of photographs or a video; or photographs with cameras, of any layout
             that `train` reads; or a trained run.
         out: folder to write.
-        masks: a folder of masks; rembg, a network; none, depth alone, as of `cutout`;
-            auto: what the photographs bring, else a network.
-        network, box, keep_table: as of `cutout`.
-        preset, minutes, light, changes, on_progress: as of `univoxel.train`.
+        on_progress: as of `univoxel.train`.
         config: how cameras are found.
         pictures: how many are made, and how large.
+        options: fields of `univoxel.cli.capture.CaptureOptions`, such as masks, box, preset and
+            minutes; until is none of them.
 
     Raises:
         ExistingFile: out holds another capture, or what other options made.
@@ -188,10 +167,10 @@ def capture(
     from univoxel.training.clock import expected_seconds
     from univoxel.training.probe import slowdown
 
-    given, asked = look_at(Path(photographs)), MasksAsked(masks, network, box, keep_table)
-    project = Project(Path(out))
-    training = chosen(preset, minutes, project.cut, project.run, light)
-    training = changed(training, changes)
+    asked = CaptureOptions(Path(photographs), Path(out), **options)
+    given, project = look_at(asked.photographs), Project(asked.out)
+    training = chosen(asked.preset, asked.minutes, project.cut, project.run, asked.light)
+    training = changed(training, asked.changes)
     if given.kind == "run":
         _check_unused(given, asked, training)
     _check_machine(given, asked)
@@ -217,20 +196,12 @@ def capture(
 
 
 def find_data(
-    photographs: str | Path,
-    out: str | Path,
-    *,
-    masks: str | Path = AUTO,
-    network: choices.NetworkName = choices.NETWORK,
-    box: Sequence[float] | None = None,
-    keep_table: bool = False,
-    until: Literal["cameras", "masks"] = "masks",
-    config: CaptureConfig = DEFAULTS,
+    photographs: str | Path, out: str | Path, config: CaptureConfig = DEFAULTS, **options: Any
 ) -> Path:
     """The first steps of a capture alone; return the folder to train on. `capture` goes on with it.
 
     Args:
-        until: the step that is the last.
+        options: fields of `CaptureOptions`; until cameras, or else masks.
 
     Raises:
         UserError: photographs are a trained run; else as of `capture`.
@@ -238,15 +209,15 @@ def find_data(
     """
     from univoxel.capture.project import Project, begin, look_at
 
-    given, asked = look_at(Path(photographs)), MasksAsked(masks, network, box, keep_table)
+    asked = CaptureOptions(Path(photographs), Path(out), **options)
+    given, project = look_at(asked.photographs), Project(asked.out)
     if given.kind == "run":
         raise UserError(f"{given.path} is a trained run: there are cameras and masks", "until")
-    project = Project(Path(out))
     _check_machine(given, asked)
     begin(project, given)
     _check_network(project, asked)
     scene = _find_cameras(project, given, asked, config)
-    return scene if until == "cameras" else _find_masks(project, scene, asked)
+    return scene if asked.until == "cameras" else _find_masks(project, scene, asked)
 
 
 def _say(step: str, what: str) -> None:
@@ -257,7 +228,7 @@ def _skip(step: str, what: Path) -> None:
     _say(step, f"there already, {what}")
 
 
-def _check_unused(given: Given, asked: MasksAsked, training: TrainConfig) -> None:
+def _check_unused(given: Given, asked: CaptureOptions, training: TrainConfig) -> None:
     """Refuse options of steps that a run has behind it."""
     from univoxel.presets import chosen
 
@@ -270,7 +241,7 @@ def _check_unused(given: Given, asked: MasksAsked, training: TrainConfig) -> Non
         )
 
 
-def _check_machine(given: Given, asked: MasksAsked) -> None:
+def _check_machine(given: Given, asked: CaptureOptions) -> None:
     """Refuse now what would fail after minutes."""
     from univoxel.capture.cutout import check_masks
     from univoxel.capture.masks import mask_network
@@ -281,18 +252,18 @@ def _check_machine(given: Given, asked: MasksAsked) -> None:
         native.require_embree("capture")
     if given.kind == "photographs":
         require_pycolmap()
-    masks = asked.source
-    check_masks(str(masks), asked.network, asked.box, asked.keep_table)
-    if str(masks) == choices.REMBG:
+    masks = str(asked.masks)
+    check_masks(masks, asked.network, asked.box, asked.keep_table)
+    if masks == choices.REMBG:
         mask_network(asked.network)
-    elif str(masks) not in (AUTO, choices.DEPTH) and not Path(masks).is_dir():
+    elif masks not in (AUTO, choices.DEPTH) and not Path(masks).is_dir():
         raise DataError(
             f"masks: expected {choices.REMBG}, {choices.DEPTH} or a folder of masks, got {masks}",
             "masks",
         )
 
 
-def _check_network(project: Project, asked: MasksAsked) -> None:
+def _check_network(project: Project, asked: CaptureOptions) -> None:
     """Refuse to go on with masks of single photographs that another network made."""
     from univoxel.capture.project import SINGLE
 
@@ -302,7 +273,7 @@ def _check_network(project: Project, asked: MasksAsked) -> None:
             *("network", "out"),
         )
 
-    if str(asked.source) not in (AUTO, choices.REMBG):
+    if str(asked.masks) not in (AUTO, choices.REMBG):
         return
     if not files.done(project.out, SINGLE, asked.network, other):
         before = choices.NETWORK  # which versions without a choice had, and did not note
@@ -310,7 +281,9 @@ def _check_network(project: Project, asked: MasksAsked) -> None:
             raise other(before)
 
 
-def _find_cameras(project: Project, given: Given, asked: MasksAsked, config: CaptureConfig) -> Path:
+def _find_cameras(
+    project: Project, given: Given, asked: CaptureOptions, config: CaptureConfig
+) -> Path:
     """The folder of photographs with cameras."""
     from univoxel.capture.poses import poses
     from univoxel.capture.project import TURNED
@@ -332,7 +305,7 @@ def _find_cameras(project: Project, given: Given, asked: MasksAsked, config: Cap
     return poses(given.path, done, masks=first, config=config)
 
 
-def _masks_before_cameras(project: Project, given: Given, asked: MasksAsked) -> Path:
+def _masks_before_cameras(project: Project, given: Given, asked: CaptureOptions) -> Path:
     """A folder of masks of single photographs."""
     import numpy as np
     import torch
@@ -344,13 +317,13 @@ def _masks_before_cameras(project: Project, given: Given, asked: MasksAsked) -> 
     from univoxel.capture.project import SINGLE
     from univoxel.core.progress_bar import track
 
-    masks = asked.source
-    if str(masks) not in (AUTO, choices.REMBG, choices.DEPTH):
+    masks = str(asked.masks)
+    if masks not in (AUTO, choices.REMBG, choices.DEPTH):
         return Path(masks)
     if project.masks.exists():
         _skip("masks", project.masks)
         return project.masks
-    if str(masks) == choices.DEPTH:
+    if masks == choices.DEPTH:
         raise UserError(
             f"{given.path}: the object was turned before a still camera, so cameras need masks: "
             f"expected masks={choices.REMBG} or a folder, got {masks}",
@@ -379,12 +352,12 @@ def _masks_before_cameras(project: Project, given: Given, asked: MasksAsked) -> 
     return project.masks
 
 
-def _find_masks(project: Project, scene: Path, asked: MasksAsked) -> Path:
+def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
     """The folder of photographs with masks and cameras."""
     from univoxel.capture.cutout import cutout
     from univoxel.capture.project import MASKS, TURNED
 
-    masks, noted = asked.source, asked.fingerprint
+    masks, noted = str(asked.masks), asked.fingerprint
 
     def other(before: str | dict[str, Any]) -> ExistingFile:
         made = before if isinstance(before, dict) else {"masks": before}
@@ -401,7 +374,7 @@ def _find_masks(project: Project, scene: Path, asked: MasksAsked) -> Path:
         _skip("masks", project.cut)
         return project.cut
     turned = bool(files.recorded(project.out, TURNED))
-    if str(masks) == AUTO and not turned and _have_masks(project, scene):
+    if masks == AUTO and not turned and _have_masks(project, scene):
         if asked.box is not None:
             raise UserError(
                 f"{scene} brings masks, which are trained on as they are: with a box expected "
@@ -414,7 +387,7 @@ def _find_masks(project: Project, scene: Path, asked: MasksAsked) -> Path:
     if turned:
         source = scene / "masks"  # those that the cameras were found with
     else:
-        source = _network_or_depth(asked.network) if str(masks) == AUTO else masks
+        source = _network_or_depth(asked.network) if masks == AUTO else asked.masks
     words = {choices.REMBG: "from a network", choices.DEPTH: "from depth alone"}
     _say("masks", words.get(str(source), f"from {source}"))
     return cutout(
@@ -495,10 +468,10 @@ def _check_trained(wanted: TrainConfig, done: bool) -> None:
 
 def _export(project: Project, run: Path) -> None:
     if _up_to_date(project.mesh, run):
-        return _skip("mesh", project.mesh)
-    _say("mesh", str(project.mesh))
-    export(run, project.mesh)
-    return None
+        _skip("mesh", project.mesh)
+    else:
+        _say("mesh", str(project.mesh))
+        export(run, project.mesh)
 
 
 def _up_to_date(file: Path, run: Path) -> bool:

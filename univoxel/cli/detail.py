@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from univoxel.cli.parsing import DataOf, Run, takes, written
+from univoxel.core import log
 from univoxel.core.choices import Detailing
 from univoxel.errors import UserError
 
@@ -46,7 +46,7 @@ class DetailOptions:
 
 
 @takes(DetailOptions)
-def make(asked: DetailOptions) -> Path | None:
+def command(asked: DetailOptions) -> Path | None:
     """Make the detail of a run, in RUN/detail; None, with a line, where its photographs have none.
 
     Raises:
@@ -60,13 +60,8 @@ def make(asked: DetailOptions) -> Path | None:
     data = None if asked.data is None else Path(asked.data)
     made = write(load_scene(run), photos_of(run, data, "train"), run, asked.size)
     if made is None:
-        logging.getLogger("univoxel").info(
-            "%s gets no detail: its photographs show no more than its grid holds", run
-        )
+        log.info("%s gets no detail: its photographs show no more than its grid holds", run)
     return made
-
-
-command = make
 
 
 def write(scene: Scene, photos: Photos, run: Path, size: int | None = None) -> Path | None:
@@ -104,7 +99,6 @@ def made_after_training(
     """
     if detail == "none":
         return None
-    log = logging.getLogger("univoxel")
     if until is not None and time.monotonic() > until:
         log.info("detail: no time is left for it; make it with `univoxel detail %s`", run)
         return None

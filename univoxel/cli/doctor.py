@@ -141,17 +141,17 @@ def memory(found: machine.Memory | None) -> Finding:
 
 def extra_findings() -> list[Finding]:
     """A finding for each extra."""
-
     known = extras()
     if known is None:
         return [Finding("extras", "unknown: the package is not installed, only on the path")]
-    return [
-        Finding(f"extra {extra.name}", f"without {', '.join(extra.missing)}", "look", remedy)
-        if extra.missing
-        else Finding(f"extra {extra.name}", "installed")
-        for extra in known
-        for remedy in [f'where a command asks for it: pip install "univoxel[{extra.name}]"']
-    ]
+    found = []
+    for name, missing in known.items():
+        finding = Finding(f"extra {name}", "installed")
+        if missing:
+            remedy = f'where a command asks for it: pip install "univoxel[{name}]"'
+            finding = Finding(finding.what, f"without {', '.join(missing)}", "look", remedy)
+        found.append(finding)
+    return found
 
 
 def table(findings: Sequence[Finding]) -> Table:
@@ -169,22 +169,10 @@ def table(findings: Sequence[Finding]) -> Table:
 
 
 def check(findings: Sequence[Finding]) -> None:
-    """Refuse an installation that cannot train.
-
-    Raises:
-        MissingNative: a part of the extension is missing; the message names it.
-    """
+    """Raise a MissingNative, which names what is missing, where training would be refused."""
     bad = [f"{f.what}: {f.found}" for f in findings if f.state == "bad"]
     if bad:
         raise MissingNative(f"this installation cannot train: {'; '.join(bad)}")
-
-
-@dataclass(frozen=True)
-class Extra:
-    """An optional set of packages."""
-
-    name: str
-    missing: tuple[str, ...]  # packages; none: the extra is there
 
 
 def openmp_runtimes() -> list[str]:
@@ -205,8 +193,8 @@ def torch_build() -> str:
     return f"{torch.__version__}, built for CPUs"
 
 
-def extras(distribution: str = "univoxel") -> list[Extra] | None:
-    """The extras for users, with what is missing of each; None where nothing is installed."""
+def extras(distribution: str = "univoxel") -> dict[str, list[str]] | None:
+    """Packages that are missing of each extra for users; None where nothing is installed."""
     try:
         requirements = metadata.requires(distribution) or []
     except metadata.PackageNotFoundError:
@@ -218,15 +206,8 @@ def extras(distribution: str = "univoxel") -> list[Extra] | None:
         if not belongs or not package or belongs[1] in DEVELOPERS:
             continue
         lacks = missing.setdefault(belongs[1], [])
-        if not is_installed(package[0]):
+        try:
+            metadata.version(package[0])
+        except metadata.PackageNotFoundError:
             lacks.append(package[0])
-    return [Extra(name, tuple(lacks)) for name, lacks in sorted(missing.items())]
-
-
-def is_installed(package: str) -> bool:
-    """Whether a distribution is there, of any version."""
-    try:
-        metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return False
-    return True
+    return dict(sorted(missing.items()))

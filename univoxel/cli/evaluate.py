@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.cli import parsing
+from univoxel.core import log
 from univoxel.core.choices import BOUNCES, SAMPLES, Behind
 from univoxel.core.files import write_json
 from univoxel.errors import UserError
@@ -176,15 +177,13 @@ def _at_full_size(
     scene: Scene, run: Path, data: Path | None, photos: Photos, save: Path | None
 ) -> dict[str, float | int | None]:
     """Measures at the size of the photographs' files."""
-    import logging
-
     from univoxel.detail.views import measure_full_size
     from univoxel.run import photos_of
 
     try:
         train = photos_of(run, data, "train")
     except (UserError, OSError) as error:  # views are the model's alone
-        logging.getLogger("univoxel").info("full size: no photographs nearby: %s", error)
+        log.info("full size: no photographs nearby: %s", error)
         train = None
     return dict(measure_full_size(scene, run, photos, train, save))
 
@@ -207,6 +206,4 @@ def _verdict(run: Path) -> dict[str, Any]:
     from univoxel.run import load_verdict
 
     verdict = load_verdict(run)
-    if verdict is None:
-        return {"complete": None, "verdict": None}
-    return {"complete": verdict.complete, "verdict": verdict.word}
+    return {"complete": verdict and verdict.complete, "verdict": verdict and verdict.word}

@@ -90,11 +90,7 @@ class ExportOptions:
 
 
 def require_levels(faces: int, lods: int) -> None:
-    """Refuse levels of detail that would have next to no triangles.
-
-    Raises:
-        UserError: the coarsest would.
-    """
+    """Refuse, by a UserError, levels of detail of which the coarsest has next to no triangles."""
     coarsest = faces // FEWER**lods
     if coarsest < LEAST_FACES:
         raise UserError(

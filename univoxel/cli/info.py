@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.cli.parsing import STDOUT, File, JsonFile, Run, json_file, takes, written
+from univoxel.core import log
 from univoxel.core.files import write_json
 from univoxel.errors import UserError
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from univoxel.scene import Scene
 
-log: logging.Logger = logging.getLogger("univoxel")
 
 # Beginning of a tensor's name in the file: the part it belongs to. The first that fits counts.
 PARTS = {
@@ -32,10 +31,8 @@ PARTS = {
     "views.": "views",
 }
 # Not learned: where the numbers of a grid belong, and directions that are computed
-INDICES = (
-    *("field.feature_rows", "field.sdf_rows", "field.sdf_side", "sky.direction"),
-    "radiance.direction_rows",
-)
+INDICES = ("field.feature_rows", "field.sdf_rows", "field.sdf_side")
+INDICES += ("sky.direction", "radiance.direction_rows")
 TILE, MARGIN, BAR = 260, 12, 26  # pixels of the picture
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999", "#f0e442")
 
@@ -224,9 +221,8 @@ def tables(found: dict[str, Any]) -> Iterable[Table | str]:
     yield table
     if found["cameras"] is None:
         return
-    table = Table(
-        "cameras", "median", "90 %", title="Matched points off their epipolar lines, pixels"
-    )
+    title = "Matched points off their epipolar lines, pixels"
+    table = Table("cameras", "median", "90 %", title=title)
     for column in table.columns[1:]:
         column.justify = "right"
     for name, key in (("as given", "given"), ("as refined", "used")):

@@ -94,11 +94,7 @@ command = inspect
 
 
 def parse_pixel(text: str) -> tuple[int, int]:
-    """Column and row as the command line writes them.
-
-    Raises:
-        UserError: not two whole numbers.
-    """
+    """Column and row as the command line writes them; a UserError for other text."""
     try:
         column, row = (int(part) for part in text.split(","))
     except ValueError:

@@ -330,21 +330,13 @@ def json_file(asked: File | None) -> Iterator[File | None]:
 
 
 def check_minutes(minutes: float | None) -> None:
-    """Refuse a limit that is not above 0.
-
-    Raises:
-        UserError: it is not.
-    """
+    """Refuse, by a UserError, a limit that is not above 0."""
     if minutes is not None and not minutes > 0:
         raise UserError(f"minutes must be above 0, got {minutes:g}", "minutes")
 
 
 def check_downscale(downscale: Downscale) -> int:
-    """The side of the squares of pixels that become one, 0 for auto.
-
-    Raises:
-        UserError: it is below 1.
-    """
+    """The side of the squares of pixels that become one, 0 for auto; a UserError below 1."""
     if downscale == "auto":
         return 0
     if downscale < 1:

@@ -88,11 +88,8 @@ class RelightOptions:
             )
 
     def quality(self) -> Quality:
-        """How a frame is rendered; a ground at the lowest point is left to the mesh.
-
-        Raises:
-            UserError: a number is out of range.
-        """
+        """How a frame is rendered, or a UserError; a ground at the lowest point is left to the
+        mesh."""
         from univoxel.render.relight import Quality
 
         ground = parse_ground(self.ground)
@@ -158,26 +155,20 @@ def sun_light(values: tuple[float, ...] | Sun) -> Sun:
         UserError: not 3 or 4 numbers, or one out of range.
     """
     from univoxel.ops import Sun
+    from univoxel.sphere import direction_at
 
     if isinstance(values, Sun):
         return values
     if len(values) not in (3, 4):
         raise UserError(f"--sun: expected AZIMUTH ELEVATION IRRADIANCE [ANGLE], got {values}")
-    azimuth, elevation = (math.radians(x) for x in values[:2])
-    across = math.cos(elevation)
-    direction = (across * math.cos(azimuth), across * math.sin(azimuth), math.sin(elevation))
     try:
-        return Sun(direction, (values[2], values[2], values[2]), *values[3:])
+        return Sun(direction_at(*values[:2]), (values[2], values[2], values[2]), *values[3:])
     except ValueError as error:
         raise UserError(f"--{error}") from None
 
 
 def point_light(values: tuple[float, float, float, float] | PointLight) -> PointLight:
-    """A white point light from x, y, z and its intensity.
-
-    Raises:
-        UserError: a number is out of range.
-    """
+    """A white point light from x, y, z and its intensity; a UserError where it cannot be."""
     from univoxel.ops import PointLight
 
     if isinstance(values, PointLight):
@@ -190,11 +181,7 @@ def point_light(values: tuple[float, float, float, float] | PointLight) -> Point
 
 
 def parse_ground(text: str | float | None) -> Ground:
-    """A height, the word lowest, or nothing.
-
-    Raises:
-        UserError: another text.
-    """
+    """A height, the word lowest, or nothing; a UserError for other text."""
     if text is None or text == "lowest":
         return text
     try:

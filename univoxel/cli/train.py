@@ -140,11 +140,7 @@ class Train(TrainOptions):
     """write no RUN/index.html at the end"""
 
     def view_at(self) -> tuple[str, int] | None:
-        """Host and port that a training is looked at, if at all.
-
-        Raises:
-            UserError: one is given, and it is not.
-        """
+        """Host and port that a training is looked at, if at all; a UserError for one alone."""
         host, port = self.host, self.port
         if self.view:
             return "127.0.0.1" if host is None else host, 8080 if port is None else port

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import shutil
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ import torch
 
 from univoxel import config, lights
 from univoxel.cli.detail import made_after_training, minutes_left
-from univoxel.core import memmap
+from univoxel.core import log, memmap
 from univoxel.core.files import write_text
 from univoxel.core.progress_bar import duration
 from univoxel.data import Photos, keep_photos, load_photos
@@ -36,7 +36,7 @@ from univoxel.run import Evidence, Verdict, judge, kept_photos, save_verdict, sa
 from univoxel.scene import FILE, Scene, load_checkpoint, save_scene
 from univoxel.training import compression
 from univoxel.training import joint_solve as joint_stage
-from univoxel.training.clock import LEAST, RESERVE_SECONDS, Clock
+from univoxel.training.clock import LEAST, RESERVE_SECONDS
 from univoxel.training.loop import batch_at, fit_sharpness_, held_out_psnr, run_stage
 from univoxel.training.pixels import TrainingPixels, check_memory, split_pixels
 from univoxel.training.probe import slowdown
@@ -45,7 +45,6 @@ from univoxel.training.progress import LOG, Progress, TrainingProgress, chosen_r
 if TYPE_CHECKING:
     from univoxel.viewer.training import Spectators
 
-log: logging.Logger = logging.getLogger("univoxel")
 
 # Of preparation, a million pixels that are trained on, on two quiet cores of a Xeon
 PREPARATION_SECONDS = 1.0
@@ -115,7 +114,7 @@ def _train(
     shutil.rmtree(cfg.out / "detail", ignore_errors=True)  # as well
 
     begin -= state.get("seconds", 0.0)
-    told = _told(spectators, on_progress)
+    told = _each(spectators and spectators.tell, on_progress)
     left = minutes_left(cfg.minutes, photos, cfg.detail, torch.get_num_threads())
     timed = replace(cfg, minutes=left)
     with Progress(timed, begin, state, told, slowdown(timed)) as progress:
@@ -139,7 +138,9 @@ def _train(
         if spectators:
             spectators.show(pixels.photos)
         progress.prepared()
-        progress.clock.watch = _between_steps(scene, progress.clock, film, spectators)
+        watchers = film and film.take_frame, spectators and spectators.look
+        now = scene, progress.clock
+        progress.clock.watch = _each(*(look and partial(look, *now) for look in watchers))
         try:
             for index in range(progress.clock.stage, len(cfg.stages)):
                 make_stage_(scene, limited, index, silhouettes.box, pinned, pixels, progress)
@@ -265,35 +266,15 @@ def evidence(
     )
 
 
-def _told(
-    spectators: Spectators | None, on_progress: Callable[[TrainingProgress], None] | None
-) -> Callable[[TrainingProgress], None] | None:
-    """What takes the reports of a training."""
-    if spectators is None:
-        return on_progress
+def _each(*calls: Callable[..., None] | None) -> Callable[..., None] | None:
+    """What calls all that there are, one after another; None: there are none."""
+    known = [call for call in calls if call is not None]
 
-    def told(now: TrainingProgress) -> None:
-        spectators.tell(now)
-        if on_progress is not None:
-            on_progress(now)
+    def call_each(*arguments: Any) -> None:
+        for call in known:
+            call(*arguments)
 
-    return told
-
-
-def _between_steps(
-    scene: Scene, clock: Clock, film: Timelapse | None, spectators: Spectators | None
-) -> Callable[[], None] | None:
-    """What is done between steps, off the clock."""
-    if film is None and spectators is None:
-        return None
-
-    def between() -> None:
-        if film:
-            film.take_frame(scene, clock)
-        if spectators:
-            spectators.look(scene, clock)
-
-    return between
+    return call_each if known else None
 
 
 def make_stage_(

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from univoxel.cli.parsing import File, Run, Title, takes, written
+from univoxel.core import log
 from univoxel.errors import UserError
 
 PAGE = "index.html"  # in the folder of a run, written at the end of `univoxel train`
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
@@ -16,8 +16,6 @@ from torch import Tensor
 
 from univoxel.core import system
 
-# Arrays of many photographs, in files where they are too large for memory.
-#
 # Inside of `large_arrays_in` an array of LARGE bytes or more is a file that is mapped into memory
 # and that nobody else sees. The system keeps its pages as it has room, and writes back and reads
 # again those that it has not. Elsewhere, and of smaller arrays, all this is memory as usual.
@@ -25,17 +23,24 @@ from univoxel.core import system
 
 LARGE = 1 << 28  # bytes of an array from which on it is a file
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 _folder: ContextVar[Path | None] = ContextVar("folder of large arrays", default=None)
 
 
 @contextmanager
-def large_arrays_in(folder: Path) -> Iterator[None]:
-    """A block in which large arrays are files of a folder, which vanish with their arrays."""
-    token = _folder.set(folder)
+def assigned(variable: ContextVar[Item], value: Item) -> Iterator[None]:
+    """A block in which a variable has a value."""
+    token = variable.set(value)
     try:
         yield
     finally:
-        _folder.reset(token)
+        variable.reset(token)
+
+
+def large_arrays_in(folder: Path) -> AbstractContextManager[None]:
+    """A block in which large arrays are files of a folder, which vanish with their arrays."""
+    return assigned(_folder, folder)
 
 
 def is_large(shape: Sequence[int], dtype: torch.dtype) -> bool:
@@ -48,11 +53,7 @@ def is_large(shape: Sequence[int], dtype: torch.dtype) -> bool:
 
 
 def zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """Zeros, in a file if they are large.
-
-    Raises:
-        OSError: there is no room on the disk.
-    """
+    """Zeros, in a file if they are large; an OSError where the disk has no room."""
     folder = _folder.get()
     if folder is None or not is_large(shape, dtype):
         return torch.zeros(tuple(shape), dtype=dtype)
@@ -66,10 +67,7 @@ def reserve(descriptor: int, size: int, place: Path) -> None:
     """Make an open file as long, on the disk too: where that is full later, the process would end.
 
     Args:
-        place: that an error names.
-
-    Raises:
-        OSError: there is no room.
+        place: that an OSError names where there is no room.
     """
     try:
         system.reserve(descriptor, size)
@@ -105,10 +103,6 @@ def on_disk(array: Tensor) -> bool:
 
 
 # Independent pieces of work, side by side.
-
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 def parallel_map(call: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:

@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.progress import Progress, ProgressColumn, TaskID
 from rich.text import Text
 
+from univoxel.core import log
+
 T = TypeVar("T")
 
 LINE_SECONDS = 10.0  # between lines, where there is no bar
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 class _Lines(Progress):

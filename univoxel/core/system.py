@@ -66,11 +66,7 @@ def flush(path: Path) -> None:
 
 
 def reserve(descriptor: int, size: int) -> None:
-    """Make an empty open file as long, on the disk too.
-
-    Raises:
-        OSError: there is no room.
-    """
+    """Make an empty open file as long, on the disk too; an OSError where there is no room."""
     if sys.platform == LINUX:
         os.posix_fallocate(descriptor, 0, size)
         return

@@ -143,15 +143,12 @@ def _test(hint: Any, said: Setting) -> tuple[str, Callable[[Any], bool]] | None:
 
 
 def check_fields(config: object, wanted: str, holds: Callable[[Any], bool], *names: str) -> None:
-    """Refuse a configuration whose named fields are not as wanted.
+    """Refuse, as `check_settings` does, a configuration whose named fields are not as wanted.
 
     Args:
         config: a dataclass.
         wanted: the range in words, such as "at least 1".
         holds: whether a value is in it; a TypeError counts as no.
-
-    Raises:
-        ConfigError: names class and field, says what is wanted and what came.
     """
     for name in names:
         value = getattr(config, name)
@@ -201,11 +198,8 @@ def _fields(kind: Any) -> tuple[dataclasses.Field[Any], ...]:
 
 
 def _typed(hint: Any, value: Any) -> Any:
-    """A value of JSON as the annotation has it.
-
-    Raises:
-        TypeError, OverflowError: it is of another type, or an integer that no float holds.
-    """
+    """A value of JSON as the annotation has it; a TypeError where it is of another type, and an
+    OverflowError for an integer that no float holds."""
     origin, inner = get_origin(hint), get_args(hint)
     if hasattr(value, "__dataclass_fields__") and isinstance(value, hint):  # read before
         return value

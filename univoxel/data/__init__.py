@@ -2,20 +2,14 @@
 
 from pathlib import Path
 
-from univoxel.data import photogrammetry, research
-from univoxel.data.colmap import is_colmap, load_colmap
+from univoxel.data import colmap, photogrammetry, research, transforms
 from univoxel.data.image_cache import keep_photos, looking_in
+from univoxel.data.load_images import read_shots
 from univoxel.data.path_sandbox import staying_in
 from univoxel.data.photos import Photos, Truth
-from univoxel.data.transforms import (
-    is_blender,
-    is_nerfstudio,
-    load_blender,
-    load_cameras,
-    load_nerfstudio,
-)
+from univoxel.data.transforms import load_cameras
 from univoxel.data.truth import load_points, load_relit, load_truth, relight_maps
-from univoxel.errors import DataError
+from univoxel.errors import DataError, some
 
 __all__ = [
     "DataError",
@@ -32,18 +26,19 @@ __all__ = [
     "splits_of",
 ]
 
-# In this order: data sets with splits of their own come first
+# Whether a folder has a layout, for a split; and the photographs of that split, or a DataError. In
+# this order: data sets with splits of their own come first
 _LAYOUTS = (
-    (is_blender, load_blender),
-    (is_nerfstudio, load_nerfstudio),
-    (is_colmap, load_colmap),
-    (research.is_llff, research.load_llff),
-    (research.is_idr, research.load_idr),
-    (research.is_neilf, research.load_neilf),
-    (photogrammetry.is_polycam, photogrammetry.load_polycam),
-    (photogrammetry.is_metashape, photogrammetry.load_metashape),
-    (photogrammetry.is_realitycapture, photogrammetry.load_realitycapture),
-    (research.is_tensoir, research.load_tensoir),
+    (transforms.is_blender, transforms.list_blender),
+    (transforms.is_nerfstudio, transforms.list_nerfstudio),
+    (colmap.is_colmap, colmap.list_colmap),
+    (research.is_llff, research.list_llff),
+    (research.is_idr, research.list_idr),
+    (research.is_neilf, research.list_neilf),
+    (photogrammetry.is_polycam, photogrammetry.list_polycam),
+    (photogrammetry.is_metashape, photogrammetry.list_metashape),
+    (photogrammetry.is_realitycapture, photogrammetry.list_realitycapture),
+    (research.is_tensoir, research.list_tensoir),
 )
 
 
@@ -75,14 +70,14 @@ def load_photos(
     if not folder.is_dir():
         what = "a file" if folder.exists() else "nothing there"
         raise DataError(f"{folder}: expected a folder with a scene, got {what}")
-    for fits, load in _LAYOUTS:
+    for fits, listed in _LAYOUTS:
         if fits(folder, split):
             with looking_in(kept), staying_in(None if allow_outside else folder):
-                return load(folder, split, downscale, masks)
+                return read_shots(folder, split, listed(folder, split), downscale, masks)
     files = sorted(path.name for path in folder.iterdir())
-    came = ", ".join(files[:5]) + (", ..." if len(files) > 5 else "") or "an empty folder"
     raise DataError(
-        f"{folder}: expected photographs with their cameras, got {came} (looked for "
+        f"{folder}: expected photographs with their cameras, got "
+        f"{some(files) or 'an empty folder'} (looked for "
         f"transforms_{split}.json, transforms.json, cameras and images (.bin or .txt) of COLMAP in "
         f"sparse/0, sparse, colmap/sparse/0 and here, poses_bounds.npy, cameras_sphere.npz, "
         f"inputs/sfm_scene.json, keyframes/corrected_cameras, XML of Metashape, CSV of "

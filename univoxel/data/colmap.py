@@ -16,12 +16,11 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from univoxel.data.conventions import TO_OPENGL, find_photo, listed_split
+from univoxel.data.conventions import TO_OPENGL, find_photo, listed_split, turned_up
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
-from univoxel.data.load_images import Shot, read_shots, upright
+from univoxel.data.load_images import Listed, Shot
 from univoxel.data.path_sandbox import inside, left_out
-from univoxel.data.photos import Photos
 from univoxel.errors import DataError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -32,6 +31,8 @@ MODELS = (
 )
 SUPPORTED = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
 SUPPORTED |= {"FULL_OPENCV": 12}  # without its denominator, k4 to k6
+# A feature of a photograph in images.bin: its pixel, and the number of the point that it shows
+SEEN = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 # What reading a broken file may raise; OverflowError: of sizes of hundreds of digits
 BROKEN = (struct.error, IndexError, ValueError, OverflowError)
 
@@ -49,16 +50,7 @@ def is_colmap(folder: Path, split: str) -> bool:
     return bool(_models(folder))
 
 
-def load_colmap(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split, as of `listed_split`.
-
-    The world keeps its scale and origin, and is turned so that +Z is up.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_colmap(folder: Path, split: str) -> Listed:
     models = _models(folder)
     if not models:
         raise DataError(f"{folder}: expected a COLMAP model in {', '.join(PLACES)}, got none")
@@ -108,11 +100,9 @@ def load_colmap(
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(images_file), missing, len(images), note)
     lost += [f"cameras of {scaled} scaled to smaller pictures"] if scaled else []
-    shots, remarks = upright(shots)
-    shots = listed_split(folder, shots, split)
     if len(models) > 1:
         lost = [f"{model.relative_to(folder)}, the largest of {len(models)} models", *lost]
-    return read_shots(folder, "COLMAP model", split, shots, downscale, [*lost, *remarks], masks)
+    return turned_up(folder, split, "COLMAP model", shots, lost, listed_split)
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
@@ -252,14 +242,24 @@ def _images_text(path: Path) -> Iterator[tuple[list[float], list[float], int, st
 
 
 def _images_binary(path: Path) -> Iterator[tuple[list[float], list[float], int, str]]:
-    data = path.read_bytes()
+    for _, pose, camera, name, _ in image_records(path.read_bytes()):
+        yield pose[:4], pose[4:], camera, name
+
+
+def image_records(data: bytes) -> Iterator[tuple[int, list[float], int, str, np.ndarray]]:
+    """Of each photograph in images.bin: number, quaternion and translation to the camera, number of
+    its camera, name, and its features as `SEEN`.
+
+    Raises:
+        ValueError, struct.error: a broken file.
+    """
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
-        _, *pose, camera = struct.unpack_from("<i7di", data, at)
+        number, *pose, camera = struct.unpack_from("<i7di", data, at)
         end = data.index(b"\0", at + 64)
         name = data[at + 64 : end].decode("utf-8")
-        (points,) = struct.unpack_from("<Q", data, end + 1)
-        at = end + 9 + 24 * points
+        (features,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9 + features * SEEN.itemsize
         if at > len(data):
             raise ValueError("the file is cut off")
-        yield pose[:4], pose[4:], camera, name
+        yield number, pose, camera, name, np.frombuffer(data, SEEN, features, end + 9)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from univoxel.data.lens import Lens
-from univoxel.data.load_images import Shot, every_eighth
+from univoxel.data.load_images import Listed, Shot, every_eighth, upright
 from univoxel.data.path_sandbox import inside, left_out
 from univoxel.data.transforms import listed_image, short
 from univoxel.errors import DataError
@@ -21,6 +21,25 @@ SKEW = 0.5  # pixels by which lines may lean and are taken as upright: no mask i
 def find_photo(folder: Path, name: str, where: str) -> Path | None:
     """A photograph by its name in a list of them: in images/ or in the folder itself."""
     return listed_image(folder / "images", name, where) or listed_image(folder, name, where)
+
+
+def turned_up(
+    folder: Path,
+    split: str,
+    kind: str,
+    shots: Sequence[Shot],
+    remarks: Sequence[str] = (),
+    chosen: Callable[[Path, Sequence[Shot], str], list[Shot]] = every_eighth,
+) -> Listed:
+    """A split of photographs whose world is turned so that +Z is up, where it is not yet.
+
+    The world keeps its scale, and its origin, too, unless that is far away.
+
+    Args:
+        chosen: the shots of a split.
+    """
+    shots, moved = upright(shots)
+    return Listed(kind, chosen(folder, shots, split), [*remarks, *moved])
 
 
 def listed_split(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
@@ -55,11 +74,7 @@ def check_skew(skew: float, lens: Lens, where: str) -> None:
 
 
 def parsed(text: str | None, what: str, where: str) -> float:
-    """A finite number from text.
-
-    Raises:
-        DataError: it is missing or no such number.
-    """
+    """A finite number from text; a DataError where it is missing or another text."""
     try:
         value = float(text) if text is not None else math.nan
     except ValueError:

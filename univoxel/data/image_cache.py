@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import math
 import os
 import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +25,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from univoxel.core import memmap, system
+from univoxel.core import log, memmap, system
 from univoxel.core.files import replacing
 from univoxel.data.photos import Photos, coverage_of
 
@@ -34,21 +33,16 @@ from univoxel.data.photos import Photos, coverage_of
 UNFIT = (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError)
 HEADER = 4096  # bytes of the header of a file that is written while photographs are read
 FLUSHED = 16  # photographs after which what was read is safe on disk
+DTYPES = {"U8": torch.uint8, "F32": torch.float32}  # by their names in safetensors
 VERSION = 4  # of what is done to pixels: another one makes all files that are there unfit
 
-log: logging.Logger = logging.getLogger("univoxel")
 # Where photographs may have been kept. Layouts read photographs and need not know of it
 _place: ContextVar[Path | None] = ContextVar("kept photographs", default=None)
 
 
-@contextmanager
-def looking_in(path: Path | None) -> Iterator[None]:
+def looking_in(path: Path | None) -> AbstractContextManager[None]:
     """Let photographs that are read in the block come from this file, where they are in it."""
-    token = _place.set(path)
-    try:
-        yield
-    finally:
-        _place.reset(token)
+    return memmap.assigned(_place, path)
 
 
 def origin_of(files: Sequence[Path], *treatment: object) -> str:
@@ -198,16 +192,13 @@ def _set_facts(path: Path, facts: dict[str, str]) -> None:
 def _opened(path: Path) -> tuple[Tensor, Tensor, dict[str, str]]:
     """Colour, alpha and facts of a file; large arrays are the file itself."""
     header, length = _header(path)
-    about = header["color"]
-    dtype = torch.uint8 if about["dtype"] == "U8" else torch.float32
-    if memmap.is_large(about["shape"], dtype) and os.access(path, os.W_OK):
-        arrays = []
-        for name in ("color", "alpha"):
-            about = header[name]
-            dtype = torch.uint8 if about["dtype"] == "U8" else torch.float32
-            begin = 8 + length + about["data_offsets"][0]
-            arrays.append(memmap.mapped(path, begin, about["shape"], dtype))
-        return arrays[0], arrays[1], header.get("__metadata__", {})
+    color, alpha = (
+        (8 + length + about["data_offsets"][0], about["shape"], DTYPES[about["dtype"]])
+        for about in (header["color"], header["alpha"])
+    )
+    if memmap.is_large(*color[1:]) and os.access(path, os.W_OK):
+        arrays = memmap.mapped(path, *color), memmap.mapped(path, *alpha)
+        return *arrays, header.get("__metadata__", {})
     with safe_open(path, "pt") as file:
         return file.get_tensor("color"), file.get_tensor("alpha"), file.metadata() or {}
 

@@ -187,9 +187,6 @@ def _old_run_lengths(path: Path, body: bytes, height: int, width: int) -> np.nda
     return np.repeat(pixels[last], count, 0).reshape(height, width, 4)
 
 
-# Pictures in files: PNG, JPEG, TIFF, WebP, OpenEXR and Radiance in; PNG and OpenEXR out.
-
-
 _LIMIT = Lock()  # of Pillow, which is the process's
 _OPENING = Lock()  # of an OpenEXR file: what it prints to is the process's, not the thread's
 EXR_HEAD = b"v/1\x01"  # first bytes of an OpenEXR file
@@ -198,6 +195,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff", ".webp")
 # What Pillow may take a file for, whatever its name says
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 KINDS = {".exr": "an OpenEXR file", ".tif": "a TIFF", ".tiff": "a TIFF", ".webp": "a WebP"}
+# Axes that are flipped, by orientation in EXIF
+FLIPPED: dict[int, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
 HEIF = (".heic", ".heif", ".avif")  # of telephones
 HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
 LARGEST = 1 << 29  # pixels of a file: panoramas and the largest telephones have 200 million
@@ -248,11 +247,8 @@ def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) 
 
 
 def kind_of(path: Path) -> str:
-    """.exr or .hdr where a file is of that kind by its first bytes, otherwise what its name says.
-
-    Raises:
-        DataError: there is no such file, or it is empty.
-    """
+    """.exr or .hdr where a file is of that kind by its first bytes, otherwise what its name says; a
+    DataError where there is no such file, or it is empty."""
     _require_file(path)
     with path.open("rb") as file:
         head = file.read(4)
@@ -306,22 +302,9 @@ def turn_note(path: Path) -> str:
 
 def upright_from_stored(pixels: Tensor, turned: int) -> Tensor:
     """Pixels [H, W, ..] as they are looked at, from those of a file of that EXIF orientation."""
-    match turned:
-        case 2:
-            return pixels.flip(1)
-        case 3:
-            return pixels.flip(0, 1)
-        case 4:
-            return pixels.flip(0)
-        case 5:
-            return pixels.transpose(0, 1)
-        case 6:
-            return pixels.transpose(0, 1).flip(1)
-        case 7:
-            return pixels.transpose(0, 1).flip(0, 1)
-        case 8:
-            return pixels.transpose(0, 1).flip(0)
-    return pixels
+    if turned >= 5:
+        pixels = pixels.transpose(0, 1)
+    return pixels.flip(axes) if (axes := FLIPPED.get(turned)) else pixels
 
 
 def stored_from_upright(pixels: Tensor, turned: int) -> Tensor:

@@ -60,11 +60,7 @@ class Lens:
 
 
 def checked(lens: Lens) -> Lens:
-    """The lens, if float32 can hold what it does.
-
-    Raises:
-        UserError: a focal length, centre or distortion is out of range.
-    """
+    """The lens, if float32 can hold what it does, or else a UserError."""
     side = max(lens.width, lens.height)
     low, high = (share * side for share in FOCALS)
     if not all(low <= focal <= high for focal in lens.focal):
@@ -125,13 +121,9 @@ def straighten(picture: Tensor, sources: Tensor) -> Tensor:
 
 def shrunk(lens: Lens, factor: int) -> Lens:
     """The same view in a picture of 1/factor of the size, rows and columns left over cut off."""
-    return replace(
-        lens,
-        width=lens.width // factor,
-        height=lens.height // factor,
-        focal=(lens.focal[0] / factor, lens.focal[1] / factor),
-        centre=(lens.centre[0] / factor, lens.centre[1] / factor),
-    )
+    width, height = lens.width // factor, lens.height // factor
+    focal, centre = ((x / factor, y / factor) for x, y in (lens.focal, lens.centre))
+    return replace(lens, width=width, height=height, focal=focal, centre=centre)
 
 
 def shrink(picture: Tensor, factor: int) -> Tensor:

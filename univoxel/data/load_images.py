@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 from collections.abc import Generator, Sequence
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from univoxel.camera import Cameras, sizes_of
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.core import system
+from univoxel.core import log, system
 from univoxel.data.image_cache import Reading, kept_pixels, origin_of, to_be_kept
 from univoxel.data.images import orientation, read_image
 from univoxel.data.lens import Lens, shrink, shrunk, sources, straighten, straightened
@@ -35,7 +34,7 @@ from univoxel.data.masks import (
 )
 from univoxel.data.path_sandbox import FEWEST, inside
 from univoxel.data.photos import Photos, coverage_of, decode
-from univoxel.errors import DataError, UserError, WithoutMasks
+from univoxel.errors import DataError, UserError, WithoutMasks, some
 
 # Pixels along the longer side that photographs are shrunk to, about. An object that fills half of
 # it is 500 pixels wide, the finest grid of the presets some 160 voxels: pixels stay finer
@@ -45,7 +44,6 @@ READERS = 4  # photographs that are read at once, at most: each may take 0.4 GB 
 BAND = 1 << 18  # pixels of a file, about, that are shrunk at once
 SIZES_TOLD = 3  # of the photographs, that are named one by one, at most
 TEST_EVERY = 8
-log: logging.Logger = logging.getLogger("univoxel")
 LINEAR = srgb_to_linear(torch.arange(256) / 255).numpy()  # of bytes
 # How far +Z may be from the cameras' common up direction in a world that is taken as upright:
 # cameras are held askew and lean over, but worlds that are not upright are turned by much more.
@@ -54,7 +52,6 @@ LEAN = math.radians(30)
 # loses what they see: it has 7 digits, and pixels need 4
 FAR = 1000
 OPAQUE = 0.98  # of alpha: some programs write 254 where there is nothing but the object
-NAMED = 5  # photographs in a message, at most
 LOOKED_AT = 12  # photographs, at most, on which it is tried whether masks can be right
 HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/guide/masks.md"
 
@@ -70,19 +67,20 @@ class Shot:
     pose: np.ndarray  # [3, 4] camera-to-world, axes as of `Cameras`
     lens: Lens
     beside: Path | None = None  # a mask that counts where the photograph has no alpha
-    moved: np.ndarray | None = (
-        None  # [3, 4] from the files' world to that of `pose`, as of `Photos`
-    )
+    moved: np.ndarray | None = None  # [3, 4] from the files' world to `pose`'s, as of `Photos`
+
+
+@dataclass(frozen=True)
+class Listed:
+    """The photographs of one split that a data set lists."""
+
+    kind: str  # of the data set, for people
+    shots: Sequence[Shot]
+    remarks: Sequence[str] = ()  # on how the files were read, for people
 
 
 def read_shots(
-    folder: Path,
-    kind: str,
-    split: str,
-    shots: Sequence[Shot],
-    downscale: int = 0,
-    remarks: Sequence[str] = (),
-    masks: bool | Path = True,
+    folder: Path, split: str, listed: Listed, downscale: int = 0, masks: bool | Path = True
 ) -> Photos:
     """Photographs as pinholes see them, each in its own size.
 
@@ -90,17 +88,13 @@ def read_shots(
     Pixels are those of the file: an orientation in its EXIF is not looked at.
 
     Args:
-        kind: of the data set, for people.
         downscale: means over squares of so many pixels; 0: what `fitting_downscale` says.
-        remarks: on how the files were read, for people.
         masks: False for photographs as they are, the whole picture opaque; or a folder of masks,
             which takes the place of what the layout names.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
     """
     if downscale < 0:
         raise ValueError(f"downscale must be at least 1, got {downscale}")
+    shots = listed.shots
     named = masks if isinstance(masks, Path) else None
     if named is None and masks:
         shots = _with_masks(folder, shots)
@@ -135,7 +129,7 @@ def read_shots(
         color=color,
         alpha=alpha,
         cameras=cameras,
-        about=f"{folder}: {kind}, {', '.join([*told, *remarks])}",
+        about=f"{folder}: {listed.kind}, {', '.join([*told, *listed.remarks])}",
         downscale=factor,
         origin=origin,
         readers=tuple(
@@ -146,19 +140,14 @@ def read_shots(
 
 
 def _reread(shot: Shot, pinhole: Lens, factor: int) -> Tensor:
-    """Stored colour [H // factor, W // factor, 3] of a photograph's file, without its mask.
-
-    Raises:
-        DataError: it cannot be read any more, or has another size.
-    """
+    """Stored colour [H // factor, W // factor, 3] of a photograph's file, without its mask; a
+    DataError where it cannot be read any more, or has another size."""
     color, alpha = read_photo(shot.image, masks=False)
     if color.shape[:2] != (shot.lens.height, shot.lens.width):
         raise DataError(
             f"{shot.image}: expected {shot.lens.width}x{shot.lens.height} pixels as when it was "
             f"first read, got {size_of(color)}"
         )
-    if factor == 1 and not shot.lens.bent:
-        return color
     grid = sources(shot.lens, pinhole) if shot.lens.bent else None
     return resampled(color, alpha, factor, grid)[0]
 
@@ -190,11 +179,8 @@ def _pinholes(shots: Sequence[Shot]) -> list[Lens]:
 
 
 def _with_masks(folder: Path, shots: Sequence[Shot]) -> list[Shot]:
-    """The shots with the masks that lie in folders of masks and beside photographs.
-
-    Raises:
-        DataError: some photographs have a mask in such a folder, and others none at all.
-    """
+    """The shots with the masks that lie in folders of masks and beside photographs; a DataError
+    where some have one in such a folder, and others none at all."""
     photographs = [(shot.name, shot.image) for shot in shots]
     found, beside = find_masks(folder, photographs), masks_beside(photographs)
     masked = [
@@ -287,19 +273,14 @@ def _read_all(
 
 def _tell_odd(folder: Path, shots: Sequence[Shot], alphas: Sequence[Tensor]) -> None:
     """Log which photographs show nothing of the object by their masks, and which nothing else."""
-    for what, odd in (
-        ("nothing of the object", [not bool(a.any()) for a in alphas]),
-        (
-            "nothing but the object",
-            [bool(a.min() > 0) and bool(a.min() == a.max()) for a in alphas],
-        ),
-    ):
+    nothing = [not bool(a.any()) for a in alphas]
+    alone = [bool(a.min() > 0) and bool(a.min() == a.max()) for a in alphas]
+    for what, odd in (("nothing of the object", nothing), ("nothing but the object", alone)):
         names = [shot.name for shot, said in zip(shots, odd, strict=True) if said]
         if names:
-            more = ", ..." if len(names) > NAMED else ""
             log.warning(
-                "%s: by their masks %d of %d photographs show %s: %s%s",
-                *(folder, len(names), len(shots), what, ", ".join(names[:NAMED]), more),
+                "%s: by their masks %d of %d photographs show %s: %s",
+                *(folder, len(names), len(shots), what, some(names)),
             )
 
 
@@ -312,11 +293,7 @@ def _read_each(
     def read(shot: Shot, pinhole: Lens) -> tuple[Tensor, Tensor]:
         color, alpha = read_photo(shot.image, shot.mask, masks, shot.beside, upright)
         grid = grid_of(shot.lens, pinhole) if shot.lens.bent else None
-        return (
-            (color, alpha)
-            if grid is None and factor == 1
-            else resampled(color, alpha, factor, grid)
-        )
+        return resampled(color, alpha, factor, grid)
 
     pool = ThreadPoolExecutor(min(READERS, os.cpu_count() or 1))
     try:
@@ -339,15 +316,10 @@ def _words(cameras: Cameras) -> str:
 
 def cameras_of(poses: Sequence[np.ndarray], lenses: Sequence[Lens]) -> Cameras:
     """Pinholes, each with its picture's size."""
-    width, height, sizes = sizes_of([(lens.width, lens.height) for lens in lenses])
-    return Cameras(
-        camera_to_world=torch.from_numpy(np.stack(poses).astype(np.float32)),
-        focal=torch.tensor([lens.focal for lens in lenses], dtype=torch.float32),
-        centre=torch.tensor([lens.centre for lens in lenses], dtype=torch.float32),
-        width=width,
-        height=height,
-        sizes=sizes,
-    )
+    pose = torch.from_numpy(np.stack(poses).astype(np.float32))
+    focal = torch.tensor([lens.focal for lens in lenses], dtype=torch.float32)
+    centre = torch.tensor([lens.centre for lens in lenses], dtype=torch.float32)
+    return Cameras(pose, focal, centre, *sizes_of([(lens.width, lens.height) for lens in lenses]))
 
 
 def read_photo(
@@ -396,11 +368,14 @@ def read_photo(
 def resampled(
     color: Tensor, alpha: Tensor, factor: int, grid: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Stored colour and alpha, straightened and then shrunk in linear light; stored as before.
+    """Stored colour and alpha, straightened and then shrunk in linear light; stored as before, and
+    as they are where there is neither to do.
 
     What a mask hides keeps single colours, that of a pixel near the middle of each square: how the
     surroundings look is asked, and not how exactly.
     """
+    if factor == 1 and grid is None:
+        return color, alpha
     height, width = (n // factor for n in alpha.shape)
     colors, alphas = color.new_zeros(height, width, 3), alpha.new_zeros(height, width)
     there = alpha > 0 if grid is None else _looked_up(alpha > 0, grid)
@@ -586,11 +561,7 @@ def up_direction(held: np.ndarray) -> np.ndarray | None:
 
 
 def check_name(name: str, where: str) -> None:
-    """Refuse names of views that files made of them would not stay in their folder with.
-
-    Raises:
-        DataError: no name, or one that means another folder.
-    """
+    """Refuse, by a DataError, names of views with which files would not stay in their folder."""
     if name in ("", "..") or Path(name).name != name or not system.can_be_a_name(name):
         raise DataError(f"{where}: expected names that files can have, got {name!r}")
 

@@ -25,7 +25,7 @@ from univoxel.data.images import (
     turn_note,
     upright_from_stored,
 )
-from univoxel.errors import DataError
+from univoxel.errors import DataError, some
 
 PLACES = ("masks", "mask", "pmasks")  # folders of masks; the first that has one counts
 # What stands before or behind a photograph's name in that of its mask. Beside a photograph the
@@ -34,7 +34,6 @@ WORDS = ("mask", "masks", "alpha", "matte", "silhouette", "removebg-preview")
 _WORD = "|".join(map(re.escape, WORDS))
 _BEHIND = re.compile(rf"(.+?)[_\-. ]+({_WORD})")
 _BEFORE = re.compile(rf"({_WORD})[_\-. ]+(.+)")
-NAMED = 5  # files in a message, at most
 SKEW = 0.01  # by which width over height of a mask and its photograph may differ
 COLORED = 64  # of 255: difference of channels from which a pixel of a mask has a colour
 FEW = 0.001  # share of a mask's pixels that may have a colour, as JPEG makes some
@@ -114,11 +113,10 @@ def require_all(where: Path, photographs: Named, masked: Sequence[bool]) -> None
     """Raise a DataError that names the photographs without a mask, if there are any."""
     without = [image for (_, image), there in zip(photographs, masked, strict=True) if not there]
     if without:
-        more = ", ..." if len(without) > NAMED else ""
         first = without[0]
         raise DataError(
             f"{where}: expected a mask for each of {len(photographs)} photographs, got none for "
-            f"{len(without)}: {', '.join(p.name for p in without[:NAMED])}{more} (looked for "
+            f"{len(without)}: {some([p.name for p in without])} (looked for "
             f"{first.stem}.png, {first.name}.png, {first.stem}_mask.png and the like)"
         )
 
@@ -402,12 +400,10 @@ def _of_palette(image: Image.Image, path: Path) -> Tensor:
         return _scaled(torch.from_numpy(np.array(image.convert("L"))), path)
     things = [n for n in used if n]
     if len(things) > 1 or palette[0].any():
-        named = ", ".join(
-            f"{n}: {palette[min(n, len(palette) - 1)].tolist()}" for n in used[:NAMED]
-        )
+        named = [f"{n}: {palette[min(n, len(palette) - 1)].tolist()}" for n in used]
         raise DataError(
             f"{path}: expected a mask of one object, got a palette of {len(used)} colours "
-            f"({named}{', ...' if len(used) > NAMED else ''}): {WHITE}"
+            f"({some(named)}): {WHITE}"
         )
     return torch.from_numpy(255 * (numbers > 0).astype(np.uint8))
 
@@ -503,13 +499,10 @@ def made_upright(pairs: Sequence[tuple[Path, Path]]) -> bool | None:
 
 
 def require_fit(where: Path, views: Sequence[tuple[Tensor, Tensor]]) -> None:
-    """Raise where masks are faint, or most are of what is not the object, mirrored or turned.
+    """Raise a DataError where masks are faint, or most are inverted, mirrored or turned.
 
     Args:
         views: colours [H, W, 3] and coverage [H, W] of some photographs.
-
-    Raises:
-        DataError: they are.
     """
     largest = max(float(mask.max()) for _, mask in views)
     if largest < 0.5 and len(views) >= FEWEST:

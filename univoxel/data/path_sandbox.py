@@ -3,31 +3,27 @@ of NumPy."""
 
 from __future__ import annotations
 
-import logging
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
 
-from univoxel.errors import DataError
+from univoxel.core import log
+from univoxel.core.memmap import assigned
+from univoxel.errors import DataError, some
 
 # The folder that files must lie in, resolved. Layouts find files and need not know of it
 _folder: ContextVar[Path | None] = ContextVar("folder of the data", default=None)
 
 
-@contextmanager
-def staying_in(folder: Path | None) -> Iterator[None]:
+def staying_in(folder: Path | None) -> AbstractContextManager[None]:
     """Let `inside` refuse, in the block, what does not lie in the folder; None: nothing."""
-    token = _folder.set(None if folder is None else folder.resolve())
-    try:
-        yield
-    finally:
-        _folder.reset(token)
+    return assigned(_folder, None if folder is None else folder.resolve())
 
 
 def inside(path: Path, where: str) -> Path:
@@ -56,8 +52,6 @@ FEWEST = 3  # photographs that must be there where one is missing: a shape needs
 SHARE = 0.5  # of those listed that must be there: with less, it is the names that are wrong
 NAMED = 3  # missing pictures that messages name, at most
 
-log: logging.Logger = logging.getLogger("univoxel")
-
 
 def left_out(where: str, missing: Sequence[object], listed: int, note: str = "") -> list[str]:
     """What is to be said of pictures that are not there; a warning in the log says which.
@@ -73,7 +67,7 @@ def left_out(where: str, missing: Sequence[object], listed: int, note: str = "")
     """
     if not missing:
         return []
-    names = ", ".join(map(str, missing[:NAMED])) + (", ..." if len(missing) > NAMED else "")
+    names = some(missing, NAMED)
     count = f"{len(missing)} of {listed}"
     if listed - len(missing) < max(FEWEST, SHARE * listed):
         raise DataError(
@@ -97,11 +91,7 @@ BROKEN = (
 
 
 def read_npy(path: Path) -> np.ndarray:
-    """The array in a .npy file.
-
-    Raises:
-        DataError: it cannot be read.
-    """
+    """The array in a .npy file; a DataError where it cannot be read."""
     inside(path, str(path))
     try:
         with path.open("rb") as stream:

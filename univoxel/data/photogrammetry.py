@@ -7,6 +7,7 @@ import csv
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 
@@ -14,14 +15,34 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from univoxel.core.files import read_json
-from univoxel.data.conventions import TO_OPENGL, check_skew, find_photo, parsed
+from univoxel.data.conventions import TO_OPENGL, check_skew, find_photo, parsed, turned_up
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import Lens, fitted
-from univoxel.data.load_images import Shot, every_eighth, in_moved_world, read_shots, upright
+from univoxel.data.load_images import Listed, Shot, every_eighth, in_moved_world
 from univoxel.data.path_sandbox import inside, left_out
-from univoxel.data.photos import Photos
 from univoxel.data.transforms import lens_of, listed_image, pose_of, read_number, short
 from univoxel.errors import DataError
+
+HEAD = 4096  # bytes of a file that say what it is
+
+
+def _first(folder: Path, pattern: str, fits: Callable[[bytes], bool]) -> Path | None:
+    """The first file of a folder by name whose beginning fits."""
+    for path in sorted(folder.glob(pattern)):
+        if path.is_file():
+            with path.open("rb") as stream:
+                if fits(stream.read(HEAD)):
+                    return path
+    return None
+
+
+def _lens(
+    where: str, size: tuple[int, int], values: dict[str, float], term: dict[str, float], note=""
+) -> Lens:
+    """A lens of the terms k1 to k4, in the words of `lens_of`."""
+    lens = lens_of(values | {key: term[key] for key in ("k1", "k2", "k3")}, where, *size, note)
+    return replace(lens, radial=(*lens.radial, term["k4"]))
+
 
 # Cameras that Metashape exported, as XML.
 #
@@ -38,7 +59,6 @@ from univoxel.errors import DataError
 # Source: Agisoft Metashape User Manual, "Camera models".
 
 
-XML_HEAD = 4096  # bytes of a file in which <document> and <chunk> stand
 OFF = ("0", "false", "False")  # as the attribute enabled of a camera
 TERMS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2", "cx", "cy")
 
@@ -47,17 +67,8 @@ def is_metashape(folder: Path, split: str) -> bool:
     return _xml_file(folder) is not None
 
 
-def load_metashape(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
-
-    The world keeps its scale, and is turned so that +Z is up; it keeps its origin, too, unless that
-    is far away. Of several components the one with most cameras is read.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_metashape(folder: Path, split: str) -> Listed:
+    """Of several components the one with most cameras is read."""
     path = _xml_file(folder) or folder / "cameras.xml"
     chunk = _chunk(path)
     sensors = {s.get("id"): s for s in chunk.iterfind("sensors/sensor")}
@@ -97,20 +108,11 @@ def load_metashape(
         if rig := sum(c.get("master_id") is not None for c in every if c not in placed):
             told += f"; {rig} of a rig, whose place is that of a master camera"
         lost += [f"{len(every) - len(chosen)} of {len(every)} cameras left out: {told}"]
-    shots, remarks = upright(shots)
-    shots = every_eighth(folder, shots, split)
-    remarks = [*lost, *remarks]
-    return read_shots(folder, "Metashape cameras", split, shots, downscale, remarks, masks)
+    return turned_up(folder, split, "Metashape cameras", shots, lost)
 
 
 def _xml_file(folder: Path) -> Path | None:
-    for path in sorted(folder.glob("*.xml")):
-        if path.is_file():
-            with path.open("rb") as stream:
-                head = stream.read(XML_HEAD)
-            if b"<document" in head and b"<chunk" in head:
-                return path
-    return None
+    return _first(folder, "*.xml", lambda head: b"<document" in head and b"<chunk" in head)
 
 
 def _chunk(path: Path) -> ET.Element:
@@ -184,10 +186,9 @@ def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
     values = {"fl_x": focal + term["b1"], "fl_y": focal}
     values |= {"cx": width / 2 + term["cx"], "cy": height / 2 + term["cy"]}
     values |= {"p1": term["p2"], "p2": term["p1"]}
-    values |= {key: term[key] for key in ("k1", "k2", "k3")}
-    lens = lens_of(values, where, width, height)
+    lens = _lens(where, (width, height), values, term)
     check_skew(term["b2"], lens, where)
-    return replace(lens, radial=(*lens.radial, term["k4"]))
+    return lens
 
 
 # Cameras that RealityCapture or RealityScan exported as "Internal/External camera parameters".
@@ -205,7 +206,6 @@ def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
 # Source: the vendor's "Registration export and camera orientations" and "XMP Camera Math".
 
 
-CSV_HEAD = 4096  # bytes of a file in which the names of columns stand
 DELIMITERS = (",", ";", "\t")
 FILM = 36  # millimetres along the longer side that focal lengths are for
 REQUIRED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
@@ -217,17 +217,7 @@ def is_realitycapture(folder: Path, split: str) -> bool:
     return _csv_file(folder) is not None
 
 
-def load_realitycapture(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
-
-    The world keeps its scale, and is turned so that +Z is up, where it is not yet; it keeps its
-    origin, too, unless that is far away.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_realitycapture(folder: Path, split: str) -> Listed:
     path = _csv_file(folder) or folder / "cameras.csv"
     rows = _rows(path)
     shots, missing = [], []
@@ -242,20 +232,14 @@ def load_realitycapture(
         shots.append(Shot(picture.stem, where, picture, None, pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(path), missing, len(rows), note)
-    shots, remarks = upright(shots)
-    shots = every_eighth(folder, shots, split)
-    remarks = [*lost, *remarks]
-    return read_shots(folder, "RealityCapture cameras", split, shots, downscale, remarks, masks)
+    return turned_up(folder, split, "RealityCapture cameras", shots, lost)
 
 
 def _csv_file(folder: Path) -> Path | None:
-    for path in sorted(folder.glob("*.csv")):
-        if path.is_file():
-            with path.open("rb") as stream:
-                head = _text(stream.read(CSV_HEAD), "replace")
-            if any(_delimiter(line) for line in head.splitlines()[:2]):
-                return path
-    return None
+    def fits(head: bytes) -> bool:
+        return any(map(_delimiter, _text(head, "replace").splitlines()[:2]))
+
+    return _first(folder, "*.csv", fits)
 
 
 def _text(data: bytes, errors: str = "strict") -> str:
@@ -307,9 +291,7 @@ def _row_lens(row: dict[str, str], picture: Path, where: str) -> Lens:
     focal = parsed(row["f"], "f", where) * side / FILM
     values = {"fl_x": focal, "cx": width / 2 + side * term["px"]}
     values |= {"cy": height / 2 + side * term["py"], "p1": term["t2"], "p2": term["t1"]}
-    values |= {key: term[key] for key in ("k1", "k2", "k3")}
-    lens = lens_of(values, where, width, height, turn_note(picture))
-    return replace(lens, radial=(*lens.radial, term["k4"]))
+    return _lens(where, (width, height), values, term, turn_note(picture))
 
 
 def _row_pose(row: dict[str, str], where: str) -> np.ndarray:
@@ -341,21 +323,11 @@ def is_polycam(folder: Path, split: str) -> bool:
     return _place(folder) is not None
 
 
-def load_polycam(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
-
-    The world keeps its scale, metres, and its origin, and is turned from +Y up to +Z up.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_polycam(folder: Path, split: str) -> Listed:
+    """The world keeps its scale, metres, and its origin, and is turned from +Y up to +Z up."""
     place = _place(folder) or PLACES[0]
-    cameras, pictures = (
-        sorted((folder / f"{place}cameras").glob("*.json")),
-        folder / f"{place}images",
-    )
+    cameras = sorted((folder / f"{place}cameras").glob("*.json"))
+    pictures = folder / f"{place}images"
     shots, missing = [], []
     for path in cameras:
         picture = listed_image(pictures, path.stem, str(path))
@@ -373,15 +345,11 @@ def load_polycam(
         note += f"; those in {others} are of the cameras in {others.with_name('cameras')}"
     lost = left_out(str(cameras[0].parent), missing, len(cameras), f"{note})")
     shots = every_eighth(folder, in_moved_world(shots, UPRIGHT), split)
-    remarks = [*lost, "world turned from +Y to +Z up"]
-    return read_shots(folder, "Polycam raw data", split, shots, downscale, remarks, masks)
+    return Listed("Polycam raw data", shots, [*lost, "world turned from +Y to +Z up"])
 
 
 def _place(folder: Path) -> str | None:
-    for place in PLACES:
-        if any((folder / f"{place}cameras").glob("*.json")):
-            return place
-    return None
+    return next((p for p in PLACES if any((folder / f"{p}cameras").glob("*.json"))), None)
 
 
 def _read(path: Path) -> dict:
@@ -389,11 +357,11 @@ def _read(path: Path) -> dict:
     root = read_json(inside(path, str(path)))
     if not isinstance(root, dict):
         raise DataError(f"{path}: expected a JSON object, got {short(root)}")
-    found = {key: read_number(root, key, str(path), 0, math.inf) for key in ("width", "height")}
-    keys = {"fx": "fl_x", "fy": "fl_y", "cx": "cx", "cy": "cy"}
-    found |= {
-        to: read_number(root, key, str(path), -math.inf, math.inf) for key, to in keys.items()
-    }
-    rows = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
-    pose = [[read_number(root, key, str(path), -math.inf, math.inf) for key in row] for row in rows]
+
+    def number(key: str, low: float = -math.inf) -> float:
+        return read_number(root, key, str(path), low, math.inf)
+
+    found = {key: number(key, low=0) for key in ("width", "height")}
+    found |= {"fl_x": number("fx"), "fl_y": number("fy"), "cx": number("cx"), "cy": number("cy")}
+    pose = [[number(f"t_{row}{column}") for column in range(4)] for row in range(3)]
     return {**found, "pose": pose}

@@ -20,9 +20,8 @@ class Photos:
 
     folder: Path
     names: list[str]  # V, unique within the split, such as r_000
-    color: (
-        Tensor  # [V, H, W, 3] uint8 sRGB, or float32 linear radiance; straight, not premultiplied
-    )
+    # [V, H, W, 3] uint8 sRGB, or float32 linear radiance; straight, not premultiplied
+    color: Tensor
     alpha: Tensor  # [V, H, W] uint8 (0 to 255) or float32 (0 to 1) coverage
     cameras: Cameras
     about: str = ""  # what was read and how, for people

@@ -11,13 +11,12 @@ import numpy as np
 from scipy.linalg import rq
 
 from univoxel.core.files import read_json
-from univoxel.data.conventions import TO_OPENGL, check_skew, listed_split
+from univoxel.data.conventions import TO_OPENGL, check_skew, listed_split, turned_up
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import Lens, fitted
-from univoxel.data.load_images import Shot, every_eighth, read_shots, upright
+from univoxel.data.load_images import Listed, Shot
 from univoxel.data.masks import find_masks, photographs_in
 from univoxel.data.path_sandbox import inside, left_out, read_npy, read_npz
-from univoxel.data.photos import Photos
 from univoxel.data.transforms import lens_of, listed_image, pose_of, read_number, short
 from univoxel.errors import DataError
 
@@ -43,16 +42,7 @@ def is_llff(folder: Path, split: str) -> bool:
     return (folder / LLFF_FILE).is_file()
 
 
-def load_llff(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split, as of `listed_split`.
-
-    The world keeps its scale and origin, and is turned so that +Z is up.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_llff(folder: Path, split: str) -> Listed:
     path = folder / LLFF_FILE
     rows, pictures = _rows(path), _llff_pictures(folder)
     if len(pictures) != len(rows):
@@ -70,9 +60,7 @@ def load_llff(
         pose = pose_of(np.stack([right, -down, back, position], 1), where)
         lens = _llff_lens(camera[:, 4], picture, where)
         shots.append(Shot(picture.stem, where, picture, None, pose, lens))
-    shots, remarks = upright(shots)
-    shots = listed_split(folder, shots, split)
-    return read_shots(folder, "LLFF layout", split, shots, downscale, remarks, masks)
+    return turned_up(folder, split, "LLFF layout", shots, chosen=listed_split)
 
 
 def _placed(folder: Path, pictures: list[Path]) -> list[Path]:
@@ -140,16 +128,8 @@ def is_idr(folder: Path, split: str) -> bool:
     return _idr_file(folder) is not None
 
 
-def load_idr(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
-
-    The world is that of world_mat: it keeps its scale and origin, and is turned so that +Z is up.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_idr(folder: Path, split: str) -> Listed:
+    """The world is that of world_mat."""
     path = _idr_file(folder) or folder / FILES[0]
     matrices, pictures = _matrices(path), _idr_pictures(folder, path)
     numbers = _numbers(path, sorted(matrices), pictures)
@@ -165,10 +145,7 @@ def load_idr(
         lens = lens_of(values, where, *size, turn_note(picture))
         check_skew(skew, lens, where)
         shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
-    shots, remarks = upright(shots)
-    shots = every_eighth(folder, shots, split)
-    kind = f"IDR layout ({path.name})"
-    return read_shots(folder, kind, split, shots, downscale, [*lost, *remarks], masks)
+    return turned_up(folder, split, f"IDR layout ({path.name})", shots, lost)
 
 
 def decomposed(matrix: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
@@ -282,16 +259,7 @@ def is_neilf(folder: Path, split: str) -> bool:
     return (folder / NEILF_FILE).is_file()
 
 
-def load_neilf(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split: every eighth is for tests.
-
-    The world keeps its scale and origin, and is turned so that +Z is up.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_neilf(folder: Path, split: str) -> Listed:
     path = folder / NEILF_FILE
     names, images = _read(path)
     shots, missing, unplaced = [], [], 0
@@ -312,9 +280,7 @@ def load_neilf(
     looked = f" (looked in {folder / 'inputs' / 'images'})"
     lost = left_out(str(path), missing, len(names) - unplaced, looked)
     lost += [f"{unplaced} without a camera left out"] if unplaced else []
-    shots, remarks = upright(shots)
-    shots = every_eighth(folder, shots, split)
-    return read_shots(folder, "NeILF layout", split, shots, downscale, [*lost, *remarks], masks)
+    return turned_up(folder, split, "NeILF layout", shots, lost)
 
 
 def _read(path: Path) -> tuple[dict[str, str], dict]:
@@ -328,8 +294,6 @@ def _read(path: Path) -> tuple[dict[str, str], dict]:
         found = {index: PureWindowsPath(name).name for index, name in names.items()}
         if not isinstance(images, dict) or not found:
             raise TypeError("no images")
-    except DataError:
-        raise
     except (KeyError, TypeError, AttributeError) as error:
         raise DataError(
             f"{path}: expected JSON with image_path.file_paths and camera_track_map.images, "
@@ -371,14 +335,8 @@ def is_tensoir(folder: Path, split: str) -> bool:
     return any(folder.glob("*_[0-9][0-9][0-9]/metadata.json"))
 
 
-def load_tensoir(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split, under the light of the training views.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_tensoir(folder: Path, split: str) -> Listed:
+    """Photographs under the light of the training views."""
     views = sorted(path.parent for path in folder.glob(f"{split}_*/metadata.json"))
     if not views:
         raise DataError(f"{folder}: expected {split}_000/metadata.json and more, got none")
@@ -387,8 +345,7 @@ def load_tensoir(
     missing = [view / picture for view in views if view not in there]
     remarks = left_out(str(folder), missing, len(views))
     shots = [_shot(view, picture) for view in there]
-    kind = f"TensoIR layout ({picture})"
-    return read_shots(folder, kind, split, shots, downscale, remarks, masks)
+    return Listed(f"TensoIR layout ({picture})", shots, remarks)
 
 
 def photographed(folder: Path) -> str:
@@ -426,11 +383,6 @@ def _shot(view: Path, picture: str) -> Shot:
     angle = read_number(meta, "cam_angle_x", str(path), 0.0, math.pi)
     camera = {"camera_angle_x": angle}
     camera |= {to: meta[key] for to, key in (("w", "imw"), ("h", "imh")) if key in meta}
-    return Shot(
-        name=view.name,
-        where=str(path),
-        image=image,
-        mask=None,
-        pose=pose_of([values[i : i + 4] for i in range(0, 16, 4)], str(path)),
-        lens=lens_of(camera, str(path), *image_size(image)),
-    )
+    pose = pose_of(np.reshape(values, (4, 4)), str(path))
+    lens = lens_of(camera, str(path), *image_size(image))
+    return Shot(view.name, str(path), image, None, pose, lens)

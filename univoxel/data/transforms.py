@@ -3,7 +3,6 @@ camera paths without pictures."""
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 import reprlib
@@ -15,16 +14,15 @@ from typing import Any
 import numpy as np
 
 from univoxel.camera import Cameras
-from univoxel.core import system
+from univoxel.core import log, system
 from univoxel.core.files import read_json, write_json
 from univoxel.data import load_images
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
 from univoxel.data.path_sandbox import inside, left_out
-from univoxel.data.photos import Photos
 from univoxel.errors import DataError, UserError
 
-# Cameras in the JSON of NeRF: what its layouts share, and camera paths without pictures.
+# The JSON of NeRF:
 #
 # {"camera_angle_x" (or "fl_x", "fl_y", "cx", "cy"), "w", "h", "k1" .., "p1", "p2", "frames": [
 #     {"file_path": .., "transform_matrix": camera-to-world with OpenGL axes, "mask_path": ..}]}
@@ -46,7 +44,6 @@ WIDEST = 1 << 16  # pixels along a side of pictures to be made: what formats of 
 OFF = 0.9  # of a picture's sides: no lens is centred so far to the right and below
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
-log: logging.Logger = logging.getLogger("univoxel")
 _SHORT = reprlib.Repr()  # writes the beginning of values of any size and depth
 _SHORT.maxlist = _SHORT.maxdict = 20
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 200
@@ -204,11 +201,7 @@ def _folder(path: Path, frame: dict[str, Any], where: str) -> Path:
 
 
 def find_image(folder: Path, file_path: str, where: str) -> Path:
-    """The picture that a frame's file_path means, as of `listed_image`.
-
-    Raises:
-        DataError: there is none.
-    """
+    """The picture that a frame's file_path means, as of `listed_image`; a DataError without one."""
     found = listed_image(folder, file_path, where)
     if found is None:
         raise DataError(f"{where}: no picture {folder / file_path} ({LOOKED_FOR})")
@@ -228,11 +221,7 @@ def listed_image(folder: Path, file_path: str, where: str) -> Path | None:
 def _found_as_written_elsewhere(folder: Path, names: Sequence[str], where: str) -> Path | None:
     """A file that a list names as another machine has it: with backslashes, in capitals or not,
     accents apart from their letters or not, or by an absolute path, of which the end says which it
-    is in the folder.
-
-    Raises:
-        DataError: two files are called so.
-    """
+    is in the folder. Two files that are called so are a DataError."""
     of_windows = "\\" in names[0] or re.match("[A-Za-z]:/", names[0])
     paths = [PureWindowsPath(name) if of_windows else PurePosixPath(name) for name in names]
     if any(".." in path.parts for path in paths):
@@ -396,13 +385,9 @@ def write_cameras(folder: Path, split: str, cameras: Cameras, names: Sequence[st
     frames = []
     for view, pose in enumerate(cameras.camera_to_world.tolist()):
         (x, y), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
-        frames.append(
-            {
-                "file_path": f"{split}/{names[view]}",
-                "transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]],
-                **{"fl_x": x, "fl_y": y, "cx": cx, "cy": cy},
-            }
-        )
+        lens = {"fl_x": x, "fl_y": y, "cx": cx, "cy": cy}
+        matrix = [*pose, [0.0, 0.0, 0.0, 1.0]]
+        frames.append({"file_path": f"{split}/{names[view]}", "transform_matrix": matrix, **lens})
     write_json(folder / f"transforms_{split}.json", {"frames": frames})
 
 
@@ -432,14 +417,7 @@ def is_blender(folder: Path, split: str) -> bool:
     return any((folder / f"transforms_{s}.json").is_file() for s in ("train", split))
 
 
-def load_blender(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_blender(folder: Path, split: str) -> load_images.Listed:
     path = folder / f"transforms_{split}.json"
     if not path.is_file():
         raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
@@ -451,7 +429,7 @@ def load_blender(
         places = [pose[:, 3] for pose in poses] or [shot.pose[:, 3] for shot in shots]
         shots, moved = load_images.near_origin(shots, np.stack(places))
         remarks = [*remarks, *moved]
-    return load_images.read_shots(folder, "NeRF layout", split, shots, downscale, remarks, masks)
+    return load_images.Listed("NeRF layout", shots, remarks)
 
 
 # The layout of nerfstudio and instant-ngp.
@@ -467,14 +445,8 @@ def is_nerfstudio(folder: Path, split: str) -> bool:
     return (folder / "transforms.json").is_file()
 
 
-def load_nerfstudio(
-    folder: Path, split: str = "train", downscale: int = 0, masks: bool | Path = True
-) -> Photos:
-    """Photographs and cameras of one split: without one in the file, every eighth is for tests.
-
-    Raises:
-        DataError: one line that names the file, what was expected and what came.
-    """
+def list_nerfstudio(folder: Path, split: str) -> load_images.Listed:
+    """Where the file has no splits, every eighth is for tests."""
     path = folder / "transforms.json"
     root, shots, lost = read_frames(path)
     shots, remarks = load_images.upright(shots)
@@ -484,9 +456,7 @@ def load_nerfstudio(
     else:
         listed = [frame["file_path"] for frame in root["frames"]]
         shots = _named(path, shots, listed, f"{split}_filenames", chosen)
-    return load_images.read_shots(
-        folder, "nerfstudio layout", split, shots, downscale, [*lost, *remarks], masks
-    )
+    return load_images.Listed("nerfstudio layout", shots, [*lost, *remarks])
 
 
 def _named(

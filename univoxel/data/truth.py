@@ -76,16 +76,9 @@ def orb_geometry(path: Path, key: str, camera_to_world: Tensor) -> tuple[Tensor,
 # Triangle meshes in PLY files.
 
 
-_TYPES = {
-    **dict.fromkeys(("char", "int8"), "<i1"),
-    **dict.fromkeys(("uchar", "uint8"), "<u1"),
-    **dict.fromkeys(("short", "int16"), "<i2"),
-    **dict.fromkeys(("ushort", "uint16"), "<u2"),
-    **dict.fromkeys(("int", "int32"), "<i4"),
-    **dict.fromkeys(("uint", "uint32"), "<u4"),
-    **dict.fromkeys(("float", "float32"), "<f4"),
-    **dict.fromkeys(("double", "float64"), "<f8"),
-}
+_TYPES = {"char": "<i1", "uchar": "<u1", "short": "<i2", "ushort": "<u2"}
+_TYPES |= {"int": "<i4", "uint": "<u4", "float": "<f4", "double": "<f8"}
+_TYPES |= {np.dtype(kind).name: kind for kind in _TYPES.values()}  # int8, uint8 and so on
 
 
 def read_ply(path: Path) -> Mesh:
@@ -208,9 +201,7 @@ def load_relit(photos: Photos, map: str) -> tuple[Tensor, Tensor]:
                 f"{path}: expected {size[0]}x{size[1]} pixels like the test view's, "
                 f"got {found[0]}x{found[1]}"
             )
-        if photos.downscale > 1:
-            color, alpha = resampled(color, alpha, photos.downscale)
-        pictures.append((color, alpha))
+        pictures.append(resampled(color, alpha, photos.downscale))
     return stacked([c for c, _ in pictures]), stacked([a for _, a in pictures])
 
 

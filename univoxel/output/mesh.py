@@ -54,24 +54,13 @@ class TexturedMesh:
     seen: Tensor | None = None  # [P] float32 in [0, 1], as of `Mesh`
 
 
-def albedo_picture(mesh: TexturedMesh) -> np.ndarray:
-    """[T, T, 3] uint8, sRGB."""
-    return _bytes(linear_to_srgb(mesh.albedo))
-
-
-def roughness_picture(mesh: TexturedMesh) -> np.ndarray:
-    """[T, T] uint8, linear."""
-    return _bytes(mesh.roughness)
-
-
-def metallic_picture(mesh: TexturedMesh) -> np.ndarray:
-    """[T, T] uint8, linear; black where the mesh has no metal."""
-    return _bytes(torch.zeros_like(mesh.roughness) if mesh.metallic is None else mesh.metallic)
-
-
-def relief_picture(mesh: TexturedMesh) -> np.ndarray:
-    """[T, T, 3] uint8, linear, 127.5 (n + 1); green is +y, upwards in the picture."""
-    return _bytes(0.5 * (mesh.relief + 1))
+def texture_pictures(mesh: TexturedMesh) -> dict[str, np.ndarray]:
+    """Textures as uint8: albedo [T, T, 3] in sRGB; linear roughness [T, T], metallic [T, T] where
+    the mesh has metal, and normal [T, T, 3], 127.5 (n + 1), green +y, upwards in the picture."""
+    values = {"albedo": linear_to_srgb(mesh.albedo), "roughness": mesh.roughness}
+    values |= {"normal": 0.5 * (mesh.relief + 1)}
+    values |= {} if mesh.metallic is None else {"metallic": mesh.metallic}
+    return {name: (x.clamp(0, 1) * 255).round().byte().numpy() for name, x in values.items()}
 
 
 def encoded(picture: np.ndarray, jpeg: int | None) -> bytes:
@@ -82,10 +71,6 @@ def encoded(picture: np.ndarray, jpeg: int | None) -> bytes:
     else:  # 4:4:4: channels of these are no colours
         Image.fromarray(picture).save(file, format="JPEG", quality=jpeg, subsampling=0)
     return file.getvalue()
-
-
-def _bytes(values: Tensor) -> np.ndarray:
-    return (values.clamp(0, 1) * 255).round().byte().numpy()
 
 
 # A texture over a mesh: the frames of its vertices, and which texel lies where.
@@ -100,8 +85,7 @@ def vertex_normals(mesh: Mesh) -> Tensor:
     Source: Thuermer and Wuethrich 1998.
     """
     corner, index = mesh.vertices.double()[mesh.faces.long()], mesh.faces.long()
-    normal = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal = _unit(normal)
+    normal = _unit(torch.linalg.cross(*_edges_at(corner, 0)))
     total = torch.zeros(len(mesh.vertices), 3, dtype=torch.float64)
     for k in range(3):
         to_next, to_last = _edges_at(corner, k)
@@ -119,8 +103,7 @@ def vertex_tangents(vertices: Tensor, faces: Tensor, normals: Tensor, uv: Tensor
     """
     index = faces.long()
     corner, flat = vertices.double()[index], uv.double()[index]
-    d1, d2 = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
-    e1, e2 = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    (d1, d2), (e1, e2) = _edges_at(flat, 0), _edges_at(corner, 0)
     winding = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]).sign()
     along_u = winding[:, None] * (d2[:, 1:] * e1 - d1[:, 1:] * e2)
     total = torch.zeros(len(vertices), 4, dtype=torch.float64)
@@ -203,7 +186,7 @@ def _reject(x: Tensor, n: Tensor) -> Tensor:
 
 
 def _edges_at(corner: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """From corner k of triangles [F, 3, 3] to the next and to the last one."""
+    """From corner k of triangles [F, 3, C] to the next and to the last one."""
     return corner[:, (k + 1) % 3] - corner[:, k], corner[:, (k + 2) % 3] - corner[:, k]
 
 
@@ -329,8 +312,7 @@ def bake(
 
 def _texel(mesh: Mesh, texels: int) -> float:
     """World units along a side of one of so many texels on a mesh."""
-    corner = mesh.vertices[mesh.faces.long()]
-    area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    area = torch.linalg.cross(*_edges_at(mesh.vertices[mesh.faces.long()], 0))
     return float((0.5 * area.norm(dim=1).sum() / texels).sqrt())
 
 
@@ -415,7 +397,6 @@ def placement_of(
 
 def placed(mesh: AnyMesh, placement: Placement) -> AnyMesh:
     """A mesh brought where a placement says; textures stay."""
-
     turn = placement.turn
 
     def turned(vectors: Tensor) -> Tensor:

@@ -20,15 +20,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.core.files import write_bytes, write_text
 from univoxel.core.records import Mesh
 from univoxel.errors import MissingExtra, UserError
-from univoxel.output.mesh import (
-    Y_UP,
-    TexturedMesh,
-    albedo_picture,
-    encoded,
-    metallic_picture,
-    relief_picture,
-    roughness_picture,
-)
+from univoxel.output.mesh import Y_UP, TexturedMesh, encoded, texture_pictures
 
 
 def write_glb(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
@@ -40,8 +32,7 @@ def write_glb(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
     Raises:
         OSError: the file cannot be written; nothing is left behind.
     """
-    data = glb(mesh, jpeg)
-    write_bytes(path, data)
+    write_bytes(path, glb(mesh, jpeg))
 
 
 def glb(
@@ -60,9 +51,11 @@ def glb(
 
     Source: Khronos Group, glTF 2.0 Specification, sections 3.7, 3.9 and 4.4.
     """
-    roughness = roughness_picture(mesh)
+    pictures = texture_pictures(mesh)
+    roughness = pictures["roughness"]
+    metallic = pictures.get("metallic", np.zeros_like(roughness))
     # Red holds ambient occlusion in files that have it: 255 is none.
-    packed = np.stack([np.full_like(roughness, 255), roughness, metallic_picture(mesh)], 2)
+    packed = np.stack([np.full_like(roughness, 255), roughness, metallic], 2)
     tangents = torch.cat([mesh.tangents[:, :3] @ Y_UP.T, mesh.tangents[:, 3:]], 1)
     uv = torch.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], 1)  # glTF counts v downwards
     file = gltf.GLTF2(
@@ -112,9 +105,9 @@ def glb(
     primitive = gltf.Primitive(attributes=attributes, indices=indices, material=0)
     file.meshes = [gltf.Mesh(name="object", primitives=[primitive])]
     for name, picture in (
-        ("base colour", albedo_picture(mesh)),
+        ("base colour", pictures["albedo"]),
         ("occlusion roughness metallic", packed),
-        ("normal", relief_picture(mesh)),
+        ("normal", pictures["normal"]),
     ):
         view = _view(file, blob, encoded(picture, jpeg), None)
         kind = "image/png" if jpeg is None else "image/jpeg"
@@ -167,11 +160,7 @@ ROOT, MESH, MATERIAL = "/object", "/object/mesh", "/object/material"
 
 
 def require_usd() -> Any:
-    """The modules of OpenUSD, as attributes. They are typed by nobody.
-
-    Raises:
-        MissingExtra: they are not installed.
-    """
+    """The modules of OpenUSD, as attributes, typed by nobody; a MissingExtra where they lack."""
     names = ("Sdf", "Usd", "UsdGeom", "UsdShade", "Vt")
     try:
         import_module("pxr")
@@ -218,17 +207,11 @@ def _write_package(usd: Any, package: Path, files: list[Path]) -> None:
 
 def _write_pictures(folder: Path, mesh: TexturedMesh, jpeg: int | None) -> dict[str, str]:
     """Files of the textures, by the input of the surface that they are for."""
-    pictures = {
-        "diffuseColor": albedo_picture(mesh),
-        "roughness": roughness_picture(mesh),
-        "normal": relief_picture(mesh),
-    }
-    if mesh.metallic is not None:
-        pictures["metallic"] = metallic_picture(mesh)
+    (folder / "textures").mkdir()
     files = {}
-    for kind, picture in pictures.items():
+    for name, picture in texture_pictures(mesh).items():
+        kind = "diffuseColor" if name == "albedo" else name
         files[kind] = f"textures/{kind}.{'png' if jpeg is None else 'jpg'}"
-        (folder / "textures").mkdir(exist_ok=True)
         (folder / files[kind]).write_bytes(encoded(picture, jpeg))
     return files
 
@@ -325,16 +308,9 @@ def write_obj(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
     name = path.stem
     if name.split() != [name]:
         raise UserError(f"{path}: readers of OBJ need a file name without spaces")
-    pictures = {
-        "albedo": albedo_picture(mesh),
-        "roughness": roughness_picture(mesh),
-        "normal": relief_picture(mesh),
-    }
-    metal, suffix = "Pm 0", "png" if jpeg is None else "jpg"
-    if mesh.metallic is not None:
-        pictures["metallic"] = metallic_picture(mesh)
-        metal = f"Pm 1\nmap_Pm {name}_metallic.{suffix}"
-    for kind, picture in pictures.items():
+    suffix = "png" if jpeg is None else "jpg"
+    metal = "Pm 0" if mesh.metallic is None else f"Pm 1\nmap_Pm {name}_metallic.{suffix}"
+    for kind, picture in texture_pictures(mesh).items():
         write_bytes(path.with_name(f"{name}_{kind}.{suffix}"), encoded(picture, jpeg))
     material = f"""newmtl object
 Kd 1 1 1
@@ -375,22 +351,18 @@ def write_ply(path: Path, mesh: Mesh) -> None:
     """
     columns: list[tuple[str, np.ndarray]] = []
 
-    def add(names: str, values: torch.Tensor, dtype: str) -> None:
-        array = values.detach().numpy().astype(dtype)
-        array = array[:, None] if array.ndim == 1 else array
-        columns.extend(zip(names.split(), array.T, strict=True))
-
-    add("x y z", mesh.vertices, "<f4")
-    if mesh.normals is not None:
-        add("nx ny nz", mesh.normals, "<f4")
-    if mesh.albedo is not None:
-        add("red green blue", (linear_to_srgb(mesh.albedo) * 255).round(), "u1")
-    if mesh.roughness is not None:
-        add("roughness", mesh.roughness, "<f4")
-    if mesh.metallic is not None:
-        add("metallic", mesh.metallic, "<f4")
-    if mesh.seen is not None:
-        add("seen", mesh.seen, "<f4")
+    color = None if mesh.albedo is None else (linear_to_srgb(mesh.albedo) * 255).round()
+    for names, values, dtype in (
+        ("x y z", mesh.vertices, "<f4"),
+        ("nx ny nz", mesh.normals, "<f4"),
+        ("red green blue", color, "u1"),
+        ("roughness", mesh.roughness, "<f4"),
+        ("metallic", mesh.metallic, "<f4"),
+        ("seen", mesh.seen, "<f4"),
+    ):
+        if values is not None:
+            array = values.detach().numpy().astype(dtype)
+            columns += zip(names.split(), np.atleast_2d(array.T), strict=True)
     vertex = np.empty(len(mesh.vertices), [(name, column.dtype) for name, column in columns])
     for name, column in columns:
         vertex[name] = column

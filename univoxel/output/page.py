@@ -124,6 +124,7 @@ def _traced(
 
 
 BUNDLED = Path(__file__).parent.parent / "example_data" / "tiny" / "envmaps"
+PHOTOGRAPHED = ("city", "sunset")
 ROWS = 128  # of maps that the page makes itself
 MOST_ROWS = 256  # of a map from a file
 
@@ -138,26 +139,14 @@ class Light:
 
 def usual_lights() -> list[Light]:
     """Those that every page offers: two photographed, two made here."""
-    photographed = [
-        Light(name, read_map(BUNDLED / f"{name}.hdr").radiance) for name in PHOTOGRAPHED
-    ]
+    photographed = (Light(n, read_map(BUNDLED / f"{n}.hdr").radiance) for n in PHOTOGRAPHED)
     return [Light("studio", studio()), *photographed, Light("overcast", overcast())]
 
 
-PHOTOGRAPHED = ("city", "sunset")
-
-
 def light_of_file(path: Path) -> Light:
-    """A map from a file, averaged to at most MOST_ROWS rows.
-
-    Raises:
-        DataError: it cannot be used as a map; OSError: it cannot be read.
-    """
+    """A map from a file, averaged to at most MOST_ROWS rows; errors as of `read_map`."""
     radiance = read_map(path).radiance
-    if len(radiance) > MOST_ROWS:
-        size = (MOST_ROWS, 2 * MOST_ROWS)
-        radiance = adaptive_avg_pool2d(radiance.movedim(2, 0), size).movedim(0, 2)
-    return Light(path.stem, radiance.contiguous())
+    return Light(path.stem, _averaged(radiance, min(len(radiance), MOST_ROWS)))
 
 
 def studio() -> Tensor:
@@ -165,7 +154,7 @@ def studio() -> Tensor:
 
     A white matte ball is about as bright as white paper on its brightest side.
     """
-    direction = _fine_directions()
+    direction = sphere.latlong_directions(2 * ROWS)
     room = torch.tensor([0.10, 0.10, 0.105]) * (0.6 + 0.4 * direction[..., 2:])
     radiance = room.expand_as(direction).clone()
     # azimuth, elevation, half width, half height (degrees), radiance, colour
@@ -177,7 +166,7 @@ def studio() -> Tensor:
     for azimuth, elevation, width, height, power, color in boxes:
         inside = _box(direction, azimuth, elevation, width, height)
         radiance += power * inside[..., None] * torch.tensor(color)
-    return _averaged(radiance)
+    return _averaged(radiance, ROWS)
 
 
 def overcast() -> Tensor:
@@ -192,17 +181,9 @@ def overcast() -> Tensor:
     return share * sky + (1 - share) * ground
 
 
-def _fine_directions() -> Tensor:
-    """Four directions a texel: [2 ROWS, 4 ROWS, 3]."""
-    v = (torch.arange(2 * ROWS) + 0.5) / (2 * ROWS)
-    u = (torch.arange(4 * ROWS) + 0.5) / (4 * ROWS)
-    return sphere.latlong_direction(torch.stack(torch.meshgrid(v, u, indexing="ij")[::-1], -1))
-
-
-def _averaged(radiance: Tensor) -> Tensor:
-    """[2 H, 2 W, 3] to [H, W, 3]."""
-    height, width, _ = radiance.shape
-    size = (height // 2, width // 2)
+def _averaged(radiance: Tensor, rows: int) -> Tensor:
+    """A map of fewer rows: [rows, 2 rows, 3]."""
+    size = (rows, 2 * rows)
     return adaptive_avg_pool2d(radiance.movedim(2, 0), size).movedim(0, 2).contiguous()
 
 
@@ -211,9 +192,8 @@ def _box(
 ) -> Tensor:
     """How much of a soft box lies in directions [..., 3], in [0, 1]; angles in degrees."""
     phi, up = math.radians(azimuth), math.radians(elevation)
-    centre = [math.cos(up) * math.cos(phi), math.cos(up) * math.sin(phi), math.sin(up)]
     axes = [
-        centre,
+        sphere.direction_at(azimuth, elevation),
         [-math.sin(phi), math.cos(phi), 0.0],
         [-math.sin(up) * math.cos(phi), -math.sin(up) * math.sin(phi), math.cos(up)],
     ]

@@ -7,9 +7,9 @@ No truth is read.
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from univoxel import __version__
 from univoxel.config import TrainConfig, load_config
+from univoxel.core import log
 from univoxel.core.files import write_text
 from univoxel.core.html import Curve, chart, document, escape, image, paragraph, table
 from univoxel.core.records import AlbedoNear, Mesh
@@ -44,8 +45,6 @@ from univoxel.run import load_verdict, photos_of
 from univoxel.scene import Scene, load_checkpoint
 from univoxel.training.clock import ALL, Clock, stage_name
 from univoxel.training.progress import LOG
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)
@@ -116,13 +115,10 @@ def stages(cfg: TrainConfig, state: dict[str, Any]) -> list[StageFacts]:
 
 
 def stage_ends(state: dict[str, Any]) -> list[float]:
-    """Seconds at which stages ended, the last first counted from the end of training; empty where
-    that was not kept."""
-    took = list(state.get("took", ()))
-    if not took or "seconds" not in state:
+    """Seconds at which stages but the last ended; empty where that was not kept."""
+    if (begin := prepared(state)) is None:
         return []
-    begin = state["seconds"] - sum(took) - state.get("stage_took", 0.0)  # preparation
-    return [begin + sum(took[: k + 1]) for k in range(len(took) - 1)]
+    return [begin + end for end in accumulate(state["took"][:-1])]
 
 
 def prepared(state: dict[str, Any]) -> float | None:
@@ -145,10 +141,6 @@ def remarks(cfg: TrainConfig, state: dict[str, Any]) -> list[str]:
         told.append(f"Training met trouble {len(troubles)} times, the last in {troubles[-1]}.")
     chosen = [entry.get("said", "") for entry in state.get("chosen", ())]
     return told + [f"Size chosen: {said}." for said in chosen if said]
-
-
-# A run as a report: one page without scripts and without network, which says how good the run is,
-# where it is in doubt, and what to photograph next. No truth is read.
 
 
 FOLDER = Path(__file__).parent / "web"
@@ -184,8 +176,7 @@ class ReportOptions:
 
     def __post_init__(self) -> None:
         for name, least in (("views", 0), ("size", 16)):
-            if getattr(self, name) < least:
-                value = getattr(self, name)
+            if (value := getattr(self, name)) < least:
                 raise UserError(f"report: {name} must be at least {least}, got {value}", name)
 
 
@@ -266,17 +257,13 @@ def report_text(
 
 
 def what_is_known(run: Path, scene: Scene, options: ReportOptions) -> Known:
-    """Survey the surface by the photographs of a run, and weigh directions for more.
-
-    Raises:
-        UserError: they cannot be used; OSError: they cannot be read.
-    """
+    """Survey the surface by the photographs of a run, and weigh directions for more; errors as of
+    `photos_of`."""
     data = None if options.data is None else Path(options.data)
     photos = photos_of(run, data, "train")
     surveyed = survey(scene, photos, POINTS)
     photos = scene.registered(photos)
-    occluder = scene.occluder()
-    advice = advise(surveyed, photos.cameras, photos.names, occluder, options.advice)
+    advice = advise(surveyed, photos.cameras, photos.names, scene.occluder(), options.advice)
     splits = [report_pictures.Split(photos, True)]
     try:
         splits.append(report_pictures.Split(photos_of(run, data, "test"), False))
@@ -288,8 +275,7 @@ def what_is_known(run: Path, scene: Scene, options: ReportOptions) -> Known:
 def next_section(advice: Advice) -> str:
     """Directions for more photographs, in words, as a list and on the sphere."""
     parts = []
-    told = in_words(advice)
-    if told:
+    if told := in_words(advice):
         text = "".join(f"<li>{escape(line)}" for line in told)
         parts.append(f'<ul class="advice">{text}</ul>')
         worth = enumerate(zip(advice.nearest, advice.gains.tolist(), strict=True))
@@ -325,8 +311,7 @@ def next_section(advice: Advice) -> str:
 
 def doubt_section(known: Known, state: dict[str, Any], pictures: Sequence[Tensor]) -> str:
     """What photographs leave open, in words and painted on the object."""
-    surveyed = known.surveyed
-    text = words(numbers(surveyed), list(state.get("troubles", [])))
+    text = words(numbers(known.surveyed), list(state.get("troubles", [])))
     legend = "Doubt of the albedo: black is well determined, white is a guess."
     return paragraph(text) + gallery(zip(report_pictures.SIDES, pictures, strict=True), legend)
 
@@ -338,17 +323,19 @@ def views_section(scene: Scene, known: Known, options: ReportOptions) -> str:
     )
     if not found:
         return ""
-    rows = "".join(
-        f'<figure class="row">{"".join(image(tile, words) for tile in tiles)}'
-        f"<figcaption>{escape(words)}</figcaption></figure>"
-        for words, tiles in report_pictures.rows(found)
-    )
+    rows = []
+    for view in found:
+        kind = "" if view.trained else " (not trained on)"
+        words = f"{view.name}{kind}: {view.error:.3f} in sRGB on the mean, {view.quality:.1f} dB"
+        tiles = "".join(image(tile, words) for tile in view.tiles)
+        caption = f"<figcaption>{escape(words)}</figcaption>"
+        rows.append(f'<figure class="row">{tiles}{caption}</figure>')
     said = (
         f"The {len(found)} that differ most, of {count} compared: photograph, render, and their "
         f"difference, drawn brightest at {report_pictures.LIMIT} in sRGB. Numbers are over the "
         "object."
     )
-    return paragraph(said) + f'<div class="views">{rows}</div>'
+    return paragraph(said) + f'<div class="views">{"".join(rows)}</div>'
 
 
 def materials_section(pictures: dict[str, list[Tensor]]) -> str:

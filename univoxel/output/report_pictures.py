@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -74,11 +74,7 @@ class Compared:
 
 
 def worst(
-    scene: Scene,
-    splits: list[Split],
-    count: int,
-    size: int,
-    albedo_near: AlbedoNear | None = None,
+    scene: Scene, splits: list[Split], count: int, size: int, albedo_near: AlbedoNear | None = None
 ) -> tuple[list[Compared], int]:
     """The views that differ most from their photographs, the worst first; how many were compared.
 
@@ -104,8 +100,7 @@ def compared(
 ) -> Compared:
     """One view, at most `size` pixels along its longer side."""
     photos = split.photos
-    longest = max(*photos.cameras.size(view))
-    share = min(1.0, size / longest)
+    share = min(1.0, size / max(photos.cameras.size(view)))
     cameras = resize(photos.cameras, max(1, round(share * photos.cameras.width)))
     width, height = cameras.size(view)
     small = shrunk(photos, view, width, height)
@@ -122,14 +117,6 @@ def on_grey(premultiplied: Tensor, alpha: Tensor) -> Tensor:
     """Linear colours [h, w, 3], premultiplied, as sRGB on what stands behind them in a report."""
     straight = premultiplied / alpha[..., None].clamp_min(1e-6)
     return linear_to_srgb(straight) * alpha[..., None] + BEHIND * (1 - alpha[..., None])
-
-
-def rows(found: list[Compared]) -> Iterator[tuple[str, tuple[Tensor, Tensor, Tensor]]]:
-    """What stands under each view, and its pictures."""
-    for view in found:
-        kind = "" if view.trained else " (not trained on)"
-        words = f"{view.name}{kind}: {view.error:.3f} in sRGB on the mean, {view.quality:.1f} dB"
-        yield words, view.tiles
 
 
 # The object from four sides, as layers.
@@ -164,11 +151,7 @@ def layers(
 
 
 def _of_view(
-    scene: Scene,
-    cameras: Cameras,
-    view: int,
-    doubts: Doubts | None,
-    albedo_near: AlbedoNear | None,
+    scene: Scene, cameras: Cameras, view: int, doubts: Doubts | None, albedo_near: AlbedoNear | None
 ) -> Iterator[tuple[str, Tensor]]:
     surface, wo = surface_of_view(scene, cameras, view, albedo_near)
     width, height = cameras.size(view)
@@ -184,18 +167,14 @@ def _of_view(
     yield "render", on_grey(grid(shade_hits(scene, surface, wo)), alpha)
     yield "albedo", plain(linear_to_srgb(surface.albedo))
     yield "roughness", plain(surface.roughness)
-    yield "metal", plain(_metal(surface) * (1 - BEHIND))
+    metal = metal_or_none(surface.metallic)
+    yield "metal", plain((torch.zeros_like(alpha) if metal is None else metal) * (1 - BEHIND))
     yield "normal", plain(0.5 * surface.normal + 0.5)
     if doubts is not None:
         met = (surface.opacity > 0).nonzero()[:, 0]
         doubt = torch.zeros_like(surface.opacity)
         doubt[met] = doubts.at(surface.position[met], surface.normal[met])[:, 0].clamp(0, 1)
         yield "doubt", plain(torch.from_numpy(heat(doubt, 1.0)).float())
-
-
-def _metal(surface: Surface) -> Tensor:
-    metal = None if surface.metallic is None else metal_or_none(surface.metallic)
-    return torch.zeros_like(surface.roughness) if metal is None else metal
 
 
 # The light that was recovered, as one map, whichever model of light it is.
@@ -317,15 +296,10 @@ def sphere(advice: Advice) -> str:
     side = RADIUS + ROOM
     box = f"{-side:.0f} {-side:.0f} {2 * side:.0f} {2 * side:.0f}"
     label = "Directions around the object, seen from above"
-    return (
-        f'<svg class="sphere" viewBox="{box}" role="img" aria-label="{label}">{_join(parts)}</svg>'
-    )
+    head = f'<svg class="sphere" viewBox="{box}" role="img" aria-label="{label}">'
+    return head + "\n".join(parts) + "</svg>"
 
 
 def _away(elevation: float) -> float:
     """Distance from the middle that keeps areas: 0 at the zenith, 1 at the nadir."""
     return math.sqrt((1 - math.sin(math.radians(elevation))) / 2)
-
-
-def _join(parts: Sequence[str]) -> str:
-    return "\n".join(parts)

@@ -3,7 +3,6 @@ smooth."""
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from univoxel.camera import Cameras, project
+from univoxel.core import log
 from univoxel.core.records import Mesh
 from univoxel.errors import UserError
 from univoxel.ops import VisibilityScene
@@ -22,8 +22,6 @@ from univoxel.output.topology import cleaned
 from univoxel.render.observations import MIN_COSINE
 from univoxel.run import photos_of
 from univoxel.scene import Scene
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 # Edges over which the border between what is seen and what is not is spread
 BORDER = 6
@@ -55,8 +53,7 @@ def surface_of(scene: Scene, cameras: Cameras | None = None) -> Mesh:
     if dropped.crumbs or dropped.voids:
         log.info(
             "mesh: small pieces beside the object that were left out: %d; hollows inside it: %d",
-            dropped.crumbs,
-            dropped.voids,
+            *(dropped.crumbs, dropped.voids),
         )
     if cameras is None:
         return mesh
@@ -128,11 +125,8 @@ def smoothed(mesh: Mesh, seen: Tensor, reach: float) -> Mesh:
         moved = vertices + STEP * free * (mean @ vertices - vertices) - start
         length = np.linalg.norm(moved, axis=1, keepdims=True)
         vertices = start + moved * (reach / np.maximum(length, reach))
-    return replace(
-        mesh,
-        vertices=torch.from_numpy(vertices.astype(np.float32)),
-        seen=torch.from_numpy(share.astype(np.float32)),
-    )
+    vertices, share = (torch.from_numpy(x.astype(np.float32)) for x in (vertices, share))
+    return replace(mesh, vertices=vertices, seen=share)
 
 
 def _mean_of_neighbours(mesh: Mesh) -> csr_matrix:

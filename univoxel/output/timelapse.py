@@ -57,14 +57,8 @@ def write_animation(path: Path, pictures: Sequence[Path], rate: int = FRAMES_PER
     with replacing(path) as temporary:
         if path.suffix == ".gif":
             first, *rest = (frame.convert("P", palette=Image.Palette.ADAPTIVE) for frame in frames)
-            first.save(
-                temporary,
-                format="GIF",
-                save_all=True,
-                append_images=rest,
-                duration=1000 // rate,
-                loop=0,
-            )
+            timing = {"duration": 1000 // rate, "loop": 0}
+            first.save(temporary, format="GIF", save_all=True, append_images=rest, **timing)
             return
         first = next(frames)
         width, height = width - width % 2, height - height % 2

@@ -44,11 +44,7 @@ def clean(mesh: Mesh) -> Mesh:
 
 
 def cleaned(mesh: Mesh) -> tuple[Mesh, Dropped]:
-    """As `clean`, and what was dropped.
-
-    Raises:
-        ValueError: nothing is left.
-    """
+    """As `clean`, and what was dropped."""
     vertices, faces = mesh.vertices.double().numpy(), mesh.faces.long().numpy()
     dropped = Dropped(0, 0)
     if len(faces):
@@ -86,7 +82,9 @@ def close(mesh: Mesh) -> Mesh:
             leave no closed surface.
     """
     vertices, faces = mesh.vertices.double().numpy(), mesh.faces.long().numpy()
-    loops = _loops(_border(faces).tolist())
+    edges = _edges(faces)
+    border = edges[~np.isin(_keys(edges), _keys(edges[:, ::-1]))]  # with none the other way round
+    loops = _loops(border.tolist())
     for loop in loops:
         fan = [[b, a, len(vertices)] for a, b in pairwise([*loop, loop[0]])]
         faces = np.concatenate([faces, fan])
@@ -122,12 +120,6 @@ def _keys(edges: np.ndarray) -> np.ndarray:
     return edges[:, 0] << 32 | edges[:, 1]
 
 
-def _border(faces: np.ndarray) -> np.ndarray:
-    """Directed edges [E, 2] that have none in the other direction."""
-    edges = _edges(faces)
-    return edges[~np.isin(_keys(edges), _keys(edges[:, ::-1]))]
-
-
 def _loops(edges: list[list[int]]) -> list[list[int]]:
     """Loops that pass each of their vertices once, together of all directed edges that form any."""
     onward: dict[int, list[int]] = {}
@@ -145,12 +137,6 @@ def _loops(edges: list[list[int]]) -> list[list[int]]:
             else:
                 path.append(b)
     return loops
-
-
-def _components(edges: np.ndarray, vertices: int) -> tuple[int, np.ndarray]:
-    """How many connected components there are, and the one of each vertex."""
-    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(vertices, vertices))
-    return connected_components(graph, directed=False)
 
 
 def _welded(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -182,7 +168,9 @@ def _component_faces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarra
     """Faces of the components that `clean` keeps."""
     if not len(faces):
         return faces, Dropped(0, 0)
-    count, label = _components(_edges(faces), len(vertices))
+    edges, size = _edges(faces), len(vertices)
+    graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(size, size))
+    count, label = connected_components(graph, directed=False)
     label = label[faces[:, 0]]
     corners = vertices[faces]
     # About each component's own middle: then also an open one has a volume that means something.

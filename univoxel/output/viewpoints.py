@@ -157,10 +157,6 @@ class Studio:
     views: Cameras
     albedo_near: AlbedoNear | None = None  # what gives the albedo, in place of the field
 
-    def surface(self, view: int) -> tuple[Surface, Tensor]:
-        """What a view shows, as of `surface_of_view`."""
-        return surface_of_view(self.scene, self.views, view, self.albedo_near)
-
 
 def open_studio(
     run: Path, cameras: str | Path | Cameras, resolution: int | None, elevation: float
@@ -183,18 +179,15 @@ def pictures_of(
     seen: tuple[int, Surface, Tensor] | None = None
     for number, frame in enumerate(frames):
         if seen is None or seen[0] != frame.view:
-            seen = (frame.view, *studio.surface(frame.view))
-        yield (
-            frame,
-            relight.render_picture(
-                *seen[1:],
-                studio.views,
-                frame.view,
-                studio.traced,
-                relight.rotated(lights[frame.light], frame.turn),
-                quality,
-                seed=frame.view,
-                report=lambda share, number=number: report(number + share),
-            ),
+            found = surface_of_view(studio.scene, studio.views, frame.view, studio.albedo_near)
+            seen = (frame.view, *found)
+        picture = relight.render_picture(
+            *seen[1:],
+            *(studio.views, frame.view, studio.traced),
+            relight.rotated(lights[frame.light], frame.turn),
+            quality,
+            seed=frame.view,
+            report=lambda share, number=number: report(number + share),
         )
+        yield frame, picture
         report(number + 1)

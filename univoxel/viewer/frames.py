@@ -22,7 +22,7 @@ from univoxel.core.records import Rays, Surface
 from univoxel.render.pictures import heat
 from univoxel.render.pipeline import at_rays, surface_at
 from univoxel.render.relight import Lighting, ground_shadow, relight_surface
-from univoxel.viewer.viewer_scene import Subject, at_hits, mesh_surface
+from univoxel.viewer.viewer_scene import Subject, at_hits, surface_along
 
 # It takes about a second of all cores, without holding Python's lock: a view that moves meanwhile
 # is answered as ever.
@@ -65,9 +65,6 @@ def denoised(
     return light, torch.from_numpy(grey)[..., 0].clamp(0, 1)
 
 
-# Pictures of a subject: a quick one while something moves, better and better ones at rest.
-
-
 Layer: TypeAlias = Literal["render", "albedo", "roughness", "metal", "normal", "depth", "doubt"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 
@@ -100,9 +97,11 @@ def quick_picture(subject: Subject, cameras: Cameras, look: Look) -> Tensor:
     Raises:
         UserError: doubts are asked for, and the photographs are not there.
     """
-    surface, wo, hit = mesh_surface(subject, cameras)
-    if look.layer == "doubt":
-        return _doubts(cameras, surface, at_hits(subject.traced.mesh, hit, subject.doubt))
+    rays = image_rays(cameras, 0)
+    surface, wo, hit = surface_along(subject, rays)
+    if look.layer == "doubt":  # in the colours of `univoxel eval`
+        colors = torch.from_numpy(heat(at_hits(subject.traced.mesh, hit, subject.doubt), 1.0))
+        return _grid(cameras, torch.cat([colors.float(), surface.opacity[:, None]], 1))
     if look.layer != "render":
         return _layer(subject, cameras, look.layer, surface)
     rgb = relight_surface(
@@ -110,7 +109,6 @@ def quick_picture(subject: Subject, cameras: Cameras, look: Look) -> Tensor:
     )
     shadow = None
     if look.ground:
-        rays = image_rays(cameras, 0)
         hidden = surface.opacity > 0
         shadow = _shadow(subject, look, rays, hidden, FLOOR_SAMPLES, QUICK_BOUNCES, 0)
     return _composed(cameras, look, surface, rgb, shadow)
@@ -136,7 +134,7 @@ def refined_pictures(
     rays = image_rays(cameras, 0)
     steps = []
     for index in torch.arange(len(rays.origin)).split(STEP_RAYS):
-        steps.append(surface_at(subject.scene, Rays(rays.origin[index], rays.direction[index])))
+        steps.append(surface_at(subject.scene, _at(rays, index)))
         yield None
     surface, wo = _joined(steps), -rays.direction
     if look.layer != "render":
@@ -295,7 +293,7 @@ def _layer(subject: Subject, cameras: Cameras, layer: Layer, surface: Surface) -
         case "roughness":
             values = surface.roughness[:, None].expand(-1, 3)
         case "metal":
-            metal = None if surface.metallic is None else metal_or_none(surface.metallic)
+            metal = metal_or_none(surface.metallic)
             metal = torch.zeros_like(surface.depth) if metal is None else metal
             values = metal[:, None].expand(-1, 3)
         case _:
@@ -309,12 +307,6 @@ def _nearness(subject: Subject, cameras: Cameras, surface: Surface) -> Tensor:
     ends = -(subject.traced.mesh.vertices - pose[:, 3]) @ pose[:, 2]
     depth = -(surface.position - pose[:, 3]) @ pose[:, 2]
     return 1 - (depth - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)
-
-
-def _doubts(cameras: Cameras, surface: Surface, doubt: Tensor) -> Tensor:
-    """Doubts [N] as colours, as in the pictures of `univoxel eval`: [H, W, 4]."""
-    colors = torch.from_numpy(heat(doubt, 1.0)).float()
-    return _grid(cameras, torch.cat([colors, surface.opacity[:, None]], 1))
 
 
 def _grid(cameras: Cameras, values: Tensor) -> Tensor:

@@ -3,7 +3,6 @@ around the object."""
 
 from __future__ import annotations
 
-import logging
 import math
 import tempfile
 import threading
@@ -16,6 +15,7 @@ import torch
 from torch import Tensor
 
 from univoxel.camera import Cameras, resize
+from univoxel.core import log
 from univoxel.core.choices import Animation
 from univoxel.data.images import write_png
 from univoxel.errors import MissingExtra, UserError
@@ -29,8 +29,6 @@ FIRST_WIDTH = 160  # pixels, before any was timed
 REST_WIDTH = 640  # most pixels along the width at rest
 REST_SECONDS = 0.25  # without a change, after which a view rests
 DONE = object()  # what a chore yields no more
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass
@@ -239,13 +237,12 @@ def film(
         OSError: there is no room for the pictures.
     """
     frames = frames or FRAMES
-    vertices = subject.traced.mesh.vertices
-    middle = (vertices.amin(0) + vertices.amax(0)) / 2
+    low, high = subject.bounds
     small = resize(cameras, min(cameras.width, WIDTH))
     with tempfile.TemporaryDirectory() as name:
         pictures = []
         for frame in range(frames):
-            stand = turned_about(small, middle, 2 * math.pi * frame / frames)
+            stand = turned_about(small, (low + high) / 2, 2 * math.pi * frame / frames)
             picture = None
             for better in refined_pictures(subject, stand, look, samples):
                 picture = picture if better is None else better

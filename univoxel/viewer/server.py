@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
-import logging
 import math
 import tempfile
 import threading
@@ -26,6 +25,7 @@ from torch import Tensor
 from univoxel import envmap as env
 from univoxel.camera import Cameras, image_rays, looked_at, pixel_rays, project, resize
 from univoxel.color import linear_to_srgb
+from univoxel.core import log
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.ops import Sun
@@ -35,6 +35,7 @@ from univoxel.output.page import FACES, JPEG_QUALITY, Light, PageOptions, light_
 from univoxel.output.topology import simplify
 from univoxel.output.viewpoints import VIEW_ANGLE, orbit
 from univoxel.render.relight import Lighting, rotated
+from univoxel.sphere import direction_at
 from univoxel.viewer import frames
 from univoxel.viewer.frames import LAYERS, Look
 from univoxel.viewer.render_queue import Studio, Viewer, film, kind
@@ -53,8 +54,6 @@ PLAIN = 0.16  # sRGB, behind a transparent picture
 JPEG = 90  # quality of pictures that are sent
 MAPS = (".hdr", ".exr")
 BOX_COLOR = (255, 160, 60)
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @contextlib.contextmanager
@@ -128,10 +127,8 @@ class Panel:
         self._denoise = gui.add_checkbox("denoise", frames.available(), visible=frames.available())
         for control in (self._layer, self._ground, self._backdrop, self._denoise):
             control.on_update(lambda event: self._ask())
-        for control in (
-            *(self._light, self._turn, self._exposure),
-            *(self._sun, self._azimuth, self._elevation),
-        ):
+        sun = self._sun, self._azimuth, self._elevation
+        for control in (self._light, self._turn, self._exposure, *sun):
             control.on_update(lambda event: self._relight())
         self._map.on_upload(lambda event: self._guarded(self._take_map))
         gui.add_button("PNG").on_click(lambda event: self._guarded(self._send_png))
@@ -152,7 +149,7 @@ class Panel:
             log.info("no photographs to show: %s", error)
             return
         self._overlay = gui.add_slider("photograph", 0.0, 1.0, 0.05, 0.0)
-        self._overlay.on_update(lambda event: self._again())
+        self._overlay.on_update(lambda event: self._last is not None and self._show(self._last))
         choice = gui.add_dropdown("go to", ["", *photos.names], initial_value="")
         choice.on_update(
             lambda event: choice.value and self._go_to(photos.names.index(choice.value))
@@ -181,7 +178,9 @@ class Panel:
 
     def _box(self, gui: Any) -> None:
         """Handles at two corners of a box, and the option of `cutout` and `capture` that it is."""
-        low, high = _bounds(self._subject)
+        low, high = self._subject.bounds
+        room = 0.02 * (high - low).norm()
+        low, high = low - room, high + room
         self._boxed = gui.add_checkbox(
             "box", False, hint="drag its two corners; click on the object to end it there, below"
         )
@@ -240,15 +239,9 @@ class Panel:
         self._studio.ask(self.viewer, self._cameras, self._look())
 
     def _look(self) -> Look:
+        controls = self._layer, self._exposure, self._ground, self._backdrop, self._denoise
         with self._lock:
-            return Look(
-                self._lighting(),
-                self._layer.value,
-                self._exposure.value,
-                self._ground.value,
-                self._backdrop.value,
-                self._denoise.value,
-            )
+            return Look(self._lighting(), *(control.value for control in controls))
 
     def _relight(self) -> None:
         """The light has changed: the picture, and what arrives at the point."""
@@ -310,9 +303,7 @@ class Panel:
         turned = rotated(Lighting(self._tables[name]), self._turn.value)
         if not self._sun.value:
             return turned
-        phi, up = math.radians(self._azimuth.value), math.radians(self._elevation.value)
-        flat = math.cos(up)
-        direction = (flat * math.cos(phi), flat * math.sin(phi), math.sin(up))
+        direction = direction_at(self._azimuth.value, self._elevation.value)
         return replace(turned, suns=(Sun(direction, (self._sun.value,) * 3),))
 
     def _show(self, picture: Tensor) -> None:
@@ -323,10 +314,6 @@ class Panel:
             rgb = laid_over(rgb, self._subject.photos, self._shown, self._cameras, share)
         values = _bytes(rgb)
         self._client.scene.set_background_image(values, format="jpeg", jpeg_quality=JPEG)
-
-    def _again(self) -> None:
-        if self._last is not None:
-            self._show(self._last)
 
     def _complain(self, line: str) -> None:
         log.warning(line)
@@ -363,13 +350,6 @@ class Panel:
         self._client.send_file_download(f"{self._title}.glb", glb(mesh, JPEG_QUALITY))
 
 
-def _bounds(subject: Subject) -> tuple[Tensor, Tensor]:
-    """The lower and the upper corner [3] of the mesh, with a little room."""
-    low, high = subject.traced.mesh.vertices.amin(0), subject.traced.mesh.vertices.amax(0)
-    room = 0.02 * (high - low).norm()
-    return low - room, high + room
-
-
 def _bytes(picture: Tensor) -> np.ndarray:
     return (255 * picture + 0.5).clamp(0, 255).byte().numpy()
 
@@ -395,13 +375,7 @@ def light_of_bytes(name: str, content: bytes) -> Light:
 def camera_of(wxyz: Any, position: Any, angle: float, width: int, height: int) -> Cameras:
     """viser's camera (+X right, +Y down, +Z ahead; vertical angle in radians) as one of ours."""
     w, x, y, z = (float(v) for v in wxyz)
-    turn = torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = torch.from_numpy(Rotation.from_quat([x, y, z, w]).as_matrix()).float()
     turn = turn * torch.tensor([1.0, -1.0, -1.0])
     place = torch.tensor([float(v) for v in position])
     focal = height / 2 / math.tan(angle / 2)
@@ -445,7 +419,6 @@ def laid_over(rgb: Tensor, photos: Photos, view: int, cameras: Cameras, share: f
 def _start_camera(server: Any, subject: Subject) -> None:
     cameras = orbit(subject.traced.mesh, 8, 512)
     pose = cameras.camera_to_world[1]
-    low, high = subject.traced.mesh.vertices.amin(0), subject.traced.mesh.vertices.amax(0)
     server.initial_camera.position = pose[:, 3].numpy()
-    server.initial_camera.look_at = ((low + high) / 2).numpy()
+    server.initial_camera.look_at = torch.stack(subject.bounds).mean(0).numpy()
     server.initial_camera.fov = math.radians(VIEW_ANGLE)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import html
 import io
-import logging
 import socket
 import threading
 import time
@@ -18,6 +17,7 @@ import torch
 
 from univoxel.camera import resize
 from univoxel.color import linear_to_srgb
+from univoxel.core import log
 from univoxel.core.html import Curve, chart
 from univoxel.data import Photos
 from univoxel.errors import MissingExtra, UserError
@@ -30,8 +30,6 @@ from univoxel.training.progress import TrainingProgress
 HOST = "127.0.0.1"
 PORT = 8080
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @contextlib.contextmanager
@@ -151,11 +149,7 @@ class Spectators:
     """Who looks at a training. Nothing that goes wrong here reaches it."""
 
     def __init__(self, server: Any, address: str) -> None:
-        """
-        Args:
-            server: of viser's.
-            address: that browsers find it at.
-        """
+        """With viser's server, and the address that browsers find it at."""
         self.address: str = address
         self._server = server
         self._photos: Photos | None = None
@@ -230,9 +224,8 @@ class Spectators:
         view = photos.names.index(self._choice.value)
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             cameras = scene.registered(photos).cameras.of(torch.tensor([view]))
-            longest = max(*cameras.size(0))
-            width = max(1, round(cameras.width * min(1.0, SIZE / longest)))
-            cameras = resize(cameras, width)
+            share = min(1.0, SIZE / max(cameras.size(0)))
+            cameras = resize(cameras, max(1, round(share * cameras.width)))
             layers = frame(scene, cameras, *shown(clock), view)
         photograph = linear_to_srgb(shrunk(photos, view, *cameras.size(0))[..., :3])
         return labelled(torch.cat([photograph, layers], 1), ("photograph", *LAYERS))

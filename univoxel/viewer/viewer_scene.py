@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from univoxel import envmap as env
-from univoxel.camera import Cameras, image_rays
+from univoxel.camera import Cameras
 from univoxel.color import linear_to_srgb
 from univoxel.core.records import Mesh, Rays, Surface
 from univoxel.data import Photos
@@ -38,9 +38,14 @@ class Subject:
     run: Path | None = None  # its folder; None: nothing is known of photographs
 
     @cached_property
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """The lower and the upper corner [3] of the mesh."""
+        return self.traced.mesh.vertices.amin(0), self.traced.mesh.vertices.amax(0)
+
+    @property
     def ground(self) -> float:
         """z of the lowest point, world units."""
-        return float(self.traced.mesh.vertices[:, 2].min())
+        return float(self.bounds[0][2])
 
     @cached_property
     def photos(self) -> Photos:
@@ -55,11 +60,7 @@ class Subject:
 
     @cached_property
     def doubt(self) -> Tensor:
-        """What photographs leave open of the albedo at the mesh's vertices: [P] in [0, 1].
-
-        Raises:
-            UserError: the photographs are not there any more.
-        """
+        """What `photos` leave open of the albedo at the mesh's vertices: [P] in [0, 1]."""
         found = Doubts(survey(self.scene, self.photos, POINTS))
         mesh = self.traced.mesh
         assert mesh.normals is not None
@@ -67,11 +68,7 @@ class Subject:
 
 
 def subject_of(run: Path) -> Subject:
-    """The scene of a run's folder, and its mesh.
-
-    Raises:
-        UserError: the run cannot be used, or there is no surface.
-    """
+    """The scene of a run's folder, and its mesh; a UserError where there is none."""
     scene = load_scene(run)
     mesh = mesh_of(scene, cameras=cameras_of(scene, run))
     return Subject(scene, traced_mesh(mesh, scene.field.voxel_size), run)
@@ -84,11 +81,6 @@ def mesh_of(scene: Scene, faces: int = FACES, cameras: Cameras | None = None) ->
         cameras: as of `surface_of`.
     """
     return with_materials(scene, simplify(surface_of(scene, cameras), faces))
-
-
-def mesh_surface(subject: Subject, cameras: Cameras, view: int = 0) -> tuple[Surface, Tensor, Hit]:
-    """What the rays of a view meet of the mesh, as of `surface_along`."""
-    return surface_along(subject, image_rays(cameras, view))
 
 
 def surface_along(subject: Subject, rays: Rays) -> tuple[Surface, Tensor, Hit]:
@@ -145,13 +137,8 @@ class Point:
 
 def point_on_mesh(subject: Subject, ray: Rays) -> Point | None:
     """Where one ray first meets the mesh; None: nowhere."""
-    hit = subject.traced.visibility.closest_hit(ray.origin, ray.direction)
-    mesh = subject.traced.mesh
-    if hit.face[0] < 0:
-        return None
-    assert mesh.normals is not None
-    normal = torch.nn.functional.normalize(at_hits(mesh, hit, mesh.normals)[0], dim=0)
-    return Point(ray.origin[0] + hit.t[0] * ray.direction[0], normal)
+    surface, _, hit = surface_along(subject, ray)
+    return None if hit.face[0] < 0 else Point(surface.position[0], surface.normal[0])
 
 
 @torch.no_grad()
