@@ -124,7 +124,7 @@ def _pictures(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def require_readers(paths: list[Path]) -> None:
-    """Raise a MissingExtra, before anything is read, where a package lacks for some files."""
+    """Raise a MissingExtra, before anything is read, where files need a package that is missing."""
     for suffixes, module, package, kind in (
         (HEIF, "pillow_heif", "pillow-heif", "HEIC"),
         (RAW, "rawpy", "rawpy", "RAW"),
@@ -137,7 +137,7 @@ def require_readers(paths: list[Path]) -> None:
 
 
 def describe(path: Path) -> Photograph:
-    """Size and camera of a photograph, from its beginning alone; a DataError where it is none."""
+    """Size and camera of a photograph, from its beginning alone; a DataError if it is damaged."""
     try:
         if path.suffix.lower() in RAW:
             return _describe_raw(path)
