@@ -11,7 +11,8 @@ test page-test network-test fuzz kill-test asan tsan wheel-test: export OMP_WAIT
 DEPS := $(CURDIR)/.deps/usr/include
 export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE_PATH))
 
-# Tests in two processes of one thread each: most are too small for a second thread to help.
+# Tests in two processes of one thread each: most are too small for a second thread to help. One
+# that a test ends is begun anew, once: the same test is tried again, and would end each.
 TWO := -n 2 --dist loadfile --max-worker-restart 1
 
 .PHONY: help dev demo test net page-test network-test fuzz kill-test lint format bench profile docs docs-check docs-write asan tsan audit wheel wheel-test index-test arm-test cross clean

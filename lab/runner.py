@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -11,12 +10,11 @@ from pathlib import Path
 from lab import worker
 from lab.record import RESULT, Outcome, Setting, identity, load_outcome
 from univoxel.batch.jobs import Job, Result, Step, connect, run_jobs
+from univoxel.core import log
 from univoxel.core.machine import threads_asked
 from univoxel.data import load_photos
 from univoxel.errors import UserError
 from univoxel.training.progress import LOG
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 NAME = re.compile(r"[\w.+=-]*\w[\w.+=-]*")
 

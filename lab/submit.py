@@ -30,11 +30,12 @@ from univoxel.cli.export import export
 from univoxel.core.choices import BOUNCES, SAMPLES
 from univoxel.core.files import write_json
 from univoxel.core.progress_bar import track
-from univoxel.core.records import Mesh
+from univoxel.core.records import AlbedoNear, Mesh
 from univoxel.data import Photos
 from univoxel.data.images import write_exr
 from univoxel.data.load_images import cameras_of
 from univoxel.data.transforms import read_frames
+from univoxel.detail.texture import albedo_near
 from univoxel.envmap import EnvMap, lookup, read_map, tables
 from univoxel.errors import DataError, ExistingFile, UserError
 from univoxel.evaluation.measures import Relighting, render_layers
@@ -82,10 +83,10 @@ def submit(
         raise ExistingFile(f"{out} is there already: choose another out", "out")
     photos = photos_of(run)
     folder, truth = scene_folders(photos.folder)
-    scene = load_scene(run)
-    info: dict[str, object] = _test_views(scene, photos, folder, truth, out)
+    scene, near = load_scene(run), albedo_near(run)
+    info: dict[str, object] = _test_views(scene, photos, folder, truth, out, near)
     mesh = extract_mesh(scene)
-    info["light"] = _relit_views(scene, mesh, photos, truth, out, samples, bounces)
+    info["light"] = _relit_views(scene, mesh, photos, truth, out, samples, bounces, near)
     export(run, out / "mesh.obj")
     target = truth / "mesh_blender" / "mesh.obj"
     info["shape"] = {"output_mesh": _text(out / "mesh.obj"), "target_mesh": _text(target)}
@@ -120,14 +121,14 @@ def orb_light(path: Path, camera: Cameras) -> EnvMap:
 
 
 def _test_views(
-    scene: Scene, photos: Photos, folder: Path, truth: Path, out: Path
+    scene: Scene, photos: Photos, folder: Path, truth: Path, out: Path, near: AlbedoNear | None
 ) -> dict[str, object]:
     """Render the test views; the lists view, geometry and material."""
     view, geometry, material = [], [], []
     cameras = resize(photos.cameras, SIZE)
     for v in track(range(len(photos)), "rendering test views"):
         name = photos.names[v]
-        layers = render_layers(scene, cameras, v)
+        layers = render_layers(scene, cameras, v, albedo_near=near)
         normal = layers.normal @ cameras.camera_to_world[v, :, :3]
         files = {
             "view": _write(out / "view" / f"{name}.exr", layers.rgb),
@@ -160,6 +161,7 @@ def _relit_views(
     out: Path,
     samples: int,
     bounces: int,
+    near: AlbedoNear | None,
 ) -> list[dict[str, str]]:
     """Render views of other scenes, each in its own light; the list light."""
     path = photos.folder / "transforms_novel.json"
@@ -174,7 +176,7 @@ def _relit_views(
         relighting = Relighting(
             {LIGHT: Lighting(tables(light))}, traced, torch.ones(3), samples, bounces
         )
-        rgb = render_layers(scene, camera, 0, relighting).relit[LIGHT]
+        rgb = render_layers(scene, camera, 0, relighting, albedo_near=near).relit[LIGHT]
         file = _write(out / "light" / f"{there}_{name}.exr", rgb)
         found.append({"output_image": file, "target_image": _text(shot.image)})
     return found

@@ -210,7 +210,9 @@ def _configuration(
     turns = isinstance(scene.light, lights.LocalLightConfig) and known != "light"
     detailed = work.minutes > PRESETS["draft"].minutes and light != "baked"
     return TrainConfig(
-        *(data, out, stages),
+        data,
+        out,
+        stages,
         exposures=exposures,
         light_frame="auto" if turns else "world",
         carving_seconds=CARVING * 60 * work.minutes,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,10 +12,9 @@ from lab.bank import measure, scenes
 from lab.bank.scenes import COUNT, HALVES, Half
 from lab.record import RESULT, Outcome, Setting, load_outcome, result_text
 from lab.stress import render
+from univoxel.core import log
 from univoxel.core.files import read_json, replacing
 from univoxel.errors import UserError
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 PRESET = "draft"
 SAMPLES = 64  # of the light, per pixel of relit pictures

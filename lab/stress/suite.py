@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -17,11 +16,10 @@ from lab.stress.axes import BASE, INTACT, SECOND, Axis, Level
 from lab.stress.damage import Damage, clipped, damaged
 from lab.stress.report import Cell
 from lab.stress.scenes import Spec
+from univoxel.core import log
 from univoxel.core.choices import LIGHTS, LightName
 from univoxel.core.files import write_text
 from univoxel.errors import UserError
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 SHOWN: tuple[LightName, ...] = ("hybrid", "sg", "sh", "envmap")
 SEEDS = 3

@@ -204,6 +204,8 @@ def test_a_run_takes_the_place_of_three_steps(captured, tmp_path, caplog):
         task.capture(captured.run, tmp_path / "other", minutes=2.0)
     with pytest.raises(UserError, match="is a trained run: masks"):
         task.capture(captured.run, tmp_path / "other", masks="none")
+    with pytest.raises(UserError, match="until: expected page, got masks"):
+        task.capture(captured.run, tmp_path / "other", until="masks")
     assert not (tmp_path / "other").exists()
 
 

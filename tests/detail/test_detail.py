@@ -13,6 +13,7 @@ from analytic import cameras_around
 from asymmetric_scene import lopsided
 from torch.nn.functional import normalize
 
+import univoxel
 from univoxel import Run, api, evaluate
 from univoxel.camera import image_rays
 from univoxel.cli import main
@@ -31,9 +32,11 @@ from univoxel.output.page import PageOptions, model
 from univoxel.output.report_pictures import Split, compared
 from univoxel.output.surface import surface_of
 from univoxel.render.pipeline import shade, shade_hits, surface_of_view
+from univoxel.run import photos_of
 from univoxel.scene import load_checkpoint, save_scene
 
 RADIUS, SIZE, VIEWS = 0.4, 240, 12
+DATA = Path(univoxel.__file__).parent / "example_data" / "tiny"
 EVEN = torch.tensor([0.4, 0.32, 0.2])  # what the model has for albedo
 
 
@@ -176,18 +179,30 @@ def test_measures_and_reports_show_it(scene, photos, detail):
 def test_runs_are_measured_rendered_and_reported_with_it(tiny_copy, monkeypatch):
     run, asked = tiny_copy / "run", []
 
-    def black(points, normals, albedo, footprint):
+    def half(points, normals, albedo, footprint):
         asked.append(footprint)
-        return torch.zeros_like(albedo)
+        return 0.5 * albedo
 
-    before = evaluate(run)["nvs_psnr"], Run(run).render()[..., :3].mean()
+    before, mean = evaluate(run, data=DATA), Run(run).render()[..., :3].mean()
+    assert before["albedo_psnr_3ch"] is not None
     for module in (texture, api):
-        monkeypatch.setattr(module, "albedo_near", lambda run: black)
-    assert evaluate(run)["nvs_psnr"] < before[0] - 1
-    assert Run(run).render()[..., :3].mean() < 0.5 * before[1]
+        monkeypatch.setattr(module, "albedo_near", lambda run: half)
+    assert Run(run).render()[..., :3].mean() < 0.8 * mean
+    after = evaluate(run, data=DATA)
+    assert after["nvs_psnr"] != before["nvs_psnr"]  # another picture
+    # The scale that brings it nearest to the truth is twice as large, but for pixels of the mask
+    # where the scene has nothing: they keep their albedo
+    assert after["albedo_psnr_3ch"] == pytest.approx(before["albedo_psnr_3ch"], abs=0.01)
+    counts = []
+    for fit_light in (False, True):
+        asked.clear()
+        evaluate(run, fit_light=fit_light)
+        counts.append(len(asked))
+    views = {split: len(photos_of(run, None, split)) for split in ("train", "test")}
+    assert counts[1] == counts[0] + views["test"]  # light is fitted with it, too
     asked.clear()
-    report(run, size=16)
-    assert len(asked) > 4  # four sides, and photographs
+    report(run, size=16, views=0)
+    assert len(asked) == 4 + sum(views.values())  # four sides, and what is compared
 
 
 def test_none_is_made_where_photographs_show_no_more(scene, photos, monkeypatch):

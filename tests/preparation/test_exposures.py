@@ -12,7 +12,12 @@ from univoxel.camera import image_rays
 from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.core.choices import Varying
 from univoxel.preparation import prepare as task
-from univoxel.preparation.prepare import exposures_of, varying_and_gains
+from univoxel.preparation.prepare import (
+    brightness_of,
+    contradictions_left,
+    log_gains,
+    varying_and_gains,
+)
 
 VIEWS = 16
 
@@ -44,7 +49,7 @@ def rms(values: torch.Tensor) -> float:
 
 @pytest.mark.parametrize("most", [0.0, 0.5, 2.0])
 def test_gains_are_found(photos, hull, most):
-    found = exposures_of(exposed(photos, stops(most)), *hull).log_gain / math.log(2)
+    found = log_gains(brightness_of(exposed(photos, stops(most)), *hull)) / math.log(2)
     assert float(found.sum()) == pytest.approx(0, abs=1e-4)
     # The hull of 16 views is larger than the ball: what is seen of a point is a little beside it
     assert rms(found - stops(most)) < 0.05
@@ -58,13 +63,13 @@ def test_what_is_no_surface_colour_counts_little(photos, hull):
     color[where < 0.05] = 1.0
     color[(where > 0.05) & (where < 0.1)] = 0.0
     color[(where > 0.1) & (where < 0.2)] *= 3.0
-    found = exposures_of(replace(photos, color=color), *hull).log_gain / math.log(2)
+    found = log_gains(brightness_of(replace(photos, color=color), *hull)) / math.log(2)
     assert rms(found - stops(1.0)) < 0.1
 
 
 def test_eight_bits_will_do(photos, hull):
     color = (255 * linear_to_srgb(exposed(photos, stops(1.0)).color)).round().to(torch.uint8)
-    found = exposures_of(replace(photos, color=color), *hull).log_gain / math.log(2)
+    found = log_gains(brightness_of(replace(photos, color=color), *hull)) / math.log(2)
     assert rms(found - stops(1.0)) < 0.1
 
 
@@ -73,7 +78,7 @@ def test_clipped_pixels_tell_no_gain(photos, hull):
     color = (5 * exposed(photos, stops(1.0)).color).clamp(max=1)
     shown = photos.alpha > 0.99
     assert ((color == 1).any(-1) & shown).sum() > 0.1 * shown.sum()
-    found = exposures_of(replace(photos, color=color), *hull).log_gain / math.log(2)
+    found = log_gains(brightness_of(replace(photos, color=color), *hull)) / math.log(2)
     assert rms(found - stops(1.0)) < 0.04  # as if nothing were clipped 0.02
 
 
@@ -82,19 +87,22 @@ def test_photographs_that_share_few_points():
     photos = photos_of(5, 32)
     wanted = torch.tensor([1.0, -0.5, 0.8, -1.2, -0.1])
     color = photos.color / 4 * 2 ** wanted[:, None, None, None]
-    found = exposures_of(replace(photos, color=color), *hull_of(photos)).log_gain / math.log(2)
+    found = log_gains(brightness_of(replace(photos, color=color), *hull_of(photos)))
+    found = found / math.log(2)
     assert rms(found - wanted) < 0.03  # 0.008 here
 
 
 def test_no_surface_says_nothing(photos, hull):
     sdf, grid = hull
-    assert not exposures_of(photos, sdf.abs() + 1, grid).log_gain.any()
+    seen = brightness_of(photos, sdf.abs() + 1, grid)
+    assert not log_gains(seen).any()
+    assert contradictions_left(seen) == 1
 
 
 def test_a_black_photograph_says_nothing(photos, hull):
     dark = photos.color.clone()
     dark[3] = 0
-    found = exposures_of(replace(photos, color=dark), *hull).log_gain
+    found = log_gains(brightness_of(replace(photos, color=dark), *hull))
     assert found.isfinite().all()
     assert rms(found) < 0.05
 
@@ -140,14 +148,14 @@ def test_what_a_ball_mirrors_is_no_exposure(photos, hull):
         sky = 0.1 * (0.5 * z + (6 * x).sin() * (5 * y + 4 * z).cos()).exp()
         color[view] = (sky * inside).reshape(color.shape[1:3])[..., None]
     mirror = replace(photos, color=color)
-    assert exposures_of(mirror, *hull).stops > 0.25
+    assert rms(log_gains(brightness_of(mirror, *hull))) > 0.25 * math.log(2)
     assert varying_and_gains(mirror, *hull, "none", look=True) == ("none", None)
     differ = exposed(mirror, stops(1.0))
     assert varying_and_gains(differ, *hull, "none", look=True)[0] == "exposure"
 
 
 def test_nothing_is_looked_for_that_was_not_asked_for(photos, hull, monkeypatch):
-    monkeypatch.setattr(task, "exposures_of", None)
+    monkeypatch.setattr(task, "brightness_of", None)
     assert varying_and_gains(photos, *hull, "none", look=False) == ("none", None)
 
 

@@ -15,7 +15,7 @@ from univoxel.preparation import masks, pose_refinement
 from univoxel.preparation.hull import estimate_bounds, hull_sdf, mask_distances, visual_hull
 from univoxel.preparation.masks import fitted_masks
 from univoxel.preparation.pose_refinement import Edges, contradiction, registered_poses
-from univoxel.preparation.prepare import exposures_of
+from univoxel.preparation.prepare import brightness_of, log_gains
 from univoxel.render.observations import observe
 from univoxel.training.loop import batch_at
 from univoxel.training.pixels import split_pixels
@@ -134,9 +134,11 @@ def test_exposures_are_those_of_whole_pictures(whole, cut):
     grid = fit_grid(*BOX, 20_000)
     hull = visual_hull(distances(whole), whole.cameras, grid)
     found, wanted = (
-        exposures_of(
-            dataclasses.replace(p, color=p.color * gains.exp()[:, None, None, None]), hull, grid
-        ).log_gain
+        log_gains(
+            brightness_of(
+                dataclasses.replace(p, color=p.color * gains.exp()[:, None, None, None]), hull, grid
+            )
+        )
         for p in (cut, whole)
     )
     torch.testing.assert_close(found, wanted, atol=1e-5, rtol=0)

@@ -148,7 +148,7 @@ def capture(
         config: how cameras are found.
         pictures: how many are made, and how large.
         options: fields of `univoxel.cli.capture.CaptureOptions`, such as masks, box, preset and
-            minutes; until is none of them.
+            minutes; until stays page, `find_data` makes the first steps alone.
 
     Raises:
         ExistingFile: out holds another capture, or what other options made.
@@ -168,6 +168,8 @@ def capture(
     from univoxel.training.probe import slowdown
 
     asked = CaptureOptions(Path(photographs), Path(out), **options)
+    if asked.until != "page":
+        raise UserError(f"until: expected page, got {asked.until}: see `find_data`", "until")
     given, project = look_at(asked.photographs), Project(asked.out)
     training = chosen(asked.preset, asked.minutes, project.cut, project.run, asked.light)
     training = changed(training, asked.changes)

@@ -88,8 +88,8 @@ class RelightOptions:
             )
 
     def quality(self) -> Quality:
-        """How a frame is rendered, or a UserError; a ground at the lowest point is left to the
-        mesh."""
+        """How a frame is rendered; a ground at the lowest point is left to the mesh. Numbers out of
+        range are a UserError."""
         from univoxel.render.relight import Quality
 
         ground = parse_ground(self.ground)
@@ -168,7 +168,7 @@ def sun_light(values: tuple[float, ...] | Sun) -> Sun:
 
 
 def point_light(values: tuple[float, float, float, float] | PointLight) -> PointLight:
-    """A white point light from x, y, z and its intensity; a UserError where it cannot be."""
+    """A white point light from x, y, z and its intensity; a UserError for a number out of range."""
     from univoxel.ops import PointLight
 
     if isinstance(values, PointLight):

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -42,6 +41,7 @@ from torch.nn.functional import (
 
 from univoxel.camera import Cameras, pixel_width, project
 from univoxel.color import linear_to_srgb, luminance, srgb_to_linear
+from univoxel.core import log
 from univoxel.core.files import replacing
 from univoxel.core.records import AlbedoNear, Mesh, Surface
 from univoxel.data import Photos
@@ -54,8 +54,6 @@ from univoxel.output.topology import simplify
 from univoxel.render.pipeline import RAYS_AT_ONCE, at_rays, shade
 from univoxel.scene import FILE as CHECKPOINT
 from univoxel.scene import Scene
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 FOLDER = "detail"  # in the folder of a run
 MESH, PICTURE = "mesh.safetensors", "albedo.png"  # in it

@@ -136,13 +136,18 @@ RAYS = 2048  # of a step
 LR = 0.05, 0.005  # at begin and end, of log gains and of codes
 
 
-def fit_light_(scene: Scene, photos: Photos, view: int) -> None:
+def fit_light_(
+    scene: Scene, photos: Photos, view: int, albedo_near: AlbedoNear | None = None
+) -> None:
     """Show the light in which a view looks most like its photograph; all else stays.
 
     That is a gain per channel and, where light varies (`SceneConfig.varying`), the code that the
     networks of light read.
+
+    Args:
+        albedo_near: as of `render_layers`.
     """
-    whole, wo = surface_of_view(scene, photos.cameras, view)
+    whole, wo = surface_of_view(scene, photos.cameras, view, albedo_near)
     color, alpha = photos.picture(view)
     hit = (whole.opacity > 0.5) & (alpha.flatten() > 0.5)
     if scene.views is None:

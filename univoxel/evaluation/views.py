@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 
 from univoxel.color import linear_to_srgb
+from univoxel.core import log
 from univoxel.core.choices import Behind
 from univoxel.core.files import write_text
 from univoxel.core.progress_bar import track
@@ -41,8 +41,6 @@ from univoxel.scene import Scene
 
 SHEET_ROWS = 12  # views on the contact sheet, at most
 COLOR_LIMIT, ROUGHNESS_LIMIT, NORMAL_LIMIT = 0.2, 0.5, 45.0  # brightest errors on it
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ def measure_views(
     rows = []
     for view in track(range(len(photos)), "rendering test views"):
         if fit_light:
-            fit_light_(scene, photos, view)
+            fit_light_(scene, photos, view, albedo_near)
         layers = render_layers(scene, photos.cameras, view, relighting, doubts, albedo_near)
         expected = expected_view(photos, truth.relit, view, background)
         for key, value in score(layers, expected, scales):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import inspect
-import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -20,9 +19,8 @@ from typing import Any, List, Literal, get_args, get_origin, get_type_hints  # n
 import torch  # first: the extension then shares torch's OpenMP runtime
 from torch import Tensor
 
+from univoxel.core import log
 from univoxel.errors import MissingNative
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 Backend = Literal["auto", "native", "reference"]
 FOLDER = Path(__file__).parent.parent / "_core"

@@ -160,7 +160,7 @@ ROOT, MESH, MATERIAL = "/object", "/object/mesh", "/object/material"
 
 
 def require_usd() -> Any:
-    """The modules of OpenUSD, as attributes, typed by nobody; a MissingExtra where they lack."""
+    """The modules of OpenUSD, as attributes, typed by nobody; a MissingExtra without them."""
     names = ("Sdf", "Usd", "UsdGeom", "UsdShade", "Vt")
     try:
         import_module("pxr")

@@ -53,7 +53,8 @@ def surface_of(scene: Scene, cameras: Cameras | None = None) -> Mesh:
     if dropped.crumbs or dropped.voids:
         log.info(
             "mesh: small pieces beside the object that were left out: %d; hollows inside it: %d",
-            *(dropped.crumbs, dropped.voids),
+            dropped.crumbs,
+            dropped.voids,
         )
     if cameras is None:
         return mesh

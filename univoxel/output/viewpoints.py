@@ -183,7 +183,9 @@ def pictures_of(
             seen = (frame.view, *found)
         picture = relight.render_picture(
             *seen[1:],
-            *(studio.views, frame.view, studio.traced),
+            studio.views,
+            frame.view,
+            studio.traced,
             relight.rotated(lights[frame.light], frame.turn),
             quality,
             seed=frame.view,

@@ -5,7 +5,6 @@ Of a turntable also a background that stood still, and cameras off the circle of
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass
 
@@ -15,6 +14,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from univoxel.camera import Circle, circle_of, looked_at
 from univoxel.color import CLIPPED, linear_to_srgb
+from univoxel.core import log
 from univoxel.core.choices import LightFrameOrAuto
 from univoxel.data import Photos
 from univoxel.errors import DataError
@@ -111,8 +111,6 @@ def _correlation(
 
 
 NAMED = 8  # photographs that the message names, at most
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 def find_strays(photos: Photos) -> Circle | None:

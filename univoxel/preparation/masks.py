@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -11,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from univoxel.color import linear_to_srgb
-from univoxel.core import memmap
+from univoxel.core import log, memmap
 from univoxel.core.choices import MasksFrom
 from univoxel.core.memmap import parallel_map
 from univoxel.data import Photos
@@ -40,9 +39,6 @@ REPEATED = 0.5
 ONE_COLOR = 0.9
 # Pixels at a depth below which their mean is noise and is left out
 MIN_PIXELS = 50
-
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @torch.no_grad()

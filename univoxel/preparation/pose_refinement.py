@@ -3,7 +3,6 @@ are believed, and how to put cameras right."""
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass
 
@@ -12,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from univoxel.camera import Cameras, PoseSteps, pixel_rays
-from univoxel.core import memmap
+from univoxel.core import log, memmap
 from univoxel.core.choices import CamerasFrom, MasksFrom
 from univoxel.core.records import Rays
 from univoxel.data import Photos
@@ -40,9 +39,6 @@ LR = (5e-3, 2.5e-4)
 RAYS = 256
 # Silhouettes that the rays of a step are held against
 VIEWS = 32
-
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 class Edges:

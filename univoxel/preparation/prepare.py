@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from torch import Tensor
 from univoxel.camera import Cameras, PoseSteps
 from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.config import StageConfig, TrainConfig
+from univoxel.core import log
 from univoxel.core.choices import Varying
 from univoxel.data import Photos
 from univoxel.errors import DataError, UserError
@@ -45,93 +45,96 @@ ROUNDS = 20
 PRIOR = 1e-3
 # Share of the object's pixels that are clipped, above which it is said
 MUCH_CLIPPED = 0.03
-# Share of the contradictions that gains leave at most where exposures differ, see `Exposures`: 0.4
-# to 0.91 of them. Where exposures are alike 0.97 to 1.25, metals and flashes among them; where the
-# light itself varies 0.86 to 1.01
+# `contradictions_left` at most where exposures differ: 0.4 to 0.91 are then. Where they are alike
+# 0.97 to 1.25 are, metals and flashes among them; where the light itself varies, 0.86 to 1.01
 MOST_LEFT = 0.93
 # Stops, root mean square, below which exposures are alike: a hull that is too large looks like 0.03
 MIN_STOPS = 0.1
-# Points that both halves of the surface share with a photograph, at least, for it to count
+# Points of either half of the surface that a photograph has to show to be compared
 COMMON = 20
 
 
-log: logging.Logger = logging.getLogger("univoxel")
-
-
 @dataclass(frozen=True)
-class Exposures:
-    """How photographs were exposed, as a surface's points tell."""
+class Brightness:
+    """How bright P points of a surface are in V photographs."""
 
-    log_gain: Tensor  # [V] of mean 0; 0 for all if the photographs show no surface
-    # Of what photographs of one half of the surface contradict each other by: the share that is
-    # left under gains that the other half told. 1 where there is nothing to compare
-    left: float
+    position: Tensor  # [P, 3] world
+    log_color: Tensor  # [P, V] natural log of the linear mean of the channels
+    observed: Tensor  # [P, V] 1 where a photograph shows a point, neither dark nor clipped; else 0
 
-    @property
-    def stops(self) -> float:
-        """Root mean square of the gains."""
-        return float(self.log_gain.square().mean().sqrt()) / math.log(2)
+    def at(self, which: Tensor) -> Brightness:
+        """Of some of the points."""
+        return Brightness(*(value[which] for value in vars(self).values()))
 
 
 @torch.no_grad()
-def exposures_of(photos: Photos, sdf: Tensor, grid: GridShape) -> Exposures:
-    """The gains of photographs that agree best on how bright a surface's points are.
-
-    log brightness_pv = log gain_v + log albedo_p, in robust least squares: many sightings are of
-    something else, where the surface is off, and highlights move. What metal mirrors changes from
-    photograph to photograph as exposures do, but on one side of the object in another way than on
-    the other. So the surface is cut in half, along each axis in turn, and the gains of each half
-    are held against what the photographs show of the other.
+def brightness_of(photos: Photos, sdf: Tensor, grid: GridShape) -> Brightness:
+    """That of POINTS points; of none, if the photographs show no surface.
 
     Args:
         photos: V, their cameras where they are believed to be.
         sdf: [X, Y, Z] world units, such as of the visual hull.
         grid: of the sdf.
-
-    Source: Brown and Lowe 2007, "Automatic panoramic image stitching using invariant features", for
-    gains from overlaps; Cauchy's weights, iterated, as in robust statistics.
     """
     seen = observe_hull(photos, sdf, grid, POINTS)
     if seen is None:
-        return Exposures(torch.zeros(len(photos)), 1.0)
+        return Brightness(torch.zeros(0, 3), *torch.zeros(2, 0, len(photos), dtype=torch.double))
     encoded = linear_to_srgb(seen.color)
     usable = (encoded.mean(1) > DARK) & (encoded < CLIPPED).all(1)
     point_and_view = torch.repeat_interleave(seen.offsets.diff())[usable], seen.view[usable]
     log_color, observed = torch.zeros(2, POINTS, len(photos), dtype=torch.double)
     log_color[point_and_view] = seen.color[usable].mean(1).double().log()
     observed[point_and_view] = 1.0
-    gain, _ = _agreed(log_color, observed)
-    with_gains = without = 0.0
+    return Brightness(seen.position, log_color, observed)
+
+
+def log_gains(seen: Brightness) -> Tensor:
+    """The log gains [V], of mean 0, of photographs that agree best on how bright points are.
+
+    log brightness_pv = log gain_v + log albedo_p, in robust least squares: many sightings are of
+    something else, where the surface is off, and highlights move.
+
+    Source: Brown and Lowe 2007, "Automatic panoramic image stitching using invariant features", for
+    gains from overlaps; Cauchy's weights, iterated, as in robust statistics.
+    """
+    return _agreed(seen)[0]
+
+
+def contradictions_left(seen: Brightness) -> float:
+    """Of what photographs of one half of the surface contradict each other by: the share that is
+    left under gains that the other half told. 1 where there is nothing to compare.
+
+    What metal mirrors changes from photograph to photograph as exposures do, but on one side of the
+    object in another way than on the other. The surface is cut in half along each axis in turn.
+    """
+    if not len(seen.position):
+        return 1.0
+    costs = torch.zeros(2, dtype=torch.double)  # with the gains, and without
     for place in seen.position.unbind(1):
-        half = place > place.median()
-        for told, asked in ((half, ~half), (~half, half)):
-            other, _ = _agreed(log_color[told], observed[told])
-            both = (observed[told].sum(0) >= COMMON) & (observed[asked].sum(0) >= COMMON)
-            for trial in (other, torch.zeros_like(other)):
-                _, cost = _agreed(log_color[asked], observed[asked], trial)
-                if trial is other:
-                    with_gains += float(cost[both].sum())
-                else:
-                    without += float(cost[both].sum())
-    return Exposures(gain.float(), with_gains / without if without else 1.0)
+        upper = place > place.median()
+        halves = seen.at(upper), seen.at(~upper)
+        shared = torch.stack([half.observed.sum(0) >= COMMON for half in halves]).all(0)
+        for told, asked in (halves, halves[::-1]):
+            gains = log_gains(told)
+            trials = gains, torch.zeros_like(gains)
+            costs += torch.stack([_agreed(asked, trial)[1][shared].sum() for trial in trials])
+    with_gains, without = costs.tolist()
+    return with_gains / without if without else 1.0
 
 
-def _agreed(
-    log_color: Tensor, observed: Tensor, gain: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def _agreed(seen: Brightness, gains: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Log gains [V] of mean 0 under which photographs agree best, and the mean Cauchy cost [V] of
     each that is left.
 
     Args:
-        log_color: [P, V] of points in photographs.
-        observed: [P, V] 1 where a photograph shows a point, 0 elsewhere.
-        gain: [V] log gains; None: they are looked for.
+        gains: [V]; None: they are looked for.
     """
-    found = torch.zeros(len(observed.T), dtype=torch.double) if gain is None else gain
-    weight = observed
+    log_color, observed = seen.log_color, seen.observed
+    found = observed.new_zeros(observed.shape[1]) if gains is None else gains
+    weight, square = observed, torch.zeros_like(observed)
     for _ in range(ROUNDS):
         share = weight / weight.sum(1, keepdim=True).clamp_min(1e-9)
-        if gain is None:
+        if gains is None:
             # The albedos eliminated: a Laplacian of the photographs, tied by the points that they
             # share
             system = torch.diag(weight.sum(0) + PRIOR) - weight.T @ share
@@ -141,8 +144,7 @@ def _agreed(
         albedo = (share * (log_color - found)).sum(1, keepdim=True)
         square = ((log_color - found - albedo) / CAUCHY).square()
         weight = observed / (1 + square)
-    cost = (observed * square.log1p()).sum(0) / observed.sum(0).clamp_min(1)
-    return found, cost
+    return found, (observed * square.log1p()).sum(0) / observed.sum(0).clamp_min(1)
 
 
 def clipped_share(photos: Photos) -> float:
@@ -190,18 +192,24 @@ def varying_and_gains(
     """
     if varying == "none" and not look:
         return varying, None
-    found = exposures_of(photos, hull, grid)
+    seen = brightness_of(photos, hull, grid)
+    gains = log_gains(seen).float()
+    stops = float(gains.square().mean().sqrt()) / math.log(2)
     if varying == "none":
-        if found.left > MOST_LEFT or found.stops < MIN_STOPS:
+        left = contradictions_left(seen) if stops >= MIN_STOPS else 1.0
+        log.debug(
+            "exposures: gains of %.2f stops leave %.2f of what halves contradict", stops, left
+        )
+        if left > MOST_LEFT:
             return varying, None
         varying = "exposure"
         log.info(
             "exposures differ by %.2f stops from photograph to photograph: a gain is learned for "
             "each, see varying",
-            found.stops,
+            stops,
             extra={"arguments": ("varying",)},
         )
-    return varying, found.log_gain
+    return varying, gains
 
 
 PINNED = "hull that stays"  # a step

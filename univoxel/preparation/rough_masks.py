@@ -7,7 +7,6 @@ as a lid, is doubted in those that disagree with the others.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from univoxel.camera import Cameras
-from univoxel.core import memmap
+from univoxel.core import log, memmap
 from univoxel.core.memmap import parallel_map
 from univoxel.data import Photos
 from univoxel.data.photos import coverage_of
@@ -26,8 +25,6 @@ from univoxel.preparation.hull import estimate_bounds, mask_distances
 from univoxel.preparation.object_shape import ObjectShape, find_object, shrunk, silhouettes
 from univoxel.preparation.pose_refinement import MAX_CONTRADICTION, Belief, contradiction
 from univoxel.preparation.stereo import DepthMaps, depth_maps
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 # Half the width, in pixels of the depth maps, of what a mask lacks or shows too much before it is
 # doubted: narrower pieces are its jagged edge

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass, replace
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from univoxel.config import StageConfig, TrainConfig
-from univoxel.core import memmap
+from univoxel.core import log, memmap
 from univoxel.core.machine import Memory, memory
 from univoxel.data import Photos
 from univoxel.data.photos import packed, packed_width
@@ -109,8 +108,6 @@ PER_PIXEL = 23  # distances, masks, orders, brightness, besides the photographs 
 PER_DRAWN = 48  # of a pixel that is trained on, where the photographs lie on disk: its row, twice
 PER_VOXEL = 100  # distances and features with gradients and moments, hulls, meshes
 PER_RAY = 40_000  # of a step: samples and what is between them
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 def needed(photos: Photos, cfg: TrainConfig) -> int:

@@ -4,7 +4,6 @@ compression chose."""
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeAlias
@@ -13,6 +12,7 @@ import torch
 from rich.progress import BarColumn, TextColumn
 
 from univoxel.config import TrainConfig
+from univoxel.core import log
 from univoxel.core.files import append_line
 from univoxel.core.progress_bar import bar
 from univoxel.core.system import peak_memory_mb
@@ -74,8 +74,6 @@ def chosen_reach(choices: Iterable[CapacityChoice]) -> float | None:
 LOG = "log.jsonl"  # in the folder of a run
 REPORT_SECONDS = 5.0
 CHECKPOINT_SECONDS = 20.0  # of work that a kill costs, about
-
-log: logging.Logger = logging.getLogger("univoxel")
 
 
 @dataclass(frozen=True)
