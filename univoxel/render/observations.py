@@ -343,6 +343,27 @@ def sample_observations(problem: JointProblem, points: int, views: int) -> tuple
     return point.repeat_interleave(views), observations_of(problem, point, views).reshape(-1)
 
 
+def halves(problem: JointProblem) -> tuple[JointProblem, JointProblem]:
+    """The problem with one half of the observations of each point, and with the other half.
+
+    Neighbouring points take the halves the other way around: no photograph is missing from either.
+    """
+    observations = problem.observations
+    counts = observations.offsets.diff()
+    even = (torch.repeat_interleave(counts) + observations.view) % 2 == 0
+    first, second = (_with_observations(problem, which) for which in (even, ~even))
+    return first, second
+
+
+def _with_observations(problem: JointProblem, kept: Tensor) -> JointProblem:
+    """The problem with only some of its observations, [S] bool."""
+    all_of = problem.observations
+    ends = torch.cat([kept.new_zeros(1, dtype=torch.long), kept.cumsum(0)])
+    by_observation = {name: getattr(all_of, name)[kept] for name in ("wo", "color", "view")}
+    observations = replace(all_of, offsets=ends[all_of.offsets], **by_observation)
+    return replace(problem, observations=observations, target=problem.target[kept])
+
+
 def observations_of(problem: JointProblem, point: Tensor, views: int) -> Tensor:
     """Random observations [P, views] of points [P], each of which has at least one."""
     offsets = problem.observations.offsets

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from univoxel import brdf
+from univoxel.color import CLIPPED, linear_to_srgb_unclipped
 from univoxel.config import JointConfig
 from univoxel.fields.field import MaterialHead
 from univoxel.ops import specular_response
@@ -48,6 +49,8 @@ VIEW_PRIOR = 10.0
 TINT = 0.5
 # Nearest nodes of the map that the smoothness ties a node to: as many as lie around one
 NODE_NEIGHBOURS = 6
+# Observations of a point that a round is judged by
+UNSEEN_VIEWS = 16
 # Parts of the points that a step builds its equations from on a machine however slow
 MIN_PARTS = 2
 
@@ -61,6 +64,7 @@ class NewtonRound:
     """What a round came to."""
 
     costs: list[float] = field(default_factory=list)  # mean weighted squared residual by step
+    unseen: float = math.inf  # mean robust cost of observations that were not used; inf: of none
     troubles: list[str] = field(default_factory=list)  # sentences about what had no solution
 
 
@@ -136,6 +140,7 @@ def newton_round_(
     decisions: MaterialLabels,
     cfg: JointConfig,
     seconds: float = math.inf,
+    unseen: JointProblem | None = None,
 ) -> NewtonRound:
     """Change the scene's map, and what its views differ by, in Gauss-Newton steps; return their
     costs. Albedo and roughness of every point are eliminated: the materials stay.
@@ -151,6 +156,7 @@ def newton_round_(
 
     Args:
         seconds: wall time that it may take, about: it takes fewer points where all would take more.
+        unseen: the same points in other observations, which the result is judged by.
     """
     begin = time.monotonic()
     points = choose_points(scene, problem, decisions, cfg) if cfg.newton_steps else None
@@ -171,14 +177,58 @@ def newton_round_(
         differences = equations.view_differences(scene)
         if differences is not None and differences.basis is not None:
             if not views_step_(scene, points, differences, cfg.newton_smooth):
-                return NewtonRound(costs, [UNSOLVABLE])
+                return NewtonRound(costs, troubles=[UNSOLVABLE])
             differences = equations.view_differences(scene)
         sun, damping = decisions.sun, cfg.newton_smooth
         cost = map_step_(scene, points, differences, sun, laplacian, damping)
         if cost is None:
-            return NewtonRound(costs, [UNSOLVABLE])
+            return NewtonRound(costs, troubles=[UNSOLVABLE])
         costs.append(cost)
-    return NewtonRound(costs)
+    if unseen is None:
+        return NewtonRound(costs)
+    return NewtonRound(costs, unseen_cost(scene, points, unseen))
+
+
+def unseen_cost(scene: Scene, points: NewtonPoints, unseen: JointProblem) -> float:
+    """Mean Cauchy cost of the points, as a round left them, in other observations of them; inf
+    where there are none."""
+    seen = (unseen.observations.offsets.diff()[points.point] > 0).nonzero()[:, 0]
+    if not len(seen):
+        return math.inf
+    among = torch.zeros(len(points.point), dtype=torch.bool)
+    among[seen] = True
+    differences, costs = equations.view_differences(scene), []
+    for part in points.parts:
+        rows = part[among[part]]
+        if not len(rows):
+            continue
+        observation = observations_of(unseen, points.point[rows], UNSEEN_VIEWS)
+        other = replace(
+            points,
+            problem=unseen,
+            point=points.point[rows],
+            observation=observation,
+            **{
+                name: getattr(points, name)[rows]
+                for name in points.ARRAYS
+                if name not in ("point", "observation")
+            },
+            parts=[torch.arange(len(rows))],
+        )
+        transport = other.transport(other.parts[0])
+        radiance = torch.stack(
+            [
+                equations.channel_radiance(
+                    transport, unseen.sky.radiance, other.log_albedo, c, differences
+                )[1]
+                for c in range(3)
+            ],
+            2,
+        )
+        residual = transport.target - linear_to_srgb_unclipped(radiance)
+        residual = residual.masked_fill((transport.target > CLIPPED) & (residual < 0), 0.0)
+        costs.append((CAUCHY**2 * torch.log1p((residual / CAUCHY).square())).mean((1, 2)))
+    return float(torch.cat(costs).mean())
 
 
 def choose_points(
