@@ -190,45 +190,24 @@ def newton_round_(
 
 
 def unseen_cost(scene: Scene, points: NewtonPoints, unseen: JointProblem) -> float:
-    """Mean Cauchy cost of the points, as a round left them, in other observations of them; inf
-    where there are none."""
-    seen = (unseen.observations.offsets.diff()[points.point] > 0).nonzero()[:, 0]
-    if not len(seen):
+    """Mean Cauchy cost of points, as a round left them, in other observations of them; inf: there
+    are none."""
+    counts = unseen.observations.offsets.diff()[points.point]
+    if not counts.any():
         return math.inf
-    among = torch.zeros(len(points.point), dtype=torch.bool)
-    among[seen] = True
-    differences, costs = equations.view_differences(scene), []
+    observation = observations_of(unseen, points.point, UNSEEN_VIEWS)
+    observation = observation.clamp_max(len(unseen.target) - 1)  # of points that have none
+    points = replace(points, problem=unseen, observation=observation)
+    differences, sky = equations.view_differences(scene), unseen.sky.radiance
+    costs = torch.zeros(len(counts))
     for part in points.parts:
-        rows = part[among[part]]
-        if not len(rows):
-            continue
-        observation = observations_of(unseen, points.point[rows], UNSEEN_VIEWS)
-        other = replace(
-            points,
-            problem=unseen,
-            point=points.point[rows],
-            observation=observation,
-            **{
-                name: getattr(points, name)[rows]
-                for name in points.ARRAYS
-                if name not in ("point", "observation")
-            },
-            parts=[torch.arange(len(rows))],
-        )
-        transport = other.transport(other.parts[0])
-        radiance = torch.stack(
-            [
-                equations.channel_radiance(
-                    transport, unseen.sky.radiance, other.log_albedo, c, differences
-                )[1]
-                for c in range(3)
-            ],
-            2,
-        )
-        residual = transport.target - linear_to_srgb_unclipped(radiance)
+        transport = points.transport(part)
+        state = transport, sky, points.log_albedo[part]
+        channels = [equations.channel_radiance(*state, c, differences)[1] for c in range(3)]
+        residual = transport.target - linear_to_srgb_unclipped(torch.stack(channels, 2))
         residual = residual.masked_fill((transport.target > CLIPPED) & (residual < 0), 0.0)
-        costs.append((CAUCHY**2 * torch.log1p((residual / CAUCHY).square())).mean((1, 2)))
-    return float(torch.cat(costs).mean())
+        costs[part] = CAUCHY**2 * torch.log1p((residual / CAUCHY).square()).mean((1, 2))
+    return float(costs[counts > 0].mean())
 
 
 def choose_points(
