@@ -34,7 +34,8 @@ def initialised(scene, problem, seconds=math.inf, before=None):
 def some_metal(problem, share):
     """Labels of which the first share is metal."""
     count = len(problem.observations.position)
-    return replace(no_metal(problem), metal=torch.arange(count) < share * count)
+    metal = torch.arange(count) < share * count
+    return replace(no_metal(problem), metal=metal, likely=share > 0.15)
 
 
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
@@ -136,7 +137,7 @@ def test_metals_that_are_found_from_metal_everywhere_have_to_be_better(
         cost = everywhere if metal.all() else left if torch.equal(metal, found) else 1.0
         return NewtonRound([1.0], cost)
 
-    def find_metal(scene, problem, cfg, done):
+    def find_metal(scene, problem, cfg, done, likely):
         """Surely, from a map for metals."""
         return found if done else torch.zeros_like(found)
 

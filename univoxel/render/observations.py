@@ -191,6 +191,9 @@ def trace(
 VERTICES = 300_000
 # Metallic from which on the stages before have taken a point for metal
 METALLIC_BEFORE = 0.2
+# Share of the surface that they have to take for metal for more of it to be expected. Of objects
+# all of metal they take a third and more, of wood and paint next to nothing
+LIKELY = 0.15
 
 
 TURNS = 64  # positions of a turntable that are told apart: closer than the map's nodes
@@ -247,6 +250,7 @@ class MaterialLabels:
     albedo: Tensor | None = None  # [P, 3] where the materials do not follow the map yet
     mirrors: Mirrors | None = None  # None: nothing mirrors the map
     only_metal: bool = False  # whether nothing but metal is there
+    likely: bool = False  # whether the stages before saw enough metal to expect more
 
 
 @torch.no_grad()
@@ -298,7 +302,8 @@ def first_labels(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mater
     is known."""
     features = scene.field.features_at(problem.observations.position)
     metal, only_metal = (scene.material(features)[2] > METALLIC_BEFORE, bool(cfg.only_metal))
-    return MaterialLabels(metal | only_metal, only_metal=only_metal)
+    likely = bool(metal.float().mean() > LIKELY)
+    return MaterialLabels(metal | only_metal, only_metal=only_metal, likely=likely)
 
 
 @torch.no_grad()

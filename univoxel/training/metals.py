@@ -48,17 +48,21 @@ ALIKE = 0.5
 # Bound of the log ratio of one point: a single one does not decide for its neighbours
 MAX_EVIDENCE = 2.0
 # Log ratio of residuals, metal over dielectric, below which a point is metal: under the first map
-# and under the last. The first asks for more: the map is wrong yet, and metals make the next one
-THRESHOLD = (-0.4, -0.15)
+# and under the last. The first asks for more: the map is wrong yet, and metals make the next one.
+# Where metal is likely, see LIKELY, less is asked for: of wood the last would make a fifth metal
+THRESHOLD = {False: (-0.4, -0.15), True: (-0.3, 0.05)}
 
 
-def find_metal(scene: Scene, problem: JointProblem, cfg: JointConfig, done: float) -> Tensor:
+def find_metal(
+    scene: Scene, problem: JointProblem, cfg: JointConfig, done: float, likely: bool
+) -> Tensor:
     """Which of the problem's points are metal under the present map: [P] bool.
 
     Args:
         done: progress of the map in [0, 1], from the first round of Newton to the last.
+        likely: whether the stages before saw metal, see `MaterialLabels`.
     """
-    first, last = THRESHOLD
+    first, last = THRESHOLD[likely]
     return evidence(scene, problem, cfg) < first + done * (last - first)
 
 
@@ -159,9 +163,6 @@ TRIAL_POINTS = 300
 TRIAL_STEPS = 6
 # Rounds of Newton in all trials, at most
 TRIAL_ROUNDS = 4
-# Share of the surface that the stages before take for metal from which metal everywhere is likely.
-# Of objects all of metal they take a third and more, of wood and paint next to nothing
-LIKELY = 0.15
 # Share of the residual so far that metals which were found again may leave to be taken
 BETTER = 0.9
 # Times the residual of metal as it was found that metal everywhere may leave for all to be metal:
@@ -190,6 +191,7 @@ class Trials:
     problem: JointProblem
     halves: tuple[JointProblem, JointProblem]  # the observations that are fitted, and the others
     cfg: JointConfig
+    likely: bool  # whether the stages before saw metal
     seconds: float  # of a round on TRIAL_POINTS
     seed: int  # of the points: the trials differ in nothing but the hypothesis
     parts: Sequence[nn.Module]  # of the scene, that a trial changes
@@ -242,7 +244,10 @@ def initialise_(
     seed = int(torch.randint(2**31, ()))
     initial = [copy.deepcopy(part.state_dict()) for part in parts]
     round_seconds = seconds / TRIAL_ROUNDS
-    trials = Trials(scene, problem, halves(problem), cfg, round_seconds, seed, parts, initial, [])
+    likely = decisions.likely
+    trials = Trials(
+        scene, problem, halves(problem), cfg, likely, round_seconds, seed, parts, initial, []
+    )
     only_metal = bool(cfg.only_metal)
     all_metal = torch.ones_like(decisions.metal)
     if only_metal:
@@ -251,7 +256,6 @@ def initialise_(
         best = assumed_(trials, decisions.metal)
         best = better_of(best, under_its_map_(trials, best))
         everywhere = assumed_(trials, all_metal)
-        likely = bool(decisions.metal.float().mean() > LIKELY)
         explained = everywhere.residual < ONLY_METAL[likely] * best.residual
         # Under a light for each photograph what is mirrored may be anything
         one_light = scene.views is None or scene.views.sky_weights is None
@@ -299,5 +303,5 @@ def under_its_map_(trials: Trials, assumed: Hypothesis) -> Hypothesis:
     trials.restore_(assumed.states)
     # Under a map for metals dielectrics stand out at once: the last threshold serves
     done = float(assumed.metal.all())
-    metal = find_metal(trials.scene, trials.problem, trials.cfg, done)
+    metal = find_metal(trials.scene, trials.problem, trials.cfg, done, trials.likely)
     return Hypothesis(trials.residual_(metal), metal, trials.states())
