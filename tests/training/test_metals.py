@@ -48,8 +48,8 @@ def test_under_even_light_nothing_is_taken_for_metal():
 def test_one_observation_says_nothing():
     scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3, views=1)
     assert torch.equal(evidence(scene, problem, CFG), torch.zeros(COUNT))
-    assert not find_metal(scene, problem, CFG, 1.0, False).any()
-    assert max(metals.THRESHOLD) < 0
+    for likely in (False, True):  # nor where metal is likely
+        assert not find_metal(scene, problem, CFG, 1.0, likely).any()
 
 
 def test_one_point_speaks_for_all():

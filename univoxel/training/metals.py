@@ -50,7 +50,7 @@ MAX_EVIDENCE = 2.0
 # Log ratio of residuals, metal over dielectric, below which a point is metal: under the first map
 # and under the last. The first asks for more: the map is wrong yet, and metals make the next one.
 # Where metal is likely, see LIKELY, less is asked for: of wood the last would make a fifth metal
-THRESHOLD = {False: (-0.4, -0.15), True: (-0.3, 0.05)}
+THRESHOLD = {False: (-0.4, -0.15), True: (-0.3, 0.0)}
 
 
 def find_metal(
