@@ -1,7 +1,6 @@
 """Arrays on disk: the same numbers as in memory."""
 
 import gc
-import logging
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from univoxel.data import image_cache, load_images, load_photos
 from univoxel.data.photos import packed, unpacked
 from univoxel.errors import DataError
 from univoxel.preparation.hull import mask_distances
-from univoxel.training import pixels as training_pixels
 from univoxel.training.loop import batch_at
 from univoxel.training.pixels import split_pixels
 
@@ -191,14 +189,12 @@ def test_packed_pixels_are_the_stored_ones(scene, of_color, of_alpha):
     assert torch.equal(alpha, expected[1])
 
 
-def test_of_very_many_pixels_some_are_drawn(scene, monkeypatch, caplog):
-    caplog.set_level(logging.INFO)
+def test_of_very_many_pixels_some_are_drawn(scene):
     photos = load_photos(scene, "train")
     distance = mask_distances(photos.alpha, photos.cameras)
     whole = split_pixels(photos, distance)
     count = len(whole.trained) + len(whole.held_out)
-    monkeypatch.setattr(training_pixels, "MOST", count // 3)
-    some = split_pixels(photos, distance)
+    some = split_pixels(photos, distance, most=count // 3)
     drawn = torch.cat([some.trained, some.held_out])
     assert abs(len(drawn) - count // 3) <= len(photos)
     assert len(drawn.unique(dim=0)) == len(drawn)

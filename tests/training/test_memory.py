@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from univoxel.camera import Cameras
+from univoxel.config import StageConfig
 from univoxel.core.machine import Memory
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.presets import preset
-from univoxel.training.pixels import check_memory, needed
+from univoxel.training.pixels import MOST, check_memory, most_pixels, needed
 
 GB = 10**9
 
@@ -72,3 +73,12 @@ def test_a_finer_grid_and_larger_photographs_need_more(photos, fast):
     full = preset("full", Path("photos"), Path("run"))
     few = Photos(Path(), ["0"], photos.color[:1], photos.alpha[:1], photos.cameras)
     assert needed(few, fast) < needed(few, full) < needed(photos, full)
+
+
+def test_a_training_keeps_no_more_pixels_than_it_has_use_for(fast):
+    """Twice the rays that it draws, whatever the size of the photographs; and never too many."""
+    kinds = [preset(name, Path("photos"), Path("run")) for name in ("draft", "fast", "best")]
+    kept = [most_pixels(cfg) for cfg in kinds]
+    rays = sum(s.iterations * s.rays for s in fast.stages if isinstance(s, StageConfig))
+    assert kept[0] < kept[1] == 2 * rays
+    assert kept[2] == MOST

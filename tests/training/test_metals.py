@@ -19,7 +19,7 @@ def test_copper_is_told_from_paint_of_its_colour(roughness):
     scene, problem = sphere_of(
         (0.9, 0.6, 0.4), lambda n: (n[:, 0] > 0).float(), roughness, noise=0.02
     )
-    found = find_metal(scene, problem, CFG, 1.0)
+    found = find_metal(scene, problem, CFG, 1.0, False)
     assert found.dtype == torch.bool
     x = problem.observations.normal[:, 0]
     # 32 neighbours of 500 points lie within half a radian: the mean over them blurs the border
@@ -30,7 +30,7 @@ def test_copper_is_told_from_paint_of_its_colour(roughness):
 def test_black_plastic_is_no_black_metal():
     """A dielectric of no albedo reflects as a metal of F0 = 0.04 does: metals reflect more."""
     scene, problem = sphere_of((0.0, 0.0, 0.0), 0.0, 0.2)
-    assert not find_metal(scene, problem, CFG, 1.0).any()
+    assert not find_metal(scene, problem, CFG, 1.0, False).any()
     assert evidence(scene, problem, CFG).median() > 1.0
 
 
@@ -42,14 +42,14 @@ def test_under_even_light_nothing_is_taken_for_metal():
     grey, rough = torch.full((COUNT, 3), 0.5), torch.full((COUNT,), 0.9)
     problem = photographed(problem, torch.ones(NODES, 3), grey, rough)
     noisy = problem.target + 0.02 * torch.randn_like(problem.target)
-    assert not find_metal(scene, replace(problem, target=noisy), CFG, 1.0).any()
+    assert not find_metal(scene, replace(problem, target=noisy), CFG, 1.0, False).any()
 
 
 def test_one_observation_says_nothing():
     scene, problem = sphere_of((0.9, 0.6, 0.4), 1.0, 0.3, views=1)
     assert torch.equal(evidence(scene, problem, CFG), torch.zeros(COUNT))
-    assert not find_metal(scene, problem, CFG, 1.0).any()
-    assert max(metals.THRESHOLD) < 0
+    for likely in (False, True):  # nor where metal is likely
+        assert not find_metal(scene, problem, CFG, 1.0, likely).any()
 
 
 def test_one_point_speaks_for_all():
@@ -85,9 +85,11 @@ def test_metal_takes_stronger_evidence_while_the_map_is_wrong(monkeypatch):
     ratios = torch.tensor([-0.5, -0.3, -0.2, -0.1, 0.4])
     monkeypatch.setattr(metals, "evidence", lambda *_: ratios)
     scene, problem = sphere_of((0.9, 0.6, 0.4), 0.0, 0.5)
-    at_first, half_way, in_the_end = (
-        find_metal(scene, problem, CFG, done).tolist() for done in (0.0, 0.5, 1.0)
+    at_first, half_way, in_the_end, where_likely = (
+        find_metal(scene, problem, CFG, done, likely).tolist()
+        for done, likely in ((0.0, False), (0.5, False), (1.0, False), (1.0, True))
     )
     assert at_first == [True, False, False, False, False]
     assert half_way == [True, True, False, False, False]
     assert in_the_end == [True, True, True, False, False]
+    assert where_likely == [True, True, True, True, False]

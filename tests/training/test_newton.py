@@ -1,5 +1,6 @@
 """Newton's method for the map, on points of a sphere whose truth is known."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,7 +10,7 @@ from observed_points import lamps, no_metal, photographed, problem_on_a_sphere, 
 
 from univoxel import brdf
 from univoxel.config import JointConfig
-from univoxel.render.observations import MaterialLabels, prefiltered_roughness
+from univoxel.render.observations import MaterialLabels, halves, prefiltered_roughness
 from univoxel.training import newton
 from univoxel.training.newton import (
     MAX_ALBEDO_CHANGE,
@@ -53,6 +54,41 @@ def test_newton_finds_the_map_under_a_roughness_that_is_wrong():
             newton_round_(scene, problem, no_metal(problem), cfg)
         errors.append((scene.sky.log_radiance.detach() - lamps(nodes).log()).abs().mean())
     assert errors[1] < 0.5 * errors[0]  # not all: roughness has a pull to where it was
+
+
+def test_a_round_is_judged_by_observations_that_it_did_not_use():
+    """It explains them if they show the same, and their error counts in full where they do not;
+    clipped pixels are lower bounds, and of points that have no other observation nothing counts."""
+    albedo, nodes = torch.tensor([0.5, 0.4, 0.3]), 64
+    problem = problem_on_a_sphere(400, 12, nodes, scene := scene_of((0.5, 0.4, 0.3), 0.3, nodes))
+    shown = prefiltered_roughness(torch.full((400,), 0.3), nodes)
+    problem = photographed(problem, lamps(nodes), albedo.expand(400, 3), shown)
+    fitted, unseen = halves(problem)
+    start = scene.sky.log_radiance.detach().clone()
+
+    def judged(other):
+        with torch.no_grad():
+            scene.sky.log_radiance.copy_(start)
+        torch.manual_seed(0)
+        return newton_round_(scene, fitted, no_metal(problem), CFG, unseen=other).unseen
+
+    explained = judged(unseen)
+    assert explained < 0.1 * newton.CAUCHY**2
+    off = replace(unseen, target=(unseen.target - 0.5))
+    assert judged(off) > newton.CAUCHY**2 * math.log1p((0.4 / newton.CAUCHY) ** 2)
+    assert judged(replace(unseen, target=torch.full_like(unseen.target, 1.0))) > explained
+    with torch.no_grad():
+        bright = replace(unseen, target=torch.full_like(unseen.target, 0.99))
+        scene.sky.log_radiance.fill_(5.0)
+        points = newton.choose_points(scene, fitted, no_metal(problem), CFG)
+        assert newton.unseen_cost(scene, points, bright) == 0
+    ends = unseen.observations.offsets.clamp_min(unseen.observations.offsets[200])
+    few = replace(off, observations=replace(unseen.observations, offsets=ends))
+    right = few.target.clone()
+    right[: ends[200]] = unseen.target[: ends[200]]  # of points that have none: they do not count
+    assert judged(replace(few, target=right)) == judged(few)
+    none = replace(unseen.observations, offsets=torch.zeros_like(unseen.observations.offsets))
+    assert judged(replace(unseen, observations=none)) == math.inf
 
 
 @pytest.mark.parametrize("views", [2, 3])

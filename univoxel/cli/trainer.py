@@ -38,7 +38,7 @@ from univoxel.training import compression
 from univoxel.training import joint_solve as joint_stage
 from univoxel.training.clock import LEAST, RESERVE_SECONDS
 from univoxel.training.loop import batch_at, fit_sharpness_, held_out_psnr, run_stage
-from univoxel.training.pixels import TrainingPixels, check_memory, split_pixels
+from univoxel.training.pixels import TrainingPixels, check_memory, most_pixels, split_pixels
 from univoxel.training.probe import slowdown
 from univoxel.training.progress import LOG, Progress, TrainingProgress, chosen_reach
 
@@ -120,7 +120,8 @@ def _train(
     with Progress(timed, begin, state, told, slowdown(timed)) as progress:
         announce(progress, photos)
         silhouettes = find_silhouettes(photos, cfg, progress.preparing)
-        pixels = split_pixels(silhouettes.photos, silhouettes.distance, silhouettes.doubted)
+        shown = silhouettes.photos, silhouettes.distance, silhouettes.doubted
+        pixels = split_pixels(*shown, most_pixels(cfg))
         pixels = replace(pixels, edges_given=silhouettes.edges_given)
         limited = compression.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
         if begun:

@@ -51,14 +51,6 @@ class MaterialHead(nn.Module):
         return out[:, :3], low + (1 - low) * out[:, 3], out[:, 4]
 
     @torch.no_grad()
-    def shift_roughness(self, features: Tensor, median: float) -> None:
-        """Make everything rougher or smoother, to that median over features [N, C]."""
-        low = self.min_roughness
-        medians = torch.stack([torch.tensor(median), self(features)[1].median()])
-        wanted, now = torch.logit((medians - low) / (1 - low), eps=1e-4)
-        self.net.linear[-1].bias[3] += wanted - now
-
-    @torch.no_grad()
     def shift_albedo(self, features: Tensor, median: Tensor) -> None:
         """Make every channel brighter or darker, to those medians [3] over features [N, C]."""
         medians = torch.stack([median, self(features)[0].median(0).values])

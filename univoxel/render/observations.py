@@ -191,6 +191,9 @@ def trace(
 VERTICES = 300_000
 # Metallic from which on the stages before have taken a point for metal
 METALLIC_BEFORE = 0.2
+# Share of the surface that they have to take for metal for more of it to be expected. Of objects
+# all of metal they take a third and more, of wood and paint next to nothing
+LIKELY = 0.15
 
 
 TURNS = 64  # positions of a turntable that are told apart: closer than the map's nodes
@@ -247,6 +250,7 @@ class MaterialLabels:
     albedo: Tensor | None = None  # [P, 3] where the materials do not follow the map yet
     mirrors: Mirrors | None = None  # None: nothing mirrors the map
     only_metal: bool = False  # whether nothing but metal is there
+    likely: bool = False  # whether the stages before saw enough metal to expect more
 
 
 @torch.no_grad()
@@ -298,7 +302,8 @@ def first_labels(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Mater
     is known."""
     features = scene.field.features_at(problem.observations.position)
     metal, only_metal = (scene.material(features)[2] > METALLIC_BEFORE, bool(cfg.only_metal))
-    return MaterialLabels(metal | only_metal, only_metal=only_metal)
+    likely = bool(metal.float().mean() > LIKELY)
+    return MaterialLabels(metal | only_metal, only_metal=only_metal, likely=likely)
 
 
 @torch.no_grad()
@@ -341,6 +346,27 @@ def sample_observations(problem: JointProblem, points: int, views: int) -> tuple
     usable = (counts > 0).nonzero()[:, 0]
     point = usable[torch.randint(len(usable), (points,))]
     return point.repeat_interleave(views), observations_of(problem, point, views).reshape(-1)
+
+
+def halves(problem: JointProblem) -> tuple[JointProblem, JointProblem]:
+    """The problem with one half of the observations of each point, and with the other half.
+
+    Neighbouring points take the halves the other way around: no photograph is missing from either.
+    """
+    observations = problem.observations
+    counts = observations.offsets.diff()
+    even = (torch.repeat_interleave(counts) + observations.view) % 2 == 0
+    first, second = (_with_observations(problem, which) for which in (even, ~even))
+    return first, second
+
+
+def _with_observations(problem: JointProblem, kept: Tensor) -> JointProblem:
+    """The problem with only some of its observations, [S] bool."""
+    all_of = problem.observations
+    ends = torch.cat([kept.new_zeros(1, dtype=torch.long), kept.cumsum(0)])
+    by_observation = {name: getattr(all_of, name)[kept] for name in ("wo", "color", "view")}
+    observations = replace(all_of, offsets=ends[all_of.offsets], **by_observation)
+    return replace(problem, observations=observations, target=problem.target[kept])
 
 
 def observations_of(problem: JointProblem, point: Tensor, views: int) -> Tensor:

@@ -218,7 +218,7 @@ def with_metals(
     `find_metal`."""
     metal = torch.ones_like(decisions.metal)
     if not decisions.only_metal:
-        metal = find_metal(scene, problem, cfg, done)
+        metal = find_metal(scene, problem, cfg, done, decisions.likely)
     mirrors = find_mirrors(scene, problem)
     if mirrors is not None:
         metal = metal | mirrors.metal

@@ -18,6 +18,7 @@ from univoxel.config import JointConfig
 from univoxel.render.observations import (
     JointProblem,
     MaterialLabels,
+    halves,
     observations_of,
     prefiltered_roughness,
     shade_observations,
@@ -47,17 +48,21 @@ ALIKE = 0.5
 # Bound of the log ratio of one point: a single one does not decide for its neighbours
 MAX_EVIDENCE = 2.0
 # Log ratio of residuals, metal over dielectric, below which a point is metal: under the first map
-# and under the last. The first asks for more: the map is wrong yet, and metals make the next one
-THRESHOLD = (-0.4, -0.15)
+# and under the last. The first asks for more: the map is wrong yet, and metals make the next one.
+# Where metal is likely, see LIKELY, less is asked for: of wood the last would make a fifth metal
+THRESHOLD = {False: (-0.4, -0.15), True: (-0.3, 0.0)}
 
 
-def find_metal(scene: Scene, problem: JointProblem, cfg: JointConfig, done: float) -> Tensor:
+def find_metal(
+    scene: Scene, problem: JointProblem, cfg: JointConfig, done: float, likely: bool
+) -> Tensor:
     """Which of the problem's points are metal under the present map: [P] bool.
 
     Args:
         done: progress of the map in [0, 1], from the first round of Newton to the last.
+        likely: whether the stages before saw metal, see `MaterialLabels`.
     """
-    first, last = THRESHOLD
+    first, last = THRESHOLD[likely]
     return evidence(scene, problem, cfg) < first + done * (last - first)
 
 
@@ -156,26 +161,15 @@ def fitted(constant: Tensor, slope: Tensor, target: Tensor, min_brightest: float
 TRIAL_POINTS = 300
 # Newton steps of a round; after three, from no map, too glossy still fits better than right
 TRIAL_STEPS = 6
-# Medians of roughness that are tried beside the present one
-TRIAL_ROUGHNESS = (0.25, 0.7)
 # Rounds of Newton in all trials, at most
-TRIAL_ROUNDS = 2 * (len(TRIAL_ROUGHNESS) + 2)
-# Share of the lowest residual so far that another roughness must not exceed
+TRIAL_ROUNDS = 4
+# Share of the residual so far that metals which were found again may leave to be taken
 BETTER = 0.9
-# Times the others' residual that metal everywhere must not exceed for all to be metal: 0.6 to 1.1
-# where all is, 1.2 and more where some or nothing is, unless grain, fur or mixed lights leave
-# much to either. Most points have to look like metal then too, see MAJORITY
-ONLY_METAL = 1.15
-# Median of roughness from which metal looks like paint and does not count there
-LIKE_PAINT = 0.5
-# Share of the others' residual that it must not exceed to start from its metals
-ALL_METAL = 0.8
-# The same, where most is found to be metal under its map. Of objects all of metal 0.67 to 0.93
-# is; of dielectrics hardly ever as much
-MOSTLY_METAL = 0.95
-# Share of the points that are most of them: look like metal for all to be metal, and for
-# MOSTLY_METAL. Under a map for metal 0.9 do where all is, 0.34 at most elsewhere
-MAJORITY = 0.5
+# Times the residual of metal as it was found that metal everywhere may leave for all to be metal:
+# where that is unlikely, and where it is likely. It leaves 0.25 of a bronze head that the stages
+# before take for paint, 0.85 of waxed wood; 1.07 at most of four of five objects all of metal, and
+# 1.12 and more where some is
+ONLY_METAL = (0.6, 1.09)
 # Median of the brightest channel where all is metal: nothing else tells how bright the light is
 ONLY_METAL_ALBEDO = 0.3
 
@@ -187,7 +181,6 @@ class Hypothesis:
     residual: float  # inf: nothing was solved
     metal: Tensor  # [P] bool
     states: list[dict[str, Any]]  # of the scene's parts
-    roughness: float  # median, [0, 1]
 
 
 @dataclass(frozen=True)
@@ -196,7 +189,9 @@ class Trials:
 
     scene: Scene
     problem: JointProblem
+    halves: tuple[JointProblem, JointProblem]  # the observations that are fitted, and the others
     cfg: JointConfig
+    likely: bool  # whether the stages before saw metal
     seconds: float  # of a round on TRIAL_POINTS
     seed: int  # of the points: the trials differ in nothing but the hypothesis
     parts: Sequence[nn.Module]  # of the scene, that a trial changes
@@ -212,31 +207,34 @@ class Trials:
             part.load_state_dict(state)
 
     def residual_(self, metal: Tensor) -> float:
-        """What is left after a round of Newton, which changes the map; inf: nothing was solved."""
+        """What is left of observations that were not used, after a round of Newton on the others,
+        which changes the map; inf: nothing was solved."""
         steps = TRIAL_STEPS if self.cfg.newton_steps else 0
-        points = TRIAL_POINTS
-        cfg = replace(self.cfg, newton_steps=steps, newton_points=points, newton_roughness=0.0)
+        cfg = replace(self.cfg, newton_steps=steps, newton_points=TRIAL_POINTS)
+        fitted, unseen = self.halves
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(self.seed)
             solved = newton_round_(
-                self.scene, self.problem, MaterialLabels(metal), cfg, self.seconds
+                self.scene, fitted, MaterialLabels(metal), cfg, self.seconds, unseen
             )
         self.troubles.extend(solved.troubles)
-        return solved.costs[-1] if solved.costs else math.inf
+        return solved.unseen
 
 
 def initialise_(
     scene: Scene, problem: JointProblem, decisions: MaterialLabels, cfg: JointConfig, seconds: float
 ) -> tuple[MaterialLabels, list[str]]:
-    """Change the scene's map and roughness to those of the best hypothesis; return the decisions
-    with its metal, and sentences about rounds that had no solution.
+    """Change the scene's map to that of the best hypothesis; return the decisions with its metal,
+    and sentences about rounds that had no solution.
 
-    Light and material are found from one another. Under a roughness that is wrong everywhere the
-    map becomes too sharp or too dull for any other. Where all is metal, a map for dielectrics is so
+    Light and material are found from one another. If all is metal, a map for dielectrics is so
     bright that nothing looks like metal under it. So rounds of Newton start from what the stages
-    before took for metal and from metal everywhere, each with the roughness of the stages before
-    and with some others, as a whole. Metals are found under the best map of either, and the
-    residuals decide, unless there is nothing but metal.
+    before took for metal, and from metal everywhere; under the map of either, metals are found
+    again. Each round fits half of the observations. What it leaves of the other half decides,
+    because a richer hypothesis always fits better what it was fitted to. If the stages before saw
+    metal, metal everywhere only has to explain them about as well, as it has fewer ways to do so.
+    If they saw none, it has to explain far more: waxed wood, whose sheen is coloured, looks a
+    little more like metal than like paint.
 
     Args:
         seconds: that the rounds of Newton may take together.
@@ -246,20 +244,26 @@ def initialise_(
     seed = int(torch.randint(2**31, ()))
     initial = [copy.deepcopy(part.state_dict()) for part in parts]
     round_seconds = seconds / TRIAL_ROUNDS
-    trials = Trials(scene, problem, cfg, round_seconds, seed, parts, initial, [])
-    everywhere = tried_roughnesses_(trials, torch.ones_like(decisions.metal))
-    best, only_metal = best_of(everywhere), bool(cfg.only_metal)
-    if not only_metal:
-        before = best_of(tried_roughnesses_(trials, decisions.metal))
-        found = under_its_map_(trials, before)
+    likely = decisions.likely
+    trials = Trials(
+        scene, problem, halves(problem), cfg, likely, round_seconds, seed, parts, initial, []
+    )
+    only_metal = bool(cfg.only_metal)
+    all_metal = torch.ones_like(decisions.metal)
+    if only_metal:
+        best = assumed_(trials, all_metal)
+    else:
+        best = assumed_(trials, decisions.metal)
+        best = better_of(best, under_its_map_(trials, best))
+        everywhere = assumed_(trials, all_metal)
+        explained = everywhere.residual < ONLY_METAL[likely] * best.residual
         # Under a light for each photograph what is mirrored may be anything
         one_light = scene.views is None or scene.views.sky_weights is None
-        if cfg.only_metal is None and one_light:
-            explained = min(before.residual, found.residual)
-            only_metal = decide_all_metal_(trials, explained, everywhere)
-        if not only_metal:
-            best = under_its_map_(trials, best)
-            best = best if better_metals(found, best) else found
+        only_metal = explained and cfg.only_metal is None and one_light
+        if only_metal:
+            best = everywhere
+        elif explained or likely:
+            best = better_of(best, under_its_map_(trials, everywhere))
     if math.isinf(best.residual):
         trials.restore_(initial)
         return decisions, trials.troubles
@@ -282,50 +286,15 @@ def neutralise_(scene: Scene, problem: JointProblem) -> None:
     problem.sky.log_radiance += (median / wanted).log()
 
 
-@torch.no_grad()
-def tried_roughnesses_(trials: Trials, metal: Tensor) -> list[Hypothesis]:
-    """A hypothesis with this metal for the present roughness, and for each that is tried."""
-    scene, tried = trials.scene, []
-    features = scene.field.features_at(trials.problem.observations.position)
-    for roughness in (None, *TRIAL_ROUGHNESS):
-        trials.restore_(trials.initial)
-        if roughness is not None:
-            scene.material.shift_roughness(features, roughness)
-        median = float(scene.material(features)[1].median())
-        tried.append(Hypothesis(trials.residual_(metal), metal, trials.states(), median))
-    return tried
+def assumed_(trials: Trials, metal: Tensor) -> Hypothesis:
+    """The hypothesis of this metal, from the state that the trials begin with."""
+    trials.restore_(trials.initial)
+    return Hypothesis(trials.residual_(metal), metal, trials.states())
 
 
-def best_of(tried: Sequence[Hypothesis]) -> Hypothesis:
-    """That of the lowest residual; another roughness than the first has to be worth it."""
-    best = tried[0]
-    for hypothesis in tried[1:]:
-        if hypothesis.residual < BETTER * best.residual:
-            best = hypothesis
-    return best
-
-
-def decide_all_metal_(trials: Trials, explained: float, everywhere: Sequence[Hypothesis]) -> bool:
-    """Whether metal everywhere explains the photographs about as well as metal as it was found, and
-    most points, however dark, look like metal under its map. It may change the scene's state.
-
-    It has no diffuse light to explain them with, and so the fewer ways. Where it is rough, its
-    highlights are as wide as diffuse light, and it explains paint. Grain, fur or lights that change
-    leave so much to either that their residuals are alike; point by point paint still looks no more
-    like metal.
-
-    Args:
-        explained: residual of metal as it was found.
-    """
-    cfg = trials.cfg
-    smooth = [h for h in everywhere if h.roughness < LIKE_PAINT]
-    best = min(smooth, key=lambda h: h.residual, default=None)
-    if best is None or not best.residual < ONLY_METAL * explained:
-        return False
-    trials.restore_(best.states)
-    however_dark = replace(cfg, metal=replace(cfg.metal, min_reflectance=0.0))
-    metal = find_metal(trials.scene, trials.problem, however_dark, 1.0)
-    return bool(metal.float().mean() > MAJORITY)
+def better_of(present: Hypothesis, other: Hypothesis) -> Hypothesis:
+    """The other hypothesis if it explains clearly more, else the present one."""
+    return other if other.residual < BETTER * present.residual else present
 
 
 def under_its_map_(trials: Trials, assumed: Hypothesis) -> Hypothesis:
@@ -334,12 +303,5 @@ def under_its_map_(trials: Trials, assumed: Hypothesis) -> Hypothesis:
     trials.restore_(assumed.states)
     # Under a map for metals dielectrics stand out at once: the last threshold serves
     done = float(assumed.metal.all())
-    metal = find_metal(trials.scene, trials.problem, trials.cfg, done)
-    return Hypothesis(trials.residual_(metal), metal, trials.states(), assumed.roughness)
-
-
-def better_metals(before: Hypothesis, everywhere: Hypothesis) -> bool:
-    """Whether the metals that were found from metal everywhere are the better ones."""
-    mostly = everywhere.metal.float().mean() > MAJORITY
-    share = MOSTLY_METAL if mostly else ALL_METAL
-    return everywhere.residual < share * before.residual
+    metal = find_metal(trials.scene, trials.problem, trials.cfg, done, trials.likely)
+    return Hypothesis(trials.residual_(metal), metal, trials.states())

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from univoxel import brdf
+from univoxel.color import CLIPPED, linear_to_srgb_unclipped
 from univoxel.config import JointConfig
 from univoxel.fields.field import MaterialHead
 from univoxel.ops import specular_response
@@ -48,6 +49,8 @@ VIEW_PRIOR = 10.0
 TINT = 0.5
 # Nearest nodes of the map that the smoothness ties a node to: as many as lie around one
 NODE_NEIGHBOURS = 6
+# Observations of a point that a round is judged by
+UNSEEN_VIEWS = 16
 # Parts of the points that a step builds its equations from on a machine however slow
 MIN_PARTS = 2
 
@@ -61,6 +64,7 @@ class NewtonRound:
     """What a round came to."""
 
     costs: list[float] = field(default_factory=list)  # mean weighted squared residual by step
+    unseen: float = math.inf  # mean robust cost of observations that were not used; inf: of none
     troubles: list[str] = field(default_factory=list)  # sentences about what had no solution
 
 
@@ -136,6 +140,7 @@ def newton_round_(
     decisions: MaterialLabels,
     cfg: JointConfig,
     seconds: float = math.inf,
+    unseen: JointProblem | None = None,
 ) -> NewtonRound:
     """Change the scene's map, and what its views differ by, in Gauss-Newton steps; return their
     costs. Albedo and roughness of every point are eliminated: the materials stay.
@@ -151,6 +156,7 @@ def newton_round_(
 
     Args:
         seconds: wall time that it may take, about: it takes fewer points where all would take more.
+        unseen: the same points in other observations, which the result is judged by.
     """
     begin = time.monotonic()
     points = choose_points(scene, problem, decisions, cfg) if cfg.newton_steps else None
@@ -171,14 +177,37 @@ def newton_round_(
         differences = equations.view_differences(scene)
         if differences is not None and differences.basis is not None:
             if not views_step_(scene, points, differences, cfg.newton_smooth):
-                return NewtonRound(costs, [UNSOLVABLE])
+                return NewtonRound(costs, troubles=[UNSOLVABLE])
             differences = equations.view_differences(scene)
         sun, damping = decisions.sun, cfg.newton_smooth
         cost = map_step_(scene, points, differences, sun, laplacian, damping)
         if cost is None:
-            return NewtonRound(costs, [UNSOLVABLE])
+            return NewtonRound(costs, troubles=[UNSOLVABLE])
         costs.append(cost)
-    return NewtonRound(costs)
+    if unseen is None:
+        return NewtonRound(costs)
+    return NewtonRound(costs, unseen_cost(scene, points, unseen))
+
+
+def unseen_cost(scene: Scene, points: NewtonPoints, unseen: JointProblem) -> float:
+    """Mean Cauchy cost of points, as a round left them, in other observations of them; inf: there
+    are none."""
+    counts = unseen.observations.offsets.diff()[points.point]
+    if not counts.any():
+        return math.inf
+    observation = observations_of(unseen, points.point, UNSEEN_VIEWS)
+    observation = observation.clamp_max(len(unseen.target) - 1)  # of points that have none
+    points = replace(points, problem=unseen, observation=observation)
+    differences, sky = equations.view_differences(scene), unseen.sky.radiance
+    costs = torch.zeros(len(counts))
+    for part in points.parts:
+        transport = points.transport(part)
+        state = transport, sky, points.log_albedo[part]
+        channels = [equations.channel_radiance(*state, c, differences)[1] for c in range(3)]
+        residual = transport.target - linear_to_srgb_unclipped(torch.stack(channels, 2))
+        residual = residual.masked_fill((transport.target > CLIPPED) & (residual < 0), 0.0)
+        costs[part] = CAUCHY**2 * torch.log1p((residual / CAUCHY).square()).mean((1, 2))
+    return float(costs[counts > 0].mean())
 
 
 def choose_points(

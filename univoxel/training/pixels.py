@@ -16,9 +16,8 @@ from univoxel.data.photos import packed, packed_width
 from univoxel.errors import UserError
 
 MARGIN = 6.0  # pixels around the silhouettes that are trained on; farther ones are empty
-MOST = (
-    1 << 24
-)  # pixels that are trained on, at most; the longest preset draws about ten million rays
+MOST = 1 << 24  # pixels that are trained on, at most
+SPARE = 2  # times the rays that a training draws: as many pixels as it has use for
 EDGE = 3.0  # pixels beside silhouettes of rough masks: they do not tell how good a render is
 HELD_OUT = 2048  # pixels of the training photographs that are only looked at, to follow quality
 
@@ -37,12 +36,19 @@ class TrainingPixels:
     edges_given: bool = True  # whether masks are as given, and none of their edges doubted
 
 
-def split_pixels(photos: Photos, distance: Tensor, doubted: Tensor | None = None) -> TrainingPixels:
+def most_pixels(cfg: TrainConfig) -> int:
+    """How many pixels a training has use for, at most: a random part of more is as good."""
+    stages = [stage for stage in cfg.stages if isinstance(stage, StageConfig)]
+    return min(MOST, SPARE * sum(stage.iterations * stage.rays for stage in stages))
+
+
+def split_pixels(
+    photos: Photos, distance: Tensor, doubted: Tensor | None = None, most: int = MOST
+) -> TrainingPixels:
     """The pixels in or near silhouettes: those to train on, and some that are held out.
 
-    Of more than MOST a random MOST are taken: trainings draw fewer rays.
-
     Args:
+        most: pixels, see `most_pixels`; of more a random part is taken.
         distance: [V, H, W] pixels to the silhouette, negative inside; infinite beyond a picture.
         doubted: [V, H, W] bool, where rough masks are not believed: left out, here and, as if there
             were no object, wherever the photographs are looked at later. None: masks are right.
@@ -51,8 +57,8 @@ def split_pixels(photos: Photos, distance: Tensor, doubted: Tensor | None = None
         photos = replace(photos, alpha=_without(photos.alpha, doubted))
     counts = [int(_near(distance, doubted, view).sum()) for view in range(len(photos))]
     draw = torch.Generator().manual_seed(0)
-    if sum(counts) > MOST:
-        share = MOST / sum(counts)
+    if sum(counts) > most:
+        share = most / sum(counts)
         counts = [round(share * count) for count in counts]
     with_colors = memmap.on_disk(photos.color)
     width = 3 + (packed_width(photos) if with_colors else 0)
@@ -113,7 +119,7 @@ PER_RAY = 40_000  # of a step: samples and what is between them
 def needed(photos: Photos, cfg: TrainConfig) -> int:
     """Bytes, about, that training takes besides the photographs, which are there already."""
     if memmap.on_disk(photos.color):
-        return needed_for(0, cfg) + PER_DRAWN * MOST
+        return needed_for(0, cfg) + PER_DRAWN * most_pixels(cfg)
     return needed_for(photos.alpha.numel(), cfg)
 
 
