@@ -103,7 +103,7 @@ def test_tables_take_their_part_of_a_file():
     assert settings(capacity({"runs": sizes}, "fields")) == ["dense", "hash"]
     lights = {f"tiny draft {x} fixed none": {"nvs_psnr": n} for n, x in enumerate(("sg", "hybrid"))}
     varying = doc_tables.KINDS["varying.json"]({"runs": lights}, "hybrid")
-    assert varying.endswith("| as they are | `none` | 1.0 |")
+    assert varying.endswith("| unchanged | `none` | 1.0 |")
 
 
 def test_a_block_that_does_not_end_is_found(copy):
