@@ -29,7 +29,7 @@ COMMON = {"--help", "--quiet", "--verbose", "--threads", "--from"}
 WORDS = {
     *("ADDRESS", "ANGLE", "AZIMUTH", "DATA", "DEGREES", "ELEVATION", "FACTOR", "FILE", "HEIGHT"),
     *("INTENSITY", "IRRADIANCE", "NAME", "PIXELS", "SHARE", "TEXELS"),
-    *("COLMAP", "EPYC", "OPENCV", "OMP_NUM_THREADS", "ATEN_CPU_CAPABILITY", "QT_QPA_PLATFORM"),
+    *("COLMAP", "EPYC", "OPENCV", "PSNR", "OMP_NUM_THREADS", "ATEN_CPU_CAPABILITY", "QT_QPA_PLATFORM"),
 }
 
 
@@ -41,7 +41,7 @@ def faults(root: Path) -> list[str]:
     for page in doc_blocks.pages(root):
         name, text = page.relative_to(root).as_posix(), page.read_text(encoding="utf-8")
         lines = [line for check in checks for line in check(text)]
-        if name.startswith(("docs/guide/", "docs/explanation/")):
+        if name.startswith(("docs/guide/", "docs/method/")):
             lines += [f"no such name: {fault}" for fault in unknown(root, text)]
         found += [f"{name}: {line}" for line in lines]
     return found

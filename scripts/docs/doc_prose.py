@@ -18,7 +18,8 @@ README_LINES = 100
 # Where numbers with units may stand anywhere: a history, and mathematics
 FREE = (
     "CHANGELOG.md",
-    "docs/derivations/",
+    "docs/method/gradients.md",
+    "docs/method/shading-gradients.md",
     "univoxel/example_data/",
 )
 
