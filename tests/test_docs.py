@@ -8,8 +8,10 @@ from pathlib import Path
 import doc_blocks
 import doc_names
 import doc_prose
+import doc_python
 import doc_reference
 import doc_tables
+import doc_truth
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -20,6 +22,7 @@ def test_pages_agree_with_results_and_code():
     assert doc_blocks.unused(ROOT) == []
     assert doc_prose.faults(ROOT) == []
     assert doc_names.faults(ROOT) == []
+    assert doc_truth.faults(ROOT) == []
 
 
 def test_every_field_of_the_configuration_has_a_meaning():
@@ -150,6 +153,8 @@ def test_a_link_to_markdown_outside_of_docs_is_found():
         (doc_names.commands, "    univoxel train x --out y\n    univoxel --version\n", 0),
         (doc_names.spans, "Look at `univoxel trian`, at `univoxel train --presett`.", 2),
         (doc_names.spans, "Look at `univoxel train --preset fast`.", 0),
+        (doc_names.spans, "Look at `univoxel cutout --from none`.", 0),
+        (doc_names.spans, "Look at `univoxel cutout --source none`.", 1),
         (doc_names.imports, "```python\nfrom univoxel import nothing\n```\n", 1),
         (doc_names.imports, "```python\nx = = 1\n```\n", 1),
         (doc_names.imports, "```python\nfrom univoxel import train\n```\n", 0),
@@ -173,3 +178,48 @@ def test_a_tree_that_is_not_the_folders_is_found(tmp_path):
     gone, lacks = doc_names.tree(tmp_path)
     assert "no such file or folder: univoxel/none/" in gone
     assert "the tree lacks joint/" in lacks
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("Use `--presett fast`, or `--preset fast`.", ["--presett"]),
+        ("`cutout --source none`, as `--from` says", ["--source"]),
+        ("    univoxel lab chart X --out Y \\\n        --onli draft\n", ["--onli"]),
+        ("    univoxel train X --out Y --preset fast  # not --fast\n", []),
+        ("`pip install --no-deps univoxel`, `git clone --depth 1`", []),
+    ],
+)
+def test_options_that_no_command_has_are_found(text, found):
+    assert doc_truth.unknown_flags(text) == found
+
+
+def test_a_promise_that_a_page_does_not_keep_is_found(tmp_path):
+    (tmp_path / "docs/results").mkdir(parents=True)
+    (tmp_path / "examples").mkdir()
+    definitions, page = tmp_path / doc_truth.DEFINITIONS, tmp_path / "docs/page.md"
+    figures = "<!-- begin x.json -->\n" + "| 1 |\n" * 300 + "<!-- end x.json -->\n"
+    definitions.write_text(figures)
+    page.write_text("[Metrics](results/index.md#metrics)\n" + figures + "a line\n" * 150)
+    assert doc_truth.faults(tmp_path) == []
+    page.write_text(figures + "a line\n" * 250)
+    (tmp_path / "examples/run.py").write_text('"""univoxel export RUN --texturesize 2"""\n')
+    long, undefined, flag = doc_truth.faults(tmp_path)
+    assert re.fullmatch(r"docs/page\.md: 25\d lines, at most 200", long)
+    assert undefined == "docs/page.md: has a table of figures and no link to docs/results/index.md"
+    assert flag == "examples/run.py: no such option: --texturesize"
+    (tmp_path / "examples/run.py").rename(tmp_path / "examples/run.ipynb")
+    (tmp_path / "examples/run.ipynb").write_text('{"cells": [{"source": ["`train --fast`"]}]}')
+    assert doc_truth.faults(tmp_path)[-1] == "examples/run.ipynb: no such option: --fast"
+
+
+def test_every_public_name_has_a_section():
+    import univoxel
+
+    text = doc_python.python()
+    public = [name for name in univoxel.__all__ if f"### univoxel.{name}\n" not in text]
+    assert public == ["Cancelled", "Run", "TrainingProgress", "UserError"]  # have other sections
+    for name in ("Run.relight", "univoxel.run.Verdict", "Options of univoxel.train"):
+        assert f"### {name}\n" in text
+    assert "| `Cancelled` | `Exception` |" in text
+    assert 'background: Literal["black", "white"] = "black",' in text

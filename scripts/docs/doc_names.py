@@ -6,7 +6,6 @@ A page that names what is not there is a fault, as a reader finds it too late.
 from __future__ import annotations
 
 import ast
-import inspect
 import re
 import shlex
 from collections.abc import Callable, Iterator
@@ -14,6 +13,7 @@ from functools import cache
 from pathlib import Path
 
 import doc_blocks
+import doc_truth
 
 from univoxel.cli import COMMANDS, LABORATORY, help_screen, laboratory, understood
 from univoxel.cli.parsing import LAB, Usage
@@ -23,8 +23,6 @@ CODE = re.compile(r"```[\s\S]*?```|`[^`\n]+`|^    .*$", re.MULTILINE)
 FIELD = re.compile(r"\b([A-Z]\w*Config)\.(\w+)")
 CONSTANT = re.compile(r"(?<![\w/.-])[A-Z][A-Z_]{3,}(?![\w/.-])")
 FILE = re.compile(r"(?<![\w./])(?:univoxel/)?((?:\w+/)*\w+\.(?:py|cpp))\b")
-# Options of every command
-COMMON = {"--help", "--quiet", "--verbose", "--threads", "--from"}
 # Placeholders of commands, and names that are not ours
 WORDS = {
     *("ADDRESS", "ANGLE", "AZIMUTH", "DATA", "DEGREES", "ELEVATION", "FACTOR", "FILE", "HEIGHT"),
@@ -80,8 +78,8 @@ def spans(text: str) -> list[str]:
         name = words[1] if words[0] == LAB and len(words) > 1 else words[0]
         if name in (LAB, "COMMAND") or name.startswith("--") or span.startswith("was built"):
             continue  # the last is a message
-        parameters = inspect.signature(known[name]).parameters if name in known else ()
-        options = {"--" + p.replace("_", "-") for p in parameters} | COMMON
+        key = name if known is COMMANDS else f"{LAB} {name}"
+        options = doc_truth.options().get(key, set())
         if name not in known or set(re.findall(r"--[a-z-]+", span)) - options:
             found.append(f"no such command or option: univoxel {span}")
     return found
