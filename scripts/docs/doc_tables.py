@@ -13,6 +13,7 @@ their own table, as written by hand or by a script of one day:
 from __future__ import annotations
 
 import json
+import math
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -47,7 +48,11 @@ def block(name: str, results: Path) -> str:
         raise ValueError(f"{file}: has no {' and no '.join(missing)}")
     if kind := KINDS.get(name) or KINDS.get(file):
         made = f"*{version(record)}.*"
-        return kind(record, part) if part == "small" else f"{made}\n\n{kind(record, part)}"
+        return (
+            kind(record, part)
+            if part in ("small", "published")
+            else f"{made}\n\n{kind(record, part)}"
+        )
     if "columns" not in record:
         raise ValueError(f"{file}: no columns, and doc_tables.KINDS has no function for {name}")
     return described(record)
@@ -172,12 +177,39 @@ def _chart(record: dict[str, Any], part: str) -> str:
     return measured(runs, keys, columns)
 
 
+def _published(record: dict[str, Any], _: str) -> str:
+    """What the paper of the method that is followed reports, on its own data."""
+    runs = [
+        ((p["name"], p["where"]), {"minutes": p["minutes"]} | p["measures"])
+        for p in record["published"]
+        if p["name"].startswith("UniVoxel")
+    ]
+    albedo = ("albedo, dB", "albedo_psnr_3ch", 1)
+    columns = (("training, minutes", "minutes", 0), NVS, albedo, ROUGHNESS, RELIT, NORMALS)
+    return measured(runs, ("method", "data and GPU"), columns)
+
+
 def _lights(record: dict[str, Any], _: str) -> str:
-    columns = (SECONDS, NVS, *ALBEDO, ROUGHNESS, RELIT, NORMALS, MEMORY)
-    columns += (("diffuse sphere, dB", "map_ball_psnr", 1),)
-    columns += (("brightest direction, degrees", "map_brightest_degrees", 1),)
-    runs = [((_scene(r["scene"]), f"`{r['setting']}`"), r["measures"]) for r in record["rows"]]
-    return measured(runs, ("scene", "light"), columns)
+    """The lighting models by scene, the baseline first; the best of a scene is bold."""
+    quality = (NVS, *ALBEDO, RELIT, ("diffuse sphere, dB", "map_ball_psnr", 1), ROUGHNESS, NORMALS)
+    lower = {ROUGHNESS, NORMALS}
+    columns = (*quality, ("brightest direction, degrees", "map_brightest_degrees", 1), SECONDS)
+    rows = []
+    for scene in dict.fromkeys(r["scene"] for r in record["rows"]):
+        runs = [r for r in record["rows"] if r["scene"] == scene]
+        best = {}
+        for column in quality:
+            values = [v for r in runs if (v := r["measures"].get(column[1])) is not None]
+            best[column] = min(values) if column in lower else max(values)
+        for run in sorted(runs, key=lambda r: r["setting"] != "baked"):
+            cells = []
+            for column in columns:
+                value = run["measures"].get(column[1])
+                text = number(value, column[2])
+                cells.append(f"**{text}**" if value == best.get(column, math.nan) else text)
+            rows.append([_scene(scene), f"`{run['setting']}`", *cells])
+    heads = ["scene", "light", *[name for name, _, _ in columns]]
+    return table(heads, grouped(rows), [False] * 2 + [True] * len(columns))
 
 
 def _trust(record: dict[str, Any], _: str) -> str:
@@ -465,6 +497,7 @@ KINDS: dict[str, Callable[[dict[str, Any], str], str]] = {
     "chart.json": _chart,
     "chart.json:small": _chart,
     "chart.json:trust": _trust,
+    "chart.json:published": _published,
     "demo.json": _demo,
     "lights.json": _lights,
     "capacity.json": _capacity,
