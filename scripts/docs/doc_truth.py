@@ -70,7 +70,7 @@ def unknown_flags(text: str) -> list[str]:
         name = command if command in known else f"lab {command}"
         own = known.get(name, everywhere)
         found += [f for f in FLAG.findall(arguments.partition("#")[0]) if f not in own]
-    for _, span in SPAN.findall(doc_prose._without_code(text)):
+    for _, span in SPAN.findall(doc_prose.without_code(text)):
         words = span.split()
         if words and words[0].startswith("--"):
             found += [flag for flag in FLAG.findall(span) if flag not in everywhere]
