@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/guide and docs/method that show the bundled scene.
+"""Draws the pictures of docs/guide and docs/explanation that show the bundled scene.
 
     univoxel train univoxel/example_data/tiny --out RUN --preset fast --minutes 4 \\
         --set stages.0.voxels=0.27 --set stages.1.voxels=0.6 --set stages.3.voxels=0.6 \\
