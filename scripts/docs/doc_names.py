@@ -1,11 +1,12 @@
-"""Names that pages take from the code: commands, options, imports, fields, constants, files.
+"""Names on pages that come from the code: commands, options, imports, fields, constants, files.
 
-A page that names what is not there is a fault, as a reader finds it too late.
+A name that does not exist is a fault.
 """
 
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 import shlex
 from collections.abc import Callable, Iterator
@@ -13,7 +14,6 @@ from functools import cache
 from pathlib import Path
 
 import doc_blocks
-import doc_truth
 
 from univoxel.cli import COMMANDS, LABORATORY, help_screen, laboratory, understood
 from univoxel.cli.parsing import LAB, Usage
@@ -23,12 +23,15 @@ CODE = re.compile(r"```[\s\S]*?```|`[^`\n]+`|^    .*$", re.MULTILINE)
 FIELD = re.compile(r"\b([A-Z]\w*Config)\.(\w+)")
 CONSTANT = re.compile(r"(?<![\w/.-])[A-Z][A-Z_]{3,}(?![\w/.-])")
 FILE = re.compile(r"(?<![\w./])(?:univoxel/)?((?:\w+/)*\w+\.(?:py|cpp))\b")
+# Pages whose names of fields, constants and files are checked
+CHECKED = tuple(f"docs/{name}/" for name in ("tutorials", "guide", "method", "explanation"))
+# Options of every command
+COMMON = {"--help", "--quiet", "--verbose", "--threads", "--from"}
 # Placeholders of commands, and names that are not ours
 WORDS = {
     *("ADDRESS", "ANGLE", "AZIMUTH", "DATA", "DEGREES", "ELEVATION", "FACTOR", "FILE", "HEIGHT"),
-    *("INTENSITY", "IRRADIANCE", "NAME", "PIXELS", "SHARE", "TEXELS"),
+    *("INTENSITY", "IRRADIANCE", "NAME", "PIXELS", "PSNR", "SHARE", "TEXELS"),
     *("COLMAP", "EPYC", "OPENCV", "OMP_NUM_THREADS", "ATEN_CPU_CAPABILITY", "QT_QPA_PLATFORM"),
-    "PSNR",
 }
 
 
@@ -40,7 +43,7 @@ def faults(root: Path) -> list[str]:
     for page in doc_blocks.pages(root):
         name, text = page.relative_to(root).as_posix(), page.read_text(encoding="utf-8")
         lines = [line for check in checks for line in check(text)]
-        if name.startswith(("docs/guide/", "docs/method/")):
+        if name.startswith(CHECKED):
             lines += [f"no such name: {fault}" for fault in unknown(root, text)]
         found += [f"{name}: {line}" for line in lines]
     return found
@@ -78,8 +81,8 @@ def spans(text: str) -> list[str]:
         name = words[1] if words[0] == LAB and len(words) > 1 else words[0]
         if name in (LAB, "COMMAND") or name.startswith("--") or span.startswith("was built"):
             continue  # the last is a message
-        key = name if known is COMMANDS else f"{LAB} {name}"
-        options = doc_truth.options().get(key, set())
+        parameters = inspect.signature(known[name]).parameters if name in known else ()
+        options = {"--" + p.replace("_", "-") for p in parameters} | COMMON
         if name not in known or set(re.findall(r"--[a-z-]+", span)) - options:
             found.append(f"no such command or option: univoxel {span}")
     return found
@@ -113,7 +116,7 @@ def targets(root: Path, text: str) -> list[str]:
 def tree(root: Path) -> list[str]:
     """Where the tree of CONTRIBUTING.md and the folders of the package differ."""
     text = (root / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    table = text.partition("## The tree")[2].partition("## Rules")[0]
+    table = text.partition("## The tree\n")[2].partition("\n## ")[0]
     rows = " ".join(re.findall(r"^\| (`.*?) \|", table, re.MULTILINE))
     places = root, root / "univoxel"
     gone = [n for n in re.findall(r"`([^`]+)`", rows) if not any((p / n).exists() for p in places)]

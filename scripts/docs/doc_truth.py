@@ -1,4 +1,4 @@
-"""What pages promise: options that exist, a length that can be read, metrics that are defined."""
+"""What pages promise: options that exist, metrics that are defined."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import doc_blocks
 import doc_prose
 import doc_reference
 
-LINES = 200  # of a page of the site, besides generated blocks
 DEFINITIONS = "docs/results/index.md"  # of all metrics
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]*\b")
 SPAN = re.compile(r"(`+)(.+?)\1", re.DOTALL)
@@ -29,8 +28,6 @@ def faults(root: Path) -> list[str]:
         name, text = page.relative_to(root).as_posix(), page.read_text(encoding="utf-8")
         if name != "CHANGELOG.md":  # which tells of options that are gone
             found += [f"{name}: no such option: {flag}" for flag in unknown_flags(text)]
-        if name.startswith("docs/") and (lines := length(text)) > LINES:
-            found.append(f"{name}: {lines} lines, at most {LINES}")
         if tables(text) and not defined(page, text, root):
             found.append(f"{name}: has a table of figures and no link to {DEFINITIONS}")
     for example in sorted((root / "examples").rglob("*")):
@@ -77,11 +74,6 @@ def unknown_flags(text: str) -> list[str]:
         elif words and words[0] in known:
             found += [flag for flag in FLAG.findall(span) if flag not in known[words[0]]]
     return list(dict.fromkeys(found))
-
-
-def length(text: str) -> int:
-    """Lines of a page without those of generated blocks."""
-    return len(doc_blocks.BLOCK.sub("", text).splitlines())
 
 
 def tables(text: str) -> bool:
