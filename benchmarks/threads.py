@@ -91,11 +91,11 @@ def result(one: list, two: list, pair: list, passive: list) -> dict:
         {"name": "stage"},
         {"name": "one thread"} | seconds,
         {"name": "two threads"} | seconds,
-        {"name": "their processor time"} | seconds,
+        {"name": "processor time of both"} | seconds,
         {"name": "gain", "digits": 2},
-        {"name": "one of two beside one another"} | seconds,
+        {"name": "one of two programs"} | seconds,
         {"name": "gain of a core", "digits": 2},
-        {"name": "share of it", "digits": 2},
+        {"name": "share", "digits": 2},
         {"name": "two threads, `OMP_WAIT_POLICY=passive`"} | seconds,
     ]
     return {"columns": columns, "rows": rows}
@@ -120,9 +120,9 @@ def main() -> None:
     about = {
         "title": "A whole training on one thread, on two, and twice side by side",
         **made(),
-        "note": f"{options.scene.name}, `{options.preset}`, all steps. Gain of a core: what two "
-        "programs side by side do together, over one alone. Its share: what the second thread "
-        "brings of that.",
+        "note": f"{options.scene.name}, `{options.preset}`, all steps. Gain of a core: work of "
+        "two programs side by side over that of one. Share: the part of this gain that the second "
+        "thread of one program reaches.",
     }
     found = about | result(one, two, pair, passive)
     options.out.write_text(result_text(found))

@@ -91,7 +91,7 @@ void composite_forward(const Composite<T>& in, T* out, T* weight, int threads) {
 
 // With g_i = grad_out . value_i + grad_weight_i and B_i the g composited behind sample i,
 //   dL/dalpha_i = T_i (g_i - B_i),   B_{i-1} = alpha_i g_i + (1 - alpha_i) B_i,
-// walked back to front: no division, so alpha = 1 stays exact. See docs/derivations/composite.md.
+// walked back to front: no division, so alpha = 1 stays exact. See docs/method/gradients.md.
 template <class T>
 void composite_backward(const Composite<T>& in, const T* grad_out, const T* grad_weight,
                         T* grad_alpha, T* grad_value, int threads) {

@@ -178,7 +178,7 @@ void forward_chunk(const FieldRays<T, Nodes>& in, int64_t begin, int64_t end, T*
 // mean of what was read and g the pull at out:
 //   dL/dc_i = g . m + [read] A / B g . (v_i - m) + g_t t_i + g_opacity,   dL/dv_i = A / B c_i g
 // A section pulls with the mean of its two ends. Then as in composite.cpp, and from opacities to
-// the distances at the ends of sections. See docs/derivations/composite_field.md.
+// the distances at the ends of sections. See docs/method/gradients.md.
 template <class T, class Nodes>
 void pull_at_ray(const FieldRays<T, Nodes>& in, int64_t ray, const T* all_held, const T* grad_out,
                  const FieldPulls<T>& pulls, Weights<T>& w, std::vector<T>& own) {

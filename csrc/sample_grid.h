@@ -213,7 +213,7 @@ inline Pull<T> pull_of(const SamplingGrads<T, Touched>& g, int64_t i) {
 
 // dL/df at node (a, b, c) is the loss's pull on the weights,
 //   (v X_a + gx X'_a) Y_b Z_c + gy X_a Y'_b Z_c + gz X_a Y_b Z'_c,
-// X the value weights and X' the slope weights along x. See docs/derivations/dense_grid.md.
+// X the value weights and X' the slope weights along x. See docs/method/gradients.md.
 template <class T, class Nodes, class Rows>
 inline void scatter_sdf(const Rows& rows, const Located<T, Nodes>& at, const Pull<T>& g,
                         T* grad_sdf) {

@@ -204,7 +204,8 @@ void point_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGrad<T
 
 // With P_k, S_k the integrals of lobe k against cosine and layer, rgb = sum_k amplitude_k (diffuse
 // P_k + S_k). In the point's own frame directions are constants, so all that a lobe's exponential
-// passes on are its moments; the frame's gradient follows once a point. See docs/derivations/sg.md.
+// passes on are its moments; the frame's gradient follows once a point. See
+// docs/method/gradients-shading.md.
 template <class T>
 void shade_sg_backward(const ShadeSG<T>& in, const T* grad_rgb, const ShadeSGGrad<T>& grad,
                        int threads) {

@@ -303,7 +303,7 @@ void shade_radiance_forward(const Shade<T>& in, const T* radiance, T* rgb, int t
 }
 
 // grad radiance_dc = g_c (diffuse_c max(n.w, 0) + layer_dc) with g = solid_angle grad_rgb, and the
-// layer receives sum_c g_c radiance_dc. See docs/derivations/shade.md.
+// layer receives sum_c g_c radiance_dc. See docs/method/gradients-shading.md.
 template <class T>
 void shade_radiance_backward(const Shade<T>& in, const T* radiance, const T* grad_rgb,
                              const ShadeGrad<T>& grad, int threads) {

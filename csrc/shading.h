@@ -1,5 +1,5 @@
 // Shared by the kernels that shade: directions in the frame of a normal, and the BRDF's loops over
-// them. docs/derivations/sg.md derives the gradients.
+// them. docs/method/gradients-shading.md derives the gradients.
 #pragma once
 
 #include <algorithm>

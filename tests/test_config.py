@@ -171,7 +171,7 @@ def test_a_light_alone(light):
     config = preset("draft", Path("photos"), Path("run"), light)
     assert config.scene.light.kind == light
     assert config.scene.sky_nodes == 0
-    # docs/research/lights.md
+    # lab/notes/lights.md
     assert config.loss.light_smoothness == (1.0 if light == "sg" else 0.1)
     assert all(isinstance(stage, StageConfig) for stage in config.stages)
     assert sum(stage.share for stage in config.stages) == pytest.approx(1)

@@ -8,8 +8,10 @@ from pathlib import Path
 import doc_blocks
 import doc_names
 import doc_prose
+import doc_python
 import doc_reference
 import doc_tables
+import doc_truth
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -20,6 +22,7 @@ def test_pages_agree_with_results_and_code():
     assert doc_blocks.unused(ROOT) == []
     assert doc_prose.faults(ROOT) == []
     assert doc_names.faults(ROOT) == []
+    assert doc_truth.faults(ROOT) == []
 
 
 def test_every_field_of_the_configuration_has_a_meaning():
@@ -103,7 +106,7 @@ def test_tables_take_their_part_of_a_file():
     assert settings(capacity({"runs": sizes}, "fields")) == ["dense", "hash"]
     lights = {f"tiny draft {x} fixed none": {"nvs_psnr": n} for n, x in enumerate(("sg", "hybrid"))}
     varying = doc_tables.KINDS["varying.json"]({"runs": lights}, "hybrid")
-    assert varying.endswith("| as they are | `none` | 1.0 |")
+    assert varying.endswith("| unchanged | `none` | 1.0 |")
 
 
 def test_a_block_that_does_not_end_is_found(copy):
@@ -173,3 +176,49 @@ def test_a_tree_that_is_not_the_folders_is_found(tmp_path):
     gone, lacks = doc_names.tree(tmp_path)
     assert "no such file or folder: univoxel/none/" in gone
     assert "the tree lacks joint/" in lacks
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("Use `--presett fast`, or `--preset fast`.", ["--presett"]),
+        ("`cutout --source none`, as `--from` says", ["--source"]),
+        ("    univoxel lab chart X --out Y \\\n        --onli draft\n", ["--onli"]),
+        ("    univoxel train X --out Y --preset fast  # not --fast\n", []),
+        ("`pip install --no-deps univoxel`, `git clone --depth 1`", []),
+    ],
+)
+def test_options_that_no_command_has_are_found(text, found):
+    assert doc_truth.unknown_flags(text) == found
+
+
+def test_a_promise_that_a_page_does_not_keep_is_found(tmp_path):
+    (tmp_path / "docs/results").mkdir(parents=True)
+    (tmp_path / "examples").mkdir()
+    definitions, page = tmp_path / doc_truth.DEFINITIONS, tmp_path / "docs/page.md"
+    figures = "<!-- begin x.json -->\n" + "| 1 |\n" * 300 + "<!-- end x.json -->\n"
+    definitions.write_text(figures)
+    page.write_text("[Metrics](results/index.md#metrics)\n" + figures + "a line\n" * 150)
+    assert doc_truth.faults(tmp_path) == []
+    page.write_text(figures + "a line\n" * 250)
+    (tmp_path / "examples/run.py").write_text('"""univoxel export RUN --texturesize 2"""\n')
+    (long,) = doc_prose.faults(tmp_path)
+    assert re.fullmatch(r"docs/page\.md: 25\d lines, at most 200", long)
+    undefined, flag = doc_truth.faults(tmp_path)
+    assert undefined == "docs/page.md: has a table of figures and no link to docs/results/index.md"
+    assert flag == "examples/run.py: no such option: --texturesize"
+    (tmp_path / "examples/run.py").rename(tmp_path / "examples/run.ipynb")
+    (tmp_path / "examples/run.ipynb").write_text('{"cells": [{"source": ["`train --fast`"]}]}')
+    assert doc_truth.faults(tmp_path)[-1] == "examples/run.ipynb: no such option: --fast"
+
+
+def test_every_public_name_has_a_section():
+    import univoxel
+
+    text = doc_python.python()
+    public = [name for name in univoxel.__all__ if f"### univoxel.{name}\n" not in text]
+    assert public == ["Cancelled", "Run", "TrainingProgress", "UserError"]  # have other sections
+    for name in ("Run.relight", "univoxel.run.Verdict", "Options of univoxel.train"):
+        assert f"### {name}\n" in text
+    assert "| `Cancelled` | `Exception` |" in text
+    assert 'background: Literal["black", "white"] = "black",' in text

@@ -1,4 +1,4 @@
-"""Draws the diagrams of docs/explanation: stages, joint solve, carving, fields, layers.
+"""Draws the diagrams of docs/method: stages, joint solve, carving, fields, layers.
 
     python docs/figures/diagrams.py docs/images
 

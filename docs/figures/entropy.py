@@ -3,7 +3,7 @@
     python docs/figures/entropy.py docs/images
 
 A matte ball of three paints stands under a sun and an even sky. Its photograph is divided by the
-light that it had, and by an even one. The entropy is that of docs/explanation/albedo-entropy.md.
+light that it had, and by an even one. The entropy is that of docs/method/optimisation.md.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ sys.path.insert(0, str(ROOT))  # the package of this tree, wherever the command 
 import doc_blocks  # noqa: E402
 import doc_names  # noqa: E402
 import doc_prose  # noqa: E402
+import doc_truth  # noqa: E402
 
 
 def main() -> int:
@@ -27,7 +28,8 @@ def main() -> int:
     parser.add_argument("--release", action="store_true", help="figures must be of one version")
     options = parser.parse_args()
     faults = doc_blocks.update(ROOT, write=options.write)
-    faults += doc_blocks.unused(ROOT) + doc_prose.faults(ROOT) + doc_names.faults(ROOT)
+    faults += doc_blocks.unused(ROOT) + doc_prose.faults(ROOT)
+    faults += doc_names.faults(ROOT) + doc_truth.faults(ROOT)
     if options.release:
         faults += doc_blocks.several_versions(ROOT)
     for fault in faults:

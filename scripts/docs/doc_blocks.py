@@ -17,6 +17,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+import doc_python
 import doc_reference
 import doc_tables
 
@@ -44,7 +45,7 @@ def generated(name: str, results: Path) -> str:
         ValueError: no generator has this name; a result file cannot be made a table of.
         OSError: the result file cannot be read.
     """
-    generators: dict[str, Callable[[], str]] = doc_reference.GENERATORS
+    generators: dict[str, Callable[[], str]] = doc_reference.GENERATORS | doc_python.GENERATORS
     if name in generators:
         return generators[name]()
     return doc_tables.block(name, results)

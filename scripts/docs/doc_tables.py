@@ -13,13 +13,18 @@ their own table, as written by hand or by a script of one day:
 from __future__ import annotations
 
 import json
+import math
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 NVS = ("novel views, dB", "nvs_psnr", 1)
-ALBEDO = ("albedo, dB", "albedo_psnr_3ch", 1)
+# The frame has a black background that every model gets right, so the mask stands beside it
+ALBEDO = (
+    ("albedo, whole frame, dB", "albedo_psnr_3ch", 1),
+    ("albedo, mask only, dB", "albedo_psnr_fg", 1),
+)
 ROUGHNESS = ("roughness MSE", "roughness_mse", 4)
 RELIT = ("relit, dB", "relit_psnr", 1)
 NORMALS = ("normals, degrees", "normal_mae_deg", 1)
@@ -41,9 +46,15 @@ def block(name: str, results: Path) -> str:
     check_one_version(record)
     if missing := [key for key in ("date", "commit") if not record.get(key)]:
         raise ValueError(f"{file}: has no {' and no '.join(missing)}")
+    if beside := BESIDE.get(name):
+        record |= {"beside": json.loads((results / beside).read_text(encoding="utf-8"))}
     if kind := KINDS.get(name) or KINDS.get(file):
         made = f"*{version(record)}.*"
-        return kind(record, part) if part == "small" else f"{made}\n\n{kind(record, part)}"
+        return (
+            kind(record, part)
+            if part in ("small", "published")
+            else f"{made}\n\n{kind(record, part)}"
+        )
     if "columns" not in record:
         raise ValueError(f"{file}: no columns, and doc_tables.KINDS has no function for {name}")
     return described(record)
@@ -145,11 +156,11 @@ def _scene(name: str) -> str:
 
 
 def _chart(record: dict[str, Any], part: str) -> str:
-    """The presets on three scenes; `small` for the README."""
-    columns = (SECONDS, NVS, ALBEDO, RELIT, NORMALS)
-    if part != "small":
-        columns = (*columns[:3], ROUGHNESS, *columns[3:], MEMORY, ("file, MB", "mb", 1))
-        columns = (*columns, ("steps made, %", "steps", 0))
+    """The presets on three scenes; `small` for the README, beside what `baked` gives."""
+    if part == "small":
+        return _beside_baked(record)
+    columns = (SECONDS, NVS, *ALBEDO, ROUGHNESS, RELIT, NORMALS, MEMORY, ("file, MB", "mb", 1))
+    columns = (*columns, ("planned steps made, %", "steps", 0))
     runs = [
         (
             (_scene(p["scene"]), f"`{p['setting']}`"),
@@ -160,20 +171,63 @@ def _chart(record: dict[str, Any], part: str) -> str:
             },
         )
         for p in record["points"]
-        if part != "small" or p["setting"] == "fast"
     ]
-    keys = ("scene", "preset")
-    if part == "small":
-        return measured([((names[0],), m) for names, m in runs], keys[:1], columns)
-    return measured(runs, keys, columns)
+    return measured(runs, ("scene", "preset"), columns)
+
+
+def _beside_baked(record: dict[str, Any]) -> str:
+    """`fast` on each scene, and the albedo and relit pictures of a training without light."""
+    rows = record["beside"]["rows"]
+    baked = {r["scene"]: r["measures"] for r in rows if r["setting"] == "baked"}
+    columns = (
+        *(SECONDS, NVS, NORMALS, ("albedo, dB", "albedo_psnr_fg", 1)),
+        *(("baked albedo, dB", "baked_albedo", 1), RELIT, ("baked relit, dB", "baked_relit", 1)),
+    )
+    runs = []
+    for p in record["points"]:
+        if p["setting"] == "fast":
+            other = baked[p["scene"]]
+            other = {
+                "baked_albedo": other["albedo_psnr_fg"],
+                "baked_relit": other["relit_psnr"],
+            }
+            runs.append(((_scene(p["scene"]),), p["measures"] | other))
+    return measured(runs, ("scene",), columns)
+
+
+def _published(record: dict[str, Any], _: str) -> str:
+    """What the paper of the method that is followed reports, on its own data."""
+    runs = [
+        ((p["name"], p["where"]), {"minutes": p["minutes"]} | p["measures"])
+        for p in record["published"]
+        if p["name"].startswith("UniVoxel")
+    ]
+    albedo = ("albedo, dB", "albedo_psnr_3ch", 1)
+    columns = (("training, minutes", "minutes", 0), NVS, albedo, ROUGHNESS, RELIT, NORMALS)
+    return measured(runs, ("method", "data and GPU"), columns)
 
 
 def _lights(record: dict[str, Any], _: str) -> str:
-    columns = (SECONDS, NVS, ALBEDO, ROUGHNESS, RELIT, NORMALS, MEMORY)
-    columns += (("grey ball, dB", "map_ball_psnr", 1),)
-    columns += (("brightest direction, degrees off", "map_brightest_degrees", 1),)
-    runs = [((_scene(r["scene"]), f"`{r['setting']}`"), r["measures"]) for r in record["rows"]]
-    return measured(runs, ("scene", "light"), columns)
+    """The lighting models by scene, the baseline first; the best of a scene is bold."""
+    quality = (NVS, *ALBEDO, RELIT, ("diffuse sphere, dB", "map_ball_psnr", 1), ROUGHNESS, NORMALS)
+    lower = {ROUGHNESS, NORMALS}
+    columns = (*quality, ("brightest direction, degrees", "map_brightest_degrees", 1), SECONDS)
+    rows = []
+    for scene in dict.fromkeys(r["scene"] for r in record["rows"]):
+        runs = [r for r in record["rows"] if r["scene"] == scene]
+        best = {}
+        for column in quality:
+            values = [v for r in runs if (v := r["measures"].get(column[1])) is not None]
+            best[column] = min(values) if column in lower else max(values)
+        for run in sorted(runs, key=lambda r: r["setting"] != "baked"):
+            cells = []
+            for column in columns:
+                value = run["measures"].get(column[1])
+                text = number(value, column[2])
+                cells.append(f"**{text}**" if value == best.get(column, math.nan) else text)
+            rows.append([_scene(scene), f"`{run['setting']}`", *cells])
+    heads = ["scene", "light", *[name for name, _, _ in columns]]
+    return table(heads, grouped(rows), [False] * 2 + [True] * len(columns))
 
 
 def _trust(record: dict[str, Any], _: str) -> str:
@@ -185,13 +239,13 @@ def _trust(record: dict[str, Any], _: str) -> str:
 def _demo(record: dict[str, Any], _: str) -> str:
     """What `univoxel eval --json` wrote of the demo."""
     shown = record | {"mb": record["model_bytes"] / 1e6}
-    columns = (SECONDS, MEMORY, NVS, ALBEDO, ROUGHNESS, RELIT, NORMALS, ("file, MB", "mb", 1))
+    columns = (SECONDS, MEMORY, NVS, *ALBEDO, ROUGHNESS, RELIT, NORMALS, ("file, MB", "mb", 1))
     return measured([(("bundled scene",), shown)], ("scene",), columns)
 
 
 def _capacity(record: dict[str, Any], part: str) -> str:
     """The preset's sizes against chosen ones; or `fields`: those sizes on every kind of field."""
-    columns = (("parameters", "stored_parameters", 0), ("file, MB", "mb", 1), SECONDS, NVS, ALBEDO)
+    columns = (("parameters", "stored_parameters", 0), ("file, MB", "mb", 1), SECONDS, NVS, *ALBEDO)
     columns = (*columns, ROUGHNESS, RELIT, NORMALS)
     runs = []
     for name, m in record["runs"].items():
@@ -321,12 +375,12 @@ def _field_scaling(record: dict[str, Any], _: str) -> str:
 
 
 VARYING = {
-    "fixed": "as they are",
+    "fixed": "unchanged",
     "exposure": "random exposure within 1 stop",
     "metered": "automatic exposure within 1 stop",
     "color": "random gains per channel within 1/2 stop",
-    "relit": "rendered anew, one light",
-    "turned": "rendered anew, light turns with the camera",
+    "relit": "rendered again under one light",
+    "turned": "rendered again, light turns with the camera",
 }
 
 
@@ -338,13 +392,13 @@ def _varying(record: dict[str, Any], light: str) -> str:
             _, _, its_light, photographs, option = name.split(" ")
             if (photographs, its_light) == (kind, light):
                 runs.append(((meaning, f"`{option}`"), m))
-    columns = (ALBEDO, RELIT, ROUGHNESS, NVS, ("gains off by, stops", "gain_stops", 2))
+    columns = (*ALBEDO, RELIT, ROUGHNESS, NVS, ("gain error, stops", "gain_stops", 2))
     return measured(runs, ("photographs", "`--varying`"), columns)
 
 
 def _priors(record: dict[str, Any], _: str) -> str:
     runs = [((f"{m['loss']['light_smoothness']:g}",), m) for m in record["runs"].values()]
-    return measured(runs, ("weight",), (NVS, ALBEDO, ROUGHNESS, RELIT, NORMALS))
+    return measured(runs, ("weight",), (NVS, *ALBEDO, ROUGHNESS, RELIT, NORMALS))
 
 
 def _stress(record: dict[str, Any], part: str) -> str:
@@ -369,7 +423,7 @@ def _stress(record: dict[str, Any], part: str) -> str:
                 rows.append([f"`{axis}`", bold, *shown])
             rows.append([f"`{axis}`", "3 dB lost at", *[broken(axis, light) for light in lights]])
         return table(["axis", "level", *[f"`{x}`, dB" for x in lights]], grouped(rows))
-    columns = (RELIT, NVS, ALBEDO, ROUGHNESS, NORMALS)
+    columns = (RELIT, NVS, *ALBEDO, ROUGHNESS, NORMALS)
     rows = []
     for r in record["rows"]:
         cells = []
@@ -407,7 +461,7 @@ def _relight(record: dict[str, Any], part: str) -> str:
     """Error by strategy; or `mitsuba`, `pictures` of Cycles, and `rays` of bare Embree."""
     if part == "mitsuba":
         heads = ["material", "samples", "error", "Mitsuba, ms", "univoxel to the same error, ms"]
-        names = {"same_brdf": "our BRDF, sampled by the cosine", "principled": "`principled`"}
+        names = {"same_brdf": "our BRDF, cosine sampling", "principled": "`principled`"}
         rows = []
         for key, name in names.items():
             for r in record["mitsuba"][key]:
@@ -423,7 +477,7 @@ def _relight(record: dict[str, Any], part: str) -> str:
         against = (r["ratio_to_bare"], r["ratio_to_bare_packets"])
         heads = ["shadow rays", "rate against `rtcOccluded1`", "against packets of 8"]
         return table(heads, [[f"{r['rays']:,}", *[f"{x:.2f}" for x in against]]], [True] * 3)
-    names = {"mis": "map and BRDF (MIS)", "map": "map alone", "brdf": "BRDF alone"}
+    names = {"mis": "map and BRDF (MIS)", "map": "map only", "brdf": "BRDF only"}
     runs: dict[str, dict[int, dict]] = {}
     for r in record["strategies"]:
         runs.setdefault(r["strategy"], {})[r["spp"]] = r
@@ -457,10 +511,14 @@ def _relight_runs(record: dict[str, Any], part: str) -> str:
     return table(["relit, dB, by bounces", *map(str, bounces)], rows)
 
 
+# Blocks that show a second file: functions find it under "beside" in the record
+BESIDE = {"chart.json:small": "lights.json"}
+
 KINDS: dict[str, Callable[[dict[str, Any], str], str]] = {
     "chart.json": _chart,
     "chart.json:small": _chart,
     "chart.json:trust": _trust,
+    "chart.json:published": _published,
     "demo.json": _demo,
     "lights.json": _lights,
     "capacity.json": _capacity,

@@ -53,7 +53,7 @@ CLONE = PACKAGE.parent  # of the repository, where the package stands in one
 OPTIONS = {"changes": "--set", "source": "--from"}
 
 # Turns that a thread waits before it leaves its core to other programs. By default it waits for
-# so long that a training beside one other program took six times as long (docs/research/speed.md)
+# so long that a training beside one other program took six times as long (lab/notes/speed.md)
 SPINS = "3000"
 
 

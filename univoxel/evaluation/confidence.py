@@ -41,7 +41,7 @@ from univoxel.sphere import fibonacci_sphere, gaps, side_of
 # Points of the surface, and what the photographs fix of each.
 #
 # No truth is read: only the photographs that were trained on, and the scene.
-# docs/explanation/trust.md explains the terms.
+# docs/method/detail.md explains the terms.
 
 
 POINTS = 20_000  # of the surface that evaluation surveys, for its maps of doubt
