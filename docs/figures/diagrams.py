@@ -139,9 +139,9 @@ def joint_solve() -> Figure:
         (2.35, 1.9),
         (1.75, 1.1),
         "trials",
-        "hypotheses on",
-        "roughness and metal",
-        "least residual wins",
+        "hypotheses on metal",
+        "unused observations",
+        "decide",
         color=RED,
     )
     box(
